@@ -26,6 +26,8 @@ DERIVED_FIELDS = {
     KIN0: "tendon_length0 eq_data cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0",
     INERT0: "dof_invweight0 body_invweight0 tendon_invweight0 actuator_acc0",
 }
+# C takes one frame for another where its compiler found them equal, and looks at these fields no more.
+_FRAMES = {"body_ipos", "body_iquat", "geom_pos", "geom_quat", "site_pos", "site_quat"}
 # Not a field of the model but of its options, which put_model cannot expand.
 GRAVITY = "gravity"
 
@@ -72,3 +74,6 @@ def write_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> 
         # A few of MuJoCo Warp's fields are its own, or laid out otherwise.
         if target is not None and target.size == value.size:
             target[:] = value.reshape(target.shape)
+    if _FRAMES & set(fields):
+        for same in (mj_model.body_sameframe, mj_model.geom_sameframe, mj_model.site_sameframe):
+            same[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE

@@ -1,7 +1,7 @@
 """This module launches the substeps of a world with the sensors that are wanted, and the refresh of what derives."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -13,6 +13,7 @@ import warp as wp
 from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.collision.collisions import collisions
 from ksim_rl.physics.contact_sensors import ContactReadings
+from ksim_rl.physics.fixed_geoms import placing_of_fixed_geoms
 from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.rows.constraint_rows import constraint_rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
@@ -56,6 +57,7 @@ class Substeps:
         aside: wp.Stream | None = None,
         mask: wp.array | None = None,
         record: Mapping[str, wp.array] | None = None,
+        expanded: Collection[str] = (),
     ) -> None:
         self.warp_model, self.warp_data_E, self._aside = warp_model, warp_data_E, aside
         sensor_type = mj_model.sensor_type
@@ -90,6 +92,7 @@ class Substeps:
             self._models = {which: upstream.without(ours, m) for which, m in self._models.items()}
             if own_broad_phase:
                 self._collide = collisions(warp_model, warp_data_E, self.contact_lists)
+        self._place_fixed_geoms = placing_of_fixed_geoms(warp_model, warp_data_E, expanded)
         if one_kernel_integration:
             self._integrate = integration(warp_model, warp_data_E, record=record)
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
@@ -112,6 +115,8 @@ class Substeps:
 
     def advance(self, *, sensors: Sensors, is_last: bool = True) -> None:
         """Launch one physics step. Sensors never change the state that it reaches; after the last, all may be read."""
+        if self._place_fixed_geoms is not None:
+            self._place_fixed_geoms()
         # Callbacks are set at any time, and stand between the stages of the kernel.
         dynamics = None if calls_back(self.warp_model) else self._dynamics
         if self._ties_bodies and dynamics is None:
@@ -146,6 +151,8 @@ class Substeps:
         """
         m, d, needed = self._refresh_warp_model, self.warp_data_E, self.refreshed_on_demand
         sums_momenta = bool(needed & SUBTREE_VELOCITIES)
+        if self._place_fixed_geoms is not None:
+            self._place_fixed_geoms()
         if self._dynamics is None:
             mjw.kinematics(m, d)
             mjw.com_pos(m, d)

@@ -123,6 +123,7 @@ class World(views.DataViews):
                 aside=aside,
                 mask=self._reset_mask,
                 record=self._overflow.arrays,
+                expanded=expanded,
             )
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)

@@ -69,7 +69,7 @@ each(NUM_CHAINS, [&](int chain) {
     }
 });
 sync();
-// Geoms of the world stay where make_data has put them.
+// Geoms of the world stay where make_data, or fixed_geoms.py, has put them.
 auto geom_of = [&](int item) { return look_up(problem.moving_geoms, item); };
 if (problem.places_geoms) {
     compute_row(problem.geom_xpos, NUM_MOVING_GEOMS, geom_of, [&](int item) {

@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import native
+from ksim_rl.physics.fixed_geoms import fixed_geoms
 from ksim_rl.physics.sim_cfg import SimCfg
 
 SMOOTH = ("world", "layout", "kinematics", "inertia", "velocities", "passive", "actuation")
@@ -247,9 +248,5 @@ def _block(parts: tuple[str, ...], sizes: Mapping[str, int], worlds: int) -> tup
 
 
 def _moving_geoms(warp_model: mjw.Model) -> np.ndarray:
-    """Return the geoms whose place `make_data` does not fix: all but those of the world and what is welded to it."""
-    m = warp_model
-    body = m.geom_bodyid.numpy()
-    moves = m.body_weldid.numpy() != 0
-    moves |= m.body_mocapid.numpy()[m.body_rootid.numpy()] != -1
-    return np.flatnonzero(moves[body])
+    """Return the geoms whose place `make_data` does not fix."""
+    return np.flatnonzero(~fixed_geoms(warp_model))
