@@ -106,16 +106,17 @@ def _summary(cfg: ManagerBasedRlEnvCfg, driver: EnvDriver) -> str:
         f"{driver.num_envs} envs on {driver.device}, "
         f"{driver.step_dt:g} s per step = {cfg.decimation} x {driver.physics_dt:g} s, "
         f"episodes of {length if driver.max_episode_length else 'any length'}\n"
-        f"constraints are solved by {_kernels(driver.world.one_kernel_unavailable, 'solver')}\n"
-        f"what precedes them is computed by {_kernels(driver.world.one_kernel_dynamics_unavailable, 'kernels')}\n"
-        f"their rows are made by {_kernels(driver.world.one_kernel_rows_unavailable, 'kernels')}\n"
-        f"contacts are found by {_kernels(driver.world.one_kernel_collisions_unavailable, 'kernels')}"
+        + "\n".join((*driver.world.plan.lines(), *_hooks(driver)))
         + "".join(f"\n{line}" for line in driver.non_finite.lines())
     )
 
 
-def _kernels(unavailable: str | None, theirs: str) -> str:
-    return "one kernel" if unavailable is None else f"MuJoCo Warp's own {theirs}, because {unavailable}"
+def _hooks(driver: EnvDriver) -> list[str]:
+    """Return a line where parts of the env, such as motor models, run between substeps."""
+    before, after = len(driver.before_substep), len(driver.after_substep)
+    if not before and not after:
+        return []
+    return [f"substeps are launched one by one, for {before} hooks before and {after} after each"]
 
 
 def _keys(transform: Transform) -> str:

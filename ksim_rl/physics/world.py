@@ -18,7 +18,7 @@ from ksim_rl.device.memory import memory_for
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device, warp_scope, warp_stream
 from ksim_rl.physics import capacity, upstream, views
-from ksim_rl.physics.collision.collisions import broad_phase_unavailable, pairs_left
+from ksim_rl.physics.callbacks import Callbacks
 from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields, fields_to_expand
 from ksim_rl.physics.masked_constants import MaskedConstants
@@ -27,9 +27,8 @@ from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.resets import resets
-from ksim_rl.physics.rows.constraint_rows import one_kernel_rows_unavailable
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.smooth import stages
+from ksim_rl.physics.substep_plan import SubstepPlan, substep_plan, with_callbacks
 from ksim_rl.physics.substeps import Sensors, Substeps
 
 
@@ -55,7 +54,7 @@ class World(views.DataViews):
         one_kernel_rows_unavailable: the same of the constraint rows.
         one_kernel_collisions_unavailable: why MuJoCo Warp's own kernels find contacts, or some of them.
         one_kernel_integration_unavailable: why MuJoCo Warp's own kernels advance the state; None where one kernel does,
-            which the same setting asks for.
+            which the same setting asks for. Callbacks that are set later count in `plan`, not in these.
     """
 
     def __init__(
@@ -104,22 +103,20 @@ class World(views.DataViews):
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
             self._launch_reset = resets(self.warp_model, self.warp_data_E, self._reset_mask)
             m, d, no_solver = self.warp_model, self.warp_data_E, self.one_kernel_unavailable
-            no_dynamics = stages.one_kernel_dynamics_unavailable(m, self.sim, solver_unavailable=no_solver)
-            no_rows = one_kernel_rows_unavailable(m, dynamics_unavailable=no_dynamics)
-            no_pairs = broad_phase_unavailable(m, d, rows_unavailable=no_rows)
-            no_integration = stages.one_kernel_integration_unavailable(m, dynamics_unavailable=no_dynamics)
-            self.one_kernel_dynamics_unavailable, self.one_kernel_rows_unavailable = no_dynamics, no_rows
-            self.one_kernel_collisions_unavailable = no_pairs or pairs_left(m)
-            self.one_kernel_integration_unavailable = no_integration
+            plan = self._plan = substep_plan(m, d, self.sim, solver_unavailable=no_solver)
+            self.one_kernel_dynamics_unavailable = plan.dynamics
+            self.one_kernel_rows_unavailable = plan.rows
+            self.one_kernel_collisions_unavailable = plan.collisions
+            self.one_kernel_integration_unavailable = plan.integration
             # One of torch's, since Warp's own wait for the default stream, which no capture allows.
             aside = None if self.device.type == "cpu" else warp_stream(torch.cuda.Stream(self.device))
             self._substeps = Substeps(
                 *(self.mj_model, m, d),
-                one_kernel_solver=no_solver is None,
-                one_kernel_dynamics=no_dynamics is None,
-                one_kernel_rows=no_rows is None,
-                own_broad_phase=no_pairs is None,
-                one_kernel_integration=no_integration is None,
+                one_kernel_solver=plan.solver is None,
+                one_kernel_dynamics=plan.dynamics is None,
+                one_kernel_rows=plan.rows is None,
+                own_broad_phase=plan.broad_phase is None,
+                one_kernel_integration=plan.integration is None,
                 aside=aside,
                 mask=self._reset_mask,
                 record=self._overflow.arrays,
@@ -134,8 +131,7 @@ class World(views.DataViews):
             with warp_scope(self.device):
                 self._nan_guard = NanGuard(self.sim.nan_guard, self.mj_model, self.warp_data_E, self._fields)
         self.gravity_EL = gravity_EL
-        # Ours only launch kernels; those that a program sets later may do anything.
-        self._own_callbacks = dict(vars(self.warp_model.callback))
+        self._callbacks = Callbacks(self.warp_model)
         super().__init__(self.warp_data_E)
         if self.device.type == "cuda":
             self._load_kernels()
@@ -147,6 +143,11 @@ class World(views.DataViews):
     def has_one_kernel_solver(self) -> bool:
         """Whether one kernel solves the constraints."""
         return self.one_kernel_unavailable is None
+
+    @property
+    def plan(self) -> SubstepPlan:
+        """Which kernels compute each stage of the next substep, and why, with the callbacks that are set now."""
+        return with_callbacks(self._plan, self._callbacks.of_program())
 
     @property
     def timestep(self) -> float:
@@ -399,8 +400,8 @@ class World(views.DataViews):
         Callbacks are Python, and set at any time: a graph of before would leave them out, and one with them would never
         run their Python again.
         """
-        calls_back = vars(self.warp_model.callback) != self._own_callbacks
-        self._graphs.run(key, launches, live=calls_back)
+        self._callbacks.keep_our_filter()
+        self._graphs.run(key, launches, live=bool(self._callbacks.of_program()))
 
     def _launch_substeps(self, n: int, sensors: str) -> None:
         for substep in range(n):

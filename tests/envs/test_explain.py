@@ -32,7 +32,7 @@ def tables(text):
     """Return the tables by title, each a list of rows without its heads."""
     found: dict[str, list[str]] = {}
     title = ""
-    for line in text.splitlines()[5:]:
+    for line in text.splitlines()[6:]:
         if line and not line.startswith(" "):
             title = line
             found[title] = []
@@ -72,18 +72,48 @@ def test_the_first_line_says_how_many_and_how_long():
     assert puck_env(limit=None).explain().splitlines()[0].endswith("episodes of any length")
 
 
-def test_the_next_lines_say_what_kernels_compute_physics():
-    assert explained().splitlines()[1:5] == [
-        "constraints are solved by one kernel",
-        "what precedes them is computed by MuJoCo Warp's own kernels, "
+def test_the_next_lines_say_whose_each_stage_of_a_substep_is_and_why():
+    assert explained().splitlines()[1:6] == [
+        "what precedes constraints is computed by MuJoCo Warp's own kernels, "
         "because sim.one_kernel_dynamics is None, on the CPU",
-        "their rows are made by MuJoCo Warp's own kernels, because what precedes them is not one kernel",
         "contacts are found by MuJoCo Warp's own kernels, because the rows of contacts are not made by one kernel",
+        "constraint rows are made by MuJoCo Warp's own kernels, because what precedes them is not one kernel",
+        "constraints are solved by one kernel",
+        "the state is advanced by MuJoCo Warp's own kernels, because sim.one_kernel_dynamics is None, on the CPU",
     ]
     env = puck_env(limit=None, sim=SimCfg(solver="cg", one_kernel_dynamics=True))
-    solver, kernels = env.explain().splitlines()[1:3]
+    dynamics, _, _, solver, integration = env.explain().splitlines()[1:6]
     assert solver == "constraints are solved by MuJoCo Warp's own solver, because the solver is not Newton's"
-    assert kernels.endswith("own kernels, because the constraints are not solved by one kernel")
+    for line in (dynamics, integration):
+        assert line.endswith("own kernels, because the constraints are not solved by one kernel")
+    env = puck_env(limit=None, sim=SimCfg(integrator="implicit", one_kernel_dynamics=True))
+    dynamics, *_, integration = env.explain().splitlines()[1:6]
+    assert dynamics == "what precedes constraints is computed by one kernel"
+    assert integration == (
+        "the state is advanced by MuJoCo Warp's own kernels, because the integrator is mjINT_IMPLICIT"
+    )
+
+
+def test_callbacks_and_hooks_show_from_when_they_are_set_until_they_are_taken_away():
+    env = puck_env(limit=None, sim=SimCfg(one_kernel_dynamics=True))
+    before = env.explain()
+    assert "what precedes constraints is computed by one kernel" in before
+    env.world.warp_model.callback.control = lambda m, d: None
+    lines = env.explain().splitlines()[1:7]
+    reason = "MuJoCo Warp's own kernels, because a program has set callbacks (control)"
+    assert lines[0] == f"what precedes constraints is computed by {reason}"
+    assert lines[1].startswith("contacts are found by MuJoCo Warp's own kernels")
+    assert lines[2] == f"constraint rows are made by {reason}"
+    assert lines[3:5] == ["constraints are solved by one kernel", "the state is advanced by one kernel"]
+    assert lines[5] == "callbacks of the program run in each substep: control"
+    env.world.warp_model.callback.control = None
+    env.world.warp_model.callback.sensor = lambda m, d, stage: None
+    assert env.explain().splitlines()[1] == before.splitlines()[1], "one of sensors has no part in the forces"
+    assert "callbacks of the program run in each substep: sensor" in env.explain()
+    env.world.warp_model.callback.sensor = None
+    assert env.explain() == before
+    env.driver.after_substep.append(lambda: None)
+    assert "substeps are launched one by one, for 0 hooks before and 1 after each" in env.explain()
 
 
 def test_an_empty_manager_says_none_and_lines_stay_within_the_width():
