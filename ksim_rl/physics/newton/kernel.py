@@ -20,7 +20,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.physics import native
-from ksim_rl.physics.newton.limbs import Limbs, padded
+from ksim_rl.physics.newton.limbs import Limbs, padded, row_stride
 
 CUDA_LANES, SORTING_THREADS = 32, 1024
 _PARTS = ("layout", "constraints", "cost", "limbs", "tiles", "hessian", "line_search", "newton")
@@ -49,8 +49,8 @@ def layout(
 ) -> dict[str, int]:
     """Return the sizes of what the lanes of a world share, by the names of the C++, and all of it in `FLOATS`."""
     arms, chains, trunk = len(limbs.trunk) + 1, len(limbs.chains), padded(len(limbs.trunk))
-    limb, stride = len(limbs.chains[-1]) if chains else 1, _row_stride(nv)
-    narrow = _row_stride(trunk + limb) if chains else stride
+    limb, stride = len(limbs.chains[-1]) if chains else 1, row_stride(nv)
+    narrow = row_stride(trunk + limb) if chains else stride
     # A column of a whole block has the entries of the block twice; one more is that of the gradient.
     column = padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
     # Part 4 of the C++ has blocks and arms of limbs, then the trunk; part 6 has two columns, or in the end two rows.
@@ -78,11 +78,6 @@ def layout(
         "ELLIPTIC": elliptic,
         "FLOATS": floats + (4 * rows + rows // 2 if elliptic else 0) + (rows // 2 if tile else 0),
     }
-
-
-def _row_stride(entries: int) -> int:
-    # Whole groups of four, which are loaded at once; an odd number of them, so that the lanes' rows lie in other banks.
-    return 4 * (-(-entries // 4) | 1)
 
 
 def launcher(

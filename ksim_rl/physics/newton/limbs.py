@@ -27,7 +27,7 @@ class Limbs:
 
 
 def limbs_of(parents: Sequence[int]) -> Limbs:
-    """Return the limbs of a tree, or nothing where there is one limb, or one part is too large."""
+    """Return the limbs of a tree, or nothing where there is one limb, one part is too large, or rows get no narrower."""
     leaves, chains = [0] * len(parents), dict[int, list[int]]()
     for dof in reversed(range(len(parents))):
         leaves[dof] = max(leaves[dof], 1)
@@ -39,8 +39,30 @@ def limbs_of(parents: Sequence[int]) -> Limbs:
     trunk = tuple(dof for dof, count in enumerate(leaves) if count > 1)
     # The longest is the last, so that what a limb lacks of it are slots of others, of which it has no entries.
     limbs = tuple(sorted(map(tuple, chains.values()), key=len))
-    suits = 1 < len(limbs) <= MOST_LIMBS and len(trunk) <= MOST_OF_TRUNK and len(limbs[-1]) <= MOST_OF_LIMB
-    return Limbs(trunk=trunk, chains=limbs) if suits else Limbs(trunk=(), chains=())
+    found = Limbs(trunk=trunk, chains=limbs)
+    return found if _suits(found, nv=len(parents)) else Limbs(trunk=(), chains=())
+
+
+def _suits(limbs: Limbs, *, nv: int) -> bool:
+    """Whether the solver gains by these limbs: each fits a lane's registers, and narrow rows are no wider than whole."""
+    if not 1 < len(limbs.chains) <= MOST_LIMBS:
+        return False
+    longest = len(limbs.chains[-1])
+    if len(limbs.trunk) > MOST_OF_TRUNK or longest > MOST_OF_LIMB:
+        return False
+    # In a small tree, such as a cart with two poles, padding makes the narrow row the wider one.
+    narrow = row_stride(padded(len(limbs.trunk)) + longest)
+    return narrow <= row_stride(nv)
+
+
+def row_stride(entries: int) -> int:
+    """Return the floats from one row of so many entries to the next on the chip.
+
+    Rows are whole groups of four floats, which are loaded at once. The number of groups is odd, so that the rows of
+    neighbouring lanes begin in other banks of shared memory.
+    """
+    groups = -(-entries // 4)
+    return 4 * (groups | 1)
 
 
 def padded(count: int) -> int:

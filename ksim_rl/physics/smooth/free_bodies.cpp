@@ -3,15 +3,18 @@
 // arm from its frame to its centre of mass, both along the axes of the world, m its mass and I its inertia there,
 //
 //     d bias / d v = [0  -m K R; 0  R' (-m [s] K + [w] I - [I w]) R],   K = s w' - w's + [w x s].
+//
+// The pose is read from qpos: xpos and xmat are written only in substeps whose results are read.
 
 if (SOLVES)
     each(NUM_FREE_BODIES, [&](int free) {
         const int body = look_up(problem.body_freeadr, free), first = look_up(problem.body_dofadr, body);
         const auto& crb = row_of(problem.crb)[body];
         const float mass = crb[9];
-        const mat33 turn = row_of(problem.xmat)[body];
+        const float* const q = row_of(problem.qpos) + look_up(problem.jnt_qposadr, look_up(problem.body_jntadr, body));
+        const mat33 turn = matrix(unit_quat(q + 3));
         const mat33 moments(crb[0], crb[3], crb[4], crb[3], crb[1], crb[5], crb[4], crb[5], crb[2]);
-        const vec3 arm = row_of(problem.subtree_com)[body] - row_of(problem.xpos)[body];
+        const vec3 arm = row_of(problem.subtree_com)[body] - vec3(q[0], q[1], q[2]);
         const float* const own_spin = row_of(problem.qvel) + first + 3;
         const vec3 spin = wp::mul(turn, vec3(own_spin[0], own_spin[1], own_spin[2]));
         mat33 K = wp::outer(arm, spin) + wp::skew(wp::cross(spin, arm));
