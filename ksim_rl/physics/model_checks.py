@@ -7,6 +7,8 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 
+from ksim_rl.physics.sensor_checks import check_sensors
+
 # Where a field's prefix is not the name of MuJoCo's type of object.
 TYPES_OF_PREFIXES = {"jnt": "joint", "cam": "camera", "mat": "material", "eq": "equality"}
 # The largest number that the float32 of the GPU holds.
@@ -81,7 +83,8 @@ def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
 
 
 def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None = None) -> mjw.Model:
-    """Put a model on Warp's current device, or name the feature that MuJoCo Warp does not have."""
+    """Put a model on Warp's current device, or name the feature that MuJoCo Warp does not have, or has wrong."""
+    check_sensors(mj_model)
     try:
         with warnings.catch_warnings():
             # It doubts friction of geoms without contacts; MuJoCo itself accepts them.

@@ -33,6 +33,9 @@ from mujoco_warp._src.smooth import tendon_bias as tendon_bias
 
 # The bits of `contact.type`.
 from mujoco_warp._src.types import ContactType as ContactType
+
+# The type of a contact's friction and of its impedance.
+from mujoco_warp._src.types import vec5 as vec5
 from torch import Tensor
 
 GEOM_TYPES = {kind.name: int(kind) for kind in mjw.GeomType}
@@ -171,18 +174,30 @@ def pair_type_counts(warp_model: mjw.Model, pairs: np.ndarray) -> tuple[int, ...
     return tuple(np.bincount(places, minlength=kinds * (kinds + 1) // 2).tolist())
 
 
-def drop_pairs(warp_model: mjw.Model, dropped: np.ndarray) -> None:
+def drop_contacts(warp_model: mjw.Model, dropped: np.ndarray) -> None:
     """Let MuJoCo Warp make no contacts of some geom pairs, in place: it has no setting for a pair.
 
-    `dropped` is bool [N], in the order of `geom_pairs`.
+    Sensors still measure them. `dropped` is bool [N], in the order of `geom_pairs`.
     """
     pairs, pair_ids = geom_pairs(warp_model)
-    left_ids = np.where(dropped[:, None], (NO_CONTACT, NO_SENSOR), pair_ids)
+    left_ids = pair_ids.copy()
+    left_ids[dropped, 0] = NO_CONTACT
     may_touch = (left_ids[:, 0] > NO_CONTACT) | (left_ids[:, 1] > NO_SENSOR)
     warp_model.nxn_pairid = wp.array(left_ids, dtype=wp.vec2i)
     warp_model.nxn_pairid_filtered = wp.array(left_ids[may_touch], dtype=wp.vec2i)
     warp_model.nxn_geom_pair_filtered = wp.array(pairs[may_touch], dtype=wp.vec2i)
     warp_model.geom_pair_type_count = pair_type_counts(warp_model, pairs[may_touch])
+
+
+def measure_without_contacts(warp_model: mjw.Model) -> None:
+    """Let sensors of distances be read where contacts are disabled, in place.
+
+    They come from the collision pass, which MuJoCo Warp then leaves out: it gets one in which no pair makes contacts.
+    """
+    m, contact = warp_model, int(mjw.DisableBit.CONTACT)
+    if m.nsensorcollision and m.opt.disableflags & contact:
+        m.opt.disableflags &= ~contact
+        drop_contacts(m, np.ones(m.nxn_pairid.shape[0], dtype=bool))
 
 
 def add_height_fields(context: mjw.RenderContext, mj_model: mujoco.MjModel) -> None:

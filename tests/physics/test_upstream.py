@@ -124,7 +124,7 @@ def test_pairs_are_numbered_as_before(warp_model: mjw.Model) -> None:
     assert pairs.tolist() == [[0, 1], [0, 2], [1, 2]], "Model.nxn_geom_pair is ordered otherwise"
     assert pair_ids.tolist() == [[-1, -1], [-1, -1], [-2, -1]], "the ids of Model.nxn_pairid changed"
     kept = warp_model.geom_pair_type_count
-    upstream.drop_pairs(warp_model, pairs[:, 1] == -1)
+    upstream.drop_contacts(warp_model, pairs[:, 1] == -1)
     assert warp_model.geom_pair_type_count == kept, "Model.geom_pair_type_count counts otherwise"
 
 

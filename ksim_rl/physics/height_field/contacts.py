@@ -378,7 +378,7 @@ def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.D
     taken &= (pair_ids[:, 0] > upstream.NO_CONTACT) & (pair_ids[:, 1] == upstream.NO_SENSOR)
     if not taken.any() or warp_model.flg_surfacevel:
         return None
-    upstream.drop_pairs(warp_model, taken)
+    upstream.drop_contacts(warp_model, taken)
     own = {
         "pairs": wp.array(height_first[taken], dtype=wp.vec2i),
         "pair_ids": wp.array(pair_ids[taken], dtype=wp.vec2i),

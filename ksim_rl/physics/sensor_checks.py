@@ -1,0 +1,83 @@
+"""A model is refused here if one of its sensors would read something else than in MuJoCo's C engine."""
+
+import mujoco
+import numpy as np
+
+DISTANCES = (
+    mujoco.mjtSensor.mjSENS_GEOMDIST,
+    mujoco.mjtSensor.mjSENS_GEOMNORMAL,
+    mujoco.mjtSensor.mjSENS_GEOMFROMTO,
+)
+SDF = mujoco.mjtGeom.mjGEOM_SDF
+GEOM, BODY, TREE = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
+
+
+def check_sensors(mj_model: mujoco.MjModel) -> None:
+    """Refuse sensors of distances or contacts that no kernel reads as MuJoCo's C engine does."""
+    check_signed_distance_fields(mj_model)
+    flags, bits = mj_model.opt.disableflags, mujoco.mjtDisableBit
+    for sensor in np.flatnonzero(np.isin(mj_model.sensor_type, DISTANCES)):
+        if flags & bits.mjDSBL_CONSTRAINT:
+            raise ValueError(
+                f"{_name(mj_model, int(sensor))} needs a collision pass, and <flag constraint='disable'/> leaves it "
+                "out: disable contact, limit, equality and frictionloss instead"
+            )
+        if flags & bits.mjDSBL_CONTACT and mj_model.nflex:
+            raise ValueError(
+                f"{_name(mj_model, int(sensor))} needs a collision pass, in which flexes would touch in spite of "
+                "<flag contact='disable'/>: set contype and conaffinity of the flexes to 0 instead"
+            )
+
+
+def check_signed_distance_fields(mj_model: mujoco.MjModel) -> None:
+    """Refuse signed distance fields of plugins that collide, and sensors of distances or contacts of any."""
+    fields = np.flatnonzero(mj_model.geom_type == SDF)
+    collides = (mj_model.geom_contype | mj_model.geom_conaffinity) != 0
+    collides[mj_model.pair_geom1] = True
+    collides[mj_model.pair_geom2] = True
+    for geom in fields:
+        if mj_model.geom_plugin[geom] >= 0 and collides[geom]:
+            raise ValueError(
+                f"geom {mj_model.geom(int(geom)).name!r} collides, and its plugin computes it, which MuJoCo Warp does "
+                "not call: give it a mesh instead, or contype='0' conaffinity='0'"
+            )
+    for sensor in np.flatnonzero(
+        np.isin(mj_model.sensor_type, (*DISTANCES, mujoco.mjtSensor.mjSENS_CONTACT))
+    ):
+        of_contacts = mj_model.sensor_type[sensor] == mujoco.mjtSensor.mjSENS_CONTACT
+        own = geoms_of(mj_model, mj_model.sensor_objtype[sensor], int(mj_model.sensor_objid[sensor]))
+        others = geoms_of(mj_model, mj_model.sensor_reftype[sensor], int(mj_model.sensor_refid[sensor]))
+        # A sensor that names one object reads its contacts with everything.
+        found = fields[own[fields] | others[fields]]
+        if of_contacts:
+            found = found[collides[found]]
+        if found.size:
+            raise ValueError(
+                f"{_name(mj_model, int(sensor))} reads {'contacts' if of_contacts else 'distances'} of geom "
+                f"{mj_model.geom(int(found[0])).name!r}, a signed distance field, whose contacts MuJoCo Warp finds "
+                "otherwise than the C engine: replace the geom by a mesh, or remove the sensor"
+            )
+
+
+def geoms_of(mj_model: mujoco.MjModel, kind: int, element: int) -> np.ndarray:
+    """Return whether each geom is of an object of a sensor, bool [ngeom]; an object that is not named is all."""
+    geoms = np.arange(mj_model.ngeom)
+    if kind == GEOM:
+        return geoms == element
+    if kind == BODY:
+        return mj_model.geom_bodyid == element
+    if kind == TREE:
+        below = [body == element or _is_below(mj_model, body, element) for body in range(mj_model.nbody)]
+        return np.array(below)[mj_model.geom_bodyid]
+    return np.ones(mj_model.ngeom, dtype=bool)
+
+
+def _is_below(mj_model: mujoco.MjModel, body: int, ancestor: int) -> bool:
+    while body > ancestor:
+        body = int(mj_model.body_parentid[body])
+    return body == ancestor
+
+
+def _name(mj_model: mujoco.MjModel, sensor: int) -> str:
+    name = mj_model.sensor(sensor).name
+    return f"sensor {name!r}" if name else f"sensor number {sensor} (unnamed)"
