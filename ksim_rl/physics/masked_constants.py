@@ -13,8 +13,8 @@ import warp as wp
 
 from ksim_rl.physics import constant_kernels as kernels
 from ksim_rl.physics.fields import FIXED, INERT0, KIN0, const_groups
+from ksim_rl.physics.rows.tie_weights import BODY_EQUALITIES
 from ksim_rl.physics.structs import filled
-from ksim_rl.physics.substeps import BODY_EQUALITIES
 from ksim_rl.physics.upstream import set_fixed_constants
 
 KINEMATIC = frozenset(("qpos0", "body_pos", "body_quat", "jnt_pos", "jnt_axis"))
