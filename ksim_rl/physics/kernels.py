@@ -39,6 +39,32 @@ def align_steep_capsules(
 
 
 @wp.kernel(enable_backward=False)
+def take_the_law_of_priority(
+    geom_priority: wp.array[int],
+    geom_solref: wp.array2d[wp.vec2],
+    pair_geom1: wp.array[int],
+    pair_geom2: wp.array[int],
+    geom: wp.array[wp.vec2i],
+    world: wp.array[int],
+    nacon: wp.array[int],
+    solref: wp.array[wp.vec2],
+):
+    """Let the geom of higher priority alone say how stiff a contact is, also where that is given directly."""
+    contact = wp.tid()
+    if contact >= nacon[0]:
+        return
+    a, b = geom[contact][0], geom[contact][1]
+    if a < 0 or b < 0 or geom_priority[a] == geom_priority[b]:
+        return
+    for pair in range(pair_geom1.shape[0]):
+        first, second = pair_geom1[pair], pair_geom2[pair]
+        if (first == a and second == b) or (first == b and second == a):
+            return
+    stronger = wp.where(geom_priority[a] > geom_priority[b], a, b)
+    solref[contact] = geom_solref[world[contact] % geom_solref.shape[0], stronger]
+
+
+@wp.kernel(enable_backward=False)
 def sparse_velocity(
     rownnz: wp.array2d[int],
     rowadr: wp.array2d[int],

@@ -40,8 +40,9 @@ from torch import Tensor
 
 GEOM_TYPES = {kind.name: int(kind) for kind in mjw.GeomType}
 FIXED = int(mjw.SetConstGroup.FIXED)
-# The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures.
-NO_CONTACT, NO_SENSOR = -2, -1
+# The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures; and the
+# first for a pair that may touch without a <pair> of its own.
+NO_CONTACT, NO_SENSOR, NO_PAIR = -2, -1, -1
 # Of what is in `sensor_acc_adr`, those that read no accelerations and forces of bodies.
 FORCELESS = mujoco.mjtSensor.mjSENS_ACTUATORFRC, mujoco.mjtSensor.mjSENS_JOINTACTFRC
 

@@ -88,3 +88,51 @@ def test_an_upright_rod_keeps_a_frame():
     world.step()
     frame = world.last_substep("contact.frame")[0].double()
     torch.testing.assert_close(frame @ frame.T, torch.eye(3, dtype=torch.float64))
+
+
+# Of each pair one geom has priority, and one gives stiffness and damping directly; the last pair has a law of its own.
+LAWS = """
+<mujoco>
+  <asset><mesh name="wedge" vertex="-.1 -.1 -.1 .1 -.1 -.1 0 .1 -.1 0 0 .1"/></asset>
+  <asset><hfield name="ground" nrow="3" ncol="3" size="1 1 0.1 0.1" elevation="0 0 0 0 0 0 0 0 0"/></asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="9 9 1" priority="1" solref="-500 -10" solimp="0.8 0.9 0.01"/>
+    <geom name="table" type="box" size="0.2 0.2 0.1" pos="3 0 0.5" priority="2" solref="0.01 1"/>
+    <geom name="hills" type="hfield" hfield="ground" pos="-3 0 1" priority="1" solref="-300 -5"/>
+    <body pos="0 0 0.09"><freejoint/><geom name="egg" type="ellipsoid" size="0.1 0.12 0.1"/></body>
+    <body pos="1 0 0.09"><freejoint/><geom name="wedge" type="mesh" mesh="wedge" priority="3" condim="4"/></body>
+    <body pos="2 0 0.09"><freejoint/><geom name="ball" size="0.1" solref="-900 -9" priority="1"/></body>
+    <body pos="3 0 0.69"><freejoint/><geom name="box" type="box" size="0.1 0.1 0.1" solref="-800 -8"/></body>
+    <body pos="-3 0.1 1.09"><freejoint/><geom name="marble" size="0.1" solref="0.03 0.5"/></body>
+    <body pos="0 3 0.09"><freejoint/><geom name="can" type="cylinder" size="0.1 0.1" priority="2"/></body>
+  </worldbody>
+  <contact><pair geom1="floor" geom2="can" solref="0.04 0.7"/></contact>
+</mujoco>
+"""
+LAW = ("solref", "solimp", "friction", "dim")
+
+
+@pytest.mark.parametrize("one_kernel", [True, False])
+def test_the_geom_of_priority_alone_says_how_stiff_a_contact_is(one_kernel: bool):
+    mj_model = load_model(LAWS)
+    sim = SimCfg(njmax=200, nconmax=60, one_kernel_dynamics=one_kernel)
+    world = World(mj_model, num_envs=2, sim=sim, per_world_fields=["geom_solref"])
+    # In the second world the table, too, gives its stiffness directly.
+    world.field("geom_solref")[1, mj_model.geom("table").id] = torch.tensor([-700.0, -7.0])
+    world.step()
+    contact, count = world.warp_data_E.contact, int(world.warp_data_E.nacon.numpy()[0])
+    owner, geom = contact.worldid.numpy()[:count], np.sort(contact.geom.numpy()[:count], axis=1)
+    for row in range(2):
+        mj_model.geom_solref[mj_model.geom("table").id] = ([0.01, 1.0], [-700.0, -7.0])[row]
+        mj_data = mujoco.MjData(mj_model)
+        mujoco.mj_forward(mj_model, mj_data)
+        pairs = {(int(each.geom1), int(each.geom2)): each for each in mj_data.contact}
+        assert len(pairs) == 6
+        for pair, each in pairs.items():
+            mine = np.flatnonzero((owner == row) & (geom == np.sort(pair)).all(-1))
+            assert mine.size, pair
+            for name in LAW:
+                for value in getattr(contact, name).numpy()[mine]:
+                    np.testing.assert_allclose(
+                        value, getattr(each, name), rtol=1e-5, err_msg=f"{pair} {name}"
+                    )
