@@ -22,6 +22,8 @@ BALL = wp.constant(int(mujoco.mjtJoint.mjJNT_BALL))
 MINVAL = wp.constant(float(mujoco.mjMINVAL))
 KIN0 = wp.constant(int(mjw.SetConstGroup.KIN0))
 INERT0 = wp.constant(int(mjw.SetConstGroup.INERT0))
+# Below this speed of its centre of mass, in m/s, a body whose joint moves at unit speed is one that does not move.
+STANDS = wp.constant(1.0e-6)
 _SOURCE = files("ksim_rl.physics").joinpath("constants_of_inertia.cpp").read_text()
 
 
@@ -46,6 +48,7 @@ class Constants:
     dof_rotates: wp.array[float]
     group_start: wp.array[int]
     group_size: wp.array[int]
+    slides_alone: wp.array[bool]
     last_dof: wp.array[int]
     actuator_dof: wp.array[int]
     xpos: wp.array2d[wp.vec3]
@@ -184,6 +187,41 @@ def _light_reference(world: int, light: int, c: Constants):
     c.light_pos0[world % c.light_pos0.shape[0], light] = offset
     c.light_poscom0[world % c.light_poscom0.shape[0], light] = from_com
     c.light_dir0[world % c.light_dir0.shape[0], light] = wp.normalize(direction)
+
+
+@wp.kernel(enable_backward=False)
+def mend_weights(c: Constants):
+    """Give bodies the weights that C does where mujoco_warp.set_const gives others, by the frames at `qpos0`."""
+    world, body = wp.tid()
+    row = world % c.body_invweight0.shape[0]
+    if c.slides_alone[body]:
+        weight = 1.0 / c.body_mass[world % c.body_mass.shape[0], body]
+        c.body_invweight0[row, body] = wp.vec2(weight, 0.0)
+        last = c.last_dof[body]
+        while last >= 0 and c.dof_bodyid[last] == body:
+            c.dof_invweight0[world % c.dof_invweight0.shape[0], last] = weight
+            last = c.dof_parentid[last]
+        return
+    frame = world % c.xpos.shape[0]
+    com = c.xpos[frame, body] + rot_vec_quat(
+        c.body_ipos[world % c.body_ipos.shape[0], body], c.xquat[frame, body]
+    )
+    fastest, turns = float(0.0), float(0.0)  # noqa: UP018 (Warp: variables that change in a loop)
+    dof = c.last_dof[body]
+    while dof >= 0:
+        turns = wp.max(turns, c.dof_rotates[dof])
+        velocity = c.axis[frame, dof]
+        if c.dof_rotates[dof] > 0.0:
+            velocity = wp.cross(velocity, com - c.anchor[frame, dof])
+        fastest = wp.max(fastest, wp.length(velocity))
+        dof = c.dof_parentid[dof]
+    weights = c.body_invweight0[row, body]
+    # Of two figures, it puts the other one in the place of what is zero; C leaves it zero.
+    if weights[0] == weights[1]:
+        if turns == 0.0:
+            c.body_invweight0[row, body] = wp.vec2(weights[0], 0.0)
+        elif fastest < STANDS:
+            c.body_invweight0[row, body] = wp.vec2(0.0, weights[1])
 
 
 def floats_per_world(nv: int, nbody: int) -> int:

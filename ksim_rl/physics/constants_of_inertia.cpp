@@ -130,8 +130,13 @@ each(NV * NV, [&](int place) {
     inverse[place] = total;
 });
 // Mean diagonal of J M^-1 J^T at each centre of mass: translation, rotation. As in C, a body that only slides has 0 for
-// rotation, where mujoco_warp.set_const takes the other figure.
+// rotation, where mujoco_warp.set_const takes the other figure; and one that C calls simple, which slides along axes of
+// the world and carries nothing, weighs what its mass does, whatever its armature.
 each(NB, [&](int body) {
+    if (c.slides_alone.data[body]) {
+        row_of(c.body_invweight0)[body] = wp::vec2(1.0f / masses[body], 0.0f);
+        return;
+    }
     const vec3 point = points[body];
     float moved = 0.0f, turned = 0.0f;
     for (int k = tips[body]; k >= 0; k = parents[k]) {
@@ -154,7 +159,8 @@ each(NV, [&](int dof) {
     float total = 0.0f;
     for (int member = first; member < first + size; ++member)
         total += inverse[member * NV + member];
-    row_of(c.dof_invweight0)[dof] = total / (float)size;
+    const int body = c.dof_bodyid.data[dof];
+    row_of(c.dof_invweight0)[dof] = c.slides_alone.data[body] ? 1.0f / masses[body] : total / (float)size;
 });
 // Norm of the acceleration from unit force: of a column of M^-1, times the gear.
 each(c.actuator_dof.shape[0], [&](int actuator) {

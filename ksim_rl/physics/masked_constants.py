@@ -19,6 +19,8 @@ from ksim_rl.physics.upstream import set_fixed_constants
 
 KINEMATIC = frozenset(("qpos0", "body_pos", "body_quat", "jnt_pos", "jnt_axis"))
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+# What `body_simple` says of a body that has slides only, along axes of the world, and carries no other.
+SLIDES_ALONE = 2
 LANES = 128  # threads that share the work of one world on a GPU: a block
 _MOST_FLOATS_ON_CHIP = 40 * 1024 // 4  # of the 48 KiB of shared memory that any block has, some is Warp's
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -56,6 +58,7 @@ class MaskedConstants:
             "dof_rotates": wp.array(_rotates(mj_model), dtype=float),
             "group_start": wp.array(starts, dtype=int),
             "group_size": wp.array(sizes, dtype=int),
+            "slides_alone": wp.array(mj_model.body_simple == SLIDES_ALONE, dtype=bool),
             "last_dof": wp.array(_last_dofs(mj_model), dtype=int),
             "actuator_dof": wp.array(_driven_dofs(mj_model), dtype=int),
             "xpos": wp.zeros((num_frames, nbody), dtype=wp.vec3),
@@ -73,6 +76,11 @@ class MaskedConstants:
         self._constants.mask = self._everywhere
         wp.launch(kernels.frames, dim=self._everywhere.shape[0], inputs=[self._constants])
         self._constants.mask = self._mask
+
+    def mend_weights(self) -> None:
+        """Launch what gives all worlds the inverse weights of C after `mujoco_warp.set_const`."""
+        self.place_frames()
+        wp.launch(kernels.mend_weights, dim=self._constants.xipos.shape, inputs=[self._constants])
 
     def covers(self, fields: Iterable[str]) -> bool:
         """Return whether the constants that follow from `fields` can be recomputed here, as `World.set_const` says."""

@@ -372,13 +372,12 @@ class World(views.DataViews):
         return MaskedConstants(self.mj_model, self.warp_model, self._reset_mask, expanded)
 
     def _set_const_everywhere(self, groups: int) -> None:
-        self._graphs.run(
-            ("set_const", groups), lambda: mjw.set_const(self.warp_model, self.warp_data_E, groups)
-        )
-        if groups & INERT0:
-            # As in C, where MuJoCo Warp lets a body that only slides turn as easily as it slides.
-            for body in (self.mj_model.body_invweight0[:, 1] == 0.0).nonzero()[0].tolist():
-                self._fields["body_invweight0"][:, body, 1].zero_()
+        def launch() -> None:
+            mjw.set_const(self.warp_model, self.warp_data_E, groups)
+            if groups & INERT0 and self._masked_constants is not None:
+                self._masked_constants.mend_weights()
+
+        self._graphs.run(("set_const", groups), launch)
 
     def _take_mask(self, mask_E: Tensor) -> None:
         if mask_E.dtype != torch.bool or mask_E.shape != (self.num_envs,):

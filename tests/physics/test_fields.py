@@ -228,27 +228,32 @@ SLIDES = """<mujoco><worldbody>
       <body name="bolted" pos="0 .1 0"><geom size=".05" mass=".3"/></body>
       <body name="arm"><joint name="turn" axis="0 1 0"/><geom size=".1" pos=".1 0 0" mass="1"/></body></body></body>
   <body name="wheel" pos="0 2 1"><joint name="axle" axis="1 0 0"/><geom size=".1" mass="1"/></body>
+  <body name="puck" pos="0 4 1"><joint name="px" type="slide" axis="1 0 0" armature=".5"/>
+    <joint name="py" type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body>
   <body name="wall" pos="0 3 1"><geom size=".1" mass="1"/></body>
 </worldbody>TENDON</mujoco>"""
 STRAP = '<tendon><fixed name="strap"><joint joint="x" coef="1"/><joint joint="z" coef="-1"/></fixed></tendon>'
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("tendon", ["", STRAP], ids=("", "with a tendon"))
+@pytest.mark.parametrize("tendon", ["", STRAP, STRAP.replace("<fixed", '<fixed armature=".2"')])
 def test_bodies_that_only_slide_or_only_turn_weigh_as_in_the_c_engine(tendon, masked):
-    """C leaves 0 where a body cannot move in that way; MuJoCo Warp puts the other figure there."""
-    world = World(load_model(SLIDES.replace("TENDON", tendon)), num_envs=2, per_world_fields=("body_mass",))
+    """C leaves 0 where a body cannot move in that way, and forgets the armature of slides of a simple body."""
+    fields = ("body_mass", "dof_armature")
+    world = World(load_model(SLIDES.replace("TENDON", tendon)), num_envs=2, per_world_fields=fields)
     world.field("body_mass")[1] *= 2.0
-    world.set_const(("body_mass",), torch.tensor([False, True]) if masked else None)
-    sliding = [world.mj_model.body(name).id for name in ("cart", "lift", "bolted")]
+    world.field("dof_armature")[1] += 0.4
+    world.set_const(fields, torch.tensor([False, True]) if masked else None)
     for row in range(2):
-        expected = with_constants(world.mj_model, row, world, ("body_mass",)).body_invweight0
-        assert not expected[sliding, 1].any() and expected[sliding, 0].all()
-        # A wheel on its axle is one that only turns: of that MuJoCo Warp's own code, for tendons, knows nothing.
-        rows = slice(None) if not tendon else sliding
-        np.testing.assert_allclose(
-            world.field("body_invweight0")[row, rows], expected[rows], rtol=2e-5, atol=1e-6
-        )
+        expected = with_constants(world.mj_model, row, world, fields)
+        weights = expected.body_invweight0
+        for name in ("cart", "lift", "bolted", "puck"):
+            assert weights[world.mj_model.body(name).id, 0] > 0.0 == weights[world.mj_model.body(name).id, 1]
+        assert not weights[world.mj_model.body("wheel").id, 0]
+        for name in ("body_invweight0", "dof_invweight0"):
+            np.testing.assert_allclose(
+                world.field(name)[row], getattr(expected, name), rtol=2e-5, atol=1e-6, err_msg=name
+            )
 
 
 def test_rows_are_recomputed_in_one_launch(monkeypatch):
