@@ -1,6 +1,7 @@
 """This module tells callbacks of MuJoCo Warp that a program sets, at any time, from our own."""
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco_warp as mjw
 
@@ -14,28 +15,30 @@ class Callbacks:
     def __init__(self, warp_model: mjw.Model) -> None:
         self._callback = warp_model.callback
         self._own = dict(vars(self._callback))
-        self._filters: Callable[[mjw.Model, mjw.Data], None] | None = None
+        self._ours_first: dict[str, Callable[..., None]] = {}
 
     def of_program(self) -> tuple[str, ...]:
         """Return the names of the callbacks that a program has set and not taken away."""
         present = vars(self._callback).items()
         return tuple(name for name, callback in present if callback and callback is not self._own[name])
 
-    def keep_our_filter(self) -> None:
-        """Let our filter of contacts run before one that a program has set in its place.
+    def keep_ours(self) -> None:
+        """Let our callbacks run before those that a program has set in their place.
 
-        Ours is where contacts of height fields come from: without it robots fall through the ground.
+        Contacts of height fields come from our filter of contacts: without it robots fall through the ground.
         """
-        own, present = self._own["contactfilter"], self._callback.contactfilter
-        if own is None or present is own or present is self._filters:
-            return
-        if present is None:
-            self._callback.contactfilter = own
-            return
+        for name, own in self._own.items():
+            present = vars(self._callback)[name]
+            if own is None or present is own or present is self._ours_first.get(name):
+                continue
+            if present is not None:
+                self._ours_first[name] = _in_turn(own, present)
+            setattr(self._callback, name, own if present is None else self._ours_first[name])
 
-        def both(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-            own(warp_model, warp_data_E)
-            present(warp_model, warp_data_E)
 
-        self._filters = both
-        self._callback.contactfilter = both
+def _in_turn(first: Callable[..., None], second: Callable[..., None]) -> Callable[..., None]:
+    def both(*args: Any) -> None:
+        first(*args)
+        second(*args)
+
+    return both

@@ -14,6 +14,12 @@ from ksim_rl.physics import native
 
 # The solver stopping at its iteration limit is a setting, not a loss of contacts.
 METRIC_BITS = ("ITERATIONS", "LS_ITERATIONS")
+# The bits that kernels of ours set, by their names in C++.
+OUT_OF = {
+    "OUT_OF_ROWS": int(mjw.OverflowType.NEFC),
+    "OUT_OF_PAIRS": int(mjw.OverflowType.BROADPHASE),
+    "OUT_OF_CONTACTS": int(mjw.OverflowType.NARROWPHASE),
+}
 # In the order of the bits, lowest first.
 BIT_NAMES = tuple(name for name, bit in mjw.OverflowType.__members__.items() if bit and bit & (bit - 1) == 0)
 
@@ -94,12 +100,19 @@ class OverflowRecord:
         sizes = {"sticky": warp_data_E.nworld, "most_nefc": warp_data_E.nworld, "most_pool": 2}
         self.arrays = {name: wp.zeros(size, dtype=int) for name, size in sizes.items()}
         self.sticky_E, self.most_nefc_E, self.most_pool = map(wp.to_torch, self.arrays.values())
-        given = native.source_of("smooth", ("record",)), {}, self.arrays, warp_model, warp_data_E
-        self.record = native.launcher(*given, lanes=1, threads=threads)
+        source = native.source_of("smooth", ("record",))
+        self.record = native.launcher(
+            source, OUT_OF, self.arrays, warp_model, warp_data_E, lanes=1, threads=threads
+        )
+        if warp_model.opt.integrator == mjw.IntegratorType.RK4:
+            # It makes rows four times in a substep, and the last ones alone are there at the end. Callbacks of controls
+            # and of passive forces come after the rows, and models may leave out one of the two.
+            warp_model.callback.control = warp_model.callback.passive = lambda m, d: self.record()
 
     def clear(self) -> None:
-        """Start the next period."""
-        for tensor in (self.sticky_E, self.most_nefc_E, self.most_pool):
+        """Start the next period. Bits that MuJoCo Warp keeps until a world resets are of the last one, too."""
+        of_worlds_E = wp.to_torch(self._warp_data_E.overflow)
+        for tensor in (self.sticky_E, self.most_nefc_E, self.most_pool, of_worlds_E):
             tensor.zero_()
 
     def counts(self) -> Int[Tensor, " N"]:

@@ -399,7 +399,7 @@ class World(views.DataViews):
         Callbacks are Python, and set at any time: a graph of before would leave them out, and one with them would never
         run their Python again.
         """
-        self._callbacks.keep_our_filter()
+        self._callbacks.keep_ours()
         self._graphs.run(key, launches, live=bool(self._callbacks.of_program()))
 
     def _launch_substeps(self, n: int, sensors: str) -> None:

@@ -1,7 +1,10 @@
+import mujoco
+import pytest
 import torch
 
 from ksim_rl.physics import SimCfg, World
 from tests.physics.models import quadruped, standing_quadrupeds
+from tests.physics.overflowing_models import SCENES, bullet, can_on_fine_field, pile, sensed_box
 
 
 def fallen(sim: SimCfg) -> World:
@@ -62,3 +65,69 @@ def test_solver_limits_are_metrics_not_messages():
     report = world.overflow_report()
     assert report.ok
     assert report.metrics["iterations_worlds"] > 0.0
+
+
+def piled(mj_model: mujoco.MjModel, sim: SimCfg) -> World:
+    """Three worlds after their first substep, each from another pose."""
+    world = World(mj_model, num_envs=3, sim=sim)
+    generator = torch.Generator().manual_seed(3)
+    world.qpos_EL.add_(0.03 * torch.rand(world.qpos_EL.shape, generator=generator))
+    world.step(1)
+    return world
+
+
+@pytest.mark.parametrize("ours", [True, False])
+@pytest.mark.parametrize("scene", SCENES, ids=lambda scene: "-".join(map(str, scene)))
+def test_each_overflow_is_told_in_scenes_of_every_kind(scene, ours):
+    mj_model = pile(*scene)
+    roomy = piled(mj_model, SimCfg(njmax=400, nconmax=200, one_kernel_dynamics=ours)).overflow_report()
+    assert roomy.ok and roomy.nefc > 16 and roomy.ncon > 12
+    places = -(-roomy.ncon // 3)
+    enough = piled(mj_model, SimCfg(njmax=roomy.nefc, nconmax=places, one_kernel_dynamics=ours))
+    assert enough.overflow_report().ok
+    for njmax in (roomy.nefc - 1, roomy.nefc // 3):
+        report = piled(mj_model, SimCfg(njmax=njmax, nconmax=200, one_kernel_dynamics=ours)).overflow_report()
+        assert report.worlds["NEFC"], (njmax, report)
+        assert report.nefc == roomy.nefc, "the need is that of the world with the most rows"
+    # Contacts that found no place have no rows, so that here those may suffice.
+    for njmax, nconmax in ((400, places - 1), (400, 1), (12, 1)):
+        report = piled(
+            mj_model, SimCfg(njmax=njmax, nconmax=nconmax, one_kernel_dynamics=ours)
+        ).overflow_report()
+        assert report.worlds["BROADPHASE"] or report.worlds["NARROWPHASE"], (njmax, nconmax, report)
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_more_prisms_of_a_height_field_than_there_is_room_for_are_told(ours):
+    world = World(can_on_fine_field(), num_envs=2, sim=SimCfg(one_kernel_dynamics=ours))
+    world.step(1)
+    report = world.overflow_report()
+    assert report.worlds["HFIELD"] == 2
+    assert "too many height-field cells" in report.messages[0]
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_more_contacts_than_a_sensor_matches_are_told(ours):
+    world = World(sensed_box("none"), num_envs=2, sim=SimCfg(one_kernel_dynamics=ours))
+    world.step(1)
+    report = world.overflow_report()
+    assert report.worlds["CONTACT_MATCH"] == 2
+    assert "contact_sensor_maxmatch" in report.messages[0]
+
+
+def test_rows_that_did_not_fit_half_way_through_a_substep_are_told():
+    world = World(bullet(), num_envs=2, sim=SimCfg(njmax=1, nconmax=4))
+    world.qvel_EL[:, 2] = -20.0
+    world.step(1)
+    assert int(world.last_substep("nefc").max()) == 0, "at the end there are no rows"
+    report = world.overflow_report()
+    assert report.worlds["NEFC"] == 2 and report.nefc == 4
+
+
+def test_a_world_that_goes_on_is_told_of_once():
+    world = fallen(SimCfg(njmax=10, nconmax=40))
+    world.step(4)
+    assert world.overflow_report().worlds["NEFC"] == 4
+    world.qpos_EL[:, 2] = 5.0
+    world.step(4)
+    assert world.overflow_report().ok, "nothing was lost since"

@@ -19,6 +19,7 @@ import warp as wp
 
 from ksim_rl.physics import native
 from ksim_rl.physics.fixed_geoms import fixed_geoms
+from ksim_rl.physics.overflow import OUT_OF
 from ksim_rl.physics.sim_cfg import SimCfg
 
 SMOOTH = ("world", "layout", "kinematics", "inertia", "velocities", "passive", "actuation")
@@ -40,9 +41,7 @@ _ENUMS = {
     **native.names_of(mujoco.mjtJoint, mujoco.mjtTrn, mujoco.mjtDyn),
     "AFFINE_GAIN": mujoco.mjtGain.mjGAIN_AFFINE,
     "AFFINE_BIAS": mujoco.mjtBias.mjBIAS_AFFINE,
-    "OUT_OF_ROWS": mjw.OverflowType.NEFC,
-    "OUT_OF_PAIRS": mjw.OverflowType.BROADPHASE,
-    "OUT_OF_CONTACTS": mjw.OverflowType.NARROWPHASE,
+    **OUT_OF,
 }
 FORCE_CALLBACKS = ("passive", "control", "act_dyn", "act_gain", "act_bias")
 HINGES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
