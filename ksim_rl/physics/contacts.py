@@ -19,16 +19,16 @@ class Mending:
     """What a collision pass calls at its end.
 
     Attributes:
-        added: append contacts that MuJoCo Warp does not find.
-        corrected: change what MuJoCo Warp has written; where it has written nothing, they need not be called.
+        always: append contacts that MuJoCo Warp does not find, and change those of everyone.
+        of_theirs: change what MuJoCo Warp's narrow phase has written, of the pairs that the model lists.
     """
 
-    added: tuple[Hook, ...]
-    corrected: tuple[Hook, ...]
+    always: tuple[Hook, ...]
+    of_theirs: tuple[Hook, ...]
 
     def __call__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-        """Launch both, the added ones first."""
-        for hook in (*self.added, *self.corrected):
+        """Launch both."""
+        for hook in (*self.always, *self.of_theirs):
             hook(warp_model, warp_data_E)
 
 
@@ -38,14 +38,21 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
     It changes the model in place: call it before anything copies it.
     """
     upstream.collide_boxes_exactly(warp_model)
+    upstream.take_pairs_as_written(warp_model)
     upstream.measure_without_contacts(warp_model)
     # The next one takes pairs away.
-    corrected = [hook for hook, is_needed in CORRECTIONS.items() if is_needed(warp_model)]
-    added = [take_over(warp_model) for take_over in (take_over_height_fields, take_over_measured_boxes)]
-    mending = Mending(added=tuple(hook for hook in added if hook), corrected=tuple(corrected))
-    if mending.added or mending.corrected:
+    ways = (take_over_height_fields, take_over_measured_boxes, rows_left_out)
+    always = [hook for hook in (way(warp_model) for way in ways) if hook]
+    of_theirs = corrections(warp_model, warp_model.nxn_geom_pair_filtered, warp_model.nxn_pairid_filtered)
+    if always or of_theirs:
         # MuJoCo Warp calls it after its own collision pass.
-        warp_model.callback.contactfilter = mending
+        warp_model.callback.contactfilter = Mending(always=tuple(always), of_theirs=of_theirs)
+
+
+def corrections(warp_model: mjw.Model, pairs: wp.array, pair_ids: wp.array) -> tuple[Hook, ...]:
+    """Return what corrects the contacts that MuJoCo Warp's narrow phase finds of pairs, listed as in the model."""
+    listed = pairs.numpy(), pair_ids.numpy()
+    return tuple(hook for hook, is_needed in CORRECTIONS.items() if is_needed(warp_model, *listed))
 
 
 def align_steep_capsules(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
@@ -55,9 +62,22 @@ def align_steep_capsules(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     wp.launch(kernels.align_steep_capsules, dim=warp_data_E.naconmax, inputs=inputs, outputs=[contact.frame])
 
 
-def _has_capsules_on_planes(warp_model: mjw.Model) -> bool:
-    types = warp_model.geom_type.numpy()[upstream.geom_pairs(warp_model)[0]]
-    return bool((np.sort(types) == (kernels.PLANE, kernels.CAPSULE)).all(-1).any())
+def _have_capsules_on_planes(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray) -> bool:
+    types = np.sort(warp_model.geom_type.numpy()[pairs])
+    return bool((types == (kernels.PLANE, kernels.CAPSULE)).all(-1).any())
+
+
+def drop_upper_corners(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    """Launch what drops contacts of planes with upper corners of boxes, which our own narrow phase does not make."""
+    contact = warp_data_E.contact
+    inputs = [warp_model.geom_type, warp_data_E.geom_xpos, warp_data_E.geom_xmat]
+    inputs += [contact.geom, contact.worldid, contact.dist, warp_data_E.nacon]
+    wp.launch(kernels.drop_upper_corners, dim=warp_data_E.naconmax, inputs=inputs, outputs=[contact.type])
+
+
+def _have_boxes_on_planes(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray) -> bool:
+    types = np.sort(warp_model.geom_type.numpy()[pairs])
+    return bool((types == (kernels.PLANE, kernels.BOX)).all(-1).any())
 
 
 def take_the_law_of_priority(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
@@ -69,9 +89,8 @@ def take_the_law_of_priority(warp_model: mjw.Model, warp_data_E: mjw.Data) -> No
     wp.launch(kernels.take_the_law_of_priority, dim=dim, inputs=inputs, outputs=[contact.solref])
 
 
-def _has_direct_laws_of_priority(warp_model: mjw.Model) -> bool:
+def _have_direct_laws_of_priority(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray) -> bool:
     """Return whether geoms of different priority may touch, one of which gives stiffness and damping directly."""
-    pairs, pair_ids = upstream.geom_pairs(warp_model)
     pairs = pairs[pair_ids[:, 0] == upstream.NO_PAIR]
     differs = np.diff(warp_model.geom_priority.numpy()[pairs])[:, 0] != 0
     # Each world may draw a law of its own at any time.
@@ -81,7 +100,29 @@ def _has_direct_laws_of_priority(warp_model: mjw.Model) -> bool:
     return bool((differs & is_direct[pairs].any(-1)).any())
 
 
-CORRECTIONS: dict[Hook, Callable[[mjw.Model], bool]] = {
-    align_steep_capsules: _has_capsules_on_planes,
-    take_the_law_of_priority: _has_direct_laws_of_priority,
+def rows_left_out(warp_model: mjw.Model) -> Hook | None:
+    """Return what keeps contacts from constraint rows that no joint can heed, as in C; None where there are none.
+
+    Only a <pair> can name geoms of one rigid body, or of bodies that never move. In C sensors still read such contacts.
+    """
+    m = warp_model
+    rigid_body = m.body_weldid.numpy()[m.geom_bodyid.numpy()]
+    # All bodies that no joint moves are one.
+    rigid_body[~m.body_isdofancestor.numpy()[rigid_body, : m.nv].any(-1)] = 0
+    if not (rigid_body[m.pair_geom1.numpy()] == rigid_body[m.pair_geom2.numpy()]).any():
+        return None
+    of_geoms = wp.array(rigid_body, dtype=int)
+
+    def leave_out(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+        contact, nacon = warp_data_E.contact, warp_data_E.nacon
+        inputs, outputs = [of_geoms, contact.geom, nacon], [contact.includemargin]
+        wp.launch(kernels.leave_out_rows, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
+
+    return leave_out
+
+
+CORRECTIONS: dict[Hook, Callable[[mjw.Model, np.ndarray, np.ndarray], bool]] = {
+    align_steep_capsules: _have_capsules_on_planes,
+    drop_upper_corners: _have_boxes_on_planes,
+    take_the_law_of_priority: _have_direct_laws_of_priority,
 }

@@ -7,9 +7,14 @@
 import mujoco_warp as mjw
 import warp as wp
 
-PLANE, CAPSULE = int(mjw.GeomType.PLANE), int(mjw.GeomType.CAPSULE)
+from ksim_rl.physics import upstream
+
+PLANE, CAPSULE, BOX = (int(mjw.GeomType[name]) for name in ("PLANE", "CAPSULE", "BOX"))
+HAS_ROWS = int(upstream.ContactType.CONSTRAINT)
 # Below this tilt, rad, the direction of a capsule is rounding of float32.
 UPRIGHT = wp.constant(1.0e-6)
+# No contact is so deep, m, that it has rows below this margin.
+NO_ROWS = wp.constant(-1.0e10)
 
 
 @wp.kernel(enable_backward=False)
@@ -39,6 +44,31 @@ def align_steep_capsules(
 
 
 @wp.kernel(enable_backward=False)
+def drop_upper_corners(
+    geom_type: wp.array[int],
+    geom_xpos: wp.array2d[wp.vec3],
+    geom_xmat: wp.array2d[wp.mat33],
+    geom: wp.array[wp.vec2i],
+    world: wp.array[int],
+    dist: wp.array[float],
+    nacon: wp.array[int],
+    kind: wp.array[int],
+):
+    """Drop the contacts of a plane with those corners of a box that are above the box's centre."""
+    contact = wp.tid()
+    if contact >= nacon[0]:
+        return
+    plane, box = geom[contact][0], geom[contact][1]
+    if plane < 0 or box < 0 or geom_type[plane] != PLANE or geom_type[box] != BOX:
+        return
+    owner = world[contact]
+    turn = geom_xmat[owner, plane]
+    normal = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+    if dist[contact] > wp.dot(normal, geom_xpos[owner, box] - geom_xpos[owner, plane]):
+        kind[contact] = kind[contact] & ~HAS_ROWS
+
+
+@wp.kernel(enable_backward=False)
 def take_the_law_of_priority(
     geom_priority: wp.array[int],
     geom_solref: wp.array2d[wp.vec2],
@@ -62,6 +92,22 @@ def take_the_law_of_priority(
             return
     stronger = wp.where(geom_priority[a] > geom_priority[b], a, b)
     solref[contact] = geom_solref[world[contact] % geom_solref.shape[0], stronger]
+
+
+@wp.kernel(enable_backward=False)
+def leave_out_rows(
+    rigid_body: wp.array[int],
+    geom: wp.array[wp.vec2i],
+    nacon: wp.array[int],
+    includemargin: wp.array[float],
+):
+    """Let contacts within one rigid body be out of reach of constraint rows, as contacts in a gap are."""
+    contact = wp.tid()
+    if contact >= nacon[0]:
+        return
+    a, b = geom[contact][0], geom[contact][1]
+    if a >= 0 and b >= 0 and rigid_body[a] == rigid_body[b]:
+        includemargin[contact] = NO_ROWS
 
 
 @wp.kernel(enable_backward=False)

@@ -167,6 +167,38 @@ def geom_pairs(warp_model: mjw.Model) -> tuple[np.ndarray, np.ndarray]:
     return warp_model.nxn_geom_pair.numpy(), warp_model.nxn_pairid.numpy()
 
 
+def repeated_pairs(warp_model: mjw.Model) -> np.ndarray:
+    """Return the <pair>s whose geoms a later <pair> has, too, int [N]."""
+    geoms = np.stack([warp_model.pair_geom1.numpy(), warp_model.pair_geom2.numpy()], axis=-1)
+    low, high = geoms.min(-1), geoms.max(-1)
+    names = low.astype(np.int64) * warp_model.ngeom + high
+    _, last = np.unique(names[::-1], return_index=True)
+    return np.setdiff1d(np.arange(names.size), names.size - 1 - last)
+
+
+def take_pairs_as_written(warp_model: mjw.Model) -> None:
+    """Let all <pair>s make contacts, in place, with the normal from the first geom to the second as in C.
+
+    `put_model` keeps one number for two geoms, the last one's. The others stand at the end of the lists, beyond those
+    that are found by their geoms. What sensors of distances measure keeps the order of the geoms, on which they count.
+    """
+    m, repeated = warp_model, repeated_pairs(warp_model)
+    if m.pair_dim.size == 0:
+        return
+    geoms = np.stack([m.pair_geom1.numpy(), m.pair_geom2.numpy()], axis=-1)
+    pairs, pair_ids = (array.copy() for array in geom_pairs(m))
+    as_written = (pair_ids[:, 0] > NO_PAIR) & (pair_ids[:, 1] == NO_SENSOR)
+    pairs[as_written] = geoms[pair_ids[as_written, 0]]
+    own_ids = np.stack([repeated, np.full_like(repeated, NO_SENSOR)], axis=-1)
+    pairs = np.concatenate([pairs, geoms[repeated]]).astype(np.int32)
+    pair_ids = np.concatenate([pair_ids, own_ids]).astype(np.int32)
+    m.nxn_geom_pair, m.nxn_pairid = wp.array(pairs, dtype=wp.vec2i), wp.array(pair_ids, dtype=wp.vec2i)
+    if repeated.size:
+        # To sweep and prune finds pairs by their geoms.
+        m.opt.broadphase = mjw.BroadphaseType.NXN
+    drop_contacts(m, np.zeros(len(pairs), dtype=bool))
+
+
 def pair_type_counts(warp_model: mjw.Model, pairs: np.ndarray) -> tuple[int, ...]:
     """Return the number of pairs of geoms [N, 2] by their types, in the order of a matrix's upper triangle."""
     types, kinds = warp_model.geom_type.numpy()[pairs], len(mjw.GeomType)

@@ -136,3 +136,69 @@ def test_the_geom_of_priority_alone_says_how_stiff_a_contact_is(one_kernel: bool
                     np.testing.assert_allclose(
                         value, getattr(each, name), rtol=1e-5, err_msg=f"{pair} {name}"
                     )
+
+
+# Several pairs of the same geoms, of which one has a margin in which a box's upper corners are; pairs that no joint can
+# heed, of one body, of a body without joints and of things that never move; and geoms that touch without a pair.
+PAIRS = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1"/>
+    <geom name="stone" size="0.1" pos="1 0 0.02"/><geom name="rock" size="0.2" pos="1 0.2 0"/>
+    <body name="thing" pos="0 0 0.09"><freejoint/>
+      <geom name="ball" size="0.1"/><geom name="box" type="box" size="0.1 0.1 0.1" pos="0.33 0 0"/>
+      <body><geom name="knob" size="0.1" pos="0.1 0 0"/></body>
+    </body>
+    <body name="shelf"><geom name="shelf" type="box" size="0.1 0.1 0.1" pos="2 0 0"/></body>
+    <body name="hand" mocap="true" pos="0 1 0.05"><geom name="hand" size="0.1"/></body>
+  </worldbody>
+  <contact>
+    <pair geom1="floor" geom2="ball" condim="1"/>
+    <pair geom1="floor" geom2="box" condim="1"/>
+    <pair geom1="floor" geom2="ball" condim="4" friction="2 2 1 1 1"/>
+    <pair geom1="floor" geom2="box" condim="3" margin="0.3"/>
+    <pair geom1="ball" geom2="floor" condim="3"/>
+    <pair geom1="rock" geom2="stone" condim="4"/>
+    <pair geom1="ball" geom2="knob"/>
+    <pair geom1="floor" geom2="shelf"/>
+    <pair geom1="floor" geom2="hand"/>
+  </contact>
+  <sensor><contact subtree1="thing" data="found force"/><contact geom1="shelf" data="found force"/></sensor>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("one_kernel", [True, False])
+def test_all_pairs_make_contacts_and_rows_where_joints_can_heed_them(one_kernel: bool):
+    mj_model = load_model(PAIRS)
+    world = World(mj_model, num_envs=2, sim=SimCfg(njmax=80, nconmax=60, one_kernel_dynamics=one_kernel))
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_forward(mj_model, mj_data)
+    assert [each.dim for each in mj_data.contact if set(each.geom) == {0, 3}] == [1, 4, 3]
+    world.step()
+    contact, count = world.warp_data_E.contact, int(world.warp_data_E.nacon.numpy()[0])
+    owner, geom, dim, dist, rows = (
+        getattr(contact, name).numpy()[:count] for name in ("worldid", "geom", "dim", "dist", "efc_address")
+    )
+    for row in range(2):
+        mine = np.flatnonzero((owner == row) & (contact.type.numpy()[:count] != 0))
+        found = sorted(
+            (*geom[i].tolist(), int(dim[i]), round(float(dist[i]), 4), rows[i, 0] >= 0) for i in mine
+        )
+        expected = [
+            (*each.geom.tolist(), each.dim, round(each.dist, 4), each.efc_address >= 0)
+            for each in mj_data.contact
+        ]
+        assert found == sorted(expected)
+        assert int(world.warp_data_E.nefc.numpy()[row]) == mj_data.nefc
+        if one_kernel:
+            in_order = sorted(
+                (int(rows[i, 0]), *geom[i].tolist(), int(dim[i])) for i in mine if rows[i, 0] >= 0
+            )
+            assert in_order == [
+                (each.efc_address, *each.geom.tolist(), each.dim)
+                for each in mj_data.contact
+                if each.efc_address >= 0
+            ]
+        np.testing.assert_allclose(world.last_substep("qacc")[row], mj_data.qacc, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(world.sensordata_EL[row], mj_data.sensordata, rtol=1e-3, atol=1e-2)

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import native, upstream
-from ksim_rl.physics.contacts import Mending
+from ksim_rl.physics.contacts import Mending, corrections
 from ksim_rl.physics.rows.contact_lists import HAS_ROWS, ContactLists
 
 # Lanes of a world on CUDA, threads of a block, which shares nothing, and registers: as many as let 4096 worlds be on an
@@ -71,7 +71,8 @@ def collisions(
     m, d = warp_model, warp_data_E
     device, aabb = d.qpos.device, m.geom_aabb
     pairs = np.array([(a, b, most) for a, b, _, most in _pairs(m)], dtype=np.int32).reshape(-1, 3)
-    others = pairs[pairs[:, 2] == 0, :2]
+    are_theirs = pairs[:, 2] == 0
+    others = pairs[are_theirs, :2]
     context = upstream.create_collision_context(d.naconmax if others.size else 0)
     own = {
         **vars(context),
@@ -95,12 +96,15 @@ def collisions(
     }
     collide = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)
     theirs = dataclasses.replace(m, geom_pair_type_count=upstream.pair_type_counts(m, others))
+    their_ids = wp.array(m.nxn_pairid_filtered.numpy()[are_theirs], dtype=wp.vec2i, device=device)
+    of_theirs = corrections(m, wp.array(others, dtype=wp.vec2i, device=device), their_ids)
 
     def launch() -> None:
         hook = m.callback.contactfilter
-        # Our own contacts need no corrections.
-        if isinstance(hook, Mending) and not hook.added and not others.size:
-            hook = None
+        if isinstance(hook, Mending):
+            # Our own contacts need no corrections.
+            own_hook = dataclasses.replace(hook, of_theirs=of_theirs)
+            hook = own_hook if own_hook.always or own_hook.of_theirs else None
         lists.are_appended = not others.size and hook is None
         if others.size:
             d.ncollision.zero_()

@@ -297,6 +297,10 @@ def height_field_contacts(c: Collisions):
         pair,
         world,
     )
+    if c.pair_ids[pair][0] < 0 and c.geom_priority[ground] != c.geom_priority[geom]:
+        # The parameters of the geom with priority hold alone, which MuJoCo Warp's function does not know of this one.
+        stronger = wp.where(c.geom_priority[ground] > c.geom_priority[geom], ground, geom)
+        solref = c.geom_solref[world % c.geom_solref.shape[0], stronger]
     reach = margin + gap
     if center[2] - bound > size[2] + reach:
         return

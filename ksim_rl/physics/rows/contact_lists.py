@@ -34,7 +34,13 @@ class ContactLists:
         self.ids, self.found = (wp.zeros((d.nworld, self.room), dtype=int, device=device) for _ in range(2))
         self.keys = wp.empty((d.nworld, self.room), dtype=wp.uint64, device=device)
         # For the kernels that read them, too.
-        self.constants = {"room": self.room, "sdf": bool(m.has_sdf_geom), "has_rows": HAS_ROWS}
+        self.constants = {
+            "room": self.room,
+            "sdf": bool(m.has_sdf_geom),
+            "has_rows": HAS_ROWS,
+            "pairs": m.pair_dim.size,
+            "repeated_pairs": bool(upstream.repeated_pairs(m).size),
+        }
         self.lanes, self.threads = (LANES, CUDA_THREADS) if device.is_cuda else (1, 1)
         sources = [native.source_of("rows", parts) for parts in (("append",), ("layout", "order"))]
         self._append, self.order = (
