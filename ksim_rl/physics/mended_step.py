@@ -1,7 +1,7 @@
 """This module launches a whole step of MuJoCo Warp's in which its constraint rows are mended, once it has made them."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco_warp as mjw
@@ -15,22 +15,47 @@ def hook_after_rows(warp_model: mjw.Model) -> str | None:
     return None if flags & bits.ACTUATION else "control"
 
 
-def mended_step(warp_model: mjw.Model, warp_data_E: mjw.Data, mend_rows: Callable[[], None] | None) -> None:
-    """Launch `mjw.step`, and `mend_rows` after the rows of each of its stages, of which Runge-Kutta's has four."""
-    if mend_rows is None:
+def check_mendable(warp_model: mjw.Model) -> None:
+    """Refuse a model whose rows have to be mended, but cannot be within a step of MuJoCo Warp's own."""
+    m = warp_model
+    if hook_after_rows(m) is None:
+        raise ValueError(
+            "the model ties a body without joints, or has a range narrower than its margins, while springs, dampers "
+            "and actuation are disabled and MuJoCo Warp's own solver is used: its rows of these cannot be mended. "
+            "Enable one of the three in <option><flag/></option>"
+        )
+    is_delayed = m.sensor_history.numpy()[:, :, 0] > 0
+    if is_delayed.any(0)[m.sensor_limitpos_adr.numpy()].any():
+        raise ValueError(
+            "a sensor of the distance to a limit has a delay or an interval, but rows of limits are mended and "
+            "MuJoCo Warp's own solver is used, which has read it by then: remove the delay"
+        )
+
+
+def mended_step(
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    row_mends: Sequence[Callable[[], None]],
+    limit_positions: mjw.Model | None = None,
+) -> None:
+    """Launch `mjw.step`, and `row_mends` after the rows of each of its stages, of which Runge-Kutta's has four.
+
+    Then the sensors of `limit_positions`, which has others no more, are computed again, as they read such rows.
+    """
+    if not row_mends:
         mjw.step(warp_model, warp_data_E)
         return
     callback, hook = warp_model.callback, hook_after_rows(warp_model)
-    if hook is None:
-        raise ValueError(
-            "the model ties a body without joints, springs, dampers and actuation are disabled, and MuJoCo Warp's own "
-            "solver is used: its rows of that body cannot be mended. Enable one of the three in <flag/>, or use "
-            'a dense Jacobian (<option jacobian="dense"/>)'
-        )
+    assert hook is not None, "check_mendable was not called"
     own = vars(callback)[hook]
+    reads = [] if warp_model.opt.disableflags & mjw.DisableBit.SENSOR else [limit_positions]
 
     def mended(*model_and_data: Any) -> None:
-        mend_rows()
+        for mend in row_mends:
+            mend()
+        # Later stages of Runge-Kutta compute no sensors.
+        if (model := reads.pop() if reads else None) is not None:
+            mjw.sensor_pos(model, warp_data_E)
         if own is not None:
             own(*model_and_data)
 

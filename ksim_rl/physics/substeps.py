@@ -14,10 +14,11 @@ from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.collision.collisions import collisions
 from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.fixed_geoms import placing_of_fixed_geoms
-from ksim_rl.physics.mended_step import mended_step
+from ksim_rl.physics.mended_step import check_mendable, mended_step
 from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.rows.constraint_rows import constraint_rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
+from ksim_rl.physics.rows.second_limits import adding_of_second_limits
 from ksim_rl.physics.rows.tie_weights import BODY_EQUALITIES, weighing_of_ties
 from ksim_rl.physics.smooth.stages import calls_back, integration, smooth_dynamics
 from ksim_rl.physics.views import CAMERAS_AND_LIGHTS, FORCES_OF_BODIES, SUBTREE_VELOCITIES
@@ -97,7 +98,16 @@ class Substeps:
         if one_kernel_integration:
             self._integrate = integration(warp_model, warp_data_E, record=record)
         self._needs_transmission = bool(np.isin(sensor_type, TRANSMISSION_SENSORS).any())
-        self._mend_rows = weighing_of_ties(mj_model, warp_model, warp_data_E)
+        mends = [
+            weighing_of_ties(mj_model, warp_model, warp_data_E),
+            adding_of_second_limits(warp_model, warp_data_E, expanded),
+        ]
+        self._row_mends = [mend for mend in mends if mend is not None]
+        self._limit_positions: mjw.Model | None = None
+        if self._row_mends and self._solve is None:
+            check_mendable(warp_model)
+            if warp_model.sensor_limitpos_adr.size:
+                self._limit_positions = upstream.with_limit_positions_only(warp_model)
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())
         self.refreshed_on_demand: set[str] = set()
         if (sensor_type == mujoco.mjtSensor.mjSENS_TENDONVEL).any():
@@ -128,7 +138,7 @@ class Substeps:
             mjw.com_vel(self.warp_model, self.warp_data_E)
         m = self._models[sensors]
         if self._solve is None:
-            mended_step(m, self.warp_data_E, self._mend_rows)
+            mended_step(m, self.warp_data_E, self._row_mends, self._limit_positions)
             return
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
         if sensors in ("kept", "all"):
@@ -143,8 +153,8 @@ class Substeps:
         stages = self._solve, dynamics, self._make_rows, self._contacts, self._integrate
         always = self._always_senses
         wanted = {"sensors": always or sensors != "none", "accelerometers": always or sensors != "contacts"}
-        mend = self._mend_rows
-        newton.step(m, self.warp_data_E, *stages, self._aside, self._collide, mend_rows=mend, **wanted)
+        mends = self._row_mends
+        newton.step(m, self.warp_data_E, *stages, self._aside, self._collide, row_mends=mends, **wanted)
 
     def refresh(self, *, masked: bool = False) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.

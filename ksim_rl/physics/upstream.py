@@ -22,6 +22,9 @@ from mujoco_warp._src.collision_core import contact_params as contact_params
 from mujoco_warp._src.collision_core import create_collision_context as create_collision_context
 from mujoco_warp._src.collision_core import write_contact as write_contact
 from mujoco_warp._src.collision_driver import _narrowphase as narrowphase  # noqa: F401
+
+# The law of a constraint row.
+from mujoco_warp._src.constraint import _efc_row as efc_row  # noqa: F401
 from mujoco_warp._src.math import make_frame as make_frame
 from mujoco_warp._src.math import mul_quat as mul_quat
 from mujoco_warp._src.math import quat_to_mat as quat_to_mat
@@ -139,6 +142,15 @@ def with_contact_sensors_only(warp_model: mjw.Model) -> mjw.Model:
     counts = dict.fromkeys(("nrangefinder", "nsensorcollision", "nsensortaxel"), 0)
     own = {f"sensor_{name}_adr": none for name in lists} | dict.fromkeys(flags, False)
     return dataclasses.replace(warp_model, **own, **counts)
+
+
+def with_limit_positions_only(warp_model: mjw.Model) -> mjw.Model:
+    """Return a model on the same arrays whose only position sensors are distances to limits, without callbacks."""
+    none = wp.zeros(0, dtype=int)
+    lists = {f"sensor_{name}_adr": none for name in ("pos", "contact_pos", "stage_pos")}
+    counts = dict.fromkeys(("nrangefinder", "nsensorcollision", "nsensortaxel"), 0)
+    sums = dict.fromkeys(("sensor_e_potential", "sensor_e_kinetic"), False)
+    return dataclasses.replace(warp_model, **lists, **counts, **sums, callback=mjw.Callback())
 
 
 def without(sensors: Sequence[int], warp_model: mjw.Model) -> mjw.Model:

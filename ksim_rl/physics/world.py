@@ -27,6 +27,7 @@ from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.resets import resets
+from ksim_rl.physics.rows.second_limits import may_add_rows
 from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.substep_plan import SubstepPlan, substep_plan, with_callbacks
 from ksim_rl.physics.substeps import Sensors, Substeps
@@ -94,8 +95,12 @@ class World(views.DataViews):
                 self.warp_model.opt.graph_conditional = takes_conditional_nodes(
                     self.warp_model, supported=wp.is_conditional_graph_supported()
                 )
+            nonzeros = None
+            if may_add_rows(self.warp_model, expanded):
+                # Its own estimate has one row for each limit, and none for dry friction that the model has not.
+                nonzeros = self.njmax * self.mj_model.nv
             self.warp_data_E = mjw.make_data(
-                stored_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax
+                stored_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax, njmax_nnz=nonzeros
             )
             upstream.drop_unread(self.warp_model, self.warp_data_E)
             gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)

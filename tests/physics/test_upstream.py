@@ -36,6 +36,11 @@ def warp_model() -> mjw.Model:
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
+        (
+            "constraint._efc_row",
+            "opt_disableflags worldid timestep efcid pos_aref pos_imp invweight solref solimp margin vel frictionloss "
+            "type id is_discrete aref_shift type_out id_out pos_out margin_out D_out vel_out aref_out frictionloss_out",
+        ),
         ("bvh.build_hfield_bvh", "mjm hfieldid constructor leaf_size"),
         ("math.make_frame", "a"),
         ("math.mul_quat", "u v"),

@@ -1,6 +1,6 @@
 """This module chooses the constraint solver of a world, and launches the one that is a single kernel."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import mujoco
@@ -139,14 +139,14 @@ def step(
     *,
     sensors: bool,
     accelerometers: bool = True,
-    mend_rows: Callable[[], None] | None = None,
+    row_mends: Sequence[Callable[[], None]] = (),
 ) -> None:
     """Launch a physics step: that of MuJoCo Warp, with this solver.
 
     The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
     not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
     which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
-    advances the state. `collide` is a collision pass other than MuJoCo Warp's, and `mend_rows` follows its rows. On a
+    advances the state. `collide` is a collision pass other than MuJoCo Warp's, and `row_mends` follow its rows. On a
     stream `aside`, the solver orders the worlds, by the last substep, and dynamics of few worlds go on beside that
     pass; then it solves beside some sensors, of which `contacts` leaves out `accelerometers` where they are not wanted.
     """
@@ -155,8 +155,8 @@ def step(
         aside = None
     if dynamics is None:
         mjw.fwd_position(m, d, factorize=False)
-        if mend_rows is not None:
-            mend_rows()
+        for mend in row_mends:
+            mend()
         mjw.fwd_velocity(m, d)
         if contacts is not None:
             contacts.list()
@@ -170,8 +170,8 @@ def step(
                 collide() if collide is not None else mjw.collision(m, d)
         if make_rows is None:
             mjw.make_constraint(m, d)
-            if mend_rows is not None:
-                mend_rows()
+            for mend in row_mends:
+                mend()
         else:
             make_rows()
 

@@ -15,6 +15,7 @@ import warp as wp
 
 from ksim_rl.physics import native
 from ksim_rl.physics.rows.contact_lists import ContactLists
+from ksim_rl.physics.rows.second_limits import joints_between_limits
 
 PARTS = ("layout", "order", "row", "joints", "contacts")
 # The degrees of freedom that move a geom are bits of a number, and a geom of a pair is 15 bits of another.
@@ -32,10 +33,14 @@ _ENUMS = {
 def one_kernel_rows_unavailable(warp_model: mjw.Model, *, dynamics_unavailable: str | None) -> str | None:
     """Return why MuJoCo Warp's own kernels make a model's rows, or None where one does, as of what precedes them."""
     m = warp_model
+    limit_sensors = m.sensor_limitpos_adr.size + m.sensor_limitvel_adr.size + m.sensor_limitfrc_adr.size
     reasons = {
         "what precedes them is not one kernel": dynamics_unavailable is not None,
         "equality constraints tie bodies": m.eq_connect_adr.size + m.eq_wld_adr.size > 0,
         "surfaces move": bool(m.flg_surfacevel),
+        # MuJoCo Warp's sensors read whichever row of a joint a thread meets last.
+        "sensors read limits of which both may hold": limit_sensors > 0
+        and joints_between_limits(m, ()).size > 0,
         f"there are more than {MOST_DOFS} degrees of freedom": m.nv > MOST_DOFS,
         f"there are more than {MOST_GEOMS} geoms": m.ngeom > MOST_GEOMS,
     }

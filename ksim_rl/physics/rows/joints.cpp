@@ -52,14 +52,16 @@ in_turns(FRICTIONLOSS ? NUM_DOFS : 0, [&](int dof, bool exists) {
 });
 const int frictions = rows_made - equalities;
 
-// "Limit": of a slide or hinge the nearer of its two; of a ball the angle by which it is turned.
+// "Limit": of a slide or hinge each of its two, of which both hold where the range is narrower than their margins; of a
+// ball the angle by which it is turned.
 in_turns(LIMITED_JOINTS, [&](int item, bool exists) {
     const int joint = exists ? problem.limited.data[item] : 0;
     const bool ball = exists && problem.jnt_type.data[joint] == BALL;
-    float distance = 0.0f, sign = 1.0f;
+    float lower = 0.0f, upper = 0.0f;  // distances of the bounds; a ball has one
     vec3 axis;
     if (exists) {
         const auto& range = model_row(problem.jnt_range)[joint];
+        const float margin = model_row(problem.jnt_margin)[joint];
         const float* const q = qpos + problem.jnt_qposadr.data[joint];
         if (ball) {
             const quat turn = wp::normalize(quat(q[0], q[1], q[2], q[3]));  // w x y z
@@ -70,29 +72,34 @@ in_turns(LIMITED_JOINTS, [&](int item, bool exists) {
             axis = sine > 0.0f ? axis * angle / sine : vec3();
             angle = wp::length(axis);
             axis = angle > 0.0f ? axis / angle : axis;
-            distance = wp::max(range[0], range[1]) - angle;
+            lower = wp::max(range[0], range[1]) - angle - margin;
         } else {
-            sign = q[0] - range[0] < range[1] - q[0] ? 1.0f : -1.0f;
-            distance = wp::min(q[0] - range[0], range[1] - q[0]);
+            lower = q[0] - range[0] - margin;
+            upper = range[1] - q[0] - margin;
         }
-        distance -= model_row(problem.jnt_margin)[joint];
     }
-    const Place place = reserve(exists && distance < 0.0f, ball ? 3 : 1);
+    const Place place = reserve((lower < 0.0f) + (upper < 0.0f), ball ? 3 : 1);
     if (place.rows == 0)
         return;
     const int dof = problem.jnt_dofadr.data[joint];
-    float velocity = sign * qvel[dof];
-    if (ball) {
-        velocity = -axis[0] * qvel[dof];
-        velocity -= axis[1] * qvel[dof + 1];
-        velocity -= axis[2] * qvel[dof + 2];
-    }
-    for (int i = 0; i < (ball ? 3 : 1); ++i)
-        write_nonzero(place.address + i, dof + i, ball ? -axis[i] : sign);
-    row_of(problem.efc_J_rownnz)[place.row] = ball ? 3 : 1;
-    row_of(problem.efc_J_rowadr)[place.row] = place.address;
     const float margin = model_row(problem.jnt_margin)[joint], invweight = model_row(problem.dof_invweight0)[dof];
-    const Law law = law_of(model_row(problem.jnt_solref)[joint], model_row(problem.jnt_solimp)[joint], distance);
-    write_row(place.row, {LIMIT_JOINT, joint, distance, margin, velocity, invweight, 0.0f, 1.0f}, law);
+#pragma unroll 1
+    for (int i = 0; i < place.rows; ++i) {
+        const bool is_lower = lower < 0.0f && i == 0;
+        const float distance = is_lower ? lower : upper, sign = is_lower ? 1.0f : -1.0f;
+        const int row = place.row + i, address = place.address + i;
+        float velocity = sign * qvel[dof];
+        if (ball) {
+            velocity = -axis[0] * qvel[dof];
+            velocity -= axis[1] * qvel[dof + 1];
+            velocity -= axis[2] * qvel[dof + 2];
+        }
+        for (int part = 0; part < (ball ? 3 : 1); ++part)
+            write_nonzero(address + part, dof + part, ball ? -axis[part] : sign);
+        row_of(problem.efc_J_rownnz)[row] = ball ? 3 : 1;
+        row_of(problem.efc_J_rowadr)[row] = address;
+        const Law law = law_of(model_row(problem.jnt_solref)[joint], model_row(problem.jnt_solimp)[joint], distance);
+        write_row(row, {LIMIT_JOINT, joint, distance, margin, velocity, invweight, 0.0f, 1.0f}, law);
+    }
 });
 const int limits = rows_made - equalities - frictions;
