@@ -36,11 +36,11 @@ def mended_step(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
     row_mends: Sequence[Callable[[], None]],
-    limit_positions: mjw.Model | None = None,
+    limits_warp_model: mjw.Model | None = None,
 ) -> None:
     """Launch `mjw.step`, and `row_mends` after the rows of each of its stages, of which Runge-Kutta's has four.
 
-    Then the sensors of `limit_positions`, which has others no more, are computed again, as they read such rows.
+    Then the sensors of `limits_warp_model`, which has others no more, are computed again, as they read such rows.
     """
     if not row_mends:
         mjw.step(warp_model, warp_data_E)
@@ -48,7 +48,7 @@ def mended_step(
     callback, hook = warp_model.callback, hook_after_rows(warp_model)
     assert hook is not None, "check_mendable was not called"
     own = vars(callback)[hook]
-    reads = [] if warp_model.opt.disableflags & mjw.DisableBit.SENSOR else [limit_positions]
+    reads = [] if warp_model.opt.disableflags & mjw.DisableBit.SENSOR else [limits_warp_model]
 
     def mended(*model_and_data: Any) -> None:
         for mend in row_mends:

@@ -103,11 +103,11 @@ class Substeps:
             adding_of_second_limits(warp_model, warp_data_E, expanded),
         ]
         self._row_mends = [mend for mend in mends if mend is not None]
-        self._limit_positions: mjw.Model | None = None
+        self._limits_warp_model: mjw.Model | None = None
         if self._row_mends and self._solve is None:
             check_mendable(warp_model)
             if warp_model.sensor_limitpos_adr.size:
-                self._limit_positions = upstream.with_limit_positions_only(warp_model)
+                self._limits_warp_model = upstream.with_limit_positions_only(warp_model)
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())
         self.refreshed_on_demand: set[str] = set()
         if (sensor_type == mujoco.mjtSensor.mjSENS_TENDONVEL).any():
@@ -138,7 +138,7 @@ class Substeps:
             mjw.com_vel(self.warp_model, self.warp_data_E)
         m = self._models[sensors]
         if self._solve is None:
-            mended_step(m, self.warp_data_E, self._row_mends, self._limit_positions)
+            mended_step(m, self.warp_data_E, self._row_mends, self._limits_warp_model)
             return
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
         if sensors in ("kept", "all"):
