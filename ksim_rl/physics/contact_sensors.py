@@ -71,7 +71,7 @@ class ContactReadings:
         }
         # Of 32768 worlds of Go1 on an H200 sensors are read in 52 us instead of 80, of G1 in 93 instead of 148.
         lanes = 4 if d.qpos.device.is_cuda and d.nworld > native.FEW_WORLDS else lists.lanes
-        parts = ("sensors", "accelerometers"), ("bodies",)
+        parts = ("matching", "sensors", "accelerometers"), ("bodies",)
         sources = [native.source_of("rows", ("layout", "wrench", *own_parts)) for own_parts in parts]
         self._read_sensors, self._sum_forces = (
             native.launcher(source, constants, own, m, d, lanes=lanes, threads=lists.threads)

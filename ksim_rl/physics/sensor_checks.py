@@ -15,6 +15,7 @@ GEOM, BODY, TREE = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY, mujoco.mj
 def check_sensors(mj_model: mujoco.MjModel) -> None:
     """Refuse sensors of distances or contacts that no kernel reads as MuJoCo's C engine does."""
     check_signed_distance_fields(mj_model)
+    check_delayed(mj_model)
     flags, bits = mj_model.opt.disableflags, mujoco.mjtDisableBit
     for sensor in np.flatnonzero(np.isin(mj_model.sensor_type, DISTANCES)):
         if flags & bits.mjDSBL_CONSTRAINT:
@@ -26,6 +27,25 @@ def check_sensors(mj_model: mujoco.MjModel) -> None:
             raise ValueError(
                 f"{_name(mj_model, int(sensor))} needs a collision pass, in which flexes would touch in spite of "
                 "<flag contact='disable'/>: set contype and conaffinity of the flexes to 0 instead"
+            )
+
+
+def check_delayed(mj_model: mujoco.MjModel) -> None:
+    """Refuse the first contacts of several where they have no order, and bounds of touch that delay comes before."""
+    for sensor in range(mj_model.nsensor):
+        kind, (samples, interpolation) = mj_model.sensor_type[sensor], mj_model.sensor_history[sensor]
+        takes_first = kind == mujoco.mjtSensor.mjSENS_CONTACT and mj_model.sensor_intprm[sensor, 1] == 0
+        if takes_first and (samples or mj_model.nflex):
+            raise ValueError(
+                f"{_name(mj_model, sensor)} reads the first contacts, which have no order "
+                f"{'where a sensor is delayed' if samples else 'in a model with flexes'}: set its reduce to mindist, "
+                "maxforce or netforce"
+            )
+        bounded = kind == mujoco.mjtSensor.mjSENS_TOUCH and mj_model.sensor_cutoff[sensor] > 0.0
+        if bounded and samples and interpolation:
+            raise ValueError(
+                f"{_name(mj_model, sensor)} has a cutoff of {mj_model.sensor_cutoff[sensor]:g}, and its samples are "
+                "interpolated before it is applied: set cutoff='0' or interp='zoh'"
             )
 
 

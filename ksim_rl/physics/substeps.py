@@ -20,6 +20,7 @@ from ksim_rl.physics.rows.constraint_rows import constraint_rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
 from ksim_rl.physics.rows.second_limits import adding_of_second_limits
 from ksim_rl.physics.rows.tie_weights import BODY_EQUALITIES, weighing_of_ties
+from ksim_rl.physics.sensor_mending import mend_sensors
 from ksim_rl.physics.smooth.stages import calls_back, integration, smooth_dynamics
 from ksim_rl.physics.views import CAMERAS_AND_LIGHTS, FORCES_OF_BODIES, SUBTREE_VELOCITIES
 
@@ -90,10 +91,14 @@ class Substeps:
             self.contact_lists = ContactLists(warp_model, warp_data_E)
             self._make_rows = constraint_rows(warp_model, warp_data_E, self.contact_lists)
             self._contacts = ContactReadings(mj_model, warp_model, warp_data_E, self.contact_lists)
-            ours = self._contacts.sensors
-            self._models = {which: upstream.without(ours, m) for which, m in self._models.items()}
             if own_broad_phase:
                 self._collide = collisions(warp_model, warp_data_E, self.contact_lists)
+        ours = [] if self._contacts is None else self._contacts.sensors
+        mended = mend_sensors(mj_model, warp_model, warp_data_E, read=ours, lists=self.contact_lists)
+        if ours or mended:
+            self._models = {which: upstream.without(ours + mended, m) for which, m in self._models.items()}
+        # Those may be of sites, and of velocities.
+        self._reads_contacts = bool(mended)
         self._place_fixed_geoms = placing_of_fixed_geoms(warp_model, warp_data_E, expanded)
         if one_kernel_integration:
             self._integrate = integration(warp_model, warp_data_E, record=record)
@@ -143,8 +148,8 @@ class Substeps:
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
         if sensors in ("kept", "all"):
             m.sensor_rne_postconstraint |= self.refreshed_on_demand >= FORCES_OF_BODIES
-        # Contact sensors that we do not read may be of sites.
-        is_read = m.sensor_contact_acc_adr.size > 0 if sensors == "contacts" else is_last or sensors != "none"
+        left = self._reads_contacts or m.sensor_contact_acc_adr.size > 0
+        is_read = left if sensors == "contacts" else is_last or sensors != "none"
         is_read |= self._always_senses or m.opt.run_rne_postconstraint
         is_read |= self._make_rows is None or self._integrate is None
         if dynamics is not None:

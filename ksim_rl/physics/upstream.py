@@ -37,6 +37,9 @@ from mujoco_warp._src.smooth import tendon_bias as tendon_bias
 # The bits of `contact.type`.
 from mujoco_warp._src.types import ContactType as ContactType
 
+# When its callback of sensors is called.
+from mujoco_warp._src.types import Stage as Stage
+
 # The type of a contact's friction and of its impedance.
 from mujoco_warp._src.types import vec5 as vec5
 from torch import Tensor
@@ -155,14 +158,13 @@ def with_limit_positions_only(warp_model: mjw.Model) -> mjw.Model:
 
 def without(sensors: Sequence[int], warp_model: mjw.Model) -> mjw.Model:
     """Return a model on the same arrays without these sensors, nor forces of all bodies if no other reads them."""
-    m, lists = warp_model, (warp_model.sensor_contact_acc_adr.numpy(), warp_model.sensor_acc_adr.numpy())
-    of_contacts, others = (ids[~np.isin(ids, sensors)] for ids in lists)
-    return dataclasses.replace(
-        m,
-        sensor_contact_acc_adr=wp.array(of_contacts, dtype=int),
-        sensor_acc_adr=wp.array(others, dtype=int),
-        sensor_rne_postconstraint=not np.isin(m.sensor_type.numpy()[others], FORCELESS).all(),
-    )
+    m, left = warp_model, dict[str, np.ndarray]()
+    for stage in ("contact_pos", "contact_vel", "contact_acc", "acc"):
+        ids = vars(m)[f"sensor_{stage}_adr"].numpy()
+        left[f"sensor_{stage}_adr"] = ids[~np.isin(ids, sensors)]
+    reads_forces = not np.isin(m.sensor_type.numpy()[left["sensor_acc_adr"]], FORCELESS).all()
+    lists = {name: wp.array(ids, dtype=int) for name, ids in left.items()}
+    return dataclasses.replace(m, **lists, sensor_rne_postconstraint=reads_forces)
 
 
 def collide_boxes_exactly(warp_model: mjw.Model) -> None:

@@ -2,12 +2,6 @@
 // one of the next contacts and passes it on to all, each of which asks whether its sensor matches it: a contact lies
 // anywhere in the pool, and what to read of it follows from what is read before.
 
-auto is_of = [=](int geom, int kind, int element) {
-    if (kind == NOTHING || kind == GEOM)
-        return kind == NOTHING || geom == element;
-    const int body = problem.geom_bodyid.data[geom];
-    return body >= element && body < element + (kind == SUBTREE ? problem.body_subtreenum.data[element] : 1);
-};
 auto vector_of_lane = [=](const vec3& v, int source) {
     return vec3(of_lane(v[0], source), of_lane(v[1], source), of_lane(v[2], source));
 };
