@@ -18,6 +18,7 @@ from ksim_rl.scene.robots.analysis import TRIAL_S
 from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.build import build_evaluator, solved_at
+from ksim_rl.trainers.metrics import losses_of
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.trainers.run_folder import policy_of
 from ksim_rl.trainers.sources import check_sources
@@ -107,6 +108,9 @@ def evaluate(arguments: list[str]) -> int:
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
         evaluate = build_evaluator(policy.cfg, policy.actor, episodes=episodes, seed=options.seed)
         evaluation = evaluate()
+        losses = losses_of(evaluate.env)
+    for text in losses:
+        say(f"warning: {text}")
     assert evaluation is not None
     threshold = solved_at(policy.cfg)
     print(f"{judged}: {verdict(evaluation, threshold)}")

@@ -6,6 +6,7 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.envs.registry import build, make, make_cfg, names, register_configs, task
+from ksim_rl.envs.room import with_room
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import (
     ActionTerm,

@@ -10,6 +10,7 @@ import numpy as np
 
 from ksim_rl.physics.load import caught_warnings
 from ksim_rl.physics.model_checks import model_bytes
+from ksim_rl.physics.overflow import OF_POOL, OF_ROWS, OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
 
 # On what the probe saw: half as much again for rows and contacts; less for candidate pairs, which all worlds share.
@@ -23,6 +24,9 @@ DROP_STEPS = 50
 # How deep a dropped body may start in the ground, in m.
 DEPTH = 0.02
 
+# On what an env's rehearsal needed, which saw the env's own resets and actions.
+REHEARSED_MARGIN = 1.25
+
 _cache: dict[bytes, tuple[int, int]] = {}
 
 
@@ -32,14 +36,46 @@ def capacities(
     """Return (njmax, nconmax) per world: those of `sim`, or the probe's where they are None."""
     if sim.njmax is not None and sim.nconmax is not None:
         return sim.njmax, sim.nconmax
-    if {"dof_frictionloss", "tendon_frictionloss"} & set(per_world_fields):
-        mj_model = _with_dry_friction(mj_model)
-    njmax, nconmax = probe(mj_model)
+    njmax, nconmax = probe(_rubbing(mj_model, per_world_fields))
     return sim.njmax or njmax, sim.nconmax or nconmax
 
 
-def _with_dry_friction(mj_model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model with some dry friction in each hinge, slide and tendon, which is a constraint row each."""
+def is_certain(mj_model: mujoco.MjModel, sim: SimCfg, *, njmax: int) -> bool:
+    """Whether `sim` gives both numbers, or no state has contacts or more rows than `njmax`."""
+    if sim.njmax is not None and sim.nconmax is not None:
+        return True
+    if mj_model.nflex or CandidatePairs(mj_model).first.size:
+        return False
+    # Each degree of freedom and tendon may rub, and be at both ends of its range; a weld has six rows.
+    most = 6 * mj_model.neq + 3 * (mj_model.nv + mj_model.ntendon)
+    return most <= njmax
+
+
+def remember(
+    mj_model: mujoco.MjModel, sim: SimCfg, per_world_fields: Sequence[str], report: OverflowReport
+) -> bool:
+    """Let later `capacities` of this model have room for what worlds needed, where it was too little.
+
+    Numbers that `sim` gives do not change. Returns whether others do.
+    """
+    probed = _rubbing(mj_model, per_world_fields)
+    key = _key(probed)
+    njmax, nconmax = probe(probed)
+    wanted_njmax, wanted_nconmax = njmax, nconmax
+    if sim.njmax is None and any(report.worlds[name] for name in OF_ROWS):
+        needed = max(report.nefc, report.njmax)
+        wanted_njmax = max(njmax, _round_up(REHEARSED_MARGIN * needed))
+    if sim.nconmax is None and any(report.worlds[name] for name in OF_POOL):
+        needed = max(report.ncon / report.num_envs, report.nconmax)
+        wanted_nconmax = max(nconmax, _round_up(REHEARSED_MARGIN * needed))
+    _cache[key] = (wanted_njmax, wanted_nconmax)
+    return (wanted_njmax, wanted_nconmax) != (njmax, nconmax)
+
+
+def _rubbing(mj_model: mujoco.MjModel, per_world_fields: Sequence[str]) -> mujoco.MjModel:
+    """Return the model as worlds may be that differ in dry friction: each hinge, slide and tendon may have a row."""
+    if not {"dof_frictionloss", "tendon_frictionloss"} & set(per_world_fields):
+        return mj_model
     rubbing = copy.copy(mj_model)
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     scalar = np.isin(mj_model.jnt_type[mj_model.dof_jntid], kinds)
@@ -50,13 +86,17 @@ def _with_dry_friction(mj_model: mujoco.MjModel) -> mujoco.MjModel:
 
 def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
     """Return how many constraint rows and contacts a world of this model needs, with margin. Cached per model."""
-    key = hashlib.sha256(model_bytes(mj_model).tobytes()).digest()
+    key = _key(mj_model)
     if key not in _cache:
         with caught_warnings():
             rows, contacts, pairs = _most(mj_model)
         nconmax = max(MARGIN * contacts, PAIR_MARGIN * pairs)
         _cache[key] = (_round_up(MARGIN * rows), _round_up(nconmax))
     return _cache[key]
+
+
+def _key(mj_model: mujoco.MjModel) -> bytes:
+    return hashlib.sha256(model_bytes(mj_model).tobytes()).digest()
 
 
 def _round_up(needed: float) -> int:

@@ -20,6 +20,8 @@ OUT_OF = {
     "OUT_OF_PAIRS": int(mjw.OverflowType.BROADPHASE),
     "OUT_OF_CONTACTS": int(mjw.OverflowType.NARROWPHASE),
 }
+# What njmax makes room for, and nconmax.
+OF_ROWS, OF_POOL = ("NEFC", "NJMAX_NNZ"), ("BROADPHASE", "NARROWPHASE", "CCD")
 # In the order of the bits, lowest first.
 BIT_NAMES = tuple(name for name, bit in mjw.OverflowType.__members__.items() if bit and bit & (bit - 1) == 0)
 

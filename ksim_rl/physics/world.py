@@ -77,7 +77,7 @@ class World(views.DataViews):
         self.num_envs, self.is_frozen = num_envs, False
         self.mj_model = copy.copy(mj_model)
         self.sim.apply_to(self.mj_model)
-        expanded = fields_to_expand(per_world_fields)
+        expanded = self._expanded = fields_to_expand(per_world_fields)
         check_not_simple(self.mj_model, expanded)
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
         self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
@@ -297,6 +297,15 @@ class World(views.DataViews):
         """Make the report of `overflow_counts` that were read on the host."""
         return self._overflow.explain(numbers)
 
+    @property
+    def room_is_certain(self) -> bool:
+        """Whether `sim` gives the room for contacts and rows, or no state of the model needs more."""
+        return capacity.is_certain(self.mj_model, self.sim, njmax=self.njmax)
+
+    def remember_needs(self, report: OverflowReport) -> bool:
+        """Let later worlds of this model in this process have room for what was needed; whether they get more."""
+        return capacity.remember(self.mj_model, self.sim, self._expanded, report)
+
     def nan_count(self) -> Int[Tensor, ""]:
         """Return how many worlds became non-finite since the last `nan_report`, on the device; 0 without a guard."""
         if self._nan_guard is None:
@@ -309,6 +318,11 @@ class World(views.DataViews):
         Without `sim.nan_guard` the report is empty.
         """
         return NanReport() if self._nan_guard is None else self._nan_guard.report()
+
+    def forget_failures(self) -> None:
+        """Let the next `nan_report` leave out worlds that became non-finite until now."""
+        if self._nan_guard is not None:
+            self._nan_guard.forget()
 
     def state_dict(self) -> dict[str, Shaped[Tensor, "*?leaf"]]:
         """Copy everything that the next steps depend on, so that a restored world continues bit for bit on CPU."""

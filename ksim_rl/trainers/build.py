@@ -4,6 +4,7 @@ import dataclasses
 import os
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -50,7 +51,8 @@ def build(
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     torch.set_num_threads(cfg.trainer.num_threads or default_threads(cfg.resolved_device()))
 
-    env = build_env(cfg, num_envs=cfg.num_envs, seed=cfg.seed)
+    said: list[str] = []
+    env = envs.with_room(partial(build_env, cfg, num_envs=cfg.num_envs, seed=cfg.seed), note=said.append)
     with eagerly(cfg.collector.eager):
         update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
     if cfg.trainer.stop_at and not hooks:  # which may log figures of their own
@@ -71,6 +73,7 @@ def build(
         hooks=hooks,
         folder=run_folder / "checkpoint" if run_folder else None,
         config=cfg.to_tree(),
+        notes=said,
     )
     # Before anything is loaded: a replay need not be kept apart meanwhile.
     began = time.monotonic()

@@ -137,3 +137,12 @@ def explain_physics(env: EnvBase, counts: Mapping[str, float]) -> PhysicsReport:
         lost=tuple(overflow.messages),
         saved=tuple(world.nan_report().messages) if counts[_NAN] else (),
     )
+
+
+def losses_of(env: EnvBase) -> tuple[str, ...]:
+    """Return a line for each kind of contacts or constraints that were lost since the last look; reads the device."""
+    simulated = part(env, SimulatedWorld)
+    if simulated is None:
+        return ()
+    world = simulated.world
+    return tuple(world.explain_overflow(world.overflow_counts().tolist()).messages)

@@ -26,6 +26,7 @@ from ksim_rl.trainers.metrics import (
     PendingMetrics,
     episode_means,
     explain_physics,
+    losses_of,
     read_episode_sums,
     read_physics,
     start_copy,
@@ -89,6 +90,8 @@ class EvaluationHook(Hook):
             evaluation = self.evaluator(stop=lambda: ranks.size() == 1 and bool(trainer.interrupt))
         if evaluation is None:
             return
+        for text in losses_of(self.evaluator.env):
+            trainer.progress.note(f"warning: evaluation at iteration {trainer.iteration}: {text}")
         trainer.evaluation, self._evaluated_at = evaluation, trainer.iteration
         figures = {f"evaluation/{name}": value for name, value in asdict(evaluation).items()}
         trainer.log(figures | probed(trainer.update, trainer.collector.env, trainer.rollout_ET))
@@ -136,6 +139,7 @@ class Trainer:
 
     Without an `evaluator` nothing is evaluated; `solved_at` is of its mean return. The `hooks` run after an evaluation
     and before a checkpoint. A checkpoint in `folder` (None saves none) holds `config`, plain data, as the run's.
+    Training begins by saying the `notes` of how things were built.
     """
 
     def __init__(
@@ -150,6 +154,7 @@ class Trainer:
         hooks: Sequence[Hook] = (),
         folder: Path | None = None,
         config: Mapping[str, Any] | None = None,
+        notes: Sequence[str] = (),
     ) -> None:
         self.cfg, self.collector, self.update = cfg, collector, update
         self.evaluator, self.solved_at = evaluator, solved_at
@@ -163,6 +168,7 @@ class Trainer:
         self.clock = RunClock()
         self.progress = RunProgress(cfg.num_iterations, enabled=False)
         self.watch: Callable[[], None] = lambda: None  # called in each iteration, before anything is written
+        self._notes = tuple(notes)
         self._own_hooks = tuple(hooks)
         judge = [EvaluationHook(evaluator, interval=cfg.eval_interval)] if evaluator is not None else []
         self._hooks = (*judge, *hooks, CheckpointHook(interval=cfg.checkpoint_interval))
@@ -203,7 +209,7 @@ class Trainer:
         """
         self.progress = progress or self.progress
         with self.interrupt, self.progress:
-            notes = notes_of(self.update, warm_up=self.cfg.warm_up)
+            notes = (*self._notes, *notes_of(self.update, warm_up=self.cfg.warm_up))
             for text in (*missing_parts(self.collector.env), *notes):
                 self.progress.note(text)
             if self.warm_up_s:

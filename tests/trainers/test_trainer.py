@@ -187,6 +187,17 @@ def test_lost_contacts_are_said_once_and_stay_in_the_metrics():
     assert [row["physics/nefc_share"] for row in logger.rows if "physics/nefc_share" in row] == [1.5] * 3
 
 
+def test_contacts_that_an_evaluation_lost_are_said():
+    trainer, notes = make_trainer(iterations=2, eval_interval=2), Notes()
+    judging = make_env(10, kind=SimulatedTargetEnv)
+    judging.base_env.__dict__["world"] = LossyWorld()
+    trainer.evaluator.env = judging
+    trainer.train(notes)
+    assert [note.split(":")[:2] for note in notes.notes if "njmax" in note] == [
+        ["warning", " evaluation at iteration 2"]
+    ]
+
+
 class GuardedWorld(LossyWorld):
     """A world whose NaN guard has something to save after the first rollout."""
 

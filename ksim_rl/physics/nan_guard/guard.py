@@ -162,6 +162,12 @@ class NanGuard:
         self._count_E[list(worlds)] = 0
         return NanReport(worlds=worlds, files=tuple(files), messages=tuple(messages))
 
+    def forget(self) -> None:
+        """Watch the worlds that failed again, without a report of them."""
+        failed_E = self._failed_E != _WATCHED
+        self._count_E.masked_fill_(failed_E, 0)
+        self._failed_E.zero_()
+
     def _write(self, world: int) -> Path:
         count, history = int(self._count_E[world]), self.cfg.history
         # The newest row stands at count - 1; fewer substeps than places leave the rest unused.

@@ -1,0 +1,109 @@
+"""Makes an env whose worlds have room for all contacts and constraint rows, as a rehearsal with random actions finds.
+
+What a model's probe sees are poses of the model alone. What an env's resets, commands and actions make of it may need
+more, which the first steps show: before anything is captured, since room is never added to a world that exists.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ksim_rl.envs.contract import part
+from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.physics import OverflowReport
+
+# Long enough for a robot to fall and lie, and so many env steps at most.
+SECONDS, MOST_STEPS = 1.0, 50
+# Contacts that found no place had no rows: only then are those seen.
+MOST_BUILDS = 5
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Room:
+    """What worlds have room for, and why MuJoCo Warp's own solver solves their constraints, if it does."""
+
+    njmax: int
+    nconmax: int
+    one_kernel_unavailable: str | None
+
+
+def with_room(make: Callable[[], EnvBase], *, note: Callable[[str], None]) -> EnvBase:
+    """Return an env that `make` builds, built once more where its worlds lost contacts or rows in a rehearsal.
+
+    The new one has room for what was needed, with a margin, as has each later world of the same model in this process.
+    `note` is told so in one line. A number of rows or contacts that the env's `sim` gives stays as it is; then `note`
+    is told what was lost. An env that is no `ManagerBasedRlEnv`, or whose room is certain, is not rehearsed.
+    """
+    env = make()
+    base = part(env, ManagerBasedRlEnv)
+    if base is None or base.world.room_is_certain:
+        return env
+    first = _room_of(base)
+    report = rehearse_room(base)
+    for _ in range(MOST_BUILDS - 1):
+        if not base.world.remember_needs(report):
+            break
+        env.close(raise_if_closed=False)
+        env = make()
+        base = part(env, ManagerBasedRlEnv)
+        assert base is not None, "it makes the same kind of env"
+        report = rehearse_room(base)
+    last = _room_of(base)
+    if last != first:
+        note(_grown(first, last))
+    for message in report.messages:
+        note(f"warning: random actions lost contacts or constraints in a rehearsal: {message}")
+    return env
+
+
+def _room_of(env: ManagerBasedRlEnv) -> _Room:
+    world = env.world
+    return _Room(
+        njmax=world.njmax, nconmax=world.nconmax, one_kernel_unavailable=world.one_kernel_unavailable
+    )
+
+
+def _grown(first: _Room, last: _Room) -> str:
+    numbers = {"task.sim.njmax": (first.njmax, last.njmax), "task.sim.nconmax": (first.nconmax, last.nconmax)}
+    grown = [f"{name} {old} -> {new}" for name, (old, new) in numbers.items() if new != old]
+    text = f"room for contacts and constraint rows has grown after a rehearsal: {', '.join(grown)}"
+    if last.one_kernel_unavailable and not first.one_kernel_unavailable:
+        text += f"; MuJoCo Warp's own solver solves constraints now, because {last.one_kernel_unavailable}"
+    return text
+
+
+def rehearse_room(env: ManagerBasedRlEnv) -> OverflowReport:
+    """Reset all envs, let them take random actions for a second, and put everything back; return what was needed."""
+    steps = min(MOST_STEPS, math.ceil(SECONDS / env.step_dt))
+    saved = env.state_dict()
+    env.world.overflow_report()
+    generator = torch.Generator().manual_seed(0)
+    devices = [env.device] if env.device.type == "cuda" else []
+    # A term of the user's may draw from torch's own generators.
+    with torch.no_grad(), torch.random.fork_rng(devices=devices):
+        state = env.reset()
+        for _ in range(steps):
+            state["action"] = _random_actions(env, generator)
+            _, state = env.step_and_maybe_reset(state)
+    report = env.world.overflow_report()
+    env.load_state_dict(saved)
+    # What was not finite here is of no state that anybody sees.
+    env.driver.non_finite.start()
+    env.world.forget_failures()
+    return report
+
+
+def _random_actions(env: ManagerBasedRlEnv, generator: torch.Generator) -> Float[Tensor, "E L"]:
+    """Draw actions: anywhere within their bounds, else as a new policy draws them, of mean 0 and deviation 1."""
+    shape_EL = (env.num_envs, env.action_manager.size)
+    bounds_L2 = env.action_manager.bounds_L2
+    if bounds_L2 is None:
+        return torch.randn(shape_EL, generator=generator).to(env.device)
+    share_EL = torch.rand(shape_EL, generator=generator).to(env.device)
+    low_L, high_L = bounds_L2.unbind(-1)
+    return torch.lerp(low_L, high_L, share_EL)

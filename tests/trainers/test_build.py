@@ -1,0 +1,26 @@
+"""What a run builds: envs with room for all contacts and rows."""
+
+import dataclasses
+
+from ksim_rl import conf
+from ksim_rl.envs import ManagerBasedRlEnv
+from ksim_rl.envs.contract import part
+from ksim_rl.physics import capacity
+from ksim_rl.trainers.build import build
+from tests.envs.test_room import sled_env
+from tests.trainers.test_trainer import Notes
+
+
+def test_a_run_whose_envs_need_more_room_gets_it_before_training_and_says_so(monkeypatch):
+    monkeypatch.setattr(capacity, "_cache", {})
+    overrides = ["task=cartpole_balance", "num_envs=8", "device=cpu", "trainer.num_iterations=1"]
+    overrides += ["data.num_env_states_per_minibatch=32", "trainer.eval_episodes=4"]
+    cfg = dataclasses.replace(conf.compose(overrides), task=sled_env(num_envs=8).cfg)
+    trainer, notes = build(cfg), Notes()
+    trainer.train(notes)
+    assert [note for note in notes.notes if "njmax 8 -> " in note and "nconmax 8 -> " in note]
+    assert not [note for note in notes.notes if "warning" in note], notes.notes
+    for env in (trainer.collector.env, trainer.evaluator.env):
+        base = part(env, ManagerBasedRlEnv)
+        assert base.world.njmax >= 48 and base.world.nconmax >= 12
+    assert trainer.metrics["physics/nefc_share"] < 1.0
