@@ -77,7 +77,7 @@ def can_on_fine_field() -> mujoco.MjModel:
 
 @functools.cache
 def sensed_box(reduction: str) -> mujoco.MjModel:
-    """Return a box whose contact sensor has room for two contacts with the floor, where there are four."""
+    """Return a box that touches the floor in four points, for two of which MuJoCo Warp's contact sensor has room."""
     return load_model(
         f"""<mujoco>
           <custom><numeric name="contact_sensor_maxmatch" data="2"/></custom>
