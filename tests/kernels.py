@@ -62,7 +62,7 @@ TESTS = {
     },
     "physics/collision/collisions.py": {"collisions": EQUAL_WORLDS},
     "physics/constant_kernels.py": {"constants_at_qpos0": EQUAL_WORLDS, "frames": EQUAL_WORLDS},
-    "physics/contact_sensors.py": {"__init__": EQUAL_WORLDS},
+    "physics/sensors/contact_sensors.py": {"__init__": EQUAL_WORLDS},
     "physics/height_field/contacts.py": {"height_field_contacts": EQUAL_WORLDS},
     "physics/kernels.py": {"align_steep_capsules": SINGLE_MODELS, "sparse_velocity": SINGLE_MODELS},
     "physics/nan_guard/guard.py": {"keep_rows": EQUAL_WORLDS, "mark_failed": EQUAL_WORLDS},

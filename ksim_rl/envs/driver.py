@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.envs.non_finite import NonFiniteTerms
-from ksim_rl.envs.term_guard import TermGuard
+from ksim_rl.envs.term_checks.term_guard import TermGuard
 from ksim_rl.envs.view import EnvView, Readings
 from ksim_rl.physics import World
 from ksim_rl.scene.sensors import Sensor, SensorTracker

@@ -126,3 +126,40 @@ def sparse_velocity(
     for i in range(rowadr[pattern, row], rowadr[pattern, row] + rownnz[pattern, row]):
         total += matrix[world, i] * qvel[world, colind[pattern, i]]
     velocity[world, row] = total
+
+
+@wp.kernel(enable_backward=False)
+def copy_columns(columns: wp.array[int], source: wp.array2d[float], target: wp.array2d[float]):
+    """Copy some columns of each world's row."""
+    world, place = wp.tid()
+    column = columns[place]
+    target[world, column] = source[world, column]
+
+
+@wp.kernel(enable_backward=False)
+def gather_controls(
+    ctrladr: wp.array[int],
+    ctrlnum: wp.array[int],
+    ctrllimited: wp.array[bool],
+    ctrlrange: wp.array2d[wp.vec2],
+    ranges_are_off: bool,
+    ctrl: wp.array2d[float],
+    gathered: wp.array2d[float],
+):
+    """Write the first control of each actuator, within its range, or zero where it has none."""
+    world, actuator = wp.tid()
+    found = float(0.0)  # noqa: UP018 (Warp: a variable that changes)
+    if ctrlnum[actuator] > 0:
+        column = ctrladr[actuator]
+        found = ctrl[world, column]
+        if ctrllimited[column] and not ranges_are_off:
+            limits = ctrlrange[world % ctrlrange.shape[0], column]
+            found = wp.clamp(found, limits[0], limits[1])
+    gathered[world, actuator] = found
+
+
+@wp.kernel(enable_backward=False)
+def shifted_time(before: wp.array[float], timestep: wp.array[float], fraction: float, time: wp.array[float]):
+    """Write each world's time, some timesteps later."""
+    world = wp.tid()
+    time[world] = before[world] + fraction * timestep[world % timestep.shape[0]]

@@ -7,7 +7,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 
-from ksim_rl.physics.sensor_checks import check_sensors
+from ksim_rl.physics.sensors.sensor_checks import check_sensors
 
 # Where a field's prefix is not the name of MuJoCo's type of object.
 TYPES_OF_PREFIXES = {"jnt": "joint", "cam": "camera", "mat": "material", "eq": "equality"}
@@ -36,6 +36,7 @@ _FIELDS = (
 )
 NOT_NEGATIVE_OPTIONS, NOT_NEGATIVE_FIELDS = tuple(_OPTIONS.split()), tuple(_FIELDS.split())
 CALLBACKS = {field: getattr(mujoco, f"get_mjcb_act_{field}") for field in ("dyn", "gain", "bias")}
+FREE = mujoco.mjtJoint.mjJNT_FREE
 
 
 def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
@@ -85,6 +86,7 @@ def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
 def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None = None) -> mjw.Model:
     """Put a model on Warp's current device, or name the feature that MuJoCo Warp does not have, or has wrong."""
     check_sensors(mj_model)
+    check_fluid(mj_model)
     try:
         with warnings.catch_warnings():
             # It doubts friction of geoms without contacts; MuJoCo itself accepts them.
@@ -94,6 +96,28 @@ def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None =
         raise ValueError(
             f"MuJoCo Warp cannot simulate this model: {_with_elements(mj_model, str(error))}"
         ) from error
+
+
+def check_fluid(mj_model: mujoco.MjModel) -> None:
+    """Refuse ellipsoids in a fluid, on bodies of several joints, with the integrator that takes their derivative wrong.
+
+    MuJoCo Warp keeps its matrix for "implicit" symmetric, which this derivative is not; "implicitfast" makes it so in C
+    as well. A body with a free joint alone is solved for on its own, rightly.
+    """
+    opt = mj_model.opt
+    if opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICIT or not (opt.density > 0 or opt.viscosity > 0):
+        return
+    for geom in np.flatnonzero(mj_model.geom_fluid[:, 0] > 0):
+        body = int(mj_model.geom_bodyid[geom])
+        tree = mj_model.body_rootid == mj_model.body_rootid[body]
+        moving = np.flatnonzero(tree & (mj_model.body_dofnum > 0))
+        is_lone = moving.size == 1 and mj_model.jnt_type[mj_model.body_jntadr[moving[0]]] == FREE
+        if moving.size and not is_lone:
+            raise ValueError(
+                f"{_element(mj_model, 'geom', int(geom))} has fluidshape='ellipsoid', and MuJoCo Warp takes the "
+                "derivative of its drag wrong for integrator='implicit': choose integrator='implicitfast' "
+                "(task.sim.integrator)"
+            )
 
 
 def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) -> None:

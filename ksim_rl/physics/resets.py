@@ -78,7 +78,9 @@ def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Call
         places = wp.array([array.ptr for array in used], dtype=wp.uint64, device=device)
         return places, wp.array(widths, dtype=int, device=device)
 
-    of_worlds = table([getattr(d, name) for name in ZEROED], d.nworld)
+    # A body that something adheres to has no contacts after a reset.
+    of_adhesion = ("actuator_moment",) if m.nacttrnbody else ()
+    of_worlds = table([getattr(d, name) for name in (*ZEROED, *of_adhesion)], d.nworld)
     of_pool = table([getattr(contact, name) for name in sorted(names)], d.naconmax)
     has_more = any(getattr(m, name) for name in HAS_MORE) or bool(m.opt.enableflags & mjw.EnableBit.SLEEP)
 

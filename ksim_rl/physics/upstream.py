@@ -25,10 +25,16 @@ from mujoco_warp._src.collision_driver import _narrowphase as narrowphase  # noq
 
 # The law of a constraint row.
 from mujoco_warp._src.constraint import _efc_row as efc_row  # noqa: F401
+
+# What `forward` does between the stages that it shows.
+from mujoco_warp._src.forward import _energy_pos as energy_of_position  # noqa: F401
+from mujoco_warp._src.forward import _energy_vel as energy_of_velocity  # noqa: F401
+from mujoco_warp._src.forward import _launch_discrete_free_gyro as turn_free_bodies
 from mujoco_warp._src.math import make_frame as make_frame
 from mujoco_warp._src.math import mul_quat as mul_quat
 from mujoco_warp._src.math import quat_to_mat as quat_to_mat
 from mujoco_warp._src.math import rot_vec_quat as rot_vec_quat
+from mujoco_warp._src.sleep import update_sleep, wake
 
 # What a step adds to the inertia matrix and to the bias forces for tendons.
 from mujoco_warp._src.smooth import tendon_armature as tendon_armature
@@ -99,6 +105,39 @@ def set_fixed_constants(warp_model: mjw.Model) -> None:
     mjw.set_const(warp_model, None, FIXED)  # pyright: ignore[reportArgumentType]
 
 
+def wake_trees(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    """Wake the sleeping trees that something disturbs, as `forward` does first."""
+    flags = warp_model.opt
+    if flags.enableflags & mjw.EnableBit.SLEEP and not flags.disableflags & mjw.DisableBit.ISLAND:
+        wake(warp_model, warp_data_E)
+        update_sleep(warp_model, warp_data_E)
+
+
+def solve_as_they_do(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    """Launch MuJoCo Warp's own solver, and what its integrator "discrete" adds to the accelerations."""
+    mjw.solve(warp_model, warp_data_E)
+    if warp_model.opt.integrator == mjw.IntegratorType.DISCRETE:
+        turn_free_bodies(warp_model, warp_data_E, warp_data_E.qacc, warp_data_E.qacc, False)
+
+
+def bias_forces(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    """Launch `qfrc_bias` and nothing else: `rne` writes accelerations and forces of bodies, too.
+
+    Those that may be read are of the last substep.
+    """
+    d = warp_data_E
+    aside = dataclasses.replace(d, cacc=wp.empty_like(d.cacc), cfrc_int=wp.empty_like(d.cfrc_int))
+    mjw.rne(warp_model, aside)
+    tendon_bias(warp_model, d, d.qfrc_bias)
+
+
+def without_limit_sensors(warp_model: mjw.Model) -> mjw.Model:
+    """Return a model on the same arrays without the sensors of joint and tendon limits."""
+    none = wp.zeros(0, dtype=int)
+    lists = ("sensor_limitpos_adr", "sensor_limitvel_adr", "sensor_limitfrc_adr")
+    return dataclasses.replace(warp_model, **dict.fromkeys(lists, none))
+
+
 def without_sensors(warp_model: mjw.Model) -> mjw.Model:
     """Return a model on the same arrays that computes no sensors."""
     disabled = int(warp_model.opt.disableflags) | int(mjw.DisableBit.SENSOR)
@@ -145,15 +184,6 @@ def with_contact_sensors_only(warp_model: mjw.Model) -> mjw.Model:
     counts = dict.fromkeys(("nrangefinder", "nsensorcollision", "nsensortaxel"), 0)
     own = {f"sensor_{name}_adr": none for name in lists} | dict.fromkeys(flags, False)
     return dataclasses.replace(warp_model, **own, **counts)
-
-
-def with_limit_positions_only(warp_model: mjw.Model) -> mjw.Model:
-    """Return a model on the same arrays whose only position sensors are distances to limits, without callbacks."""
-    none = wp.zeros(0, dtype=int)
-    lists = {f"sensor_{name}_adr": none for name in ("pos", "contact_pos", "stage_pos")}
-    counts = dict.fromkeys(("nrangefinder", "nsensorcollision", "nsensortaxel"), 0)
-    sums = dict.fromkeys(("sensor_e_potential", "sensor_e_kinetic"), False)
-    return dataclasses.replace(warp_model, **lists, **counts, **sums, callback=mjw.Callback())
 
 
 def without(sensors: Sequence[int], warp_model: mjw.Model) -> mjw.Model:

@@ -18,6 +18,8 @@ from ksim_rl.device.memory import memory_for
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device, warp_scope, warp_stream
 from ksim_rl.physics import capacity, upstream, views
+from ksim_rl.physics.actuators.actuators_of_joints import let_actuators_add
+from ksim_rl.physics.actuators.disabled_actuators import switch_off
 from ksim_rl.physics.callbacks import Callbacks
 from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields, fields_to_expand
@@ -88,6 +90,8 @@ class World(views.DataViews):
         with memory_for(num_envs, self.device), warp_scope(self.device):
             self.warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
             follow_the_c_engine(self.warp_model)
+            switch_off(self.mj_model, self.warp_model)
+            let_actuators_add(self.mj_model, self.warp_model, expanded)
             self.warp_model.opt.warn_overflow = 0
             if self.sim.tolerance is not None:
                 self.warp_model.opt.tolerance.fill_(self.sim.tolerance)
@@ -215,7 +219,7 @@ class World(views.DataViews):
                     f"{name} is not computed: let a term of the config read it during construction"
                 )
             together = next(names for names in views.ON_DEMAND_TOGETHER if name in names)
-            self._substeps.refreshed_on_demand |= together
+            self._substeps.refreshed_on_demand.update(together)
             self._graphs.clear()
             self._record_resets()
         return super().view(name)

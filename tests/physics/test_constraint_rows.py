@@ -226,7 +226,7 @@ def test_steps_reach_what_mujoco_warps_rows_reach():
         world = touching("elliptic")
         assert world.one_kernel_rows_unavailable is None
         if not one_kernel:
-            world._substeps._make_rows = None
+            world._substeps.stages = dataclasses.replace(world._substeps.stages, make_rows=None)
         for _ in range(4):
             world.step(2)
         assert (world.warp_data_E.contact.efc_address.numpy() >= 0).any()

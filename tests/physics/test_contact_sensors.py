@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from ksim_rl.physics import SimCfg, World, prepare_spec
-from ksim_rl.physics.contact_sensors import NET, STRONGEST, read_by_us
+from ksim_rl.physics.sensors.contact_sensors import NET, STRONGEST, read_by_us
 from tests.physics import row_models
 
 OBJECT = mujoco.mjtObj
@@ -153,7 +153,7 @@ def test_values_are_those_of_the_c_engine(world: World):
 
 
 def test_bits_do_not_depend_on_places_in_the_pool(world: World):
-    contacts = world._substeps._contacts
+    contacts = world._substeps.stages.contacts
     assert contacts is not None
     read = world.sensordata_EL.numpy().copy()
     with wp.ScopedDevice("cpu"):
@@ -196,7 +196,7 @@ def test_of_equally_strong_contacts_the_first_in_the_order_of_the_c_engine_count
 
 
 def test_forces_on_bodies_are_those_of_mujoco_warp(world: World):
-    contacts, found = world._substeps._contacts, {}
+    contacts, found = world._substeps.stages.contacts, {}
     assert contacts is not None
     world.xfrc_applied_EL[:, 1, :] = torch.arange(6.0)
     with wp.ScopedDevice("cpu"):
@@ -254,4 +254,4 @@ def test_forces_on_bodies_are_computed_from_when_on_they_are_read():
 
 
 def test_without_the_kernel_of_the_dynamics_mujoco_warp_reads_all():
-    assert stepped("elliptic", one_kernel=False)._substeps._contacts is None
+    assert stepped("elliptic", one_kernel=False)._substeps.stages.contacts is None

@@ -10,7 +10,8 @@ import pytest
 import torch
 import warp as wp
 
-from ksim_rl.physics import SimCfg, World, load_model
+from ksim_rl.physics import SimCfg, World, load_model, substep
+from ksim_rl.physics.integration.integrators import integrator
 from ksim_rl.physics.newton import kernel
 from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.newton.kernel import Invariant
@@ -248,8 +249,10 @@ def broken_invariants(world: World, substeps: int) -> Invariant:
         model, data = world.warp_model, world.warp_data_E
         broken = wp.zeros(NUM_ENVS, dtype=int)
         solve = newton.solver(model, data, broken=broken)
+        integrate = integrator(world.mj_model, model, data)
+        stages = substep.Stages(solve=solve, integrate=integrate)
         for _ in range(substeps):
-            newton.step(model, data, solve, sensors=False)
+            substep.run(stages, model, data, sensors=False)
     return Invariant(int(np.bitwise_or.reduce(broken.numpy())))
 
 

@@ -86,10 +86,3 @@ def test_rows_without_room_are_counted():
     world = thrown(1, SimCfg(one_kernel_dynamics=False, njmax=2, nconmax=4))
     world.step(1)
     assert "njmax" in " ".join(world.overflow_report().messages)
-
-
-def test_a_delayed_sensor_of_such_a_limit_is_refused_where_it_would_be_read_too_early():
-    late = '<sensor><jointlimitpos joint="swing" delay=".008" nsample="4"/></sensor>'
-    with pytest.raises(ValueError, match="a sensor of the distance to a limit has a delay"):
-        thrown(1, DENSE, more=late)
-    thrown(1, THEIRS, more=late)

@@ -27,7 +27,7 @@ class Limbs:
 
 
 def limbs_of(parents: Sequence[int]) -> Limbs:
-    """Return the limbs of a tree, or nothing where there is one limb, one part is too large, or rows get no narrower."""
+    """Return the limbs of a tree, or nothing where there is one limb, a part is too large, or no row gets narrower."""
     leaves, chains = [0] * len(parents), dict[int, list[int]]()
     for dof in reversed(range(len(parents))):
         leaves[dof] = max(leaves[dof], 1)
@@ -44,7 +44,7 @@ def limbs_of(parents: Sequence[int]) -> Limbs:
 
 
 def _suits(limbs: Limbs, *, nv: int) -> bool:
-    """Whether the solver gains by these limbs: each fits a lane's registers, and narrow rows are no wider than whole."""
+    """Whether the solver gains by these limbs: each fits a lane's registers, and narrow rows are not the wider ones."""
     if not 1 < len(limbs.chains) <= MOST_LIMBS:
         return False
     longest = len(limbs.chains[-1])

@@ -1,14 +1,12 @@
 """This module chooses the constraint solver of a world, and launches the one that is a single kernel."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.device.streams import beside
-from ksim_rl.physics.contact_sensors import ContactReadings
 from ksim_rl.physics.native import FEW_WORLDS
 from ksim_rl.physics.newton.kernel import CUDA_LANES, launcher, layout, put_longest_first
 from ksim_rl.physics.newton.limbs import limbs_of
@@ -124,84 +122,3 @@ def solver(
             solve()
 
     return launch
-
-
-def step(
-    warp_model: mjw.Model,
-    warp_data_E: mjw.Data,
-    solve: Callable[..., None],
-    dynamics: Callable[..., None] | None = None,
-    make_rows: Callable[[], None] | None = None,
-    contacts: ContactReadings | None = None,
-    integrate: Callable[[], None] | None = None,
-    aside: wp.Stream | None = None,
-    collide: Callable[[], None] | None = None,
-    *,
-    sensors: bool,
-    accelerometers: bool = True,
-    row_mends: Sequence[Callable[[], None]] = (),
-) -> None:
-    """Launch a physics step: that of MuJoCo Warp, with this solver.
-
-    The model has `opt.run_qacc_smooth` off, since the solver does not need that acceleration. Sensors, computed or
-    not, never change the state that is reached. `dynamics` launches the smooth dynamics as one kernel; `make_rows`,
-    which needs it, the constraint rows as one, with the lists of contacts that `contacts` reads; and `integrate` what
-    advances the state. `collide` is a collision pass other than MuJoCo Warp's, and `row_mends` follow its rows. On a
-    stream `aside`, the solver orders the worlds, by the last substep, and dynamics of few worlds go on beside that
-    pass; then it solves beside some sensors, of which `contacts` leaves out `accelerometers` where they are not wanted.
-    """
-    m, d = warp_model, warp_data_E
-    if dynamics is None or m.callback.sensor:
-        aside = None
-    if dynamics is None:
-        mjw.fwd_position(m, d, factorize=False)
-        for mend in row_mends:
-            mend()
-        mjw.fwd_velocity(m, d)
-        if contacts is not None:
-            contacts.list()
-    else:
-        # Where dynamics alone fill a GPU, placing bodies twice, for collisions first, takes longer than it saves.
-        at_once = aside is not None and d.nworld <= FEW_WORLDS
-        rest = [partial(dynamics, places_geoms=False)] if at_once else []
-        with beside(aside, partial(solve, solves=False), *rest):
-            dynamics(goes_on=not at_once)
-            if m.opt.run_collision_detection:
-                collide() if collide is not None else mjw.collision(m, d)
-        if make_rows is None:
-            mjw.make_constraint(m, d)
-            for mend in row_mends:
-                mend()
-        else:
-            make_rows()
-
-    def act_and_solve() -> None:
-        if dynamics is None:
-            if m.callback.control and not m.opt.disableflags & mjw.DisableBit.ACTUATION:
-                m.callback.control(m, d)
-            mjw.fwd_actuation(m, d)
-            mjw.fwd_acceleration(m, d, factorize=True)
-        solve(orders=dynamics is None)
-
-    with beside(aside if sensors else None, act_and_solve):
-        if sensors:
-            if dynamics is not None:
-                mjw.camlight(m, d)
-            d.sensordata.zero_()
-            mjw.sensor_pos(m, d)
-            mjw.sensor_vel(m, d)
-    runs_rne = m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint)
-    if runs_rne and contacts is not None:
-        contacts.rne_postconstraint(m)
-    elif runs_rne:
-        mjw.rne_postconstraint(m, d)
-    if sensors:
-        if contacts is not None:
-            contacts.read_sensors(accelerometers=accelerometers)
-        mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
-    if integrate is not None:
-        integrate()
-    elif m.opt.integrator == mjw.IntegratorType.EULER:
-        mjw.euler(m, d)
-    else:
-        mjw.implicit(m, d)

@@ -17,7 +17,8 @@ each(NUM_ACTUATORS, [&](int actuator) {
     const float length = qpos[look_up(problem.jnt_qposadr, joint)] * gear, speed = gear * qvel[dof];
     if (problem.is_read) {
         row_of(problem.actuator_length)[actuator] = length;
-        row_of(problem.actuator_velocity)[actuator] = speed;
+        // C does not compute it without actuation.
+        row_of(problem.actuator_velocity)[actuator] = ACTUATORS_ACT ? speed : 0.0f;
         row_of(problem.moment_rownnz)[actuator] = 1;
         row_of(problem.moment_rowadr)[actuator] = actuator;
         row_of(problem.moment_colind)[actuator] = dof;
@@ -31,7 +32,7 @@ each(NUM_ACTUATORS, [&](int actuator) {
         row_of(problem.act_dot)[address] = rate;
     }
     const float input = input_of(actuator, rate);
-    if (ACTUATORS_ACT) {
+    if (ACTUATORS_ACT && !is_switched_off(actuator)) {
         auto affine = [&](const auto& factors) {
             return factors[0] + factors[1] * length + factors[2] * speed;
         };

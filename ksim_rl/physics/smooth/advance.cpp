@@ -8,7 +8,7 @@ each(NUM_DOFS, [&](int dof) {
 if (ACTUATORS_ACT)
     each(NUM_ACTUATORS, [&](int actuator) {
         const int address = activation_of(actuator);
-        if (address >= 0)
+        if (address >= 0 && !is_switched_off(actuator))
             row_of(problem.act)[address] = next_activation(actuator, address, row_of(problem.act_dot)[address]);
     });
 sync();

@@ -31,6 +31,8 @@ auto drive_rate = [&](int dof) {
 #pragma unroll 1
     for (int i = look_up(problem.first_driver, dof); i < look_up(problem.first_driver, dof + 1); ++i) {
         const int actuator = look_up(problem.drivers, i);
+        if (is_switched_off(actuator))
+            continue;
         if (problem.actuator_forcelimited.data[actuator]
             && is_clamped(row_of(problem.actuator_force)[actuator], model_row(problem.actuator_forcerange)[actuator]))
             continue;

@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import native
+from ksim_rl.physics.actuators.disabled_actuators import SWITCHED_OFF
 from ksim_rl.physics.fixed_geoms import fixed_geoms
 from ksim_rl.physics.overflow import OUT_OF
 from ksim_rl.physics.sim_cfg import SimCfg
@@ -42,6 +43,7 @@ _ENUMS = {
     "AFFINE_GAIN": mujoco.mjtGain.mjGAIN_AFFINE,
     "AFFINE_BIAS": mujoco.mjtBias.mjBIAS_AFFINE,
     **OUT_OF,
+    "SWITCHED_OFF": SWITCHED_OFF,
 }
 FORCE_CALLBACKS = ("passive", "control", "act_dyn", "act_gain", "act_bias")
 HINGES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -185,6 +187,7 @@ def _sizes(warp_model: mjw.Model) -> dict[str, int]:
         "dampers": not flags & bits.DAMPER,
         "clamps_ctrl": not flags & bits.CLAMPCTRL,
         "actuators_act": actuators_act,
+        "some_switched_off": bool((m.actuator_gaintype.numpy() == SWITCHED_OFF).any()),
         "num_entries": m.M_colind.size,
         "num_free_bodies": _num_free_bodies(m),
         "implicit_fast": fast and actuators_act,
@@ -229,7 +232,7 @@ def _elimination(warp_model: mjw.Model) -> dict[str, Sequence[int] | np.ndarray]
 def _has_affine_actuators(warp_model: mjw.Model) -> bool:
     m = warp_model
     for enum, names in AFFINE.items():
-        known = [native.names_of(enum)[name] for name in names]
+        known = [SWITCHED_OFF, *(native.names_of(enum)[name] for name in names)]
         if not np.isin(getattr(m, f"actuator_{enum.__name__[3:].lower()}type").numpy(), known).all():
             return False
     return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())

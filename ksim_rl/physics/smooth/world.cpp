@@ -106,6 +106,10 @@ auto damping_of = [&](int joint, int dof) {
     found.more = model_row(problem.dof_dampingpoly)[dof] + found.more;
     return found;
 };
+// Whether the option actuatorgroupdisable disables it (disabled_actuators.py).
+auto is_switched_off = [&](int actuator) {
+    return SOME_SWITCHED_OFF && look_up(problem.actuator_gaintype, actuator) == SWITCHED_OFF;
+};
 // The activation at the end of the substep.
 auto next_activation = [&](int actuator, int address, float rate) {
     const float timestep = of_world(problem.timestep);

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checks import naming
-from ksim_rl.physics.contact_sensors import MATCHED, NET, STRONGEST
+from ksim_rl.physics.sensors.contact_sensors import MATCHED, NET, STRONGEST
 from ksim_rl.scene.names import as_index, match_names
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker, check_present

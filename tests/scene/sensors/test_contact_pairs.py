@@ -66,7 +66,7 @@ SENSORS = {
 @pytest.fixture(scope="module", params=[False, True], ids=["mujoco_warp", "one_kernel"])
 def settled(request):
     bench = SensorBench(SCENE, 2, SENSORS, sim=SimCfg(one_kernel_dynamics=request.param))
-    assert (bench.world._substeps._contacts is not None) == request.param
+    assert (bench.world._substeps.stages.contacts is not None) == request.param
     # World 0 squeezes its fingers together, world 1 pulls them apart.
     bench.world.ctrl_EL.copy_(torch.tensor([[SQUEEZE, -SQUEEZE], [-1.0, 1.0]]))
     for _ in range(50):

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ksim_rl.device import recording
-from ksim_rl.envs.term_memory import INPUT, MOCAP, STATE, Piece, TermMemory, bits_of
-from ksim_rl.envs.term_rules import may_write, refusal
+from ksim_rl.envs.term_checks.term_memory import INPUT, MOCAP, STATE, Piece, TermMemory, bits_of
+from ksim_rl.envs.term_checks.term_rules import may_write, refusal
 from ksim_rl.envs.view import EnvView, Readings
 from ksim_rl.scene.state.buffers import Kept
 from ksim_rl.scene.state.simulation import UNWATCHED, Simulation

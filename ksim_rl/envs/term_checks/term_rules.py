@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ksim_rl.envs.term_memory import DIFFICULTY, FIELD, INPUT, MOCAP, PARAMETER, STATE, Piece
+from ksim_rl.envs.term_checks.term_memory import DIFFICULTY, FIELD, INPUT, MOCAP, PARAMETER, STATE, Piece
 
 _READS = "only reads what the view gives it, and keeps what it must in `view.buffer`"
 # Positions and velocities only by `view.write_qpos` and its like, which know the rows and what becomes stale.

@@ -28,6 +28,8 @@ MATCHED = {name: int(getattr(mujoco.mjtObj, f"mjOBJ_{theirs}")) for name, theirs
 def read_by_us(mj_model: mujoco.MjModel) -> tuple[list[int], list[int]]:
     """Return the sensors that the kernel reads, without delay and cutoff: kinds of `ContactSensor`, accelerometers."""
     m, kinds, objects = mj_model, mujoco.mjtSensor, list(MATCHED.values())
+    if m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
+        return [], []
     plain = ~m.sensor_history.any(-1) & (m.sensor_cutoff == 0.0)
     known = (m.sensor_intprm[:, None, :3] == (NET, STRONGEST)).all(-1).any(-1)
     known &= np.isin(m.sensor_objtype, objects[1:]) & np.isin(m.sensor_reftype, objects)

@@ -15,8 +15,8 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import native, upstream
-from ksim_rl.physics.contact_sensors import MATCHED
 from ksim_rl.physics.rows.contact_lists import ContactLists
+from ksim_rl.physics.sensors.contact_sensors import MATCHED
 
 _SITE_TYPES = ("SPHERE", "CAPSULE", "CYLINDER", "BOX")
 

@@ -1,0 +1,157 @@
+"""This module launches MuJoCo Warp's integrators such that they reach the C engine's state; docs/upstream.md shows why.
+
+What its implicit integrators leave out is given back by a shallow variant of the model:
+
+* Without actuation, or without dampers, they take no derivative at all. C drops the derivative of what is disabled.
+* They multiply a gain that depends on velocity by controls out of their range, and by those of another actuator where
+  one has several controls or none.
+
+And an activation of a disabled actuator is put back.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from ksim_rl.physics import kernels
+from ksim_rl.physics.actuators.disabled_actuators import still_activations
+from ksim_rl.physics.integration.runge_kutta import mended_runge_kutta
+
+_KINDS = mjw.IntegratorType
+_IMPLICIT = (_KINDS.IMPLICIT, _KINDS.IMPLICITFAST)
+_DAMPING_FIELDS = (
+    *("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
+    *("actuator_damping", "actuator_dampingpoly"),
+)
+
+
+def integrator(
+    mj_model: mujoco.MjModel,
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    *,
+    mend: Callable[[], None] | None = None,
+) -> Callable[[mjw.Model], None]:
+    """Return what launches the integrator of a model, with arrays in their final place.
+
+    It takes the variant of the model that the substep used. `mend` follows the constraint rows of each stage of
+    Runge-Kutta. ValueError where C's derivative cannot be had.
+    """
+    if warp_model.opt.integrator in _IMPLICIT:
+        integrate = _implicit(mj_model, warp_model, warp_data_E)
+    else:
+        integrate = _explicit(warp_model, warp_data_E, mend)
+    columns = still_activations(mj_model)
+    if columns.size == 0:
+        return integrate
+    still = wp.array(columns, dtype=int)
+    kept_E = wp.empty_like(warp_data_E.act)
+    dim = (warp_data_E.nworld, columns.size)
+
+    def integrate_but_disabled(substep_warp_model: mjw.Model) -> None:
+        wp.launch(kernels.copy_columns, dim=dim, inputs=[still, warp_data_E.act], outputs=[kept_E])
+        integrate(substep_warp_model)
+        wp.launch(kernels.copy_columns, dim=dim, inputs=[still, kept_E], outputs=[warp_data_E.act])
+
+    return integrate_but_disabled
+
+
+def _explicit(
+    warp_model: mjw.Model, warp_data_E: mjw.Data, mend: Callable[[], None] | None
+) -> Callable[[mjw.Model], None]:
+    kind = _KINDS(int(warp_model.opt.integrator))
+    if kind == _KINDS.RK4:
+        return mended_runge_kutta(warp_model, warp_data_E, mend)
+    if kind == _KINDS.DISCRETE:
+        launch = mjw.discrete
+    else:
+        launch = mjw.euler
+    return lambda substep_warp_model: launch(substep_warp_model, warp_data_E)
+
+
+def _implicit(
+    mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
+) -> Callable[[mjw.Model], None]:
+    of_integration = _with_all_derivatives(warp_model)
+    inputs = _inputs_of_gains(mj_model, warp_model, warp_data_E)
+    if inputs is None:
+        return lambda substep_warp_model: mjw.implicit(of_integration, warp_data_E)
+    gather, gathered_E = inputs
+
+    def integrate(substep_warp_model: mjw.Model) -> None:
+        gather()
+        mjw.implicit(of_integration, gathered_E)
+
+    return integrate
+
+
+def _with_all_derivatives(warp_model: mjw.Model) -> mjw.Model:
+    """Return a model in which what is disabled has no velocity to depend on, so that nothing needs to be disabled."""
+    m = warp_model
+    bits = mjw.DisableBit
+    flags = int(m.opt.disableflags)
+    changes = {}
+    if flags & bits.ACTUATION:
+        changes["nactuator"] = 0
+    if flags & bits.DAMPER:
+        for name in _DAMPING_FIELDS:
+            changes[name] = wp.zeros_like(getattr(m, name))
+    if not changes:
+        return m
+    opt = dataclasses.replace(m.opt, disableflags=flags & ~int(bits.ACTUATION | bits.DAMPER))
+    return dataclasses.replace(m, opt=opt, **changes)
+
+
+def _inputs_of_gains(
+    mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
+) -> tuple[Callable[[], None], mjw.Data] | None:
+    """Return what gathers the control of each actuator, within its range, and worlds that have these as `ctrl`.
+
+    None where no derivative reads a control.
+    """
+    m = warp_model
+    flags = int(m.opt.disableflags)
+    if flags & mjw.DisableBit.ACTUATION or not _gain_depends_on_velocity(m):
+        return None
+    ranges = mj_model.actuator_ctrllimited if not flags & mjw.DisableBit.CLAMPCTRL else np.zeros(0)
+    if not np.any(ranges) and _has_own_controls(mj_model):
+        return None
+    if np.any(mj_model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR) and not _has_own_controls(
+        mj_model
+    ):
+        raise ValueError(
+            "a gain depends on velocity, and a DC motor has several controls or none: MuJoCo Warp's implicit "
+            "integrators mix their controls up; choose integrator='euler', or drop one of the two actuators"
+        )
+    d = warp_data_E
+    gathered = wp.zeros((d.nworld, m.nactuator), dtype=float)
+    inputs = [
+        *(m.actuator_ctrladr, m.actuator_ctrlnum, m.actuator_ctrllimited, m.actuator_ctrlrange),
+        *(bool(flags & mjw.DisableBit.CLAMPCTRL), d.ctrl),
+    ]
+
+    def gather() -> None:
+        wp.launch(kernels.gather_controls, dim=gathered.shape, inputs=inputs, outputs=[gathered])
+
+    return gather, dataclasses.replace(d, ctrl=gathered)
+
+
+def _gain_depends_on_velocity(warp_model: mjw.Model) -> bool:
+    affine = warp_model.actuator_gaintype.numpy() == mujoco.mjtGain.mjGAIN_AFFINE
+    stateless = warp_model.actuator_dyntype.numpy() == mujoco.mjtDyn.mjDYN_NONE
+    gains = warp_model.actuator_gainprm
+    may_differ = gains.shape[0] > 1
+    # Fields that differ between worlds may be written at any time.
+    depends = np.ones(affine.size, dtype=bool) if may_differ else gains.numpy()[0, :, 2] != 0.0
+    return bool(np.any(affine & stateless & depends))
+
+
+def _has_own_controls(mj_model: mujoco.MjModel) -> bool:
+    """Whether actuator i has control i, and no other."""
+    return np.array_equal(mj_model.actuator_ctrladr, np.arange(mj_model.nu)) and bool(
+        np.all(mj_model.actuator_ctrlnum == 1)
+    )

@@ -1,0 +1,104 @@
+"""This module launches MuJoCo Warp's Runge-Kutta, and mends what its stages leave wrong."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import mujoco_warp as mjw
+import warp as wp
+
+from ksim_rl.physics import kernels
+
+# When the stages after the first are, in timesteps from the beginning of the step.
+STAGE_TIMES = (0.5, 0.5, 1.0)
+
+
+def hook_after_rows(warp_model: mjw.Model) -> str | None:
+    """Return the callback that MuJoCo Warp calls between its rows and its solver, or None if its flags leave none."""
+    flags, bits = int(warp_model.opt.disableflags), mjw.DisableBit
+    if not (flags & bits.SPRING and flags & bits.DAMPER):
+        return "passive"
+    return None if flags & bits.ACTUATION else "control"
+
+
+def mended_runge_kutta(
+    warp_model: mjw.Model, warp_data_E: mjw.Data, mend: Callable[[], None] | None
+) -> Callable[[mjw.Model], None]:
+    """Return what launches `mjw.rungekutta4`, and `mend` after the rows of each of its stages.
+
+    It leaves the `act_dot` of the last stage, as C does, and not the mean of all four, and delayed controls are those
+    of the stage's own time. ValueError if the model's flags leave no callback by which `mend` could run.
+    """
+    d = warp_data_E
+    acts = not int(warp_model.opt.disableflags) & mjw.DisableBit.ACTUATION
+    hooks: dict[str, list[Callable[[], None]]] = {}
+    if mend is not None:
+        hook = hook_after_rows(warp_model)
+        if hook is None:
+            raise ValueError(
+                "integrator='rk4' with springs, dampers and actuation disabled: the rows or transmissions that MuJoCo "
+                "Warp has wrong in this model cannot be mended. Enable one of the three in <flag/>, or choose "
+                "integrator='implicitfast'"
+            )
+        hooks.setdefault(hook, []).append(mend)
+    keeps_rate = acts and warp_model.na > 0
+    last_rate_E = wp.zeros_like(d.act_dot)
+    if keeps_rate:
+        hooks.setdefault("act_dyn", []).append(lambda: wp.copy(last_rate_E, d.act_dot))
+    clock = _StageClock(warp_model, warp_data_E)
+    if acts and warp_model.nhistory > 0:
+        hooks.setdefault("control", []).append(clock.advance)
+        hooks.setdefault("act_dyn", []).append(clock.put_back)
+
+    def launch(substep_warp_model: mjw.Model) -> None:
+        clock.start()
+        callback = _with_hooks(substep_warp_model.callback, hooks)
+        mjw.rungekutta4(dataclasses.replace(substep_warp_model, callback=callback), d)
+        if keeps_rate:
+            wp.copy(d.act_dot, last_rate_E)
+
+    return launch
+
+
+class _StageClock:
+    """The time of the worlds while a stage reads delayed controls: MuJoCo Warp lets it stand still."""
+
+    def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+        self._time_E = warp_data_E.time
+        self._before_E = wp.zeros_like(warp_data_E.time)
+        self._timestep = warp_model.opt.timestep
+        self._stage = 0
+
+    def start(self) -> None:
+        """Take the present time as that of the first stage."""
+        self._stage = 0
+        wp.copy(self._before_E, self._time_E)
+
+    def advance(self) -> None:
+        """Launch the time of the next stage."""
+        fraction = STAGE_TIMES[self._stage]
+        self._stage += 1
+        inputs = [self._before_E, self._timestep, fraction]
+        wp.launch(kernels.shifted_time, dim=self._time_E.shape, inputs=inputs, outputs=[self._time_E])
+
+    def put_back(self) -> None:
+        """Launch the time of the first stage again, from which the step goes on."""
+        wp.copy(self._time_E, self._before_E)
+
+
+def _with_hooks(callback: Any, hooks: dict[str, list[Callable[[], None]]]) -> Any:
+    """Return a copy of the callbacks in which hooks precede the program's own callback of that name."""
+    hooked: dict[str, Callable[..., None]] = {}
+    for name, launches in hooks.items():
+        hooked[name] = _in_turn(launches, vars(callback)[name])
+    return dataclasses.replace(callback, **hooked)
+
+
+def _in_turn(launches: list[Callable[[], None]], own: Callable[..., None] | None) -> Callable[..., None]:
+    def all_of_them(*model_and_data: Any) -> None:
+        for launch in launches:
+            launch()
+        if own is not None:
+            own(*model_and_data)
+
+    return all_of_them

@@ -1,0 +1,48 @@
+"""Actuators that adhere to a body, beside the C engine, and what a refresh and a reset leave of them."""
+
+import mujoco
+import pytest
+import torch
+
+from tests.physics.beside_c import KERNELS, check_sensors, started, step_and_check
+
+STUCK = """
+<mujoco>
+  <option timestep="0.004" integrator="{integrator}"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1"/>
+    <geom name="post" pos="2.5 0 0.3" size="0.1"/>
+    <body name="ball" pos="2 0 0.0995"><joint type="slide" axis="0 0 1"/><geom name="ball" size="0.1" mass="1"/></body>
+    <body name="box" pos="1 0 0.0995"><freejoint/><geom type="box" size="0.1 0.1 0.1" mass="1"/></body>
+    {more}
+  </worldbody>
+  <actuator>
+    <adhesion name="ball" body="ball" ctrlrange="0 10" gain="3"/>
+    <adhesion name="box" body="box" ctrlrange="0 10" gain="3"/>
+  </actuator>
+  <sensor>
+    <actuatorvel actuator="ball"/><actuatorvel actuator="box"/><actuatorfrc actuator="ball"/>
+    <distance geom1="ball" geom2="post" cutoff="2"/>
+  </sensor>
+</mujoco>
+"""
+# So slow that what is in contact stays in contact.
+CALM = {"spread": 0.0003, "speed": 0.02}
+
+
+@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize("integrator", ("implicitfast", "RK4"))
+def test_pairs_that_a_sensor_measures_are_no_contacts(integrator: str, kernels: str) -> None:
+    step_and_check(STUCK.format(integrator=integrator, more=""), KERNELS[kernels], **CALM)
+
+
+@pytest.mark.parametrize("more", ("", '<body mocap="true"/>'), ids=("own reset", "their reset"))
+def test_a_reset_of_one_world_leaves_the_adhesion_of_another(more: str) -> None:
+    world, mj_data, in_c = started(STUCK.format(integrator="Euler", more=more), KERNELS["ours"], **CALM)
+    world.step(1)
+    mujoco.mj_step(in_c, mj_data)
+    world.reset(torch.tensor([True, False]))
+    world.refresh()
+    assert (world.sensordata_EL[0, :2] == 0.0).all()
+    mujoco.mj_forward(in_c, mj_data)
+    check_sensors(world, mj_data, of_forces=False)

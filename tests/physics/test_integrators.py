@@ -1,0 +1,91 @@
+"""MuJoCo Warp's integrators as `physics.integrators` and `physics.runge_kutta` launch them, beside the C engine."""
+
+import pytest
+
+from tests.physics.beside_c import KERNELS, started, step_and_check
+
+IMPLICIT = ("implicit", "implicitfast")
+DAMPED = """
+<mujoco>
+  <option timestep="0.01" integrator="{integrator}"><flag {flags}/></option>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body><joint name="a" axis="0 1 0" damping="0.5" stiffness="2"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.3" mass="0.3"/>
+      <body pos="0 0 -0.3"><joint name="b" axis="1 0 0" damping="0.3"/>
+        <geom size="0.05" pos="0.1 0 0" mass="0.2"/></body>
+    </body>
+    <body pos="1 0 1"><freejoint/><geom type="box" size="0.1 0.06 0.02" mass="1"/></body>
+  </worldbody>
+  <actuator><position joint="a" kp="20" kv="2"/><motor joint="b" gear="2"/></actuator>
+</mujoco>
+"""
+DISABLED = (
+    'actuation="disable"',
+    'damper="disable"',
+    'actuation="disable" damper="disable"',
+    'actuation="disable" spring="disable" damper="disable"',
+)
+HINGE = (
+    '<body><joint name="h" axis="0 1 0" damping="0.1"/><geom size="0.05" pos="0 0 -0.3" mass="0.5"/></body>'
+)
+SLOWED = '<general joint="h" gaintype="affine" gainprm="1 0 -3" ctrllimited="true" ctrlrange="-0.05 0.05"/>'
+
+WITH_ACTUATORS = (
+    '<mujoco><option timestep="0.01" integrator="{integrator}"/><worldbody>'
+    + HINGE
+    + "</worldbody><actuator>{actuators}</actuator></mujoco>"
+)
+
+
+@pytest.mark.parametrize("flags", DISABLED)
+@pytest.mark.parametrize("integrator", IMPLICIT)
+def test_what_is_disabled_leaves_the_other_derivatives(integrator: str, flags: str) -> None:
+    step_and_check(DAMPED.format(integrator=integrator, flags=flags), KERNELS["our solver"])
+
+
+@pytest.mark.parametrize("flags", DISABLED)
+def test_so_it_does_without_our_solver(flags: str) -> None:
+    step_and_check(DAMPED.format(integrator="implicitfast", flags=flags), KERNELS["theirs"])
+
+
+@pytest.mark.parametrize("integrator", IMPLICIT)
+def test_a_gain_that_depends_on_velocity_has_its_control_within_its_range(integrator: str) -> None:
+    xml = WITH_ACTUATORS.format(integrator=integrator, actuators=SLOWED)
+    step_and_check(xml, KERNELS["our solver"], substeps=6)
+
+
+def test_such_a_gain_beside_a_motor_of_several_controls_is_refused() -> None:
+    motor = '<dcmotor joint="h" motorconst="0.1" resistance="1" input="pos vel"/>'
+    xml = WITH_ACTUATORS.format(integrator="implicitfast", actuators=motor + SLOWED)
+    with pytest.raises(ValueError, match="DC motor has several controls.*choose integrator='euler'"):
+        started(xml, KERNELS["our solver"])
+    step_and_check(xml.replace("implicitfast", "Euler"), KERNELS["our solver"])
+
+
+def test_runge_kutta_leaves_the_rates_of_its_last_stage() -> None:
+    xml = (
+        f'<mujoco><option timestep="0.01" integrator="RK4"/><worldbody>{HINGE}</worldbody><actuator>'
+        '<general joint="h" dyntype="filter" dynprm="0.05" gainprm="2"/></actuator></mujoco>'
+    )
+    step_and_check(xml, KERNELS["ours"], names=("qpos", "qvel", "act", "act_dot"))
+
+
+@pytest.mark.parametrize("integrator", ("Euler", "implicitfast", "RK4"))
+def test_controls_are_delayed_by_the_time_of_each_stage(integrator: str) -> None:
+    xml = (
+        f'<mujoco><option timestep="0.004" integrator="{integrator}"/><worldbody>{HINGE}</worldbody><actuator>'
+        '<position joint="h" kp="5" kv="0.2" delay="0.008" nsample="4"/></actuator></mujoco>'
+    )
+    step_and_check(xml, KERNELS["ours"], substeps=6, names=("qpos", "qvel", "qacc", "actuator_force"))
+
+
+def test_ellipsoids_in_a_fluid_are_refused_with_the_integrator_that_has_them_wrong() -> None:
+    geom = '<geom type="ellipsoid" size="0.1 0.05 0.03" mass="0.5" fluidshape="ellipsoid"/>'
+    lone = f'<body pos="1 0 0"><freejoint/>{geom}</body>'
+    jointed = f'<body name="fin"><joint axis="0 1 0"/>{geom}</body>'
+    xml = '<mujoco><option density="1000" viscosity="0.1" integrator="{}"/><worldbody>{}</worldbody></mujoco>'
+    with pytest.raises(ValueError, match="fluidshape='ellipsoid'.*choose integrator='implicitfast'"):
+        started(xml.format("implicit", jointed), KERNELS["ours"])
+    step_and_check(xml.format("implicit", lone), KERNELS["ours"])
+    step_and_check(xml.format("implicitfast", jointed), KERNELS["ours"])
