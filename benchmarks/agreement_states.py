@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from ksim_rl.physics import capacity
+from ksim_rl.physics import poses
 
 SETTLE_STEPS = 150
 CTRL_EVERY = 50
@@ -35,9 +35,9 @@ def _rounded(rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> States:
 def anywhere(mj_model: mujoco.MjModel, num_worlds: int, *, seed: int) -> States:
     """Any pose, velocities of about 1 rad/s or m/s, any control: for models that touch nothing."""
     rng = np.random.default_rng(seed)
-    qpos_EL = capacity.random_qpos(mj_model, num_worlds, rng)
+    qpos_EL = poses.random_qpos(mj_model, num_worlds, rng)
     return _rounded(
-        [(qpos, rng.normal(size=mj_model.nv), capacity.random_ctrl(mj_model, rng)) for qpos in qpos_EL]
+        [(qpos, rng.normal(size=mj_model.nv), poses.random_ctrl(mj_model, rng)) for qpos in qpos_EL]
     )
 
 
@@ -59,7 +59,7 @@ def in_contact(mj_model: mujoco.MjModel, num_worlds: int, *, spread: float, seed
                 mj_data.qpos[adr + 3 : adr + 7] = _tilted(mj_data.qpos[adr + 3 : adr + 7], rng)
             else:
                 mj_data.qpos[adr] += 0.1 * rng.normal()
-        capacity.put_in_ground(mj_model, mj_data, depth=0.0)
+        poses.put_in_ground(mj_model, mj_data, depth=0.0)
         for step in range(SETTLE_STEPS):
             if step % CTRL_EVERY == 0:
                 mj_data.ctrl[:] = home + spread * rng.normal(size=mj_model.nu)
@@ -73,11 +73,11 @@ def thrown(mj_model: mujoco.MjModel, num_worlds: int, *, seed: int) -> States:
     rng = np.random.default_rng(seed)
     mj_data = mujoco.MjData(mj_model)
     rows = []
-    for qpos in capacity.random_qpos(mj_model, num_worlds, rng):
+    for qpos in poses.random_qpos(mj_model, num_worlds, rng):
         mujoco.mj_resetData(mj_model, mj_data)
         mj_data.qpos[:] = qpos
-        capacity.put_in_ground(mj_model, mj_data, depth=0.0)
-        mj_data.ctrl[:] = np.clip(capacity.random_ctrl(mj_model, rng), -1.0, 1.0)
+        poses.put_in_ground(mj_model, mj_data, depth=0.0)
+        mj_data.ctrl[:] = np.clip(poses.random_ctrl(mj_model, rng), -1.0, 1.0)
         mujoco.mj_step(mj_model, mj_data, int(rng.integers(20, 200)))
         rows.append((mj_data.qpos.copy(), mj_data.qvel.copy(), mj_data.ctrl.copy()))
     return _rounded(rows)

@@ -11,11 +11,13 @@ import numpy as np
 from ksim_rl.physics.load import caught_warnings
 from ksim_rl.physics.model_checks import model_bytes
 from ksim_rl.physics.overflow import OF_POOL, OF_ROWS, OverflowReport
+from ksim_rl.physics.poses import extreme_ctrl, put_in_ground, random_ctrl, random_qpos, scatter
 from ksim_rl.physics.sim_cfg import SimCfg
 
-# On what the probe saw: half as much again for rows and contacts; less for candidate pairs, which all worlds share.
-MARGIN = 1.5
-PAIR_MARGIN = 1.2
+# On what poses of the probe needed: half as much again for rows and contacts, less for candidate pairs, which all
+# worlds share. On what its falls needed, and an env's rehearsal: less, since these go on as an episode does.
+MARGIN, PAIR_MARGIN = 1.5, 1.2
+FALLS_MARGIN = REHEARSED_MARGIN = 1.25
 EXTRA = 4
 MULTIPLE = 8
 RANDOM_STATES = 512
@@ -23,9 +25,11 @@ DROPS = 12
 DROP_STEPS = 50
 # How deep a dropped body may start in the ground, in m.
 DEPTH = 0.02
-
-# On what an env's rehearsal needed, which saw the env's own resets and actions.
-REHEARSED_MARGIN = 1.25
+# Falls, their steps, the steps between new controls, the speed at first (of each degree of freedom, rad/s or m/s), and
+# how much heavier everything is in the second half.
+FALLS, FALL_STEPS, HOLD, FALL_SPEED, PRESSURE = 24, 200, 10, 1.0, 3.0
+# Degrees of freedom, geoms and vertices of flexes, times steps of all falls: about a second.
+MOST_WORK = 1_200_000
 
 _cache: dict[bytes, tuple[int, int]] = {}
 
@@ -89,9 +93,22 @@ def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
     key = _key(mj_model)
     if key not in _cache:
         with caught_warnings():
-            rows, contacts, pairs = _most(mj_model)
-        nconmax = max(MARGIN * contacts, PAIR_MARGIN * pairs)
-        _cache[key] = (_round_up(MARGIN * rows), _round_up(nconmax))
+            posed, fallen = Need(mj_model), Need(mj_model)
+            _look_at_poses(mj_model, posed)
+            _look_at_falls(mj_model, fallen)
+        rows = max(
+            MARGIN * posed.rows,
+            FALLS_MARGIN * fallen.rows,
+            # All limits at once.
+            max(posed.rows_without_limits, fallen.rows_without_limits) + _most_limits(mj_model),
+        )
+        nconmax = max(
+            MARGIN * posed.contacts,
+            FALLS_MARGIN * fallen.contacts,
+            PAIR_MARGIN * posed.pairs,
+            fallen.pairs,
+        )
+        _cache[key] = (_round_up(rows + _inactive_equality_rows(mj_model)), _round_up(nconmax))
     return _cache[key]
 
 
@@ -103,124 +120,99 @@ def _round_up(needed: float) -> int:
     return MULTIPLE * math.ceil((needed + EXTRA) / MULTIPLE)
 
 
-def _most(mj_model: mujoco.MjModel) -> tuple[int, int, int]:
-    """Return the most constraint rows, contacts and candidate pairs of one world over many states."""
+def _most_limits(mj_model: mujoco.MjModel) -> int:
+    """Return how many limits may have a row at once: both of one joint where its range is within its margins."""
+    joints, margin = mj_model.jnt_limited.astype(bool), mj_model.jnt_margin
+    is_narrow = joints & (np.ptp(mj_model.jnt_range, axis=1) < 2.0 * margin)
+    return int(joints.sum() + is_narrow.sum() + mj_model.tendon_limited.sum())
+
+
+def _inactive_equality_rows(mj_model: mujoco.MjModel) -> int:
+    """Return how many rows the equality constraints have that are off at first, and may be switched on."""
+    is_off = mj_model.eq_active0 == 0
+    rows = {mujoco.mjtEq.mjEQ_CONNECT: 3, mujoco.mjtEq.mjEQ_WELD: 6}
+    return sum(rows.get(mujoco.mjtEq(kind), 1) for kind in mj_model.eq_type[is_off])
+
+
+class Need:
+    """The most of everything that states of one world needed, of those that it was shown."""
+
+    def __init__(self, mj_model: mujoco.MjModel) -> None:
+        self._candidates = CandidatePairs(mj_model)
+        self.rows = self.rows_without_limits = self.contacts = self.pairs = 0
+
+    def look_at(self, mj_data: mujoco.MjData, *, pairs_too: bool = True) -> None:
+        """Take in a state whose contacts and rows have been made; candidate pairs take the longest to count."""
+        self.rows = max(self.rows, mj_data.nefc)
+        self.rows_without_limits = max(self.rows_without_limits, mj_data.nefc - mj_data.nl)
+        self.contacts = max(self.contacts, mj_data.ncon)
+        if pairs_too:
+            self.pairs = max(self.pairs, self._candidates.count(mj_data))
+
+
+def _look_at_poses(mj_model: mujoco.MjModel, need: Need) -> None:
+    """Show the model's own poses, and random ones in the ground, of which a few go on."""
     rng = np.random.default_rng(0)
     mj_data = mujoco.MjData(mj_model)
-    pairs = CandidatePairs(mj_model)
-    most = np.zeros(3, dtype=int)
-
-    def measure() -> None:
-        np.maximum(most, (mj_data.nefc, mj_data.ncon, pairs.count(mj_data)), out=most)
-
     for key in range(-1, mj_model.nkey):
-        mujoco.mj_resetData(mj_model, mj_data)
-        if key >= 0:
-            mujoco.mj_resetDataKeyframe(mj_model, mj_data, key)
+        _put_to_key(mj_model, mj_data, key)
         if np.isin(mujoco.mjtGeom.mjGEOM_HFIELD, mj_model.geom_type):
             # A height field may be above the pose, which the model has no way to know.
             put_in_ground(mj_model, mj_data, depth=0.0)
         mujoco.mj_fwdPosition(mj_model, mj_data)
-        measure()
+        need.look_at(mj_data)
     for index, qpos in enumerate(random_qpos(mj_model, RANDOM_STATES, rng)):
         mujoco.mj_resetData(mj_model, mj_data)
         mj_data.qpos[:] = qpos
         scatter(mj_model, mj_data, rng)
         put_in_ground(mj_model, mj_data, depth=DEPTH * rng.random())
         mujoco.mj_fwdPosition(mj_model, mj_data)
-        measure()
+        need.look_at(mj_data)
         if index < DROPS:
             mj_data.ctrl[:] = random_ctrl(mj_model, rng)
             for _ in range(DROP_STEPS):
                 mujoco.mj_step(mj_model, mj_data)
-                measure()
-    return int(most[0]), int(most[1]), int(most[2])
+                need.look_at(mj_data)
 
 
-def random_qpos(mj_model: mujoco.MjModel, num_states: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw poses [num_states, nq]: joints within their limits (else within a turn or a metre), any orientation."""
-    qpos = np.tile(mj_model.qpos0, (num_states, 1))
-    for joint in range(mj_model.njnt):
-        adr, kind = int(mj_model.jnt_qposadr[joint]), mj_model.jnt_type[joint]
-        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            start = adr + 3 if kind == mujoco.mjtJoint.mjJNT_FREE else adr
-            quat = rng.normal(size=(num_states, 4))
-            qpos[:, start : start + 4] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
-        elif mj_model.jnt_limited[joint]:
-            qpos[:, adr] = rng.uniform(*mj_model.jnt_range[joint], size=num_states)
-        else:
-            reach = math.pi if kind == mujoco.mjtJoint.mjJNT_HINGE else 1.0
-            qpos[:, adr] += rng.uniform(-reach, reach, size=num_states)
-    return qpos
+def _look_at_falls(mj_model: mujoco.MjModel, need: Need) -> None:
+    """Show how the model falls and lies, from its own poses and from random ones, limp, at random and with all force.
 
-
-def random_ctrl(mj_model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
-    """Draw controls [nu] within their ranges, else in [-1, 1]."""
-    low = np.where(mj_model.actuator_ctrllimited, mj_model.actuator_ctrlrange[:, 0], -1.0)
-    high = np.where(mj_model.actuator_ctrllimited, mj_model.actuator_ctrlrange[:, 1], 1.0)
-    return rng.uniform(low, high)
-
-
-def scatter(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Generator) -> None:
-    """Move free bodies to random places of the first height field, if there is one: its middle may be flat."""
-    fields = np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
-    if fields.size == 0:
-        return
-    half = mj_model.hfield_size[mj_model.geom_dataid[fields[0]], :2]
-    for joint in np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-        address = mj_model.jnt_qposadr[joint]
-        mj_data.qpos[address : address + 2] = rng.uniform(-0.9 * half, 0.9 * half)
-
-
-def put_in_ground(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, *, depth: float) -> None:
-    """Move each free body, with what hangs on it, so that one of its geoms is `depth` (m) deep in the ground.
-
-    That is the highest plane, and the highest of the height field below a geom.
+    In the second half of a fall it is pressed on the ground, and against its limits.
     """
-    ground_types = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-    free_joints = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    if not np.isin(mj_model.geom_type, ground_types).any() or free_joints.size == 0:
-        return
+    rng = np.random.default_rng(1)
+    mj_data = mujoco.MjData(mj_model)
+    heavy = copy.copy(mj_model)
+    heavy.opt.gravity *= PRESSURE
+    is_moving = mj_model.body_weldid[mj_model.geom_bodyid] != 0
     mujoco.mj_kinematics(mj_model, mj_data)
-    depths = _ground_heights(mj_model, mj_data) - _lowest_points(mj_model, mj_data)
-    roots = mj_model.body_rootid[mj_model.geom_bodyid]
-    collides = (mj_model.geom_contype | mj_model.geom_conaffinity) != 0
-    for joint in free_joints:
-        geoms = collides & (roots == mj_model.body_rootid[mj_model.jnt_bodyid[joint]])
-        deepest = depths[geoms].max(initial=-np.inf)
-        if np.isfinite(deepest):
-            mj_data.qpos[mj_model.jnt_qposadr[joint] + 2] += deepest - depth
+    size = float(np.ptp(mj_data.geom_xpos[is_moving], axis=0).max(initial=0.0)) if is_moving.any() else 0.0
+    work = mj_model.nv + mj_model.ngeom + mj_model.nflexvert + 1
+    steps = min(FALL_STEPS, max(1, MOST_WORK // (FALLS * work)))
+    for index, qpos in enumerate(random_qpos(mj_model, FALLS, rng)):
+        if index % 2:
+            mujoco.mj_resetData(mj_model, mj_data)
+            mj_data.qpos[:] = qpos
+        else:
+            _put_to_key(mj_model, mj_data, index // 2 % (mj_model.nkey + 1) - 1)
+        scatter(mj_model, mj_data, rng)
+        put_in_ground(mj_model, mj_data, depth=-rng.uniform(0.0, size))
+        mj_data.qvel[:] = rng.normal(scale=FALL_SPEED, size=mj_model.nv)
+        draw = (None, random_ctrl, extreme_ctrl)[index // 2 % 3]
+        for step in range(steps):
+            if draw is not None and step % HOLD == 0:
+                mj_data.ctrl[:] = draw(mj_model, rng)
+            mujoco.mj_step(mj_model if step < steps // 2 else heavy, mj_data)
+            if mj_data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+                break
+            need.look_at(mj_data, pairs_too=step % HOLD == 0)
 
 
-def _ground_heights(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarray:
-    """Return the height of the ground below each geom (the highest of 9 points), m; -inf where there is none."""
-    ground = np.full(mj_model.ngeom, -np.inf)
-    planes = np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
-    if planes.size:
-        ground[:] = mj_data.geom_xpos[planes, 2].max()
-    down = np.array([0.0, 0.0, -1.0])
-    for field in np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD):
-        above = mj_data.geom_xpos[field, 2] + mj_model.hfield_size[mj_model.geom_dataid[field], 2] + 1.0
-        for geom, (x, y, _) in enumerate(mj_data.geom_xpos):
-            reach = mj_model.geom_rbound[geom]
-            for dx, dy in np.ndindex(3, 3):
-                start = np.array([x + (dx - 1) * reach, y + (dy - 1) * reach, above])
-                distance = mujoco.mj_rayHfield(mj_model, mj_data, int(field), start, down, None)
-                if distance >= 0:
-                    ground[geom] = max(ground[geom], above - distance)
-    return ground
-
-
-def _lowest_points(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarray:
-    """Return the height of each geom's lowest point, in m; for other than round geoms, that of its bounding box."""
-    up = mj_data.geom_xmat.reshape(-1, 3, 3)[:, 2]
-    center, half = mj_model.geom_aabb[:, :3], mj_model.geom_aabb[:, 3:]
-    box = mj_data.geom_xpos[:, 2] + (up * center).sum(1) - (np.abs(up) * half).sum(1)
-    radius = mj_model.geom_size[:, 0]
-    length = np.where(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE, mj_model.geom_size[:, 1], 0.0)
-    round_end = mj_data.geom_xpos[:, 2] - radius - np.abs(up[:, 2]) * length
-    is_round = np.isin(mj_model.geom_type, (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE))
-    return np.where(is_round, round_end, box)
+def _put_to_key(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, key: int) -> None:
+    """Put the data to a keyframe, or to the model's own pose for -1."""
+    mujoco.mj_resetData(mj_model, mj_data)
+    if key >= 0:
+        mujoco.mj_resetDataKeyframe(mj_model, mj_data, key)
 
 
 class CandidatePairs:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ksim_rl.physics import SimCfg, World, capacity
+from ksim_rl.physics import SimCfg, World, poses
 from ksim_rl.physics.newton import solver as newton
 from tests.physics.solver_problem import problems
 
@@ -97,10 +97,10 @@ def touching(mj_model: mujoco.MjModel, num_envs: int, device: str = "cpu") -> Wo
     sim = SimCfg(njmax=640) if mj_model.nv > 50 else SimCfg()
     world = World(mj_model, num_envs=num_envs, device=device, sim=sim)
     rng, mj_data = np.random.default_rng(0), mujoco.MjData(mj_model)
-    for row, qpos in enumerate(capacity.random_qpos(mj_model, num_envs, rng)):
+    for row, qpos in enumerate(poses.random_qpos(mj_model, num_envs, rng)):
         mj_data.qpos[:] = 0.7 * mj_model.qpos0 + 0.3 * qpos
         mujoco.mj_normalizeQuat(mj_model, mj_data.qpos)
-        capacity.put_in_ground(mj_model, mj_data, depth=0.005 * rng.random())
+        poses.put_in_ground(mj_model, mj_data, depth=0.005 * rng.random())
         world.qpos_EL[row] = torch.from_numpy(mj_data.qpos)
     world.qvel_EL.copy_(torch.from_numpy(0.5 * rng.normal(size=(num_envs, mj_model.nv))))
     world.refresh()
