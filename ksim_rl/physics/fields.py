@@ -26,17 +26,22 @@ DERIVED_FIELDS = {
     KIN0: "tendon_length0 eq_data cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0",
     INERT0: "dof_invweight0 body_invweight0 tendon_invweight0 actuator_acc0",
 }
-# C takes one frame for another where its compiler found them equal, and looks at these fields no more.
-_FRAMES = {"body_ipos", "body_iquat", "geom_pos", "geom_quat", "site_pos", "site_quat"}
+# What paths go by: tendons over sites and geoms, and transmissions from sites.
+_PATH_FIELDS = {"geom_size", "geom_pos", "geom_quat", "site_pos", "site_quat", "actuator_cranklength"}
+_PATH_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK)
 # Not a field of the model but of its options, which put_model cannot expand.
 GRAVITY = "gravity"
 
 
-def const_groups(fields: Iterable[str]) -> int:
-    """Return the `SetConstGroup` bits of the constants that follow from `fields`."""
+def const_groups(fields: Iterable[str], mj_model: mujoco.MjModel) -> int:
+    """Return the `SetConstGroup` bits of the constants that follow from `fields` in a model."""
+    has_paths = bool(np.isin(mj_model.actuator_trntype, _PATH_TRANSMISSIONS).any())
+    has_paths |= bool((mj_model.wrap_type != mujoco.mjtWrap.mjWRAP_JOINT).any())
     groups = 0
     for field in fields:
         groups |= GROUPS_OF_FIELD.get(field, 0)
+        if has_paths and field in _PATH_FIELDS:
+            groups |= KIN0 | INERT0
     return groups
 
 
@@ -45,35 +50,43 @@ def derived_fields(groups: int) -> tuple[str, ...]:
     return tuple(name for group, names in DERIVED_FIELDS.items() if groups & group for name in names.split())
 
 
-def fields_to_expand(fields: Sequence[str]) -> tuple[str, ...]:
+def fields_to_expand(fields: Sequence[str], mj_model: mujoco.MjModel) -> tuple[str, ...]:
     """Return `fields` and, after them, the fields that are derived from them and so must differ as well."""
     if isinstance(fields, str):
         raise ValueError(f"per_world_fields={fields!r}: expected a sequence of names, such as ({fields!r},)")
     valid = per_world_fields()
     for field in fields:
         check_known("per-world model field", field, (*valid, GRAVITY))
-    derived = derived_fields(const_groups(fields))
+    derived = derived_fields(const_groups(fields, mj_model))
     return tuple(dict.fromkeys([*(field for field in fields if field != GRAVITY), *derived]))
 
 
 def prepare_spec(spec: mujoco.MjSpec, per_world_fields: Iterable[str]) -> None:
     """Switch off what MuJoCo's compiler would specialize on a field that is to differ between worlds.
 
-    A body that floats about its centre of mass is compiled as "simple", with a diagonal inertia matrix, which a moved
-    centre of mass makes wrong.
+    A body that floats about its centre of mass, or slides along axes at right angles, is compiled as "simple", with a
+    diagonal inertia matrix, which a moved centre of mass or a turned axis makes wrong.
     """
-    if {"body_ipos", "body_iquat"} & set(per_world_fields):
+    if {"body_ipos", "body_iquat", "jnt_axis"} & set(per_world_fields):
         for body in spec.bodies:
             body.simple = False
 
 
 def write_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> None:
-    """Write one row of `World.per_world_fields` into a model of the C engine, in place."""
+    """Write one row of `World.per_world_fields` into a model of the C engine, in place, and what C derives from it."""
+    _copy_fields(mj_model, fields)
+    shown = ("mat_", "light_", "cam_fovy", "cam_intrinsic", "geom_matid", "geom_rgba", GRAVITY)
+    follows = [name for name in fields if name in GROUPS_OF_FIELD or not name.startswith(shown)]
+    if follows and all(np.isfinite(value).all() for value in fields.values()):
+        # Of frames that its compiler found equal C looks at one, and at gravity compensation if it found any; and the
+        # inertia of simple bodies, and margins of whole bodies, are fields that no world has.
+        mujoco.mj_setConst(mj_model, mujoco.MjData(mj_model))
+        _copy_fields(mj_model, fields)
+
+
+def _copy_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> None:
     for name, value in fields.items():
         target = mj_model.opt.gravity if name == GRAVITY else getattr(mj_model, name, None)
         # A few of MuJoCo Warp's fields are its own, or laid out otherwise.
         if target is not None and target.size == value.size:
             target[:] = value.reshape(target.shape)
-    if _FRAMES & set(fields):
-        for same in (mj_model.body_sameframe, mj_model.geom_sameframe, mj_model.site_sameframe):
-            same[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE

@@ -36,7 +36,7 @@ class MaskedConstants:
     def __init__(
         self, mj_model: mujoco.MjModel, warp_model: mjw.Model, mask: wp.array, expanded: Iterable[str]
     ) -> None:
-        self._warp_model = warp_model
+        self._mj_model, self._warp_model = mj_model, warp_model
         self._moves, self._resizes = KINEMATIC & set(expanded), "geom_size" in expanded
         self._inert = not mj_model.ntendon and not mj_model.nflex and _drives_scalar_joints(mj_model)
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any()) or mj_model.ntendon > 0
@@ -85,7 +85,7 @@ class MaskedConstants:
     def covers(self, fields: Iterable[str]) -> bool:
         """Return whether the constants that follow from `fields` can be recomputed here, as `World.set_const` says."""
         fields = set(fields)
-        groups = const_groups(fields)
+        groups = const_groups(fields, self._mj_model)
         moves = bool(fields & (KINEMATIC | {"eq_data"}))
         return (self._inert or not groups & INERT0) and not (moves and self._ties_bodies)
 

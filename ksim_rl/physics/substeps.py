@@ -125,8 +125,7 @@ class Substeps:
 
     def advance(self, *, sensors: Sensors, is_last: bool = True) -> None:
         """Launch one physics step. Sensors never change the state that it reaches; after the last, all may be read."""
-        if self._place_fixed_geoms is not None:
-            self._place_fixed_geoms()
+        self.place_fixed_geoms()
         m = self._models[sensors]
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
         if sensors in ("kept", "all"):
@@ -170,6 +169,11 @@ class Substeps:
             # Contact sensors that follow MuJoCo Warp's may be of sites, and of velocities.
             return self._reads_contacts or warp_model.sensor_contact_acc_adr.size > 0
         return is_last or sensors != "none"
+
+    def place_fixed_geoms(self) -> None:
+        """Launch what places the geoms that are fixed to the world, where fields that move them differ."""
+        if self._place_fixed_geoms is not None:
+            self._place_fixed_geoms()
 
     def refresh(self, *, masked: bool = False) -> None:
         """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.

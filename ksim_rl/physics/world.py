@@ -22,6 +22,7 @@ from ksim_rl.physics.actuators.actuators_of_joints import let_actuators_add
 from ksim_rl.physics.actuators.disabled_actuators import switch_off
 from ksim_rl.physics.callbacks import Callbacks
 from ksim_rl.physics.contacts import follow_the_c_engine
+from ksim_rl.physics.field_effects import as_if_drawn, check_effects, switch_on
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields, fields_to_expand
 from ksim_rl.physics.masked_constants import MaskedConstants
 from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
@@ -29,7 +30,7 @@ from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
 from ksim_rl.physics.resets import resets
-from ksim_rl.physics.rows.second_limits import may_add_rows
+from ksim_rl.physics.rows.second_limits import room_for_nonzeros
 from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.substep_plan import SubstepPlan, substep_plan, with_callbacks
 from ksim_rl.physics.substeps import Sensors, Substeps
@@ -79,8 +80,10 @@ class World(views.DataViews):
         self.num_envs, self.is_frozen = num_envs, False
         self.mj_model = copy.copy(mj_model)
         self.sim.apply_to(self.mj_model)
-        expanded = self._expanded = fields_to_expand(per_world_fields)
+        expanded = self._expanded = fields_to_expand(per_world_fields, self.mj_model)
         check_not_simple(self.mj_model, expanded)
+        check_effects(self.mj_model, expanded)
+        switch_on(self.mj_model, expanded)
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
         self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
         stored_model = copy.copy(self.mj_model)
@@ -89,7 +92,8 @@ class World(views.DataViews):
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
         with memory_for(num_envs, self.device), warp_scope(self.device):
             self.warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
-            follow_the_c_engine(self.warp_model)
+            with as_if_drawn(self.warp_model, expanded):
+                follow_the_c_engine(self.warp_model)
             switch_off(self.mj_model, self.warp_model)
             let_actuators_add(self.mj_model, self.warp_model, expanded)
             self.warp_model.opt.warn_overflow = 0
@@ -99,10 +103,7 @@ class World(views.DataViews):
                 self.warp_model.opt.graph_conditional = takes_conditional_nodes(
                     self.warp_model, supported=wp.is_conditional_graph_supported()
                 )
-            nonzeros = None
-            if may_add_rows(self.warp_model, expanded):
-                # Its own estimate has one row for each limit, and none for dry friction that the model has not.
-                nonzeros = self.njmax * self.mj_model.nv
+            nonzeros = room_for_nonzeros(self.warp_model, expanded, njmax=self.njmax)
             self.warp_data_E = mjw.make_data(
                 stored_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax, njmax_nnz=nonzeros
             )
@@ -119,18 +120,19 @@ class World(views.DataViews):
             self.one_kernel_integration_unavailable = plan.integration
             # One of torch's, since Warp's own wait for the default stream, which no capture allows.
             aside = None if self.device.type == "cpu" else warp_stream(torch.cuda.Stream(self.device))
-            self._substeps = Substeps(
-                *(self.mj_model, m, d),
-                one_kernel_solver=plan.solver is None,
-                one_kernel_dynamics=plan.dynamics is None,
-                one_kernel_rows=plan.rows is None,
-                own_broad_phase=plan.broad_phase is None,
-                one_kernel_integration=plan.integration is None,
-                aside=aside,
-                mask=self._reset_mask,
-                record=self._overflow.arrays,
-                expanded=expanded,
-            )
+            with as_if_drawn(m, expanded):
+                self._substeps = Substeps(
+                    *(self.mj_model, m, d),
+                    one_kernel_solver=plan.solver is None,
+                    one_kernel_dynamics=plan.dynamics is None,
+                    one_kernel_rows=plan.rows is None,
+                    own_broad_phase=plan.broad_phase is None,
+                    one_kernel_integration=plan.integration is None,
+                    aside=aside,
+                    mask=self._reset_mask,
+                    record=self._overflow.arrays,
+                    expanded=expanded,
+                )
             self._masked_constants = self._prepare_constants(expanded)
         self._reset_mask_E = wp.to_torch(self._reset_mask)
         self._fields = {name: wp.to_torch(getattr(self.warp_model, name)) for name in expanded}
@@ -253,7 +255,7 @@ class World(views.DataViews):
         """
         for name in fields:
             self.field(name)
-        groups = const_groups(fields)
+        groups = const_groups(fields, self.mj_model)
         if not groups:
             return
         constants = self._masked_constants
@@ -386,7 +388,7 @@ class World(views.DataViews):
             self.refresh(nowhere_E)
 
     def _prepare_constants(self, expanded: Sequence[str]) -> MaskedConstants | None:
-        groups = const_groups(expanded)
+        groups = const_groups(expanded, self.mj_model)
         if not groups:
             return None
         if groups & FIXED:
@@ -396,6 +398,8 @@ class World(views.DataViews):
 
     def _set_const_everywhere(self, groups: int) -> None:
         def launch() -> None:
+            # Tendons may lie on them.
+            self._substeps.place_fixed_geoms()
             mjw.set_const(self.warp_model, self.warp_data_E, groups)
             if groups & INERT0 and self._masked_constants is not None:
                 self._masked_constants.mend_weights()

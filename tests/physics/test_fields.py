@@ -260,5 +260,5 @@ def test_rows_are_recomputed_in_one_launch(monkeypatch):
     """At resets few rows need it, so that launches cost more than the work."""
     world, launched = every_joint(INERTIAL), []
     monkeypatch.setattr(wp, "launch", lambda kernel, **_: launched.append(kernel.func.__name__))
-    world._masked_constants.launch(const_groups(INERTIAL))
+    world._masked_constants.launch(const_groups(INERTIAL, world.mj_model))
     assert launched == ["constants_at_qpos0"]

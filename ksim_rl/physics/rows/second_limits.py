@@ -71,12 +71,17 @@ def tendons_between_limits(warp_model: mjw.Model, expanded: Collection[str]) -> 
     return _narrow(limited, m.tendon_range.numpy(), m.tendon_margin.numpy(), differs=differs)
 
 
-def may_add_rows(warp_model: mjw.Model, expanded: Collection[str]) -> bool:
-    """Return whether a world may have rows of limits or dry friction beyond those that its model says."""
+def room_for_nonzeros(warp_model: mjw.Model, expanded: Collection[str], *, njmax: int) -> int | None:
+    """Return how many entries of the Jacobian a world needs room for, or None where MuJoCo Warp's estimate will do.
+
+    That has one row for each limit, and none for dry friction that the model itself does not have.
+    """
     between = (
         joints_between_limits(warp_model, expanded).size + tendons_between_limits(warp_model, expanded).size
     )
-    return between > 0 or bool({"dof_frictionloss", "tendon_frictionloss"}.intersection(expanded))
+    if between or {"dof_frictionloss", "tendon_frictionloss"}.intersection(expanded):
+        return njmax * warp_model.nv
+    return None
 
 
 def adding_of_second_limits(

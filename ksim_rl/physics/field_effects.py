@@ -1,0 +1,76 @@
+"""This module lets fields that differ between worlds have the effect that they have in a model compiled with them.
+
+C and MuJoCo Warp leave out what a model's own numbers do not ask for, such as adhesion where none is given. A world may
+draw such numbers later. What can be switched on is; fields whose effect hangs on memory or tables that the model does
+not have are refused by name.
+"""
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+# What builders of our kernels look at, and a value that asks for all of it: a solref below 0 is a stiffness.
+_LOOKED_AT = {
+    **dict.fromkeys(("body_gravcomp", "geom_margin", "geom_gap", "pair_margin", "pair_gap"), 1.0),
+    **dict.fromkeys(("geom_solref", "pair_solref"), -1.0),
+}
+_PLACES = ("actuator_history", "actuator_historyadr", "sensor_history", "sensor_historyadr")
+
+
+def check_effects(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
+    """Refuse fields that could not have their effect in this model, by name."""
+    for field in _PLACES:
+        if field in expanded:
+            raise ValueError(
+                f"per_world_fields has {field!r}, which says where past values lie and is the same in all worlds: "
+                "leave it out; delays are in actuator_delay and sensor_delay"
+            )
+    lacking = {
+        "jnt_springyield": (mj_model.jnt_plasticadr < 0, "no joint yields", "give one springyield"),
+        "tendon_springyield": (mj_model.tendon_plasticadr < 0, "no tendon yields", "give one springyield"),
+        "actuator_delay": (mj_model.actuator_history[:, 0] < 1, "no actuator is delayed", "give one nsample"),
+        "sensor_delay": (mj_model.sensor_history[:, 0] < 1, "no sensor is delayed", "give one nsample"),
+        "sensor_interval": (mj_model.sensor_history[:, 0] < 1, "no sensor is delayed", "give one nsample"),
+    }
+    for field, (lacks, what, remedy) in lacking.items():
+        if field in expanded and lacks.all():
+            raise ValueError(
+                f"per_world_fields has {field!r}, but {what} in the model, so that it has no memory for that: {remedy} "
+                "in its XML, or leave the field out"
+            )
+    fluid = mj_model.geom_fluid[:, 0] > 0.0
+    if "geom_size" in expanded and mj_model.opt.density > 0.0 and fluid.any():
+        geom = mj_model.geom(int(fluid.argmax())).name or f"number {int(fluid.argmax())} (unnamed)"
+        raise ValueError(
+            f"per_world_fields has 'geom_size', but geom {geom!r} moves the fluid around it, whose mass follows from "
+            'that size and is the same in all worlds: leave out fluidshape="ellipsoid" in its XML, or geom_size'
+        )
+    slides = (mj_model.body_simple == 2) & (mj_model.body_dofnum > 1)
+    if "jnt_axis" in expanded and slides.any():
+        body = mj_model.body(int(slides.argmax())).name or f"number {int(slides.argmax())} (unnamed)"
+        raise ValueError(
+            f"per_world_fields has 'jnt_axis', but body {body!r} is compiled as simple, with slides at right angles: "
+            'call prepare_spec(spec, per_world_fields) before compiling, or set simple="false" in its XML'
+        )
+
+
+def switch_on(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
+    """Let a model look at fields that its own numbers do not ask for, in place, before MuJoCo Warp takes it over."""
+    mj_model.flg_gravcomp |= "body_gravcomp" in expanded
+    mj_model.flg_surfacevel |= "geom_surfacevel" in expanded
+    mj_model.flg_adhesion |= not {"geom_adhesion", "pair_adhesion"}.isdisjoint(expanded)
+
+
+@contextmanager
+def as_if_drawn(warp_model: mjw.Model, expanded: Collection[str]) -> Iterator[None]:
+    """Show builders of kernels values of the fields that worlds may draw, instead of those that they begin with."""
+    fields = {name: vars(warp_model)[name] for name in _LOOKED_AT if name in expanded}
+    present = {name: wp.clone(array) for name, array in fields.items()}
+    for name, array in fields.items():
+        array.fill_(_LOOKED_AT[name])
+    yield
+    for name, array in fields.items():
+        wp.copy(array, present[name])
