@@ -102,11 +102,12 @@ def evaluate(arguments: list[str]) -> int:
         policy = policy_of(checkpoint.load_latest(run, note=say), device=options.device)
         judged = f"{policy.cfg.task_name}, iteration {policy.iteration}"
         if options.trials is not None:
-            how = {"trials": options.trials, "seed": options.seed, "pushes": options.pushes}
+            how = {"trials": options.trials, "seed": options.seed, "pushes": options.pushes, "note": say}
             print(f"{judged}: {run_trials(policy.cfg, policy.actor, **how)}")
             return 0
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
-        evaluate = build_evaluator(policy.cfg, policy.actor, episodes=episodes, seed=options.seed)
+        how = {"episodes": episodes, "seed": options.seed, "note": say}
+        evaluate = build_evaluator(policy.cfg, policy.actor, **how)
         evaluation = evaluate()
         losses = losses_of(evaluate.env)
     for text in losses:

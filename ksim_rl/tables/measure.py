@@ -77,7 +77,8 @@ class _Judge(Hook):
         metrics = {name: float(sums[name] / sums["episodes"]) for name in sums if name.startswith("metric/")}
         self.found["means"] = {f"evaluation/{name}": round(mean, 4) for name, mean in metrics.items()}
         if self._trials:
-            self.found["trials"] = asdict(run_trials(self._cfg, trainer.update.actor, trials=self._trials))
+            how = {"trials": self._trials, "note": trainer.progress.note}
+            self.found["trials"] = asdict(run_trials(self._cfg, trainer.update.actor, **how))
 
 
 def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) -> dict[str, Any]:

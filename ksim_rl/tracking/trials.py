@@ -8,7 +8,9 @@ in the height of the anchor and of feet and hands, 0.8 in how upright the anchor
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,11 +19,13 @@ from tensordict.nn import TensorDictModuleBase
 from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.room import with_room
 from ksim_rl.mdp.events import PushByVelocity
 from ksim_rl.tracking.starts import StartInMotion
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, build_env
 from ksim_rl.trainers.evaluation import Evaluator
+from ksim_rl.trainers.metrics import losses_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,12 +93,15 @@ def run_trials(
     trials: int,
     seed: int | None = None,
     pushes: bool = False,
+    note: Callable[[str], None],
 ) -> Trials:
-    """Run trials of a policy of a tracking task, by its deterministic actions."""
+    """Run trials of a policy of a tracking task, by its deterministic actions.
+
+    `note` is told of room that worlds get, and of contacts and constraints that they lose.
+    """
     seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
-    env = build_env(
-        dataclasses.replace(cfg, task=trial_cfg(cfg.task, pushes=pushes)), num_envs=trials, seed=seed
-    )
+    of_trials = dataclasses.replace(cfg, task=trial_cfg(cfg.task, pushes=pushes))
+    env = with_room(partial(build_env, of_trials, num_envs=trials, seed=seed), note=note)
     base = part(env, ManagerBasedRlEnv)
     assert base is not None
     files = {event.file for event in (base.cfg.events or {}).values() if isinstance(event, StartInMotion)}
@@ -103,6 +110,8 @@ def run_trials(
         base, env=env, policy=actor, max_steps=math.ceil(duration_s / base.step_dt - 1e-6), seed=seed
     )
     runner()
+    for text in losses_of(env):
+        note(f"warning: {text}")
     steps = runner.length_E.sum()
     errors = (runner.errors_EM.sum(0) / steps).tolist()
     success = float(runner.ended_well_E.double().mean())

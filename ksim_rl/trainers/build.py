@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -114,16 +114,23 @@ def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None 
 
 
 def build_evaluator(
-    cfg: RunCfg, actor: TensorDictModuleBase, *, episodes: int | None = None, seed: int | None = None
+    cfg: RunCfg,
+    actor: TensorDictModuleBase,
+    *,
+    episodes: int | None = None,
+    seed: int | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> Evaluator:
     """Build envs for evaluation, without sensor noise and curricula, and what runs a policy in them.
 
-    Weights and ranges are those of the config, whatever curricula have come to in training.
+    Weights and ranges are those of the config, whatever curricula have come to in training. With a `note`, which is
+    told so, the worlds get room as those of training do, which they have already in the process of a run.
     """
     seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
     cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, curriculum={}))
     all_ranks = episodes or cfg.trainer.eval_episodes
-    env = build_env(cfg, num_envs=-(-all_ranks // ranks.size()), seed=seed)
+    make = partial(build_env, cfg, num_envs=-(-all_ranks // ranks.size()), seed=seed)
+    env = make() if note is None else envs.with_room(make, note=note)
     env.eval()
     clock = part(env, EpisodeClock)
     max_steps = (clock and clock.max_episode_length) or UNLIMITED_EPISODE_STEPS

@@ -47,7 +47,7 @@ def still():
 
 
 def test_all_succeed_whom_no_limit_ends(short_clip):
-    found = run_trials(run_cfg(short_clip, distance=10.0), still(), trials=6)
+    found = run_trials(run_cfg(short_clip, distance=10.0), still(), trials=6, note=pytest.fail)
     assert (found.trials, found.success) == (6, 1.0)
     assert 0.005 < found.errors["body_pos_error"] < 0.2
     assert "100.0% of 6 trials succeed" in str(found)
@@ -69,7 +69,7 @@ def test_the_command_says_how_many_succeed(short_clip, monkeypatch, capsys):
 
 
 def test_none_succeeds_where_the_limit_is_tight(short_clip):
-    assert run_trials(run_cfg(short_clip, distance=1e-4), still(), trials=6).success == 0.0
+    assert run_trials(run_cfg(short_clip, distance=1e-4), still(), trials=6, note=pytest.fail).success == 0.0
 
 
 def test_trials_begin_with_the_motion_and_are_not_pushed():
