@@ -12,10 +12,13 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-# What builders of our kernels look at, and a value that asks for all of it: a solref below 0 is a stiffness.
+# What builders of our kernels look at, and a value that asks for all of it: a solref below 0 is a stiffness, and ranges
+# without a width lie within their margins.
 _LOOKED_AT = {
     **dict.fromkeys(("body_gravcomp", "geom_margin", "geom_gap", "pair_margin", "pair_gap"), 1.0),
     **dict.fromkeys(("geom_solref", "pair_solref"), -1.0),
+    "jnt_range": 0.0,
+    "jnt_margin": 1e9,
 }
 _PLACES = ("actuator_history", "actuator_historyadr", "sensor_history", "sensor_historyadr")
 

@@ -33,14 +33,10 @@ _ENUMS = {
 def one_kernel_rows_unavailable(warp_model: mjw.Model, *, dynamics_unavailable: str | None) -> str | None:
     """Return why MuJoCo Warp's own kernels make a model's rows, or None where one does, as of what precedes them."""
     m = warp_model
-    limit_sensors = m.sensor_limitpos_adr.size + m.sensor_limitvel_adr.size + m.sensor_limitfrc_adr.size
     reasons = {
         "what precedes them is not one kernel": dynamics_unavailable is not None,
         "equality constraints tie bodies": m.eq_connect_adr.size + m.eq_wld_adr.size > 0,
         "surfaces move": bool(m.flg_surfacevel),
-        # MuJoCo Warp's sensors read whichever row of a joint a thread meets last.
-        "sensors read limits of which both may hold": limit_sensors > 0
-        and joints_between_limits(m, ()).size > 0,
         f"there are more than {MOST_DOFS} degrees of freedom": m.nv > MOST_DOFS,
         f"there are more than {MOST_GEOMS} geoms": m.ngeom > MOST_GEOMS,
     }
@@ -74,6 +70,7 @@ def constraint_rows(
         **(lists.constants | _ENUMS | sizes),
         "equalities": m.eq_jnt_adr.size if on[bits.EQUALITY] else 0,
         "limited_joints": limited.size if on[bits.LIMIT] else 0,
+        "both_limits": joints_between_limits(m, ()).size > 0,
         "frictionloss": on[bits.FRICTIONLOSS],
         "contacts": on[bits.CONTACT],
         "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,

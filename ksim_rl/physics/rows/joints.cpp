@@ -84,7 +84,7 @@ in_turns(LIMITED_JOINTS, [&](int item, bool exists) {
     const int dof = problem.jnt_dofadr.data[joint];
     const float margin = model_row(problem.jnt_margin)[joint], invweight = model_row(problem.dof_invweight0)[dof];
 #pragma unroll 1
-    for (int i = 0; i < place.rows; ++i) {
+    for (int i = 0; i < (BOTH_LIMITS ? place.rows : 1); ++i) {
         const bool is_lower = lower < 0.0f && i == 0;
         const float distance = is_lower ? lower : upper, sign = is_lower ? 1.0f : -1.0f;
         const int row = place.row + i, address = place.address + i;
