@@ -91,6 +91,19 @@ def sensed_box(reduction: str) -> mujoco.MjModel:
 
 
 @functools.cache
+def felt_crowd() -> mujoco.MjModel:
+    """Return a body whose skin feels 55 balls at once, where MuJoCo Warp's tactile sensor keeps 50."""
+    balls = "".join(f'<geom type="sphere" size="0.05" pos="{0.001 * index} 0 0.95"/>' for index in range(55))
+    return load_model(
+        f"""<mujoco>
+          <asset><mesh name="skin" builtin="sphere" params="0" scale="0.1 0.1 0.1"/></asset>
+          <worldbody><body pos="0 0 1"><freejoint/><geom name="skin" type="mesh" mesh="skin"/></body>{balls}</worldbody>
+          <sensor><tactile geom="skin" mesh="skin"/></sensor>
+        </mujoco>"""
+    )
+
+
+@functools.cache
 def bullet() -> mujoco.MjModel:
     """Return a ball that is in a thin plate only half-way through its first substep, by Runge-Kutta's method."""
     return load_model(

@@ -1,10 +1,12 @@
 import mujoco
+import mujoco_warp as mjw
 import pytest
 import torch
 
 from ksim_rl.physics import SimCfg, World
+from ksim_rl.physics.overflow import METRIC_BITS
 from tests.physics.models import quadruped, standing_quadrupeds
-from tests.physics.overflowing_models import SCENES, bullet, can_on_fine_field, pile, sensed_box
+from tests.physics.overflowing_models import SCENES, bullet, can_on_fine_field, felt_crowd, pile, sensed_box
 
 
 def fallen(sim: SimCfg) -> World:
@@ -116,6 +118,32 @@ def test_a_sensor_matches_as_many_contacts_as_in_c(sim):
     mujoco.mj_step(world.mj_model, mj_data)
     found = torch.from_numpy(mj_data.sensordata).float().expand(2, -1)
     torch.testing.assert_close(world.sensordata_EL, found, atol=1e-6, rtol=0.0)
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_more_geoms_than_a_tactile_sensor_keeps_are_told(ours):
+    world = World(felt_crowd(), num_envs=2, sim=SimCfg(one_kernel_dynamics=ours))
+    world.step(1)
+    report = world.overflow_report()
+    assert report.worlds["TACTILE"] == 2
+    assert "tactile" in report.messages[0]
+
+
+@pytest.mark.parametrize("bit", [bit for bit in mjw.OverflowType if bit and bit & (bit - 1) == 0], ids=str)
+@pytest.mark.parametrize("sim", [{"one_kernel_dynamics": True}, {}, {"one_kernel_solver": False}])
+def test_each_bit_of_a_substep_is_told_even_if_the_world_resets_after_it(sim, bit):
+    world = World(quadruped(), num_envs=4, sim=SimCfg(njmax=80, nconmax=40, **sim))
+    world.qpos_EL[:, 2] = 5.0
+    # It comes before the solver, as the collisions do that set most of them.
+    world.warp_model.callback.control = lambda m, d: d.overflow.fill_(int(bit))
+    world.step(1)
+    world.warp_model.callback.control = None
+    world.reset(torch.ones(4, dtype=torch.bool))
+    world.step(2)
+    report = world.overflow_report()
+    assert report.worlds[bit.name] == 4
+    assert report.ok == (bit.name in METRIC_BITS)
+    assert world.overflow_report().ok
 
 
 def test_rows_that_did_not_fit_half_way_through_a_substep_are_told():
