@@ -26,8 +26,11 @@ _MANAGERS = (
     "metric_manager",
     "curriculum_manager",
 )
-# Emptied whenever the state changes, filled on the way, or a note of what was said.
-_CACHES = frozenset({"cache", "command_cache", "_has_warned"})
+# Emptied whenever the state changes, filled on the way, a note of what was said, or what the device tells the host
+# after a step (`ActionManager`).
+_CACHES = frozenset({"cache", "command_cache", "_has_warned", "_accepts_any", "_arrived"})
+# TorchRL's own, of the keys of specs.
+_KEYS_OF_SPECS = "_cache"
 _OF_DRIVER = ("ground", "before_substep", "after_substep", "substep_sensors", "step_dt", "max_episode_length")
 # Fields of terms that managers read when the env is built.
 _READ_ONCE: tuple[tuple[type, frozenset[str], str], ...] = (
@@ -90,7 +93,8 @@ def _leaves(transform: Any) -> list[Transform]:
 
 
 def _of_wrapper(wrapper: TransformedEnv) -> dict[str, Any]:
-    return attributes_of(wrapper) | {"transform": wrapper.transform}
+    own = {name: value for name, value in attributes_of(wrapper).items() if name != _KEYS_OF_SPECS}
+    return own | {"transform": wrapper.transform}
 
 
 def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Any]:
@@ -111,7 +115,8 @@ def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Any]:
 
 
 def _of_env(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    own = {name: value for name, value in attributes_of(env).items() if name != "cfg"}
+    left_out = ("cfg", _KEYS_OF_SPECS)
+    own = {name: value for name, value in attributes_of(env).items() if name not in left_out}
     return own | {"cfg.decimation": env.cfg.decimation}
 
 
