@@ -119,6 +119,23 @@ def test_each_field_has_its_effect(model: str, sim: SimCfg):
     assert not faults, "\n".join(faults)
 
 
+@pytest.mark.parametrize(
+    ("model", "sim"), [("plain", OURS), ("plain", THEIRS), ("rich", THEIRS), ("sticky", OURS)]
+)
+def test_each_world_has_a_gravity_of_its_own(model: str, sim: SimCfg):
+    mj_model = compiled(model)
+    world = World(mj_model, num_envs=2, sim=sim)
+    world.view("cam_xpos")
+    world.field("gravity")[1] = torch.tensor([1.0, -2.0, -5.0])
+    for name, values in start(mj_model).items():
+        world.view(name).copy_(torch.from_numpy(values).expand_as(world.view(name)))
+    world.step(STEPS)
+    world.refresh()
+    for row in range(2):
+        write_fields(mj_model, {"gravity": world.field("gravity")[row].numpy()})
+        assert not differences(world, row, in_c(mj_model, start(mj_model)))
+
+
 def test_no_field_is_left_out():
     tested = {name for fields in FIELDS.values() for name in fields}
     assert {*tested, *OF_PICTURES, *OF_OTHER_TESTS, *REFUSED} == set(per_world_fields())

@@ -7,6 +7,7 @@ import torch
 
 from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.physics.fields import write_fields
+from ksim_rl.physics.ray_casting import RayBatch
 
 # A table with a lamp that is welded to it, a ball over it, and a cart that a mocap body carries.
 TABLE = """
@@ -79,6 +80,18 @@ def test_a_ball_lies_on_the_table_of_its_own_world(one_kernel, moved):
         mujoco.mj_step(changed, mj_data, 200)
         np.testing.assert_allclose(world.qpos_EL[row], mj_data.qpos, atol=2e-4)
     assert world.qpos_EL[1, 2] - world.qpos_EL[0, 2] > 0.19
+
+
+def test_rays_meet_the_table_of_their_own_world():
+    world = tables(False, ("body_pos",))
+    world.field("body_pos")[0, world.mj_model.body("table").id, 2] -= 0.2
+    world.set_const(("body_pos",))
+    world.refresh()
+    rays = RayBatch(world, 1, geom_groups=(0,))
+    rays.start_EN3.copy_(torch.tensor([-0.5, -0.5, 2.0]).expand(2, 1, 3))
+    rays.direction_EN3.copy_(torch.tensor([0.0, 0.0, -1.0]).expand(2, 1, 3))
+    rays.cast()
+    np.testing.assert_allclose(rays.distance_EN[0] - rays.distance_EN[1], 0.2, atol=1e-5)
 
 
 def test_worlds_that_share_these_fields_launch_nothing_for_them():

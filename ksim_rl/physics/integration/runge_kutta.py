@@ -26,13 +26,18 @@ def mended_runge_kutta(
 ) -> Callable[[mjw.Model], None]:
     """Return what launches `mjw.rungekutta4`, and `mend` after the rows of each of its stages.
 
+    Rows that tie bodies are made a second time, when the velocities are those of the stage and not of the one before.
     It leaves the `act_dot` of the last stage, as C does, and not the mean of all four, and delayed controls are those
     of the stage's own time. ValueError if the model's flags leave no callback by which `mend` could run.
     """
     d = warp_data_E
     acts = not int(warp_model.opt.disableflags) & mjw.DisableBit.ACTUATION
     hooks: dict[str, list[Callable[[], None]]] = {}
-    if mend is not None:
+    mends = [] if mend is None else [mend]
+    if warp_model.eq_connect_adr.size + warp_model.eq_wld_adr.size:
+        # Rows of connect and weld read body velocities, which by the time of the hook are those of the stage.
+        mends.insert(0, lambda: mjw.make_constraint(warp_model, warp_data_E))
+    if mends:
         hook = hook_after_rows(warp_model)
         if hook is None:
             raise ValueError(
@@ -40,7 +45,7 @@ def mended_runge_kutta(
                 "Warp has wrong in this model cannot be mended. Enable one of the three in <flag/>, or choose "
                 "integrator='implicitfast'"
             )
-        hooks.setdefault(hook, []).append(mend)
+        hooks.setdefault(hook, []).extend(mends)
     keeps_rate = acts and warp_model.na > 0
     last_rate_E = wp.zeros_like(d.act_dot)
     if keeps_rate:
