@@ -53,3 +53,10 @@ def test_groups_without_a_bit_are_never_disabled() -> None:
     mj_model = mujoco.MjModel.from_xml_string(WITHOUT_TENDON.format(integrator="Euler", more=""))
     mj_model.actuator_group[:] = 32 + 1
     step_and_check(mj_model, KERNELS["ours"])
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_without_actuation_activations_keep_still_even_out_of_their_range(integrator: str) -> None:
+    flag = '<option><flag actuation="disable"/></option>'
+    xml = WITHOUT_TENDON.format(integrator=integrator, more="").replace("<worldbody>", flag + "<worldbody>")
+    step_and_check(xml.replace('actrange="-1 1"', 'actrange="-1 -0.9"'), KERNELS["our solver"])

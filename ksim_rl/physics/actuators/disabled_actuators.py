@@ -27,7 +27,10 @@ def switch_off(mj_model: mujoco.MjModel, warp_model: mjw.Model) -> None:
 
 
 def still_activations(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return the columns of `act` that belong to disabled actuators, which no step may change."""
+    """Return the columns of `act` that no step may change: of disabled actuators, or of all without actuation."""
+    if mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
+        # MuJoCo Warp would put them into their range.
+        return np.arange(mj_model.na, dtype=np.int32)
     columns: list[int] = []
     for actuator in np.flatnonzero(_is_disabled(mj_model)):
         first = mj_model.actuator_actadr[actuator]
