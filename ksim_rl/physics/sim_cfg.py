@@ -25,7 +25,7 @@ class SimCfg(Checked):
         ls_iterations: most iterations of its line search.
         ccd_iterations: most iterations of convex collision detection.
         njmax: most constraint rows of one world; `None` probes the model, and a run raises it where its env needs more.
-        nconmax: contacts (and candidate pairs) per world, which share one pool of `num_envs * nconmax`; `None` as above.
+        nconmax: contacts (and candidate pairs) per world. They share one pool of `num_envs * nconmax`; `None` as above.
         one_kernel_solver: solve the constraints of a substep in one kernel instead of some hundred. It is MuJoCo Warp's
             algorithm, so that results agree up to rounding (four substeps of 4096 worlds on an H200: Go1 2.4 ms instead
             of 8.2, G1 5.0 instead of 9.9). Models out of its range (solvers other than Newton, integrators "rk4" and
