@@ -60,11 +60,21 @@ TESTS = {
         "sum_gradients": CAPTURED_STEPS,
         "take_means": "ranks/test_fused_ranks.py::test_fused_updates_of_two_ranks_equal_those_of_torch",
     },
+    "physics/collision/box_distances.py": {
+        "forget_touching_boxes": SINGLE_MODELS,
+        "measure_boxes": SINGLE_MODELS,
+    },
     "physics/collision/collisions.py": {"collisions": EQUAL_WORLDS},
     "physics/constant_kernels.py": {"constants_at_qpos0": EQUAL_WORLDS, "frames": EQUAL_WORLDS},
     "physics/sensors/contact_sensors.py": {"__init__": EQUAL_WORLDS},
     "physics/height_field/contacts.py": {"height_field_contacts": EQUAL_WORLDS},
-    "physics/kernels.py": {"align_steep_capsules": SINGLE_MODELS, "sparse_velocity": SINGLE_MODELS},
+    "physics/kernels.py": {
+        "align_steep_capsules": SINGLE_MODELS,
+        "drop_upper_corners": SINGLE_MODELS,
+        "leave_out_rows": SINGLE_MODELS,
+        "sparse_velocity": SINGLE_MODELS,
+        "take_the_law_of_priority": SINGLE_MODELS,
+    },
     "physics/nan_guard/guard.py": {"keep_rows": EQUAL_WORLDS, "mark_failed": EQUAL_WORLDS},
     "physics/native.py": {"kernel": EQUAL_WORLDS},
     "physics/newton/kernel.py": {"launcher": EQUAL_WORLDS, "sort_worlds": EQUAL_WORLDS},
@@ -78,6 +88,7 @@ TESTS = {
         )
     },
     "physics/rows/contact_lists.py": {"__init__": EQUAL_WORLDS},
+    "physics/sensor_mending.py": {"_reading_of": SINGLE_MODELS, "bound_touch": SINGLE_MODELS},
     "physics/smooth/stages.py": {
         "_launcher": (
             "gpu/test_smooth.py::test_all_numbers_of_lanes_give_the_same_bits_which_are_those_of_mujoco_warp"

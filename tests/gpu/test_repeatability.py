@@ -110,6 +110,38 @@ TENDON = """
 """
 
 
+# Boxes whose distance is measured, in a margin, in a pair that no joint can heed, and of other priorities, with a law that
+# is direct; and sensors of contacts that only such models have.
+MENDED = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1" priority="1" solref="-500 -10"/>
+    <geom name="table" type="box" size="0.3 0.3 0.05"/><geom name="stone" size="0.1" pos="0 0 0.05"/>
+    <body pos="0 0 0.14"><freejoint/>
+      <geom name="box" type="box" size="0.1 0.1 0.1" margin="0.05"/><site name="zone" size="0.3"/>
+    </body>
+  </worldbody>
+  <contact><pair geom1="table" geom2="stone"/></contact>
+  <sensor>
+    <touch site="zone" cutoff="5"/><contact geom1="box" num="4" data="found force pos"/>
+    <distance geom1="box" geom2="table" cutoff="1"/><fromto geom1="box" geom2="table" cutoff="1"/>
+  </sensor>
+</mujoco>
+"""
+
+
+def mended(device: str, *, one_kernel: bool) -> list[torch.Tensor]:
+    """What kernels leave that mend contacts and sensors of MuJoCo Warp's."""
+    sim = SimCfg(njmax=120, nconmax=40, one_kernel_dynamics=one_kernel)
+    world = World(load_model(MENDED), num_envs=8, device=device, sim=sim)
+    world.qpos_EL[:, 3:6] += 0.1 * torch.arange(24.0, device=device).view(8, 3).sin()
+    world.step()
+    contact, count = world.warp_data_E.contact, int(world.warp_data_E.nacon.numpy()[0])
+    fields = (getattr(contact, name).numpy()[:count] for name in ("geom", "worldid", "type", "pos", "solref"))
+    rows = np.concatenate([field.reshape(count, -1) for field in fields], axis=1)
+    return [torch.tensor(sorted(map(tuple, rows))), world.view("sensordata").cpu().clone()]
+
+
 def single(device: str) -> list[torch.Tensor]:
     """What kernels leave that few models have: contacts of steep rods, in an order of their own, and tendons."""
     mj_model = load_model(THINGS.format(turned=""))
@@ -124,7 +156,8 @@ def single(device: str) -> list[torch.Tensor]:
     contact, count = rods.warp_data_E.contact, int(rods.warp_data_E.nacon.numpy()[0])
     fields = (getattr(contact, name).numpy()[:count] for name in ("geom", "worldid", "pos", "frame"))
     rows = np.concatenate([field.reshape(count, -1) for field in fields], axis=1)
-    return [torch.tensor(sorted(map(tuple, rows))), tendons.view("ten_velocity").cpu().clone()]
+    found = [torch.tensor(sorted(map(tuple, rows))), tendons.view("ten_velocity").cpu().clone()]
+    return [*found, *mended(device, one_kernel=True), *mended(device, one_kernel=False)]
 
 
 @pytest.mark.gpu
