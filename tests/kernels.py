@@ -88,7 +88,7 @@ TESTS = {
         )
     },
     "physics/rows/contact_lists.py": {"__init__": EQUAL_WORLDS},
-    "physics/sensor_mending.py": {"_reading_of": SINGLE_MODELS, "bound_touch": SINGLE_MODELS},
+    "physics/sensors/sensor_mending.py": {"_reading_of": SINGLE_MODELS, "bound_touch": SINGLE_MODELS},
     "physics/smooth/stages.py": {
         "_launcher": (
             "gpu/test_smooth.py::test_all_numbers_of_lanes_give_the_same_bits_which_are_those_of_mujoco_warp"

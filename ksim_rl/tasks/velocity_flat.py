@@ -212,13 +212,13 @@ HUMANOID = _task(humanoid_velocity_flat, "our humanoid", num_iterations=3_000, a
 def go1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree Go1."""
     flat, height = go1_velocity_flat(), GO1_ROBOT.init_pos[2]
-    return velocity.on_rough_ground(flat, root_height=height, njmax=120, nconmax=40)
+    return velocity.on_rough_ground(flat, root_height=height, njmax=208, nconmax=40)
 
 
 def g1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree G1."""
     flat, height = g1_velocity_flat(), G1_ROBOT.init_pos[2]
-    return velocity.on_rough_ground(flat, root_height=height, njmax=250, nconmax=80)
+    return velocity.on_rough_ground(flat, root_height=height, njmax=840, nconmax=100)
 
 
 ROUGH = "over stairs, slopes and rough ground"

@@ -110,8 +110,8 @@ TENDON = """
 """
 
 
-# Boxes whose distance is measured, in a margin, in a pair that no joint can heed, and of other priorities, with a law that
-# is direct; and sensors of contacts that only such models have.
+# Boxes whose distance is measured, in a margin, and of other priorities, with a direct law; a pair that no joint
+# can heed; and sensors of contacts that only such models have.
 MENDED = """
 <mujoco>
   <worldbody>

@@ -1,6 +1,4 @@
-"""Contacts with height fields are the C engine's, or those with a plane where the ground is one."""
-
-import math
+"""Contacts with height fields are the C engine's."""
 
 import mujoco
 import numpy as np
@@ -12,6 +10,7 @@ from ksim_rl.physics import SimCfg, World, load_model
 NUM_ENVS = 48
 SIDE, CELLS, TOP = 2.0, 13, 0.3
 """Half an edge of the field, m; its cells along an edge; its highest point, m."""
+# Without a margin C's contacts of boxes with height fields are less deep than they are (docs/upstream.md).
 THINGS = """
 <mujoco>
   <option timestep="0.002"/>
@@ -25,7 +24,7 @@ THINGS = """
     <body name="rod"><freejoint/>
       <geom name="rod" type="capsule" size="0.03 0.15" condim="1" solmix="3" solimp="0.8 0.9 0.002"/>
     </body>
-    <body name="box"><freejoint/><geom name="box" type="box" size="0.2 0.15 0.1"/></body>
+    <body name="box"><freejoint/><geom name="box" type="box" size="0.2 0.15 0.1" margin="1e-6"/></body>
     <body name="can"><freejoint/><geom name="can" type="cylinder" size="0.1 0.1"/></body>
   </worldbody>
 </mujoco>
@@ -137,24 +136,55 @@ def of_the_c_engine(mj_model: mujoco.MjModel, pose_L: torch.Tensor, geom: str) -
     return sorted(found, key=lambda c: c.dist)
 
 
-@pytest.mark.parametrize("body", ["ball", "rod"])
+def cliffs() -> np.ndarray:
+    """Heights of a floor with steps, whose walls are as wide as a cell."""
+    return np.round(2.0 * noise()) / 2.0
+
+
+@pytest.mark.parametrize("body", ["ball", "rod", "box"])
 @pytest.mark.parametrize("depth", [0.0005, 0.01])
-def test_the_deepest_contact_on_rough_ground_is_that_of_the_c_engine(body, depth):
+def test_contacts_on_rough_ground_are_those_of_the_c_engine(body, depth):
     mj_model = model(noise())
     pose_EL = lowered(mj_model, poses(), body, depth)
-    check_deepest(Contacts(mj_model, pose_EL), pose_EL, body)
+    check_contacts(Contacts(mj_model, pose_EL), pose_EL, body)
 
 
-def check_deepest(ours: Contacts, pose_EL: torch.Tensor, body: str) -> None:
-    """Compare the deepest contact of a body in each world with the C engine's."""
+@pytest.mark.parametrize("body", ["ball", "rod", "box"])
+def test_contacts_in_corners_and_on_ridges_are_those_of_the_c_engine(body):
+    mj_model = model(cliffs())
+    pose_EL = lowered(mj_model, poses(1), body, 0.004)
+    check_contacts(Contacts(mj_model, pose_EL), pose_EL, body)
+
+
+@pytest.mark.parametrize("body", ["ball", "rod", "box"])
+def test_what_is_deep_in_the_ground_or_at_its_rim_touches_as_in_the_c_engine(body):
+    mj_model, first = model(noise()), 7 * BODIES.index(body)
+    pose_EL = lowered(mj_model, poses(), body, 0.15)
+    # A half of them hang over the rim, or are beside it.
+    pose_EL[::2, first] = SIDE + torch.linspace(-0.2, 0.06, NUM_ENVS // 2)
+    check_contacts(Contacts(mj_model, pose_EL), pose_EL, body)
+
+
+def check_contacts(ours: Contacts, pose_EL: torch.Tensor, body: str) -> None:
+    """Compare all contacts of a body in each world with the C engine's."""
+    several = 0
     for row in range(NUM_ENVS):
-        mine, theirs = ours.of(row, body), of_the_c_engine(ours.mj_model, pose_EL[row], body)[0]
-        assert mine["dist"][0] == pytest.approx(theirs.dist, abs=2e-5), row
-        assert np.allclose(mine["frame"][0, 0], theirs.frame[:3], atol=2e-3), row
-        if body == "ball":  # a rod that lies on the ground touches it in more than one place equally
-            assert np.allclose(mine["pos"][0], theirs.pos, atol=1e-4), row
-        for name in ("dim", "friction", "solref", "solimp", "includemargin"):
-            assert np.allclose(mine[name][0], getattr(theirs, name), atol=1e-6), name
+        mine, theirs = ours.of(row, body), of_the_c_engine(ours.mj_model, pose_EL[row], body)
+        assert len(mine["dist"]) == len(theirs), row
+        several += len(theirs) > 1
+        used: set[int] = set()
+        for each in theirs:
+            # Where edges or faces are parallel, any place of theirs is as close.
+            away = np.linalg.norm(mine["pos"] - each.pos, axis=1) + 10.0 * np.abs(mine["dist"] - each.dist)
+            away[list(used)] = np.inf
+            nearest = int(away.argmin())
+            used.add(nearest)
+            assert mine["dist"][nearest] == pytest.approx(each.dist, abs=2e-5), row
+            assert np.allclose(mine["frame"][nearest, 0], each.frame[:3], atol=2e-3), row
+            assert np.allclose(mine["pos"][nearest], each.pos, atol=5e-4), row
+            for name in ("dim", "friction", "solref", "solimp", "includemargin"):
+                assert np.allclose(mine[name][nearest], getattr(each, name), atol=1e-6), name
+    assert several > 0
 
 
 def test_what_does_not_touch_in_the_c_engine_does_not_touch():
@@ -166,115 +196,39 @@ def test_what_does_not_touch_in_the_c_engine_does_not_touch():
     assert all(ours.of(row, body)["dist"].size == 0 for row in range(NUM_ENVS) for body in BODIES)
 
 
-@pytest.mark.parametrize("body", ["ball", "rod", "box"])
-def test_on_an_even_slope_contacts_are_those_with_a_plane(body):
-    """A box or rod has as many as corners or ends below it; MuJoCo's plane leaves none of these few out."""
-    mj_model = model(tilted())
-    pose_EL = lowered(mj_model, poses(1), body, 0.004)
-    check_on_slope(Contacts(mj_model, pose_EL), pose_EL, body)
-
-
-def check_on_slope(ours: Contacts, pose_EL: torch.Tensor, body: str) -> None:
-    """Compare the contacts of a body on the ground of `tilted` with those of its points below that plane."""
-    angle = math.atan2(TOP, 2 * SIDE)
-    normal = np.array([-math.sin(angle), 0.0, math.cos(angle)])
-    compared = 0
-    for row in range(NUM_ENVS):
-        number = BODIES.index(body)
-        pos, quat = (
-            pose_EL[row, 7 * number : 7 * number + 3].double().numpy(),
-            pose_EL[row, 7 * number + 3 :][:4],
-        )
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, quat.double().numpy())
-        points = {
-            "ball": np.zeros((1, 3)),
-            "rod": np.array([[0, 0, 0.15], [0, 0, -0.15]]),
-            "box": np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.15, 0.15) for z in (-0.1, 0.1)]),
-        }[body]
-        radius = {"ball": 0.05, "rod": 0.03, "box": 0.0}[body]
-        above = (points @ turn.reshape(3, 3).T + pos - [-SIDE, 0, 0]) @ normal - radius
-        below = np.sort(above[above < -1e-5])
-        mine = ours.of(row, body)
-        assert np.allclose(mine["dist"][mine["dist"] < -1e-5], below[:4], atol=1e-5), row
-        assert np.allclose(mine["frame"][:, 0], normal, atol=1e-4), row
-        compared += below.size
-    assert compared >= NUM_ENVS
-
-
-def test_an_edge_of_the_ground_presses_into_faces_and_between_the_ends_of_rods():
-    """A ridge along y, lower than what lies across it: contact at the ridge, straight up, as deep as it stands out."""
-    heights = np.zeros((CELLS + 2, CELLS + 2))
-    heights[:, (CELLS + 1) // 2] = 1.0
-    mj_model = model(heights, top=0.05)
-    pose_EL = poses()[:1]
-    x = mj_model.hfield_size[0, 0] * (2 * ((CELLS + 1) // 2) / (CELLS + 1) - 1)
-    flat, lying = [1.0, 0.0, 0.0, 0.0], [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]
-    pose_EL[0, 7:14] = torch.tensor([x + 0.02, 0.5, 0.05 + 0.03 - 0.002, *lying])
-    pose_EL[0, 14:21] = torch.tensor([x + 0.02, -0.5, 0.05 + 0.1 - 0.003, *flat])
+def test_a_box_that_lies_flat_has_a_contact_for_each_prism_below_it():
+    """Which place of a prism it touches is another matter: all are as deep."""
+    mj_model = model(np.zeros((CELLS + 1, CELLS + 1)))
+    pose_EL = poses()
+    pose_EL[:, 14 + 2] = 0.1 - 0.003
+    pose_EL[:, 14 + 4 : 14 + 6] = 0.0
+    pose_EL[:, 14 + 3 : 14 + 7] /= pose_EL[:, 14 + 3 : 14 + 7].norm(dim=1, keepdim=True)
     ours = Contacts(mj_model, pose_EL)
-    for body, depth in (("rod", 0.002), ("box", 0.003)):
-        mine = ours.of(0, body)
-        assert mine["dist"].size and np.allclose(mine["dist"], -depth, atol=1e-5), body
-        assert np.allclose(mine["pos"][:, 0], x, atol=1e-5) and np.allclose(
-            mine["frame"][:, 0], [0, 0, 1], atol=1e-5
-        )
-        if body == "rod":
-            assert mine["dist"][0] == pytest.approx(
-                of_the_c_engine(mj_model, pose_EL[0], body)[0].dist, abs=1e-5
-            )
-
-
-@pytest.mark.parametrize(("roll", "touching"), [(0.0, (-0.15, 0.15)), (0.2, (-0.15,)), (-0.2, (0.15,))])
-@pytest.mark.parametrize("turned", [False, True])
-def test_edges_of_a_box_touch_a_ridge_between_points_of_the_lattice(roll, touching, turned):
-    """A ridge with one point per metre: edges that cross it touch it, both where the box lies flat, else one."""
-    heights = np.zeros((5, 5))
-    heights[2 if turned else slice(None), slice(None) if turned else 2] = 1.0
-    mj_model = model(heights, top=0.5)
-    pose_EL = poses()[:1]
-    # The lower edges are at +-0.15 along the ridge, 0.1 below the middle.
-    half_turn = [math.cos(roll / 2), math.sin(roll / 2), 0.0, 0.0]
-    if turned:
-        quat = np.zeros(4)
-        mujoco.mju_mulQuat(quat, np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]), np.array(half_turn))
-        half_turn = quat.tolist()
-    lowest = 0.15 * abs(math.sin(roll)) + 0.1 * math.cos(roll)
-    along = 0.5
-    place = [-along, 0.03] if turned else [0.03, along]
-    pose_EL[0, 14:21] = torch.tensor([*place, 0.5 + lowest - 0.004, *half_turn])
-    mine = Contacts(mj_model, pose_EL).of(0, "box")
-    assert len(mine["dist"]) == len(touching)
-    assert np.allclose(mine["dist"], -0.004, atol=1e-5) and np.allclose(
-        mine["frame"][:, 0], [0, 0, 1], atol=1e-4
-    )
-    assert np.allclose(mine["pos"][:, 1 if turned else 0], 0.0, atol=1e-5)
-    found = np.sort(mine["pos"][:, 0 if turned else 1])
-    expected = [y * math.cos(roll) + 0.1 * math.sin(roll) for y in touching]
-    expected = [-along - y for y in expected] if turned else [along + y for y in expected]
-    assert np.allclose(found, np.sort(expected), atol=1e-4)
-
-
-def test_a_ball_in_a_corner_touches_floor_and_wall():
-    heights = np.zeros((41, 41))
-    heights[:, 21:] = 1.0
-    mj_model = model(heights, top=0.4)
-    pose_EL = poses()[:1]
-    wall = math.atan2(0.4, 0.1)
-    touching = (0.05 * (1 - math.cos(wall))) / math.sin(wall)
-    pose_EL[0, :7] = torch.tensor([0.0 - touching + 0.001, 0.0, 0.05 - 0.001, 1.0, 0.0, 0.0, 0.0])
-    mine = Contacts(mj_model, pose_EL).of(0, "ball")
-    normals = mine["frame"][:, 0][np.argsort(mine["frame"][:, 0, 2])]
-    assert np.allclose(normals, [[-math.sin(wall), 0.0, math.cos(wall)], [0.0, 0.0, 1.0]], atol=1e-4)
-
-
-def test_nothing_tunnels_however_deep_it_got():
-    mj_model = model(noise())
-    pose_EL = lowered(mj_model, poses(), "ball", 0.4)
-    mine = Contacts(mj_model, pose_EL)
     for row in range(NUM_ENVS):
-        contact = mine.of(row, "ball")
-        assert contact["dist"][0] < -0.1 and contact["frame"][0, 0, 2] > 0.0
+        mine, theirs = ours.of(row, "box"), of_the_c_engine(mj_model, pose_EL[row], "box")
+        assert len(mine["dist"]) == len(theirs) > 1
+        assert np.allclose(mine["dist"], [each.dist for each in theirs], atol=1e-5)
+        # Along the rim of the footprint, where a side of a prism is nearer than its top, the way out is sideways.
+        assert (mine["frame"][:, 0, 2] > 0.99).sum() == sum(each.frame[2] > 0.99 for each in theirs)
+
+
+def test_more_contacts_than_a_pair_may_have_are_left_out_as_in_the_c_engine_and_told():
+    spec = mujoco.MjSpec()
+    heights = np.random.default_rng(0).uniform(size=(24, 24))
+    spec.add_hfield(name="field", size=[1, 1, 0.2, 0.5], nrow=24, ncol=24, userdata=heights.ravel().tolist())
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field")
+    body = spec.worldbody.add_body(pos=[0, 0, 0.4])
+    body.add_freejoint()
+    body.add_geom(size=[0.4, 0, 0])
+    mj_model = load_model(spec)
+    world = World(mj_model, num_envs=1, sim=SimCfg(njmax=400, nconmax=100))
+    world.step()
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_forward(mj_model, mj_data)
+    assert int(world.warp_data_E.nacon.numpy()[0]) == mj_data.ncon == mujoco.mjMAXCONPAIR
+    dist = world.last_substep("contact.dist").numpy()[: mj_data.ncon]
+    assert np.allclose(dist, mj_data.contact.dist, atol=1e-6)
+    assert world.overflow_report().worlds["HFIELD"] == 1
 
 
 def test_a_pair_of_the_model_keeps_its_own_parameters():

@@ -15,7 +15,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.physics import upstream
-from ksim_rl.physics.height_field.geometry import closest_of_segments
+from ksim_rl.physics.shapes import along_edge, closest_of_segments, corner_of, start_of_edge
 from ksim_rl.physics.structs import filled, struct_with
 from ksim_rl.physics.upstream import make_frame, vec5, write_contact
 
@@ -62,36 +62,6 @@ class Measured:
     """The pairs of boxes that sensors measure, and the contacts through which the sensors read them."""
 
     pairs: wp.array[wp.vec2i]
-
-
-@wp.func
-def corner_of(corner: int, half: wp.vec3) -> wp.vec3:
-    """Return one of the 8 corners of a box."""
-    return wp.vec3(
-        wp.where((corner & 1) == 0, -half[0], half[0]),
-        wp.where((corner & 2) == 0, -half[1], half[1]),
-        wp.where((corner & 4) == 0, -half[2], half[2]),
-    )
-
-
-@wp.func
-def start_of_edge(edge: int, half: wp.vec3) -> wp.vec3:
-    """Return where one of the 12 edges of a box begins; it runs along the axis `edge // 4`."""
-    axis = edge // 4
-    start = wp.vec3()
-    start[axis] = -half[axis]
-    one, other = (axis + 1) % 3, (axis + 2) % 3
-    start[one] = wp.where((edge & 1) == 0, -half[one], half[one])
-    start[other] = wp.where((edge & 2) == 0, -half[other], half[other])
-    return start
-
-
-@wp.func
-def along_edge(edge: int, half: wp.vec3) -> wp.vec3:
-    """Return the vector from the beginning of an edge to its end."""
-    along = wp.vec3()
-    along[edge // 4] = 2.0 * half[edge // 4]
-    return along
 
 
 @wp.func

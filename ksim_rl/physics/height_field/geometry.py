@@ -1,30 +1,37 @@
-"""These Warp functions find how far a point is from the ground of a height field, and where its ridges are.
+"""These Warp functions measure how far points and boxes are from the prisms below the triangles of a height field.
 
-The ground is what is below the triangles, however deep, and ends at the field's edges. A point above it is closest to
-a point of the triangles; a point below it finds out along the normal of the triangle right above it, so that nothing
-tunnels. All places are in the field's own frame, m.
+As in MuJoCo's C engine, the ground is made of a prism below each triangle, down to the field's base, and each collides
+on its own (https://mujoco.readthedocs.io/en/stable/XMLreference.html#asset-hfield). A capsule is a box without width,
+whose surface is its radius away. All places are in the field's own frame, m.
 """
 
-# Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for, and a number that a loop
-# changes has to be made a variable by its type.
-# ruff: noqa: UP018
+# Kernels are Python only in their spelling, and a number that a loop changes has to be made a variable by its type.
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
 # pyright: reportAttributeAccessIssue=false, reportReturnType=false, reportInvalidTypeForm=false
 
 import warp as wp
 
+from ksim_rl.physics.shapes import (
+    along_edge,
+    closest_of_segments,
+    closest_on_triangle,
+    corner_of,
+    start_of_edge,
+)
+
 FAR = wp.constant(1.0e10)
-TINY = wp.constant(1.0e-9)
-# Contacts of one ball whose normals are closer than about 18 degrees are one contact: neighbouring triangles of a
-# nearly even ground all come close to it.
-SAME_NORMAL = wp.constant(0.95)
-# The cosine from which on a point is said to be straight above a face.
-STRAIGHT = wp.constant(0.9999)
-# The sine below which a ridge and an edge of a box are parallel, and have no point in common.
-PARALLEL = wp.constant(1.0e-2)
-# How much a point or an edge of the ground has to stand out above its neighbours to be a peak or a ridge, m.
-PEAK = wp.constant(1.0e-4)
+# Below this gap, m, the direction from one closest place to the other is rounding of float32.
+TOUCHING = wp.constant(1.0e-5)
+# The sine below which two edges are parallel, and have no common normal.
+PARALLEL = wp.constant(1.0e-6)
+# How much farther apart, m, two shapes have to be along what is normal to two edges than along the normal of a face:
+# where edges lie in a face, both are the same but for rounding.
+NEARLY = wp.constant(1.0e-6)
+FACES, EDGES, CORNERS = wp.constant(5), wp.constant(9), wp.constant(6)
+# The directions that may separate a prism and a box: normals of faces of each, then of each two edges that differ in
+# direction, of which a prism has seven.
+FACE_AXES, AXES = wp.constant(8), wp.constant(29)
 
 
 @wp.struct
@@ -37,16 +44,50 @@ class Field:
     half_x: float
     half_y: float
     top: float
+    base: float
     dx: float
     dy: float
 
 
 @wp.struct
+class Prism:
+    """The ground below one triangle."""
+
+    a: wp.vec3
+    b: wp.vec3
+    c: wp.vec3
+    base: float
+
+
+@wp.struct
+class Core:
+    """What of a geom collides, but for its radius: a box, of which a capsule has one edge and a sphere the centre."""
+
+    center: wp.vec3
+    turn: wp.mat33
+    half: wp.vec3
+    radius: float
+    first_edge: int
+    num_edges: int
+    corner_step: int
+
+
+@wp.struct
 class Touch:
-    """The closest place of the ground to a point: signed distance, negative below it, and the way out."""
+    """How far a geom is from a prism, negative inside, the way out, and the place half-way between the surfaces."""
 
     distance: float
     normal: wp.vec3
+    place: wp.vec3
+
+
+@wp.struct
+class Gap:
+    """What lies between a prism and a core that are not in each other: a place on each, and their distance."""
+
+    distance: float
+    ground: wp.vec3
+    place: wp.vec3
 
 
 @wp.func
@@ -60,203 +101,205 @@ def field_point(field: Field, data: wp.array[float], row: int, column: int) -> w
 
 
 @wp.func
-def face_normal(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
-    """Return the normal of a triangle that points up."""
-    normal = wp.normalize(wp.cross(b - a, c - a))
-    return wp.where(normal[2] < 0.0, -normal, normal)
+def prism_of(field: Field, data: wp.array[float], row: int, column: int, half: int) -> Prism:
+    """Return the first or second prism of a cell."""
+    prism = Prism()
+    prism.a = field_point(field, data, row, column)
+    prism.b = field_point(field, data, row + 1 - half, column + half)
+    prism.c = field_point(field, data, row + 1, column + 1)
+    prism.base = -field.base
+    return prism
 
 
 @wp.func
-def is_over(field: Field, point: wp.vec3) -> bool:
-    """Return whether a point is above or below the field, within its edges."""
-    return wp.abs(point[0]) <= field.half_x and wp.abs(point[1]) <= field.half_y
+def corner_of_prism(prism: Prism, corner: int) -> wp.vec3:
+    """Return one of three corners at the top, or below them at the base."""
+    which = corner % 3
+    point = wp.where(which == 0, prism.a, wp.where(which == 1, prism.b, prism.c))
+    if corner >= 3:
+        point[2] = prism.base
+    return point
 
 
 @wp.func
-def ground_at(field: Field, data: wp.array[float], point: wp.vec3) -> Touch:
-    """Return the distance of a point to the plane of the triangle right above or below it."""
-    x, y = (point[0] + field.half_x) / field.dx, (point[1] + field.half_y) / field.dy
-    column = wp.clamp(int(wp.floor(x)), 0, field.columns - 2)
-    row = wp.clamp(int(wp.floor(y)), 0, field.rows - 2)
-    a = field_point(field, data, row, column)
-    b = field_point(field, data, row + 1, column)
-    if x - float(column) >= y - float(row):
-        b = field_point(field, data, row, column + 1)
+def start_and_end(prism: Prism, edge: int):
+    """Return the ends of an edge: three at the top, three at the base, and three between them."""
+    if edge < 6:
+        level = 3 * (edge // 3)
+        return corner_of_prism(prism, level + edge % 3), corner_of_prism(prism, level + (edge + 1) % 3)
+    return corner_of_prism(prism, edge - 3), corner_of_prism(prism, edge - 6)
+
+
+@wp.func
+def normal_of_face(prism: Prism, face: int) -> wp.vec3:
+    """Return the outward normal of a face: three at the sides, then top and base."""
+    if face == 4:
+        return wp.vec3(0.0, 0.0, -1.0)
+    if face == 3:
+        up = wp.normalize(wp.cross(prism.b - prism.a, prism.c - prism.a))
+        return wp.where(up[2] < 0.0, -up, up)
+    start = corner_of_prism(prism, face)
+    along = corner_of_prism(prism, (face + 1) % 3) - start
+    normal = wp.normalize(wp.vec3(along[1], -along[0], 0.0))
+    return wp.where(wp.dot(normal, corner_of_prism(prism, (face + 2) % 3) - start) > 0.0, -normal, normal)
+
+
+@wp.func
+def point_of_face(prism: Prism, face: int) -> wp.vec3:
+    """Return a corner of a face."""
+    if face == 4:
+        return corner_of_prism(prism, 3)
+    return corner_of_prism(prism, face % 3)
+
+
+@wp.func
+def closest_on_face(prism: Prism, face: int, point: wp.vec3) -> wp.vec3:
+    """Return the closest place of a face to a point."""
+    if face >= 3:
+        level = 3 * (face - 3)
+        return closest_on_triangle(
+            point,
+            corner_of_prism(prism, level),
+            corner_of_prism(prism, level + 1),
+            corner_of_prism(prism, level + 2),
+        )
+    start, end = corner_of_prism(prism, face), corner_of_prism(prism, (face + 1) % 3)
+    below = corner_of_prism(prism, 3 + (face + 1) % 3)
+    place = closest_on_triangle(point, start, end, below)
+    other = closest_on_triangle(point, start, corner_of_prism(prism, 3 + face), below)
+    return wp.where(wp.length(other - point) < wp.length(place - point), other, place)
+
+
+@wp.func
+def touch_of_point(prism: Prism, point: wp.vec3) -> Touch:
+    """Return how far a point is from a prism, and the closest place of its surface."""
     touch = Touch()
-    touch.normal = face_normal(a, b, field_point(field, data, row + 1, column + 1))
-    touch.distance = wp.dot(point - a, touch.normal)
-    return touch
-
-
-@wp.func
-def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
-    """Return the closest point of a triangle (Ericson, "Real-Time Collision Detection", 2005, 5.1.5)."""
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
-    if d1 <= 0.0 and d2 <= 0.0:
-        return a
-    bp = p - b
-    d3, d4 = wp.dot(ab, bp), wp.dot(ac, bp)
-    if d3 >= 0.0 and d4 <= d3:
-        return b
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        return a + ab * (d1 / (d1 - d3))
-    cp = p - c
-    d5, d6 = wp.dot(ab, cp), wp.dot(ac, cp)
-    if d6 >= 0.0 and d5 <= d6:
-        return c
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        return a + ac * (d2 / (d2 - d6))
-    va = d3 * d6 - d5 * d4
-    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        return b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
-    scale = 1.0 / (va + vb + vc)
-    return a + ab * (vb * scale) + ac * (vc * scale)
-
-
-@wp.func
-def closest_of_segments(p: wp.vec3, d1: wp.vec3, q: wp.vec3, d2: wp.vec3):
-    """Return the parameters in [0, 1] of the closest points of p + s d1 and q + t d2 (Ericson 2005, 5.1.9)."""
-    r = p - q
-    a, e, f = wp.dot(d1, d1), wp.dot(d2, d2), wp.dot(d2, r)
-    b, c = wp.dot(d1, d2), wp.dot(d1, r)
-    denominator = a * e - b * b
-    s = float(0.5)
-    if denominator > TINY * a * e:
-        s = wp.clamp((b * f - c * e) / denominator, 0.0, 1.0)
-    t = (b * s + f) / e
-    if t < 0.0:
-        t = 0.0
-        s = wp.clamp(-c / a, 0.0, 1.0)
-    elif t > 1.0:
-        t = 1.0
-        s = wp.clamp((b - c) / a, 0.0, 1.0)
-    return s, t
-
-
-@wp.func
-def closest_ground(
-    field: Field,
-    data: wp.array[float],
-    point: wp.vec3,
-    reach: float,
-    found: int,
-    first: wp.vec3,
-    second: wp.vec3,
-) -> Touch:
-    """Return the closest place of the ground to a point above it, within `reach`; the distance is `FAR` if none.
-
-    After `found` contacts with normals `first` and `second`, only faces with other normals count, and only where the
-    point is straight above them.
-    """
-    touch = Touch()
+    touch.distance = -FAR
+    for face in range(FACES):
+        normal = normal_of_face(prism, face)
+        height = wp.dot(normal, point - point_of_face(prism, face))
+        if height > touch.distance:
+            touch.distance = height
+            touch.normal = normal
+    touch.place = point - touch.distance * touch.normal
+    if touch.distance <= 0.0:
+        return touch
+    # The closest place of a convex shape is on a face that looks towards the point.
+    axis = touch.normal
     touch.distance = FAR
-    low_column = wp.max(int(wp.floor((point[0] - reach + field.half_x) / field.dx)), 0)
-    low_row = wp.max(int(wp.floor((point[1] - reach + field.half_y) / field.dy)), 0)
-    high_column = wp.min(int(wp.floor((point[0] + reach + field.half_x) / field.dx)), field.columns - 2)
-    high_row = wp.min(int(wp.floor((point[1] + reach + field.half_y) / field.dy)), field.rows - 2)
-    for row in range(low_row, high_row + 1):
-        for column in range(low_column, high_column + 1):
-            a = field_point(field, data, row, column)
-            c = field_point(field, data, row + 1, column + 1)
-            for half in range(2):
-                b = field_point(field, data, row + half, column + 1 - half)
-                if wp.max(wp.max(a[2], b[2]), c[2]) < point[2] - reach:
-                    continue
-                away = point - closest_on_triangle(point, a, b, c)
-                distance = wp.length(away)
-                if distance > reach or distance >= touch.distance:
-                    continue
-                normal = face_normal(a, b, c)
-                lift = wp.dot(away, normal)
-                if lift < 0.0:
-                    continue
-                # Else the closest point is on an edge or a corner.
-                is_face = lift >= STRAIGHT * distance
-                if not is_face:
-                    normal = away / distance
-                if found > 0 and (not is_face or wp.dot(normal, first) > SAME_NORMAL):
-                    continue
-                if found > 1 and wp.dot(normal, second) > SAME_NORMAL:
-                    continue
+    for face in range(FACES):
+        normal = normal_of_face(prism, face)
+        if wp.dot(normal, point - point_of_face(prism, face)) > 0.0:
+            place = closest_on_face(prism, face, point)
+            distance = wp.length(point - place)
+            if distance < touch.distance:
                 touch.distance = distance
-                touch.normal = normal
+                touch.place = place
+    touch.normal = axis
+    if touch.distance > TOUCHING:
+        touch.normal = (point - touch.place) / touch.distance
     return touch
 
 
 @wp.func
-def is_ridge(field: Field, data: wp.array[float], row: int, column: int, kind: int) -> bool:
-    """Return whether the ground falls off from an edge of a cell on both sides, rather than being even or a valley.
-
-    The edges that a cell owns start at its first corner: 0 runs along x, 1 along y, 2 is the diagonal.
-    """
-    a = field_point(field, data, row, column)
-    c = field_point(field, data, row + 1, column + 1)
-    b = field_point(field, data, row, column + 1)
-    d = field_point(field, data, row + 1, column)
-    if kind == 2:
-        return wp.dot(face_normal(a, b, c), d - a) < -PEAK
-    if kind == 0:
-        if row == 0:
-            return False
-        return wp.dot(face_normal(a, b, c), field_point(field, data, row - 1, column) - a) < -PEAK
-    if column == 0:
-        return False
-    return wp.dot(face_normal(a, d, c), field_point(field, data, row, column - 1) - a) < -PEAK
+def nearer(gap: Gap, ground: wp.vec3, place: wp.vec3) -> Gap:
+    """Return the gap between two places if it is the narrower one."""
+    distance = wp.length(place - ground)
+    if distance < gap.distance:
+        gap.distance = distance
+        gap.ground = ground
+        gap.place = place
+    return gap
 
 
 @wp.func
-def ridge_normal(
-    field: Field, data: wp.array[float], row: int, column: int, kind: int, direction: wp.vec3
-) -> wp.vec3:
-    """Return the upward normal of the plane through a ridge and along a direction; zero where the plane cuts ground."""
-    a = field_point(field, data, row, column)
-    end = field_point(field, data, row + wp.where(kind == 0, 0, 1), column + wp.where(kind == 1, 0, 1))
-    # What the triangles on both sides have besides the ridge.
-    left = field_point(
-        field, data, row + wp.where(kind == 0, -1, 0), column + wp.where(kind == 1, -1, kind // 2)
-    )
-    right = field_point(field, data, row + 1, column + wp.where(kind == 2, 0, 1))
-    normal = wp.cross(end - a, direction)
-    if wp.length(normal) < PARALLEL * wp.length(end - a):
-        return wp.vec3(0.0)
-    normal = wp.normalize(normal)
-    normal = wp.where(normal[2] < 0.0, -normal, normal)
-    if wp.dot(normal, left - a) > PEAK or wp.dot(normal, right - a) > PEAK:
-        return wp.vec3(0.0)
-    return normal
+def gap_between(prism: Prism, core: Core) -> Gap:
+    """Return the gap between a prism and a core that are not in each other: at corners of either, or at edges."""
+    gap = Gap()
+    gap.distance = FAR
+    for corner in range(0, 8, core.corner_step):
+        point = core.center + core.turn @ corner_of(corner, core.half)
+        touch = touch_of_point(prism, point)
+        gap = nearer(gap, wp.where(touch.distance > 0.0, touch.place, point), point)
+    if core.num_edges > 1:
+        for corner in range(CORNERS):
+            ground = corner_of_prism(prism, corner)
+            inside = wp.transpose(core.turn) @ (ground - core.center)
+            place = core.center + core.turn @ wp.max(wp.min(inside, core.half), -core.half)
+            gap = nearer(gap, ground, place)
+    for edge in range(core.first_edge, core.first_edge + core.num_edges):
+        start = core.center + core.turn @ start_of_edge(edge, core.half)
+        along = core.turn @ along_edge(edge, core.half)
+        for other in range(EDGES):
+            ground, end = start_and_end(prism, other)
+            s, t = closest_of_segments(start, along, ground, end - ground)
+            gap = nearer(gap, ground + t * (end - ground), start + s * along)
+    return gap
 
 
 @wp.func
-def closest_ridge(field: Field, data: wp.array[float], start: wp.vec3, along: wp.vec3, reach: float):
-    """Return distance, parameter on the segment and normal of the ridge that is closest to the inside of a segment."""
-    best, parameter, normal = float(FAR), float(0.0), wp.vec3(0.0, 0.0, 1.0)
-    stop = start + along
-    low_x, high_x = wp.min(start[0], stop[0]) - reach, wp.max(start[0], stop[0]) + reach
-    low_y, high_y = wp.min(start[1], stop[1]) - reach, wp.max(start[1], stop[1]) + reach
-    lowest = wp.min(start[2], stop[2]) - reach
-    low_column = wp.max(int(wp.floor((low_x + field.half_x) / field.dx)), 0)
-    low_row = wp.max(int(wp.floor((low_y + field.half_y) / field.dy)), 0)
-    high_column = wp.min(int(wp.floor((high_x + field.half_x) / field.dx)), field.columns - 2)
-    high_row = wp.min(int(wp.floor((high_y + field.half_y) / field.dy)), field.rows - 2)
-    for row in range(low_row, high_row + 1):
-        for column in range(low_column, high_column + 1):
-            a = field_point(field, data, row, column)
-            for kind in range(3):
-                end = field_point(
-                    field, data, row + wp.where(kind == 0, 0, 1), column + wp.where(kind == 1, 0, 1)
-                )
-                if wp.max(a[2], end[2]) < lowest:
-                    continue
-                s, t = closest_of_segments(start, along, a, end - a)
-                if s <= 0.0 or s >= 1.0:
-                    continue
-                away = start + s * along - (a + t * (end - a))
-                distance = wp.length(away)
-                if distance > reach or distance >= best or distance < TINY or away[2] < 0.0:
-                    continue
-                if is_ridge(field, data, row, column, kind):
-                    best, parameter, normal = distance, s, away / distance
-    return best, parameter, normal
+def column_of(turn: wp.mat33, column: int) -> wp.vec3:
+    """Return a column of a matrix."""
+    return wp.vec3(turn[0, column], turn[1, column], turn[2, column])
+
+
+@wp.func
+def widest_axis(prism: Prism, core: Core) -> Touch:
+    """Return the direction along which prism and core are the farthest apart, or the least deep in each other."""
+    best = Touch()
+    best.distance = -FAR
+    for axis in range(AXES):
+        normal = wp.vec3()
+        if axis < FACES:
+            normal = normal_of_face(prism, axis)
+        elif axis < FACE_AXES:
+            normal = column_of(core.turn, axis - FACES)
+        else:
+            edge = (axis - FACE_AXES) // 3
+            start, end = start_and_end(prism, edge)
+            normal = wp.cross(wp.normalize(end - start), column_of(core.turn, (axis - FACE_AXES) % 3))
+        length = wp.length(normal)
+        if length > PARALLEL:
+            normal = normal / length
+            low, high = float(FAR), float(-FAR)
+            for corner in range(CORNERS):
+                along = wp.dot(normal, corner_of_prism(prism, corner))
+                low, high = wp.min(low, along), wp.max(high, along)
+            middle = wp.dot(normal, core.center)
+            reach = wp.dot(wp.abs(wp.transpose(core.turn) @ normal), core.half)
+            above, below = middle - reach - high, low - middle - reach
+            needed = best.distance + wp.where(axis < FACE_AXES, 0.0, NEARLY)
+            if wp.max(above, below) > needed:
+                best.distance = wp.max(above, below)
+                best.normal = wp.where(above >= below, normal, -normal)
+    return best
+
+
+@wp.func
+def touch_of_core(prism: Prism, core: Core, reach: float) -> Touch:
+    """Return how far a geom is from a prism; the distance is `FAR` where it is beyond `reach`."""
+    touch = Touch()
+    if core.num_edges == 0:
+        touch = touch_of_point(prism, core.center)
+        touch.distance = touch.distance - core.radius
+        touch.place = touch.place + 0.5 * touch.distance * touch.normal
+        return touch
+    widest = widest_axis(prism, core)
+    touch.distance = FAR
+    if widest.distance - core.radius >= reach:
+        return touch
+    # Shapes that are in each other are drawn apart until they touch, which tells where.
+    moved = wp.max(-widest.distance, 0.0) * widest.normal
+    apart = core
+    apart.center = core.center + moved
+    gap = gap_between(prism, apart)
+    touch.normal = widest.normal
+    distance = gap.distance
+    if widest.distance < 0.0:
+        distance = widest.distance
+    elif distance > TOUCHING:
+        touch.normal = (gap.place - gap.ground) / distance
+    touch.distance = distance - core.radius
+    # On the surface of the geom, then half-way to the ground.
+    touch.place = gap.place - moved - (core.radius + 0.5 * touch.distance) * touch.normal
+    return touch

@@ -16,6 +16,7 @@ from ksim_rl.scene.terrains import (
 )
 
 RADIUS, EDGE = 0.1, 0.16
+# Without a margin C's contacts of boxes with height fields are less deep than they are (docs/upstream.md).
 THINGS = f"""
 <mujoco>
   <option timestep="0.004"/>
@@ -27,7 +28,7 @@ THINGS = f"""
     </body>
     <body name="box" pos="0 1 {EDGE / 2}">
       <freejoint/>
-      <geom name="box" type="box" size="{EDGE / 2} {EDGE / 2} {EDGE / 2}" mass="1"/>
+      <geom name="box" type="box" size="{EDGE / 2} {EDGE / 2} {EDGE / 2}" mass="1" margin="1e-6"/>
     </body>
   </worldbody>
 </mujoco>

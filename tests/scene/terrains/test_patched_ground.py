@@ -110,30 +110,27 @@ def test_each_world_collides_with_its_own_patch(bench, mj_models):
         assert sum(depth < -1e-3 for depth in expected) > NUM_ENVS / 3
 
 
-def test_things_fall_onto_platforms_as_onto_a_plane_in_the_c_engine(bench):
-    """From 5 cm above, until they rest; the engine's own boxes on height fields jump. On noise nothing is compared."""
+def test_things_fall_as_in_the_c_engine(bench):
+    """From 5 cm above, until they rest. Flat on a level prism a box touches any place, which makes it drift."""
     ball_E2, box_E2 = (spread(-0.05, 0.05, seed=seed) for seed in (0, 2))
     ball_E2[:, 0] += 0.2
     box_E2[:, 0] -= 0.2
     bench.place(on_ground(bench, ball_E2, RADIUS + 0.05), on_ground(bench, box_E2, EDGE / 2 + 0.05))
     start_EL = bench.world.qpos_EL.clone()
-    steps, compared = 100, 0
+    steps = 100
     bench.world.step(steps)
     for row in range(NUM_ENVS):
-        if GRID.columns[row // 3] == "rough":
-            continue
-        spec = mujoco.MjSpec.from_string(THINGS)
-        height = float(bench.ground.origins_E3[row, 2])
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, height])
-        mj_model = spec.compile()
+        mj_model = bench.mj_model(row)
         mj_data = mujoco.MjData(mj_model)
         mj_data.qpos[:] = start_EL[row].numpy()
         mujoco.mj_step(mj_model, mj_data, steps)
         reached = bench.world.qpos_EL[row].numpy()
-        assert np.allclose(reached, mj_data.qpos, atol=1e-3), row
-        assert reached[[2, 9]] == pytest.approx([height + RADIUS, height + EDGE / 2], abs=2e-3)
-        compared += 1
-    assert compared == 12
+        assert np.allclose(reached[:7], mj_data.qpos[:7], atol=1e-4), row
+        if GRID.columns[row // 3] == "rough":
+            assert np.allclose(reached[7:], mj_data.qpos[7:], atol=1e-3), row
+        else:
+            assert np.allclose(reached[7:9], mj_data.qpos[7:9], atol=2e-2), row
+            assert np.allclose(reached[[9, 11, 12]], mj_data.qpos[[9, 11, 12]], atol=3e-3), row
 
 
 def test_other_levels_move_the_masked_rows_only():
