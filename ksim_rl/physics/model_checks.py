@@ -1,7 +1,7 @@
 """A model is refused here before kernels are compiled for it, if a number is not finite or Warp lacks a feature."""
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import mujoco
 import mujoco_warp as mjw
@@ -87,6 +87,7 @@ def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None =
     """Put a model on Warp's current device, or name the feature that MuJoCo Warp does not have, or has wrong."""
     check_sensors(mj_model)
     check_fluid(mj_model)
+    _check_still_tendons(mj_model)
     try:
         with warnings.catch_warnings():
             # It doubts friction of geoms without contacts; MuJoCo itself accepts them.
@@ -118,6 +119,50 @@ def check_fluid(mj_model: mujoco.MjModel) -> None:
                 "derivative of its drag wrong for integrator='implicit': choose integrator='implicitfast' "
                 "(task.sim.integrator)"
             )
+
+
+def _check_still_tendons(mj_model: mujoco.MjModel) -> None:
+    """Refuse constraints of tendons that lie on one rigid body: no joint moves them, so that they weigh nothing.
+
+    Their rows are as hard as numbers allow, on a Jacobian of rounding errors, and what they do is noise, in C too.
+    """
+    still = {tendon for tendon in range(mj_model.ntendon) if _is_still(mj_model, tendon)}
+    for tendon in sorted(still):
+        if why := _constraint_of_still_tendon(mj_model, tendon, still):
+            raise ValueError(
+                f"{_element(mj_model, 'tendon', tendon)} lies on one rigid body, but {why}: no joint can do anything "
+                "about that, and its force would be rounding error. Let it span a joint, or remove what holds it"
+            )
+
+
+def _constraint_of_still_tendon(mj_model: mujoco.MjModel, tendon: int, still: Collection[int]) -> str | None:
+    m = mj_model
+    if m.tendon_frictionloss[tendon] > 0.0:
+        return "it has a frictionloss"
+    length, margin = m.tendon_length0[tendon], m.tendon_margin[tendon]
+    low, high = m.tendon_range[tendon]
+    if m.tendon_limited[tendon] and (length - low < margin or high - length < margin):
+        return f"its length, {length:.3g}, violates its range"
+    for equality in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_TENDON):
+        other = int(m.eq_obj2id[equality])
+        if m.eq_obj1id[equality] == tendon and (other < 0 or other in still):
+            return "an equality holds it"
+    return None
+
+
+def _is_still(mj_model: mujoco.MjModel, tendon: int) -> bool:
+    """Whether all that a spatial tendon goes by belongs to one rigid body."""
+    first = mj_model.tendon_adr[tendon]
+    bodies = set()
+    for wrap in range(first, first + mj_model.tendon_num[tendon]):
+        kind, owner = mj_model.wrap_type[wrap], mj_model.wrap_objid[wrap]
+        if kind == mujoco.mjtWrap.mjWRAP_JOINT:
+            return False
+        if kind == mujoco.mjtWrap.mjWRAP_SITE:
+            bodies.add(int(mj_model.body_weldid[mj_model.site_bodyid[owner]]))
+        elif kind != mujoco.mjtWrap.mjWRAP_PULLEY:
+            bodies.add(int(mj_model.body_weldid[mj_model.geom_bodyid[owner]]))
+    return len(bodies) == 1
 
 
 def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) -> None:

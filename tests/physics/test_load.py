@@ -153,3 +153,40 @@ def test_a_solver_that_warp_lacks_is_refused_with_the_override_that_makes_it_run
         load_model(path)
     mj_model = load_model(path, sim=SimCfg(solver="newton"))
     assert mj_model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+
+
+ONE_BODY = """
+<mujoco>
+  <worldbody>
+    <site name="base"/>
+    <body pos="0 0 1"><joint name="hinge"/><geom size=".1"/><site name="near" pos=".1 0 0"/>
+      <body><geom size=".1"/><site name="far" pos=".3 0 0"/></body>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="still" {still}><site site="near"/><site site="far"/></spatial>
+    <spatial name="other" limited="true" range="0 .1"><site site="base"/><site site="far"/></spatial>
+  </tendon>
+  <equality>{equality}</equality>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("still", "equality", "words"),
+    [
+        ('frictionloss="1"', "", "it has a frictionloss"),
+        ('limited="true" range="0 .1"', "", "its length, 0.2, violates its range"),
+        ('limited="true" range="0 .25" margin=".1"', "", "its length, 0.2, violates its range"),
+        ("", '<tendon tendon1="still"/>', "an equality holds it"),
+    ],
+)
+def test_constraints_of_tendons_that_no_joint_moves_are_refused(still: str, equality: str, words: str):
+    """Of a tendon on one rigid body C finds accelerations by chance, and worlds had some of 1e16."""
+    with pytest.raises(ValueError, match=f"tendon 'still' lies on one rigid body, but {words}"):
+        load_model(ONE_BODY.format(still=still, equality=equality))
+
+
+def test_tendons_that_no_joint_moves_may_be_there():
+    tie = '<tendon tendon1="still" tendon2="other"/>'
+    load_model(ONE_BODY.format(still='limited="true" range="0 .3" stiffness="3"', equality=tie))
