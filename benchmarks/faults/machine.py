@@ -46,14 +46,14 @@ def headless(folder: Path) -> Figures:
     message = ""
     for works, expected in (({"egl", "osmesa"}, "egl"), ({"osmesa"}, "osmesa"), (set(), "")):
 
-        def probe(_command, *, env, works=works, **_options) -> SimpleNamespace:
-            failed = env["MUJOCO_GL"] not in works
+        def probe(_words, *, environment, works=works, **_options) -> SimpleNamespace:
+            failed = environment["MUJOCO_GL"] not in works
             return SimpleNamespace(returncode=int(failed), stderr="no such display")
 
         kept = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
         with (
             mock.patch.dict(os.environ, kept, clear=True),
-            mock.patch.object(subprocess, "run", probe),
+            mock.patch.object(rendering, "run_python", probe),
             mock.patch.object(rendering.importlib, "reload", lambda _module: None),
         ):
             try:

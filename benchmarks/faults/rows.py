@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from benchmarks.faults import disk, gpu, growth, interrupts, machine, numbers, saving, strangers
+from benchmarks.faults import (
+    disk,
+    gpu,
+    growth,
+    hostile_folder,
+    interrupts,
+    machine,
+    numbers,
+    saving,
+    strangers,
+)
 from benchmarks.faults.row import Row
 
 ROWS: dict[str, Row] = {
@@ -11,6 +21,7 @@ ROWS: dict[str, Row] = {
     **interrupts.ROWS,
     **numbers.ROWS,
     **strangers.ROWS,
+    **hostile_folder.ROWS,
     **machine.ROWS,
     **growth.ROWS,
     **gpu.ROWS,

@@ -38,7 +38,8 @@ usage: ksim-rl <command> [arguments]
 
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
 --plugin PACKAGE, with any command and repeatable, imports a package of yours: its tasks, and the terms, robots,
-transforms, networks and algorithms that configs name. KSIM_RL_PLUGINS=PACKAGE,... does so for all commands.
+transforms, networks and algorithms that configs name. KSIM_RL_PLUGINS=PACKAGE,... does so for all commands; what is not
+installed lies in a folder of KSIM_RL_PLUGIN_PATH, or for --plugin in the working directory.
 `ksim-rl <command> --help` tells more. KSIM_RL_TRACEBACK=1 shows the traceback of an error.
 
 exit codes: 0 done (and solved, or its target met, where there is one), 1 not solved, or a fault found, 2 refused: the
@@ -71,6 +72,10 @@ COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if argv is None:  # a program of its own
+        # Libraries start Python too: compilers of kernels, launchers of jobs. As with `-P`, the working directory,
+        # which may be a stranger's, is not on the path of these.
+        os.environ["PYTHONSAFEPATH"] = "1"
     try:
         with sigterm_interrupts():
             code = _dispatch(arguments)
@@ -102,7 +107,7 @@ def _dispatch(words: list[str]) -> int:
     module, _, function = COMMANDS[command].partition(":")
     with gc_disabled():
         run = getattr(importlib.import_module(module), function)
-        importlib.import_module("ksim_rl.config.plugins").load(names)
+        importlib.import_module("ksim_rl.config.plugins").load_from_here(names, note=say)
     if int(os.environ.get("WORLD_SIZE") or 1) == 1:
         return run(rest)
     with importlib.import_module("ksim_rl.ranks").joined(command):

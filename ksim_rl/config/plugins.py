@@ -12,23 +12,28 @@ An installed package declares what it has in its pyproject.toml, and is then kno
     my_robots = "my_robots.conf"       # a package of YAML files, laid out like ksim_rl/conf
 
 Any other package is a plug-in where the user names it: `--plugin my_package` for one command, the environment variable
-`KSIM_RL_PLUGINS=my_package,other` for all. Its modules are imported at once, each `Task` and `Algorithm` at the top
-level of one is registered, its subpackage `conf`, where there is one, holds YAML files, and configs may name its
-classes as `_target_`. What a run folder or a checkpoint says is never a reason to import anything.
+`KSIM_RL_PLUGINS=my_package,other` for all. One that is not installed is looked for in the folders, absolute paths, of
+`KSIM_RL_PLUGIN_PATH`; `--plugin` takes it from the working directory too, and says so. Its modules are imported at
+once, each `Task` and `Algorithm` at the top level of one is registered, its subpackage `conf`, where there is one,
+holds YAML files, and configs may name its classes as `_target_`. What a run folder or a checkpoint says is never a
+reason to import anything.
 """
 
 import importlib
 import os
 import pkgutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 TASKS, CONF, ALGORITHMS = "ksim_rl.tasks", "ksim_rl.conf", "ksim_rl.algorithms"
 VARIABLE = "KSIM_RL_PLUGINS"
+PATH_VARIABLE = "KSIM_RL_PLUGIN_PATH"
 
 _named: list[str] = []
 _allowed: set[str] = set()
@@ -45,22 +50,63 @@ def allow_package(name: str) -> None:
     _allowed.add(name)
 
 
+def load_from_here(names: Sequence[str], *, note: Callable[[str], None]) -> None:
+    """Load plug-ins as `load` does, and also from the working directory, as `--plugin` asks; `note` is told of that.
+
+    Only a package that is nowhere else puts the folder on Python's path, behind all else.
+    """
+    here = os.getcwd()
+    _extend_path()
+    for name in names:
+        package = name.strip().partition(".")[0]
+        if package in sys.modules or find_spec(package) is not None:
+            continue
+        if PathFinder.find_spec(package, [here]) is not None:
+            note(f"--plugin {name}: taken from {here}, where Python finds modules from now on")
+            os.environ[PATH_VARIABLE] = os.pathsep.join([*_folders(), here])
+            break
+    load(names)
+
+
 def load(names: Sequence[str]) -> None:
     """Import the plug-ins that a command or a caller names, with those of `KSIM_RL_PLUGINS`.
 
-    Packages of the working directory are found too, after installed ones. Processes that this one starts load the same
-    plug-ins, as the environment variable takes up the names. A ValueError names one that cannot be imported.
+    Processes that this one starts load the same plug-ins, as the environment variable takes up the names. A ValueError
+    names one that cannot be imported.
     """
+    _extend_path()
     wanted = [*os.environ.get(VARIABLE, "").split(","), *names]
     for name in dict.fromkeys(name.strip() for name in wanted if name.strip()):
         if name in _named:
             continue
-        if os.getcwd() not in sys.path and "" not in sys.path:
-            sys.path.append(os.getcwd())
-        _import(f"plug-in {name!r}", name, "correct the name, or install the package")
+        fix = f"correct the name, install the package, or put its folder into {PATH_VARIABLE}"
+        _import(f"plug-in {name!r}", name, fix)
         _named.append(name)
     if _named:
         os.environ[VARIABLE] = ",".join(_named)
+
+
+def environment() -> dict[str, str]:
+    """Return the variables by which a process that is started finds the plug-ins of this one, by absolute paths."""
+    folders = _folders()
+    for name in sorted({name.split(".")[0] for name in _named} | _allowed):
+        module = sys.modules.get(name)
+        if module is None or module.__spec__ is None:  # one that was only allowed may not be imported yet
+            continue
+        # A package has places, and of a module that is one file this is the place.
+        places = module.__spec__.submodule_search_locations or [module.__spec__.origin]
+        folders += [str(Path(place).absolute().parent) for place in places if place]
+    found = {PATH_VARIABLE: os.pathsep.join(dict.fromkeys(folders))}
+    return {**found, VARIABLE: ",".join(_named)} if _named else found
+
+
+def _folders() -> list[str]:
+    """Return the folders of `KSIM_RL_PLUGIN_PATH`; relative ones would lead into whatever folder the user stands in."""
+    return [folder for folder in os.environ.get(PATH_VARIABLE, "").split(os.pathsep) if os.path.isabs(folder)]
+
+
+def _extend_path() -> None:
+    sys.path += [folder for folder in _folders() if folder not in sys.path]
 
 
 def named() -> tuple[str, ...]:

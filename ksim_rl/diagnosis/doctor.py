@@ -5,18 +5,19 @@ What it prints is meant for a bug report: no names of host and user are in it. A
 
 import getpass
 import os
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from subprocess import TimeoutExpired
 
 import torch
 import warp as wp
 
 from ksim_rl.checks import OneLineParser
+from ksim_rl.config.child_processes import run_python
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.device.streams import start_warp, warp_device
 from ksim_rl.diagnosis.self_test import try_device
@@ -178,18 +179,10 @@ def _look_at_opengl(report: Report) -> None:
     except RuntimeError as error:
         report.say("OpenGL", str(error), wrong=True)
         return
-    environment = os.environ | {"MUJOCO_GL": platform}
     try:
-        tried = subprocess.run(
-            [sys.executable, "-c", _DRAWS],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=_DRAW_SECONDS,
-            check=False,
-        )
+        tried = run_python(["-c", _DRAWS], environment={"MUJOCO_GL": platform}, seconds=_DRAW_SECONDS)
         said = "" if tried.returncode == 0 else (tried.stderr.strip().splitlines() or ["failed"])[-1]
-    except subprocess.TimeoutExpired:
+    except TimeoutExpired:
         said = f"no answer in {_DRAW_SECONDS} s"
     if not said:
         report.say("OpenGL", f"{platform} draws")

@@ -1,8 +1,6 @@
 """This module is the commands `ksim-rl export` and `ksim-rl sim2sim`, and the report of the second one."""
 
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ksim_rl.checks import OneLineParser
+from ksim_rl.config.child_processes import run_python
 from ksim_rl.export.causes import Cause, find_causes
 from ksim_rl.export.folder import export, runner_source
 from ksim_rl.export.standalone.signals import read_arrays, read_json
@@ -82,10 +81,8 @@ def sim2sim(
         program.write_text(runner_source())
         arguments = [str(folder.absolute()), "--episodes", str(episodes), "--seed", str(seed)]
         arguments += ["--output", str(output), "--replay", str(replay)]
-        # Isolated: neither the current folder nor PYTHONPATH adds modules.
-        done = subprocess.run(
-            [sys.executable, "-I", str(program), *arguments], capture_output=True, text=True, check=False
-        )
+        # Isolated: PYTHONPATH adds no modules either, as the runner needs none of this library.
+        done = run_python(["-I", str(program), *arguments])
         if done.returncode:
             raise ValueError(f"{folder}: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
         found = json.loads(output.read_text())

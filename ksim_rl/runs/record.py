@@ -9,7 +9,6 @@ import json
 import os
 import platform
 import shlex
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -23,6 +22,7 @@ import torch
 
 from ksim_rl.checked import Checked
 from ksim_rl.config import plain_data, plugins
+from ksim_rl.config.child_processes import ask_git
 from ksim_rl.runs.run_lock import is_locked
 from ksim_rl.runs.whole_file import write_whole
 
@@ -42,8 +42,6 @@ PACKAGES = [
     "omegaconf",
 ]
 MOST_SESSIONS, MOST_LETTERS, MOST_DIFF_BYTES = 1000, 10_000, 4 * 2**20
-# What a repository's own settings could have git run.
-_GIT = ("git", "-c", "core.fsmonitor=false", "-c", "core.hooksPath=/dev/null", "-c", "core.quotePath=false")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,35 +153,26 @@ def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
         commit, top = repository
         seen.add(top)
         found[name] = {"commit": commit}
-        if changes := _git(top, "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD"):
+        if changes := ask_git(top, "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD"):
             kept = f"{name}.diff" if session == 1 else f"{name}.{session}.diff"
             if len(changes) <= MOST_DIFF_BYTES:
                 (folder / kept).unlink(missing_ok=True)
                 (folder / kept).write_bytes(changes)
             found[name]["changed"] = kept if len(changes) <= MOST_DIFF_BYTES else "too much to keep"
-        if new := _git(top, "ls-files", "--others", "--exclude-standard", "--exclude=__pycache__"):
+        if new := ask_git(top, "ls-files", "--others", "--exclude-standard", "--exclude=__pycache__"):
             found[name]["not in git"] = ", ".join(new.decode(errors="replace").splitlines()[:20])
     return found
 
 
 def _repository(file: Path) -> tuple[str, Path] | None:
     """Return the commit and the top folder of the repository that has a file, and not only lies around it."""
-    if _git(file.parent, "ls-files", "--error-unmatch", "--", file.name) is None:
+    if ask_git(file.parent, "ls-files", "--error-unmatch", "--", file.name) is None:
         return None
-    answer = _git(file.parent, "rev-parse", "HEAD", "--show-toplevel")
+    answer = ask_git(file.parent, "rev-parse", "HEAD", "--show-toplevel")
     if answer is None:  # nothing is committed yet
         return None
     commit, top = answer.decode().splitlines()
     return commit, Path(top)
-
-
-def _git(folder: Path, *arguments: str) -> bytes | None:
-    own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
-    try:
-        command = [*_GIT, "-C", str(folder), *arguments]
-        return subprocess.run(command, capture_output=True, check=True, timeout=20, env=own).stdout
-    except (OSError, subprocess.SubprocessError):  # there is no git, or nothing of what was asked for
-        return None
 
 
 def versions() -> dict[str, str]:

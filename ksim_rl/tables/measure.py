@@ -17,6 +17,7 @@ from typing import Any
 
 from ksim_rl import conf
 from ksim_rl.config import plugins
+from ksim_rl.config.child_processes import go_to_parents_folder
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.envs.contract import EpisodeSums, part
 from ksim_rl.runs import record
@@ -118,6 +119,7 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
 
 def main(name: str, row: str, seed: str, result: str, run_folder: str, device: str, smoke: str = "") -> None:
     """Measure and write; the result appears whole or not at all."""
+    go_to_parents_folder()  # the table, and the paths of the command, are as they were given there
     plugins.load([])  # those of KSIM_RL_PLUGINS, where `ksim-rl --plugin` has put its own
     found = measure(load(name).rows[row], int(seed), Path(run_folder), device=device, smoke=bool(smoke))
     path = Path(result)

@@ -2,16 +2,16 @@
 
 import json
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
+from subprocess import STDOUT, Popen
 from typing import Any
 
 import torch
 
+from ksim_rl.config.child_processes import start_python
 from ksim_rl.tables.measure import run_cfg, settings
 from ksim_rl.tables.table import Table
 
@@ -53,7 +53,7 @@ class Runs:
         A GPU that is named twice takes two at a time; "" stands for the CPU.
         """
         waiting, left = list(jobs), 0
-        running: dict[int, tuple[Job, subprocess.Popen[bytes]]] = {}
+        running: dict[int, tuple[Job, Popen[bytes]]] = {}
         try:
             while waiting or running:
                 is_over = time.monotonic() > until
@@ -78,16 +78,16 @@ class Runs:
                 process.wait()
         return left
 
-    def _start(self, job: Job, gpu: str) -> subprocess.Popen[bytes]:
+    def _start(self, job: Job, gpu: str) -> Popen[bytes]:
         (name, seed), log = job, self._log(job)
         result = self.folder / name / f"seed_{seed}.json"
         words = [self.table.source, name, seed, result, log.with_suffix(""), "cuda" if gpu else "cpu"]
-        command = [sys.executable, "-m", "ksim_rl.tables.measure", *map(str, words), "smoke" * self.smoke]
+        command = ["-m", "ksim_rl.tables.measure", *map(str, words), "smoke" * self.smoke]
         log.parent.mkdir(parents=True, exist_ok=True)
         result.unlink(missing_ok=True)
-        environment = os.environ | ({"CUDA_VISIBLE_DEVICES": gpu} if gpu else {})
+        environment = {"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}
         with log.open("wb") as file:
-            return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+            return start_python(command, environment=environment, stdout=file, stderr=STDOUT)
 
     def _log(self, job: Job) -> Path:
         return self.run_folder / job[0] / f"seed_{job[1]}.log"

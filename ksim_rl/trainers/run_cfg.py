@@ -38,7 +38,7 @@ PLUGINS = "plugins"
 # It becomes part of the path of the run folder.
 TASK_NAME = re.compile(r"\w[\w.+-]*")
 # Fields that reach beyond the run folder, to write or to listen, and the variables of those that have one.
-WRITTEN = ("logger.mlflow.tracking_uri", "task.sim.nan_guard.folder", "viewer.host")
+WRITTEN = ("logger.mlflow.tracking_uri", "task.sim.nan_guard.folder", "viewer.browser", "viewer.host")
 VOUCHED_BY = {"logger.mlflow.tracking_uri": "MLFLOW_TRACKING_URI"}
 
 
@@ -251,7 +251,8 @@ def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[st
         for name in path.split("."):
             value = value.get(name) if isinstance(value, Mapping) else None
         own = any(f"{path}.".startswith(f"{field}.") for field in given)
-        if value is not None and not own and value != os.environ.get(VOUCHED_BY.get(path, "")):
+        reaches = value is not None and value is not False
+        if reaches and not own and value != os.environ.get(VOUCHED_BY.get(path, "")):
             raise ValueError(
                 f"{where}: {path}={value!r} reaches outside of the run folder: if that is yours, set "
                 f"{path} on the command line, or resume with --trust"

@@ -6,12 +6,11 @@ that broke while it was recorded.
 
 import dataclasses
 import json
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterable
 
 from ksim_rl.config import plugins
+from ksim_rl.config.child_processes import go_to_parents_folder, run_python
 from ksim_rl.data import ReplayCfg
 from ksim_rl.device.memory import free_bytes
 from ksim_rl.trainers.build import build
@@ -39,13 +38,7 @@ def first_that_fits(cfg: RunCfg, numbers: Iterable[int], *, note: Callable[[str]
         except ValueError:
             continue
         note(f"memory does not suffice: trying num_envs={num_envs}")
-        ended = subprocess.run(
-            [sys.executable, "-c", PROGRAM],
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-            input=json.dumps(fewer.to_tree()),
-            capture_output=True,
-            text=True,
-        )
+        ended = run_python(["-c", PROGRAM], text=json.dumps(fewer.to_tree()))
         if ended.returncode == FITS:
             return num_envs
         # Behind the exit without a teardown, helpers of Python still write to stderr.
@@ -58,6 +51,7 @@ def first_that_fits(cfg: RunCfg, numbers: Iterable[int], *, note: Callable[[str]
 
 def main() -> int:
     """Train the config on stdin for a few iterations; return whether memory suffices, as an exit code."""
+    go_to_parents_folder()
     tree = json.load(sys.stdin)
     plugins.load(tree.get(PLUGINS, ()))
     cfg = RunCfg.from_tree(tree)

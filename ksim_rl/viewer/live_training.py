@@ -6,7 +6,6 @@ Otherwise it does nothing for the viewer: its graphs, its envs and its stream st
 
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import threading
@@ -14,10 +13,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import torch
 
 from ksim_rl.config import plugins
+from ksim_rl.config.child_processes import go_to_parents_folder, start_python
 from ksim_rl.device import state_tree
 from ksim_rl.runs.whole_file import whole_file
 from ksim_rl.trainers import Hook, RunCfg, Trainer
@@ -69,17 +70,13 @@ def watched(cfg: RunCfg, note: Callable[[str], None]) -> Iterator[list[Hook]]:
         folder = Path(name)
         (folder / CONFIG).write_text(json.dumps(cfg.to_tree()))
         hook = GiveWeights(folder)
-        child = subprocess.Popen(
-            [sys.executable, "-m", "ksim_rl.viewer.live_training", name],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
+        child = start_python(
+            ["-m", "ksim_rl.viewer.live_training", name],
+            stdin=PIPE,
+            stdout=PIPE,
             text=True,
             # No memory on the GPU, and no core that the training needs.
-            env={
-                **os.environ,
-                "CUDA_VISIBLE_DEVICES": "",
-                "OMP_NUM_THREADS": "1",
-            },
+            environment={"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"},
             preexec_fn=lambda: os.nice(10),
             start_new_session=True,  # Ctrl-C is for the training, which closes the viewer
         )
@@ -91,7 +88,7 @@ def watched(cfg: RunCfg, note: Callable[[str], None]) -> Iterator[list[Hook]]:
             child.wait()
 
 
-def _listen(child: "subprocess.Popen[str]", hook: GiveWeights, note: Callable[[str], None]) -> None:
+def _listen(child: "Popen[str]", hook: GiveWeights, note: Callable[[str], None]) -> None:
     assert child.stdout is not None
     for line in child.stdout:
         if line.strip() in (_SOME, _NOBODY):
@@ -108,6 +105,7 @@ def main(folder: Path) -> None:
     # The training holds the other end of the pipe for as long as it lives.
     threading.Thread(target=lambda: (sys.stdin.read(), os._exit(0)), daemon=True).start()
     torch.set_num_threads(1)
+    go_to_parents_folder()
     plugins.load(())
     cfg = RunCfg.from_tree({**json.loads((folder / CONFIG).read_text()), "device": "cpu", "checkpoint": None})
     viewer = BrowserViewer(host=cfg.viewer.address, port=cfg.viewer.port, label="training")

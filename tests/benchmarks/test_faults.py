@@ -14,7 +14,7 @@ import torch
 
 from benchmarks import report
 from benchmarks.faults import __main__ as command
-from benchmarks.faults import children, machine, page
+from benchmarks.faults import children, hostile_folder, machine, page
 from benchmarks.faults.row import Row
 from benchmarks.faults.rows import ROWS
 from ksim_rl.algorithms.gradient_steps import RolloutUpdate
@@ -185,6 +185,11 @@ def pickles_are_loaded(patch):
 def as_mujoco_takes_them(patch):
     patch.setattr(load, "check_meant", lambda *_, **__: None)
     patch.setattr(load, "check_finite", lambda *_, **__: None)
+
+
+@sabotage("hostile_folder")
+def commands_and_children_begin_where_the_user_stands(patch):
+    patch.setattr(hostile_folder, "PROGRAM", [word for word in hostile_folder.PROGRAM if word != "-P"])
 
 
 @sabotage("caches")

@@ -66,6 +66,8 @@ def as_a_run_would(cfg, folder, resume_from=None):
         (folder / "environment").write_text(SECRET)
     if cfg.task.sim.nan_guard is not None:
         Path(cfg.task.sim.nan_guard.folder).mkdir(parents=True)
+    if cfg.viewer.browser:  # a port is opened, which lets in who reaches it
+        (folder / "environment").write_text(SECRET)
     if cfg.logger.mlflow is not None:
         Path(cfg.logger.mlflow.tracking_uri.removeprefix("sqlite:///")).write_text("")
     return 0
@@ -237,6 +239,17 @@ def folder_of_the_nan_guard(place):
 @family(without_the_check_of_places)
 def database_of_mlflow(place):
     return with_logger(place, mlflow={"tracking_uri": f"sqlite:///{place.outside}/written"})
+
+
+@family(without_the_check_of_places)
+def viewer_that_listens(place):
+    place.write_checkpoint(viewer={"browser": True})
+    return ["resume", str(place.run)]
+
+
+@family(without_the_check_of_places)
+def viewer_that_listens_in_config(place):
+    return place.write_config(viewer={"browser": True})
 
 
 @family(without_the_check_of_places)

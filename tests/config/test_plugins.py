@@ -131,7 +131,8 @@ def test_it_is_named_by_the_flag_or_by_the_users_settings(work, trained):
     done = ksim_rl(work, "eval", "run", "--episodes", "2", "--plugin=mine_of_test")
     assert done.returncode == 0, done.stderr[-2000:]
     assert "my_swingup, iteration 1" in done.stdout
-    done = ksim_rl(work, "envs", KSIM_RL_PLUGINS="mine_of_test")
+    assert f"taken from {work}, where Python finds modules from now on" in done.stderr
+    done = ksim_rl(work, "envs", KSIM_RL_PLUGINS="mine_of_test", KSIM_RL_PLUGIN_PATH=str(work))
     assert "my_swingup" in done.stdout
 
 
@@ -139,6 +140,15 @@ def test_a_plug_in_that_does_not_exist_is_refused(refused):
     assert "plug-in 'mine_of_tset' cannot be loaded" in refused("envs", "--plugin", "mine_of_tset")
     assert "plug-in 'mine_of_tset' cannot be loaded" in refused("--plugin", "mine_of_tset", "envs")
     assert "--plugin: expected the name" in refused("envs", "--plugin")
+
+
+def test_only_the_flag_takes_a_plug_in_from_the_working_directory(refused, work, monkeypatch):
+    """A variable that is set for all commands also counts in the folder of a stranger."""
+    monkeypatch.setenv("KSIM_RL_PLUGINS", "mine_of_test")
+    for path in ("", ".", f":{os.path.relpath(work)}"):
+        monkeypatch.setenv("KSIM_RL_PLUGIN_PATH", path)
+        assert "plug-in 'mine_of_test' cannot be loaded: ModuleNotFoundError" in refused("envs")
+        assert str(work) not in sys.path and "mine_of_test" not in sys.modules
 
 
 def test_python_names_it_for_a_policy(work, trained, monkeypatch):

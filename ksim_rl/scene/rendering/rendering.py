@@ -3,15 +3,15 @@
 import copy
 import importlib
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from functools import cache
+from subprocess import TimeoutExpired
 
 import mujoco
 import numpy as np
 
 from ksim_rl.checks import near
+from ksim_rl.config.child_processes import run_python
 from ksim_rl.physics import World
 from ksim_rl.physics.fields import write_fields
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer, add_geoms, place, visible_groups
@@ -36,13 +36,10 @@ def choose_gl_platform() -> str:
         return os.environ["MUJOCO_GL"]
     said = []
     for platform in (["glfw"] if os.environ.get("DISPLAY") else []) + ["egl", "osmesa"]:
-        environment = {**os.environ, "MUJOCO_GL": platform}
-        command = [sys.executable, "-c", _PROBE]
+        environment = {"MUJOCO_GL": platform}
         try:
-            tried = subprocess.run(
-                command, env=environment, capture_output=True, text=True, timeout=_PROBE_SECONDS, check=False
-            )
-        except subprocess.TimeoutExpired:
+            tried = run_python(["-c", _PROBE], environment=environment, seconds=_PROBE_SECONDS)
+        except TimeoutExpired:
             said.append(f"{platform}: no answer in {_PROBE_SECONDS} s")
             continue
         if tried.returncode == 0:
