@@ -35,7 +35,7 @@ def write_modules(folder: Path, *, marks: Path) -> None:
 def _commands(output: Path) -> dict[str, list[str]]:
     """Return the arguments of every command, for who stands in a run folder."""
     quick = ["trainer.num_iterations=1", "trainer.eval_episodes=0"]
-    model = str(files("ksim_rl.scene.robots").joinpath("cartpole.xml"))
+    model = str(files("ksim_rl.scene.robots").joinpath("quadruped.xml"))
     return {
         "doctor": ["--no-test"],
         "play": [".", "--seconds", "0.1", "--device", "cpu"],
@@ -75,7 +75,7 @@ def hostile_folder(folder: Path, *, commands: int) -> Figures:
     subprocess.run([sys.executable, *PROGRAM, *words], env=environment, cwd=folder, timeout=1800)
     write_modules(run, marks=marks)
     (folder / "table.yaml").write_text(TABLE)
-    frame = ",".join(["0", "0", "1", "0", "0", "0", "1", *["0"] * 21])
+    frame = ",".join(["0", "0", "1", "0", "0", "0", "1", *["0"] * 19])
     (run / "motion.csv").write_text(f"{frame}\n{frame}\n")
     found = {"commands": 0, "executed": 0, "tracebacks": 0, "failed": 0}
     for command, arguments in list(_commands(folder / "output").items())[:commands]:
