@@ -7,6 +7,7 @@ from functools import partial
 import viser
 
 from ksim_rl.viewer.session import SPEEDS, Conditions, Session
+from ksim_rl.viewer.shown_text import as_html, paragraph
 
 _SPEED_NAMES = {("1/8", "1/4", "1/2", "1", "2", "4", "8")[i]: speed for i, speed in enumerate(SPEEDS)}
 
@@ -26,8 +27,8 @@ class Panel:
         self.follows, self.contacts = True, False
         self.drawn: set[str] = set()
         self._steering: dict[str, tuple[viser.GuiCheckboxHandle, dict[str, viser.GuiSliderHandle]]] = {}
-        self._status = gui.add_markdown("")
-        self._error = gui.add_markdown("", visible=False)
+        self._status = gui.add_html("")
+        self._error = gui.add_html("", visible=False)
         self._play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self._play.on_click(lambda _: session.ask(lambda: session.play(not session.playing)))
         runs = gui.add_button_group("Run", ("Step", "Reset"))
@@ -66,8 +67,8 @@ class Panel:
         if self._play.label != label:
             self._play.label, self._play.icon = label, icon
         self._env.value = session.env_index
-        self._status.content = self._status_text()
-        self._error.content = f"**Paused by an error**\n```text\n{session.error}\n\n{session.trace}\n```"
+        self._status.content = self._status_html()
+        self._error.content = self._error_html()
         self._error.visible = bool(session.error)
 
     def drive(self, shares: Mapping[int, float]) -> None:
@@ -85,15 +86,22 @@ class Panel:
             self._session.ask(partial(self._steer, command))
             return
 
-    def _status_text(self) -> str:
+    def _status_html(self) -> str:
         session = self._session
         ours = session.ours
         seconds = float(ours.episode_step_E[session.env_index]) * ours.step_dt
         state = "running" if session.playing else "paused"
-        return (
-            f"**{session.title}** {session.note}\n\n{state}, episode {seconds:.2f} s, return "
+        heading = f"<b>{as_html(session.title)}</b> {as_html(session.note)}"
+        figures = (
+            f"{state}, episode {seconds:.2f} s, return "
             f"{session.episode_return:.2f}, speed {session.achieved_speed:.2f}, step {session.steps}"
         )
+        return paragraph(heading) + paragraph(figures)
+
+    def _error_html(self) -> str:
+        told = as_html(f"{self._session.error}\n\n{self._session.trace}")
+        listing = f'<pre style="margin:0;padding:0 1em;overflow-x:auto;font-size:0.8em">{told}</pre>'
+        return paragraph("<b>Paused by an error</b>") + listing
 
     def _add_command(self, name: str, ranges: Mapping[str, tuple[float, float]], *, prefix: str) -> None:
         gui = self._gui

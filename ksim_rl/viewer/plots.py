@@ -9,6 +9,7 @@ import viser
 from viser import uplot
 
 from ksim_rl.viewer.session import Session
+from ksim_rl.viewer.shown_text import as_html
 
 SECONDS = 5.0
 PERIOD_S = 0.1
@@ -65,15 +66,23 @@ class Curves:
                 )
         else:
             self._chart.data = data
-        rows = [
-            f'<tr><td style="color:{COLORS[column % len(COLORS)] if column < MOST_CURVES else "inherit"}">&#9632;</td>'
-            f'<td>{name}</td><td style="text-align:right" data-value="{name}">{y[-1, column]:+.4f}</td></tr>'
-            for column, name in enumerate(self._names)
-        ]
+        rows = []
+        for column, name in enumerate(self._names):
+            color = COLORS[column % len(COLORS)] if column < MOST_CURVES else "inherit"
+            rows.append(_row(name, color=color, value=y[-1, column]))
         self._table.content = (
             '<table style="width:100%;font-size:0.8em;font-variant-numeric:tabular-nums;padding:0 1em">'
             f"{''.join(rows)}</table>"
         )
+
+
+def _row(name: str, *, color: str, value: float) -> str:
+    """Return the row of a table: the colour of the curve, its name, which a run has chosen, and its present value."""
+    shown = as_html(name)
+    return (
+        f'<tr><td style="color:{color}">&#9632;</td><td>{shown}</td>'
+        f'<td style="text-align:right" data-value="{shown}">{value:+.4f}</td></tr>'
+    )
 
 
 class Plots:

@@ -1,41 +1,20 @@
 """A real browser opens the viewer: the robot moves, sliders and keys command it, plots hold the present values.
 
-It needs Debian's packages chromium and chromium-driver, and is skipped where they are missing, unless
-KSIM_RL_NEEDS_CHROMIUM says that they have to be there. With KSIM_RL_SCREENSHOTS=DIR it leaves its pictures there.
-
-A browser that draws without a graphics card needs seconds for what takes one a millisecond. So the window is small,
-lights are plain, the session stands still unless a test lets it go, and each test waits for what it looks for.
+With KSIM_RL_SCREENSHOTS=DIR it leaves its pictures there.
 """
 
 import io
 import os
-import shutil
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from tests.viewer.chromium import TEXT, WIDTH, browsing, check_chromium, click, serving, until
 from tests.viewer.test_session import session_of
 
 TASK = "quadruped_velocity_flat"
-# How long a check waits before it fails. Nothing here takes a tenth of it on two idle cores.
-PATIENCE_S = 180.0
-WIDTH, HEIGHT = 760, 480
-FLAGS = (
-    *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
-    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-    f"--window-size={WIDTH},{HEIGHT}",
-)
-NEEDED = {
-    "chromium": shutil.which("chromium") or shutil.which("google-chrome"),
-    "chromedriver": shutil.which("chromedriver"),
-}
-TEXT = "return document.body.textContent"
-BUTTON = "return [...document.querySelectorAll('button')].find(b => b.textContent.trim() === arguments[0])"
 # What a widget with this label holds that fits the selector.
 LABELLED = """
     const label = [...document.querySelectorAll('label')].find(l => l.textContent.trim() === arguments[0]);
@@ -59,75 +38,26 @@ CHARTS = """
 
 @pytest.fixture(scope="module", autouse=True)
 def needs_chromium():
-    missing = [name for name, path in NEEDED.items() if path is None]
-    if missing and os.environ.get("KSIM_RL_NEEDS_CHROMIUM"):
-        pytest.fail(f"{missing} are not installed, and KSIM_RL_NEEDS_CHROMIUM is set")
-    if missing:
-        pytest.skip(f"{missing} are not installed (Debian: chromium chromium-driver)")
+    check_chromium()
 
 
 @pytest.fixture(scope="module")
 def served():
-    """A session that a thread steps and serves, as `ksim-rl play --live` does; it is paused."""
-    from ksim_rl.viewer.browser import BrowserViewer
+    def make_session():
+        session = session_of(TASK, agent="random")
+        session.title = TASK
+        return session
 
-    ready, end, made = threading.Event(), threading.Event(), {}
-
-    def run():
-        try:
-            session = session_of(TASK, agent="random")
-            session.title = TASK
-            session.play(False)
-            made["viewer"] = viewer = BrowserViewer(port=18080)
-            # Reflections alone would take half a minute to prepare.
-            viewer.server.scene.configure_environment_map(None)
-            viewer.server.scene.configure_default_lights(cast_shadow=False)
-            viewer.open(session)
-            made["session"] = session
-        finally:
-            ready.set()
-        viewer.run(goes_on=lambda: not end.is_set())
-        viewer.close()
-        session.close()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    ready.wait()
-    yield made["viewer"], made["session"]
-    end.set()
-    thread.join()
+    with serving(make_session, port=18080) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")
 def page(served, tmp_path_factory):
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = NEEDED["chromium"]
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    driver = webdriver.Chrome(options=options, service=Service(NEEDED["chromedriver"]))
-    driver.command_executor.client_config.timeout = PATIENCE_S
-    driver.get(f"{served[0].address}/?fixedDpr=0.4")
-    until(lambda: "paused, " in driver.execute_script(TEXT), "the panel")
-    yield driver
-    driver.quit()
-
-
-def until(condition, what: str):
-    """Wait for a condition, and return what it is."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := condition()):
-        if time.monotonic() > deadline:
-            pytest.fail(f"not seen within {PATIENCE_S:.0f} s: {what}")
-        time.sleep(0.1)
-    return found
-
-
-def click(page, text: str):
-    button = until(lambda: page.execute_script(BUTTON, text), f"a button {text!r}")
-    page.execute_script("arguments[0].click()", button)
+    with browsing(tmp_path_factory.mktemp("profile")) as driver:
+        driver.get(f"{served[0].address}/?fixedDpr=0.4")
+        until(lambda: "paused, " in driver.execute_script(TEXT), "the panel")
+        yield driver
 
 
 def step(page, session):
