@@ -12,6 +12,7 @@ from benchmarks.faults import (
     numbers,
     saving,
     strangers,
+    viewer,
 )
 from benchmarks.faults.row import Row
 
@@ -22,6 +23,7 @@ ROWS: dict[str, Row] = {
     **numbers.ROWS,
     **strangers.ROWS,
     **hostile_folder.ROWS,
+    **viewer.ROWS,
     **machine.ROWS,
     **growth.ROWS,
     **gpu.ROWS,

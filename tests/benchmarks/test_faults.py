@@ -192,6 +192,12 @@ def commands_and_children_begin_where_the_user_stands(patch):
     patch.setattr(hostile_folder, "PROGRAM", [word for word in hostile_folder.PROGRAM if word != "-P"])
 
 
+@sabotage("viewer_markup")
+def names_as_they_stand(patch):
+    for module in ("panel", "plots"):
+        patch.setattr(f"ksim_rl.viewer.{module}.as_html", lambda text: text)
+
+
 @sabotage("caches")
 def errors_as_warp_raises_them(patch):
     program = (
