@@ -70,7 +70,7 @@ def shown(text):
     return "".join(letter if letter == "\n" or letter.isprintable() else " " for letter in text)
 
 
-def named_by_markup(task, markups=tuple(MARKUP.values())):
+def named_by_markup(task, markups):
     """A session whose rewards, observations, commands, title and note are markup."""
     cfg = envs.make_cfg(task)
     reward = next(iter(cfg.rewards.values()))

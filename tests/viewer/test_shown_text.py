@@ -27,13 +27,13 @@ def test_the_panel_and_the_plots_hold_no_markup_of_a_run():
 def test_a_real_browser_runs_nothing_of_a_run(tmp_path):
     check_chromium()
 
+    def make_session():
+        return named_by_markup("quadruped_velocity_flat", tuple(MARKUP.values()))
+
     def broken(_):
         raise RuntimeError("".join(MARKUP.values()))
 
-    with (
-        serving(lambda: named_by_markup("quadruped_velocity_flat"), port=18330) as (viewer, session),
-        browsing(tmp_path) as page,
-    ):
+    with serving(make_session, port=18330) as (viewer, session), browsing(tmp_path) as page:
         page.get(f"{viewer.address}/?fixedDpr=0.4")
         until(lambda: "paused, " in page.execute_script(TEXT), "the panel")
         for wanted in (1, 2):
