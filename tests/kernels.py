@@ -68,6 +68,7 @@ TESTS = {
     "physics/constant_kernels.py": {"constants_at_qpos0": EQUAL_WORLDS, "frames": EQUAL_WORLDS},
     "physics/sensors/contact_sensors.py": {"__init__": EQUAL_WORLDS},
     "physics/height_field/contacts.py": {"height_field_contacts": EQUAL_WORLDS},
+    "physics/height_field/convex_contacts.py": {"convex_height_field_contacts": SINGLE_MODELS},
     "physics/kernels.py": {
         "align_steep_capsules": SINGLE_MODELS,
         "drop_upper_corners": SINGLE_MODELS,

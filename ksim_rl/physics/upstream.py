@@ -20,8 +20,13 @@ from mujoco_warp._src.collision_core import contact_params as contact_params
 
 # What lies between its broad phase and its narrow one, and the second.
 from mujoco_warp._src.collision_core import create_collision_context as create_collision_context
+
+# Its search for the distance of convex shapes, and what that needs.
+from mujoco_warp._src.collision_core import geom_collision_pair as geom_collision_pair
 from mujoco_warp._src.collision_core import write_contact as write_contact
 from mujoco_warp._src.collision_driver import _narrowphase as narrowphase  # noqa: F401
+from mujoco_warp._src.collision_gjk import ccd as ccd
+from mujoco_warp._src.collision_gjk import support as support
 
 # The law of a constraint row.
 from mujoco_warp._src.constraint import _efc_row as efc_row  # noqa: F401
@@ -39,6 +44,10 @@ from mujoco_warp._src.sleep import update_sleep, wake
 # What a step adds to the inertia matrix and to the bias forces for tendons.
 from mujoco_warp._src.smooth import tendon_armature as tendon_armature
 from mujoco_warp._src.smooth import tendon_bias as tendon_bias
+
+# How much memory that search needs, and the corners of a prism.
+from mujoco_warp._src.types import MJ_MAX_EPAFACES as MJ_MAX_EPAFACES
+from mujoco_warp._src.types import MJ_MAX_EPAHORIZON as MJ_MAX_EPAHORIZON
 
 # The bits of `contact.type`.
 from mujoco_warp._src.types import ContactType as ContactType

@@ -114,12 +114,18 @@ TENDON = """
 # can heed; and sensors of contacts that only such models have.
 MENDED = """
 <mujoco>
+  <asset>
+    <hfield name="hills" nrow="3" ncol="3" size="1 1 0.1 0.1" elevation="0 1 2 2 3 1 0 1 2"/>
+    <mesh name="wedge" vertex="-.1 -.1 -.1 .1 -.1 -.1 0 .1 -.1 0 0 .1"/>
+  </asset>
   <worldbody>
+    <geom type="hfield" hfield="hills" pos="3 0 1"/>
     <geom name="floor" type="plane" size="5 5 1" priority="1" solref="-500 -10"/>
     <geom name="table" type="box" size="0.3 0.3 0.05"/><geom name="stone" size="0.1" pos="0 0 0.05"/>
     <body pos="0 0 0.14"><freejoint/>
       <geom name="box" type="box" size="0.1 0.1 0.1" margin="0.05"/><site name="zone" size="0.3"/>
     </body>
+    <body pos="3 0 1.18"><freejoint/><geom type="mesh" mesh="wedge"/></body>
   </worldbody>
   <contact><pair geom1="table" geom2="stone"/></contact>
   <sensor>

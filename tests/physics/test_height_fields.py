@@ -240,8 +240,40 @@ def test_a_pair_of_the_model_keeps_its_own_parameters():
         assert mine["dim"][0] == theirs.dim == 4 and np.allclose(mine["friction"][0], theirs.friction)
 
 
-def test_other_shapes_stay_with_mujoco_warp():
-    mj_model = model(np.tile([[0.0, 1.0]], (2, 1)), top=1e-3)
-    pose_EL = poses()
-    pose_EL[:, 21:28] = torch.tensor([0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0])
-    assert Contacts(mj_model, pose_EL[:1]).of(0, "can")["dist"].size > 0
+OTHER_SHAPES = {
+    "cylinder": 'type="cylinder" size="0.06 0.08"',
+    "ellipsoid": 'type="ellipsoid" size="0.06 0.08 0.1"',
+    "mesh": 'type="mesh" mesh="wedge"',
+}
+
+
+@pytest.mark.parametrize("shape", OTHER_SHAPES)
+@pytest.mark.parametrize("depth", [0.0005, 0.01, 0.1])
+def test_other_shapes_touch_each_prism_as_in_the_c_engine(shape, depth):
+    """Directions are those of a search that ends within a tolerance; a smooth shape has others nearby."""
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco>
+        <asset><mesh name="wedge" vertex="-.1 -.1 -.1 .1 -.1 -.1 0 .12 -.1 0 0 .15 .05 .05 .1"/></asset>
+        <worldbody>
+          <body name="ball"><freejoint/><geom name="ball" {OTHER_SHAPES[shape]} margin="1e-6"/></body>
+        </worldbody>
+        </mujoco>"""
+    )
+    heights = noise()
+    rows, columns = heights.shape
+    size, data = [SIDE, SIDE, TOP, 0.5], heights.ravel().tolist()
+    spec.add_hfield(name="field", size=size, nrow=rows, ncol=columns, userdata=data)
+    spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field")
+    mj_model = load_model(spec)
+    pose_EL = lowered(mj_model, poses()[:, :7], "ball", depth)
+    ours, several = Contacts(mj_model, pose_EL), 0
+    for row in range(NUM_ENVS):
+        mine, theirs = ours.of(row, "ball"), of_the_c_engine(mj_model, pose_EL[row], "ball")
+        assert len(mine["dist"]) == len(theirs) > 0, row
+        several += len(theirs) > 1
+        assert np.allclose(mine["dist"], [each.dist for each in theirs], atol=1e-4), row
+        for each in theirs:
+            nearest = int(np.linalg.norm(mine["pos"] - each.pos, axis=1).argmin())
+            assert np.allclose(mine["pos"][nearest], each.pos, atol=3e-3), row
+            assert np.allclose(mine["frame"][nearest, 0], each.frame[:3], atol=0.1), row
+    assert several > 0

@@ -21,7 +21,9 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics import upstream
-from ksim_rl.physics.height_field.geometry import Core, Field, prism_of, touch_of_core
+from ksim_rl.physics.height_field import convex_contacts
+from ksim_rl.physics.height_field.fields import CONTACT_FIELDS, DATA_FIELDS, MODEL_FIELDS
+from ksim_rl.physics.height_field.geometry import Core, field_of, prism_of, touch_of_core
 from ksim_rl.physics.structs import filled, struct_with
 from ksim_rl.physics.upstream import contact_params, make_frame, write_contact
 
@@ -35,20 +37,7 @@ TOO_MANY = wp.constant(int(mjw.OverflowType.HFIELD))
 
 
 @struct_with(
-    (
-        "",
-        mjw.Model,
-        "geom_type geom_condim geom_dataid geom_priority geom_solmix geom_solref geom_solimp geom_size geom_rbound "
-        "geom_friction geom_margin geom_gap geom_adhesion hfield_size hfield_nrow hfield_ncol hfield_adr hfield_data "
-        "pair_dim pair_solref pair_solreffriction pair_solimp pair_margin pair_gap pair_adhesion pair_friction",
-    ),
-    ("", mjw.Data, "geom_xpos geom_xmat naconmax nacon overflow"),
-    (
-        "contact_",
-        mjw.Contact,
-        "dist pos frame includemargin friction solref solreffriction solimp dim geom efc_address worldid type "
-        "geomcollisionid adhesion",
-    ),
+    ("", mjw.Model, MODEL_FIELDS), ("", mjw.Data, DATA_FIELDS), ("contact_", mjw.Contact, CONTACT_FIELDS)
 )
 class Collisions:
     """What the kernel reads of a model and its worlds, and the contacts that it appends to."""
@@ -122,16 +111,7 @@ def height_field_contacts(c: Collisions):
     if wp.abs(center[0]) - bound > size[0] + reach or wp.abs(center[1]) - bound > size[1] + reach:
         return
 
-    field = Field()
-    field.address = c.hfield_adr[patch]
-    field.rows = c.hfield_nrow[patch]
-    field.columns = c.hfield_ncol[patch]
-    field.half_x = size[0]
-    field.half_y = size[1]
-    field.top = size[2]
-    field.base = size[3]
-    field.dx = 2.0 * size[0] / float(field.columns - 1)
-    field.dy = 2.0 * size[1] / float(field.rows - 1)
+    field = field_of(size, c.hfield_nrow[patch], c.hfield_ncol[patch], c.hfield_adr[patch])
     core = core_of(
         c.geom_type[geom],
         c.geom_size[world % c.geom_size.shape[0], geom],
@@ -198,27 +178,45 @@ def height_field_contacts(c: Collisions):
 
 
 def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None] | None:
-    """Take the pairs of height fields with spheres, capsules and boxes away from MuJoCo Warp, in place.
+    """Take the pairs of height fields away from MuJoCo Warp, in place.
 
     Returns what appends their contacts instead after its collision pass, or None where there are no such pairs. Pairs
-    with other geoms (cylinders, ellipsoids, meshes), and pairs that a distance sensor measures, stay with MuJoCo Warp.
+    with signed distance fields stay with MuJoCo Warp, as do all where surfaces move.
     """
     geom_type = warp_model.geom_type.numpy()
     pairs, pair_ids = upstream.geom_pairs(warp_model)
     types = geom_type[pairs]
     height_first = np.where(types[:, :1] == HEIGHT_FIELD, pairs, pairs[:, ::-1])
-    taken = (types == HEIGHT_FIELD).any(-1) & np.isin(geom_type[height_first[:, 1]], (SPHERE, CAPSULE, BOX))
-    taken &= (pair_ids[:, 0] > upstream.NO_CONTACT) & (pair_ids[:, 1] == upstream.NO_SENSOR)
+    others = geom_type[height_first[:, 1]]
+    touches = (types == HEIGHT_FIELD).any(-1) & (pair_ids[:, 0] > upstream.NO_CONTACT)
+    is_exact = touches & np.isin(others, (SPHERE, CAPSULE, BOX))
+    is_convex = touches & np.isin(others, convex_contacts.TYPES)
+    taken = is_exact | is_convex
     if not taken.any() or warp_model.flg_surfacevel:
         return None
     upstream.drop_contacts(warp_model, taken)
-    own = {
-        "pairs": wp.array(height_first[taken], dtype=wp.vec2i),
-        "pair_ids": wp.array(pair_ids[taken], dtype=wp.vec2i),
-    }
+    lists = [
+        {
+            "pairs": wp.array(height_first[chosen], dtype=wp.vec2i),
+            "pair_ids": wp.array(pair_ids[chosen], dtype=wp.vec2i),
+        }
+        for chosen in (is_exact, is_convex)
+    ]
+
+    # Made at the first launch, which nothing records, since it depends on the number of worlds.
+    memory: dict[str, wp.array] = {}
 
     def append(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-        collisions = filled(Collisions, own, warp_model, warp_data_E)
-        wp.launch(height_field_contacts, dim=(warp_data_E.nworld, int(taken.sum())), inputs=[collisions])
+        if is_exact.any():
+            collisions = filled(Collisions, lists[0], warp_model, warp_data_E)
+            wp.launch(
+                height_field_contacts, dim=(warp_data_E.nworld, int(is_exact.sum())), inputs=[collisions]
+            )
+        if is_convex.any():
+            if not memory:
+                memory.update(
+                    convex_contacts.memory_for(warp_model, warp_data_E, num_pairs=int(is_convex.sum()))
+                )
+            convex_contacts.append({**lists[1], **memory}, warp_model, warp_data_E)
 
     return append

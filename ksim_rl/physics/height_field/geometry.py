@@ -91,6 +91,22 @@ class Gap:
 
 
 @wp.func
+def field_of(size: wp.vec4, rows: int, columns: int, address: int) -> Field:
+    """Return a field of some rows and columns, whose size is as in a model and whose data begin at an address."""
+    field = Field()
+    field.address = address
+    field.rows = rows
+    field.columns = columns
+    field.half_x = size[0]
+    field.half_y = size[1]
+    field.top = size[2]
+    field.base = size[3]
+    field.dx = 2.0 * size[0] / float(columns - 1)
+    field.dy = 2.0 * size[1] / float(rows - 1)
+    return field
+
+
+@wp.func
 def field_point(field: Field, data: wp.array[float], row: int, column: int) -> wp.vec3:
     """Return a point of the lattice."""
     return wp.vec3(
