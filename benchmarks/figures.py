@@ -34,6 +34,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "learning": (*STEP, *LEARN, *TASK),
     "manipulation": (*STEP, *LEARN, "ksim_rl/suites"),
     "nan_names": ("ksim_rl/envs/non_finite.py", "ksim_rl/device/quick_launch.py"),
+    "narrow_phase": ("ksim_rl/physics",),
     "num_envs": (*STEP, *LEARN),
     "off_policy_update": (*LEARN, "ksim_rl/device"),
     "peer_settings": (*STEP, *LEARN, *TASK),
