@@ -20,7 +20,7 @@ from ksim_rl.trainers import Trainer, checkpoint
 from ksim_rl.trainers.checkpoint import CheckpointError
 
 FILES = (
-    "ksim_rl/runs/whole_file.py",
+    "ksim_rl/files/writing.py",
     "ksim_rl/runs/watch.py",
     "ksim_rl/trainers/checkpoint.py",
     "ksim_rl/trainers/run_folder.py",

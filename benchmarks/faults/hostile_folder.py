@@ -52,7 +52,7 @@ def _commands(output: Path) -> dict[str, list[str]]:
         "warmup": [*children.SMALLEST, *quick],
         "envs": [],
         "robot": [model],
-        "new": ["robot", model, "--output", str(output / "package")],
+        "new": ["robot", model, "--name", "robot_of_mine", "--output", str(output / "package")],
         "motion": ["csv", "motion.csv", str(output / "motion.npz"), "--robot", "humanoid"],
         "reproduce": [
             str(output.parent / "table.yaml"),

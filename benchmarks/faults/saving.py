@@ -15,7 +15,7 @@ from ksim_rl.device import state_tree
 from ksim_rl.trainers import Hook, Trainer, checkpoint
 from ksim_rl.trainers.checkpoint import MANIFEST, TENSORS, CheckpointError
 
-FILES = ("ksim_rl/trainers/checkpoint.py", "ksim_rl/trainers/trainer.py", "ksim_rl/runs/whole_file.py")
+FILES = ("ksim_rl/trainers/checkpoint.py", "ksim_rl/trainers/trainer.py", "ksim_rl/files/writing.py")
 # About as many file operations as a save makes with the deletion of an old checkpoint, so all of them are hit.
 OPERATIONS_OF_A_SAVE = 12
 

@@ -72,7 +72,7 @@ def _files(folder: Path) -> set[str]:
 
 def data_files(folder: Path) -> Figures:
     """Give motions and motor models that are pickles, pipes, devices, and longer than they may be."""
-    from ksim_rl.config.plain_data import MOST_DATA_BYTES
+    from ksim_rl.files.reading import MOST_DATA_BYTES
     from tests.cli.test_foreign_files import DATA_FILES
 
     def pipe(path: Path, _code: str) -> None:

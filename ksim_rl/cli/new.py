@@ -13,6 +13,7 @@ from rich.pretty import pretty_repr
 from ksim_rl import envs
 from ksim_rl.checks import OneLineParser
 from ksim_rl.cli.report import shown, shown_working
+from ksim_rl.files.writing import write_whole
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S, robot_name
@@ -67,7 +68,7 @@ def new(arguments: list[str]) -> int:
     }
     for file, text in texts.items():
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
-        (folder / file).write_text(text)
+        write_whole(folder / file, text)
     if is_file:
         copy_model(Path(options.model), folder / name / f"{name}.xml")
     for file in sorted(path for path in folder.rglob("*") if path.is_file()):
@@ -91,7 +92,7 @@ def copy_model(source: Path, target: Path) -> None:
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(target.parent)
     spec.compile()
-    target.write_text(spec.to_xml())
+    write_whole(target, spec.to_xml())
 
 
 def _text(name: str, words: dict[str, object], imports: str = "") -> str:

@@ -20,14 +20,12 @@ from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.build import build_evaluator, solved_at
 from ksim_rl.trainers.metrics import losses_of
 from ksim_rl.trainers.run_cfg import check_run_tree
-from ksim_rl.trainers.run_folder import policy_of
+from ksim_rl.trainers.run_folder import FOLDERS, policy_of
 from ksim_rl.trainers.sources import check_sources
 from ksim_rl.zoo import locate
 
 # What a checkpoint is of, and a resumed run cannot change.
 KEPT = ("task_name", "num_envs", "seed", "modules", "checkpoint")
-# Folders in a run folder that a run writes to.
-FOLDERS = ("checkpoint", "tensorboard", "wandb", "mlflow")
 
 
 def resume(arguments: list[str]) -> int:

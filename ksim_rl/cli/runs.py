@@ -12,6 +12,7 @@ from rich.text import Text
 
 from ksim_rl.checks import OneLineParser
 from ksim_rl.cli.report import shown
+from ksim_rl.files.writing import whole_file
 from ksim_rl.runs import comparison, listing
 
 ORDERS = {"began": "began", "return": "evaluation", "speed": "speed"}
@@ -54,7 +55,8 @@ def compare(arguments: list[str]) -> int:
             raise ValueError(f"{folder}: expected a run folder, which has a {listing.CONFIG}")
     head, *rows = comparison.figures(options.runs)
     print_table(head, rows)
-    comparison.draw(options.runs, options.output)
+    with whole_file(options.output) as temporary:
+        comparison.draw(options.runs, temporary)
     print(shown(options.output))
     return 0
 

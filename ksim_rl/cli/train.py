@@ -20,8 +20,10 @@ from ksim_rl.cli.errors import report
 from ksim_rl.cli.report import run_and_report
 from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
+from ksim_rl.config.plain_data import check_links
 from ksim_rl.runs.run_lock import is_locked
 from ksim_rl.trainers import RunCfg
+from ksim_rl.trainers.run_folder import FOLDERS
 from ksim_rl.trainers.sources import check_sources
 
 
@@ -120,7 +122,10 @@ def _train_one(config: DictConfig) -> int:
     folder = Path(launched.runtime.output_dir)
     # Where the user named the folder of a run that is under way, that run's lock says so.
     named = any(text.startswith("hydra.run.dir=") for text in launched.overrides.hydra) and is_locked(folder)
-    return run_and_report(cfg, folder if named else _unused(folder))
+    folder = folder if named else _unused(folder)
+    if folder.is_dir():
+        check_links(folder, below=FOLDERS)
+    return run_and_report(cfg, folder)
 
 
 def _unused(folder: Path) -> Path:

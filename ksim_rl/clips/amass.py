@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ksim_rl.clips.recording import Array, Recording, chain, from_rotation_vector, refused
-from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
+from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 
 HEIGHT = 1.70
 """m."""

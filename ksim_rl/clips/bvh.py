@@ -8,7 +8,7 @@ import numpy as np
 
 from ksim_rl.checks import near
 from ksim_rl.clips.recording import Array, Recording, chain, from_rotation_vector, multiply, refused
-from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
+from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 # Turns (x, y, z) with y up and z ahead into (x ahead, y left, z up): z, x, y.

@@ -7,6 +7,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ksim_rl.files.writing import write_whole
+
 Array = np.ndarray
 
 
@@ -49,4 +51,4 @@ def motion_bytes(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: fl
 
 def write_motion(path: Path, mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float) -> None:
     """Write a motion of the model, whose scene may hold other things without joints, at `fps` frames per second."""
-    path.write_bytes(motion_bytes(mj_model, qpos_FL, fps))
+    write_whole(path, motion_bytes(mj_model, qpos_FL, fps))

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ksim_rl.checks import near
 from ksim_rl.clips.recording import between, refused, slerp
-from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
+from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 from ksim_rl.scene.names import scalar_joint_ids
 
 Array = np.ndarray

@@ -1,44 +1,18 @@
 """This module reads files that a stranger may have written as plain data: nothing in them executes or leads on."""
 
 import os
-import stat
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-MOST_YAML_BYTES, MOST_DATA_BYTES, MOST_DEPTH = 4 * 2**20, 2**30, 50
+from ksim_rl.files.reading import read_bytes
+from ksim_rl.files.writing import check_own
 
-
-def open_regular(path: Path, *, limit: int, follows_links: bool = False) -> BinaryIO:
-    """Open a regular file of at most `limit` bytes, and refuse pipes, devices and, unless it follows them, links."""
-    link = 0 if follows_links else os.O_NOFOLLOW
-    try:
-        file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | link), "rb")
-    except FileNotFoundError as error:
-        raise ValueError(f"{path}: missing: {error.strerror}") from error
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-    about = os.fstat(file.fileno())
-    if not stat.S_ISREG(about.st_mode):
-        file.close()
-        raise ValueError(f"{path}: cannot be read: it is no regular file")
-    if about.st_size > limit:
-        file.close()
-        raise ValueError(f"{path}: damaged: longer than the {limit} bytes it may have")
-    return file
-
-
-def read_bytes(path: Path, *, limit: int, follows_links: bool = False) -> bytes:
-    """Read a file that `open_regular` opens."""
-    with open_regular(path, limit=limit, follows_links=follows_links) as file:
-        try:
-            return file.read(os.fstat(file.fileno()).st_size)  # Python takes memory for all that is asked for
-        except OSError as error:
-            raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+MOST_YAML_BYTES, MOST_DEPTH = 4 * 2**20, 50
 
 
 def read_yaml(path: Path) -> Any:
@@ -93,7 +67,10 @@ def flat(tree: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def check_links(folder: Path, *, below: Sequence[str]) -> None:
-    """Refuse a folder in which a link, at its top or in the folders `below`, leads out: a run writes there."""
+    """Refuse a folder in which something, at its top or in the folders `below`, leads out: a run writes there.
+
+    That are links to other folders, files with other names (hard links), pipes and devices.
+    """
     inside = folder.resolve()
     walked = (
         os.path.join(root, name)
@@ -106,3 +83,5 @@ def check_links(folder: Path, *, below: Sequence[str]) -> None:
             raise ValueError(
                 f"{path}: a link that leads out of the run folder, and a run writes only into its own"
             )
+        if not path.is_symlink() and not path.is_dir():
+            check_own(path)

@@ -12,6 +12,7 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl.data.dataset_storage import MASK_KEY
 from ksim_rl.device import random
+from ksim_rl.files.writing import write_whole
 
 _STREAM = random.stream_id("data.epoch_sampler")
 
@@ -134,7 +135,7 @@ class EpochSampler(Sampler):
         """Write the state as JSON into the folder `path`."""
         folder = Path(path)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "epoch_sampler.json").write_text(json.dumps(self.state_dict()))
+        write_whole(folder / "epoch_sampler.json", json.dumps(self.state_dict()))
 
     def loads(self, path: str | Path) -> None:
         """Read what `dumps` wrote."""

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from subprocess import TimeoutExpired
@@ -100,7 +101,7 @@ def _look_at_caches(report: Report) -> bool:
     for name, variable, folder in _caches(warp_starts=wrong is None):
         refusal = _refusal(folder)
         if refusal is None:
-            size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+            size = _bytes_in(folder)
             report.say(f"cache of {name}", f"{folder}, {size / 1e6:,.0f} MB, writable")
         else:
             change = f"make it writable, or set {variable} to a folder that is"
@@ -120,6 +121,14 @@ def _caches(*, warp_starts: bool) -> Iterator[tuple[str, str, Path]]:
     if torch.cuda.is_available():
         default = Path(os.path.expanduser("~")) / ".triton" / "cache"
         yield "Triton", "TRITON_CACHE_DIR", Path(os.environ.get("TRITON_CACHE_DIR") or default)
+
+
+def _bytes_in(folder: Path) -> int:
+    total = 0
+    for path in folder.rglob("*"):
+        with suppress(OSError):  # another process compiles, and moves what it has made
+            total += path.stat().st_size if path.is_file() else 0
+    return total
 
 
 def _refusal(folder: Path) -> str | None:

@@ -16,6 +16,7 @@ from ksim_rl.export import controls, policy
 from ksim_rl.export.describe import NotDescribedError, describe, joint_names
 from ksim_rl.export.record import Recording
 from ksim_rl.export.robot import write_robot
+from ksim_rl.files.writing import check_folder, check_own, whole_folder
 from ksim_rl.physics import prepare_spec
 from ksim_rl.runs import record
 from ksim_rl.scene.scene import build_spec
@@ -26,6 +27,16 @@ from ksim_rl.trainers.run_folder import Policy, policy_of
 
 STANDALONE = Path(__file__).parent / "standalone"
 TRACED, TRACED_STEPS = 4, 60
+FILES = (
+    "policy.onnx",
+    "policy.pt2",
+    "robot.xml",
+    "export.json",
+    "runner.py",
+    "README.md",
+    "episodes.npz",
+    "trace.npz",
+)
 EXTRA = ("onnx", "onnxruntime", "onnxscript")
 README = """# {task}, iteration {iteration}
 
@@ -51,10 +62,15 @@ def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **opti
     if sessions:
         commit = sessions[-1].code.get("ksim_rl", {}).get("commit")
         options["trained_with"] = {"commit": commit, "versions": dict(sessions[-1].versions)}
+    below = run_folder if folder is None else folder
     folder = run_folder / "export" if folder is None else folder
+    check_folder(folder, below=below)
+    for name in FILES:  # before minutes of work
+        check_own(folder / name)
     return export_policy(
         policy_of(saved, device=device),
         folder,
+        below=below,
         run_path=str(saved.path.absolute().relative_to(saved.run_folder.parent)),
         **options,
     )
@@ -64,6 +80,7 @@ def export_policy(
     trained: Policy,
     folder: Path,
     *,
+    below: Path | None = None,
     run_path: str = "",
     trained_with: Mapping[str, Any] | None = None,
     episodes: int = 100,
@@ -74,14 +91,41 @@ def export_policy(
     """Write a policy into a folder, and return it; `trained_with` holds commit and versions.
 
     `episodes` are recorded from `seed` for `sim2sim` to compare with, with or without `noise` of the sensors; 0 leaves
-    them out. Raises ValueError where the policy or an observation term cannot be written down, naming it and what to
-    do, or the files differ from the policy.
+    them out. The files appear at the end, all or none; links are refused in their places, and in folders from `below`
+    on, by default `folder`. Raises ValueError where the policy or an observation term cannot be written down, naming
+    it and what to do, or the files differ from the policy.
     """
     if episodes < 0:
         raise ValueError(f"--episodes {episodes}: expected 0 or more")
     missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
     if missing:
         raise ValueError(f"no package {missing[0]!r}: pip install 'ksim_rl[export]'")
+    with whole_folder(folder, below=folder if below is None else below) as unfinished:
+        _fill(
+            trained,
+            unfinished,
+            run_path=run_path,
+            trained_with=trained_with or {},
+            episodes=episodes,
+            seed=seed,
+            noise=noise,
+            note=note,
+        )
+    return folder
+
+
+def _fill(
+    trained: Policy,
+    folder: Path,
+    *,
+    run_path: str,
+    trained_with: Mapping[str, Any],
+    episodes: int,
+    seed: int | None,
+    noise: bool,
+    note: Callable[[str], None],
+) -> None:
+    """Write the files of an export into a folder that is empty."""
     cfg = dataclasses.replace(trained.cfg, task=dataclasses.replace(trained.cfg.task, curriculum={}))
     seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
     env = build_env(cfg, num_envs=max(episodes, TRACED), seed=seed)
@@ -103,12 +147,10 @@ def export_policy(
         for group in groups
     }
     exported = policy.ExportedPolicy(trained.actor.cpu().eval(), columns)
-    folder.mkdir(parents=True, exist_ok=True)
     note("writing policy.onnx and policy.pt2")
     policy.write(exported, folder)
     difference = policy.greatest_difference(exported, folder / "policy.onnx")
     if not difference <= policy.TOLERANCE:
-        (folder / "policy.onnx").unlink()
         raise ValueError(
             f"policy.onnx differs from the policy by {difference:.2g}: expected at most {policy.TOLERANCE:g}; weights "
             "or observations that large lose digits in float32"
@@ -125,7 +167,7 @@ def export_policy(
     own = {"inputs": exported.input_names, "outputs": exported.output_names, "states": states}
     own |= {"num_actions": ours.action_manager.size, "obs_dim": exported.obs_dim, "difference": difference}
     meta |= {"policy": own, "task": cfg.task_name, "iteration": trained.iteration, "run_path": run_path}
-    meta |= {"commit": None, "versions": {}, **(trained_with or {})}
+    meta |= {"commit": None, "versions": {}, **trained_with}
     meta |= {"seed": seed, "ours": None, "noisy": noise}
     env.train(noise)
     if episodes:
@@ -153,7 +195,6 @@ def export_policy(
             checked=policy.CHECKED,
         )
     )
-    return folder
 
 
 def runner_source() -> str:

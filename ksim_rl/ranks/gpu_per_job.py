@@ -4,14 +4,16 @@ import fcntl
 import itertools
 import os
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-_taken: list[int] = []  # open, and so locked, until the process ends
+from ksim_rl.files.writing import open_own
+
+_taken: list[IO[str]] = []  # open, and so locked, until the process ends
 
 
 class GpuPerJob(Callback):
@@ -35,11 +37,11 @@ def take_gpu(sweep: Path) -> None:
     visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(count)))
     sweep.mkdir(parents=True, exist_ok=True)
     for slot in itertools.count():
-        file = os.open(sweep / f".gpu-{slot}", os.O_CREAT | os.O_RDWR)
+        file = open_own(sweep / f".gpu-{slot}")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            os.close(file)
+            file.close()
             continue
         _taken.append(file)
         os.environ["CUDA_VISIBLE_DEVICES"] = visible.split(",")[slot % count]

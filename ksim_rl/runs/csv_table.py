@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from ksim_rl.config.plain_data import MOST_DATA_BYTES, open_regular
-from ksim_rl.runs.whole_file import whole_file
+from ksim_rl.files.reading import MOST_DATA_BYTES, open_regular
+from ksim_rl.files.writing import check_own, whole_file
 
 STEP = "env_states"
 T = TypeVar("T")
@@ -25,6 +25,7 @@ class CsvTable:
     def __init__(self, path: Path) -> None:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
+        check_own(path)  # rows are appended in place
         with _opened(path) as (self._columns, _):
             pass
         # The last row, and those before it that could not be written yet.

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from ksim_rl.config.plain_data import MOST_YAML_BYTES, read_bytes
+from ksim_rl.config.plain_data import MOST_YAML_BYTES
+from ksim_rl.files.reading import read_bytes
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import STEP, read_table
 

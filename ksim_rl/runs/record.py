@@ -23,8 +23,9 @@ import torch
 from ksim_rl.checked import Checked
 from ksim_rl.config import plain_data, plugins
 from ksim_rl.config.child_processes import ask_git
+from ksim_rl.files.reading import read_bytes
+from ksim_rl.files.writing import write_whole
 from ksim_rl.runs.run_lock import is_locked
-from ksim_rl.runs.whole_file import write_whole
 
 RECORD = "run.json"
 Status = Literal["running", "done", "interrupted", "failed"]
@@ -100,7 +101,7 @@ def read(folder: Path) -> list[Session]:
     if not os.path.lexists(path):
         return []
     try:
-        entries = json.loads(plain_data.read_bytes(path, limit=plain_data.MOST_YAML_BYTES))["sessions"]
+        entries = json.loads(read_bytes(path, limit=plain_data.MOST_YAML_BYTES))["sessions"]
         sessions = [Session(**_text(entry)) for entry in entries[:MOST_SESSIONS]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path}: no record of a run: {printable(str(error))}") from error
@@ -156,8 +157,7 @@ def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
         if changes := ask_git(top, "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD"):
             kept = f"{name}.diff" if session == 1 else f"{name}.{session}.diff"
             if len(changes) <= MOST_DIFF_BYTES:
-                (folder / kept).unlink(missing_ok=True)
-                (folder / kept).write_bytes(changes)
+                write_whole(folder / kept, changes)
             found[name]["changed"] = kept if len(changes) <= MOST_DIFF_BYTES else "too much to keep"
         if new := ask_git(top, "ls-files", "--others", "--exclude-standard", "--exclude=__pycache__"):
             found[name]["not in git"] = ", ".join(new.decode(errors="replace").splitlines()[:20])

@@ -11,7 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+from ksim_rl.files.reading import open_regular
+from ksim_rl.files.writing import open_own
 
 LOCK, MOST_LETTERS = ".lock", 1000
 # What some file systems of clusters answer.
@@ -52,15 +55,15 @@ def locked(folder: Path, *, note: Callable[[str], None]) -> Iterator[None]:
 def is_locked(folder: Path) -> bool:
     """Whether a living process writes a run folder."""
     try:
-        with open(folder / LOCK) as file:
+        with open_regular(folder / LOCK, limit=MOST_LETTERS) as file:
             return not _try_lock(file)
-    except OSError:  # there is none, or there can be none
+    except (ValueError, OSError):  # there is none, it is none of ours, or there can be none
         return False
 
 
 def _take(folder: Path) -> IO[str]:
     for attempt in itertools.count():
-        file = os.fdopen(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644), "r+")
+        file = open_own(folder / LOCK)
         try:
             if _try_lock(file):
                 with suppress(FileNotFoundError):  # whoever had it may have removed it meanwhile
@@ -77,7 +80,7 @@ def _take(folder: Path) -> IO[str]:
     raise AssertionError
 
 
-def _try_lock(file: IO[str]) -> bool:
+def _try_lock(file: IO[Any]) -> bool:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -20,10 +20,10 @@ from ksim_rl.config import plugins
 from ksim_rl.config.child_processes import go_to_parents_folder
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.envs.contract import EpisodeSums, part
+from ksim_rl.files.writing import write_whole
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.runs.listing import METRICS
-from ksim_rl.runs.whole_file import write_whole
 from ksim_rl.tables.levels import HELD_STATES, means_of, reached
 from ksim_rl.tables.table import Row, load
 from ksim_rl.tracking.trials import run_trials

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ksim_rl.runs.whole_file import write_whole
+from ksim_rl.files.writing import whole_file, write_whole
 from ksim_rl.tables.levels import is_reached, value_of
 from ksim_rl.tables.table import Row, Table
 
@@ -72,7 +72,8 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
     if rows:
         from ksim_rl.tables import picture  # Matplotlib takes half a second to import
 
-        picture.draw(table, rows, path.with_suffix(".png"))
+        with whole_file(path.with_suffix(".png")) as temporary:
+            picture.draw(table, rows, temporary)
     return path
 
 

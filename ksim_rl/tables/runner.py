@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from ksim_rl.config.child_processes import start_python
+from ksim_rl.files.writing import open_own
 from ksim_rl.tables.measure import run_cfg, settings
 from ksim_rl.tables.table import Table
 
@@ -86,7 +87,8 @@ class Runs:
         log.parent.mkdir(parents=True, exist_ok=True)
         result.unlink(missing_ok=True)
         environment = {"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}
-        with log.open("wb") as file:
+        with open_own(log) as file:
+            file.truncate()
             return start_python(command, environment=environment, stdout=file, stderr=STDOUT)
 
     def _log(self, job: Job) -> Path:

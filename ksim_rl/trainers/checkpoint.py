@@ -21,9 +21,9 @@ import safetensors.torch
 from safetensors import SafetensorError
 
 from ksim_rl import ranks
-from ksim_rl.config import plain_data
 from ksim_rl.device import state_tree
-from ksim_rl.runs.whole_file import WRITING
+from ksim_rl.files.reading import read_bytes
+from ksim_rl.files.writing import WRITING
 from ksim_rl.trainers import checkpoint_formats
 
 MANIFEST, TENSORS = "manifest.json", "tensors.safetensors"
@@ -249,7 +249,7 @@ def _has(tree: Any, **kinds: type) -> bool:
 
 def _read_regular_file(path: Path, *, limit: int) -> bytes:
     try:
-        return plain_data.read_bytes(path, limit=limit)
+        return read_bytes(path, limit=limit)
     except ValueError as error:
         raise CheckpointError(str(error)) from error
 

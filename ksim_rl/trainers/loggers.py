@@ -15,6 +15,8 @@ from torchrl.record.loggers.wandb import WandbLogger
 
 from ksim_rl.checked import Checked, Name
 from ksim_rl.config import plain_data
+from ksim_rl.files.reading import read_bytes
+from ksim_rl.files.writing import make_folder, write_whole
 from ksim_rl.runs.csv_table import CsvTable
 from ksim_rl.runs.listing import METRICS
 
@@ -47,8 +49,8 @@ def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> Me
     """Begin the run with the config of a training run, or continue that of a resumed one."""
     path = run_folder / "wandb" / "run_id"
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(uuid.uuid4().hex)
+        make_folder(path.parent, below=run_folder)
+        write_whole(path, uuid.uuid4().hex)
     logger = WandbLogger(
         cfg.name or run_folder.name,
         save_dir=run_folder,
@@ -66,7 +68,7 @@ def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> Me
 def kept_id(run_folder: Path, logger: str = "wandb") -> str:
     """Return the id that a run folder keeps of its run elsewhere, which becomes part of paths and addresses."""
     path = run_folder / logger / "run_id"
-    text = plain_data.read_bytes(path, limit=100).decode(errors="replace")
+    text = read_bytes(path, limit=100).decode(errors="replace")
     if not re.fullmatch(r"[\w-]+", text, re.ASCII):
         raise ValueError(f"{path}: {text!r} is not the id of a run: letters, digits, _ and -")
     return text
@@ -100,7 +102,7 @@ def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> 
     import mlflow  # pyright: ignore[reportMissingImports]
 
     folder = run_folder / "mlflow"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, below=run_folder)
     path = folder / "run_id"
     resumes = path.exists()
     if resumes:
@@ -111,7 +113,7 @@ def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> 
     artifacts = (folder / "artifacts").resolve().as_uri() if uri == own else None
     logger = _Run(cfg.experiment, uri, artifact_location=artifacts)
     if not resumes:
-        path.write_text(logger.experiment.info.run_id)
+        write_whole(path, logger.experiment.info.run_id)
         mlflow.set_tag("mlflow.runName", cfg.name or run_folder.name)
         params = [(name, str(value)[:_MAX_LETTERS]) for name, value in plain_data.flat(config)]
         for first in range(0, len(params), _MAX_PARAMS):

@@ -17,11 +17,11 @@ from ksim_rl.config.plugins import load as load_plugins
 from ksim_rl.device import state_tree
 from ksim_rl.device.memory import memory_for
 from ksim_rl.envs.contract import EpisodeClock, part
+from ksim_rl.files.writing import whole_file, write_whole
 from ksim_rl.runs.listing import CONFIG, METRICS
 from ksim_rl.runs.record import recorded
 from ksim_rl.runs.run_lock import locked
 from ksim_rl.runs.watch import threads_that_fail, watch
-from ksim_rl.runs.whole_file import whole_file, write_whole
 from ksim_rl.trainers import checkpoint, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
@@ -32,6 +32,8 @@ from ksim_rl.trainers.trainer import Hook, Trainer
 from ksim_rl.trainers.trial import first_that_fits
 from ksim_rl.transforms import observation_columns
 
+# Folders in a run folder that a run writes to.
+FOLDERS = ("checkpoint", "tensorboard", "wandb", "mlflow")
 EVALUATION, CURVES, VIDEO = "evaluation.json", "curves.png", "video.mp4"
 
 

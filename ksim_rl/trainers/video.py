@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl.envs.contract import Pictures, part
-from ksim_rl.runs.whole_file import whole_file
+from ksim_rl.files.writing import whole_file
 from ksim_rl.trainers.interrupt import InterruptRequest
 
 # Pictures per second of simulated time. Software takes 50 to 90 ms for each, many times what a step of one env takes.

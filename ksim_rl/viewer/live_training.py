@@ -20,7 +20,7 @@ import torch
 from ksim_rl.config import plugins
 from ksim_rl.config.child_processes import go_to_parents_folder, start_python
 from ksim_rl.device import state_tree
-from ksim_rl.runs.whole_file import whole_file
+from ksim_rl.files.writing import whole_file, write_whole
 from ksim_rl.trainers import Hook, RunCfg, Trainer
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build_env
@@ -68,7 +68,7 @@ def watched(cfg: RunCfg, note: Callable[[str], None]) -> Iterator[list[Hook]]:
     check_viser()
     with tempfile.TemporaryDirectory(prefix="ksim_rl_viewer_") as name:
         folder = Path(name)
-        (folder / CONFIG).write_text(json.dumps(cfg.to_tree()))
+        write_whole(folder / CONFIG, json.dumps(cfg.to_tree()))
         hook = GiveWeights(folder)
         child = start_python(
             ["-m", "ksim_rl.viewer.live_training", name],

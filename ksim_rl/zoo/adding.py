@@ -4,11 +4,11 @@ import json
 import math
 import re
 import shutil
-import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from ksim_rl.export import export, sim2sim
+from ksim_rl.files.writing import unfinished_folder
 from ksim_rl.runs import listing, record
 from ksim_rl.runs.csv_table import STEP
 from ksim_rl.trainers import checkpoint
@@ -33,8 +33,8 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
     check_run_tree(saved.config, saved.path)
     card = _of_run(saved, name=name)
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder) as temporary:
-        entry, exported = Path(temporary) / name, Path(temporary) / "export"
+    with unfinished_folder(folder) as temporary:
+        entry, exported = temporary / name, temporary / "export"
         actor = dict(saved.state["update"]["actor"])
         actor |= {key: x.half() for key, x in actor.items() if x.is_floating_point() and x.ndim > 1}
         state = {"observation_columns": saved.state["observation_columns"], "update": {"actor": actor}}

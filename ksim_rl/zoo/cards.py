@@ -13,7 +13,7 @@ from typing import Any
 
 from ksim_rl.checked import Checked, WholeNumber
 from ksim_rl.checks import near
-from ksim_rl.config import plain_data
+from ksim_rl.files.reading import read_bytes
 from ksim_rl.runs import record
 
 FOLDER = Path(__file__).parent / "policies"
@@ -57,7 +57,7 @@ def read_card(name: str, folder: Path = FOLDER) -> Card:
         raise ValueError(f"zoo:{name}: no such policy: {near(name, known)}")
     path = folder / name / CARD
     try:
-        tree = json.loads(plain_data.read_bytes(path, limit=MOST_BYTES))
+        tree = json.loads(read_bytes(path, limit=MOST_BYTES))
         plain: Any = {key: record.printable(v) if isinstance(v, str) else v for key, v in tree.items()}
         card = Card(**plain)
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
@@ -70,6 +70,6 @@ def read_card(name: str, folder: Path = FOLDER) -> Card:
 def hashes(entry: Path) -> dict[str, str]:
     """Return the SHA-256 of each file but the card; a ValueError refuses links and large files."""
     paths = [path for path in sorted(entry.rglob("*")) if path.is_symlink() or not path.is_dir()]
-    files = {str(path.relative_to(entry)): plain_data.read_bytes(path, limit=MOST_BYTES) for path in paths}
+    files = {str(path.relative_to(entry)): read_bytes(path, limit=MOST_BYTES) for path in paths}
     files.pop(CARD, None)
     return {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from ksim_rl.files.writing import check_folder, whole_folder
 from ksim_rl.zoo import wandb_runs
 from ksim_rl.zoo.cards import CHECKPOINT, FOLDER, read_card
 
@@ -20,7 +21,10 @@ def locate(text: str | Path, *, note: Callable[[str], None] = print) -> Path:
         return wandb_runs.download(name, Path("runs/wandb"), note=note)
     card = read_card(name, FOLDER)
     copy = Path("runs/zoo") / name
+    runs = Path("runs")  # which may be a link of the user's, to a larger disk
+    check_folder(copy / CHECKPOINT, below=runs)
     shutil.rmtree(copy / CHECKPOINT, ignore_errors=True)
-    shutil.copytree(FOLDER / name, copy, dirs_exist_ok=True)
+    with whole_folder(copy, below=runs) as unfinished:
+        shutil.copytree(FOLDER / name, unfinished, dirs_exist_ok=True)
     note(f"{text}: {card.task}, {card.env_states:,} env states; copied to {copy}")
     return copy

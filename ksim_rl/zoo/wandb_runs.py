@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ksim_rl.config import plain_data
 from ksim_rl.export import export
+from ksim_rl.files.writing import make_folder
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.loggers import LoggerCfg, WandbCfg, check_installed, kept_id
 
@@ -67,6 +68,8 @@ def download(address: str, folder: Path, *, note: Callable[[str], None]) -> Path
         if not FILES.fullmatch(name):
             raise ValueError(f"wandb:{address}: {name!r} is no file of a run")
     target = folder / address.replace("/", "_")
+    make_folder(target, below=folder)
+    plain_data.check_links(target, below=("checkpoint",))
     found[-1].download(root=str(target))
     plain_data.check_links(target, below=("checkpoint",))
     note(f"wandb:{address}: copied to {target}")

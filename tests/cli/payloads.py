@@ -1,5 +1,6 @@
 """Families of payloads in run folders of strangers: what writes each one, and what removes the check that stops it."""
 
+import contextlib
 import copy
 import hashlib
 import io
@@ -20,6 +21,7 @@ from omegaconf import OmegaConf
 from ksim_rl import conf
 from ksim_rl.cli import main, run_commands
 from ksim_rl.config import plain_data, plugins
+from ksim_rl.export import folder as export_folder
 from ksim_rl.scene.actuators import nets
 from ksim_rl.trainers import checkpoint, run_cfg
 
@@ -370,6 +372,41 @@ def link_for_the_folder_of_checkpoints(place):
     (place.run / "checkpoint").symlink_to(place.outside / "checkpoint")
     (place.run / "config.yaml").symlink_to(place.outside / "written")
     return ["resume", str(place.run)]
+
+
+# -- exports ----------------------------------------------------------------------------------------------------------
+
+
+def written_where_it_is(monkeypatch):
+    @contextlib.contextmanager
+    def as_it_is(path, below):
+        path.mkdir(exist_ok=True)
+        yield path
+
+    def fill(trained, path, **_):
+        for name in ("README.md", "written"):
+            (path / name).write_text("x")
+
+    for name in ("check_folder", "check_own"):
+        monkeypatch.setattr(export_folder, name, lambda *_, **__: None)
+    monkeypatch.setattr(export_folder, "whole_folder", as_it_is)
+    monkeypatch.setattr(export_folder, "policy_of", lambda *_, **__: None)
+    monkeypatch.setattr(export_folder, "_fill", fill)
+
+
+@family(written_where_it_is)
+def link_for_the_folder_of_an_export(place):
+    place.write_checkpoint()
+    (place.run / "export").symlink_to(place.outside)
+    return ["export", str(place.run)]
+
+
+@family(written_where_it_is)
+def link_for_a_file_of_an_export(place):
+    place.write_checkpoint()
+    (place.run / "export").mkdir()
+    (place.run / "export" / "README.md").symlink_to(place.outside / "written")
+    return ["export", str(place.run)]
 
 
 # -- what is done and seen ---------------------------------------------------------------------------------------------

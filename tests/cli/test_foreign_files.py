@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from ksim_rl.config import class_paths, plain_data
+from ksim_rl.config import class_paths
+from ksim_rl.files import reading
 from ksim_rl.scene.actuators import nets
 from ksim_rl.scene.motions import motion
 from ksim_rl.trainers import loggers, run_folder
@@ -60,7 +61,7 @@ def test_data_files_are_files_of_a_size(kind, special, place, monkeypatch):
         path.symlink_to("/dev/zero")
     else:
         with open(path, "wb") as file:
-            file.truncate(plain_data.MOST_DATA_BYTES + 1)
+            file.truncate(reading.MOST_DATA_BYTES + 1)
     with pytest.raises(ValueError, match="no regular file|longer than"):
         DATA_FILES[kind][1](path)
 
@@ -104,6 +105,23 @@ def test_a_folder_of_ones_own_is_trusted_where_the_user_says_so(place):
     assert call(["resume", str(place.run)]) == 2
     assert call(["resume", str(place.run), "--trust"]) == 0
     assert (place.run / "nan").is_dir()
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", ".lock", "tensorboard/events", "checkpoint/file"])
+@pytest.mark.parametrize("kind", ["hard link", "pipe"])
+def test_a_run_goes_on_only_among_files_of_its_own(place, name, kind, capsys):
+    place.write_checkpoint()
+    path, precious = place.run / name, place.outside / "precious"
+    path.parent.mkdir(exist_ok=True)
+    precious.write_text("precious")
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.hardlink_to(precious)
+    assert call(["resume", str(place.run)]) == 2
+    assert "only files of this folder alone are written" in capsys.readouterr().err
+    path.unlink()
+    assert call(["resume", str(place.run)]) == 0
 
 
 def test_policies_are_loaded_without_a_folder_for_failures(place, monkeypatch):

@@ -150,3 +150,21 @@ def test_where_there_are_no_locks_a_run_says_so_and_goes_on(tmp_path, notes, mon
     monkeypatch.setattr(fcntl, "flock", refuse)
     with locked(tmp_path, note=notes.append):
         assert len(notes) == 1 and "cannot be locked" in notes[0]
+
+
+@pytest.mark.parametrize("kind", ["link", "hard link", "pipe"])
+def test_what_leads_elsewhere_is_no_lock(tmp_path, notes, kind):
+    run, precious = tmp_path / "run", tmp_path / "precious"
+    run.mkdir()
+    precious.write_text("precious")
+    if kind == "pipe":
+        os.mkfifo(run / LOCK)
+    elif kind == "link":
+        (run / LOCK).symlink_to(precious)
+    else:
+        (run / LOCK).hardlink_to(precious)
+    assert not is_locked(run)
+    refused = pytest.raises(ValueError, match=r"run/\.lock: .*only files of this folder alone are written")
+    with refused, locked(run, note=notes.append):
+        pass
+    assert precious.read_text() == "precious"

@@ -6,8 +6,8 @@ import threading
 
 import pytest
 
+from ksim_rl.files.writing import whole_file
 from ksim_rl.runs import watch
-from ksim_rl.runs.whole_file import whole_file
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from ksim_rl.checked import Checked, Count, Filled
+from ksim_rl.files.writing import whole_file
 from ksim_rl.physics.fields import GRAVITY
 from ksim_rl.physics.model_checks import model_bytes
 from ksim_rl.physics.upstream import per_world_fields
@@ -214,12 +215,10 @@ def write(path: Path, failure: Failure) -> None:
     about = {"format": FORMAT, "mujoco": mujoco.__version__}
     about |= {"world": failure.world, "substep": failure.substep, "sha256": _sha256(tensors)}
     data = safetensors.numpy.save(tensors, metadata={"about": json.dumps(about)})
-    part = path.with_name(f".{path.name}.part")
-    with open(part, "wb") as file:
+    with whole_file(path) as temporary, open(temporary, "wb") as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(part, path)
 
 
 def read(path: Path) -> Failure:

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from ksim_rl.checked import Filled, WholeNumber, check_value
 from ksim_rl.checks import check_choice, check_in_range, near
-from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
+from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 from ksim_rl.scene.actuators.actuator import Drive, ExplicitActuator, Law, SubstepRing
 from ksim_rl.scene.state.joint_targets import JointState, JointTarget
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from ksim_rl.checks import near
-from ksim_rl.config.plain_data import MOST_DATA_BYTES, read_bytes
+from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 from ksim_rl.scene.names import Index, scalar_joint_ids
 
 KEYS = ("fps", "qpos", "qvel")

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.pretty import pretty_repr
 from rich.table import Table
 
+from ksim_rl.files.writing import whole_file
 from ksim_rl.physics import load_model, load_spec
 from ksim_rl.physics.capacity import probe
 from ksim_rl.physics.load import Source
@@ -145,7 +146,9 @@ TASK = velocity.VelocityTask.for_robot({name})
         camera.azimuth, camera.elevation = 130.0, -15.0
         with mujoco.Renderer(mj_model, 480, 640) as renderer:
             renderer.update_scene(posed(mj_model, mj_model.key_qpos[0]), camera, visible_groups(mj_model))
-            Image.fromarray(renderer.render()).save(file)
+            picture = Image.fromarray(renderer.render())
+        with whole_file(file) as temporary:
+            picture.save(temporary)
 
 
 def analyse(source: Source) -> RobotAnalysis:

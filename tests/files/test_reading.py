@@ -4,7 +4,7 @@ import tracemalloc
 
 import pytest
 
-from ksim_rl.config.plain_data import read_bytes
+from ksim_rl.files.reading import read_bytes
 
 
 def test_memory_is_taken_for_the_file_and_not_for_the_limit(tmp_path):

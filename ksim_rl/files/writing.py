@@ -1,0 +1,158 @@
+"""This module writes every file that a command leaves: whole or not at all, and never through links.
+
+A folder may come from a stranger, with links in the place of files: `RUN/export/README.md` may be the user's `.bashrc`.
+So a link, a file that has other names (hard links) and what is no file are refused by name. A file appears under its
+own name once it is whole.
+"""
+
+import fcntl
+import os
+import secrets
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+# What a name begins with until its file is whole; who writes there next deletes what a crash left.
+WRITING = ".writing-"
+
+
+def check_own(path: Path) -> None:
+    """Refuse a path at which something lies that is more than a file of this folder alone."""
+    with suppress(FileNotFoundError):
+        _check_status(path, os.lstat(path))
+
+
+def check_folder(folder: Path, *, below: Path) -> None:
+    """Refuse a folder of a user's folder `below` that is reached by a link; `below` itself may be one."""
+    reached = below
+    for name in folder.relative_to(below).parts:
+        reached /= name
+        if reached.is_symlink():
+            raise ValueError(
+                f"{reached}: a link, and nothing is written through links: delete it, or name another folder"
+            )
+
+
+def make_folder(folder: Path, *, below: Path) -> None:
+    """Make a folder of a user's folder `below`, which `check_folder` passes."""
+    check_folder(folder, below=below)
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a path to write to, which becomes `path` at the end; where writing fails, `path` stays as it was.
+
+    A ValueError refuses a `path` that leads elsewhere, see `check_own`.
+    """
+    check_own(path)
+    temporary = path.with_name(f"{WRITING}{secrets.token_hex(4)}-{path.name}")  # another writer has another
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a text or bytes into a file that appears once it is whole."""
+    data = content.encode() if isinstance(content, str) else content
+    with whole_file(path) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextmanager
+def whole_folder(folder: Path, *, below: Path) -> Iterator[Path]:
+    """Give an empty folder to fill, whose files become those of `folder` at the end; others stay there.
+
+    Where filling it fails, nothing of `folder` has changed, and it is not there if it was not. A ValueError refuses
+    links, in the folders from `below` on and in the place of the files.
+    """
+    make_folder(folder, below=below)
+    try:
+        with unfinished_folder(folder) as temporary:
+            yield temporary
+            files = [path for path in sorted(temporary.rglob("*")) if path.is_file()]
+            targets = [folder / path.relative_to(temporary) for path in files]
+            for target in targets:
+                check_folder(target.parent, below=below)
+                check_own(target)
+            for path, target in zip(files, targets, strict=True):
+                make_folder(target.parent, below=below)
+                os.replace(path, target)
+    finally:
+        with suppress(OSError):
+            folder.rmdir()  # only where nothing is in it
+
+
+@contextmanager
+def unfinished_folder(folder: Path) -> Iterator[Path]:
+    """Give a new folder in `folder`, which is deleted at the end, and after a kill by who comes here next."""
+    _remove_abandoned(folder)
+    temporary = folder / f"{WRITING}{secrets.token_hex(4)}"
+    temporary.mkdir()
+    try:
+        with _held(temporary):
+            yield temporary
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def open_own(path: Path) -> IO[str]:
+    """Open a file to read and write, which is made where there is none, and is refused as `check_own` refuses it."""
+    try:
+        number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+    except OSError:
+        check_own(path)  # which names a link
+        raise
+    try:
+        _check_status(path, os.fstat(number))
+        return os.fdopen(number, "r+")
+    except BaseException:
+        os.close(number)
+        raise
+
+
+def _check_status(path: Path, about: os.stat_result) -> None:
+    if stat.S_ISLNK(about.st_mode):
+        what = "a link"
+    elif not stat.S_ISREG(about.st_mode):
+        what = "no regular file"
+    elif about.st_nlink > 1:
+        what = f"a file with {about.st_nlink} names (hard links)"
+    else:
+        return
+    raise ValueError(
+        f"{path}: {what}, and only files of this folder alone are written: delete it, or choose another"
+    )
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder that is being filled, so that others see that its process lives."""
+    number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        with suppress(OSError):  # some file systems have no locks
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(number)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Delete what processes left here that were killed while they filled a folder."""
+    for entry in folder.glob(f"{WRITING}*"):
+        if entry.is_symlink() or not entry.is_dir():
+            continue
+        with suppress(OSError):
+            number = os.open(entry, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(entry, ignore_errors=True)
+            finally:
+                os.close(number)
