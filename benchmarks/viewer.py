@@ -10,11 +10,13 @@ that of the blocks without. The messages and bytes that it read are there too: a
 
 from __future__ import annotations
 
+import re
 import select
 import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Sequence
 
 import torch
 from rich.console import Console
@@ -44,8 +46,8 @@ CAMERA = {
 """What a browser says first; viser counts it as connected from then on."""
 
 
-def read_all(port: int) -> None:
-    """Connect as a browser does and read every message until the input ends; print messages and bytes."""
+def read_all(address: str) -> None:
+    """Connect to a viewer as a browser does and read every message until the input ends; print messages and bytes."""
     import msgspec
     import viser
     from websockets.sync.client import connect
@@ -54,7 +56,8 @@ def read_all(port: int) -> None:
     while True:
         try:
             version = f"viser-v{viser.__version__}"
-            connection = connect(f"ws://127.0.0.1:{port}", subprotocols=[version], max_size=None)  # pyright: ignore
+            place = address.replace("http:", "ws:", 1)
+            connection = connect(place, subprotocols=[version], max_size=None)  # pyright: ignore
             break
         except OSError:
             if time.monotonic() > deadline:
@@ -72,10 +75,13 @@ def read_all(port: int) -> None:
 
 
 class Alternate(Hook):
-    """Lets the client connect and leave in turn, and takes the time of the iterations between."""
+    """Lets the client connect and leave in turn, and takes the time of the iterations between.
 
-    def __init__(self, given: GiveWeights, *, interval: int, port: int) -> None:
-        self.interval, self._given, self._port = interval, given, port
+    The viewer's address, which has a token, is the first of `addresses` once it is known.
+    """
+
+    def __init__(self, given: GiveWeights, *, interval: int, addresses: Sequence[str]) -> None:
+        self.interval, self._given, self._addresses = interval, given, addresses
         self.seconds: dict[bool, list[float]] = {False: [], True: []}
         self.messages, self.bytes = 0, 0
         self._client: subprocess.Popen[str] | None = None
@@ -95,7 +101,8 @@ class Alternate(Hook):
         self._start = time.monotonic()
 
     def _connect(self) -> None:
-        command = [sys.executable, "-m", "benchmarks.viewer", "--client", str(self._port)]
+        _wait_for(lambda: bool(self._addresses), "the viewer did not say its address")
+        command = [sys.executable, "-m", "benchmarks.viewer", "--client", self._addresses[0]]
         self._client = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._wait(watched=True)
 
@@ -110,18 +117,23 @@ class Alternate(Hook):
         self._wait(watched=False)
 
     def _wait(self, *, watched: bool) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while self._given.is_watched != watched:
-            if time.monotonic() > deadline:
-                raise RuntimeError(f"the viewer did not become {'watched' if watched else 'alone'}")
-            time.sleep(0.05)
+        state = "watched" if watched else "alone"
+        _wait_for(lambda: self._given.is_watched == watched, f"the viewer did not become {state}")
+
+
+def _wait_for(condition: Callable[[], bool], otherwise: str) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        if time.monotonic() > deadline:
+            raise RuntimeError(otherwise)
+        time.sleep(0.05)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure, print the table, and write the figures."""
     words = sys.argv[1:] if arguments is None else arguments
     if words[:1] == ["--client"]:
-        read_all(int(words[1]))
+        read_all(words[1])
         return
     device = "cuda" if torch.cuda.is_available() else "cpu"
     defaults = {
@@ -149,10 +161,17 @@ def main(arguments: list[str] | None = None) -> None:
         ]
     )
     console = Console(highlight=False)
-    with watched(cfg, console.print) as hooks:
+    addresses: list[str] = []
+
+    def note(line: str) -> None:
+        console.print(line)
+        if found := re.match(r"viewer: ([^;]+);", line):
+            addresses.append(found[1])
+
+    with watched(cfg, note) as hooks:
         given_away = hooks[0]
         assert isinstance(given_away, GiveWeights)
-        alternate = Alternate(given_away, interval=interval, port=int(given["port"]))
+        alternate = Alternate(given_away, interval=interval, addresses=addresses)
         trainer = build(cfg, hooks=[*hooks, alternate])
         trainer.train(RunProgress(num_iterations, enabled=False))
         alternate.leave()

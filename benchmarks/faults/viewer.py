@@ -1,10 +1,10 @@
-"""These rows send to the viewer what strangers may: names in a run that are markup."""
+"""These rows send to the viewer what strangers may: names in a run that are markup, and messages."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.faults.row import AT_LEAST, EXACTLY, Figures, Row
+from benchmarks.faults.row import AT_LEAST, AT_MOST, EXACTLY, Figures, Row
 
 
 def viewer_markup(folder: Path, *, names: int) -> Figures:
@@ -12,6 +12,13 @@ def viewer_markup(folder: Path, *, names: int) -> Figures:
     from tests.viewer.markup import MARKUP, figures
 
     return figures(list(MARKUP.values())[:names])
+
+
+def viewer_ports(folder: Path, *, messages: int) -> Figures:
+    """Connect to both ports as strangers, and send as their pages what these never send."""
+    from tests.viewer.strange_clients import figures
+
+    return figures(messages=messages)
 
 
 ROWS = {
@@ -26,5 +33,20 @@ ROWS = {
         amounts={"names": 11},
         short={"names": 4},
         files=("ksim_rl/viewer", "tests/viewer/markup.py"),
+    ),
+    "viewer_ports": Row(
+        fault="other sites, rebound names and clients without the token; malformed messages; numbers beyond; floods",
+        must="nobody is let in; messages are ignored and counted, numbers clamped; what waits is bounded",
+        limits={
+            "strangers": (AT_LEAST, 56),
+            "messages": (AT_LEAST, 35),
+            "own_page_drives": (EXACTLY, 1),
+            "waiting_at_most": (AT_MOST, 256),
+            **dict.fromkeys(("let_in", "not_ignored", "beyond_the_control"), (EXACTLY, 0)),
+        },
+        measure=viewer_ports,
+        amounts={"messages": 100_000},
+        short={"messages": 2_000},
+        files=("ksim_rl/viewer", "tests/viewer/strange_clients.py"),
     ),
 }

@@ -1,7 +1,5 @@
 """The browser viewer serves a session on a port of this machine, through viser."""
 
-import contextlib
-import io
 import time
 from collections.abc import Callable
 
@@ -9,7 +7,9 @@ import numpy as np
 import viser
 
 from ksim_rl.scene.viewer_cfg import ViewerCfg
+from ksim_rl.viewer import guarded_server
 from ksim_rl.viewer.browser_scene import BrowserScene, SceneOfEnv
+from ksim_rl.viewer.gate import Gate, check_listens
 from ksim_rl.viewer.pad import Pad
 from ksim_rl.viewer.panel import Panel
 from ksim_rl.viewer.plots import Plots
@@ -23,16 +23,19 @@ IDLE_S = 0.2
 class BrowserViewer:
     """A server on `host`:`port`, or the next port that is free; it opens at once and shows a session once it has one.
 
-    Anybody who reaches the port can drive, and nobody beyond this machine does with the default host.
+    Who opens `address` or `pad_address`, which hold a token, can drive; see `ksim_rl.viewer.gate` for who cannot.
+    Nobody beyond this machine reaches the ports with the default host. Raises ValueError for a host or port that
+    cannot be.
     """
 
     def __init__(self, *, host: str = "127.0.0.1", port: int = 8080, label: str = "ksim_rl") -> None:
-        with contextlib.redirect_stdout(io.StringIO()):  # where it prints a panel of its own
-            self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        check_listens(host, port)
+        self._gate = Gate(host)
+        self.server = guarded_server.start(self._gate, host=host, port=port, label=label)
         self.server.gui.configure_theme(show_share_button=False, show_logo=False)
         self.server.gui.main_panel.dock_right()
         self.port = self.server.get_port()
-        self.address = f"http://{'localhost' if host == '0.0.0.0' else host}:{self.port}"
+        self.address = self._gate.address(self.port)
         self._host = host
         self._notice = self.server.gui.add_markdown("building the env ...")
         self._session: Session | None = None
@@ -41,6 +44,11 @@ class BrowserViewer:
     def watched(self) -> bool:
         """Whether a browser is connected."""
         return bool(self.server.get_clients())
+
+    @property
+    def ignored(self) -> int:
+        """How many messages of clients were none of the page's, or more than there was room for."""
+        return self._gate.ignored
 
     def open(self, session: Session) -> None:
         """Show a session from now on."""
@@ -52,7 +60,9 @@ class BrowserViewer:
         # No tab: charts that are made while they are hidden stay empty.
         with server.gui.add_folder("Plots") as plots:
             self._plots = Plots(server.gui, plots, session)
-        self._pad = Pad(self._panel, session, host=self._host, port=self.port + 1, viewer_port=self.port)
+        self._pad = Pad(
+            self._panel, session, self._gate, host=self._host, port=self.port + 1, viewer_port=self.port
+        )
         self._built = 0
         self._scene: BrowserScene | None = None
 
@@ -76,7 +86,7 @@ class BrowserViewer:
                 self._env_scene.center(session.ours.cfg.viewer.body) if self._panel.follows else np.zeros(3)
             )
             self._scene.show(self._env_scene.mjv, center=center)
-            self._panel.show()
+            self._panel.show(ignored=self.ignored)
             self._plots.show()
 
     def run(self, *, goes_on: Callable[[], bool] = lambda: True) -> None:

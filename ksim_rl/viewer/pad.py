@@ -2,37 +2,46 @@
 
 import json
 import threading
+import time
+from collections.abc import Callable, Mapping
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
-from urllib.parse import urlsplit
+from typing import Any, NoReturn
 
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
+from ksim_rl.viewer.client_messages import clamped, is_number
+from ksim_rl.viewer.gate import MESSAGES_PER_S, MOST_CLIENTS, Gate
 from ksim_rl.viewer.panel import Panel
 from ksim_rl.viewer.session import Session
 
 PAGE = Path(__file__).with_name("pad.html")
 # Bytes of a message; a page sends a few dozen.
-MOST_BYTES = 4096
+MOST_BYTES = 1024
+AXES = ("0", "1", "2")
+DOES = ("pause", "step", "reset", "push")
 
 
 class Pad:
     """Serves the page on `host`:`port`, or the next port that is free, and does what it says.
 
     A message is JSON: `{"axes": {"0": 0.5}}` drives (see `Panel.drive`), `{"do": "pause" | "step" | "reset" | "push"}`.
-    Pages of other sites are refused.
+    All others are ignored and counted by the gate, which also refuses pages of other sites.
     """
 
-    def __init__(self, panel: Panel, session: Session, *, host: str, port: int, viewer_port: int) -> None:
-        self._panel, self._session = panel, session
+    def __init__(
+        self, panel: Panel, session: Session, gate: Gate, *, host: str, port: int, viewer_port: int
+    ) -> None:
+        self._panel, self._session, self._gate = panel, session, gate
+        self._places = threading.BoundedSemaphore(MOST_CLIENTS)
         self._page = PAGE.read_text().replace("VIEWER_PORT", str(viewer_port)).encode()
         self._server = self._bind(host, port)
         self.port = int(self._server.socket.getsockname()[1])
-        self.address = f"http://{'localhost' if host == '0.0.0.0' else host}:{self.port}"
+        self.address = gate.address(self.port)
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def close(self) -> None:
@@ -48,9 +57,9 @@ class Pad:
         raise OSError(f"ports {port} to {port + 99} of {host} are all taken: choose another with --port")
 
     def _answer(self, _: ServerConnection, request: Request) -> Response | None:
-        origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
-            return Response(HTTPStatus.FORBIDDEN, "Forbidden", Headers(), b"only its own page may drive\n")
+        refusal = self._gate.refusal(request)
+        if refusal is not None:
+            return refusal
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return None
         headers = Headers(
@@ -59,20 +68,61 @@ class Pad:
         return Response(HTTPStatus.OK, "OK", headers, self._page)
 
     def _listen(self, connection: ServerConnection) -> None:
+        if not self._places.acquire(blocking=False):
+            connection.close(1013, f"{MOST_CLIENTS} pages are open already")
+            return
         try:
             for message in connection:
-                self._session.ask(partial(self._obey, message))
+                asked = parsed(message)
+                if asked is None:
+                    self._gate.ignore()
+                else:
+                    self._session.ask(partial(self._obey, asked))
+                # What is not read stays with the client, whose own queue then fills.
+                time.sleep(1.0 / MESSAGES_PER_S)
         except ConnectionClosed:
             return
+        finally:
+            self._places.release()
 
-    def _obey(self, message: str | bytes) -> None:
-        asked = json.loads(message)
-        if axes := asked.get("axes"):
-            self._panel.drive(
-                {int(number): max(-1.0, min(1.0, float(share))) for number, share in axes.items()}
-            )
+    def _obey(self, asked: Mapping[str, Any]) -> None:
         session = self._session
-        does = {"pause": lambda: session.play(not session.playing), "step": session.step_once}
-        does |= {"reset": session.reset, "push": lambda: session.push(float(self._panel.push_speed.value))}
+        if "axes" in asked:
+            self._panel.drive(asked["axes"])
+        does: dict[str, Callable[[], None]] = {
+            "pause": lambda: session.play(not session.playing),
+            "step": session.step_once,
+            "reset": session.reset,
+            "push": lambda: session.push(float(self._panel.push_speed.value)),
+        }
         if "do" in asked:
             does[asked["do"]]()
+
+
+def parsed(message: str | bytes) -> dict[str, Any] | None:
+    """Return what a message of the page asks for, shares by axis clamped to [-1, 1], or None for any other message."""
+    try:
+        asked = json.loads(message, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(asked, dict) or not asked or not asked.keys() <= {"axes", "do"}:
+        return None
+    found: dict[str, Any] = {}
+    if "axes" in asked:
+        axes = asked["axes"]
+        if (
+            not isinstance(axes, dict)
+            or not axes.keys() <= set(AXES)
+            or not all(map(is_number, axes.values()))
+        ):
+            return None
+        found["axes"] = {int(number): clamped(float(share), -1.0, 1.0) for number, share in axes.items()}
+    if "do" in asked:
+        if asked["do"] not in DOES:
+            return None
+        found["do"] = asked["do"]
+    return found
+
+
+def _refuse(number: str) -> NoReturn:
+    raise ValueError(number)

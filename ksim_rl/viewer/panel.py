@@ -58,8 +58,8 @@ class Panel:
             for name in session.ours.setup_manager_visualizers():
                 self._add_drawing(name)
 
-    def show(self) -> None:
-        """Bring the widgets up to date; viser sends those that changed."""
+    def show(self, *, ignored: int = 0) -> None:
+        """Bring the widgets up to date; viser sends those that changed. `ignored` messages were not let in."""
         session = self._session
         label, icon = (
             ("Pause", viser.Icon.PLAYER_PAUSE) if session.playing else ("Play", viser.Icon.PLAYER_PLAY)
@@ -67,7 +67,7 @@ class Panel:
         if self._play.label != label:
             self._play.label, self._play.icon = label, icon
         self._env.value = session.env_index
-        self._status.content = self._status_html()
+        self._status.content = self._status_html(ignored)
         self._error.content = self._error_html()
         self._error.visible = bool(session.error)
 
@@ -86,7 +86,7 @@ class Panel:
             self._session.ask(partial(self._steer, command))
             return
 
-    def _status_html(self) -> str:
+    def _status_html(self, ignored: int) -> str:
         session = self._session
         ours = session.ours
         seconds = float(ours.episode_step_E[session.env_index]) * ours.step_dt
@@ -96,6 +96,9 @@ class Panel:
             f"{state}, episode {seconds:.2f} s, return "
             f"{session.episode_return:.2f}, speed {session.achieved_speed:.2f}, step {session.steps}"
         )
+        count = ignored + session.refused
+        if count:
+            figures += f", {count} messages ignored"
         return paragraph(heading) + paragraph(figures)
 
     def _error_html(self) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
@@ -94,7 +95,7 @@ def serve(session: Session, *, host: str, port: int, note: Callable[[str], None]
 
 def addresses(viewer: str, pad: str) -> list[str]:
     """Return the lines that say where the viewer is, and how to reach it from another machine."""
-    ports = [address.rpartition(":")[2] for address in (viewer, pad)]
+    ports = [urlsplit(address).port for address in (viewer, pad)]
     forwarded = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
     return [
         f"viewer: {viewer}; with keyboard and gamepad: {pad} (Ctrl-C closes it)",
@@ -159,6 +160,7 @@ def _check(options: argparse.Namespace) -> None:
         )
     if options.viewer == "browser":
         check_viser()
+        importlib.import_module("ksim_rl.viewer.gate").check_listens(options.host, options.port)
     if options.viewer == "native":
         importlib.import_module("ksim_rl.viewer.native").check_display()
     if options.viewer is not None and given:

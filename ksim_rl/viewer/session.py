@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from ksim_rl.checks import check_in_range
 from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from ksim_rl.envs.contract import part
 from ksim_rl.transforms import ActionDelay, ObservationDelay, ObservationNoise
@@ -22,6 +23,8 @@ from ksim_rl.transforms import ActionDelay, ObservationDelay, ObservationNoise
 AGENTS = ("zero", "random")
 Agent = Callable[[TensorDictBase], TensorDictBase]
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+# Requests that may wait: more than anybody clicks between two steps. Nobody takes them while nobody watches.
+MOST_REQUESTS = 256
 # Longer gaps in which nothing was stepped, such as a rebuilt env, are not made up for.
 MOST_LAG_S = 0.1
 
@@ -86,6 +89,7 @@ class Session:
         env_index: the env that is shown, pushed and plotted.
         rewards: the weighted reward terms of that env in the last step.
         note: what is said beside the figures, such as how old the policy is.
+        refused: how many requests found no room.
     """
 
     def __init__(
@@ -106,7 +110,8 @@ class Session:
         self.rewards: dict[str, float] = {}
         self.episode_return, self.achieved_speed = 0.0, 0.0
         self._steered: dict[str, dict[str, float]] = {}
-        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._requests: queue.Queue[Callable[[], None]] = queue.Queue(MOST_REQUESTS)
+        self.refused = 0
         self._last: float | None = None
         self._due = 0.0
         self._paces: list[tuple[float, int]] = []
@@ -132,8 +137,11 @@ class Session:
         return {name: value_EK[self.env_index] for name, value_EK in self.ours.command_manager.values.items()}
 
     def ask(self, request: Callable[[], None]) -> None:
-        """Let `request` run between two steps; from any thread."""
-        self._requests.put(request)
+        """Let `request` run between two steps, if fewer than `MOST_REQUESTS` wait; from any thread."""
+        try:
+            self._requests.put_nowait(request)
+        except queue.Full:
+            self.refused += 1
 
     def play(self, playing: bool = True) -> None:
         """Go on, or pause; an error is forgotten."""
@@ -159,8 +167,12 @@ class Session:
     def push(self, speed: float, direction: float | None = None) -> None:
         """Add a horizontal velocity (m/s) in a direction (rad, world frame; None draws one) to the shown env's robot.
 
-        A robot that stands on a fixed base gets its first joint pushed instead, in rad/s or m/s.
+        A robot that stands on a fixed base gets its first joint pushed instead, in rad/s or m/s. Raises ValueError for
+        a speed or direction that is not finite.
         """
+        check_in_range("speed", speed)
+        if direction is not None:
+            check_in_range("direction", direction)
         ours = self.ours
         angle = torch.rand(()) * 2.0 * torch.pi if direction is None else torch.tensor(direction)
         robot = ours.view.entity("")
@@ -213,7 +225,7 @@ class Session:
         """Do what was asked for, then the steps that are due by now; return whether anything changed."""
         changed = False
         while not self._requests.empty():
-            self._guarded(self._requests.get())
+            self._guarded(self._requests.get_nowait())
             changed = True
         now = time.monotonic()
         if self._last is None or not self.playing:

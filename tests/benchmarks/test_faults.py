@@ -198,6 +198,11 @@ def names_as_they_stand(patch):
         patch.setattr(f"ksim_rl.viewer.{module}.as_html", lambda text: text)
 
 
+@sabotage("viewer_ports")
+def the_gate_stands_open(patch):
+    patch.setattr("ksim_rl.viewer.gate.Gate.refusal", lambda gate, request: None)
+
+
 @sabotage("caches")
 def errors_as_warp_raises_them(patch):
     program = (

@@ -1,0 +1,77 @@
+"""What the viewer's page says is checked before viser takes it: a message it sends, with a value that its control has.
+
+viser lets a client set any property of a widget to anything, open a tunnel to other machines, and upload files.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import viser
+
+CAMERA, UPDATE = "ViewerCameraMessage", "GuiUpdateMessage"
+# Bytes of a message; the longest that the page sends has a few hundred.
+MOST_BYTES = 16 * 1024
+_MOST_NUMBERS = 4
+
+
+def checked(raw: str | bytes, widgets: Mapping[str, Any]) -> bytes | None:
+    """Return a message as viser may have it, with its number clamped to the widget's range, or None for any other.
+
+    `widgets` are viser's handles by the identifier that its messages have.
+    """
+    if not isinstance(raw, bytes):
+        return None
+    try:
+        message = msgspec.msgpack.decode(raw)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return None
+    if not isinstance(message, dict):
+        return None
+    kind = message.get("type")
+    if kind == CAMERA:
+        entries = [entry for name, entry in message.items() if name != "type"]
+        return raw if all(map(_is_pose, entries)) else None
+    if kind != UPDATE or message.keys() != {"type", "uuid", "updates"}:
+        return None
+    uuid, updates = message["uuid"], message["updates"]
+    if not isinstance(uuid, str) or not isinstance(updates, dict) or updates.keys() != {"value"}:
+        return None
+    value = _allowed(updates["value"], widgets.get(uuid))
+    if value is None:
+        return None
+    return msgspec.msgpack.encode({"type": UPDATE, "uuid": uuid, "updates": {"value": value}})
+
+
+def clamped(value: float, low: float | None, high: float | None) -> float:
+    """Return the number of a range that is nearest to `value`; None is no bound."""
+    value = value if low is None else max(low, value)
+    return value if high is None else min(high, value)
+
+
+def is_number(value: object) -> bool:
+    """Whether it is a finite number, which a truth value is not."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number that no float holds
+        return False
+
+
+def _is_pose(entry: object) -> bool:
+    if isinstance(entry, list | tuple):
+        return len(entry) <= _MOST_NUMBERS and all(map(is_number, entry))
+    return is_number(entry)
+
+
+def _allowed(value: Any, widget: Any) -> Any:
+    """Return the value that a widget may take for the one that a page has sent, or None."""
+    if isinstance(widget, viser.GuiButtonHandle | viser.GuiCheckboxHandle):
+        return value if isinstance(value, bool) else None
+    if isinstance(widget, viser.GuiDropdownHandle | viser.GuiButtonGroupHandle):
+        return value if isinstance(value, str) and value in widget.options else None
+    if isinstance(widget, viser.GuiSliderHandle | viser.GuiNumberHandle):
+        return clamped(value, widget.min, widget.max) if is_number(value) else None
+    return None
