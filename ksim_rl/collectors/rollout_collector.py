@@ -57,6 +57,20 @@ class CollectorCfg(Checked):
             )
 
 
+def _compiles(env: EnvBase, cfg: CollectorCfg) -> bool:
+    """Whether the env's step is to become kernels; a ValueError where that is asked for and cannot be."""
+    simulated = part(env, SimulatedWorld)
+    records = simulated is not None and simulated.world.can_be_recorded
+    if cfg.compile is None:
+        return records
+    if cfg.compile and simulated is not None and not records:
+        raise ValueError(
+            "collector.compile=True, but no kernel can step MuJoCo's C engine: leave compile out, or choose "
+            "task.sim.engine=warp"
+        )
+    return cfg.compile
+
+
 _exploring = partial(set_exploration_type, ExplorationType.RANDOM)
 
 
@@ -101,8 +115,7 @@ class RolloutCollector:
         self._is_allocated = False
         self._leaves: list[tuple[NestedKey, Tensor]] = []
         device = env.device or torch.device("cpu")
-        simulates = part(env, SimulatedWorld) is not None
-        compiles = simulates if cfg.compile is None else cfg.compile
+        compiles = _compiles(env, cfg)
         with eagerly(cfg.eager):
             self._run = Captured(
                 self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs

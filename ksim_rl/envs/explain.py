@@ -106,7 +106,7 @@ def _summary(cfg: ManagerBasedRlEnvCfg, driver: EnvDriver) -> str:
         f"{driver.num_envs} envs on {driver.device}, "
         f"{driver.step_dt:g} s per step = {cfg.decimation} x {driver.physics_dt:g} s, "
         f"episodes of {length if driver.max_episode_length else 'any length'}\n"
-        + "\n".join((*driver.world.plan.lines(), *_hooks(driver)))
+        + "\n".join((*driver.world.explained(), *_hooks(driver)))
         + "".join(f"\n{line}" for line in driver.non_finite.lines())
     )
 

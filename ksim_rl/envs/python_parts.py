@@ -99,15 +99,15 @@ def _of_wrapper(wrapper: TransformedEnv) -> dict[str, Any]:
 
 def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Any]:
     """Return what calls the terms of an env, and what they read beside tensors."""
-    driver, warp_model = env.driver, env.world.warp_model
+    driver = env.driver
     parts = {
         "env": Listed(env, partial(_of_env, env)),
         "view": Listed(env.view, partial(_public, env.view)),
         "driver": Listed(driver, lambda: {name: getattr(driver, name) for name in _OF_DRIVER}),
-        "world.warp_model.callback": Listed(warp_model.callback, lambda: vars(warp_model.callback)),
-        OPTIONS: Listed(warp_model.opt, partial(_plain, warp_model.opt)),
         CFG: Listed(env.cfg, partial(_read_once, env), reads_code=False),
     }
+    for name, (owner, read) in env.world.recorded_python().items():
+        parts[name] = Listed(owner, read if name != OPTIONS else partial(_plain, owner))
     for name in _MANAGERS:
         manager = getattr(env, name)
         parts[name] = Listed(manager, partial(_without_caches, manager))

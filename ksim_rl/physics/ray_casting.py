@@ -1,6 +1,7 @@
 """This module casts rays in all worlds at once: those of a sensor, or those of a camera's picture."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
@@ -11,7 +12,9 @@ from jaxtyping import Float32, Int32, UInt8
 from torch import Tensor
 
 from ksim_rl.device.streams import warp_scope
+from ksim_rl.physics.c_engine.c_world import CWorld
 from ksim_rl.physics.upstream import add_height_fields
+from ksim_rl.physics.warp_world import WarpWorld
 from ksim_rl.physics.world import World
 
 Groups = wp.types.vector(length=mujoco.mjNGROUP, dtype=wp.float32)
@@ -33,7 +36,9 @@ class RayBatch:
     ) -> None:
         self._world = world
         # All -1 would mean every group, so groups are switched one by one.
-        self._groups = Groups(*[float(group in geom_groups) for group in range(mujoco.mjNGROUP)])
+        self._chosen = [group in geom_groups for group in range(mujoco.mjNGROUP)]
+        self._groups = Groups(*map(float, self._chosen))
+        self._exclude_body = exclude_body
         shape = (world.num_envs, num_rays)
         with warp_scope(world.device):
             self._start, self._direction, self._normal = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
@@ -44,11 +49,20 @@ class RayBatch:
 
     def cast(self) -> None:
         """Cast all rays against the present poses of the geoms."""
-        self._world.launch(self, self._launch)
+        world = self._world
+        if isinstance(world, WarpWorld):
+            world.launch(self, partial(self._launch, world))
+            return
+        assert isinstance(world, CWorld)
+        distance_EN, normal_EN3 = world.cast_rays(
+            self.start_EN3, self.direction_EN3, self._chosen, self._exclude_body
+        )
+        self.distance_EN.copy_(distance_EN)
+        self.normal_EN3.copy_(normal_EN3)
 
-    def _launch(self) -> None:
+    def _launch(self, world: WarpWorld) -> None:
         found = self._distance, self._geom, self._normal
-        m, d = self._world.warp_model, self._world.warp_data_E
+        m, d = world.warp_model, world.warp_data_E
         mjw.rays(m, d, self._start, self._direction, self._groups, True, self._exclude, *found)
 
 
@@ -72,6 +86,10 @@ class BatchCamera:
         textures: bool = True,
         shadows: bool = False,
     ) -> None:
+        if not isinstance(world, WarpWorld):
+            raise ValueError(
+                f"camera {camera!r} draws pictures of all worlds by MuJoCo Warp: choose sim.engine='warp'"
+            )
         self._world, self._camera = world, camera
         model, fields = world.mj_model, world.per_world_fields()
         world.view("cam_xpos")  # so that refreshes place cameras and lights

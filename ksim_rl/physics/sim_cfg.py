@@ -26,6 +26,9 @@ class SimCfg(Checked):
         ccd_iterations: most iterations of convex collision detection.
         njmax: most constraint rows of one world; `None` probes the model, and a run raises it where its env needs more.
         nconmax: contacts (and candidate pairs) per world. They share one pool of `num_envs * nconmax`; `None` as above.
+        engine: "warp" simulates on MuJoCo Warp, with our kernels, on GPU or CPU. "c" simulates on MuJoCo's C engine, on
+            all cores of the CPU, in float64: it judges the first, compiles nothing at the first start, and has no
+            limits of contacts and rows. Cameras that see all worlds need "warp".
         one_kernel_solver: solve the constraints of a substep in one kernel instead of some hundred. It is MuJoCo Warp's
             algorithm, so that results agree up to rounding (four substeps of 4096 worlds on an H200: Go1 2.4 ms instead
             of 8.2, G1 5.0 instead of 9.9). Models out of its range (solvers other than Newton, integrators "rk4" and
@@ -57,6 +60,7 @@ class SimCfg(Checked):
     ccd_iterations: Count | None = None
     njmax: Count | None = None
     nconmax: Count | None = None
+    engine: Literal["warp", "c"] = "warp"
     one_kernel_solver: bool = True
     one_kernel_dynamics: bool | None = None
     require_graphs: bool = False

@@ -1,6 +1,7 @@
 """This module makes zero-copy torch views of Warp arrays, and names those that the next steps of a world depend on."""
 
 import dataclasses
+from collections.abc import Collection
 
 import mujoco_warp as mjw
 import warp as wp
@@ -93,19 +94,19 @@ class DataViews:
     site_xmat_EL: Tensor
     time_E: Tensor
 
-    def __init__(self, warp_data_E: mjw.Data) -> None:
-        self._arrays = arrays(warp_data_E)
+    def show_views(self) -> None:
+        """Make the views that are attributes, once the engine has its arrays."""
         self._views: dict[str, Tensor] = {}
         for attribute in DataViews.__annotations__:
             setattr(self, attribute, self.view(attribute.rpartition("_")[0]))
 
     def view(self, name: str) -> Shaped[Tensor, "*shape"]:
-        """Return the view of an array of the Warp data, such as "qfrc_constraint", "xquat" or "M".
+        """Return the view of an array of MuJoCo's data, such as "qfrc_constraint", "xquat" or "M".
 
         Vectors, quaternions (w x y z) and matrices become trailing dims. Arrays that no `refresh` makes current, such
         as "efc.force" or "contact.dist", are refused: see `last_substep`.
         """
-        if name in self._arrays and name not in READABLE:
+        if name in self.array_names() and name not in READABLE:
             raise ValueError(
                 f"data array {name!r} is what the last substep computed on its way, and nothing refreshes it: read a "
                 f"sensor, or last_substep({name!r}) where that moment is meant"
@@ -113,14 +114,22 @@ class DataViews:
         return self.last_substep(name)
 
     def last_substep(self, name: str) -> Shaped[Tensor, "*shape"]:
-        """Return the view of any array of the Warp data as the last substep left it.
+        """Return the view of any array of the engine's data as the last substep left it.
 
         Rows of `efc` beyond `nefc`, and all of `contact` after a reset, hold leftovers.
         """
         if name not in self._views:
-            check_known("data array", name, self._arrays)
-            self._views[name] = wp.to_torch(self._arrays[name])
+            check_known("data array", name, self.array_names())
+            self._views[name] = self.make_view(name)
         return self._views[name]
+
+    def array_names(self) -> Collection[str]:
+        """Return the names of all arrays that a view can show."""
+        raise NotImplementedError
+
+    def make_view(self, name: str) -> Shaped[Tensor, "*shape"]:
+        """Make the view of an array of that name."""
+        raise NotImplementedError
 
     def views(self) -> dict[str, Shaped[Tensor, "*?leaf"]]:
         """Return the views made so far, by name."""
@@ -128,7 +137,6 @@ class DataViews:
 
     def drop_views(self) -> None:
         """Forget the views, so that their memory can be freed."""
-        self._arrays.clear()
         self._views.clear()
         for attribute in DataViews.__annotations__.keys() & vars(self).keys():
             delattr(self, attribute)

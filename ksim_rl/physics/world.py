@@ -1,65 +1,62 @@
-"""A world batch simulates many copies of one model on MuJoCo Warp, and shows their data as zero-copy torch views."""
+"""The door to the physics: many copies of one model, stepped by MuJoCo Warp or by MuJoCo's C engine."""
 
 import copy
-from collections.abc import Callable, Hashable, Sequence
-from typing import Literal, get_args
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from typing import Any, Literal
 
 import mujoco
-import mujoco_warp as mjw
 import torch
-import warp as wp
 from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
-from ksim_rl.checks import check_choice, check_count, unknown_name
-from ksim_rl.device.capture import WarpGraphs
-from ksim_rl.device.kernel_loading import loaded_together
-from ksim_rl.device.memory import memory_for
+from ksim_rl.checks import check_count, unknown_name
 from ksim_rl.device.state_tree import copy_into
-from ksim_rl.device.streams import checked_device, warp_scope, warp_stream
-from ksim_rl.physics import capacity, upstream, views
-from ksim_rl.physics.actuators.actuators_of_joints import let_actuators_add
-from ksim_rl.physics.actuators.disabled_actuators import switch_off
-from ksim_rl.physics.callbacks import Callbacks
-from ksim_rl.physics.contacts import follow_the_c_engine
-from ksim_rl.physics.field_effects import as_if_drawn, check_effects, switch_on
-from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields, fields_to_expand
-from ksim_rl.physics.masked_constants import MaskedConstants
-from ksim_rl.physics.model_checks import check_not_simple, warp_model_of
-from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
-from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
-from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
-from ksim_rl.physics.resets import resets
-from ksim_rl.physics.rows.second_limits import room_for_nonzeros
+from ksim_rl.device.streams import checked_device
+from ksim_rl.physics import views
+from ksim_rl.physics.field_effects import check_effects, switch_on
+from ksim_rl.physics.fields import fields_to_expand
+from ksim_rl.physics.model_checks import check_not_simple
+from ksim_rl.physics.nan_guard.guard import NanReport
+from ksim_rl.physics.overflow import OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.substep_plan import SubstepPlan, substep_plan, with_callbacks
-from ksim_rl.physics.substeps import Sensors, Substeps
+
+ENGINES: dict[str, type["World"]] = {}
+"""The worlds of each engine, by the names that `SimCfg.engine` knows; their modules enter them here."""
 
 
 class World(views.DataViews):
-    """`num_envs` worlds of one model, which is copied; `sim` is laid over its settings.
+    """`num_envs` worlds of one model, which is copied; `sim` is laid over its settings, and names the engine.
+
+    `World(...)` makes a `WarpWorld`, or with `sim.engine` "c" a `CWorld`, which behave alike.
 
     Position- and velocity-stage quantities (poses, velocities, their sensors) are those of the present state after
     `refresh`. Acceleration-stage ones (`qacc`, actuator and contact forces, contact sensors, accelerometers) belong to
     the last substep; rows that reset since then read zero. All views keep their address for the life of the world and
-    are changed in place. Everything after construction can be captured in a CUDA graph, except `overflow_report`,
-    `state_dict` and `load_state_dict`.
+    are changed in place, float32.
 
     The model fields named in `per_world_fields`, by MuJoCo's names, and gravity may differ between worlds, and with
     them what MuJoCo derives from them at compile time: call `set_const` after writing.
 
     Attributes:
-        njmax, nconmax: constraint rows and contacts that a world has room for.
+        mj_model: the copy of the model, with the settings of `sim`.
         is_frozen: whether graphs may hold `refresh`, so that it computes nothing further.
-        one_kernel_unavailable: why MuJoCo Warp's own solver solves the constraints, several times slower on CUDA; None
-            where one kernel does (`SimCfg.one_kernel_solver`). That one computes no `qacc_smooth`, which stays zero.
-        one_kernel_dynamics_unavailable: why MuJoCo Warp's own kernels compute what precedes the constraints; None where
-            one kernel does (`SimCfg.one_kernel_dynamics`).
-        one_kernel_rows_unavailable: the same of the constraint rows.
-        one_kernel_collisions_unavailable: why MuJoCo Warp's own kernels find contacts, or some of them.
-        one_kernel_integration_unavailable: why MuJoCo Warp's own kernels advance the state; None where one kernel does,
-            which the same setting asks for. Callbacks that are set later count in `plan`, not in these.
+        njmax, nconmax: constraint rows and contacts that a world has room for; 0 where there is no limit.
+        gravity_EL: gravity of each world, m/s^2, [E, 3].
+        can_be_recorded: whether graphs and recordings may hold steps of the engine.
     """
+
+    can_be_recorded: bool = True
+    njmax: int = 0
+    nconmax: int = 0
+    one_kernel_unavailable: str | None = None
+    gravity_EL: Tensor
+
+    def __new__(cls, *args: Any, sim: SimCfg | None = None, **kwargs: Any) -> "World":
+        """Choose the engine that `sim` names."""
+        if cls is not World:
+            return super().__new__(cls)
+        name = sim.engine if isinstance(sim, SimCfg) else SimCfg().engine
+        return object.__new__(ENGINES[name])
 
     def __init__(
         self,
@@ -77,88 +74,15 @@ class World(views.DataViews):
             raise ValueError(f"sim={sim!r}: expected a SimCfg, or None")
         self.sim = SimCfg() if sim is None else sim
         self.device = checked_device(device)
-        self.num_envs, self.is_frozen = num_envs, False
+        self.num_envs = num_envs
+        self.is_frozen = False
         self.mj_model = copy.copy(mj_model)
         self.sim.apply_to(self.mj_model)
-        expanded = self._expanded = fields_to_expand(per_world_fields, self.mj_model)
-        check_not_simple(self.mj_model, expanded)
-        check_effects(self.mj_model, expanded)
-        switch_on(self.mj_model, expanded)
-        self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
-        self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
-        stored_model = copy.copy(self.mj_model)
-        if self.has_one_kernel_solver:
-            stored_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-        self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
-        with memory_for(num_envs, self.device), warp_scope(self.device):
-            self.warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
-            with as_if_drawn(self.warp_model, expanded):
-                follow_the_c_engine(self.warp_model)
-            switch_off(self.mj_model, self.warp_model)
-            let_actuators_add(self.mj_model, self.warp_model, expanded)
-            self.warp_model.opt.warn_overflow = 0
-            if self.sim.tolerance is not None:
-                self.warp_model.opt.tolerance.fill_(self.sim.tolerance)
-            if self.device.type == "cuda":
-                self.warp_model.opt.graph_conditional = takes_conditional_nodes(
-                    self.warp_model, supported=wp.is_conditional_graph_supported()
-                )
-            nonzeros = room_for_nonzeros(self.warp_model, expanded, njmax=self.njmax)
-            self.warp_data_E = mjw.make_data(
-                stored_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax, njmax_nnz=nonzeros
-            )
-            upstream.drop_unread(self.warp_model, self.warp_data_E)
-            gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)
-            self._overflow = OverflowRecord(self.warp_model, self.warp_data_E)
-            self._reset_mask = wp.zeros(num_envs, dtype=bool)
-            self._launch_reset = resets(self.warp_model, self.warp_data_E, self._reset_mask)
-            m, d, no_solver = self.warp_model, self.warp_data_E, self.one_kernel_unavailable
-            plan = self._plan = substep_plan(m, d, self.sim, solver_unavailable=no_solver)
-            self.one_kernel_dynamics_unavailable = plan.dynamics
-            self.one_kernel_rows_unavailable = plan.rows
-            self.one_kernel_collisions_unavailable = plan.collisions
-            self.one_kernel_integration_unavailable = plan.integration
-            # One of torch's, since Warp's own wait for the default stream, which no capture allows.
-            aside = None if self.device.type == "cpu" else warp_stream(torch.cuda.Stream(self.device))
-            with as_if_drawn(m, expanded):
-                self._substeps = Substeps(
-                    *(self.mj_model, m, d),
-                    one_kernel_solver=plan.solver is None,
-                    one_kernel_dynamics=plan.dynamics is None,
-                    one_kernel_rows=plan.rows is None,
-                    own_broad_phase=plan.broad_phase is None,
-                    one_kernel_integration=plan.integration is None,
-                    aside=aside,
-                    mask=self._reset_mask,
-                    record=self._overflow.arrays,
-                    expanded=expanded,
-                )
-            self._masked_constants = self._prepare_constants(expanded)
-        self._reset_mask_E = wp.to_torch(self._reset_mask)
-        self._fields = {name: wp.to_torch(getattr(self.warp_model, name)) for name in expanded}
-        self._fields[GRAVITY] = gravity_EL
-        self._nan_guard: NanGuard | None = None
-        if self.sim.nan_guard is not None:
-            with warp_scope(self.device):
-                self._nan_guard = NanGuard(self.sim.nan_guard, self.mj_model, self.warp_data_E, self._fields)
-        self.gravity_EL = gravity_EL
-        self._callbacks = Callbacks(self.warp_model)
-        super().__init__(self.warp_data_E)
-        if self.device.type == "cuda":
-            self._load_kernels()
-        with warp_scope(self.device):
-            self._launch_once()
-        self._record_resets()
-
-    @property
-    def has_one_kernel_solver(self) -> bool:
-        """Whether one kernel solves the constraints."""
-        return self.one_kernel_unavailable is None
-
-    @property
-    def plan(self) -> SubstepPlan:
-        """Which kernels compute each stage of the next substep, and why, with the callbacks that are set now."""
-        return with_callbacks(self._plan, self._callbacks.of_program())
+        self._expanded = fields_to_expand(per_world_fields, self.mj_model)
+        check_not_simple(self.mj_model, self._expanded)
+        check_effects(self.mj_model, self._expanded)
+        switch_on(self.mj_model, self._expanded)
+        self._fields: dict[str, Tensor] = {}
 
     @property
     def timestep(self) -> float:
@@ -175,56 +99,20 @@ class World(views.DataViews):
     ) -> None:
         """Advance all worlds by `n` substeps under the present `ctrl`.
 
-        Sensors are computed on the last one, but for those that `refresh` computes, which read zero until then; with
-        those of contacts on every one, which until the last computes nothing else; or all on every one. Hooks are
-        called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when `refresh`
-        has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the substep computed
-        on its way. With hooks the substeps are launches of their own, with the hooks' torch work in between; without,
-        all of them are one. Inside an outer capture both become part of its graph.
+        Sensors are computed on the last one, but for those that `refresh` computes; with those of contacts on every
+        one; or all on every one. Hooks are called, in order, before each substep (such as a motor model that writes
+        `ctrl`) and after it, when `refresh` has not run: `qpos` and `qvel` are those of the state reached, poses and
+        sensors those that the substep computed on its way.
         """
-        check_count("n", n)
-        check_choice("sensors", sensors, ("last", "contacts", "every"))
-        if not before and not after:
-            self._run_substeps(("step", n, sensors), lambda: self._launch_substeps(n, sensors))
-        else:
-            for substep in range(n):
-                for hook in before:
-                    hook()
-                which = self._sensors_of(substep, n, sensors)
-                self._run_substeps(("substep", which), lambda which=which: self._launch_substep(which))
-                for hook in after:
-                    hook()
-        if self._nan_guard is not None:
-            self._nan_guard.keep_fields()
+        raise NotImplementedError
 
     def refresh(self, mask_E: Bool[Tensor, " E"] | None = None) -> None:
         """Recompute position- and velocity-stage quantities and sensors from the present `qpos` and `qvel`.
 
-        Acceleration-stage quantities keep the last substep's values: there is no collision pass. Actuator lengths and
-        velocities are recomputed only if a sensor reads them. With a mask, rows outside of it must be current already.
+        Acceleration-stage quantities keep the last substep's values. With a mask, rows outside of it must be current
+        already.
         """
-        if mask_E is None:
-            self._run_substeps("refresh", self._substeps.refresh)
-            return
-        self._take_mask(mask_E)
-        self._run_substeps("refresh of rows", lambda: self._substeps.refresh(masked=True))
-
-    def view(self, name: str) -> Shaped[Tensor, "*shape"]:
-        """Return the view of an array that is current after `refresh`, and let `refresh` compute it from now on.
-
-        Forces of bodies (`cfrc_ext` and the like) are those of the last substep, from the next one on. A RuntimeError
-        once the world is frozen, if nothing has read that array before.
-        """
-        if name in views.ON_DEMAND - self._substeps.refreshed_on_demand:
-            if self.is_frozen:
-                raise RuntimeError(
-                    f"{name} is not computed: let a term of the config read it during construction"
-                )
-            together = next(names for names in views.ON_DEMAND_TOGETHER if name in names)
-            self._substeps.refreshed_on_demand.update(together)
-            self._graphs.clear()
-            self._record_resets()
-        return super().view(name)
+        raise NotImplementedError
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Put the worlds where `mask_E` is true back to the model's `qpos0`, at rest, time 0.
@@ -232,61 +120,37 @@ class World(views.DataViews):
         Their acceleration-stage quantities and sensors read zero until the next step; the other rows do not change.
         Call `refresh` afterwards, and after writing another pose, before reading poses.
         """
-        self._take_mask(mask_E)
-        self._graphs.run("reset", self._launch_reset)
+        raise NotImplementedError
 
     def field(self, name: str) -> Shaped[Tensor, " E *leaf"]:
         """Return the view of a model field that differs between worlds."""
-        if name not in self._fields:
-            if hasattr(self.warp_model, name):
-                raise ValueError(
-                    f"model field {name!r} is shared by all worlds: add it to per_world_fields when the world is built "
-                    f"(now: {', '.join(sorted(self._fields))})"
-                )
-            raise unknown_name("per-world model field", name, self._fields)
-        return self._fields[name]
-
-    def set_const(self, fields: Sequence[str], mask_E: Bool[Tensor, " E"] | None = None) -> None:
-        """Recompute the constants that MuJoCo derives from `fields`, after writing into them.
-
-        Fields that nothing derives from cost nothing. Worlds outside of `mask_E` keep their constants bit for bit, and
-        on most robots cost little: as much as the others only on models with tendons or flexes, with actuators on
-        anything but hinges and slides, or with moved frames of bodies that equality constraints tie.
-        """
-        for name in fields:
-            self.field(name)
-        groups = const_groups(fields, self.mj_model)
-        if not groups:
-            return
-        constants = self._masked_constants
-        if constants is not None and constants.covers(fields):
-            self._take_mask(torch.ones_like(self._reset_mask_E) if mask_E is None else mask_E)
-            self._graphs.run(("set_const of rows", groups), lambda: constants.launch(groups))
-            return
-        if mask_E is None:
-            self._set_const_everywhere(groups)
-            return
-        self._take_mask(mask_E)
-        held = {name: self._fields[name].clone() for name in derived_fields(groups)}
-        self._set_const_everywhere(groups)
-        for name, before in held.items():
-            rows = mask_E.view(-1, *[1] * (before.ndim - 1))
-            self._fields[name].copy_(torch.where(rows, self._fields[name], before))
-
-    def launch(self, key: Hashable, launches: Callable[[], None]) -> None:
-        """Run Warp launches of the caller's own, such as a camera's, in order with the world's.
-
-        They are recorded once for each `key` and replayed from then on: their arrays must keep their addresses.
-        """
-        self._graphs.run(("of others", key), launches)
+        if name in self._fields:
+            return self._fields[name]
+        if name in dir(self.mj_model):
+            raise ValueError(
+                f"model field {name!r} is shared by all worlds: add it to per_world_fields when the world is built "
+                f"(now: {', '.join(sorted(self._fields))})"
+            )
+        raise unknown_name("per-world model field", name, self._fields)
 
     def per_world_fields(self) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
         """Return the views of the model fields that differ between worlds, by name."""
         return dict(self._fields)
 
+    def set_const(self, fields: Sequence[str], mask_E: Bool[Tensor, " E"] | None = None) -> None:
+        """Recompute the constants that MuJoCo derives from `fields`, after writing into them.
+
+        Fields that nothing derives from cost nothing. Worlds outside of `mask_E` keep their constants bit for bit.
+        """
+        raise NotImplementedError
+
+    def launch(self, key: Hashable, launches: Callable[[], None]) -> None:
+        """Run Warp launches of the caller's own, such as a camera's, in order with the world's."""
+        raise NotImplementedError
+
     def record_overflow(self) -> None:
         """Keep the overflow bits and needs of the last substep for the next report, as each substep does by itself."""
-        self._graphs.run("record_overflow", self._overflow.record)
+        raise NotImplementedError
 
     def overflow_report(self, *, clear: bool = True) -> OverflowReport:
         """Read what the physics needed since the last report; one transfer to the host. Call it once per rollout."""
@@ -294,41 +158,35 @@ class World(views.DataViews):
 
     def overflow_counts(self, *, clear: bool = True) -> Int[Tensor, " N"]:
         """Return what `explain_overflow` explains, whole numbers on the device, without waiting for it."""
-        counts = self._overflow.counts()
-        if clear:
-            self._overflow.clear()
-        return counts
+        raise NotImplementedError
 
     def explain_overflow(self, numbers: Sequence[int]) -> OverflowReport:
         """Make the report of `overflow_counts` that were read on the host."""
-        return self._overflow.explain(numbers)
+        raise NotImplementedError
 
     @property
     def room_is_certain(self) -> bool:
         """Whether `sim` gives the room for contacts and rows, or no state of the model needs more."""
-        return capacity.is_certain(self.mj_model, self.sim, njmax=self.njmax)
+        raise NotImplementedError
 
     def remember_needs(self, report: OverflowReport) -> bool:
         """Let later worlds of this model in this process have room for what was needed; whether they get more."""
-        return capacity.remember(self.mj_model, self.sim, self._expanded, report)
+        raise NotImplementedError
 
     def nan_count(self) -> Int[Tensor, ""]:
         """Return how many worlds became non-finite since the last `nan_report`, on the device; 0 without a guard."""
-        if self._nan_guard is None:
-            return torch.zeros((), dtype=torch.int64, device=self.device)
-        return self._nan_guard.count()
+        raise NotImplementedError
 
     def nan_report(self) -> NanReport:
         """Write the worlds that became non-finite since the last report to files; one transfer to the host.
 
         Without `sim.nan_guard` the report is empty.
         """
-        return NanReport() if self._nan_guard is None else self._nan_guard.report()
+        raise NotImplementedError
 
     def forget_failures(self) -> None:
         """Let the next `nan_report` leave out worlds that became non-finite until now."""
-        if self._nan_guard is not None:
-            self._nan_guard.forget()
+        raise NotImplementedError
 
     def state_dict(self) -> dict[str, Shaped[Tensor, "*?leaf"]]:
         """Copy everything that the next steps depend on, so that a restored world continues bit for bit on CPU."""
@@ -336,113 +194,29 @@ class World(views.DataViews):
 
     def load_state_dict(self, state_dict: dict[str, Shaped[Tensor, "*?leaf"]]) -> None:
         """Write a saved state of the same model and `num_envs` into the present arrays, then `refresh`."""
-        what = "state of a world (of the same model, num_envs and per_world_fields)"
+        what = "state of a world (of the same model, engine, num_envs and per_world_fields)"
         copy_into(self._state_tensors(), state_dict, what=what)
         self.refresh()
 
     def bytes_per_world(self) -> int:
         """Return the memory that one more world takes, in bytes (arrays of data and of expanded fields)."""
-        fields = sum(tensor.numel() * tensor.element_size() for tensor in self._fields.values())
-        return (views.nbytes(self.warp_data_E) + fields) // self.num_envs
+        raise NotImplementedError
+
+    def explained(self) -> tuple[str, ...]:
+        """Return a line for each stage of a substep, which says what computes it, and why."""
+        raise NotImplementedError
+
+    def recorded_python(self) -> Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]:
+        """Return the objects whose Python a recorded step depends on, each with what reads its values, by name."""
+        raise NotImplementedError
+
+    def memory(self) -> Iterator[tuple[str, Shaped[Tensor, "*?shape"] | None, int, int]]:
+        """Yield all arrays: name, view (None where there is none), first byte, and the one behind the last."""
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Free the graphs and arrays, after a last `nan_report`. Views that are still held keep their memory."""
-        if hasattr(self, "_fields"):
-            self.nan_report()
-        self._nan_guard = None
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        self._graphs.clear()
-        parts = ("_substeps", "_masked_constants", "_overflow", "_launch_reset", "_fields")
-        for name in ("warp_data_E", "warp_model", *parts):
-            if hasattr(self, name):
-                delattr(self, name)
-        self.drop_views()
-
-    def _load_kernels(self) -> None:
-        """Compile and load what steps, refreshes, resets and `set_const` launch, before any of them runs."""
-        with warp_scope(self.device), loaded_together(self.device):
-            self._launch_once()
-            for sensors in get_args(Sensors):
-                self._launch_substep(sensors)
-            self._substeps.refresh()
-            self._launch_reset()
-            if self._masked_constants is not None:
-                self._masked_constants.launch(~FIXED)
-
-    def _launch_once(self) -> None:
-        """Launch what has to run before anything else."""
-        mjw.reset_data(self.warp_model, self.warp_data_E)
-        if self._masked_constants is not None:
-            self._masked_constants.place_frames()
-
-    def _record_resets(self) -> None:
-        """Refresh, and record the graphs of `reset` and `refresh`, which warm-ups of outer captures run per env step.
-
-        Launched one by one, resets take longer than the substeps: MuJoCo Warp makes their kernels anew each time.
-        """
-        nowhere_E = torch.zeros_like(self._reset_mask_E)
-        for _ in range(2):
-            self.reset(nowhere_E)
-            self.refresh()
-            self.refresh(nowhere_E)
-
-    def _prepare_constants(self, expanded: Sequence[str]) -> MaskedConstants | None:
-        groups = const_groups(expanded, self.mj_model)
-        if not groups:
-            return None
-        if groups & FIXED:
-            # From now on the same bits, however often they are recomputed.
-            upstream.set_fixed_constants(self.warp_model)
-        return MaskedConstants(self.mj_model, self.warp_model, self._reset_mask, expanded)
-
-    def _set_const_everywhere(self, groups: int) -> None:
-        def launch() -> None:
-            # Tendons may lie on them.
-            self._substeps.place_fixed_geoms()
-            mjw.set_const(self.warp_model, self.warp_data_E, groups)
-            if groups & INERT0 and self._masked_constants is not None:
-                self._masked_constants.mend_weights()
-
-        self._graphs.run(("set_const", groups), launch)
-
-    def _take_mask(self, mask_E: Tensor) -> None:
-        if mask_E.dtype != torch.bool or mask_E.shape != (self.num_envs,):
-            raise ValueError(
-                f"mask_E is {mask_E.dtype} of shape {tuple(mask_E.shape)}: expected torch.bool of shape "
-                f"({self.num_envs},)"
-            )
-        self._reset_mask_E.copy_(mask_E)
+        """Free the arrays, after a last `nan_report`. Views that are still held keep their memory."""
+        raise NotImplementedError
 
     def _state_tensors(self) -> dict[str, Tensor]:
-        tensors = views.state_tensors(self.warp_data_E)
-        tensors |= {f"field/{name}": tensor for name, tensor in self._fields.items()}
-        overflow = self._overflow.arrays
-        return tensors | {f"overflow/{name}": wp.to_torch(array) for name, array in overflow.items()}
-
-    def _run_substeps(self, key: Hashable, launches: Callable[[], None]) -> None:
-        """Run launches of MuJoCo Warp's stages, among which callbacks may stand.
-
-        Callbacks are Python, and set at any time: a graph of before would leave them out, and one with them would never
-        run their Python again.
-        """
-        self._callbacks.keep_ours()
-        self._graphs.run(key, launches, live=bool(self._callbacks.of_program()))
-
-    def _launch_substeps(self, n: int, sensors: str) -> None:
-        for substep in range(n):
-            self._launch_substep(self._sensors_of(substep, n, sensors), is_last=substep == n - 1)
-
-    @staticmethod
-    def _sensors_of(substep: int, n: int, sensors: str) -> Sensors:
-        amid: dict[str, Sensors] = {"last": "none", "contacts": "contacts", "every": "all"}
-        return "kept" if substep == n - 1 and sensors != "every" else amid[sensors]
-
-    def _launch_substep(self, sensors: Sensors, *, is_last: bool = True) -> None:
-        if self._nan_guard is not None:
-            self._nan_guard.before_substep()
-        self._substeps.advance(sensors=sensors, is_last=is_last)
-        if self.one_kernel_integration_unavailable is not None:
-            self._overflow.record()
-        if self._nan_guard is not None:
-            self._nan_guard.after_substep()
+        raise NotImplementedError

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import torch
-import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
@@ -190,22 +189,15 @@ class TermMemory:
         shown = {name: f"view.world.view({name!r})" for name in views.READABLE}
         for attribute in views.DataViews.__annotations__:
             shown[attribute.rpartition("_")[0]] = f"view.world.{attribute}"
-        copied = {*views.STATE, *world.views()} & views.READABLE
-        for name, array in views.arrays(world.warp_data_E).items():
-            if not array.size:
-                continue
-            owner = _KIND_OF_ARRAY.get(name, COMPUTED)
-            called = shown.get(name, f"warp_data_E.{name}")
-            if name in copied:
-                tensor = wp.to_torch(array)
-                has_rows = tensor.ndim > 0 and tensor.shape[0] == world.num_envs
-                yield _piece(called, owner, tensor, has_rows=has_rows)
+        for called, tensor, start, end in world.memory():
+            room, _, name = called.rpartition(".")
+            owner = MODEL if room.endswith("model") else _KIND_OF_ARRAY.get(name, COMPUTED)
+            spelled = called if owner == MODEL else shown.get(name, called)
+            if tensor is None:
+                yield Piece(name=spelled, owner=owner, start=start, end=end)
             else:
-                yield Piece(name=called, owner=owner, start=array.ptr, end=array.ptr + array.capacity)
-        for name, array in views.arrays(world.warp_model).items():
-            if array.size and array.ptr:
-                called = f"warp_model.{name}"
-                yield Piece(name=called, owner=MODEL, start=array.ptr, end=array.ptr + array.capacity)
+                has_rows = tensor.ndim > 0 and tensor.shape[0] == world.num_envs
+                yield _piece(spelled, owner, tensor, has_rows=has_rows)
 
     def _of_tables(self) -> Iterator[Piece]:
         """List the tensors of the view's parts that nothing above has named: clocks, limits, poses, indices."""

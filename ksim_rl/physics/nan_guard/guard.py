@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated
 
 import mujoco
-import mujoco_warp as mjw
 import numpy as np
 import safetensors.numpy
 import torch
@@ -26,7 +25,7 @@ from ksim_rl.files.writing import whole_file
 from ksim_rl.physics.fields import GRAVITY
 from ksim_rl.physics.model_checks import model_bytes
 from ksim_rl.physics.upstream import per_world_fields
-from ksim_rl.physics.views import SUBSTEP_INPUTS, float_rows
+from ksim_rl.physics.views import SUBSTEP_INPUTS
 
 FORMAT = "ksim_rl.nan_guard/2"
 _MODEL, _STATE, _FIELD, _REACHED = "model", "state/", "field/", "reached/"
@@ -101,37 +100,64 @@ class NanGuard:
         self,
         cfg: NanGuardCfg,
         mj_model: mujoco.MjModel,
-        warp_data_E: mjw.Data,
+        state: Mapping[str, Shaped[Tensor, "*?shape"]],
         fields: Mapping[str, Shaped[Tensor, " E *?leaf"]],
+        *,
+        num_envs: int,
+        by_warp: bool,
     ) -> None:
-        self.cfg, self._mj_model, self._warp_data_E = cfg, mj_model, warp_data_E
+        self.cfg, self._mj_model = cfg, mj_model
+        self._launches = by_warp
         self._folder = Path(cfg.folder)
         self._folder.mkdir(parents=True, exist_ok=True)
         self._written = 0
-        num_envs = warp_data_E.nworld
-        self._names = [name for name in SUBSTEP_INPUTS if getattr(warp_data_E, name).size]
-        self._rows = float_rows(warp_data_E, tuple(self._names))
+        self._names = [name for name in SUBSTEP_INPUTS if name in state and state[name].numel()]
+        self._rows = [_as_rows(state[name], num_envs) for name in self._names]
+        self._reached_from = {name: _as_rows(state[name], num_envs) for name in ("qpos", "qvel")}
         self._rings = [wp.zeros((num_envs, cfg.history, rows.shape[1]), dtype=float) for rows in self._rows]
         self._failed, self._count = wp.zeros(num_envs, dtype=int), wp.zeros(num_envs, dtype=int)
-        self._reached = {name: wp.zeros_like(getattr(warp_data_E, name)) for name in ("qpos", "qvel")}
+        self._reached = {name: wp.zeros_like(rows) for name, rows in self._reached_from.items()}
         self._failed_E, self._count_E = wp.to_torch(self._failed), wp.to_torch(self._count)
         self._fields = dict(fields)
         self._kept_fields = {name: tensor.clone() for name, tensor in fields.items()}
 
     def before_substep(self) -> None:
         """Launch the copies of the state that the substep starts from."""
+        if not self._launches:
+            self._keep_rows()
+            return
         for rows, ring in zip(self._rows, self._rings, strict=True):
             wp.launch(keep_rows, dim=rows.shape, inputs=[rows, self._failed, self._count], outputs=[ring])
 
     def after_substep(self) -> None:
         """Launch the search for worlds that failed in this substep."""
-        d = self._warp_data_E
+        if not self._launches:
+            self._mark_failed()
+            return
         wp.launch(
             mark_failed,
-            dim=d.nworld,
-            inputs=[d.qpos, d.qvel, self._failed, self._count],
+            dim=self._failed.shape,
+            inputs=[self._reached_from["qpos"], self._reached_from["qvel"], self._failed, self._count],
             outputs=[self._reached["qpos"], self._reached["qvel"]],
         )
+
+    def _keep_rows(self) -> None:
+        """Do by torch what `keep_rows` does, where no kernel is to be compiled."""
+        watched_E = (self._failed_E == _WATCHED).nonzero().flatten()
+        places_E = (self._count_E % self.cfg.history)[watched_E].long()
+        for rows, ring in zip(self._rows, self._rings, strict=True):
+            wp.to_torch(ring)[watched_E, places_E] = wp.to_torch(rows)[watched_E]
+
+    def _mark_failed(self) -> None:
+        """Do by torch what `mark_failed` does."""
+        watched_E = self._failed_E == _WATCHED
+        self._count_E += watched_E
+        reached = {name: wp.to_torch(rows) for name, rows in self._reached_from.items()}
+        total_E = reached["qpos"].sum(-1) + reached["qvel"].sum(-1)
+        fails_E = watched_E & ~total_E.isfinite()
+        self._failed_E[fails_E] = _FAILED
+        for name, rows in reached.items():
+            wp.to_torch(self._reached[name])[fails_E] = rows[fails_E]
 
     def keep_fields(self) -> None:
         """Copy the model fields of the worlds that just failed, before a reset draws new ones."""
@@ -188,6 +214,11 @@ class NanGuard:
         write(path, failure)
         self._written += 1
         return path
+
+
+def _as_rows(tensor: Tensor, num_envs: int) -> wp.array:
+    """Return a tensor as rows of floats, one per world, on the same memory."""
+    return wp.from_torch(tensor.reshape(num_envs, -1), dtype=wp.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
