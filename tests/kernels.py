@@ -65,7 +65,7 @@ TESTS = {
         "measure_boxes": SINGLE_MODELS,
     },
     "physics/collision/collisions.py": {"collisions": EQUAL_WORLDS},
-    "physics/constant_kernels.py": {"constants_at_qpos0": EQUAL_WORLDS, "frames": EQUAL_WORLDS},
+    "physics/constants/constant_kernels.py": {"constants_at_qpos0": EQUAL_WORLDS, "frames": EQUAL_WORLDS},
     "physics/sensors/contact_sensors.py": {"__init__": EQUAL_WORLDS},
     "physics/height_field/contacts.py": {"height_field_contacts": EQUAL_WORLDS},
     "physics/height_field/convex_contacts.py": {"convex_height_field_contacts": SINGLE_MODELS},
@@ -81,7 +81,7 @@ TESTS = {
     "physics/newton/kernel.py": {"launcher": EQUAL_WORLDS, "sort_worlds": EQUAL_WORLDS},
     "physics/newton/solver.py": {"solver": EQUAL_WORLDS},
     "physics/overflow.py": {"__init__": EQUAL_WORLDS},
-    "physics/principal_axes.py": {"_diagonalize": EQUAL_WORLDS},
+    "physics/constants/principal_axes.py": {"_diagonalize": EQUAL_WORLDS},
     "physics/resets.py": {"empty_contacts": EQUAL_WORLDS, "fill_rows": EQUAL_WORLDS},
     "physics/rows/constraint_rows.py": {
         "constraint_rows": (

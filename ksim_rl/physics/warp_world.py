@@ -20,10 +20,10 @@ from ksim_rl.physics import capacity, upstream, views
 from ksim_rl.physics.actuators.actuators_of_joints import let_actuators_add
 from ksim_rl.physics.actuators.disabled_actuators import switch_off
 from ksim_rl.physics.callbacks import Callbacks
+from ksim_rl.physics.constants.masked_constants import MaskedConstants
 from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.field_effects import as_if_drawn
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields
-from ksim_rl.physics.masked_constants import MaskedConstants
 from ksim_rl.physics.model_checks import warp_model_of
 from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes

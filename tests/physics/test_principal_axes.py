@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from ksim_rl.physics.principal_axes import principal_axes
+from ksim_rl.physics.constants.principal_axes import principal_axes
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant, index_constant
 from ksim_rl.mdp.randomization.randomize import Pair, Randomize, RandomizeModelField, write_entries
-from ksim_rl.physics.principal_axes import principal_axes
+from ksim_rl.physics.constants.principal_axes import principal_axes
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.small_matrices import product

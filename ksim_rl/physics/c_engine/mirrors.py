@@ -29,14 +29,14 @@ class Mirror:
         self._seen = self.tensor.clone()
         self.pull()
 
-    def pull(self, rows: Int[Tensor, " N"] | None = None) -> None:
+    def pull(self, row_ids_N: Int[Tensor, " N"] | None = None) -> None:
         """Show the array's present numbers, in all rows or in some, int64 [N]."""
-        if rows is None:
+        if row_ids_N is None:
             self.tensor.copy_(self._present)
             self._seen.copy_(self.tensor)
         else:
-            self.tensor[rows] = self._present[rows].to(self.tensor.dtype)
-            self._seen[rows] = self.tensor[rows]
+            self.tensor[row_ids_N] = self._present[row_ids_N].to(self.tensor.dtype)
+            self._seen[row_ids_N] = self.tensor[row_ids_N]
 
     def push(self) -> None:
         """Write the tensor's numbers into the array, all of which are float32 from then on."""

@@ -11,7 +11,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from ksim_rl.physics import constant_kernels as kernels
+from ksim_rl.physics.constants import constant_kernels as kernels
 from ksim_rl.physics.fields import FIXED, INERT0, KIN0, const_groups
 from ksim_rl.physics.rows.tie_weights import BODY_EQUALITIES
 from ksim_rl.physics.structs import filled

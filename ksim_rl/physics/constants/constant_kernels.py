@@ -24,7 +24,7 @@ KIN0 = wp.constant(int(mjw.SetConstGroup.KIN0))
 INERT0 = wp.constant(int(mjw.SetConstGroup.INERT0))
 # Below this speed of its centre of mass, in m/s, a body whose joint moves at unit speed is one that does not move.
 STANDS = wp.constant(1.0e-6)
-_SOURCE = files("ksim_rl.physics").joinpath("constants_of_inertia.cpp").read_text()
+_SOURCE = files("ksim_rl.physics.constants").joinpath("constants_of_inertia.cpp").read_text()
 
 
 @struct_with(
