@@ -60,19 +60,32 @@ TESTS = {
         "sum_gradients": CAPTURED_STEPS,
         "take_means": "ranks/test_fused_ranks.py::test_fused_updates_of_two_ranks_equal_those_of_torch",
     },
+    "physics/actuators/adhesion.py": {
+        "_gather_moments": SINGLE_MODELS,
+        "_hide_measured_pairs": SINGLE_MODELS,
+        "_scatter_moments": SINGLE_MODELS,
+    },
     "physics/collision/box_distances.py": {
         "forget_touching_boxes": SINGLE_MODELS,
         "measure_boxes": SINGLE_MODELS,
     },
     "physics/collision/collisions.py": {"collisions": EQUAL_WORLDS},
-    "physics/constants/constant_kernels.py": {"constants_at_qpos0": EQUAL_WORLDS, "frames": EQUAL_WORLDS},
+    "physics/constants/constant_kernels.py": {
+        "constants_at_qpos0": EQUAL_WORLDS,
+        "frames": EQUAL_WORLDS,
+        "mend_weights": SINGLE_MODELS,
+    },
+    "physics/fixed_geoms.py": {"place_fixed_geoms": SINGLE_MODELS},
     "physics/sensors/contact_sensors.py": {"__init__": EQUAL_WORLDS},
     "physics/height_field/contacts.py": {"height_field_contacts": EQUAL_WORLDS},
     "physics/height_field/convex_contacts.py": {"convex_height_field_contacts": SINGLE_MODELS},
     "physics/kernels.py": {
         "align_steep_capsules": SINGLE_MODELS,
+        "copy_columns": SINGLE_MODELS,
         "drop_upper_corners": SINGLE_MODELS,
+        "gather_controls": SINGLE_MODELS,
         "leave_out_rows": SINGLE_MODELS,
+        "shifted_time": SINGLE_MODELS,
         "sparse_velocity": SINGLE_MODELS,
         "take_the_law_of_priority": SINGLE_MODELS,
     },
@@ -88,8 +101,11 @@ TESTS = {
             "gpu/test_constraint_rows.py::test_all_numbers_of_lanes_and_places_in_the_pool_give_the_same_bits"
         )
     },
+    "physics/rows/second_limits.py": {"add_second_limits": SINGLE_MODELS},
+    "physics/rows/tie_weights.py": {"weigh_ties": SINGLE_MODELS},
     "physics/rows/contact_lists.py": {"__init__": EQUAL_WORLDS},
     "physics/sensors/sensor_mending.py": {"_reading_of": SINGLE_MODELS, "bound_touch": SINGLE_MODELS},
+    "physics/sensors/limit_sensors.py": {"_read_forces": SINGLE_MODELS, "_read_state": SINGLE_MODELS},
     "physics/smooth/stages.py": {
         "_launcher": (
             "gpu/test_smooth.py::test_all_numbers_of_lanes_give_the_same_bits_which_are_those_of_mujoco_warp"

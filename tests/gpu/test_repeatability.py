@@ -148,6 +148,75 @@ def mended(device: str, *, one_kernel: bool) -> list[torch.Tensor]:
     return [torch.tensor(sorted(map(tuple, rows))), world.view("sensordata").cpu().clone()]
 
 
+# Limits near both of which a joint may be, sensors of limits, a disabled actuator with an activation, a gain that depends
+# on velocity, adhesion beside a measured pair, and a delayed control.
+DRIVEN = """
+<mujoco>
+  <option integrator="{integrator}" actuatorgroupdisable="1"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1"/><geom name="post" pos="1 0 0.1" size="0.1"/>
+    <body pos="0 0 0.5"><joint name="arm" axis="0 1 0" range="-2 2" limited="true" margin="0.1"/>
+      <geom size="0.1" pos="0.2 0 0" contype="0" conaffinity="0"/></body>
+    <body name="ball" pos="2 0 0.099"><joint name="lift" type="slide" axis="0 0 1"/>
+      <geom name="ball" size="0.1"/></body>
+  </worldbody>
+  <actuator>
+    <intvelocity joint="arm" group="1" kp="5" actrange="-1 1"/>
+    <general joint="arm" gaintype="affine" gainprm="1 0 -0.1" ctrllimited="true" ctrlrange="-0.1 0.1"/>
+    <position joint="arm" kp="2" delay="0.004" nsample="3"/><adhesion body="ball" ctrlrange="0 1"/>
+  </actuator>
+  <sensor>
+    <jointlimitpos joint="arm"/><jointlimitvel joint="arm"/><jointlimitfrc joint="arm"/>
+    <distance geom1="ball" geom2="post" cutoff="2"/>
+  </sensor>
+</mujoco>
+"""
+
+
+def driven(device: str, integrator: str) -> list[torch.Tensor]:
+    """What kernels leave that mend actuators, limits, their sensors and the integration of MuJoCo Warp's."""
+    world = World(load_model(DRIVEN.format(integrator=integrator)), num_envs=8, device=device)
+    world.qvel_EL[:, 0] = torch.arange(8.0, device=device).sin()
+    world.ctrl_EL.fill_(0.5)
+    world.step(5)
+    world.refresh()
+    return [
+        world.view(name).cpu().clone() for name in ("qpos", "qvel", "act", "sensordata", "actuator_velocity")
+    ]
+
+
+# A table that worlds have elsewhere, a tool without joints that is tied, and a body that only slides beside a tendon.
+VARIED = """
+<mujoco>
+  <worldbody>
+    <body pos="0 0 0.4"><geom type="box" size="0.5 0.5 0.05"/></body>
+    <body pos="0 0 0.56"><freejoint/><geom size="0.1" mass="1"/>
+      <body name="tool" pos="0.1 0 0"><geom size="0.02"/></body></body>
+    <body name="arm" pos="1 0 1"><joint name="a" axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/></body>
+    <body pos="2 0 1"><joint name="b" type="slide" axis="0 0 1"/><geom size="0.1"/></body>
+  </worldbody>
+  <tendon><fixed><joint joint="a" coef="1"/><joint joint="b" coef="-1"/></fixed></tendon>
+  <equality><connect body1="tool" body2="arm" anchor="0 0 0"/></equality>
+</mujoco>
+"""
+
+
+def varied(device: str) -> list[torch.Tensor]:
+    """What kernels leave that follow fields of a world."""
+    fields = ("body_pos", "body_mass")
+    sim = SimCfg(one_kernel_dynamics=False)
+    world = World(load_model(VARIED), num_envs=8, device=device, sim=sim, per_world_fields=fields)
+    scale = 1.0 + 0.1 * torch.arange(8.0, device=device).sin()
+    for name in fields:
+        field = world.field(name)
+        field *= scale.view(8, *[1] * (field.ndim - 1))
+    world.set_const(fields)
+    world.step(5)
+    world.refresh()
+    of_fields = [world.field(name).cpu().clone() for name in ("body_invweight0", "dof_invweight0")]
+    return [*of_fields, *(world.view(name).cpu().clone() for name in ("qpos", "qvel", "geom_xpos"))]
+
+
 def single(device: str) -> list[torch.Tensor]:
     """What kernels leave that few models have: contacts of steep rods, in an order of their own, and tendons."""
     mj_model = load_model(THINGS.format(turned=""))
@@ -163,6 +232,7 @@ def single(device: str) -> list[torch.Tensor]:
     fields = (getattr(contact, name).numpy()[:count] for name in ("geom", "worldid", "pos", "frame"))
     rows = np.concatenate([field.reshape(count, -1) for field in fields], axis=1)
     found = [torch.tensor(sorted(map(tuple, rows))), tendons.view("ten_velocity").cpu().clone()]
+    found += driven(device, "implicitfast") + driven(device, "RK4") + varied(device)
     return [*found, *mended(device, one_kernel=True), *mended(device, one_kernel=False)]
 
 
