@@ -148,7 +148,7 @@ def mended(device: str, *, one_kernel: bool) -> list[torch.Tensor]:
     return [torch.tensor(sorted(map(tuple, rows))), world.view("sensordata").cpu().clone()]
 
 
-# Limits near both of which a joint may be, sensors of limits, a disabled actuator with an activation, a gain that depends
+# Limits, and sensors of them, a disabled actuator with an activation, a gain that depends
 # on velocity, adhesion beside a measured pair, and a delayed control.
 DRIVEN = """
 <mujoco>
