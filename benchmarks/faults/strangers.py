@@ -100,6 +100,13 @@ def data_files(folder: Path) -> Figures:
     return {"files": files, "not_refused_by_name": files - refused, "executed": mark.exists()}
 
 
+def small_files(folder: Path, *, files: int) -> Figures:
+    """Read files that would hang a program or fill its memory, each in a process of its own."""
+    from tests.files import bombs
+
+    return bombs.figures(list(bombs.BOMBS)[:files], folder)
+
+
 def models(folder: Path, *, kinds: int) -> Figures:
     """Load each kind of malformed model in a process of its own."""
     from tests.physics import malformed_kinds
@@ -129,6 +136,15 @@ ROWS = {
         limits={"files": (AT_LEAST, 8), "not_refused_by_name": (EXACTLY, 0), "executed": (EXACTLY, 0)},
         measure=data_files,
         files=("ksim_rl/config/plain_data.py", "ksim_rl/scene/motions", "ksim_rl/scene/actuators/nets.py"),
+    ),
+    "small_files": Row(
+        fault="small files that claim much: YAML, tables, tensors, motions, recordings, and pipes, also for a lock",
+        must="refused by name, or read, within 10 s and 1 GiB",
+        limits={"files": (AT_LEAST, "files"), **dict.fromkeys(("crashes", "hangs"), (EXACTLY, 0))},
+        measure=small_files,
+        amounts={"files": 19},
+        short={"files": 5},
+        files=("ksim_rl/files", "ksim_rl/config/plain_data.py", "ksim_rl/runs/csv_table.py", "ksim_rl/clips"),
     ),
     "models": Row(
         fault="malformed models, models that nobody means, and models that explode while they compile",

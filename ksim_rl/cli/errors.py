@@ -16,6 +16,8 @@ def report(error: Exception, *, about: str = "") -> int:
 
     Its traceback comes first where `KSIM_RL_TRACEBACK` asks for it, or where no message can explain it.
     """
+    if isinstance(error, MemoryError):
+        error = OSError(f"out of memory: {error}" if str(error) else "out of memory")
     explained = isinstance(error, (ValueError, RuntimeError, OSError)) and not isinstance(
         error, NotImplementedError
     )

@@ -13,6 +13,7 @@ from rich.pretty import pretty_repr
 from ksim_rl import envs
 from ksim_rl.checks import OneLineParser
 from ksim_rl.cli.report import shown, shown_working
+from ksim_rl.files.reading import MOST_MODEL_BYTES, read_bytes
 from ksim_rl.files.writing import write_whole
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.robots import analyse
@@ -86,13 +87,17 @@ def copy_model(source: Path, target: Path) -> None:
         (target.parent / "assets").mkdir(exist_ok=True)
         copied = shutil.copy(source.resolve().parent / folder / entry.file, target.parent / "assets")
         entry.file = Path(copied).name
-    if not assets and source.suffix == ".xml" and "<include" not in source.read_text():
+    if not assets and source.suffix == ".xml" and "<include" not in _read(source):
         shutil.copyfile(source, target)  # with its comments
         return
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(target.parent)
     spec.compile()
     write_whole(target, spec.to_xml())
+
+
+def _read(model: Path) -> str:
+    return read_bytes(model, limit=MOST_MODEL_BYTES, follows_links=True).decode(errors="replace")
 
 
 def _text(name: str, words: dict[str, object], imports: str = "") -> str:

@@ -5,8 +5,6 @@ given. Limbs are those of Winter, "Biomechanics and Motor Control of Human Movem
 height.
 """
 
-import io
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ksim_rl.clips.recording import Array, Recording, chain, from_rotation_vector, refused
-from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
+from ksim_rl.files.arrays import read_arrays
 
 HEIGHT = 1.70
 """m."""
@@ -69,22 +67,20 @@ def read_amass(
 
 def _read(path: Path) -> tuple[Array, Array, float]:
     try:
-        data = io.BytesIO(read_bytes(path, limit=MOST_DATA_BYTES, follows_links=True))
-        with zipfile.ZipFile(data) as archive:
-            if sum(entry.file_size for entry in archive.filelist) > MOST_DATA_BYTES:
-                raise refused(
-                    path, f"its arrays are larger than {MOST_DATA_BYTES} bytes", "cut it into parts"
-                )
-        data.seek(0)
-        with np.load(data, allow_pickle=False) as archive:
-            rate = next((name for name in _RATES if name in archive.files), "")
-            missing = [name for name in ("poses", "trans") if name not in archive.files]
-            if missing or not rate:
-                lacks = (missing or [_RATES[0]])[0]
-                raise refused(path, f"no array {lacks!r}", f"it has {', '.join(archive.files) or 'none'}")
-            poses_FC, root_F3, fps = archive["poses"], archive["trans"], float(archive[rate])
-    except (zipfile.BadZipFile, OSError, TypeError) as error:
+        arrays = read_arrays(path)
+    except ValueError as error:
         raise refused(path, f"cannot be read as .npz: {error}", "give an archive of AMASS") from None
+    rate = next((name for name in _RATES if name in arrays), "")
+    missing = [name for name in ("poses", "trans") if name not in arrays]
+    if missing or not rate:
+        lacks = (missing or [_RATES[0]])[0]
+        raise refused(path, f"no array {lacks!r}", f"it has {', '.join(arrays) or 'none'}")
+    poses_FC, root_F3 = arrays["poses"], arrays["trans"]
+    if arrays[rate].size != 1 or any(
+        array.dtype.kind not in "fiu" for array in (poses_FC, root_F3, arrays[rate])
+    ):
+        raise refused(path, f"poses, trans or {rate} are no numbers, or {rate} is not one", "repair it")
+    fps = float(arrays[rate].item())
     if poses_FC.ndim != 2 or poses_FC.shape[1] < 3 * len(JOINTS) or len(poses_FC) < 2:
         raise refused(
             path, f"poses has shape {poses_FC.shape}", f"expected [F, {3 * len(JOINTS)} or more], F >= 2"

@@ -8,7 +8,7 @@ import numpy as np
 
 from ksim_rl.checks import near
 from ksim_rl.clips.recording import Array, Recording, chain, from_rotation_vector, multiply, refused
-from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
+from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 # Turns (x, y, z) with y up and z ahead into (x ahead, y left, z up): z, x, y.
@@ -64,7 +64,7 @@ def read_bvh(path: Path, *, scale: float = 0.01, y_up: bool = True) -> Recording
     the vertical one, and z the one ahead, x.
     """
     try:
-        text = read_bytes(path, limit=MOST_DATA_BYTES, follows_links=True).decode()
+        text = read_bytes(path, limit=MOST_TEXT_BYTES, follows_links=True).decode()
     except UnicodeDecodeError:
         raise refused(path, "it is no text", "give a BVH file") from None
     words, skeleton = _Words(path, text), _Skeleton()
@@ -73,14 +73,18 @@ def read_bvh(path: Path, *, scale: float = 0.01, y_up: bool = True) -> Recording
     _read_joint(words, skeleton, parent=-1)
     words.next("MOTION")
     words.next("Frames:")
-    frames = int(words.number())
+    frames = words.number()
     words.next("Frame")
     words.next("Time:")
     frame_s = words.number()
     if frames < 2 or frame_s <= 0.0:
-        raise words.wrong(f"{frames} frames of {frame_s:g} s")
+        raise words.wrong(f"{frames:g} frames of {frame_s:g} s")
     count = sum(len(channels) for channels in skeleton.channels)
-    table_FC = np.array([[words.number() for _ in range(count)] for _ in range(frames)])
+    # Each number takes a letter at least.
+    if not 0 < frames * count <= len(text):
+        raise words.wrong(f"{frames:g} frames of {count} numbers, in a file of {len(text)} letters")
+    size = int(frames) * count
+    table_FC = np.fromiter((words.number() for _ in range(size)), float, size).reshape(-1, count)
     turns_FN4, root_F3 = _turns(skeleton, table_FC)
     pos_FN3, quat_FN4 = chain(skeleton.parents, np.array(skeleton.offsets), turns_FN4, root_F3)
     pos_FN3 = pos_FN3 * scale

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ksim_rl.checks import near
 from ksim_rl.clips.recording import between, refused, slerp
-from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
+from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
 from ksim_rl.scene.names import scalar_joint_ids
 
 Array = np.ndarray
@@ -62,7 +62,7 @@ def read_csv(
 
 def _table(path: Path, columns: int) -> Array:
     try:
-        text = read_bytes(path, limit=MOST_DATA_BYTES, follows_links=True).decode()
+        text = read_bytes(path, limit=MOST_TEXT_BYTES, follows_links=True).decode()
     except UnicodeDecodeError:
         raise refused(path, "it is no text", "give a CSV file") from None
     rows = []

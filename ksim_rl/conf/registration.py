@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from ksim_rl import algorithms, envs
 from ksim_rl.conf import choices
 from ksim_rl.config import plain_data, plugins, upstream
-from ksim_rl.files.reading import read_bytes
+from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
 from ksim_rl.runs.listing import CONFIG
 from ksim_rl.trainers.run_cfg import check_run_tree, without_env_size
 
@@ -104,7 +104,7 @@ def check_groups(folder: Path) -> None:
             "config groups of yours"
         )
     for path in found:
-        text = read_bytes(folder / path, limit=plain_data.MOST_YAML_BYTES).decode(errors="replace")
+        text = read_bytes(folder / path, limit=MOST_CONFIG_BYTES).decode(errors="replace")
         try:
             tree = yaml.safe_load(text)  # as well as the text, in which a name may be spelled with escapes
         except yaml.YAMLError as error:

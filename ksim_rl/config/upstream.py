@@ -12,6 +12,7 @@ from typing import Any
 
 from hydra.core.config_store import ConfigNode, ConfigStore
 from omegaconf import DictConfig, OmegaConf
+from omegaconf._utils import get_yaml_loader
 
 
 class _Kept(ConfigNode):
@@ -59,3 +60,8 @@ def quicken(folder: dict[str, Any] | None = None) -> None:
             quicken(entry)
         elif type(entry) is ConfigNode:
             folder[name] = _Kept(**vars(entry))
+
+
+def yaml_resolvers() -> dict[str, Any]:
+    """Return what OmegaConf takes for which kind of scalar: 1e-3 is a number, and a date is text."""
+    return dict(get_yaml_loader().yaml_implicit_resolvers)

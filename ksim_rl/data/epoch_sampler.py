@@ -12,9 +12,12 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl.data.dataset_storage import MASK_KEY
 from ksim_rl.device import random
+from ksim_rl.files.reading import read_bytes
 from ksim_rl.files.writing import write_whole
 
 _STREAM = random.stream_id("data.epoch_sampler")
+
+MOST_STATE_BYTES = 10_000
 
 
 class EpochSampler(Sampler):
@@ -139,7 +142,9 @@ class EpochSampler(Sampler):
 
     def loads(self, path: str | Path) -> None:
         """Read what `dumps` wrote."""
-        self.load_state_dict(json.loads((Path(path) / "epoch_sampler.json").read_text()))
+        self.load_state_dict(
+            json.loads(read_bytes(Path(path) / "epoch_sampler.json", limit=MOST_STATE_BYTES))
+        )
 
     def _empty(self) -> None:
         self._size = 0

@@ -1,13 +1,14 @@
 """This module writes the model of a scene as one file, with its actuators in the order of the policy's actions."""
 
 import hashlib
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+
+from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 
 EXACT = ("gainprm", "biasprm", "dynprm", "ctrlrange", "forcerange", "actrange")
 
@@ -52,10 +53,11 @@ def _bring_files(root: ElementTree.Element, source: Path, folder: Path) -> None:
         for element in root.iter(tag):
             for field, name in [(k, v) for k, v in element.items() if k.startswith("file")]:
                 found = source / folders.get(directory, folders.get("assetdir", "")) / name
-                digest = hashlib.sha256(found.read_bytes()).hexdigest()[:8]
+                content = read_bytes(found, limit=MOST_DATA_BYTES, follows_links=True)
+                digest = hashlib.sha256(content).hexdigest()[:8]
                 copy = Path("assets") / f"{found.stem}_{digest}{found.suffix}"
                 (folder / "assets").mkdir(exist_ok=True)
-                shutil.copyfile(found, folder / copy)
+                (folder / copy).write_bytes(content)
                 element.set(field, str(copy))
     if compiler is not None:
         for directory in ("meshdir", "texturedir", "assetdir"):

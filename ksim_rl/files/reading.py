@@ -6,7 +6,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 # Bytes that a file of a kind may have.
-MOST_DATA_BYTES = 2**30  # motions, recordings, motor models, tables of metrics
+MOST_DATA_BYTES = 2**30  # motions, motor models, meshes and pictures
+MOST_TENSOR_BYTES = 4 * 2**30  # of a checkpoint
+MOST_TEXT_BYTES = 128 * 2**20  # recordings, tables of metrics
+MOST_MODEL_BYTES = 64 * 2**20  # the text of a model
+MOST_CONFIG_BYTES = 2**19  # YAML, of which a config of ours has some 20 kB
+# A file that takes next to nothing on the disk, and claims more than this, was made to fill memory.
+MOST_SPARSE_BYTES, LEAST_SHARE = 64 * 2**20, 0.01
 
 
 def open_regular(path: Path, *, limit: int, follows_links: bool = False) -> BinaryIO:
@@ -25,7 +31,16 @@ def open_regular(path: Path, *, limit: int, follows_links: bool = False) -> Bina
     if about.st_size > limit:
         file.close()
         raise ValueError(f"{path}: damaged: longer than the {limit} bytes it may have")
+    on_disk = 512 * about.st_blocks  # blocks are counted in this unit, whatever their size is
+    if about.st_size > MOST_SPARSE_BYTES and on_disk < LEAST_SHARE * about.st_size:
+        file.close()
+        raise ValueError(f"{path}: damaged: of its {about.st_size} bytes only {on_disk} were ever written")
     return file
+
+
+def check_regular(path: Path, *, limit: int) -> None:
+    """Refuse what `open_regular` refuses, links apart, for libraries that open a file themselves."""
+    open_regular(path, limit=limit, follows_links=True).close()
 
 
 def read_bytes(path: Path, *, limit: int, follows_links: bool = False) -> bytes:

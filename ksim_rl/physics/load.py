@@ -13,6 +13,7 @@ import warp as wp
 
 from ksim_rl.checks import naming, near
 from ksim_rl.device.streams import start_warp
+from ksim_rl.files.reading import MOST_MODEL_BYTES, read_bytes
 from ksim_rl.physics.model_checks import check_finite, check_meant, warp_model_of
 from ksim_rl.physics.model_size import check_text
 from ksim_rl.physics.sim_cfg import SimCfg
@@ -108,11 +109,11 @@ def _read(source: str | Path) -> tuple[Path | None, str, str]:
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"model file {str(path)!r}: expected a name that ends in {', '.join(SUFFIXES)}")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bytes(path, limit=MOST_MODEL_BYTES, follows_links=True).decode()
     except UnicodeDecodeError as error:
         raise ValueError(f"model file {str(path)!r} is not UTF-8 text: byte {error.start}") from None
-    except OSError as error:
-        raise ValueError(f"model file {str(path)!r} cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"model file {error}") from None
     if not text.strip():
         raise ValueError(f"model file {str(path)!r} is empty")
     return path, text, str(path)

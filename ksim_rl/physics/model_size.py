@@ -1,16 +1,28 @@
 """A model that a few words make enormous is refused here, before MuJoCo spends minutes or all memory on it."""
 
+import html
 import math
 import os
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
+
+from ksim_rl.checks import naming
+from ksim_rl.files.reading import MOST_DATA_BYTES, MOST_MODEL_BYTES, check_regular, read_bytes
 
 VARIABLE = "KSIM_RL_LARGEST_MODEL"
 LARGEST = 10**8
 
-# By a pattern, because it must find the same tags as MuJoCo's parser in what a stricter one refuses.
-_TAG = re.compile(r"<!--.*?-->|<(?P<close>/?)(?P<tag>[A-Za-z_]\w*)(?P<rest>[^<>]*?)(?P<alone>/?)>", re.DOTALL)
-_ATTRIBUTE = re.compile(r"(\w+)\s*=\s*[\"']([^\"']*)")
+# By a pattern, because it must find the same tags as MuJoCo's parser in what a stricter one refuses. Comments, text as
+# it is, instructions and declarations come first, since words in them are no tags; brackets in quotes end no tag.
+_TAG = re.compile(
+    r"<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>|<![^>]*>"
+    r"|<(?P<close>/?)(?P<tag>[A-Za-z_][\w:.-]*)(?P<rest>(?:[^<>\"']|\"[^\"]*\"|'[^']*')*?)(?P<alone>/?)>",
+    re.DOTALL,
+)
+_ATTRIBUTE = re.compile(r"([\w:.-]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
+_FOLDERS = ("meshdir", "texturedir", "assetdir")
+MOST_FOLDERS = 16
 # How many numbers an element comes to: the product of these attributes to some power, times what is had of each.
 _NUMBERS = {
     "hfield": (("nrow", "ncol"), 1, 1),
@@ -22,9 +34,46 @@ _NUMBERS = {
 }
 
 
+@dataclass
+class _Files:
+    """The files that a model takes in, each counted once, and those that it names for MuJoCo to read."""
+
+    label: str
+    folder: Path  # of the model itself
+    counts: dict[Path, tuple[int, int]] = field(default_factory=dict)
+    folders: set[Path] = field(default_factory=set)
+    below: set[str] = field(default_factory=lambda: {""})  # folders of assets, as any of the texts has them
+    named: set[str] = field(default_factory=set)
+
+    def text(self, path: Path) -> str:
+        """Read a file that is included or attached."""
+        with naming(self.label):
+            return read_bytes(path, limit=MOST_MODEL_BYTES, follows_links=True).decode(errors="replace")
+
+    def check_assets(self) -> None:
+        """Refuse pipes and devices, at which MuJoCo would wait or never end, and files that are too large."""
+        if len(self.below) > MOST_FOLDERS:
+            raise ValueError(
+                f"{self.label}: {len(self.below)} folders of assets: expected {MOST_FOLDERS} at most"
+            )
+        # Which folder belongs to which name depends on the order of texts; so each is tried with each.
+        for start in {self.folder, *self.folders}:
+            for below in self.below:
+                for name in self.named:
+                    path = start / below / name
+                    if os.path.exists(path) and not path.is_dir():
+                        with naming(self.label):
+                            check_regular(path, limit=MOST_DATA_BYTES)
+
+
 def check_text(text: str, folder: Path, label: str) -> None:
-    """Refuse an XML text that comes to too much with its replicas, grids and surfaces, and the files it includes."""
-    elements, numbers = _count(text, folder, label, ())
+    """Refuse an XML text that comes to too much with its replicas, grids and surfaces, and the files it includes.
+
+    The files that it names, of meshes, pictures and height fields too, are regular ones of limited size, or refused.
+    """
+    read = _Files(label=label, folder=folder)
+    elements, numbers = _count(text, folder, read, ())
+    read.check_assets()
     given = os.environ.get(VARIABLE, str(LARGEST))
     if not given.isdecimal():
         raise ValueError(f"{VARIABLE}={given!r}: expected a whole number")
@@ -37,15 +86,18 @@ def check_text(text: str, folder: Path, label: str) -> None:
         )
 
 
-def _count(text: str, folder: Path, label: str, within: tuple[Path, ...]) -> tuple[int, int]:
+def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> tuple[int, int]:
     """Return how many elements a text comes to, and how many numbers they have beside."""
     elements = numbers = attachments = user = 0
     largest_model = 0, 0
     times = [1]
+    read.folders.add(folder)
     for found in _TAG.finditer(text):
-        tag, attributes = found["tag"], dict(_ATTRIBUTE.findall(found["rest"] or ""))
+        tag, attributes = found["tag"], _attributes(found["rest"] or "")
         if tag is None:
             continue
+        read.below |= {attributes[name] for name in _FOLDERS if name in attributes}
+        read.named |= {value for name, value in attributes.items() if name.startswith("file")}
         if found["close"]:
             if tag == "replicate" and len(times) > 1:
                 times.pop()
@@ -65,16 +117,30 @@ def _count(text: str, folder: Path, label: str, within: tuple[Path, ...]) -> tup
         elif tag in ("include", "model") and "file" in attributes:
             path = (folder / attributes["file"]).resolve()
             if path in within:
-                raise ValueError(f"{label}: <{tag} file={attributes['file']!r}>: the file takes in itself")
-            inner = 0, 0
-            if path.is_file():
-                inner = _count(path.read_text(errors="replace"), path.parent, label, (*within, path))
+                raise ValueError(
+                    f"{read.label}: <{tag} file={attributes['file']!r}>: the file takes in itself"
+                )
+            if path not in read.counts:
+                # What is no file, a pipe among them, is refused; one that is missing MuJoCo names with its line.
+                counts = (
+                    _count(read.text(path), path.parent, read, (*within, path)) if path.exists() else (0, 0)
+                )
+                read.counts[path] = counts
+            inner = read.counts[path]
             if tag == "model":
                 largest_model = max(largest_model, inner)
             else:
                 elements, numbers = elements + inner[0] * times[-1], numbers + inner[1]
     elements += attachments * largest_model[0]
     return elements, numbers + attachments * largest_model[1] + user * elements
+
+
+def _attributes(text: str) -> dict[str, str]:
+    """Return attributes with their values as a parser of XML reads them; of those that are there twice, the first."""
+    found: dict[str, str] = {}
+    for name, double, single in _ATTRIBUTE.findall(text):
+        found.setdefault(name, html.unescape(double or single))
+    return found
 
 
 def _product(text: str) -> int:

@@ -2,15 +2,19 @@
 
 import csv
 import io
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from ksim_rl.files.reading import MOST_DATA_BYTES, open_regular
+from ksim_rl.files.reading import MOST_TEXT_BYTES, open_regular
 from ksim_rl.files.writing import check_own, whole_file
 
 STEP = "env_states"
+# Of a table in memory: more columns are refused, and of more cells only each second, fourth ... row is kept.
+MOST_COLUMNS, MOST_CELLS = 10_000, 4_000_000
+MOST_LETTERS = 2**22  # of a line
 T = TypeVar("T")
 
 
@@ -73,18 +77,43 @@ class CsvTable:
 
 
 def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    """Read a table: its columns, and its rows as text by column; a row that a crash cut off is left out."""
-    open_regular(path, limit=MOST_DATA_BYTES).close()  # which says that there is none
-    with _opened(path) as (columns, rows):
-        return columns, list(rows)
+    """Read a table: its columns, and its rows as text by column, without those cells that are empty.
+
+    A row that a crash cut off is left out. Of a table with more than `MOST_CELLS` cells the rows are thinned, but for
+    the last one. A ValueError says what is no table.
+    """
+    open_regular(path, limit=MOST_TEXT_BYTES).close()  # which says that there is none
+    kept: list[dict[str, str]] = []
+    last: dict[str, str] = {}
+    every, cells = 1, 0
+    try:
+        with _opened(path) as (columns, rows):
+            for number, row in enumerate(rows):
+                last = {name: text for name, text in row.items() if text}
+                if number % every:
+                    continue
+                kept.append(last)
+                cells += len(last)
+                while cells > MOST_CELLS and len(kept) > 1:
+                    kept, every = kept[::2], 2 * every
+                    cells = sum(map(len, kept))
+    except csv.Error as error:
+        raise ValueError(f"{path}: damaged: {error}") from error
+    if kept and kept[-1] is not last:
+        kept.append(last)
+    return columns, kept
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[list[str], Iterator[dict[str, str]]]]:
     """Give the columns of a table, and its whole rows one by one; of no file, those of a new table."""
-    content = open_regular(path, limit=MOST_DATA_BYTES) if path.exists() else io.BytesIO()
+    content = open_regular(path, limit=MOST_TEXT_BYTES) if path.exists() else io.BytesIO()
     with io.TextIOWrapper(content, errors="replace", newline="") as file:
-        reader = csv.DictReader(line for line in file if line.endswith("\n"))
+        lines = iter(lambda: file.readline(MOST_LETTERS), "")
+        head = next(lines, "")
+        if head.count(",") >= MOST_COLUMNS:
+            raise ValueError(f"{path}: damaged: more than {MOST_COLUMNS} columns")
+        reader = csv.DictReader(line for line in itertools.chain([head], lines) if line.endswith("\n"))
         rows = (row for row in reader if row.get(STEP) and None not in row.values())
         yield list(reader.fieldnames or [STEP]), rows
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from ksim_rl.config.plain_data import MOST_YAML_BYTES
-from ksim_rl.files.reading import read_bytes
+from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import STEP, read_table
 
@@ -78,7 +77,7 @@ def summarize(folder: Path) -> Summary:
     try:
         sessions = record.read(folder)
         began = sessions[0].began if sessions else "?"
-        text = read_bytes(folder / CONFIG, limit=MOST_YAML_BYTES).decode(errors="replace")
+        text = read_bytes(folder / CONFIG, limit=MOST_CONFIG_BYTES).decode(errors="replace")
         task = found[1] if (found := _TASK.search(text)) else "?"
         rows = metric_rows(folder)
     except (ValueError, csv.Error) as error:

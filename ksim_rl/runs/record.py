@@ -21,7 +21,7 @@ from typing import Any, Literal
 import torch
 
 from ksim_rl.checked import Checked
-from ksim_rl.config import plain_data, plugins
+from ksim_rl.config import plugins
 from ksim_rl.config.child_processes import ask_git
 from ksim_rl.files.reading import read_bytes
 from ksim_rl.files.writing import write_whole
@@ -42,7 +42,8 @@ PACKAGES = [
     "hydra-core",
     "omegaconf",
 ]
-MOST_SESSIONS, MOST_LETTERS, MOST_DIFF_BYTES = 1000, 10_000, 4 * 2**20
+MOST_SESSIONS, MOST_LETTERS = 1000, 10_000
+MOST_DIFF_BYTES = MOST_RECORD_BYTES = 4 * 2**20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +102,7 @@ def read(folder: Path) -> list[Session]:
     if not os.path.lexists(path):
         return []
     try:
-        entries = json.loads(read_bytes(path, limit=plain_data.MOST_YAML_BYTES))["sessions"]
+        entries = json.loads(read_bytes(path, limit=MOST_RECORD_BYTES))["sessions"]
         sessions = [Session(**_text(entry)) for entry in entries[:MOST_SESSIONS]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path}: no record of a run: {printable(str(error))}") from error

@@ -12,11 +12,13 @@ from typing import Any
 import torch
 
 from ksim_rl.config.child_processes import start_python
+from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 from ksim_rl.files.writing import open_own
 from ksim_rl.tables.measure import run_cfg, settings
 from ksim_rl.tables.table import Table
 
 POLL_S = 0.2
+MOST_RESULT_BYTES = 4 * 2**20
 Job = tuple[str, int]  # a row and a seed
 
 
@@ -32,7 +34,7 @@ class Runs:
         found: dict[str, dict[int, dict[str, Any]]] = {}
         for name, row in self.table.rows.items():
             paths = {seed: self.folder / name / f"seed_{seed}.json" for seed in row.seeds}
-            present = {seed: json.loads(path.read_text()) for seed, path in paths.items() if path.exists()}
+            present = {seed: _result(path) for seed, path in paths.items() if path.exists()}
             own = settings(row, self._of(name)) if present else ""
             found[name] = {seed: result for seed, result in present.items() if result["settings"] == own}
         return found
@@ -68,7 +70,7 @@ class Runs:
                 for slot, (job, process) in list(running.items()):
                     if (code := process.poll()) is not None:
                         del running[slot]
-                        last = "".join(self._log(job).read_text(errors="replace").splitlines()[-1:])
+                        last = "".join(self._said(job).splitlines()[-1:])
                         why = "no time left" if is_over else f"exit code {code}, {last} ({self._log(job)})"
                         note(f"{job[0]}, seed {job[1]}: " + (why if code else "done"))
                         left += bool(code)
@@ -91,8 +93,15 @@ class Runs:
             file.truncate()
             return start_python(command, environment=environment, stdout=file, stderr=STDOUT)
 
+    def _said(self, job: Job) -> str:
+        return read_bytes(self._log(job), limit=MOST_DATA_BYTES).decode(errors="replace")
+
     def _log(self, job: Job) -> Path:
         return self.run_folder / job[0] / f"seed_{job[1]}.log"
+
+
+def _result(path: Path) -> dict[str, Any]:
+    return json.loads(read_bytes(path, limit=MOST_RESULT_BYTES))
 
 
 def gpus_for(device: str, *, per_gpu: int) -> list[str]:

@@ -22,14 +22,14 @@ from safetensors import SafetensorError
 
 from ksim_rl import ranks
 from ksim_rl.device import state_tree
-from ksim_rl.files.reading import read_bytes
+from ksim_rl.files.reading import MOST_TENSOR_BYTES, read_bytes
 from ksim_rl.files.writing import WRITING
 from ksim_rl.trainers import checkpoint_formats
 
 MANIFEST, TENSORS = "manifest.json", "tensors.safetensors"
 _DISCARDED = ".discarded-"
 RANKS = "ranks"  # of a state: what the other ranks have
-_MAX_MANIFEST_BYTES = 64 * 2**20
+_MAX_MANIFEST_BYTES = 16 * 2**20
 Columns = Mapping[str, Mapping[str, Sequence[int]]]
 
 
@@ -130,7 +130,7 @@ def load(path: Path) -> Checkpoint:
         raise CheckpointError(
             f"{path}: unexpected file {sorted(surplus)[0]!r}; a checkpoint holds only its own"
         )
-    tensor_bytes = _read_regular_file(path / TENSORS, limit=files[TENSORS]["bytes"])
+    tensor_bytes = _read_regular_file(path / TENSORS, limit=min(files[TENSORS]["bytes"], MOST_TENSOR_BYTES))
     if len(tensor_bytes) != files[TENSORS]["bytes"]:
         raise CheckpointError(
             f"{path / TENSORS}: damaged: {len(tensor_bytes)} bytes, the manifest says {files[TENSORS]['bytes']}"

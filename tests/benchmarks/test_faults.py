@@ -19,6 +19,7 @@ from benchmarks.faults.row import Row
 from benchmarks.faults.rows import ROWS
 from ksim_rl.algorithms.gradient_steps import RolloutUpdate
 from ksim_rl.cli import errors
+from ksim_rl.config import plain_data
 from ksim_rl.envs.managers.action_manager import ActionManager
 from ksim_rl.envs.non_finite import NonFiniteTerms
 from ksim_rl.physics import World, load
@@ -179,6 +180,12 @@ def configs_are_not_checked(patch):
 def pickles_are_loaded(patch):
     with_pickles(patch)
     with_pickled_arrays(patch)
+
+
+@sabotage("small_files")
+def tables_as_they_are(patch):
+    patch.setattr(csv_table, "MOST_CELLS", 10**12)
+    patch.setattr(plain_data, "MOST_CONFIG_BYTES", 2**40)
 
 
 @sabotage("models")

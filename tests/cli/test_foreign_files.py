@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from ksim_rl.config import class_paths
-from ksim_rl.files import reading
+from ksim_rl.files import arrays, reading
 from ksim_rl.scene.actuators import nets
 from ksim_rl.scene.motions import motion
 from ksim_rl.trainers import loggers, run_folder
@@ -27,8 +27,11 @@ def pickled_net(path, code):
 
 
 def with_pickled_arrays(monkeypatch):
-    load = np.load
-    monkeypatch.setattr(np, "load", lambda file, allow_pickle: load(file, allow_pickle=True))
+    def read(archive, entry):
+        with archive.open(entry) as file:
+            return np.lib.format.read_array(file, allow_pickle=True)
+
+    monkeypatch.setattr(arrays, "_read_array", read)
 
 
 DATA_FILES = {

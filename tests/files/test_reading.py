@@ -1,9 +1,12 @@
-"""Files that a stranger may have written are read as plain data."""
+"""Every file that a stranger may have written is opened by one function: a regular one of limited size."""
 
+import ast
 import tracemalloc
+from pathlib import Path
 
 import pytest
 
+from ksim_rl.files import reading
 from ksim_rl.files.reading import read_bytes
 
 
@@ -29,3 +32,52 @@ def test_a_file_beyond_the_limit_and_what_is_no_file_are_refused_by_name(tmp_pat
         read_bytes(tmp_path, limit=999)
     with pytest.raises(ValueError, match="none: missing"):
         read_bytes(tmp_path / "none", limit=999)
+
+
+PACKAGE = Path(reading.__file__).parents[1]
+LOADS = {"np.load", "torch.load", "json.load", "onnx.load", "safe_open", "open"}
+METHODS = {"read_text", "from_file", "from_xml_path"}
+# What they read is the system's, of their own child, in a folder of their own, or was checked before; `signals.py`
+# stands alone beside an export, and has a function of its own.
+OTHERS = {
+    "diagnosis/doctor.py": {"NVIDIA.read_text"},
+    "export/folder.py": {"(STANDALONE / f'{name}.py').read_text", "onnx.load"},
+    "export/sim2sim.py": {"output.read_text"},
+    "export/standalone/signals.py": {"np.load", "mujoco.MjModel.from_xml_path"},
+    "physics/load.py": {"mujoco.MjSpec.from_file"},
+    "physics/nan_guard/guard.py": {"open", "safe_open"},
+    "runs/csv_table.py": {"open"},
+    "runs/record.py": {"processors.read_text"},
+    "trainers/checkpoint.py": {"open"},
+    "trainers/trial.py": {"json.load"},
+    "viewer/live_training.py": {"(folder / CONFIG).read_text", "torch.load"},
+    "viewer/pad.py": {"PAGE.read_text"},
+}
+
+
+def readers(tree):
+    """Return what a module calls that reads files in another way than by `files/reading.py`."""
+    found = set()
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        called = ast.unparse(node.func)
+        name = called.rpartition(".")[2]
+        is_method = name in METHODS or (name == "read_bytes" and called != name)
+        # Files that come with the package are its own.
+        if called in LOADS or (is_method and not called.startswith(("files(", "(files("))):
+            found.add(called)
+    return found
+
+
+def test_one_module_opens_files():
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = path.relative_to(PACKAGE).as_posix()
+        found[name] = readers(ast.parse(path.read_text())) - OTHERS.get(name, set())
+    assert {name: seen for name, seen in found.items() if seen} == {}
+
+
+def test_the_search_finds_others():
+    text = "path.read_text()\nnp.load(path)\nopen(path)\npath.read_bytes()"
+    assert readers(ast.parse(text)) == {"path.read_text", "np.load", "open", "path.read_bytes"}

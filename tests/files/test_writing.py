@@ -33,7 +33,7 @@ WRITES = {
 OTHERS = {
     "cli/new.py": {"copy", "copyfile"},
     "export/folder.py": {"write_text", "savez_compressed"},
-    "export/robot.py": {"write_text", "copyfile"},
+    "export/robot.py": {"write_text", "write_bytes"},
     "export/sim2sim.py": {"write_text"},
     "export/standalone/runner.py": {"write_text", "savez_compressed"},
     "zoo/adding.py": {"write_text", "copyfile"},

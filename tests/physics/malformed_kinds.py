@@ -156,6 +156,17 @@ def _enormous() -> Iterator[tuple[str, str]]:
         "replicas of replicas",
         world(f'<replicate count="10000"><replicate count="10000">{bare}</replicate></replicate>'),
     )
+    for what, attribute in (
+        ("an entity", 'count="5&#48;000000"'),
+        ("brackets before it", 'sep="&gt; >" count="50000000"'),
+        ("a name that ends as it does", 'count="50000000" x-count="1"'),
+        ("quotes in quotes", "count='50000000' sep=\"x' count='1\""),
+        ("another after it", 'count="50000000" count="1"'),
+    ):
+        yield f"replicas, with {what}", world(f"<replicate {attribute}>{bare}</replicate>")
+    hidden = f'<replicate count="50000000">{bare}</replicate>'
+    for what, begins in (("text", "<![CDATA[ <!-- ]]>"), ("declaration", "<!x <!-- >")):
+        yield f"replicas hidden by a {what}", world(f"{begins}{hidden}<!-- -->")
     yield "replicas of nothing", world('<replicate count="50000000"><site/></replicate>')
     yield "many geoms", world(bare * 20_000)
     yield "deep bodies", world("<body>" * 20_000 + bare + "</body>" * 20_000)
@@ -243,6 +254,45 @@ def _files() -> Iterator[tuple[str, Writes]]:
          '<attach model="m" prefix="p"/></worldbody></mujoco>'),
     ):  # fmt: skip
         yield f"{tag} in itself", lambda folder, xml=xml: xml
+    yield from _special_files(mesh)
+
+
+def _special_files(mesh: Callable[[str], str]) -> Iterator[tuple[str, Writes]]:
+    """Yield models that name pipes, devices, and files that include each other."""
+    include = '<mujoco><include file="{}"/></mujoco>'.format
+    hills = _asset('<hfield name="h" file="{}" size="1 1 1 1"/>').format
+    attached = _asset('<model name="m" file="{}"/>').format
+    skin = '<mujoco><deformable><skin name="s" file="{}"/></deformable></mujoco>'.format
+    for what, xml, name in (
+        ("mesh", mesh, "m.stl"),
+        (
+            "mesh in a folder",
+            lambda name: mesh(name).replace("<asset>", '<compiler meshdir="below"/><asset>'),
+            "m.stl",
+        ),
+        ("height field", hills, "h.png"),
+        ("include", include, "i.xml"),
+        ("model", attached, "i.xml"),
+        ("skin", skin, "s.skn"),
+    ):
+        for special in ("pipe", "device"):
+
+            def write(folder: Path, xml=xml, name=name, special=special) -> str:
+                text = xml(name)
+                path = folder / ("below" if "below" in text else "") / name
+                path.parent.mkdir(exist_ok=True)
+                os.mkfifo(path) if special == "pipe" else path.symlink_to("/dev/zero")
+                return text
+
+            yield f"{what} that is a {special}", write
+
+    def write_chain(folder: Path) -> str:
+        for number in range(60):
+            following = f'<include file="{number + 1}.xml"/>'
+            (folder / f"{number}.xml").write_text(f"<mujoco>{following}{following}</mujoco>")
+        return include("0.xml")
+
+    yield "includes of includes", write_chain
 
 
 def kinds() -> dict[str, Writes]:

@@ -264,7 +264,7 @@ def test_a_file_that_was_damaged_is_refused(failure_file, tmp_path):
 
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(ValueError, match="no such file"):
+    with pytest.raises(ValueError, match="it is no regular file"):
         nan_file.read(tmp_path / "pipe")
 
 

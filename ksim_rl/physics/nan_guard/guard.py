@@ -21,6 +21,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from ksim_rl.checked import Checked, Count, Filled
+from ksim_rl.files.reading import MOST_DATA_BYTES, check_regular
 from ksim_rl.files.writing import whole_file
 from ksim_rl.physics.fields import GRAVITY
 from ksim_rl.physics.model_checks import model_bytes
@@ -258,8 +259,7 @@ def read(path: Path) -> Failure:
     Raises ValueError where the file is none of ours, is damaged, holds other counters, names, shapes or dtypes than the
     guard writes, or was written with another MuJoCo.
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: there is no such file")
+    check_regular(path, limit=MOST_DATA_BYTES)
     try:
         # It compares all sizes with the file's before any memory is taken.
         with safe_open(path, framework="numpy") as file:

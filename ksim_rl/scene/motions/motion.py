@@ -1,7 +1,5 @@
 """This module reads reference motions: recorded states of a scene, at any time between their frames."""
 
-import io
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from ksim_rl.checks import near
-from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
+from ksim_rl.files.arrays import read_arrays
+from ksim_rl.files.reading import MOST_DATA_BYTES
 from ksim_rl.scene.names import Index, scalar_joint_ids
 
 KEYS = ("fps", "qpos", "qvel")
@@ -160,17 +159,8 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
             f"motion {path}: no such file, and none of that name comes with the package: {shipped}"
         )
     try:
-        data = io.BytesIO(read_bytes(path, limit=MOST_DATA_BYTES, follows_links=True))
-        entries = zipfile.ZipFile(data).filelist if zipfile.is_zipfile(data) else ()
-        if sum(entry.file_size for entry in entries) > MOST_DATA_BYTES:
-            raise ValueError(f"its arrays are larger than {MOST_DATA_BYTES} bytes")
-        data.seek(0)
-        archive = np.load(data, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError("it holds one array, not an archive of arrays")
-        with archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(path, limit=MOST_DATA_BYTES)
+    except ValueError as error:
         raise ValueError(f"motion {path}: cannot be read as .npz without pickles: {error}") from None
     for key in KEYS:
         if key not in arrays:
