@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from benchmarks.faults import (
     disk,
+    exports,
     gpu,
     growth,
     hostile_folder,
@@ -24,6 +25,7 @@ ROWS: dict[str, Row] = {
     **strangers.ROWS,
     **hostile_folder.ROWS,
     **viewer.ROWS,
+    **exports.ROWS,
     **machine.ROWS,
     **growth.ROWS,
     **gpu.ROWS,

@@ -199,10 +199,12 @@ def _fill(
 
 def runner_source() -> str:
     """Return the text of `runner.py`: the modules of the folder `standalone` as one."""
-    signals, runner = ((STANDALONE / f"{name}.py").read_text() for name in ("signals", "runner"))
+    files, signals, runner = (
+        (STANDALONE / f"{name}.py").read_text() for name in ("files", "signals", "runner")
+    )
     doc, body = re.split(r'(?<=\n""")\n', runner, maxsplit=1)
-    body = re.sub(r"from ksim_rl[^\n]*\n", "", body)
-    return doc + "\n" + re.sub(r'\A""".*?"""\n', "", signals, flags=re.DOTALL) + "\n\n" + body
+    inner = [re.sub(r'\A""".*?"""\n', "", text, flags=re.DOTALL) for text in (files, signals)]
+    return doc + "\n" + re.sub(r"from ksim_rl[^\n]*\n", "", "\n\n".join([*inner, body]))
 
 
 def _metadata(

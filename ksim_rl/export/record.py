@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ksim_rl.envs import ManagerBasedRlEnv
+from ksim_rl.export.standalone.files import CHOICE, FIELDS
 from ksim_rl.scene.sensors import ContactSensor
 
 Arrays = dict[str, np.ndarray]
@@ -104,6 +105,8 @@ class Recording:
         by_joint |= {f"actuator/{name}": view.actuator_param(name).clamp(max=1e30) for name in params}
         found |= {name: value[:, self._columns] for name, value in by_joint.items()}
         for name, value in world.per_world_fields().items():
+            if name not in (*FIELDS, CHOICE, "gravity"):
+                continue  # that which only pictures show
             value = value[:, list(order)] if name.startswith("actuator_") else value
             found["gravity" if name == "gravity" else f"model/{name}"] = value
         return {f"start/{name}": value.detach().cpu().numpy().copy() for name, value in found.items()}

@@ -13,7 +13,8 @@ from ksim_rl.checks import OneLineParser
 from ksim_rl.config.child_processes import run_python
 from ksim_rl.export.causes import Cause, find_causes
 from ksim_rl.export.folder import export, runner_source
-from ksim_rl.export.standalone.signals import read_arrays, read_json
+from ksim_rl.export.standalone.files import check_closed, read_arrays, read_json
+from ksim_rl.physics import load_spec
 
 TABLE = ("return", "length", "fell", "reward/", "metric/", "torque/", "contact/")
 
@@ -70,11 +71,9 @@ def sim2sim(
     if episodes < 1:
         raise ValueError(f"--episodes {episodes}: expected at least 1")
     meta = read_json(folder / "export.json")
-    ours = meta.get("ours")
-    if not isinstance(ours, dict) or not ours.get("return"):
-        raise ValueError(
-            f"{folder}: exported without episodes: export the run once more, with --episodes 100"
-        )
+    ours = _recorded(meta, folder)
+    check_closed(folder / "robot.xml")
+    load_spec(folder / "robot.xml")
     note(f"running {episodes} episodes")
     with tempfile.TemporaryDirectory() as temporary:
         program, output, replay = (Path(temporary) / name for name in ("runner.py", "out.json", "replay.npz"))
@@ -84,27 +83,49 @@ def sim2sim(
         # Isolated: PYTHONPATH adds no modules either, as the runner needs none of this library.
         done = run_python(["-I", str(program), *arguments])
         if done.returncode:
-            raise ValueError(f"{folder}: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
+            last = (done.stderr.strip() or "no message").splitlines()[-1]
+            said = last.removeprefix("runner.py: error: ")
+            raise ValueError(said if str(folder.absolute()) in said else f"{folder}: {said}")
         found = json.loads(output.read_text())
         try:
             causes = find_causes(meta, read_arrays(folder / "trace.npz"), read_arrays(replay))
-        except (KeyError, IndexError, TypeError) as error:
+        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
             raise ValueError(f"{folder}: trace.npz does not fit export.json: {error!r}") from error
     # The same episodes on both sides, in pairs, and returns of the same terms.
     pairs = np.arange(episodes) % len(ours["return"])
-    own = {name: np.array(values)[pairs] for name, values in ours.items() if name.startswith(TABLE)}
+    own = {name: values[pairs] for name, values in ours.items() if name.startswith(TABLE)}
     theirs = {name: np.array([one[name] for one in found]) for name in found[0] if name.startswith(TABLE)}
     described = [own[name] for name in own if name.startswith("reward/") and name in theirs]
     own["return"] = np.sum(described, axis=0) if described else np.zeros(episodes)
     return Report(
-        task=str(meta["task"]),
+        task=str(meta.get("task")),
         episodes=episodes,
         ours={name: float(values.mean()) for name, values in own.items()},
         theirs={name: float(values.mean()) for name, values in theirs.items()},
         standard_error=ratio_error(own["return"], theirs["return"]),
         causes=causes,
-        left_out=meta["left_out"],
+        left_out=[str(name) for name in meta.get("left_out", ())],
     )
+
+
+def _recorded(meta: Mapping[str, Any], folder: Path) -> dict[str, np.ndarray]:
+    """Return the figures of the recorded episodes [N] by name; a ValueError tells what an export does not write."""
+    ours = meta.get("ours")
+    if not isinstance(ours, dict) or not ours.get("return"):
+        raise ValueError(
+            f"{folder}: exported without episodes: export the run once more, with --episodes 100"
+        )
+    returns = ours["return"]
+    count = len(returns) if isinstance(returns, list) else 0
+    found = {}
+    for name, values in ours.items():
+        numbers = isinstance(values, list) and all(isinstance(value, int | float) for value in values)
+        if not numbers or len(values) != count:
+            raise ValueError(
+                f"{folder}: export.json: ours.{name}: expected a number for each recorded episode"
+            )
+        found[name] = np.array(values, np.float64)
+    return found
 
 
 def ratio_error(ours: np.ndarray, theirs: np.ndarray) -> float:

@@ -15,8 +15,13 @@ from ksim_rl.scene.rendering import rendering
 
 PACKAGE = Path(plugins.__file__).parents[1]
 STARTS = {"config/child_processes.py"}
-# It runs without this library, and its workers are as isolated as it is; and one that asks which process it is.
-OTHERS = {"export/standalone/runner.py": {"multiprocessing"}, "transforms/upstream.py": {"multiprocessing"}}
+# It runs without this library, and its workers are as isolated as it is; one that asks which process it is; and one
+# that waits in the event loop of a server.
+OTHERS = {
+    "export/standalone/runner.py": {"multiprocessing", "concurrent.futures", "concurrent.futures.process"},
+    "transforms/upstream.py": {"multiprocessing"},
+    "viewer/guarded_server.py": {"asyncio"},
+}
 # Words for what is started elsewhere, and threads.
 HARMLESS = {"PIPE", "STDOUT", "TimeoutExpired", "Popen", "ThreadPoolExecutor", "Future"}
 STARTERS = {"subprocess", "multiprocessing", "pty", "concurrent", "asyncio"}

@@ -25,7 +25,8 @@ from ksim_rl.envs.term import ObservationTerm, RewardTerm  # noqa: E402
 from ksim_rl.envs.view import EnvView  # noqa: E402
 from ksim_rl.export import controls, describe, export_policy, sim2sim  # noqa: E402
 from ksim_rl.export.sim2sim import ratio_error  # noqa: E402
-from ksim_rl.export.standalone.runner import Runner, read_arrays  # noqa: E402
+from ksim_rl.export.standalone.files import read_arrays  # noqa: E402
+from ksim_rl.export.standalone.runner import Runner  # noqa: E402
 from ksim_rl.modules import update_normalizers  # noqa: E402
 from ksim_rl.trainers.algorithm import make_policy  # noqa: E402
 from ksim_rl.trainers.build import build_env  # noqa: E402

@@ -11,14 +11,18 @@ import argparse
 import json
 import multiprocessing
 import os
+import sys
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from ksim_rl.export.standalone.signals import Array, Lag, Noise, Signals, read, read_arrays
+from ksim_rl.export.standalone.files import Array, check_record, read, read_arrays
+from ksim_rl.export.standalone.signals import Lag, Noise, Signals
 
 RECORD = "episodes.npz"
 KINDS = ("pos", "vel", "effort")
@@ -225,7 +229,7 @@ class Runner(Signals):
         elif kind == "gravity":
             self.model.opt.gravity[:] = value
         elif kind == "model":
-            whole = getattr(self.model, field)
+            whole = getattr(self.model, field)  # one that `check_record` lets through
             whole[:] = np.reshape(value, np.shape(whole))
             mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
         elif kind == "encoder_bias":
@@ -365,7 +369,15 @@ _own: list[Any] = []
 
 
 def _begin(folder: str, seed: int) -> None:
-    _own[:] = [Runner(folder, seed), read_arrays(Path(folder) / RECORD), seed]
+    runner = Runner(folder, seed)
+    _own[:] = [runner, _record(runner), seed]
+
+
+def _record(runner: Runner) -> dict[str, Array]:
+    path = runner.folder / RECORD
+    record = read_arrays(path)
+    check_record(path, record, runner.meta, runner.model)
+    return record
 
 
 def _run(number: int) -> dict[str, float]:
@@ -398,18 +410,37 @@ def main() -> None:
     parser.add_argument("--output", help="a JSON file; without it the means are printed")
     parser.add_argument("--replay", help="an .npz file for what each recorded step of trace.npz gives here")
     options = parser.parse_args()
-    if options.replay:
-        _replay(Runner(options.folder, options.seed), Path(options.replay))
-    cores = min(len(os.sched_getaffinity(0)), options.episodes)
-    pool = multiprocessing.get_context("spawn").Pool(cores, _begin, (options.folder, options.seed))
-    with pool:
-        found = pool.map(_run, range(options.episodes), chunksize=1)
+    try:
+        found = _run_all(options)
+    except BrokenProcessPool:
+        sys.exit(_refused("a process that ran episodes has crashed, or was killed for its memory"))
+    except ValueError as error:
+        sys.exit(_refused(str(error)))
+    except Exception as error:  # whatever a stranger's file makes a library raise
+        sys.exit(_refused(f"{options.folder}: {type(error).__name__}: {error}"))
     if options.output:
         Path(options.output).write_text(json.dumps(found))
         return
     for name in found[0]:
         values = [one[name] for one in found]
         print(f"{name:<40} {np.mean(values):12.4f} +- {np.std(values):.4f}")
+
+
+def _run_all(options: argparse.Namespace) -> list[dict[str, float]]:
+    # What is wrong is said here: a process that fails as it begins has nobody to tell.
+    runner = Runner(options.folder, options.seed)
+    _record(runner)
+    if options.replay:
+        _replay(runner, Path(options.replay))
+    cores = min(len(os.sched_getaffinity(0)), options.episodes)
+    how: dict[str, Any] = {"mp_context": multiprocessing.get_context("spawn"), "initializer": _begin}
+    with ProcessPoolExecutor(cores, initargs=(options.folder, options.seed), **how) as pool:
+        return list(pool.map(_run, range(options.episodes)))
+
+
+def _refused(why: str) -> int:
+    print(f"runner.py: error: {' '.join(why.split())}", file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":

@@ -1,11 +1,6 @@
-"""This module reads an exported folder, and computes what its descriptions say from MuJoCo's state."""
+"""This module computes what the descriptions of an exported folder say from MuJoCo's state."""
 
-import json
 import math
-import os
-import re
-import stat
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,11 +8,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-Array = np.ndarray
+from ksim_rl.export.standalone.files import Array, check_count, read_json, read_model
+
 Value = Callable[[], Array]
-MOST_BYTES, MOST_DEPTH, MOST_NODES = 2**30, 40, 100_000
-LEAVES_THE_FOLDER = re.compile(rb"<!|<\s*(include|extension|plugin|attach|model)\b", re.IGNORECASE)
-PATHS = re.compile(r"\b(?:file\w*|content_type|\w*dir)\s*=\s*[\"']([^\"']*)[\"']")
+MOST_DEPTH, MOST_NODES = 40, 100_000
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     name: getattr(np, name)
     for name in (
@@ -47,61 +41,12 @@ def rotated(quat: Array, vector: Array) -> Array:
     return result
 
 
-def read(path: Path, most: int = MOST_BYTES) -> bytes:
-    """Return the bytes of a regular file of limited size; links, pipes and devices are refused."""
-    try:
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW), "rb") as file:
-            about = os.fstat(file.fileno())
-            if not stat.S_ISREG(about.st_mode) or about.st_size > most:
-                raise ValueError(f"{path}: expected a regular file of at most {most} bytes")
-            return file.read(most)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Return an export's metadata; a ValueError says what is wrong with the file."""
-    content = read(path, 2**26)
-    try:
-        found = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: {error}") from None
-    if not isinstance(found, dict) or found.get("format") != 1:
-        raise ValueError(f"{path}: expected the metadata of an export, of format 1")
-    return found
-
-
-def read_arrays(path: Path) -> dict[str, Array]:
-    """Return the arrays of numbers of an .npz file."""
-    read(path)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > MOST_BYTES:
-                raise ValueError(f"{path}: unpacked larger than {MOST_BYTES} bytes")
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (zipfile.BadZipFile, ValueError, EOFError, KeyError) as error:
-        raise ValueError(f"{path}: not arrays of numbers: {error}") from None
-
-
-def read_model(folder: Path) -> mujoco.MjModel:
-    """Return the model of `robot.xml`, which may name files of its own folder only."""
-    path = folder / "robot.xml"
-    text = read(path, 2**28)
-    if found := LEAVES_THE_FOLDER.search(text):
-        raise ValueError(f"{path}: {found.group().decode()!r}: an exported model stands for itself")
-    for name in PATHS.findall(text.decode(errors="replace")):
-        inside = (folder / name).resolve().is_relative_to(folder.resolve())
-        if not inside or os.path.isabs(name) or "&" in name:
-            raise ValueError(f"{path}: {name!r} is outside of the folder")
-    return mujoco.MjModel.from_xml_path(str(path))
-
-
 class Lag:
     """A value as it was some steps ago; before an episode's first value lies that value, or `initial`."""
 
     def __init__(self, spec: dict[str, Any], signals: "Signals") -> None:
-        self.spec, self.signals, self.most = spec, signals, int(spec["max"])
+        self.spec, self.signals = spec, signals
+        self.most = check_count("steps of a delay", spec["max"])
         self.reset()
 
     def reset(self) -> None:
@@ -218,7 +163,8 @@ class Signals:
         self.model = model = read_model(self.folder)
         self.data = mujoco.MjData(model)
         self.draws = np.random.default_rng(seed)
-        self.decimation, self.limit = int(meta["decimation"]), int(meta["episode_steps"])
+        self.decimation = check_count("decimation", meta["decimation"])
+        self.limit = check_count("episode_steps", meta["episode_steps"])
         self.resets: list[Callable[[], None]] = []
         self.drawn: dict[Any, int] = {}
         self._nodes = 0
@@ -226,9 +172,12 @@ class Signals:
         self.joints = {n: (int(model.joint(n).qposadr[0]), int(model.joint(n).dofadr[0])) for n in names}
         self.default = dict(zip(names, meta["joints"]["default_pos"], strict=True))
         self.bias = dict.fromkeys(names, 0.0)
-        self.command: dict[str, Array] = {n: np.zeros(c["size"]) for n, c in meta["commands"].items()}
+        sizes = {n: check_count(f"commands.{n}.size", c["size"]) for n, c in meta["commands"].items()}
+        self.command: dict[str, Array] = {name: np.zeros(size) for name, size in sizes.items()}
         self.contacts = {name: Contacts(spec, model) for name, spec in meta["contacts"].items()}
-        self.action = self.last_action = np.zeros(meta["policy"]["num_actions"])
+        self.action = self.last_action = np.zeros(
+            check_count("policy.num_actions", meta["policy"]["num_actions"])
+        )
         self.steps, self.terminated = 0, False
         self.ground = [g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_HFIELD]
 

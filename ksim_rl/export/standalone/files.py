@@ -1,0 +1,193 @@
+"""This module reads the files of an exported folder, which may be a stranger's: as data, of limited size."""
+
+import json
+import math
+import os
+import re
+import stat
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+Array = np.ndarray
+MOST_BYTES = 2**30
+# Far more than an export has of anything that is counted, such as actions or steps of a delay.
+MOST = 1_000_000
+LEAVES_THE_FOLDER = re.compile(rb"<!|<\s*(include|extension|plugin|attach|model)\b", re.IGNORECASE)
+PATHS = re.compile(r"\b(?:file\w*|content_type|\w*dir)\s*=\s*[\"']([^\"']*)[\"']")
+# What an export writes of the model's fields where worlds differ: numbers, and none by which C finds other numbers.
+_FIELDS = {
+    "qpos0": "",
+    "qpos": "spring",
+    "body": "pos quat ipos iquat mass subtreemass inertia invweight0 gravcomp",
+    "jnt": "solref solimp pos axis stiffness stiffnesspoly springyield range actfrcrange margin",
+    "dof": "solref solimp frictionloss armature damping dampingpoly invweight0",
+    "geom": "solmix solref solimp size aabb rbound pos quat friction margin gap surfacevel adhesion rgba",
+    "site": "pos quat",
+    "cam": "pos quat poscom0 pos0 mat0 fovy intrinsic",
+    "light": "pos dir poscom0 pos0 dir0 attenuation cutoff exponent ambient diffuse specular",
+    "mat": "texrepeat emission specular shininess rgba",
+    "pair": "solref solreffriction solimp margin gap adhesion friction",
+    "eq": "solref solimp data",
+    "tendon": "solref_lim solimp_lim solref_fri solimp_fri range actfrcrange margin stiffness stiffnesspoly damping "
+    "dampingpoly armature frictionloss lengthspring springyield length0 invweight0",
+    "actuator": "cranklength dynprm gainprm biasprm actrange damping dampingpoly armature forcerange ctrlrange gear "
+    "acc0 lengthrange",
+}
+FIELDS = frozenset(f"{kind}_{name}" for kind, names in _FIELDS.items() for name in names.split()) | {"qpos0"}
+# Which mesh or height field a geom has; each that the model has may stand in the place of another of its kind.
+CHOICE = "geom_dataid"
+
+
+def read(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Return the bytes of a regular file of limited size; links, pipes and devices are refused."""
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW), "rb") as file:
+            about = os.fstat(file.fileno())
+            if not stat.S_ISREG(about.st_mode) or about.st_size > most:
+                raise ValueError(f"{path}: expected a regular file of at most {most} bytes")
+            return file.read(most)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return an export's metadata; a ValueError says what is wrong with the file."""
+    content = read(path, 2**26)
+    try:
+        found = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    if not isinstance(found, dict) or found.get("format") != 1:
+        raise ValueError(f"{path}: expected the metadata of an export, of format 1")
+    return found
+
+
+def read_arrays(path: Path) -> dict[str, Array]:
+    """Return the arrays of numbers of an .npz file."""
+    read(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MOST_BYTES:
+                raise ValueError(f"{path}: unpacked larger than {MOST_BYTES} bytes")
+            return {
+                entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in archive.infolist()
+            }
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for a damaged file
+        raise ValueError(f"{path}: not arrays of numbers: {error}") from None
+
+
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
+    """Return one array, once its header claims no more than the file holds."""
+    with archive.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        if version not in headers:
+            raise ValueError(f"{entry.filename}: version {version} of the format")
+        shape, _, dtype = headers[version](file)
+        claimed = math.prod(shape) * dtype.itemsize
+        if dtype.kind not in "fiub" or min(shape, default=0) < 0 or claimed > entry.file_size:
+            raise ValueError(f"{entry.filename}: {shape} of {dtype}")
+    with archive.open(entry) as file:
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def read_model(folder: Path) -> mujoco.MjModel:
+    """Return the model of `robot.xml`, which may name regular files of its own folder only."""
+    path = folder / "robot.xml"
+    check_closed(path)
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+
+
+def check_closed(path: Path) -> None:
+    """Refuse a model that takes in others, or names what is no regular file of its own folder."""
+    folder, text = path.parent, read(path, 2**28)
+    if found := LEAVES_THE_FOLDER.search(text):
+        raise ValueError(f"{path}: {found.group().decode()!r}: an exported model stands for itself")
+    for name in PATHS.findall(text.decode(errors="replace")):
+        named = folder / name
+        inside = named.resolve().is_relative_to(folder.resolve())
+        if not inside or os.path.isabs(name) or "&" in name:
+            raise ValueError(f"{path}: {name!r} is outside of the folder")
+        if named.exists() and not named.is_dir():
+            read(named)
+
+
+def check_count(what: str, value: Any) -> int:
+    """Return a whole number of 0 to a million, or refuse it."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MOST:
+        raise ValueError(f"export.json: {what} is {str(value)[:40]}: expected a whole number of 0 to {MOST}")
+    return value
+
+
+def check_record(
+    path: Path, record: Mapping[str, Array], meta: Mapping[str, Any], model: mujoco.MjModel
+) -> int:
+    """Return how many episodes a record has, or refuse it: what it writes into the model has to fit.
+
+    A model's field is one of `FIELDS`, of finite numbers and the model's own shape.
+    """
+    joints, shapes = len(meta["joints"]["names"]), {"qpos": (model.nq,), "qvel": (model.nv,), "gravity": (3,)}
+    shapes |= {"encoder_bias": (joints,), "default_pos": (joints,)}
+    if "start/qpos" not in record or record["start/qpos"].ndim != 2 or not len(record["start/qpos"]):
+        raise ValueError(f"{path}: no 'start/qpos' of [episodes, {model.nq}] numbers")
+    episodes = len(record["start/qpos"])
+    for name, value in record.items():
+        kind, _, rest = name.partition("/")
+        if kind == "start":
+            shape = (joints,) if rest.startswith("actuator/") else shapes.get(rest)
+            if rest.startswith("model/"):
+                shape = _check_field(path, rest.removeprefix("model/"), value, model)
+            if shape is None:
+                raise ValueError(f"{path}: {name!r}: no part of the start of an episode")
+            _check_shape(path, name, value, (episodes, *shape))
+    for name, command in meta["commands"].items():
+        values = record.get(f"command/{name}", np.zeros(0))
+        if values.ndim != 3 or values.shape[0] != episodes or values.shape[1] < 1:
+            raise ValueError(f"{path}: no 'command/{name}' of [{episodes}, steps, {command['size']}] numbers")
+        _check_shape(path, f"command/{name}", values, (*values.shape[:2], command["size"]))
+    pushes = record.get("pushes", np.zeros(0))
+    _check_shape(path, "pushes", pushes, (len(pushes), 2 + model.nv))
+    return episodes
+
+
+def _check_field(path: Path, field: str, value: Array, model: mujoco.MjModel) -> tuple[int, ...]:
+    """Return the shape that a field of the model has, as an export writes it; refuse one that none writes."""
+    if field not in FIELDS | {CHOICE}:
+        raise ValueError(f"{path}: 'start/model/{field}' is no field that an export writes")
+    own = getattr(model, field)
+    if field == CHOICE:
+        _check_choice(path, value, model)
+    elif value.dtype.kind != "f":
+        raise ValueError(f"{path}: 'start/model/{field}' is {value.dtype}: expected floats")
+    # MuJoCo Warp has matrices where C has rows of nine.
+    shape = value.shape[1:]
+    if math.prod(shape) != own.size or shape[:1] != own.shape[:1]:
+        raise ValueError(
+            f"{path}: 'start/model/{field}' is {shape} in each episode, and {own.shape} in the model"
+        )
+    return shape
+
+
+def _check_choice(path: Path, value: Array, model: mujoco.MjModel) -> None:
+    counts = {mujoco.mjtGeom.mjGEOM_HFIELD: model.nhfield, mujoco.mjtGeom.mjGEOM_MESH: model.nmesh}
+    for geom, kind in enumerate(model.geom_type.tolist()):
+        chosen, own = value[..., geom], model.geom_dataid[geom]
+        count = counts.get(mujoco.mjtGeom(kind), 0)
+        fits = (chosen == own) | ((chosen >= 0) & (chosen < count) & (own >= 0))
+        if value.dtype.kind != "i" or not bool(np.all(fits)):
+            raise ValueError(f"{path}: 'start/model/{CHOICE}' names what geom {geom} of the model cannot be")
+
+
+def _check_shape(path: Path, name: str, value: Array, shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise ValueError(f"{path}: {name!r} is {value.shape}: expected {shape}")
+    if not np.isfinite(value).all():
+        raise ValueError(f"{path}: {name!r} holds numbers that are not finite")
