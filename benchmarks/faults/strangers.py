@@ -107,6 +107,26 @@ def small_files(folder: Path, *, files: int) -> Figures:
     return bombs.figures(list(bombs.BOMBS)[:files], folder)
 
 
+def control_codes(folder: Path) -> Figures:
+    """Name folders by what a terminal obeys, and call the commands that say so."""
+    from tests.cli.payloads import call
+    from tests.test_terminal import COMMANDS, EVIL, OBEYED
+
+    found = {"cases": 0, "obeyed_letters": 0, "not_one_line": 0}
+    names = [os.fsencode(EVIL), b"\xff\xfe", b"a\nb\x7f"]
+    for command in COMMANDS:
+        for name in names:
+            path = os.fsdecode(os.fsencode(folder) + b"/" + name)
+            os.makedirs(path, exist_ok=True)
+            said = io.StringIO()
+            with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+                call([command, path, path] if command == "compare" else [command, path])
+            found["cases"] += 1
+            found["obeyed_letters"] += len(OBEYED & set(said.getvalue()))
+            found["not_one_line"] += len(said.getvalue().splitlines()) != 1
+    return found
+
+
 def models(folder: Path, *, kinds: int) -> Figures:
     """Load each kind of malformed model in a process of its own."""
     from tests.physics import malformed_kinds
@@ -145,6 +165,13 @@ ROWS = {
         amounts={"files": 19},
         short={"files": 5},
         files=("ksim_rl/files", "ksim_rl/config/plain_data.py", "ksim_rl/runs/csv_table.py", "ksim_rl/clips"),
+    ),
+    "control_codes": Row(
+        fault="names of files that hold ESC, its like, line ends, marks of direction, and bytes that are no UTF-8",
+        must="one line, in which a terminal finds nothing to obey",
+        limits={"cases": (AT_LEAST, 24), **dict.fromkeys(("obeyed_letters", "not_one_line"), (EXACTLY, 0))},
+        measure=control_codes,
+        files=("ksim_rl/terminal.py", "ksim_rl/cli"),
     ),
     "models": Row(
         fault="malformed models, models that nobody means, and models that explode while they compile",

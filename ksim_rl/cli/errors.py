@@ -2,11 +2,11 @@
 
 import os
 import signal
-import sys
 import threading
-import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from ksim_rl.terminal import printable, show, show_traceback
 
 REFUSED, FAILED = 2, 3
 
@@ -22,7 +22,7 @@ def report(error: Exception, *, about: str = "") -> int:
         error, NotImplementedError
     )
     if os.environ.get("KSIM_RL_TRACEBACK") or not explained:
-        traceback.print_exception(error)
+        show_traceback(error)
     text = " ".join(str(error).split())
     say(f"error: {about}{text if explained and text else f'{type(error).__name__}: {text}'}")
     return REFUSED if isinstance(error, ValueError) else FAILED
@@ -53,4 +53,4 @@ def interruption(stopped: KeyboardInterrupt) -> signal.Signals:
 def say(text: str) -> None:
     """Print one line of the program's own on stderr, and which of several ranks says it."""
     rank = f"rank {os.environ['RANK']}: " if os.environ.get("WORLD_SIZE", "1") != "1" else ""
-    print(f"ksim-rl: {rank}{text}", file=sys.stderr)
+    show(f"ksim-rl: {rank}{printable(text)}", to_stderr=True)

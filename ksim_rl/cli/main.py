@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from ksim_rl.cli.errors import REFUSED, interruption, report, say, sigterm_interrupts
+from ksim_rl.terminal import show, show_warnings_as_lines
 
 USAGE = """\
 usage: ksim-rl <command> [arguments]
@@ -76,6 +77,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         # Libraries start Python too: compilers of kernels, launchers of jobs. As with `-P`, the working directory,
         # which may be a stranger's, is not on the path of these.
         os.environ["PYTHONSAFEPATH"] = "1"
+        show_warnings_as_lines()
     try:
         with sigterm_interrupts():
             code = _dispatch(arguments)
@@ -91,13 +93,13 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _dispatch(words: list[str]) -> int:
     arguments, names = _without_plugins(words)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(USAGE)
+        show(USAGE)
         return 0 if arguments else REFUSED
     command, *rest = arguments
     if command == "--version":
         from ksim_rl import __version__
 
-        print(f"ksim-rl {__version__}")
+        show(f"ksim-rl {__version__}")
         return 0
     if command not in COMMANDS:
         from ksim_rl.checks import unknown_name

@@ -18,6 +18,7 @@ from ksim_rl.files.writing import write_whole
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S, robot_name
+from ksim_rl.terminal import show
 
 MODEL = "@model@"
 
@@ -73,8 +74,8 @@ def new(arguments: list[str]) -> int:
     if is_file:
         copy_model(Path(options.model), folder / name / f"{name}.xml")
     for file in sorted(path for path in folder.rglob("*") if path.is_file()):
-        print(shown(file))
-    print(f"next: cd {shown(folder)}; its README.md has the commands")
+        show(shown(file))
+    show(f"next: cd {shown(folder)}; its README.md has the commands")
     return 0 if stands else 1
 
 

@@ -15,6 +15,7 @@ from ksim_rl.envs.contract import part
 from ksim_rl.objectives import AMPCfg
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
+from ksim_rl.terminal import show
 from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.build import build_evaluator, solved_at
@@ -101,7 +102,7 @@ def evaluate(arguments: list[str]) -> int:
         judged = f"{policy.cfg.task_name}, iteration {policy.iteration}"
         if options.trials is not None:
             how = {"trials": options.trials, "seed": options.seed, "pushes": options.pushes, "note": say}
-            print(f"{judged}: {run_trials(policy.cfg, policy.actor, **how)}")
+            show(f"{judged}: {run_trials(policy.cfg, policy.actor, **how)}")
             return 0
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
         how = {"episodes": episodes, "seed": options.seed, "note": say}
@@ -112,7 +113,7 @@ def evaluate(arguments: list[str]) -> int:
         say(f"warning: {text}")
     assert evaluation is not None
     threshold = solved_at(policy.cfg)
-    print(f"{judged}: {verdict(evaluation, threshold)}")
+    show(f"{judged}: {verdict(evaluation, threshold)}")
     return 0 if threshold is None or evaluation.return_mean >= threshold else 1
 
 
@@ -129,7 +130,7 @@ def list_envs(arguments: list[str]) -> int:
             env = envs.make(options.task, num_envs=1, device=device)
         ours = part(env, envs.ManagerBasedRlEnv)
         assert ours is not None
-        print(ours.explain(), end="")
+        show(ours.explain(), end="")
         return 0
     rows = []
     for name in envs.names():
@@ -165,7 +166,7 @@ def robot(arguments: list[str]) -> int:
         raise ValueError(f"--picture {options.picture}: expected a file that ends in .png")
     with shown_working(f"analysing {options.model}"):
         found = analyse(options.model)
-    print(found.code() if options.code else found.table(), end="")
+    show(found.code() if options.code else found.table(), end="")
     if options.picture is not None:
         found.draw(options.picture)
     return 0 if found.stands_s >= TRIAL_S else 1

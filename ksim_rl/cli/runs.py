@@ -14,6 +14,7 @@ from ksim_rl.checks import OneLineParser
 from ksim_rl.cli.report import shown
 from ksim_rl.files.writing import whole_file
 from ksim_rl.runs import comparison, listing
+from ksim_rl.terminal import printable, show
 
 ORDERS = {"began": "began", "return": "evaluation", "speed": "speed"}
 
@@ -32,7 +33,7 @@ def runs(arguments: list[str]) -> int:
         chosen, key=lambda summary: (getattr(summary, field) is not None, getattr(summary, field) or 0.0)
     )
     if not ordered:
-        print(f"no runs in {', '.join(map(str, options.folders))}")
+        show(f"no runs in {', '.join(map(str, options.folders))}")
         return 0
     print_table(listing.HEADS, (listing.line(summary, name=shown(summary.folder)) for summary in ordered))
     return 0
@@ -57,7 +58,7 @@ def compare(arguments: list[str]) -> int:
     print_table(head, rows)
     with whole_file(options.output) as temporary:
         comparison.draw(options.runs, temporary)
-    print(shown(options.output))
+    show(shown(options.output))
     return 0
 
 
@@ -69,7 +70,7 @@ class TableOfJobs(Callback):
         folder = Path(str(config.hydra.sweep.dir))
         found = sorted(listing.find(folder), key=lambda run: (len(run.name.partition("_")[0]), run.name))
         print_table(listing.HEADS, (listing.line(listing.summarize(run), name=run.name) for run in found))
-        print(f"{shown(folder)}: ksim-rl runs {shown(folder)} --sort return")
+        show(f"{shown(folder)}: ksim-rl runs {shown(folder)} --sort return")
 
 
 def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
@@ -78,6 +79,6 @@ def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     for index, head in enumerate(heads):
         table.add_column(Text(head), no_wrap=index == 0)
     for row in rows:
-        table.add_row(*map(Text, row))
+        table.add_row(*(Text(printable(cell)) for cell in row))
     console = Console(highlight=False)
     Console(highlight=False, width=None if console.is_terminal else 400).print(table)

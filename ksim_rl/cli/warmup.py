@@ -7,6 +7,7 @@ import warp as wp
 
 from ksim_rl import conf
 from ksim_rl.device.kernel_loading import compile_notice
+from ksim_rl.terminal import show
 from ksim_rl.trainers import RunProgress, build
 from ksim_rl.trainers.sources import check_sources
 
@@ -19,7 +20,7 @@ that the next run with the same task starts at once: one iteration runs, with no
 def warmup(arguments: list[str]) -> int:
     """Run one iteration of the config, say how long it took and where the kernels are, and return the exit code."""
     if arguments and arguments[0] in ("-h", "--help"):
-        print(USAGE)
+        show(USAGE)
         return 0
     cfg = conf.compose([*arguments, "logger=none", "trainer.eval_episodes=0"])
     check_sources(cfg)
@@ -34,7 +35,7 @@ def warmup(arguments: list[str]) -> int:
     with compile_notice(notice), progress.busy("compiling"):
         build(cfg).iterate()
     seconds = time.perf_counter() - began
-    print(
+    show(
         f"{cfg.task_name} on {cfg.device}: {seconds:.1f} s; {len(compiled)} kernel modules were compiled, the others "
         f"were cached in {wp.config.kernel_cache_dir}"
     )

@@ -15,6 +15,7 @@ from ksim_rl.physics import load_spec
 from ksim_rl.scene.robots.booster_t1 import BoosterT1
 from ksim_rl.scene.robots.own_robots import Humanoid
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
+from ksim_rl.terminal import show
 
 ROBOTS = {"g1": UnitreeG1, "t1": BoosterT1, "humanoid": Humanoid}
 
@@ -45,7 +46,7 @@ def motion(arguments: Sequence[str]) -> int:
         )
         qpos_FL = retargeted(recording, model, read_retarget(options.pairs), fps=options.fps)
     write_motion(options.motion, model, qpos_FL, options.fps)
-    print(f"{options.motion}: {len(qpos_FL)} frames, {(len(qpos_FL) - 1) / options.fps:.2f} s")
+    show(f"{options.motion}: {len(qpos_FL)} frames, {(len(qpos_FL) - 1) / options.fps:.2f} s")
     return 0
 
 

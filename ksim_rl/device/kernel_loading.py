@@ -9,7 +9,6 @@ first line of a burst to stderr; a program with its own display sets another:
 """
 
 import os
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +22,7 @@ import warp as wp
 from ksim_rl.device import upstream
 from ksim_rl.device.quick_launch import QuickLaunch
 from ksim_rl.device.streams import warp_device
+from ksim_rl.terminal import show
 
 CompileHook = Callable[[str], None]
 # A process with more compilers than this waits for its disk.
@@ -61,17 +61,17 @@ class CompileLogger:
 
     def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
         """Write Warp's warnings to stderr."""
-        sys.stderr.write(f"Warp warning: {message}\n")
+        show(f"Warp warning: {message}", to_stderr=True)
 
     def error(self, message: str) -> None:
         """Write Warp's errors to stderr."""
-        sys.stderr.write(f"Warp error: {message}\n")
+        show(f"Warp error: {message}", to_stderr=True)
 
 
 def say_first(text: str) -> None:
     """Write the first line of a burst of compilations to stderr; the default hook."""
     if _logger.count == 1:
-        sys.stderr.write(text.rsplit(":", 1)[0] + " ...\n")
+        show(f"{text.rsplit(':', 1)[0]} ...", to_stderr=True)
 
 
 _logger = CompileLogger(say_first)

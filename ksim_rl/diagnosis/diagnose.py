@@ -8,6 +8,7 @@ from pathlib import Path
 from ksim_rl.checks import OneLineParser
 from ksim_rl.diagnosis.curves import LEAST_ROWS, Curves, read_run
 from ksim_rl.diagnosis.faults import EXPLAINS, FAULTS
+from ksim_rl.terminal import show
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +64,7 @@ def command(arguments: Sequence[str]) -> int:
     folder = parser.parse_args(arguments).run
     curves = read_run(folder)
     found = findings(curves)
-    print("\n".join(map(str, found)) if found else one_line(folder, str(folder)))
+    show("\n".join(map(str, found)) if found else one_line(folder, str(folder)))
     return 1 if found else 0
 
 

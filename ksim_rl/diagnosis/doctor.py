@@ -5,7 +5,6 @@ What it prints is meant for a bug report: no names of host and user are in it. A
 
 import getpass
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +23,7 @@ from ksim_rl.device.streams import start_warp, warp_device
 from ksim_rl.diagnosis.self_test import try_device
 from ksim_rl.runs import record
 from ksim_rl.scene.rendering import rendering
+from ksim_rl.terminal import show
 
 NVIDIA = Path("/proc/driver/nvidia/version")
 _DRAWS = """
@@ -82,7 +82,7 @@ def command(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--no-test", action="store_true", help="look only, and simulate nothing")
     report = examine(test_devices=not parser.parse_args(arguments).no_test)
-    print(report)
+    show(str(report))
     return 1 if report.faults else 0
 
 
@@ -203,7 +203,7 @@ def _look_at_opengl(report: Report) -> None:
 
 
 def _try_device(report: Report, device: torch.device) -> None:
-    say: Callable[[str], None] = lambda text: print(f"{text} ...", file=sys.stderr)  # noqa: E731
+    say: Callable[[str], None] = lambda text: show(f"{text} ...", to_stderr=True)  # noqa: E731
     began = time.monotonic()
     with compile_notice(say):
         done = try_device(device)

@@ -21,6 +21,7 @@ from ksim_rl.physics import prepare_spec
 from ksim_rl.runs import record
 from ksim_rl.scene.scene import build_spec
 from ksim_rl.scene.sensors import ContactSensor
+from ksim_rl.terminal import show
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, UNLIMITED_EPISODE_STEPS, build_env
 from ksim_rl.trainers.run_folder import Policy, policy_of
@@ -86,7 +87,7 @@ def export_policy(
     episodes: int = 100,
     seed: int | None = None,
     noise: bool = True,
-    note: Callable[[str], None] = print,
+    note: Callable[[str], None] = show,
 ) -> Path:
     """Write a policy into a folder, and return it; `trained_with` holds commit and versions.
 

@@ -15,6 +15,7 @@ from ksim_rl.export.causes import Cause, find_causes
 from ksim_rl.export.folder import export, runner_source
 from ksim_rl.export.standalone.files import check_closed, read_arrays, read_json
 from ksim_rl.physics import load_spec
+from ksim_rl.terminal import show
 
 TABLE = ("return", "length", "fell", "reward/", "metric/", "torque/", "contact/")
 
@@ -61,7 +62,7 @@ class Report:
 
 
 def sim2sim(
-    folder: Path, *, episodes: int = 100, seed: int = 0, note: Callable[[str], None] = print
+    folder: Path, *, episodes: int = 100, seed: int = 0, note: Callable[[str], None] = show
 ) -> Report:
     """Run episodes of an exported folder on MuJoCo's C engine, on all cores, and compare them with the recorded ones.
 
@@ -152,7 +153,7 @@ def run_export(arguments: Sequence[str]) -> int:
     options: Any = parser.parse_args(arguments)
     how = {"episodes": options.episodes, "seed": options.seed, "noise": options.noise}
     folder = export(options.run, options.output, device=options.device, **how)
-    print(f"{folder}: see README.md in it; next: ksim-rl sim2sim {folder}")
+    show(f"{folder}: see README.md in it; next: ksim-rl sim2sim {folder}")
     return 0
 
 
@@ -166,5 +167,5 @@ def run_sim2sim(arguments: Sequence[str]) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of noise and lags")
     options: Any = parser.parse_args(arguments)
     report = sim2sim(options.folder, episodes=options.episodes, seed=options.seed)
-    print(report.table())
+    show(report.table())
     return 1 if report.causes else 0

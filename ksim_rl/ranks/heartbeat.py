@@ -5,13 +5,13 @@ beats go through the run's key-value store, beside all collectives.
 """
 
 import os
-import sys
 import threading
 import time
 from contextlib import suppress
 from typing import Protocol
 
 from ksim_rl.ranks import group
+from ksim_rl.terminal import show
 
 # Between beats; a rank whose thread is silent for so long is dead or stopped, and one that says to be in the same
 # place for `KSIM_RL_RANK_TIMEOUT_S` hangs: compiling kernels and evaluating take less.
@@ -110,8 +110,8 @@ class Heartbeat:
         if self._stop.is_set():
             return
         self._tell("ended", why)
-        sys.stderr.write(
-            f"ksim-rl: rank {group.rank()}: error: {why}; this rank ends too (it was {_place[0]})\n"
+        show(
+            f"ksim-rl: rank {group.rank()}: error: {why}; this rank ends too (it was {_place[0]})",
+            to_stderr=True,
         )
-        sys.stderr.flush()
         os._exit(FAILED)

@@ -10,7 +10,7 @@ from ksim_rl.config.plain_data import flat, read_yaml
 from ksim_rl.runs import curves
 from ksim_rl.runs.csv_table import STEP
 from ksim_rl.runs.listing import CONFIG, HEADS, METRICS, line, metric_rows, numbers, summarize, written
-from ksim_rl.runs.record import printable
+from ksim_rl.terminal import printable
 
 RETURN = ("evaluation/return_mean", "episode/return")
 # Title, the metrics of which the first that all runs have a curve of is drawn, and over what.

@@ -12,6 +12,7 @@ from statistics import median
 from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import STEP, read_table
+from ksim_rl.terminal import printable
 
 CONFIG, METRICS = "config.yaml", "metrics.csv"
 _TASK = re.compile(r"^task_name: *['\"]?([\w.+-]+)", re.MULTILINE)
@@ -81,7 +82,7 @@ def summarize(folder: Path) -> Summary:
         task = found[1] if (found := _TASK.search(text)) else "?"
         rows = metric_rows(folder)
     except (ValueError, csv.Error) as error:
-        faults.append(record.printable(str(error)))
+        faults.append(printable(str(error)))
     speeds = numbers(rows[-LATEST:], "throughput/env_states_per_s")
     iteration, env_states = last(rows, "iteration"), last(rows, STEP)
     return Summary(
@@ -127,7 +128,7 @@ def line(summary: Summary, *, name: str) -> list[str]:
         f"{summary.status} ({summary.why})" if summary.why and summary.status != "done" else summary.status
     )
     return [
-        record.printable(name),
+        printable(name),
         summary.task,
         status,
         summary.began,

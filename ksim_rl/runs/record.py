@@ -26,6 +26,7 @@ from ksim_rl.config.child_processes import ask_git
 from ksim_rl.files.reading import read_bytes
 from ksim_rl.files.writing import write_whole
 from ksim_rl.runs.run_lock import is_locked
+from ksim_rl.terminal import printable
 
 RECORD = "run.json"
 Status = Literal["running", "done", "interrupted", "failed"]
@@ -42,7 +43,7 @@ PACKAGES = [
     "hydra-core",
     "omegaconf",
 ]
-MOST_SESSIONS, MOST_LETTERS = 1000, 10_000
+MOST_SESSIONS = 1000
 MOST_DIFF_BYTES = MOST_RECORD_BYTES = 4 * 2**20
 
 
@@ -123,11 +124,6 @@ def status(folder: Path) -> tuple[str, str]:
     if last.status == "running":
         return "failed", "its process ended without a word: killed, or the machine went down"
     return last.status, last.why
-
-
-def printable(text: str) -> str:
-    """Return a stranger's text as one line that a terminal shows and does not obey."""
-    return "".join(c if c.isprintable() else " " for c in text[:MOST_LETTERS])
 
 
 def _text(value: Any) -> Any:

@@ -14,6 +14,7 @@ from ksim_rl.tables.levels import is_reached
 from ksim_rl.tables.measure import run_cfg
 from ksim_rl.tables.runner import Runs, gpus_for
 from ksim_rl.tables.table import load, shipped
+from ksim_rl.terminal import show
 
 
 def reproduce(arguments: Sequence[str]) -> int:
@@ -42,7 +43,7 @@ def reproduce(arguments: Sequence[str]) -> int:
 
     def write(said: str) -> None:
         report.write(table, runs.complete(seeds), output, seeds=seeds)
-        print(said, flush=True)
+        show(said)
 
     present = {} if smoke else runs.results()
     # Seed by seed, so that what is cut off has some seeds of all rows; the longest first, so that all end together.

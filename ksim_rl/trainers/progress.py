@@ -11,8 +11,10 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from ksim_rl import ranks
+from ksim_rl.terminal import printable
 
 # What is shown, in this order, where the run has it: metric, label, format.
 SHOWN = (
@@ -110,7 +112,7 @@ class RunProgress:
         if ranks.rank() and not text.startswith("NaN guard"):
             return
         self._spoken = time.monotonic()
-        self.console.print(text, markup=False, soft_wrap=True)
+        self.console.print(printable(text), markup=False, soft_wrap=True)
 
     def status(self, text: str) -> None:
         """Show what is going on now; in a pipe, a repetition of the same beginning is printed once."""
@@ -132,7 +134,7 @@ class RunProgress:
                 self.status(text)
                 shown.callback(self.status, "")
             elif self._enabled and self.console.is_terminal and text:
-                shown.enter_context(self.console.status(text))
+                shown.enter_context(self.console.status(Text(printable(text))))
             elif self._enabled and not self.console.is_terminal and not self._watched:
                 shown.enter_context(self._watch())
             yield
@@ -168,7 +170,7 @@ class RunProgress:
         table = Table.grid(padding=(0, 2))
         for start in range(0, len(figures), 3):
             table.add_row(*(f"[dim]{label}[/dim] {text}" for label, text in figures[start : start + 3]))
-        return Group(self._bar, table, *([self._status] if self._status else []))
+        return Group(self._bar, table, *([Text(printable(self._status))] if self._status else []))
 
 
 class RunClock:

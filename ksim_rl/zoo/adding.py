@@ -11,6 +11,7 @@ from ksim_rl.export import export, sim2sim
 from ksim_rl.files.writing import unfinished_folder
 from ksim_rl.runs import listing, record
 from ksim_rl.runs.csv_table import STEP
+from ksim_rl.terminal import show
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.zoo.cards import CARD, CHECKPOINT, FOLDER, MOST_BYTES, ONNX, Card, hashes, read_card
@@ -41,8 +42,8 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
         entry.mkdir()
         checkpoint.save(entry / CHECKPOINT, state, iteration=saved.iteration, config=saved.config)
         made = {"commit": card.commit, "versions": dict(record.read(run)[-1].versions)}
-        export(entry, exported, episodes=episodes, note=print, trained_with=made)
-        report = sim2sim(exported, episodes=episodes, note=print)
+        export(entry, exported, episodes=episodes, note=show, trained_with=made)
+        report = sim2sim(exported, episodes=episodes, note=show)
         if not math.isfinite(report.return_ratio):
             raise ValueError(f"{run}: of its rewards none has a description; see docs/deploy.md")
         shutil.copyfile(exported / ONNX, entry / ONNX)

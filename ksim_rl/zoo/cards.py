@@ -14,7 +14,7 @@ from typing import Any
 from ksim_rl.checked import Checked, WholeNumber
 from ksim_rl.checks import near
 from ksim_rl.files.reading import read_bytes
-from ksim_rl.runs import record
+from ksim_rl.terminal import printable
 
 FOLDER = Path(__file__).parent / "policies"
 CARD, ONNX, CHECKPOINT = "card.json", "policy.onnx", "checkpoint"
@@ -58,10 +58,10 @@ def read_card(name: str, folder: Path = FOLDER) -> Card:
     path = folder / name / CARD
     try:
         tree = json.loads(read_bytes(path, limit=MOST_BYTES))
-        plain: Any = {key: record.printable(v) if isinstance(v, str) else v for key, v in tree.items()}
+        plain: Any = {key: printable(v) if isinstance(v, str) else v for key, v in tree.items()}
         card = Card(**plain)
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path}: no card: {record.printable(str(error))}") from error
+        raise ValueError(f"{path}: no card: {printable(str(error))}") from error
     if card.name != name or hashes(path.parent) != dict(card.files):
         raise ValueError(f"{path.parent}: its files are not those of its card: install the package once more")
     return card

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ksim_rl.checks import OneLineParser
+from ksim_rl.terminal import show
 from ksim_rl.zoo import adding
 from ksim_rl.zoo.cards import FOLDER, cards, read_card
 
@@ -26,12 +27,12 @@ def zoo(arguments: Sequence[str]) -> int:
     options: Any = parser.parse_args(arguments)
     match options.words:
         case []:
-            print(ROW.format("name", "task", "env states", "return", "C engine", "commit"))
+            show(ROW.format("name", "task", "env states", "return", "C engine", "commit"))
             for card in cards(options.folder):
                 earned = "-" if card.return_mean is None else f"{card.return_mean:.4g}"
                 ratio = f"x {card.sim2sim.get('return_ratio', float('nan')):.3f}"
                 row = (card.name, card.task, f"{card.env_states:,}", earned, ratio, card.commit[:7])
-                print(ROW.format(*row))
+                show(ROW.format(*row))
             return 0
         case ["add", run, name]:
             card = adding.add(Path(run), name, folder=options.folder, episodes=options.episodes)
@@ -39,5 +40,5 @@ def zoo(arguments: Sequence[str]) -> int:
             card = read_card(name, options.folder)
         case words:
             raise ValueError(f"{' '.join(words)}: expected NAME, or add RUN NAME")
-    print(json.dumps(asdict(card), indent=1))
+    show(json.dumps(asdict(card), indent=1))
     return 0

@@ -5,11 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ksim_rl.files.writing import check_folder, whole_folder
+from ksim_rl.terminal import show
 from ksim_rl.zoo import wandb_runs
 from ksim_rl.zoo.cards import CHECKPOINT, FOLDER, read_card
 
 
-def locate(text: str | Path, *, note: Callable[[str], None] = print) -> Path:
+def locate(text: str | Path, *, note: Callable[[str], None] = show) -> Path:
     """Return a run folder: `zoo:NAME` and `wandb:ENTITY/PROJECT/RUN` are copied into `runs/zoo` and `runs/wandb`.
 
     Any other text is a path. What is copied is data, checked by hash; a ValueError says what is wrong with it.

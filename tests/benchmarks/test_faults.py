@@ -17,6 +17,7 @@ from benchmarks.faults import __main__ as command
 from benchmarks.faults import children, hostile_folder, machine, page
 from benchmarks.faults.row import Row
 from benchmarks.faults.rows import ROWS
+from ksim_rl import terminal
 from ksim_rl.algorithms.gradient_steps import RolloutUpdate
 from ksim_rl.cli import errors
 from ksim_rl.config import plain_data
@@ -34,7 +35,16 @@ from tests.cli.test_foreign_files import with_pickled_arrays
 
 RESULTS = report.RESULTS / "faults.json"
 # Those of seconds; the others run in the full tests, as their long forms do by the command.
-QUICK = ("latest", "corruption", "kill9", "data_files", "headless", "nan_actions", "nan_worlds")
+QUICK = (
+    "latest",
+    "corruption",
+    "kill9",
+    "data_files",
+    "control_codes",
+    "headless",
+    "nan_actions",
+    "nan_worlds",
+)
 
 
 def short(name, folder):
@@ -187,6 +197,11 @@ def pickles_are_loaded(patch):
 def tables_as_they_are(patch):
     patch.setattr(csv_table, "MOST_CELLS", 10**12)
     patch.setattr(plain_data, "MOST_CONFIG_BYTES", 2**40)
+
+
+@sabotage("control_codes")
+def letters_as_they_are(patch):
+    patch.setattr(terminal, "_letter", lambda letter: letter)
 
 
 @sabotage("models")

@@ -24,8 +24,19 @@ OTHERS = {
 }
 # Words for what is started elsewhere, and threads.
 HARMLESS = {"PIPE", "STDOUT", "TimeoutExpired", "Popen", "ThreadPoolExecutor", "Future"}
-STARTERS = {"subprocess", "multiprocessing", "pty", "concurrent", "asyncio"}
-CALLS = {"Popen", "system", "popen", "fork", "forkpty", "posix_spawn", "posix_spawnp", "start_processes"}
+STARTERS = {"subprocess", "multiprocessing", "pty", "concurrent"}
+CALLS = {
+    "Popen",
+    "system",
+    "popen",
+    "fork",
+    "forkpty",
+    "posix_spawn",
+    "posix_spawnp",
+    "start_processes",
+    "create_subprocess_exec",
+    "create_subprocess_shell",
+}
 
 
 def starters(tree):

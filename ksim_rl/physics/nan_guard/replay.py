@@ -7,7 +7,6 @@ forces and model fields, and takes one step in double precision.
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from ksim_rl.physics.fields import write_fields
 from ksim_rl.physics.load import caught_warnings
 from ksim_rl.physics.nan_guard.guard import Failure, read
+from ksim_rl.terminal import show
 
 # The C engine sets all controls to zero if one exceeds 1e10 or is not finite.
 MOST_CONTROL = 1e9
@@ -145,9 +145,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         failure = read(path)
     except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        show(f"error: {error}", to_stderr=True)
         return 1
-    print(describe(failure, replay(failure)))
+    show(describe(failure, replay(failure)))
     return 0
 
 
