@@ -9,10 +9,10 @@ MOST_LETTERS = 10_000  # of a line
 
 
 def printable(text: str) -> str:
-    """Return a text as one line that a terminal shows and does not obey.
+    r"""Return a text as one line that a terminal shows and does not obey.
 
     Control codes such as ESC, line ends and marks that turn the direction of writing become spaces. Bytes of a file's
-    name that are no UTF-8 are written as `\\xff`.
+    name that are no UTF-8 are written as `\xff`.
     """
     return "".join(map(_letter, text[:MOST_LETTERS]))
 

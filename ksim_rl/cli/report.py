@@ -11,6 +11,7 @@ from ksim_rl import envs, ranks
 from ksim_rl.cli.errors import interruption
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.diagnosis.diagnose import one_line
+from ksim_rl.terminal import printable
 from ksim_rl.trainers import (
     Checkpoint,
     Evaluation,
@@ -100,9 +101,9 @@ def verdict(evaluation: Evaluation, threshold: float | None) -> str:
 
 
 def shown(path: Path) -> str:
-    """Return a path as short as it can be written from here."""
+    """Return a path as short as it can be written from here, and in one line."""
     relative = os.path.relpath(path)
-    return str(path) if relative.startswith("..") else relative
+    return printable(str(path) if relative.startswith("..") else relative)
 
 
 def _far_from(cfg: RunCfg, length: int) -> str:

@@ -33,7 +33,7 @@ def runs(arguments: list[str]) -> int:
         chosen, key=lambda summary: (getattr(summary, field) is not None, getattr(summary, field) or 0.0)
     )
     if not ordered:
-        show(f"no runs in {', '.join(map(str, options.folders))}")
+        show(f"no runs in {', '.join(map(shown, options.folders))}")
         return 0
     print_table(listing.HEADS, (listing.line(summary, name=shown(summary.folder)) for summary in ordered))
     return 0

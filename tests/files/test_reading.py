@@ -37,13 +37,13 @@ def test_a_file_beyond_the_limit_and_what_is_no_file_are_refused_by_name(tmp_pat
 PACKAGE = Path(reading.__file__).parents[1]
 LOADS = {"np.load", "torch.load", "json.load", "onnx.load", "safe_open", "open"}
 METHODS = {"read_text", "from_file", "from_xml_path"}
-# What they read is the system's, of their own child, in a folder of their own, or was checked before; `signals.py`
+# What they read is the system's, of their own child, in a folder of their own, or was checked before; `files.py`
 # stands alone beside an export, and has a function of its own.
 OTHERS = {
     "diagnosis/doctor.py": {"NVIDIA.read_text"},
     "export/folder.py": {"(STANDALONE / f'{name}.py').read_text", "onnx.load"},
     "export/sim2sim.py": {"output.read_text"},
-    "export/standalone/signals.py": {"np.load", "mujoco.MjModel.from_xml_path"},
+    "export/standalone/files.py": {"np.load", "mujoco.MjModel.from_xml_path"},
     "physics/load.py": {"mujoco.MjSpec.from_file"},
     "physics/nan_guard/guard.py": {"open", "safe_open"},
     "runs/csv_table.py": {"open"},
