@@ -1,4 +1,4 @@
-"""This row runs `sim2sim` on exported folders of strangers."""
+"""These rows run `sim2sim` on exported folders of strangers, and `reproduce` on their tables."""
 
 from __future__ import annotations
 
@@ -16,6 +16,13 @@ def sim2sim_folders(folder: Path, *, folders: int) -> Figures:
     return figures(whole, folder, folders=folders)
 
 
+def strange_tables(folder: Path, *, tables: int) -> Figures:
+    """Run `ksim-rl reproduce` on tables whose names and overrides lead out."""
+    from tests.tables.strange_tables import figures
+
+    return figures(folder, tables=tables)
+
+
 ROWS = {
     "sim2sim_folders": Row(
         fault="exported folders that write index arrays, other shapes and NaN, are cut, or claim terabytes",
@@ -29,5 +36,17 @@ ROWS = {
         amounts={"folders": 38},
         short={"folders": 5},
         files=("ksim_rl/export", "tests/export/strange_folders.py"),
+    ),
+    "strange_tables": Row(
+        fault="tables whose names, groups and rows are paths, whose overrides write elsewhere or read the environment",
+        must="refused in one line, exit code 2; nothing written, deleted or told",
+        limits={
+            "tables": (AT_LEAST, "tables"),
+            **dict.fromkeys(("not_refused_in_one_line", "written_deleted_or_leaked"), (EXACTLY, 0)),
+        },
+        measure=strange_tables,
+        amounts={"tables": 28},
+        short={"tables": 4},
+        files=("ksim_rl/tables", "ksim_rl/config", "tests/tables/strange_tables.py"),
     ),
 }

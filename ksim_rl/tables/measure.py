@@ -28,6 +28,7 @@ from ksim_rl.tables.levels import HELD_STATES, means_of, reached
 from ksim_rl.tables.table import Row, load
 from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
+from ksim_rl.trainers.run_cfg import reaching_outside
 
 KEPT_POINTS = 60
 # One evaluation, at the end, of the final policy.
@@ -39,10 +40,18 @@ LATER = re.compile('"min_advantage_std": 0.0001, |"min_std": 0.001, |"engine": "
 
 
 def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -> RunCfg:
-    """Compose the config of a seed, as `ksim-rl train` does; a ValueError names the override that is wrong."""
+    """Compose the config of a seed, as `ksim-rl train` does; a ValueError names the override that is wrong.
+
+    A table is data: a field by which a run writes or listens outside of its folder is refused.
+    """
     words = [f"task={row.task}", f"objective={row.objective}", f"seed={seed}", f"device={device}"]
     words += [*FIXED.split(), *row.overrides, f"trainer.eval_episodes={8 if smoke else row.episodes}"]
     cfg = conf.compose([*words, *(SMOKE.split() if smoke else ())])
+    for path, value in reaching_outside(cfg.to_tree()):
+        raise ValueError(
+            f"overrides: {path}={value!r} reaches outside of the run folder, which a table may not: leave it out, or "
+            "train that row with ksim-rl train"
+        )
     per_iteration = cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)
     num_iterations = 2 if smoke else max(1, int(row.env_states // per_iteration))
     quick = {"compile": False} if smoke and hasattr(cfg.objective, "compile") else {}

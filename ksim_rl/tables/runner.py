@@ -13,7 +13,8 @@ import torch
 
 from ksim_rl.config.child_processes import start_python
 from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
-from ksim_rl.files.writing import open_own
+from ksim_rl.files.writing import make_folder, open_own
+from ksim_rl.runs import run_lock
 from ksim_rl.tables.measure import run_cfg, settings
 from ksim_rl.tables.table import Table
 
@@ -57,6 +58,7 @@ class Runs:
         """
         waiting, left = list(jobs), 0
         running: dict[int, tuple[Job, Popen[bytes]]] = {}
+        elsewhere: set[Job] = set()
         try:
             while waiting or running:
                 is_over = time.monotonic() > until
@@ -65,11 +67,16 @@ class Runs:
                     for _, process in running.values():
                         process.kill()
                 for slot, gpu in enumerate(gpus):
-                    if slot not in running and waiting:
-                        running[slot] = waiting[0], self._start(waiting.pop(0), gpu)
+                    if slot not in running:
+                        job = self._next(waiting, elsewhere, note)
+                        if job is not None:
+                            running[slot] = job, self._start(job, gpu)
                 for slot, (job, process) in list(running.items()):
                     if (code := process.poll()) is not None:
                         del running[slot]
+                        if code and not is_over and run_lock.is_locked(self._run(job)):
+                            waiting.append(job)  # the other was faster
+                            continue
                         last = "".join(self._said(job).splitlines()[-1:])
                         why = "no time left" if is_over else f"exit code {code}, {last} ({self._log(job)})"
                         note(f"{job[0]}, seed {job[1]}: " + (why if code else "done"))
@@ -81,17 +88,34 @@ class Runs:
                 process.wait()
         return left
 
+    def _next(self, waiting: list[Job], elsewhere: set[Job], note: Callable[[str], None]) -> Job | None:
+        """Take a job that no other process does now, or None; what another has done meanwhile is not done again."""
+        for job in list(waiting):
+            if run_lock.is_locked(self._run(job)):
+                elsewhere.add(job)
+                continue
+            waiting.remove(job)
+            if job in elsewhere and job[1] in self.results()[job[0]]:
+                note(f"{job[0]}, seed {job[1]}: done by another process")
+                continue
+            return job
+        return None
+
     def _start(self, job: Job, gpu: str) -> Popen[bytes]:
         (name, seed), log = job, self._log(job)
         result = self.folder / name / f"seed_{seed}.json"
-        words = [self.table.source, name, seed, result, log.with_suffix(""), "cuda" if gpu else "cpu"]
+        words = [self.table.source, name, seed, result, self._run(job), "cuda" if gpu else "cpu"]
         command = ["-m", "ksim_rl.tables.measure", *map(str, words), "smoke" * self.smoke]
-        log.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(log.parent, below=self.run_folder.parent)
+        make_folder(result.parent, below=self.folder.parent)
         result.unlink(missing_ok=True)
         environment = {"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}
         with open_own(log) as file:
             file.truncate()
             return start_python(command, environment=environment, stdout=file, stderr=STDOUT)
+
+    def _run(self, job: Job) -> Path:
+        return self._log(job).with_suffix("")
 
     def _said(self, job: Job) -> str:
         return read_bytes(self._log(job), limit=MOST_DATA_BYTES).decode(errors="replace")

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ksim_rl.checked import Checked, Count, Positive, Share, WholeNumber
-from ksim_rl.checks import unknown_name
+from ksim_rl.checks import naming, unknown_name
 from ksim_rl.config import plain_data
 from ksim_rl.config.config_tree import from_tree
+from ksim_rl.tables.rules import check_name, check_override
 
 SUFFIX = ".yaml"
 FOLDER = Path(str(files("ksim_rl.tables")))
@@ -57,9 +58,10 @@ class Row(Checked):
             raise ValueError(f"seeds={self.seeds!r}: expected at least one, and each once")
         if self.measure == "seconds" and not self.levels:
             raise ValueError("levels={}: measure=seconds waits until metrics reach some; give one at least")
+        check_name("task", self.task)
+        check_name("objective", self.objective)
         for word in self.overrides:
-            if word.partition("=")[0] in ("task", "objective", "seed", "trainer.num_iterations"):
-                raise ValueError(f"overrides: {word!r} has a field of its own in the row")
+            check_override(word)
 
     @property
     def goal(self) -> float | None:
@@ -106,12 +108,28 @@ def load(name: str) -> Table:
     if path.parent == FOLDER and path.stem not in shipped():
         raise unknown_name("table", name, shipped())
     tree = plain_data.read_yaml(path)
-    groups, rows = tree.pop("groups", None) if isinstance(tree, dict) else None, {}
+    groups = tree.pop("groups", None) if isinstance(tree, dict) else None
+    with naming(str(path)):
+        rows = _rows(groups)
+    table = from_tree(Table, {"name": path.stem, **tree, "source": name, "rows": rows}, str(path))
+    with naming(str(path)):
+        check_name("name", table.name)
+    return table
+
+
+def _rows(groups: Any) -> dict[str, Any]:
+    """Return the fields of each row by `<group>/<name>`, with those of its group."""
     found = groups if isinstance(groups, dict) else {"": {}}
-    if not all(isinstance((fields or {}).get("rows"), dict) for fields in found.values()):
-        raise ValueError(f"{path}: expected a mapping with a title, and groups that have rows")
+    rows = {}
     for group, fields in found.items():
+        if not isinstance(fields, dict) or not isinstance(fields.get("rows"), dict):
+            raise ValueError("expected a mapping with a title, and groups that have rows")
+        if group != "":
+            check_name("group", group)
         shared = {key: value for key, value in fields.items() if key != "rows"}
         for row, own in fields["rows"].items():
-            rows[f"{group}/{row}" if group else row] = {**shared, **(own or {})}
-    return from_tree(Table, {"name": path.stem, **tree, "source": name, "rows": rows}, str(path))
+            check_name("row", row)
+            if own is not None and not isinstance(own, dict):
+                raise ValueError(f"row {row!r} is {own!r}: expected its fields")
+            rows[f"{group}/{row}" if group else str(row)] = {**shared, **(own or {})}
+    return rows

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -246,6 +246,18 @@ def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[st
         if name not in known:
             raise ValueError(f"{where}: {name!r} is no field of a run's config, and it may hold nothing else")
     check_plain(tree, str(where))
+    for path, value in reaching_outside(tree, given=given):
+        raise ValueError(
+            f"{where}: {path}={value!r} reaches outside of the run folder: if that is yours, set "
+            f"{path} on the command line, or resume with --trust"
+        )
+
+
+def reaching_outside(tree: Mapping[str, Any], *, given: Collection[str] = ()) -> Iterator[tuple[str, Any]]:
+    """Yield the fields of a run's tree, by dotted path, by which a run writes or listens elsewhere.
+
+    Those that are `given` are left out, with all that is below them.
+    """
     for path in WRITTEN:
         value: Any = tree
         for name in path.split("."):
@@ -253,10 +265,7 @@ def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[st
         own = any(f"{path}.".startswith(f"{field}.") for field in given)
         reaches = value is not None and value is not False
         if reaches and not own and value != os.environ.get(VOUCHED_BY.get(path, "")):
-            raise ValueError(
-                f"{where}: {path}={value!r} reaches outside of the run folder: if that is yours, set "
-                f"{path} on the command line, or resume with --trust"
-            )
+            yield path, value
 
 
 def without_env_size(tree: Mapping[str, Any]) -> dict[str, Any]:

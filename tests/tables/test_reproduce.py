@@ -140,6 +140,39 @@ def test_a_run_that_fails_is_said_and_costs_its_row_only(reproduce, capsys):
     assert "ppo/Balance, seed 2: exit code 1, no such cube" in said and "1 runs are missing" in said
 
 
+def test_what_another_process_does_is_waited_for_and_not_done_again(reproduce, monkeypatch, capsys):
+    reproduce("--rows", "ppo/Balance", "--seeds", "1")
+    result = reproduce.folder / "poles" / "ppo" / "Balance" / "seed_1.json"
+    done = result.read_text()
+    result.unlink()
+    looks = []
+
+    def is_locked(folder):
+        looks.append(folder.name)
+        if looks.count("seed_1") == 3:
+            result.write_text(done)  # the other is done
+        return folder.name == "seed_1" and looks.count("seed_1") < 3
+
+    monkeypatch.setattr(runner.run_lock, "is_locked", is_locked)
+    capsys.readouterr()
+    code, started, table = reproduce("--rows", "ppo/Balance")
+    assert (code, started) == (0, [("ppo/Balance", 2)])
+    assert table["figures"]["poles/ppo/Balance"] == 101.5
+    assert "ppo/Balance, seed 1: done by another process" in capsys.readouterr().out
+
+
+def test_a_job_that_another_process_took_first_is_no_failure(reproduce, monkeypatch):
+    looks = []
+
+    def is_locked(folder):
+        looks.append(folder)
+        return len(looks) == 2  # once the own process has failed
+
+    monkeypatch.setattr(runner.run_lock, "is_locked", is_locked)
+    code, started, _ = reproduce("--rows", "ppo/Balance", "--seeds", "1", fail=("ppo/Balance", 1))
+    assert started == [("ppo/Balance", 1)] * 2 and code == 1  # it fails again, and nobody else does it
+
+
 def test_without_time_nothing_runs_and_the_table_is_of_what_is_there(reproduce):
     reproduce("--rows", "ppo/Balance")
     code, started, table = reproduce("--minutes", "0")
