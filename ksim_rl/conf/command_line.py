@@ -90,6 +90,11 @@ def _compose(overrides: list[str], name: str) -> RunCfg:
 def _parse(text: str, loader: ConfigLoader) -> Override:
     if text.startswith("-"):
         raise spelling.of_flag(text)
+    if not text.isascii() and text.encode(errors="replace").decode() != text:
+        raise ValueError(
+            f"override {text!r}: bytes that are no UTF-8, of which Hydra's configs are made: give the folder or file "
+            "another name"
+        )
     try:
         return OverridesParser.create(config_loader=loader).parse_override(text)
     except HydraException as error:

@@ -9,7 +9,7 @@ import yaml
 
 from ksim_rl.config.upstream import yaml_resolvers
 from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
-from ksim_rl.files.writing import check_own
+from ksim_rl.files.writing import check_name, check_own
 
 MOST_DEPTH = 50
 # In C where PyYAML was built with it: a hundred times as fast.
@@ -91,6 +91,7 @@ def check_links(folder: Path, *, below: Sequence[str]) -> None:
 
     That are links to other folders, files with other names (hard links), pipes and devices.
     """
+    check_name(folder)
     inside = folder.resolve()
     walked = (
         os.path.join(root, name)

@@ -8,7 +8,7 @@ from pathlib import Path
 from ksim_rl.checks import OneLineParser
 from ksim_rl.diagnosis.curves import LEAST_ROWS, Curves, read_run
 from ksim_rl.diagnosis.faults import EXPLAINS, FAULTS
-from ksim_rl.terminal import show
+from ksim_rl.terminal import printable, show
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +22,8 @@ class Finding:
 
     def __str__(self) -> str:
         """Return it as a paragraph."""
-        return f"{self.name.replace('_', ' ')}: {self.seen}\n  {self.reason}\n  What to change: {self.change}"
+        name = self.name.replace("_", " ")
+        return f"{name}: {printable(self.seen)}\n  {self.reason}\n  What to change: {self.change}"
 
 
 def findings(curves: Curves) -> list[Finding]:

@@ -15,7 +15,7 @@ from ksim_rl.export.causes import Cause, find_causes
 from ksim_rl.export.folder import export, runner_source
 from ksim_rl.export.standalone.files import check_closed, read_arrays, read_json
 from ksim_rl.physics import load_spec
-from ksim_rl.terminal import show
+from ksim_rl.terminal import printable, show
 
 TABLE = ("return", "length", "fell", "reward/", "metric/", "torque/", "contact/")
 
@@ -58,7 +58,7 @@ class Report:
             lines.append(
                 f"single steps agree: {what}; export with --no-noise compares without the sensors' noise"
             )
-        return "\n".join(lines)
+        return "\n".join(map(printable, lines))  # names of the export stay in their lines
 
 
 def sim2sim(

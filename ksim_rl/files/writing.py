@@ -21,12 +21,22 @@ WRITING = ".writing-"
 
 def check_own(path: Path) -> None:
     """Refuse a path at which something lies that is more than a file of this folder alone."""
+    check_name(path)
     with suppress(FileNotFoundError):
         _check_status(path, os.lstat(path))
 
 
+def check_name(path: Path) -> None:
+    """Refuse a path with bytes that are no UTF-8: libraries that write files abort there, or write elsewhere."""
+    if os.fsencode(path) != str(path).encode(errors="replace"):
+        raise ValueError(
+            f"{path.absolute()}: bytes that are no UTF-8, with which nothing is written: rename the folder"
+        )
+
+
 def check_folder(folder: Path, *, below: Path) -> None:
     """Refuse a folder of a user's folder `below` that is reached by a link; `below` itself may be one."""
+    check_name(folder)
     reached = below
     for name in folder.relative_to(below).parts:
         reached /= name
@@ -105,6 +115,7 @@ def unfinished_folder(folder: Path) -> Iterator[Path]:
 
 def open_own(path: Path) -> IO[str]:
     """Open a file to read and write, which is made where there is none, and is refused as `check_own` refuses it."""
+    check_name(path)
     try:
         number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
     except OSError:

@@ -18,6 +18,7 @@ from ksim_rl.envs.recorded_python import FrozenPythonError
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import HasProgress, Update, notes_of
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
+from ksim_rl.trainers.hook_states import paired
 from ksim_rl.trainers.interrupt import InterruptRequest
 from ksim_rl.trainers.loggers import MetricLogger
 from ksim_rl.trainers.metrics import (
@@ -421,10 +422,7 @@ class Trainer:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue where `state_dict` was taken; a ValueError where networks, observations or env are others."""
         checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
-        if len(state["hooks"]) != len(self._own_hooks):
-            raise ValueError(
-                f"the checkpoint is of a run with {len(state['hooks'])} hooks, and this one has {len(self._own_hooks)}"
-            )
+        hooks = paired(self._own_hooks, state["hooks"], keeps=_keeps)
         # A first reset allocates what the collector and the transforms keep, before the saved values go in.
         self.collector.reset()
         state = checkpoint.own_part(state, self.state_dict)
@@ -438,11 +436,15 @@ class Trainer:
                 "may still fit: ksim-rl train checkpoint=RUN"
             ) from error
         self.collector.load_state_dict(state["collector"])
-        for index, hook in enumerate(self._own_hooks):
-            hook.load_state_dict(state["hooks"][str(index)])
+        for hook, own in hooks:
+            hook.load_state_dict(own)
         self.iteration = self.saved_at = state["iteration"]
         self.clock.total = state["seconds"]
         # A run that moves to another kind of device keeps that one's present state.
         torch.set_rng_state(state["random"]["cpu"])
         if self.update.device.type == "cuda" and "cuda" in state["random"]:
             torch.cuda.set_rng_state(state["random"]["cuda"], self.update.device)
+
+
+def _keeps(hook: Hook) -> bool:
+    return type(hook).state_dict is not Hook.state_dict

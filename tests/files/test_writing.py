@@ -116,6 +116,19 @@ def test_no_file_is_written_where_something_leads_elsewhere(trap, tmp_path):
     assert sorted(os.listdir(tmp_path)) == before
 
 
+def test_a_name_that_is_no_utf8_is_refused(tmp_path):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
+    folder.mkdir()
+    for write in (
+        lambda: write_whole(folder / "a", "x"),
+        lambda: open_own(folder / "a"),
+        lambda: fill(folder),
+    ):
+        with pytest.raises(ValueError, match="bytes that are no UTF-8, with which nothing is written"):
+            write()
+    assert list(folder.iterdir()) == []
+
+
 def test_a_folder_is_filled_wholly_or_not_at_all(trap, tmp_path):
     folder = tmp_path / "folder"
     (folder / "assets").mkdir(parents=True)

@@ -267,8 +267,23 @@ def test_a_hook_continues_from_a_checkpoint(tmp_path):
     resumed.load(tmp_path)
     resumed.train()
     assert hook.calls == [(3, 3)] * 3 + [(4, 4)]
-    with pytest.raises(ValueError, match="1 hooks, and this one has 0"):
+    with pytest.raises(ValueError, match="1 hooks that keep something, and this one has 0"):
         make_trainer().load(tmp_path)
+
+
+def test_hooks_that_keep_nothing_come_and_go(tmp_path):
+    """As a viewer does, which `ksim-rl resume RUN viewer.browser=true` opens on a run that had none."""
+    make_trainer(tmp_path, iterations=2, hooks=[Diary()]).train()
+    hook = Diary()
+    resumed = make_trainer(tmp_path, iterations=3, hooks=[Hook(), hook])
+    resumed.load(tmp_path)
+    resumed.train()
+    assert hook.calls == [(2, 2)] * 2 + [(3, 3)]
+    hook = Diary()
+    resumed = make_trainer(iterations=4, hooks=[hook])
+    resumed.load(tmp_path)
+    resumed.train()
+    assert hook.calls[-1] == (4, 4) and len(hook.calls) == 4
 
 
 def test_what_a_hook_changes_counts_in_the_next_iteration():

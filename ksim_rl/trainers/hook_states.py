@@ -1,0 +1,25 @@
+"""This module gives the hooks of a run that goes on what those of its checkpoint have kept."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+H = TypeVar("H")
+
+
+def paired(
+    hooks: Sequence[H], saved: Mapping[str, Any], *, keeps: Callable[[H], bool]
+) -> list[tuple[H, Mapping[str, Any]]]:
+    """Pair hooks, in their order, with the states saved by number; a ValueError where they are of another run.
+
+    Hooks that keep nothing, such as a viewer's, may come and go between the sessions of a run; `keeps` knows others.
+    """
+    states = [saved[number] for number in sorted(saved, key=int)]
+    own = list(hooks)
+    if len(states) != len(own):
+        states = [state for state in states if state]
+        own = [hook for hook in own if keeps(hook)]
+    if len(states) != len(own):
+        raise ValueError(
+            f"the checkpoint is of a run with {len(states)} hooks that keep something, and this one has {len(own)}"
+        )
+    return list(zip(own, states, strict=True))
