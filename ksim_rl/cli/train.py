@@ -5,6 +5,7 @@ import dataclasses
 import os
 import sys
 import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from ksim_rl.config import plugins
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.runs.run_lock import is_locked
 from ksim_rl.trainers import RunCfg
+from ksim_rl.trainers.run_cfg import reaching_outside
 from ksim_rl.trainers.run_folder import FOLDERS
 from ksim_rl.trainers.sources import check_sources
 
@@ -44,6 +46,8 @@ def train(arguments: list[str]) -> int:
         for cfg in conf.check_command_line(flags.overrides, name=name, multirun=multirun, values=builds):
             check_sources(cfg)
 
+    groups = _folders_of_groups(flags, own_config)
+    given = conf.fields_of(flags.overrides)
     codes: list[int] = []
     process, own_command = os.getpid(), sys.argv
 
@@ -51,7 +55,7 @@ def train(arguments: list[str]) -> int:
     def job(config: DictConfig) -> None:
         sys.argv = own_command  # which the run's folder keeps
         try:
-            codes.append(_train_one(config))
+            codes.append(_train_one(config, groups, given))
         except Exception as error:
             if os.getpid() != process:  # some launchers run jobs elsewhere; only Hydra can bring it here then
                 raise
@@ -109,9 +113,25 @@ def _job_of_a_multirun() -> str:
     return f"job {launched.job.num} ({', '.join(launched.overrides.task)}): "
 
 
-def _train_one(config: DictConfig) -> int:
+def _folders_of_groups(flags: argparse.Namespace, own_config: bool) -> list[Path]:
+    """Return the folders of groups that Hydra searches and nobody vouches for, checked as the config of a run is."""
+    searched = conf.searched_folders(flags.overrides)
+    for folder in searched:
+        conf.check_groups(folder)
+    # A primary config of the user's own vouches for its folder; `_primary_config` has checked the others.
+    if own_config and not flags.config_name and not flags.config_path:
+        searched.append(Path(flags.config_dir))
+    return searched
+
+
+def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str]) -> int:
     plugins.load(())  # those of the environment, where a launcher runs the job in a process of its own
     plain: Any = OmegaConf.to_container(config, resolve=True)
+    for path, value in reaching_outside(plain, given=given) if groups else ():
+        raise ValueError(
+            f"{', '.join(map(str, groups))}: {path}={value!r} reaches outside of the run folder, and groups of a "
+            f"folder may not: set {path} on the command line"
+        )
     cfg = RunCfg.from_tree(plain)
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     # The run's own config must find what it names from anywhere.

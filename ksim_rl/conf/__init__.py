@@ -10,4 +10,5 @@ from ksim_rl.conf.registration import (
     check_groups,
     register,
     register_run,
+    searched_folders,
 )

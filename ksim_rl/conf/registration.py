@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
@@ -17,7 +18,7 @@ from omegaconf import OmegaConf
 from ksim_rl import algorithms, envs
 from ksim_rl.conf import choices
 from ksim_rl.config import plain_data, plugins, upstream
-from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
+from ksim_rl.files.reading import read_bytes
 from ksim_rl.runs.listing import CONFIG
 from ksim_rl.trainers.run_cfg import check_run_tree, without_env_size
 
@@ -27,6 +28,8 @@ CHOSEN_BY_TASK = TRAINING, OBJECTIVE_TRAINING = "task/training", "task/objective
 WRITTEN_BY_LOGGERS = ("wandb", "mlflow")
 
 MOST_LETTERS = 120
+# Hydra reads a group in Python, a letter in some 50 us.
+MOST_GROUP_BYTES = 2**16
 
 
 def job_folder(number: int, task: str, overrides: str) -> str:
@@ -95,7 +98,11 @@ def config_files(folder: Path) -> list[Path]:
 
 
 def check_groups(folder: Path) -> None:
-    """Refuse a folder of config groups that says how Hydra launches, logs or calls back, or replaces our own parts."""
+    """Refuse a folder of config groups that holds more than values for fields and choices of groups.
+
+    That is what the config of a run may not hold either (tags, anchors, resolvers such as `${oc.env:HOME}`), links, and
+    how Hydra launches, logs or calls back. References to other fields, such as `${num_envs}`, are values.
+    """
     found = config_files(folder)
     if not any(len(path.parts) > 1 and path.name != RUN_CONFIG for path in found):
         # Hydra would go on as if the folder had not been named.
@@ -103,17 +110,38 @@ def check_groups(folder: Path) -> None:
             f"--config-dir {folder}: expected a run folder, which has the {RUN_CONFIG} of a run, or a folder with "
             "config groups of yours"
         )
+    for root, folders, _ in os.walk(folder):
+        for name in folders:
+            if os.path.islink(os.path.join(root, name)):  # which Hydra follows
+                raise ValueError(
+                    f"{os.path.join(root, name)}: a link, and what it leads to is no part of the folder"
+                )
     for path in found:
-        text = read_bytes(folder / path, limit=MOST_CONFIG_BYTES).decode(errors="replace")
+        text = read_bytes(folder / path, limit=MOST_GROUP_BYTES).decode(errors="replace")
         try:
+            plain_data.check_events(folder / path, text)
             tree = yaml.safe_load(text)  # as well as the text, in which a name may be spelled with escapes
         except yaml.YAMLError as error:
             raise ValueError(f"{folder / path}: cannot be read: {' '.join(str(error).split())}") from error
+        plain_data.check_references(tree, str(folder / path))
         if len(path.parts) == 1 or "hydra" in f"{path} {text} {tree}".lower():
             raise ValueError(
                 f"{folder / path}: a folder of config groups holds choices of groups only, which do not name Hydra; "
                 "a config of your own that may do all that a program can is named with --config-name"
             )
+
+
+def searched_folders(overrides: Sequence[str]) -> list[Path]:
+    """Return the folders that overrides of `hydra.searchpath` name, which hold groups as `--config-dir` does."""
+    found = []
+    for text in overrides:
+        if text.lstrip("+").partition("=")[0] == "hydra.searchpath":
+            value = OverridesParser.create().parse_override(text).value()
+            places = value if isinstance(value, list) else [value]
+            found += [
+                Path(str(place).removeprefix("file://")) for place in places if "pkg://" not in str(place)
+            ]
+    return found
 
 
 class DeclaredConfigs(SearchPathPlugin):

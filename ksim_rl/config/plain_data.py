@@ -1,6 +1,7 @@
 """This module reads files that a stranger may have written as plain data: nothing in them executes or leads on."""
 
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from ksim_rl.files.writing import check_name, check_own
 MOST_DEPTH = 50
 # In C where PyYAML was built with it: a hundred times as fast.
 _FastLoader: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader
+
+
+_REFERENCE = re.compile(r"\$\{[A-Za-z_.][\w.]*\}", re.ASCII)
 
 
 class _Loader(_FastLoader):
@@ -75,6 +79,20 @@ def check_plain(tree: Any, where: str) -> None:
             check_plain(entry, f"{where}[{index}]")
     elif isinstance(tree, str) and "${" in tree:
         raise ValueError(f"{where}={tree[:80]!r}: an interpolation, and a run's config holds values only")
+
+
+def check_references(tree: Any, where: str) -> None:
+    """Refuse interpolations that do more than name another field of the config, such as `${num_envs}`."""
+    check_plain(_without_references(tree), where)
+
+
+def _without_references(tree: Any) -> Any:
+    if isinstance(tree, Mapping):
+        return {_without_references(key): _without_references(entry) for key, entry in tree.items()}
+    if isinstance(tree, (list, tuple)):
+        return [_without_references(entry) for entry in tree]
+    # An escaped one stays, of which Hydra's grammar may make another.
+    return _REFERENCE.sub("", tree) if isinstance(tree, str) and "\\" not in tree else tree
 
 
 def flat(tree: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Any]]:

@@ -15,6 +15,7 @@ import numpy as np
 from ksim_rl.clips.amass import read_amass
 from ksim_rl.clips.bvh import read_bvh
 from ksim_rl.clips.robot_csv import read_csv
+from ksim_rl.conf.registration import check_groups
 from ksim_rl.config.plain_data import read_yaml
 from ksim_rl.runs import listing, record, run_lock
 from ksim_rl.runs.csv_table import read_table
@@ -62,6 +63,23 @@ def yaml_of_keys_that_are_compared(folder):
     path = folder / "config.yaml"
     path.write_text("".join(f"{number}:\n" for number in range(70_000)))
     return lambda: read_yaml(path)
+
+
+@bomb
+def group_of_anchors(folder):
+    """Each list holds the one before it ten times, which the check of names wrote out."""
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]" for level in range(1, 10)]
+    (folder / "logger").mkdir()
+    (folder / "logger" / "mine.yaml").write_text("\n".join(lines))
+    return lambda: check_groups(folder)
+
+
+@bomb
+def group_that_takes_minutes_to_read(folder):
+    (folder / "logger").mkdir()
+    (folder / "logger" / "mine.yaml").write_text("".join(f"k{number}: [1, 2, 3]\n" for number in range(30_000)))
+    return lambda: check_groups(folder)
 
 
 @bomb
