@@ -1,8 +1,10 @@
 """Tells the packages of a user from those of libraries, whose code keeps nothing in Python that a step depends on."""
 
 import functools
+import importlib.metadata
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 OURS = "ksim_rl"
@@ -25,7 +27,22 @@ def is_library(package: str) -> bool:
         return True
     spec = getattr(sys.modules.get(package), "__spec__", None)
     places = [*(getattr(spec, "submodule_search_locations", None) or ()), getattr(spec, "origin", None) or ""]
-    return any("site-packages" in place or "dist-packages" in place for place in places)
+    if any("site-packages" in place or "dist-packages" in place for place in places):
+        return True
+    return any(parent in _installed_into() for place in places for parent in Path(place).parents)
+
+
+@functools.cache
+def _installed_into() -> frozenset[Path]:
+    """Return the folders that installers have put packages into, wherever these are on the path.
+
+    A project that lies in a folder of its own, though it is installed as editable, is not in one of them.
+    """
+    folders: set[Path] = set()
+    for distribution in importlib.metadata.distributions():
+        if distribution.read_text("INSTALLER") is not None:
+            folders.add(Path(str(distribution.locate_file(""))))
+    return frozenset(folders)
 
 
 def packages_of(parts: Iterable[Any]) -> frozenset[str]:

@@ -10,7 +10,7 @@ import warp as wp
 from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.actuators.adhesion import transmissions_of_refresh
 from ksim_rl.physics.sensors.limit_sensors import LimitSensors
-from ksim_rl.physics.views import CAMERAS_AND_LIGHTS, FORCES_OF_BODIES, SUBTREE_VELOCITIES
+from ksim_rl.physics.views import CAMERAS_AND_LIGHTS, SUBTREE_VELOCITIES
 
 # These read the contacts of the last substep's collision pass, which a reset empties.
 COLLISION_SENSORS = (
@@ -79,8 +79,6 @@ class Refresh:
             names.add("M")
         if warp_model.sensor_subtree_vel:
             names |= SUBTREE_VELOCITIES
-        if warp_model.opt.run_rne_postconstraint or self.kept_by_substep.sensor_rne_postconstraint:
-            names |= FORCES_OF_BODIES
         if self.needs_cameras:
             names |= CAMERAS_AND_LIGHTS
         return names

@@ -96,6 +96,9 @@ class Substeps:
         if ours or mended:
             self._models = {which: upstream.without(ours + mended, m) for which, m in self._models.items()}
         self._reads_contacts = bool(mended)
+        if warp_model.opt.run_rne_postconstraint or self._models["kept"].sensor_rne_postconstraint:
+            # A sensor is left that needs forces of all bodies: our own kernels read accelerometers without them.
+            self._refresh.on_demand |= FORCES_OF_BODIES
         mend = _mending(mj_model, warp_model, warp_data_E, expanded)
         self._integrates = one_kernel_integration
         if one_kernel_integration:

@@ -72,7 +72,9 @@ def test_solver_limits_are_metrics_not_messages():
     assert report.metrics["iterations_worlds"] > 0.0
 
 
-def piled(mj_model: mujoco.MjModel, sim: SimCfg, *, device: str, num_envs: int) -> OverflowReport:
+def piled(
+    mj_model: mujoco.MjModel, sim: SimCfg, *, device: str, num_envs: int, repeats: bool
+) -> OverflowReport:
     """Report a substep from given poses, each world's its own, that a graph replays where there are any."""
     world = World(mj_model, num_envs=num_envs, device=device, sim=sim)
     generator = torch.Generator().manual_seed(3)
@@ -86,7 +88,7 @@ def piled(mj_model: mujoco.MjModel, sim: SimCfg, *, device: str, num_envs: int) 
         reports.append(world.overflow_report())
     first, *later = reports
     # Which contacts find a place in a pool that is full may differ.
-    if not first.worlds["BROADPHASE"] and not first.worlds["NARROWPHASE"]:
+    if repeats and not first.worlds["BROADPHASE"] and not first.worlds["NARROWPHASE"]:
         for report in later:
             assert (report.worlds["NEFC"], report.nefc) == (first.worlds["NEFC"], first.nefc)
     return reports[-1]
@@ -95,10 +97,12 @@ def piled(mj_model: mujoco.MjModel, sim: SimCfg, *, device: str, num_envs: int) 
 def check_overflows(scene: Sequence[Any], *, ours: bool, device: str = "cpu", num_envs: int = 3) -> None:
     """Make the room of a scene too small in every way, and look that each is told, and no other."""
     mj_model = pile(*scene)
+    # On a GPU the threads of MuJoCo Warp's rows race for the Jacobian, and those that lose count no rows.
+    counts_all = ours or device == "cpu"
 
     def report_with(njmax: int, nconmax: int) -> OverflowReport:
         sim = SimCfg(njmax=njmax, nconmax=nconmax, one_kernel_dynamics=ours)
-        return piled(mj_model, sim, device=device, num_envs=num_envs)
+        return piled(mj_model, sim, device=device, num_envs=num_envs, repeats=counts_all)
 
     roomy = report_with(400, 200)
     assert roomy.ok and roomy.nefc > 16 and roomy.ncon > 4 * num_envs
@@ -107,7 +111,8 @@ def check_overflows(scene: Sequence[Any], *, ours: bool, device: str = "cpu", nu
     for njmax in (roomy.nefc - 1, roomy.nefc // 3):
         report = report_with(njmax, 200)
         assert report.worlds["NEFC"], (njmax, report)
-        assert report.nefc == roomy.nefc, "the need is that of the world with the most rows"
+        if counts_all:
+            assert report.nefc == roomy.nefc, "the need is that of the world with the most rows"
     # Contacts that found no place have no rows, so that here those may suffice.
     for njmax, nconmax in ((400, places - 1), (400, 1), (12, 1)):
         report = report_with(njmax, nconmax)
