@@ -85,6 +85,7 @@ TESTS = {
         "drop_upper_corners": SINGLE_MODELS,
         "gather_controls": SINGLE_MODELS,
         "leave_out_rows": SINGLE_MODELS,
+        "loosen_measured": SINGLE_MODELS,
         "shifted_time": SINGLE_MODELS,
         "sparse_velocity": SINGLE_MODELS,
         "take_the_law_of_priority": SINGLE_MODELS,

@@ -41,7 +41,7 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
     upstream.take_pairs_as_written(warp_model)
     upstream.measure_without_contacts(warp_model)
     # The next one takes pairs away.
-    ways = (take_over_height_fields, take_over_measured_boxes, rows_left_out)
+    ways = (take_over_height_fields, take_over_measured_boxes, rows_left_out, loose_measures)
     always = [hook for hook in (way(warp_model) for way in ways) if hook]
     of_theirs = corrections(warp_model, warp_model.nxn_geom_pair_filtered, warp_model.nxn_pairid_filtered)
     if always or of_theirs:
@@ -119,6 +119,22 @@ def rows_left_out(warp_model: mjw.Model) -> Hook | None:
         wp.launch(kernels.leave_out_rows, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
 
     return leave_out
+
+
+def loose_measures(warp_model: mjw.Model) -> Hook | None:
+    """Return what keeps geoms from sticking where a sensor measures their distance; None where nothing could stick.
+
+    MuJoCo Warp has a contact for each distance that it measures, and lets geoms with adhesion pull at it from afar.
+    """
+    if not (warp_model.flg_adhesion and warp_model.nsensorcollision):
+        return None
+
+    def loosen(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+        contact = warp_data_E.contact
+        inputs, outputs = [contact.type, warp_data_E.nacon], [contact.adhesion]
+        wp.launch(kernels.loosen_measured, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
+
+    return loosen
 
 
 CORRECTIONS: dict[Hook, Callable[[mjw.Model, np.ndarray, np.ndarray], bool]] = {

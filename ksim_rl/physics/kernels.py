@@ -111,6 +111,14 @@ def leave_out_rows(
 
 
 @wp.kernel(enable_backward=False)
+def loosen_measured(kind: wp.array[int], nacon: wp.array[int], adhesion: wp.array[float]):
+    """Let contacts that only a sensor of distances needs not stick: they are out of reach."""
+    contact = wp.tid()
+    if contact < nacon[0] and (kind[contact] & HAS_ROWS) == 0:
+        adhesion[contact] = 0.0
+
+
+@wp.kernel(enable_backward=False)
 def sparse_velocity(
     rownnz: wp.array2d[int],
     rowadr: wp.array2d[int],

@@ -92,11 +92,30 @@ def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None =
         with warnings.catch_warnings():
             # It doubts friction of geoms without contacts; MuJoCo itself accepts them.
             warnings.filterwarnings("ignore", message=".*may cause NaN")
+            check_flags(mj_model)
             return mjw.put_model(mj_model, batch_sizes)
     except (NotImplementedError, ValueError) as error:
         raise ValueError(
             f"MuJoCo Warp cannot simulate this model: {_with_elements(mj_model, str(error))}"
         ) from error
+
+
+def check_flags(mj_model: mujoco.MjModel) -> None:
+    """Refuse flags that MuJoCo Warp does not have, with NotImplementedError: its own check names no two at once."""
+    opt = mj_model.opt
+    names = []
+    for flags, kind, theirs in (
+        (opt.disableflags, mujoco.mjtDisableBit, mjw.DisableBit),
+        (opt.enableflags, mujoco.mjtEnableBit, mjw.EnableBit),
+    ):
+        known = {int(bit) for bit in theirs}
+        for name, bit in kind.__members__.items():
+            # The count of all bits is a member, too.
+            is_flag = not name.startswith("mjN")
+            if is_flag and flags & int(bit) and int(bit) not in known:
+                names.append(name)
+    if names:
+        raise NotImplementedError(f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} unsupported.")
 
 
 def check_fluid(mj_model: mujoco.MjModel) -> None:

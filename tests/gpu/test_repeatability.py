@@ -158,7 +158,7 @@ DRIVEN = """
     <body pos="0 0 0.5"><joint name="arm" axis="0 1 0" range="-2 2" limited="true" margin="0.1"/>
       <geom size="0.1" pos="0.2 0 0" contype="0" conaffinity="0"/></body>
     <body name="ball" pos="2 0 0.099"><joint name="lift" type="slide" axis="0 0 1"/>
-      <geom name="ball" size="0.1"/></body>
+      <geom name="ball" size="0.1" adhesion="1"/></body>
   </worldbody>
   <actuator>
     <intvelocity joint="arm" group="1" kp="5" actrange="-1 1"/>

@@ -1,5 +1,7 @@
 """Actuators that adhere to a body, beside the C engine, and what a refresh and a reset leave of them."""
 
+from typing import Any
+
 import mujoco
 import pytest
 import torch
@@ -27,7 +29,7 @@ STUCK = """
 </mujoco>
 """
 # So slow that what is in contact stays in contact.
-CALM = {"spread": 0.0003, "speed": 0.02}
+CALM: dict[str, Any] = {"spread": 0.0003, "speed": 0.02}
 
 
 @pytest.mark.parametrize("kernels", ("our solver", "theirs"))
@@ -46,3 +48,18 @@ def test_a_reset_of_one_world_leaves_the_adhesion_of_another(more: str) -> None:
     assert (world.sensordata_EL[0, :2] == 0.0).all()
     mujoco.mj_forward(in_c, mj_data)
     check_sensors(world, mj_data, of_forces=False)
+
+
+@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+def test_geoms_do_not_stick_where_a_sensor_alone_reaches_them(kernels: str) -> None:
+    xml = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom name="post" size="0.1" adhesion="4"/>
+    <body pos="0.5 0 0"><joint axis="0 1 0" pos="0.2 0 0.1"/><geom name="ball" size="0.1" mass="1"/></body>
+  </worldbody>
+  <sensor><distance geom1="ball" geom2="post" cutoff="2"/></sensor>
+</mujoco>
+"""
+    step_and_check(xml, KERNELS[kernels], names=("qpos", "qvel", "qacc", "qfrc_passive"))

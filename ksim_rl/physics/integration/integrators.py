@@ -6,7 +6,8 @@ What its implicit integrators leave out is given back by a shallow variant of th
 * They multiply a gain that depends on velocity by controls out of their range, and by those of another actuator where
   one has several controls or none.
 
-And an activation of a disabled actuator is put back.
+And an activation of a disabled actuator is put back, and where trees may sleep what the substep read: MuJoCo Warp then
+computes velocities, passive forces and forces of bodies once more, of the state that it reached.
 """
 
 import dataclasses
@@ -23,6 +24,8 @@ from ksim_rl.physics.integration.runge_kutta import mended_runge_kutta
 
 _KINDS = mjw.IntegratorType
 _IMPLICIT = (_KINDS.IMPLICIT, _KINDS.IMPLICITFAST)
+# What is read of the last substep, and computed once more where trees may sleep.
+_READ_ONCE = ("actuator_velocity", "qfrc_passive", "cacc", "cfrc_int")
 _DAMPING_FIELDS = (
     *("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
     *("actuator_damping", "actuator_dampingpoly"),
@@ -45,6 +48,9 @@ def integrator(
         integrate = _implicit(mj_model, warp_model, warp_data_E)
     else:
         integrate = _explicit(warp_model, warp_data_E, mend)
+    flags = warp_model.opt
+    if flags.enableflags & mjw.EnableBit.SLEEP and not flags.disableflags & mjw.DisableBit.ISLAND:
+        integrate = _keeping_readings(integrate, warp_data_E)
     columns = still_activations(mj_model)
     if columns.size == 0:
         return integrate
@@ -58,6 +64,23 @@ def integrator(
         wp.launch(kernels.copy_columns, dim=dim, inputs=[still, kept_E], outputs=[warp_data_E.act])
 
     return integrate_but_disabled
+
+
+def _keeping_readings(
+    integrate: Callable[[mjw.Model], None], warp_data_E: mjw.Data
+) -> Callable[[mjw.Model], None]:
+    """Return what launches an integrator and puts back what the substep read before it."""
+    arrays = [getattr(warp_data_E, name) for name in _READ_ONCE]
+    kept = [wp.empty_like(array) for array in arrays]
+
+    def integrate_and_put_back(substep_warp_model: mjw.Model) -> None:
+        for array, copy in zip(arrays, kept, strict=True):
+            wp.copy(copy, array)
+        integrate(substep_warp_model)
+        for array, copy in zip(arrays, kept, strict=True):
+            wp.copy(array, copy)
+
+    return integrate_and_put_back
 
 
 def _explicit(
