@@ -1,6 +1,7 @@
 """Agreement of the batched physics (float32, Warp) with MuJoCo's C engine (float64), per model and quantity.
 
     python -m benchmarks.agreement [--device cpu] [--worlds 64] [--models quadruped go1_velocity_flat robot.xml ...]
+    python -m benchmarks.agreement --generated 400 [--seed 0] [--jobs 2] [--minutes 15] [--shrink]
 
 Models are small ones, robots of the menagerie (where MENAGERIE_ROOT is set), the flat tasks, or any MJCF file. Both
 engines start from the same float32 states without a warm start, run the same substeps, and are compared after the last
@@ -10,11 +11,15 @@ each column. `contact_force` counts only worlds with a contact.
 
 Each model runs twice: with its own solver tolerance, and as worlds train: with MuJoCo Warp's 1e-6, and for tasks with
 the settings of the task. The C engine iterates until its own tolerance in both.
+
+`--generated` draws random models instead (`benchmarks/judge`), and compares all that a view can name. Those that fail
+are written to build/judge, with `--shrink` made small.
 """
 
 import argparse
 import copy
 import dataclasses
+import math
 import os
 from collections.abc import Callable
 from functools import partial
@@ -29,6 +34,7 @@ from benchmarks import command_line, report
 from benchmarks.agreement_errors import COMPARED, CONTACT_LIMIT, FAR_LIMIT, Errors, compare
 from benchmarks.agreement_models import CARTPOLE, DOUBLE_PENDULUM, QUADRUPED, SPINNING_BODY
 from benchmarks.agreement_states import States, anywhere, in_contact, thrown
+from benchmarks.judge import hunt
 from ksim_rl import envs
 from ksim_rl.checks import unknown_name
 from ksim_rl.device.streams import checked_device
@@ -36,6 +42,7 @@ from ksim_rl.envs.contract import SimulatedWorld, part
 from ksim_rl.physics import SimCfg, World, load_model, load_spec
 from ksim_rl.physics.load import SUFFIXES
 
+FAILURES = Path("build/judge")
 SMOOTH_LIMIT = 1e-4
 CONTACT_SHARE, MEDIAN_LIMIT, FAR_SHARE = 0.95, 1e-5, 0.99
 
@@ -229,6 +236,33 @@ def _needs_menagerie(name: str) -> bool:
     return name.startswith(("unitree", "booster", "robotis", "go1", "go2", "g1", "t1"))
 
 
+def hunt_generated(options: argparse.Namespace, device: torch.device) -> int:
+    """Judge random models, write what was found, and return 1 if any differs from C."""
+    outcomes = hunt.hunt(
+        options.generated,
+        seed=options.seed,
+        device=options.device,
+        jobs=options.jobs,
+        shrinks=options.shrink,
+        most_minutes=options.minutes,
+    )
+    prefix = f"{report.device_label(device)}/generated"
+    figures = {f"{prefix}/{name}": value for name, value in hunt.figures(outcomes).items()}
+    for name, value in figures.items():
+        print(f"{name:40s}{value:g}")
+    hunt.keep_failures(outcomes, FAILURES)
+    path = report.write(
+        "agreement",
+        figures=figures,
+        device=device,
+        module="benchmarks.agreement",
+        generated_refused={prefix: hunt.refusals(outcomes)},
+        generated_features={prefix: hunt.features_of(outcomes)},
+    )
+    print(f"written: {path}")
+    return 1 if figures[f"{prefix}/worse"] else 0
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Print the table, write the results, and return 1 if anything disagrees."""
     parser = argparse.ArgumentParser(
@@ -239,8 +273,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--models", nargs="+", metavar="MODEL", help="names of models or tasks, or MJCF files"
     )
+    parser.add_argument("--generated", type=int, default=0, metavar="N", help="judge N random models instead")
+    parser.add_argument("--seed", type=int, default=0, help="of the random models")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes for random models")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no further model after these")
+    parser.add_argument("--shrink", action="store_true", help="make each random model that fails small")
     options = parser.parse_args(arguments)
     device = checked_device(options.device)
+    if options.generated:
+        return hunt_generated(options, device)
     cases = chosen_cases(options.models)
     label = report.device_label(device)
     figures, all_agree = {}, True

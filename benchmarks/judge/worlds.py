@@ -1,0 +1,158 @@
+"""The worlds of a model: fields and states of their own, for both engines."""
+
+import copy
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+import torch
+
+from ksim_rl.physics import World, poses
+from ksim_rl.physics.fields import GRAVITY, write_fields
+from ksim_rl.physics.load import caught_warnings
+
+Arrays = dict[str, np.ndarray]
+# What a step depends on, but for what a reset makes: past values of delays, and which trees sleep.
+STATE = (
+    "time",
+    "qpos",
+    "qvel",
+    "act",
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "mocap_pos",
+    "mocap_quat",
+    "eq_active",
+    "plastic",
+)
+# By how much numbers are rounded on the way into float32.
+ROUNDING = 1.2e-7
+_TURNED = ("body_quat", "geom_quat", "site_quat", "cam_quat")
+_MOVED = ("body_pos", "body_ipos", "geom_pos", "site_pos", "jnt_pos", "qpos_spring")
+_ADDED = {
+    "body_gravcomp": 0.5,
+    "geom_margin": 0.01,
+    "dof_armature": 0.05,
+    "dof_frictionloss": 0.1,
+    "dof_damping": 0.2,
+}
+
+
+def drawn_field(mj_model: mujoco.MjModel, name: str, rng: np.random.Generator) -> np.ndarray:
+    """Draw other values of a field, in C's layout."""
+    if name == GRAVITY:
+        return mj_model.opt.gravity + rng.normal(size=3)
+    values = np.array(getattr(mj_model, name), dtype=np.float64)
+    if name in _TURNED:
+        values += 0.05 * rng.normal(size=values.shape)
+        return values / np.linalg.norm(values, axis=-1, keepdims=True)
+    if name == "qpos0":
+        mujoco.mj_integratePos(mj_model, values, 0.02 * rng.normal(size=mj_model.nv), 1.0)
+        return values
+    if name in _MOVED:
+        values += 0.02 * rng.normal(size=values.shape)
+        # The world has no frame to move.
+        if name.startswith("body"):
+            values[0] = 0.0
+        if name == "qpos_spring":
+            mujoco.mj_normalizeQuat(mj_model, values)
+        return values
+    if name in _ADDED:
+        values += _ADDED[name] * rng.uniform(0.0, 1.0, size=values.shape)
+        if name == "body_gravcomp":
+            values[0] = 0.0
+        return values
+    return values * rng.uniform(0.8, 1.2, size=values.shape)
+
+
+def give_fields(world: World, fields: tuple[str, ...], rng: np.random.Generator) -> list[mujoco.MjModel]:
+    """Draw fields of all worlds but the first, and return C's model of each world."""
+    for row in range(1, world.num_envs):
+        for name in fields:
+            field = world.field(name)
+            drawn = torch.from_numpy(drawn_field(world.mj_model, name, rng))
+            field[row] = drawn.reshape(field[row].shape)
+    if fields:
+        world.set_const(fields)
+    models = []
+    for row in range(world.num_envs):
+        mj_model = copy.copy(world.mj_model)
+        if fields:
+            values = {name: world.field(name)[row].numpy(force=True).astype(np.float64) for name in fields}
+            write_fields(mj_model, values)
+        # Both engines solve the constraints as well as they can.
+        mj_model.opt.tolerance = 0.0
+        mj_model.opt.iterations = 100
+        mj_model.opt.ls_iterations = 100
+        models.append(mj_model)
+    return models
+
+
+def drawn_state(mj_model: mujoco.MjModel, rng: np.random.Generator, *, forces: bool) -> Arrays:
+    """Draw a state: a keyframe's or a random one, after some steps, in which things may have come to rest."""
+    mj_data = mujoco.MjData(mj_model)
+    if mj_model.nkey and rng.random() < 0.5:
+        mujoco.mj_resetDataKeyframe(mj_model, mj_data, 0)
+    else:
+        mujoco.mj_integratePos(mj_model, mj_data.qpos, 0.15 * rng.normal(size=mj_model.nv), 1.0)
+        mj_data.qvel[:] = 0.5 * rng.normal(size=mj_model.nv)
+    mj_data.ctrl[:] = poses.random_ctrl(mj_model, rng)
+    mj_data.mocap_pos[:] += 0.05 * rng.normal(size=mj_data.mocap_pos.shape)
+    if forces:
+        mj_data.qfrc_applied[:] = 0.3 * rng.normal(size=mj_model.nv)
+        mj_data.xfrc_applied[1:] = 0.3 * rng.normal(size=(mj_model.nbody - 1, 6))
+    start = state_of(mj_data)
+    with caught_warnings():
+        mujoco.mj_step(mj_model, mj_data, int(rng.integers(0, 60)))
+        reached = state_of(mj_data)
+    unsteady = not np.isfinite(mj_data.qacc).all() or np.abs(mj_data.qvel).max(initial=0.0) > 30.0
+    return start if unsteady or mj_data.time == 0.0 else reached
+
+
+def state_of(mj_data: mujoco.MjData) -> Arrays:
+    """Return C's state, rounded to float32."""
+    state = {}
+    for name in STATE:
+        value = np.array(getattr(mj_data, name))
+        state[name] = value if value.dtype == bool else value.astype(np.float32).astype(np.float64)
+    # Time is a sum of steps, which float32 rounds at each.
+    state["time"] = np.zeros(())
+    return state
+
+
+def perturbed(state: Mapping[str, np.ndarray], rng: np.random.Generator) -> Arrays:
+    """Return a state whose numbers are rounded once more."""
+    found = dict(state)
+    for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "qfrc_applied", "xfrc_applied", "plastic"):
+        value = state[name]
+        sign = rng.choice((-1.0, 1.0), size=value.shape)
+        found[name] = value + ROUNDING * sign * np.maximum(1.0, np.abs(value))
+    return found
+
+
+def put(state: Mapping[str, np.ndarray], mj_model: mujoco.MjModel) -> mujoco.MjData:
+    """Return C's data in a state, as after a reset."""
+    mj_data = mujoco.MjData(mj_model)
+    for name, value in state.items():
+        if name == "time":
+            mj_data.time = float(value)
+        else:
+            getattr(mj_data, name)[:] = value
+    return mj_data
+
+
+def put_all(world: World, states: list[Arrays]) -> None:
+    """Reset all worlds and put each into its state."""
+    everywhere = torch.ones(world.num_envs, dtype=torch.bool, device=world.device)
+    world.reset(everywhere)
+    put_rows(world, states, list(range(world.num_envs)))
+
+
+def put_rows(world: World, states: list[Arrays], rows: list[int]) -> None:
+    """Put some worlds into states."""
+    for name in STATE:
+        view = world.view(name)
+        for row in rows:
+            value = torch.as_tensor(states[row][name]).to(view)
+            view[row] = value.reshape(view[row].shape)

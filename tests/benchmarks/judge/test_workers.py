@@ -1,0 +1,26 @@
+"""A task that crashes or hangs ends alone."""
+
+import os
+import time
+
+from benchmarks.judge.workers import in_processes
+
+
+def do(task: str) -> str:
+    if task == "crash":
+        os._exit(7)
+    if task == "hang":
+        time.sleep(1000.0)
+    return task.upper()
+
+
+def test_others_go_on():
+    tasks = ["a", "crash", "b", "hang", "c"]
+    found = dict(in_processes(do, tasks, jobs=2, most_seconds=8.0))
+    assert [found[name] for name in "abc"] == ["A", "B", "C"]
+    assert "ended with code 7" in str(found["crash"])
+    assert "took too long" in str(found["hang"])
+
+
+def test_no_task_begins_too_late():
+    assert list(in_processes(do, ["a"], jobs=1, most_seconds=8.0, until=time.monotonic() - 1.0)) == []
