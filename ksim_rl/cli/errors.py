@@ -23,7 +23,8 @@ def report(error: Exception, *, about: str = "") -> int:
     )
     if os.environ.get("KSIM_RL_TRACEBACK") or not explained:
         show_traceback(error)
-    text = " ".join(str(error).split())
+    notes = getattr(error, "__notes__", ())  # where in the config it was, for instance
+    text = " ".join(" ".join((str(error), *notes)).split())
     say(f"error: {about}{text if explained and text else f'{type(error).__name__}: {text}'}")
     return REFUSED if isinstance(error, ValueError) else FAILED
 

@@ -65,7 +65,7 @@ class Cells:
         if tensor.dtype not in CTYPES:
             raise NotARowError(f"numbers of type {tensor.dtype}")
         if not tensor.numel():
-            return "nothing"
+            return "0"  # stands in sums over no elements, whose loops never run
         if tensor.device != self.device:
             return literal(tensor.item(), CTYPES[tensor.dtype])
         indices = ([""] if self.rows else []) + list(place)

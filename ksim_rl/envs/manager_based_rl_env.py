@@ -1,7 +1,6 @@
 """This module is the env: a TorchRL `EnvBase` over Warp-batched MuJoCo, made of terms."""
 
 import dataclasses
-import math
 import secrets
 from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager
@@ -39,6 +38,7 @@ from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.envs.rehearsal import rehearse
 from ksim_rl.envs.reset_to_default import ResetToDefault
 from ksim_rl.envs.specs import make_specs
+from ksim_rl.envs.step_counts import episode_steps
 from ksim_rl.physics import World, load_model, prepare_spec
 from ksim_rl.scene.actuators import JointDrives
 from ksim_rl.scene.rendering.rendering import OffscreenRenderer
@@ -98,6 +98,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.world = World(
             model, num_envs=cfg.scene.num_envs, device=device, sim=cfg.sim, per_world_fields=varied
         )
+        self._max_episode_length = episode_steps(cfg, self.step_dt)
         self.driver = EnvDriver(
             self.world,
             step_dt=self.step_dt,
@@ -188,8 +189,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     @property
     def max_episode_length(self) -> int:
         """Env steps after which an episode is cut; 0 for never."""
-        # Rounding first keeps 20 s / 0.02 s at 1000 steps in floating point.
-        return math.ceil(round(self.cfg.episode_length_s / self.step_dt, 6))
+        return self._max_episode_length
 
     @property
     def episode_step_E(self) -> Int64[Tensor, " E"]:

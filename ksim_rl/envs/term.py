@@ -10,12 +10,12 @@ It writes nothing that the view gives it: `term_rules` says what each kind may w
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from ksim_rl.checked import Checked, NonNegativeRange
+from ksim_rl.checked import Checked, NonNegativeRange, Within
 from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 
@@ -44,7 +44,8 @@ class ObservationTerm(Term):
 class RewardTerm(Term):
     """A reward per second (or per step, if the env does not scale by dt), before its weight; 0 is not computed."""
 
-    weight: float = 1.0
+    # Losses have squares of returns, which would overflow float32: every gradient step would be skipped.
+    weight: Annotated[float, Within(low=-1e12, high=1e12)] = 1.0
 
     @abstractmethod
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

@@ -83,5 +83,7 @@ class ObservationManager:
         with rows:
             with self._driver.scope(f"observations/{name}", part=self.terms[name]) as written:
                 reading = self.terms[name](self._view)
+                if not isinstance(reading, Tensor):
+                    raise ValueError(f"returns {type(reading).__name__}: expected a tensor, one row per env")
             kept.update(written)
         return reading

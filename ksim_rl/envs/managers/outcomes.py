@@ -31,6 +31,11 @@ class _OutcomeManager:
         for name, term in self._terms.items():
             with self._driver.scope(f"{self.kind}s/{name}", part=term):
                 value_E = term(self._view)
+            if not isinstance(value_E, Tensor):
+                raise ValueError(
+                    f"{self.kind} term {name!r} returns {type(value_E).__name__}: expected a tensor {shape}, one value "
+                    "per env"
+                )
             if value_E.shape != shape or dtype not in (None, value_E.dtype):
                 raise ValueError(
                     f"{self.kind} term {name!r} returns {value_E.dtype} {tuple(value_E.shape)}: expected "

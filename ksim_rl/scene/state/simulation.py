@@ -139,6 +139,12 @@ class Simulation:
         except ValueError as error:
             # A term does not know its own place in the config.
             raise ValueError(f"{name.replace('/', '.')}: {error}") from error
+        except SystemExit as error:
+            # It would end the run as one that has done its work.
+            raise RuntimeError(f"{name.replace('/', '.')}: it ends the program: {error!r}") from error
+        except Exception as error:
+            error.add_note(f"(in {name.replace('/', '.')})")  # of the same class, which others look for
+            raise
         finally:
             self._scope = self.reader = ""
 
