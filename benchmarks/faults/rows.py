@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.faults import (
+    bad_input,
     disk,
     exports,
     gpu,
@@ -26,6 +27,7 @@ ROWS: dict[str, Row] = {
     **hostile_folder.ROWS,
     **viewer.ROWS,
     **exports.ROWS,
+    **bad_input.ROWS,
     **machine.ROWS,
     **growth.ROWS,
     **gpu.ROWS,

@@ -17,7 +17,7 @@ from ksim_rl.device.capture import eagerly
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
 from ksim_rl.trainers.algorithm import HasWarmUp, make_update
-from ksim_rl.trainers.checkpoint import Checkpoint
+from ksim_rl.trainers.checkpoint import Checkpoint, fitting
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.loggers import check_installed, make_loggers
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -83,9 +83,11 @@ def build(
     if cfg.trainer.warm_up or collector.compiled_step is not None:
         trainer.warm_up_s = time.monotonic() - began
     if resume_from is not None:
-        trainer.load_state_dict(resume_from.state)
+        with fitting(resume_from.path):
+            trainer.load_state_dict(resume_from.state)
     elif cfg.checkpoint is not None:
-        trainer.load_weights(Path(cfg.checkpoint))
+        with fitting(Path(cfg.checkpoint)):
+            trainer.load_weights(Path(cfg.checkpoint))
     if run_folder is not None and ranks.rank() == 0:
         # Last, because a run that cannot be built must not show up anywhere.
         trainer.loggers = make_loggers(cfg.logger, run_folder, config=trainer.config)

@@ -11,8 +11,8 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,11 +138,28 @@ def load(path: Path) -> Checkpoint:
     if _sha256(tensor_bytes) != files[TENSORS]["sha256"]:
         raise CheckpointError(f"{path / TENSORS}: damaged: its SHA-256 is not the manifest's")
     try:
-        state = state_tree.join(safetensors.torch.load(tensor_bytes), manifest["values"])
+        with fitting(path):
+            state = state_tree.join(safetensors.torch.load(tensor_bytes), manifest["values"])
     except (SafetensorError, ValueError) as error:
         raise CheckpointError(f"{path / TENSORS}: not a valid tensor file: {error}") from error
-    state, config = checkpoint_formats.migrate(state, manifest["config"], version=manifest["format_version"])
+    with fitting(path):
+        state, config = checkpoint_formats.migrate(
+            state, manifest["config"], version=manifest["format_version"]
+        )
     return Checkpoint(path=path, iteration=manifest["iteration"], config=config, state=state)
+
+
+@contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """Say that a checkpoint is of no such run where what is made of its state lacks a part, or meets another kind.
+
+    A manifest with a right hash may hold anything: hashes have no key.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
+        what = f"{type(error).__name__}: {error}"
+        raise CheckpointError(f"{path}: it holds another state than such a run has: {what}") from error
 
 
 def saved(folder: Path) -> list[Path]:

@@ -134,10 +134,11 @@ def policy_of(saved: checkpoint.Checkpoint, *, device: str = "auto", cfg: RunCfg
     cfg = RunCfg.from_tree({**saved.config, "device": device}) if cfg is None else cfg
     cfg = without_nan_guard(cfg)
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
-    checkpoint.check_columns(saved.state["observation_columns"], observation_columns(env))
     actor = make_policy(cfg, env)
+    with checkpoint.fitting(saved.path):
+        checkpoint.check_columns(saved.state["observation_columns"], observation_columns(env))
+        state_tree.copy_into(actor.state_dict(), saved.state["update"]["actor"], what="actor")
     env.close(raise_if_closed=False)
-    state_tree.copy_into(actor.state_dict(), saved.state["update"]["actor"], what="actor")
     return Policy(cfg=cfg, actor=actor, iteration=saved.iteration)
 
 

@@ -439,8 +439,8 @@ class Trainer:
         self.collector.load_state_dict(state["collector"])
         for hook, own in hooks:
             hook.load_state_dict(own)
-        self.iteration = self.saved_at = state["iteration"]
-        self.clock.total = state["seconds"]
+        self.iteration = self.saved_at = int(state["iteration"])
+        self.clock.total = float(state["seconds"])
         # A run that moves to another kind of device keeps that one's present state.
         torch.set_rng_state(state["random"]["cpu"])
         if self.update.device.type == "cuda" and "cuda" in state["random"]:

@@ -36,9 +36,10 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
     folder.mkdir(parents=True, exist_ok=True)
     with unfinished_folder(folder) as temporary:
         entry, exported = temporary / name, temporary / "export"
-        actor = dict(saved.state["update"]["actor"])
-        actor |= {key: x.half() for key, x in actor.items() if x.is_floating_point() and x.ndim > 1}
-        state = {"observation_columns": saved.state["observation_columns"], "update": {"actor": actor}}
+        with checkpoint.fitting(saved.path):
+            actor = dict(saved.state["update"]["actor"])
+            actor |= {key: x.half() for key, x in actor.items() if x.is_floating_point() and x.ndim > 1}
+            state = {"observation_columns": saved.state["observation_columns"], "update": {"actor": actor}}
         entry.mkdir()
         checkpoint.save(entry / CHECKPOINT, state, iteration=saved.iteration, config=saved.config)
         made = {"commit": card.commit, "versions": dict(record.read(run)[-1].versions)}

@@ -241,6 +241,12 @@ def names_and_overrides_as_they_are(patch):
         patch.setattr(f"ksim_rl.tables.table.{check}", lambda *_: None)
 
 
+@sabotage("crafted_manifests")
+def states_as_they_come(patch):
+    patch.setattr("ksim_rl.trainers.build.fitting", contextlib.nullcontext)
+    patch.setattr(checkpoint, "fitting", contextlib.nullcontext)
+
+
 @sabotage("caches")
 def errors_as_warp_raises_them(patch):
     program = (

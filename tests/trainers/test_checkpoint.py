@@ -377,3 +377,12 @@ def test_a_newest_checkpoint_of_an_unknown_format_is_not_passed_over(tmp_path):
     with_version(checkpoint.save(tmp_path, STATE, iteration=7, config=CONFIG), 99)
     with pytest.raises(CheckpointError, match="newer ksim_rl"):
         checkpoint.load_latest(tmp_path)
+
+
+@pytest.mark.parametrize("error", [KeyError("seed"), TypeError("no"), AttributeError("no"), IndexError("no")])
+def test_a_state_of_another_kind_is_refused_with_its_checkpoint(tmp_path, error):
+    with (
+        pytest.raises(checkpoint.CheckpointError, match=f"{tmp_path}: it holds another state .*{error}"),
+        checkpoint.fitting(tmp_path),
+    ):
+        raise error
