@@ -1,6 +1,5 @@
 """The training loop collects and learns in turn; hooks evaluate, save, and do what users add between iterations."""
 
-import math
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -202,7 +201,7 @@ class Trainer:
         """Whether the last evaluation reached the task's threshold; None where there is no such thing."""
         if self.solved_at is None or self.evaluation is None:
             return None
-        return self.solved_at <= self.evaluation.return_mean < math.inf
+        return self.solved_at <= self.evaluation.return_mean < float("inf")
 
     def train(self, progress: RunProgress | None = None) -> Outcome:
         """Run until all iterations are done, the task is solved, a target is met, or a signal asks to stop.
