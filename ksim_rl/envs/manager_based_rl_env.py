@@ -98,7 +98,6 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.world = World(
             model, num_envs=cfg.scene.num_envs, device=device, sim=cfg.sim, per_world_fields=varied
         )
-        self._max_episode_length = episode_steps(cfg, self.step_dt)
         self.driver = EnvDriver(
             self.world,
             step_dt=self.step_dt,
@@ -189,7 +188,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     @property
     def max_episode_length(self) -> int:
         """Env steps after which an episode is cut; 0 for never."""
-        return self._max_episode_length
+        return episode_steps(self.cfg, self.step_dt)
 
     @property
     def episode_step_E(self) -> Int64[Tensor, " E"]:
