@@ -78,7 +78,9 @@ def group_of_anchors(folder):
 @bomb
 def group_that_takes_minutes_to_read(folder):
     (folder / "logger").mkdir()
-    (folder / "logger" / "mine.yaml").write_text("".join(f"k{number}: [1, 2, 3]\n" for number in range(30_000)))
+    (folder / "logger" / "mine.yaml").write_text(
+        "".join(f"k{number}: [1, 2, 3]\n" for number in range(30_000))
+    )
     return lambda: check_groups(folder)
 
 

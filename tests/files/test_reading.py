@@ -37,9 +37,10 @@ def test_a_file_beyond_the_limit_and_what_is_no_file_are_refused_by_name(tmp_pat
 PACKAGE = Path(reading.__file__).parents[1]
 LOADS = {"np.load", "torch.load", "json.load", "onnx.load", "safe_open", "open"}
 METHODS = {"read_text", "from_file", "from_xml_path"}
-# What they read is the system's, of their own child, in a folder of their own, or was checked before; `files.py`
-# stands alone beside an export, and has a function of its own.
+# What they read is the system's, an installed package's, their own child's, in a folder of their own, or was checked
+# before; `files.py` stands alone beside an export, and has a function of its own.
 OTHERS = {
+    "compiled/packages.py": {"distribution.read_text"},
     "diagnosis/doctor.py": {"NVIDIA.read_text"},
     "export/folder.py": {"(STANDALONE / f'{name}.py').read_text", "onnx.load"},
     "export/sim2sim.py": {"output.read_text"},
