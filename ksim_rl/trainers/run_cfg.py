@@ -178,6 +178,10 @@ class RunCfg(TrainingCfg):
             raise ValueError(f"device={self.device!r}: expected 'auto', 'cpu', 'cuda' or 'cuda:<index>'")
         if self.device.startswith("cuda") and not torch.cuda.is_available():
             raise ValueError(f"device={self.device!r}: torch finds no CUDA device here; use device=cpu")
+        if not self.task.actions:
+            raise ValueError(
+                "task.actions is empty: a policy needs one at least, which says what it controls"
+            )
         scene = replace(self.task.scene, num_envs=self.num_envs)
         object.__setattr__(self, "task", replace(self.task, scene=scene, seed=self.seed))
         groups = {key for key in self.modules.observation_keys() if isinstance(key, str)}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ksim_rl import envs
+from ksim_rl import conf, envs
 from ksim_rl.cli.errors import FAILED, report
 from ksim_rl.envs.step_counts import episode_steps
 from ksim_rl.envs.term import ObservationTerm, RewardTerm
@@ -80,9 +80,9 @@ def test_a_task_without_rewards_gives_none():
     env.close()
 
 
-def test_an_env_without_actions_is_refused():
-    with pytest.raises(ValueError, match="actions: none"):
-        envs.build(config(actions={}))
+def test_a_run_without_actions_is_refused():
+    with pytest.raises(ValueError, match="task.actions is empty: a policy needs one"):
+        conf.compose([f"task={TASK}", "~task.actions.force"])
 
 
 def test_a_weight_beyond_float32_is_refused():

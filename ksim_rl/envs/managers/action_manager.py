@@ -19,8 +19,6 @@ class ActionManager:
     """
 
     def __init__(self, terms: Mapping[str, ActionTerm], driver: EnvDriver) -> None:
-        if not terms:
-            raise ValueError("actions: none: an env needs one at least, which says what a policy controls")
         self._driver = driver
         self._view = view = driver.view
         self.sizes: dict[str, int] = {}
