@@ -78,7 +78,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def whole_folder(folder: Path, *, below: Path) -> Iterator[Path]:
-    """Give an empty folder to fill, whose files become those of `folder` at the end; others stay there.
+    """Give an empty folder to fill, whose files move to `folder` at the end; others stay there.
 
     Where filling it fails, nothing of `folder` has changed, and it is not there if it was not. A ValueError refuses
     links, in the folders from `below` on and in the place of the files.
