@@ -34,7 +34,7 @@ ROWS = {
         },
         measure=sim2sim_folders,
         amounts={"folders": 38},
-        short={"folders": 5},
+        short={"folders": 10},
         files=("ksim_rl/export", "tests/export/strange_folders.py"),
     ),
     "strange_tables": Row(

@@ -243,7 +243,7 @@ def names_and_overrides_as_they_are(patch):
 
 @sabotage("crafted_manifests")
 def states_as_they_come(patch):
-    patch.setattr("ksim_rl.trainers.build.fitting", contextlib.nullcontext)
+    patch.setattr(sys.modules["ksim_rl.trainers.build"], "fitting", contextlib.nullcontext)
     patch.setattr(checkpoint, "fitting", contextlib.nullcontext)
 
 
