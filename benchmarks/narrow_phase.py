@@ -24,7 +24,8 @@ from rich.table import Table
 from benchmarks import command_line, report
 from ksim_rl.checks import check_choice
 from ksim_rl.device.streams import checked_device
-from ksim_rl.physics import SimCfg, World
+from ksim_rl.physics import SimCfg
+from ksim_rl.physics.warp_world import WarpWorld
 
 ROWS = 9
 ASSETS = f"""
@@ -114,7 +115,7 @@ def touching(mj_model: mujoco.MjModel, worlds: int, *, depth: float, upright: bo
 def compared(mj_model: mujoco.MjModel, pose_EL: torch.Tensor, device: torch.device) -> dict[str, float]:
     """Return the share of worlds with as many contacts as in C, and errors of the deepest contact in 99 of 100."""
     sim = SimCfg(njmax=400, nconmax=60, one_kernel_dynamics=True)
-    world = World(mj_model, num_envs=len(pose_EL), device=device, sim=sim)
+    world = WarpWorld(mj_model, num_envs=len(pose_EL), device=device, sim=sim)
     world.qpos_EL.copy_(pose_EL)
     world.step()
     contact, count = world.warp_data_E.contact, int(world.warp_data_E.nacon.numpy()[0])

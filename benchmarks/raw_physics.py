@@ -25,7 +25,7 @@ from benchmarks.stopwatch import milliseconds
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.device.capture import no_collection
 from ksim_rl.device.streams import warp_scope
-from ksim_rl.physics import World
+from ksim_rl.physics.warp_world import WarpWorld
 from ksim_rl.transforms.innermost import innermost
 
 RECORDED_STEPS = 16
@@ -52,12 +52,12 @@ def record_steps(collector: RolloutCollector, count: int = RECORDED_STEPS) -> li
     return steps
 
 
-def stock_world(world: World) -> World:
+def stock_world(world: WarpWorld) -> WarpWorld:
     """Return worlds of the same model and fields on which `mjw.step` is MuJoCo Warp's own from end to end."""
     model = copy.copy(world.mj_model)
     if world.has_one_kernel_solver:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
-    return World(
+    return WarpWorld(
         model,
         num_envs=world.num_envs,
         device=world.device,
@@ -68,7 +68,7 @@ def stock_world(world: World) -> World:
     )
 
 
-def physics_ms(world: World, decimation: int, steps: Sequence[RecordedStep], *, repeats: int) -> float:
+def physics_ms(world: WarpWorld, decimation: int, steps: Sequence[RecordedStep], *, repeats: int) -> float:
     """Time MuJoCo Warp's substeps of one env step, as one graph with all sensors in each, over the recorded steps."""
     stock = stock_world(world)
     device, warp_device = stock.device, wp.get_device(str(stock.device))
@@ -88,7 +88,9 @@ def physics_ms(world: World, decimation: int, steps: Sequence[RecordedStep], *, 
     return found
 
 
-def own_physics_ms(world: World, decimation: int, steps: Sequence[RecordedStep], *, repeats: int) -> float:
+def own_physics_ms(
+    world: WarpWorld, decimation: int, steps: Sequence[RecordedStep], *, repeats: int
+) -> float:
     """Time this project's substeps of one env step, over the recorded steps."""
     for _ in range(2):
         world.step(decimation)
@@ -96,7 +98,7 @@ def own_physics_ms(world: World, decimation: int, steps: Sequence[RecordedStep],
 
 
 def _mean_ms(
-    world: World, substeps: Callable[[], object], steps: Sequence[RecordedStep], *, repeats: int
+    world: WarpWorld, substeps: Callable[[], object], steps: Sequence[RecordedStep], *, repeats: int
 ) -> float:
     times = []
     for step in steps:

@@ -24,8 +24,8 @@ from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
 from ksim_rl import envs
 from ksim_rl.device.streams import checked_device
-from ksim_rl.physics import World
 from ksim_rl.physics.smooth.stages import integration, smooth_dynamics
+from ksim_rl.physics.warp_world import WarpWorld
 from ksim_rl.transforms.innermost import innermost
 
 RANDOM_STEPS = 20
@@ -66,7 +66,7 @@ def main() -> None:
     print(f"written to {path}")
 
 
-def stages_ms(world: World, lanes: list[int]) -> dict[str, float]:
+def stages_ms(world: WarpWorld, lanes: list[int]) -> dict[str, float]:
     """Return the time of the stages by MuJoCo Warp's kernels and by ours, ms; a RuntimeError where they differ."""
     opt = dataclasses.replace(world.warp_model.opt, run_qacc_smooth=False)
     m, d = dataclasses.replace(world.warp_model, opt=opt), world.warp_data_E
@@ -91,7 +91,7 @@ def stages_ms(world: World, lanes: list[int]) -> dict[str, float]:
     return found
 
 
-def integration_ms(world: World, lanes: list[int]) -> dict[str, float]:
+def integration_ms(world: WarpWorld, lanes: list[int]) -> dict[str, float]:
     """Return the time of an integration by MuJoCo Warp's kernels and by ours, ms; a RuntimeError where they differ."""
     if world.one_kernel_integration_unavailable is not None:
         return {}
@@ -135,7 +135,7 @@ def check(results: list[dict[str, torch.Tensor]]) -> None:
             )
 
 
-def _stages_ms(world: World, name: str, way: Callable[[], None]) -> float:
+def _stages_ms(world: WarpWorld, name: str, way: Callable[[], None]) -> float:
     def often() -> None:
         for _ in range(TIMES_IN_A_GRAPH):
             way()
@@ -146,7 +146,7 @@ def _stages_ms(world: World, name: str, way: Callable[[], None]) -> float:
     return took / TIMES_IN_A_GRAPH
 
 
-def substeps_ms(world: World, decimation: int) -> dict[str, float]:
+def substeps_ms(world: WarpWorld, decimation: int) -> dict[str, float]:
     """Return the time of one env step's substeps from the present state, with either way of the smooth dynamics, ms."""
     state, ctrl_EL = world.state_dict(), world.ctrl_EL.clone()
     found = {}
@@ -158,7 +158,7 @@ def substeps_ms(world: World, decimation: int) -> dict[str, float]:
             njmax=world.njmax,
             nconmax=world.nconmax,
         )
-        own = World(
+        own = WarpWorld(
             world.mj_model,
             num_envs=world.num_envs,
             device=world.device,
@@ -166,7 +166,7 @@ def substeps_ms(world: World, decimation: int) -> dict[str, float]:
             per_world_fields=tuple(world.per_world_fields()),
         )
 
-        def restore(own: World = own) -> None:
+        def restore(own: WarpWorld = own) -> None:
             own.load_state_dict(state)
             own.ctrl_EL.copy_(ctrl_EL)
 

@@ -32,7 +32,7 @@ from benchmarks.host_traffic import cuda_events, host_traffic
 from benchmarks.raw_physics import own_physics_ms, physics_ms, record_steps
 from benchmarks.stopwatch import milliseconds
 from ksim_rl.device.capture import Captured
-from ksim_rl.physics import World
+from ksim_rl.physics.warp_world import WarpWorld
 from ksim_rl.trainers import RunCfg, Trainer, build
 from ksim_rl.trainers.algorithm import make_update
 
@@ -192,9 +192,12 @@ def _iteration_ms(trainer: Trainer, device: torch.device, iterations: int) -> fl
     return statistics.median(times)
 
 
-def _world(trainer: Trainer) -> World:
+def _world(trainer: Trainer) -> WarpWorld:
     env: Any = trainer.collector.env
-    return env.base_env.world
+    world = env.base_env.world
+    if not isinstance(world, WarpWorld):
+        raise ValueError(f"sim.engine={world.sim.engine!r}: this benchmark measures worlds on MuJoCo Warp")
+    return world
 
 
 @torch.no_grad()

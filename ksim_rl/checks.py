@@ -7,6 +7,9 @@ from contextlib import contextmanager
 from numbers import Real
 from typing import NoReturn
 
+# What is raised where data of a file is well formed, and lacks a part or has one of another kind.
+MISFITS = (LookupError, TypeError, AttributeError, ArithmeticError)
+
 
 def near(name: str, choices: Iterable[str]) -> str:
     """Return a hint with the choices that resemble `name`, or with all of them when none does."""

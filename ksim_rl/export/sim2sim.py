@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ksim_rl.checks import OneLineParser
+from ksim_rl.checks import MISFITS, OneLineParser
 from ksim_rl.config.child_processes import run_python
 from ksim_rl.export.causes import Cause, find_causes
 from ksim_rl.export.folder import export, runner_source
@@ -90,7 +90,7 @@ def sim2sim(
         found = json.loads(output.read_text())
         try:
             causes = find_causes(meta, read_arrays(folder / "trace.npz"), read_arrays(replay))
-        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+        except (*MISFITS, ValueError) as error:
             raise ValueError(f"{folder}: trace.npz does not fit export.json: {error!r}") from error
     # The same episodes on both sides, in pairs, and returns of the same terms.
     pairs = np.arange(episodes) % len(ours["return"])

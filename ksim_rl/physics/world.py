@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Self, cast
 
 import mujoco
 import torch
@@ -51,12 +51,12 @@ class World(views.DataViews):
     one_kernel_unavailable: str | None = None
     gravity_EL: Tensor
 
-    def __new__(cls, *args: Any, sim: SimCfg | None = None, **kwargs: Any) -> "World":
+    def __new__(cls, *args: Any, sim: SimCfg | None = None, **kwargs: Any) -> Self:
         """Choose the engine that `sim` names."""
         if cls is not World:
             return super().__new__(cls)
         name = sim.engine if isinstance(sim, SimCfg) else SimCfg().engine
-        return object.__new__(ENGINES[name])
+        return cast("Self", object.__new__(ENGINES[name]))
 
     def __init__(
         self,

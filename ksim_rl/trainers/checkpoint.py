@@ -21,6 +21,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 
 from ksim_rl import ranks
+from ksim_rl.checks import MISFITS
 from ksim_rl.device import state_tree
 from ksim_rl.files.reading import MOST_TENSOR_BYTES, read_bytes
 from ksim_rl.files.writing import WRITING
@@ -157,7 +158,7 @@ def fitting(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
+    except MISFITS as error:
         what = f"{type(error).__name__}: {error}"
         raise CheckpointError(f"{path}: it holds another state than such a run has: {what}") from error
 

@@ -128,23 +128,26 @@ def check_count(what: str, value: Any) -> int:
 
 
 def check_record(
-    path: Path, record: Mapping[str, Array], meta: Mapping[str, Any], model: mujoco.MjModel
+    path: Path, record: Mapping[str, Array], meta: Mapping[str, Any], mj_model: mujoco.MjModel
 ) -> int:
     """Return how many episodes a record has, or refuse it: what it writes into the model has to fit.
 
     A model's field is one of `FIELDS`, of finite numbers and the model's own shape.
     """
-    joints, shapes = len(meta["joints"]["names"]), {"qpos": (model.nq,), "qvel": (model.nv,), "gravity": (3,)}
+    joints, shapes = (
+        len(meta["joints"]["names"]),
+        {"qpos": (mj_model.nq,), "qvel": (mj_model.nv,), "gravity": (3,)},
+    )
     shapes |= {"encoder_bias": (joints,), "default_pos": (joints,)}
     if "start/qpos" not in record or record["start/qpos"].ndim != 2 or not len(record["start/qpos"]):
-        raise ValueError(f"{path}: no 'start/qpos' of [episodes, {model.nq}] numbers")
+        raise ValueError(f"{path}: no 'start/qpos' of [episodes, {mj_model.nq}] numbers")
     episodes = len(record["start/qpos"])
     for name, value in record.items():
         kind, _, rest = name.partition("/")
         if kind == "start":
             shape = (joints,) if rest.startswith("actuator/") else shapes.get(rest)
             if rest.startswith("model/"):
-                shape = _check_field(path, rest.removeprefix("model/"), value, model)
+                shape = _check_field(path, rest.removeprefix("model/"), value, mj_model)
             if shape is None:
                 raise ValueError(f"{path}: {name!r}: no part of the start of an episode")
             _check_shape(path, name, value, (episodes, *shape))
@@ -154,17 +157,17 @@ def check_record(
             raise ValueError(f"{path}: no 'command/{name}' of [{episodes}, steps, {command['size']}] numbers")
         _check_shape(path, f"command/{name}", values, (*values.shape[:2], command["size"]))
     pushes = record.get("pushes", np.zeros(0))
-    _check_shape(path, "pushes", pushes, (len(pushes), 2 + model.nv))
+    _check_shape(path, "pushes", pushes, (len(pushes), 2 + mj_model.nv))
     return episodes
 
 
-def _check_field(path: Path, field: str, value: Array, model: mujoco.MjModel) -> tuple[int, ...]:
+def _check_field(path: Path, field: str, value: Array, mj_model: mujoco.MjModel) -> tuple[int, ...]:
     """Return the shape that a field of the model has, as an export writes it; refuse one that none writes."""
     if field not in FIELDS | {CHOICE}:
         raise ValueError(f"{path}: 'start/model/{field}' is no field that an export writes")
-    own = getattr(model, field)
+    own = getattr(mj_model, field)
     if field == CHOICE:
-        _check_choice(path, value, model)
+        _check_choice(path, value, mj_model)
     elif value.dtype.kind != "f":
         raise ValueError(f"{path}: 'start/model/{field}' is {value.dtype}: expected floats")
     # MuJoCo Warp has matrices where C has rows of nine.
@@ -176,10 +179,10 @@ def _check_field(path: Path, field: str, value: Array, model: mujoco.MjModel) ->
     return shape
 
 
-def _check_choice(path: Path, value: Array, model: mujoco.MjModel) -> None:
-    counts = {mujoco.mjtGeom.mjGEOM_HFIELD: model.nhfield, mujoco.mjtGeom.mjGEOM_MESH: model.nmesh}
-    for geom, kind in enumerate(model.geom_type.tolist()):
-        chosen, own = value[..., geom], model.geom_dataid[geom]
+def _check_choice(path: Path, value: Array, mj_model: mujoco.MjModel) -> None:
+    counts = {mujoco.mjtGeom.mjGEOM_HFIELD: mj_model.nhfield, mujoco.mjtGeom.mjGEOM_MESH: mj_model.nmesh}
+    for geom, kind in enumerate(mj_model.geom_type.tolist()):
+        chosen, own = value[..., geom], mj_model.geom_dataid[geom]
         count = counts.get(mujoco.mjtGeom(kind), 0)
         fits = (chosen == own) | ((chosen >= 0) & (chosen < count) & (own >= 0))
         if value.dtype.kind != "i" or not bool(np.all(fits)):
