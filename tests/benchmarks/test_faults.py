@@ -24,7 +24,8 @@ from ksim_rl.config import plain_data
 from ksim_rl.envs.managers.action_manager import ActionManager
 from ksim_rl.envs.non_finite import NonFiniteTerms
 from ksim_rl.export.folder import runner_source
-from ksim_rl.physics import World, load
+from ksim_rl.physics import load
+from ksim_rl.physics.warp_world import WarpWorld
 from ksim_rl.runs import csv_table, run_lock
 from ksim_rl.scene.rendering import rendering
 from ksim_rl.trainers import checkpoint, progress, run_cfg, run_folder
@@ -138,7 +139,7 @@ def wall_clock(patch):
 
 @sabotage("nan_worlds")
 def worlds_are_not_cleared(patch):
-    patch.setattr(World, "reset", lambda *_: None)
+    patch.setattr(WarpWorld, "reset", lambda *_: None)
 
 
 @sabotage("nan_actions")
@@ -163,13 +164,13 @@ def no_stop(patch):
 
 @sabotage("overflow")
 def resets_forget(patch):
-    reset = World.reset
+    reset = WarpWorld.reset
 
     def forget(self, mask_E):
         reset(self, mask_E)
         self.overflow_report()
 
-    patch.setattr(World, "reset", forget)
+    patch.setattr(WarpWorld, "reset", forget)
 
 
 @sabotage("same_seed")

@@ -1,5 +1,6 @@
 """Paths of classes in configs: public ones now, and those that 0.1 wrote."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -33,6 +34,7 @@ def test_configs_name_classes_by_public_paths():
 
 
 OLD = (Path(__file__).parent / "targets_of_0_1.txt").read_text().split()
+ROUGH = ("go1_velocity_rough",)
 RUNS = json.loads((Path(__file__).parent / "runs_of_0_1.json").read_text())
 
 
@@ -48,7 +50,13 @@ def test_each_path_that_0_1_wrote_leads_to_its_class(target):
 
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_a_task_config_that_0_1_wrote_builds_the_same_task(name):
-    assert from_tree(ManagerBasedRlEnvCfg, RUNS[name]) == envs.make_cfg(name)
+    found = from_tree(ManagerBasedRlEnvCfg, RUNS[name])
+    expected = envs.make_cfg(name)
+    if name in ROUGH:
+        # A foot on rough ground has more contacts than 0.1 found, and today's task has room for them.
+        assert found.sim.njmax < expected.sim.njmax
+        found = dataclasses.replace(found, sim=dataclasses.replace(found.sim, njmax=expected.sim.njmax))
+    assert found == expected
 
 
 def test_fields_that_are_gone_are_ignored_and_only_where_they_were():

@@ -151,8 +151,8 @@ SIM = {
 
 
 def test_sim_fields_reach_the_physics():
-    # These have their own tests, in tests/envs/test_nan_guard.py, tests/physics/test_newton.py and test_smooth.py.
-    assert {*SIM, "nan_guard", "one_kernel_solver", "one_kernel_dynamics"} == {
+    # The others have tests of their own, in tests/envs/test_nan_guard.py and tests/physics.
+    assert {*SIM, "nan_guard", "one_kernel_solver", "one_kernel_dynamics", "engine"} == {
         field.name for field in dataclasses.fields(SimCfg)
     }
     world = made(*(f"task.sim.{name}={value}" for name, value in SIM.items())).base_env.world

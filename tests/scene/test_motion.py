@@ -95,5 +95,5 @@ def test_a_file_that_is_no_archive_is_refused(model, tmp_path):
     with pytest.raises(ValueError, match="cannot be read as .npz"):
         load_motion(file, model, CPU)
     np.save(tmp_path / "clip.npy", np.zeros(3))
-    with pytest.raises(ValueError, match="one array, not an archive"):
+    with pytest.raises(ValueError, match="no archive of arrays"):
         load_motion(tmp_path / "clip.npy", model, CPU)

@@ -3,7 +3,7 @@
 import pytest
 
 from ksim_rl import envs
-from ksim_rl.physics import World
+from ksim_rl.physics.warp_world import WarpWorld
 from ksim_rl.testing import check_physics
 from ksim_rl.testing.check_physics import SUBSTEPS, check_c_engine
 
@@ -17,7 +17,7 @@ def env():
 
 
 def wrong_in(rows, by):
-    step = World.step
+    step = WarpWorld.step
 
     def wrong(world, n=1, **kwargs):
         step(world, n, **kwargs)
@@ -39,7 +39,7 @@ def test_a_robot_in_contact_agrees_in_all_rows(env):
     ],
 )
 def test_what_differs_is_named(env, monkeypatch, rows, by, message):
-    monkeypatch.setattr(World, "step", wrong_in(list(rows), by))
+    monkeypatch.setattr(WarpWorld, "step", wrong_in(list(rows), by))
     with pytest.raises(AssertionError, match=message):
         check_c_engine(env, 20)
 
