@@ -25,6 +25,7 @@ TASK = ("ksim_rl/tasks", "ksim_rl/trainers/trainer.py")
 # What each benchmark measures; a result takes the longest name that it begins with.
 MEASURED: dict[str, tuple[str, ...]] = {
     "agreement": STEP[:1],
+    "before_and_now": (*STEP, *LEARN),
     "collector": (*STEP, "ksim_rl/collectors"),
     "dm_control": (*STEP, *LEARN, "ksim_rl/suites"),
     "determinism": (*STEP, *LEARN, *TASK),
