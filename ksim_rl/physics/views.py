@@ -1,6 +1,7 @@
 """This module makes zero-copy torch views of Warp arrays, and names those that the next steps of a world depend on."""
 
 import dataclasses
+from abc import abstractmethod
 from collections.abc import Collection
 
 import mujoco_warp as mjw
@@ -123,13 +124,13 @@ class DataViews:
             self._views[name] = self.make_view(name)
         return self._views[name]
 
+    @abstractmethod
     def array_names(self) -> Collection[str]:
         """Return the names of all arrays that a view can show."""
-        raise NotImplementedError
 
+    @abstractmethod
     def make_view(self, name: str) -> Shaped[Tensor, "*shape"]:
         """Make the view of an array of that name."""
-        raise NotImplementedError
 
     def views(self) -> dict[str, Shaped[Tensor, "*?leaf"]]:
         """Return the views made so far, by name."""

@@ -1,6 +1,7 @@
 """The door to the physics: many copies of one model, stepped by MuJoCo Warp or by MuJoCo's C engine."""
 
 import copy
+from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Self, cast
 
@@ -89,6 +90,7 @@ class World(views.DataViews):
         """Duration of one substep, in s."""
         return float(self.mj_model.opt.timestep)
 
+    @abstractmethod
     def step(
         self,
         n: int = 1,
@@ -104,23 +106,22 @@ class World(views.DataViews):
         `ctrl`) and after it, when `refresh` has not run: `qpos` and `qvel` are those of the state reached, poses and
         sensors those that the substep computed on its way.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def refresh(self, mask_E: Bool[Tensor, " E"] | None = None) -> None:
         """Recompute position- and velocity-stage quantities and sensors from the present `qpos` and `qvel`.
 
         Acceleration-stage quantities keep the last substep's values. With a mask, rows outside of it must be current
         already.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Put the worlds where `mask_E` is true back to the model's `qpos0`, at rest, time 0.
 
         Their acceleration-stage quantities and sensors read zero until the next step; the other rows do not change.
         Call `refresh` afterwards, and after writing another pose, before reading poses.
         """
-        raise NotImplementedError
 
     def field(self, name: str) -> Shaped[Tensor, " E *leaf"]:
         """Return the view of a model field that differs between worlds."""
@@ -137,56 +138,56 @@ class World(views.DataViews):
         """Return the views of the model fields that differ between worlds, by name."""
         return dict(self._fields)
 
+    @abstractmethod
     def set_const(self, fields: Sequence[str], mask_E: Bool[Tensor, " E"] | None = None) -> None:
         """Recompute the constants that MuJoCo derives from `fields`, after writing into them.
 
         Fields that nothing derives from cost nothing. Worlds outside of `mask_E` keep their constants bit for bit.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def launch(self, key: Hashable, launches: Callable[[], None]) -> None:
         """Run Warp launches of the caller's own, such as a camera's, in order with the world's."""
-        raise NotImplementedError
 
+    @abstractmethod
     def record_overflow(self) -> None:
         """Keep the overflow bits and needs of the last substep for the next report, as each substep does by itself."""
-        raise NotImplementedError
 
     def overflow_report(self, *, clear: bool = True) -> OverflowReport:
         """Read what the physics needed since the last report; one transfer to the host. Call it once per rollout."""
         return self.explain_overflow(self.overflow_counts(clear=clear).tolist())
 
+    @abstractmethod
     def overflow_counts(self, *, clear: bool = True) -> Int[Tensor, " N"]:
         """Return what `explain_overflow` explains, whole numbers on the device, without waiting for it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def explain_overflow(self, numbers: Sequence[int]) -> OverflowReport:
         """Make the report of `overflow_counts` that were read on the host."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def room_is_certain(self) -> bool:
         """Whether `sim` gives the room for contacts and rows, or no state of the model needs more."""
-        raise NotImplementedError
 
+    @abstractmethod
     def remember_needs(self, report: OverflowReport) -> bool:
         """Let later worlds of this model in this process have room for what was needed; whether they get more."""
-        raise NotImplementedError
 
+    @abstractmethod
     def nan_count(self) -> Int[Tensor, ""]:
         """Return how many worlds became non-finite since the last `nan_report`, on the device; 0 without a guard."""
-        raise NotImplementedError
 
+    @abstractmethod
     def nan_report(self) -> NanReport:
         """Write the worlds that became non-finite since the last report to files; one transfer to the host.
 
         Without `sim.nan_guard` the report is empty.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def forget_failures(self) -> None:
         """Let the next `nan_report` leave out worlds that became non-finite until now."""
-        raise NotImplementedError
 
     def state_dict(self) -> dict[str, Shaped[Tensor, "*?leaf"]]:
         """Copy everything that the next steps depend on, so that a restored world continues bit for bit on CPU."""
@@ -198,25 +199,26 @@ class World(views.DataViews):
         copy_into(self._state_tensors(), state_dict, what=what)
         self.refresh()
 
+    @abstractmethod
     def bytes_per_world(self) -> int:
         """Return the memory that one more world takes, in bytes (arrays of data and of expanded fields)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def explained(self) -> tuple[str, ...]:
         """Return a line for each stage of a substep, which says what computes it, and why."""
-        raise NotImplementedError
 
+    @abstractmethod
     def recorded_python(self) -> Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]:
         """Return the objects whose Python a recorded step depends on, each with what reads its values, by name."""
-        raise NotImplementedError
 
+    @abstractmethod
     def memory(self) -> Iterator[tuple[str, Shaped[Tensor, "*?shape"] | None, int, int]]:
         """Yield all arrays: name, view (None where there is none), first byte, and the one behind the last."""
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
         """Free the arrays, after a last `nan_report`. Views that are still held keep their memory."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _state_tensors(self) -> dict[str, Tensor]:
-        raise NotImplementedError
+        """Return the tensors that make up the state, by name."""
