@@ -4,6 +4,8 @@
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
 
+from collections.abc import Sequence
+
 import mujoco_warp as mjw
 import warp as wp
 
@@ -134,6 +136,14 @@ def sparse_velocity(
     for i in range(rowadr[pattern, row], rowadr[pattern, row] + rownnz[pattern, row]):
         total += matrix[world, i] * qvel[world, colind[pattern, i]]
     velocity[world, row] = total
+
+
+def multiply_by_qvel(
+    pattern: Sequence[wp.array], matrix: wp.array, qvel: wp.array, velocity: wp.array
+) -> None:
+    """Launch the products of each world's sparse matrix and its qvel; see `sparse_velocity` for the pattern."""
+    inputs = [*pattern, matrix, qvel]
+    wp.launch(sparse_velocity, dim=velocity.shape, inputs=inputs, outputs=[velocity])
 
 
 @wp.kernel(enable_backward=False)

@@ -1,11 +1,10 @@
 """This module launches the refresh of a world: what derives from the present state, without a collision pass."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
-import warp as wp
 
 from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.actuators.adhesion import transmissions_of_refresh
@@ -122,17 +121,13 @@ class Refresh:
         if TENDON_VELOCITY in self.on_demand:
             pattern = (m.ten_J_rownnz, m.ten_J_rowadr, m.ten_J_colind)
             shared = [array.reshape((1, -1)) for array in pattern]
-            self._launch_product(shared, d.ten_J, d.ten_velocity)
+            kernels.multiply_by_qvel(shared, d.ten_J, d.qvel, d.ten_velocity)
 
     def _launch_actuator_velocities(self) -> None:
         d = self._warp_data_E
         if self._actuators_act:
             pattern = (d.moment_rownnz, d.moment_rowadr, d.moment_colind)
-            self._launch_product(pattern, d.actuator_moment, d.actuator_velocity)
+            kernels.multiply_by_qvel(pattern, d.actuator_moment, d.qvel, d.actuator_velocity)
         else:
             # As in C, which does not compute them then.
             d.actuator_velocity.zero_()
-
-    def _launch_product(self, pattern: Sequence[wp.array], matrix: wp.array, velocity: wp.array) -> None:
-        inputs = [*pattern, matrix, self._warp_data_E.qvel]
-        wp.launch(kernels.sparse_velocity, dim=velocity.shape, inputs=inputs, outputs=[velocity])

@@ -36,14 +36,8 @@ def transmissions_of_contacts(warp_model: mjw.Model, warp_data_E: mjw.Data) -> C
         wp.launch(_hide_measured_pairs, dim=d.naconmax, inputs=inputs, outputs=[geom])
         mjw.transmission(warp_model, hiding)
         # In a stage of Runge-Kutta they have been found already, by the wrong moments.
-        pattern = [d.moment_rownnz, d.moment_rowadr, d.moment_colind]
-        inputs_of_velocity = [*pattern, d.actuator_moment, d.qvel]
-        wp.launch(
-            kernels.sparse_velocity,
-            dim=d.actuator_velocity.shape,
-            inputs=inputs_of_velocity,
-            outputs=[d.actuator_velocity],
-        )
+        pattern = (d.moment_rownnz, d.moment_rowadr, d.moment_colind)
+        kernels.multiply_by_qvel(pattern, d.actuator_moment, d.qvel, d.actuator_velocity)
 
     return launch
 
