@@ -15,6 +15,7 @@ from torch import Tensor
 from ksim_rl.checks import check_choice, check_count
 from ksim_rl.physics import views
 from ksim_rl.physics.c_engine import geom_bounds
+from ksim_rl.physics.c_engine.by_world import ByWorld, left_out
 from ksim_rl.physics.c_engine.mirrors import Mirror, bound
 from ksim_rl.physics.fields import FIXED, GRAVITY, const_groups, derived_fields
 from ksim_rl.physics.load import caught_warnings
@@ -25,19 +26,11 @@ from ksim_rl.physics.world import ENGINES, World
 
 _STAGE_NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
 _STAGE_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
+_STAGE_ACC = int(mujoco.mjtStage.mjSTAGE_ACC)
 # What a step reads of its worlds, and writes back.
 _STATE = (*views.SUBSTEP_INPUTS, "eq_active", "userdata", "history", "plastic", "plugin_state")
 # What MuJoCo Warp alone has, or calls by another name.
 _NOT_OF_C = frozenset(("nbody_awake", "ntree_awake", "nv_awake", "overflow"))
-_SENSORS = mujoco.mjtSensor
-# C computes these only for the sensors that need them.
-_FOR_SENSORS = {
-    views.FORCES_OF_BODIES: (
-        *(_SENSORS.mjSENS_ACCELEROMETER, _SENSORS.mjSENS_FORCE, _SENSORS.mjSENS_TORQUE),
-        *(_SENSORS.mjSENS_FRAMELINACC, _SENSORS.mjSENS_FRAMEANGACC),
-    ),
-    views.SUBTREE_VELOCITIES: (_SENSORS.mjSENS_SUBTREELINVEL, _SENSORS.mjSENS_SUBTREEANGMOM),
-}
 # Fields that move or resize geoms within their bodies, whose trees of bounds MuJoCo's compiler makes once.
 _MOVES_GEOMS = frozenset(("geom_size", "geom_pos", "geom_quat"))
 
@@ -81,6 +74,8 @@ class CWorld(World):
             self._batch.reset(stage=_STAGE_NONE)
         self._of_state = bound(self._batch, _STATE)
         self._of_data = dict(self._of_state)
+        self._left_out = left_out(stepped)
+        self._by_world = ByWorld(self._batch)
         self._nan_guard: NanGuard | None = None
         if self.sim.nan_guard is not None:
             tensors = {name: mirror.tensor for name, mirror in self._of_state.items()}
@@ -106,16 +101,16 @@ class CWorld(World):
         check_choice("sensors", sensors, ("last", "contacts", "every"))
         self._push_all()
         if before or after or self._nan_guard is not None:
-            for _ in range(n):
-                self._step_between(before, after)
+            for substep in range(n):
+                is_read = sensors == "every" or substep == n - 1
+                self._step_between(before, after, is_read=is_read)
         else:
-            self._run(lambda: self._batch.step(nstep=n, stage=_STAGE_NONE))
-            self._pull()
+            self._advance(n, is_read=True)
         if self._nan_guard is not None:
             self._nan_guard.keep_fields()
 
     def _step_between(
-        self, before: Sequence[Callable[[], None]], after: Sequence[Callable[[], None]]
+        self, before: Sequence[Callable[[], None]], after: Sequence[Callable[[], None]], *, is_read: bool
     ) -> None:
         """Advance by one substep between hooks, whose changes alone are float32."""
         for hook in before:
@@ -123,13 +118,25 @@ class CWorld(World):
         if self._nan_guard is not None:
             self._nan_guard.before_substep()
         self._push_changes()
-        self._run(lambda: self._batch.step(nstep=1, stage=_STAGE_NONE))
-        self._pull()
+        self._advance(1, is_read=is_read)
         if self._nan_guard is not None:
             self._nan_guard.after_substep()
         for hook in after:
             hook()
         self._push_changes()
+
+    def _advance(self, n: int, *, is_read: bool) -> None:
+        """Advance by `n` substeps, with the forces of bodies on the last one where anything reads them."""
+        if is_read and self._by_world.has(views.FORCES_OF_BODIES):
+            if n > 1:
+                self._run(lambda: self._batch.step(nstep=n - 1, stage=_STAGE_NONE))
+            # Integrators leave other velocities, and "rk4" other stages, than those that the forces belong to. The step
+            # continues from here, to the same bits.
+            self._run(lambda: self._batch.forward(stage=_STAGE_ACC))
+            self._by_world.fill(views.FORCES_OF_BODIES, range(self.num_envs))
+            n = 1
+        self._run(lambda: self._batch.step(nstep=n, stage=_STAGE_NONE))
+        self._pull()
 
     def refresh(self, mask_E: Bool[Tensor, " E"] | None = None) -> None:
         """Recompute position- and velocity-stage quantities and sensors from the present state; see `World.refresh`."""
@@ -137,13 +144,18 @@ class CWorld(World):
         if rows is not None and rows.numel() == 0:
             return
         self._push_all()
-        ids = None if rows is None else rows.numpy()
         kept = {name: self._of_data[name].tensor.clone() for name in self._kept_by_refresh()}
-        self._run(lambda: self._batch.forward(ids=ids, stage=_STAGE_VEL))
+        self._compute_velocities(rows)
         for mirror in self._of_data.values():
             mirror.pull(rows)
         for name, tensor in kept.items():
             self._of_data[name].tensor.copy_(tensor)
+
+    def _compute_velocities(self, rows: Tensor | None = None) -> None:
+        """Compute the stages of positions and velocities, in all worlds or in some."""
+        ids = None if rows is None else rows.numpy()
+        self._run(lambda: self._batch.forward(ids=ids, stage=_STAGE_VEL))
+        self._by_world.fill(views.SUBTREE_VELOCITIES, range(self.num_envs) if ids is None else ids)
 
     def _kept_by_refresh(self) -> list[str]:
         """Return the names of what belongs to the last substep, though C computes it on its way to the velocities."""
@@ -279,24 +291,20 @@ class CWorld(World):
         return views.READABLE - _NOT_OF_C
 
     def make_view(self, name: str) -> Shaped[Tensor, "*shape"]:
-        """Make the view of an array; ValueError for one that C does not compute for this model."""
-        for names, kinds in _FOR_SENSORS.items():
-            if name in names and not np.isin(self.mj_model.sensor_type, kinds).any():
-                shown = ", ".join(kind.name for kind in kinds)
-                raise ValueError(
-                    f"{name} is computed by MuJoCo's C engine only for sensors that need it ({shown}): add one, or "
-                    "choose sim.engine='warp'"
-                )
+        """Make the view of an array; what C computes only for sensors, and the model has none of, costs extra."""
         if name not in self._of_data:
             if self.is_frozen:
                 raise RuntimeError(
                     f"{name} is not computed: let a term of the config read it during construction"
                 )
-            self._of_data[name] = Mirror(name, self._batch.bind(name))
+            self._of_data[name] = Mirror(name, self._array(name))
             # Arrays are filled by the next call.
-            self._run(lambda: self._batch.forward(stage=_STAGE_VEL))
+            self._compute_velocities()
             self._of_data[name].pull()
         return self._of_data[name].tensor
+
+    def _array(self, name: str) -> np.ndarray:
+        return self._by_world.array(name) if name in self._left_out else self._batch.bind(name)
 
     def close(self) -> None:
         """Free the simulations, after a last `nan_report`. Views that are still held keep their memory."""

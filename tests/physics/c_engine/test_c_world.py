@@ -1,5 +1,6 @@
 """Worlds on MuJoCo's C engine, beside `mujoco.mj_step` on float32 states, and beside worlds on MuJoCo Warp."""
 
+import copy
 import dataclasses
 
 import mujoco
@@ -8,7 +9,7 @@ import pytest
 import torch
 
 from benchmarks.agreement_models import QUADRUPED
-from ksim_rl.physics import NanGuardCfg, SimCfg, World, load_model
+from ksim_rl.physics import NanGuardCfg, SimCfg, World, load_model, views
 from ksim_rl.physics.c_engine.c_world import CWorld
 from ksim_rl.physics.ray_casting import BatchCamera, RayBatch
 from tests.physics.models import SUBSTEPS, quadruped
@@ -28,8 +29,15 @@ TABLE = """
 """
 
 
-def thrown(num_envs: int = NUM_ENVS, **kwargs) -> World:
-    world = World(quadruped(), num_envs=num_envs, sim=kwargs.pop("sim", IN_C), **kwargs)
+def without_sensors() -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_string(QUADRUPED)
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    return spec.compile()
+
+
+def thrown(num_envs: int = NUM_ENVS, mj_model: mujoco.MjModel | None = None, **kwargs) -> World:
+    world = World(mj_model or quadruped(), num_envs=num_envs, sim=kwargs.pop("sim", IN_C), **kwargs)
     generator = torch.Generator().manual_seed(3)
     world.qvel_EL.copy_(0.5 * torch.randn(world.qvel_EL.shape, generator=generator))
     world.ctrl_EL.copy_(0.2 * torch.randn(world.ctrl_EL.shape, generator=generator))
@@ -71,6 +79,50 @@ def test_each_step_is_that_of_mj_step_bit_for_bit():
             np.testing.assert_array_equal(
                 found, getattr(mj_data, name).astype(np.float32).reshape(found.shape)
             )
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "rk4"])
+def test_forces_of_bodies_and_momenta_need_no_sensor(integrator):
+    sim = dataclasses.replace(IN_C, integrator=integrator)
+    world = thrown(mj_model=without_sensors(), sim=sim, per_world_fields=("body_mass",))
+    read = sorted(views.FORCES_OF_BODIES | views.SUBTREE_VELOCITIES)
+    for name in read:
+        world.view(name)
+    world.field("body_mass")[2] *= 2.0
+    # Beside it, a world in which nobody reads them.
+    plain = thrown(mj_model=without_sensors(), sim=sim, per_world_fields=("body_mass",))
+    plain.field("body_mass")[2] *= 2.0
+    heavier = copy.copy(world.mj_model)
+    heavier.body_mass[:] = world.field("body_mass")[2].double().numpy()
+    mj_data = mujoco.MjData(heavier)
+    for _ in range(30):
+        world.step(SUBSTEPS)
+        plain.step(SUBSTEPS)
+    put(world, mj_data, 2)
+    for _ in range(SUBSTEPS - 1):
+        mujoco.mj_step(heavier, mj_data)
+    mujoco.mj_forward(heavier, mj_data)
+    mujoco.mj_rnePostConstraint(heavier, mj_data)
+    forces = {name: getattr(mj_data, name).astype(np.float32) for name in views.FORCES_OF_BODIES}
+    assert np.abs(forces["cfrc_ext"]).max() > 1.0
+    world.step(SUBSTEPS)
+    plain.step(SUBSTEPS)
+    world.refresh()
+    for name, expected in forces.items():
+        np.testing.assert_array_equal(world.view(name)[2].numpy(), expected, err_msg=name)
+    assert torch.equal(world.qpos_EL, plain.qpos_EL)
+    put(world, mj_data, 2)
+    mujoco.mj_forward(heavier, mj_data)
+    mujoco.mj_subtreeVel(heavier, mj_data)
+    for name in views.SUBTREE_VELOCITIES:
+        expected = getattr(mj_data, name).astype(np.float32)
+        np.testing.assert_array_equal(world.view(name)[2].numpy(), expected, err_msg=name)
+    mask_E = torch.tensor([False, False, True, False])
+    world.reset(mask_E)
+    world.refresh(mask_E)
+    for name in read:
+        assert not world.view(name)[2].any(), name
+        assert world.view(name)[1].any(), name
 
 
 def test_hooks_round_nothing_and_other_worlds_change_no_bit():
@@ -212,8 +264,6 @@ def test_settings_of_warp_alone_are_refused(sim, match):
 
 def test_what_the_engine_has_not_is_refused_by_name():
     world = World(load_model(TABLE), num_envs=1, sim=IN_C)
-    with pytest.raises(ValueError, match="sensors that need it"):
-        world.view("cfrc_ext")
     with pytest.raises(ValueError, match=r"camera 'eye' .* choose sim.engine='warp'"):
         BatchCamera(world, "eye", width=8, height=8)
     with pytest.raises(ValueError, match="no Warp arrays"):
