@@ -1,5 +1,6 @@
 """This module turns a policy into a file: its deterministic action, with normalization and recurrent state inside."""
 
+import io
 import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -213,7 +214,10 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
         # They name the folders of this machine, in files that are made to be given away.
         for node in program.graph.nodes:
             node.meta.pop("stack_trace", None)
-        torch.export.save(program, folder / "policy.pt2")
+        # Torch's writer of files aborts the process where the disk is full.
+        memory = io.BytesIO()
+        torch.export.save(program, memory)
+        (folder / "policy.pt2").write_bytes(memory.getvalue())
         onnx = torch.onnx.export(
             program,
             args=example,

@@ -61,8 +61,9 @@ def whole_file(path: Path) -> Iterator[Path]:
     check_own(path)
     temporary = path.with_name(f"{WRITING}{secrets.token_hex(4)}-{path.name}")  # another writer has another
     try:
-        yield temporary
-        os.replace(temporary, path)
+        with _named(path):
+            yield temporary
+            os.replace(temporary, path)
     except BaseException:
         with suppress(OSError):
             temporary.unlink()
@@ -107,7 +108,7 @@ def unfinished_folder(folder: Path) -> Iterator[Path]:
     temporary = folder / f"{WRITING}{secrets.token_hex(4)}"
     temporary.mkdir()
     try:
-        with _held(temporary):
+        with _held(temporary), _named(folder):
             yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -141,6 +142,17 @@ def _check_status(path: Path, about: os.stat_result) -> None:
     raise ValueError(
         f"{path}: {what}, and only files of this folder alone are written: delete it, or choose another"
     )
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Say what could not be written where an error does not: a full disk answers a write without any name."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 @contextmanager

@@ -4,6 +4,7 @@ The training gives its weights away every few seconds, between two iterations an
 Otherwise it does nothing for the viewer: its graphs, its envs and its stream stay as they are.
 """
 
+import io
 import json
 import os
 import sys
@@ -20,7 +21,7 @@ import torch
 from ksim_rl.config import plugins
 from ksim_rl.config.child_processes import go_to_parents_folder, start_python
 from ksim_rl.device import state_tree
-from ksim_rl.files.writing import whole_file, write_whole
+from ksim_rl.files.writing import write_whole
 from ksim_rl.trainers import Hook, RunCfg, Trainer
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build_env
@@ -52,8 +53,10 @@ class GiveWeights(Hook):
             self._every = max(1, round(PERIOD_S * iterations / max(seconds, 1e-3)))
         self._last = now, trainer.iteration
         state = {name: tensor.cpu() for name, tensor in trainer.update.actor.state_dict().items()}
-        with whole_file(self._path) as unfinished:
-            torch.save({"iteration": trainer.iteration, "actor": state}, unfinished)
+        # Torch's writer of files aborts the process where the disk is full.
+        memory = io.BytesIO()
+        torch.save({"iteration": trainer.iteration, "actor": state}, memory)
+        write_whole(self._path, memory.getvalue())
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Files appear whole, and what leads elsewhere is refused: links, hard links, pipes."""
 
 import ast
+import errno
 import os
 import signal
 from pathlib import Path
@@ -33,6 +34,7 @@ WRITES = {
 OTHERS = {
     "cli/new.py": {"copy", "copyfile"},
     "export/folder.py": {"write_text", "savez_compressed"},
+    "export/policy.py": {"write_bytes"},
     "export/robot.py": {"write_text", "write_bytes"},
     "export/sim2sim.py": {"write_text"},
     "export/standalone/runner.py": {"write_text", "savez_compressed"},
@@ -201,3 +203,35 @@ def test_a_file_that_was_a_writers_own_is_replaced_and_never_seen_half(tmp_path)
         temporary.write_text("ne")
         assert path.read_text() == "old"
     assert path.read_text() == "ne" and os.listdir(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("write", [write_whole, lambda path, text: fill(path.parent)])
+def test_a_full_disk_is_said_with_the_file_or_folder_that_was_written(write, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*/(a|export)'"):
+        write(tmp_path / "a", "x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def savers(tree):
+    """Return the calls of torch that write a file themselves, where a full disk aborts the process."""
+    found = []
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call) or ast.unparse(node.func) not in (
+            "torch.save",
+            "torch.export.save",
+        ):
+            continue
+        if ast.unparse(node.args[1]) != "memory":
+            found.append(ast.unparse(node))
+    return found
+
+
+def test_torch_writes_into_memory_only():
+    found = [call for path in PACKAGE.rglob("*.py") for call in savers(ast.parse(path.read_text()))]
+    assert found == []
+    assert savers(ast.parse("torch.save(state, path)"))
