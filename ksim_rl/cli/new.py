@@ -42,7 +42,8 @@ def new(arguments: list[str]) -> int:
     with shown_working(f"analysing {options.model}"):
         found = analyse(options.model)
     robot, stands = replace(found.robot, name=name, model=MODEL), found.stands_s >= TRIAL_S
-    is_file = Path(options.model).exists()
+    model = Path(options.model).expanduser()
+    is_file = model.exists()
     path = f'str(files("{name}").joinpath("{name}.xml"))'
     words = {
         "name": name,
@@ -72,7 +73,7 @@ def new(arguments: list[str]) -> int:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         write_whole(folder / file, text)
     if is_file:
-        copy_model(Path(options.model), folder / name / f"{name}.xml")
+        copy_model(model, folder / name / f"{name}.xml")
     for file in sorted(path for path in folder.rglob("*") if path.is_file()):
         show(shown(file))
     show(f"next: cd {shown(folder)}; its README.md has the commands")

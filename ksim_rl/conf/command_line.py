@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ksim_rl.checks import check_known
 from ksim_rl.conf import spelling
 from ksim_rl.conf.registration import CHOSEN_BY_TASK, MODULE, NAME, RUN_AGAIN, register, store_run
-from ksim_rl.config.overrides import check_parsed
+from ksim_rl.config.overrides import check_parsed, quoting
 from ksim_rl.trainers import RunCfg
 
 # A sweep over more combinations than this is checked in part here; each job checks its own config again.
@@ -55,6 +55,7 @@ def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, value
             if sweeps and not multirun:
                 raise ValueError(
                     f"override {sweeps[0]!r} has several values: add --multirun to run one job for each"
+                    f"{quoting(sweeps[0])}"
                 )
             _check_names(overrides, loader, name)
             jobs = itertools.islice(_jobs(overrides), MAX_CHECKED_JOBS if values else 0)
@@ -102,7 +103,7 @@ def _parse(text: str, loader: ConfigLoader) -> Override:
             raise explained from error
         reason = " ".join(str(error).split())
         raise ValueError(
-            f"override {text!r} does not parse (expected group=name or field=value): {reason}"
+            f"override {text!r} does not parse (expected group=name or field=value): {reason}{quoting(text)}"
         ) from error
 
 

@@ -1,6 +1,7 @@
 """This module checks Hydra overrides against a config tree before anything is composed."""
 
 import copy
+import string
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,9 @@ from omegaconf import OmegaConf
 
 from ksim_rl.checks import near
 
+# What a value of one word may hold without quotes.
+UNQUOTED = frozenset(string.ascii_letters + string.digits + "_/.:+-%*@?")
+
 
 def check_overrides(tree: Mapping[str, Any], overrides: Sequence[str]) -> None:
     """Refuse overrides that do not parse, or change a field which the tree does not have, with the near names there."""
@@ -19,8 +23,21 @@ def check_overrides(tree: Mapping[str, Any], overrides: Sequence[str]) -> None:
         try:
             parsed.append(OverridesParser.create().parse_override(text))
         except HydraException as error:
-            raise ValueError(f"override {text!r} does not parse: {str(error).splitlines()[0]}") from None
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"override {text!r} does not parse: {reason}{quoting(text)}") from None
     check_parsed(tree, parsed)
+
+
+def quoting(text: str) -> str:
+    """Return how to write an override whose value has signs of Hydra's grammar; nothing for one without a value.
+
+    Names of files have them: spaces with brackets, commas, `=`, `~` and letters beyond ASCII.
+    """
+    field, equals, value = text.partition("=")
+    if not equals or value[:1] in "'\"[{" or set(value) <= UNQUOTED:
+        return ""
+    escaped = value.replace('"', '\\"')
+    return f"; a name or text with such signs is quoted, for the shell too: '{field}=\"{escaped}\"'"
 
 
 def check_parsed(tree: Mapping[str, Any], overrides: Iterable[Override]) -> None:

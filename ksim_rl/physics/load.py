@@ -1,6 +1,5 @@
 """This module loads and checks a model from a file, an XML string, a spec or a menagerie name."""
 
-import os
 import re
 import warnings
 import weakref
@@ -11,17 +10,16 @@ from pathlib import Path
 import mujoco
 import warp as wp
 
-from ksim_rl.checks import naming, near
+from ksim_rl.checks import naming
 from ksim_rl.device.streams import start_warp
-from ksim_rl.files.reading import MOST_MODEL_BYTES, read_bytes
 from ksim_rl.physics.model_checks import check_finite, check_meant, warp_model_of
+from ksim_rl.physics.model_files.source import read_source
+from ksim_rl.physics.model_files.urdf import is_urdf, ready_urdf
 from ksim_rl.physics.model_size import check_text
 from ksim_rl.physics.sim_cfg import SimCfg
 
-SUFFIXES = (".xml", ".mjcf", ".urdf")
 Source = str | Path | mujoco.MjSpec
 
-_MENAGERIE_NAME = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)?")
 _ELEMENT = re.compile(r"Element '(?P<tag>[^']*)', line (?P<line>\d+)")
 _NAMED_ELEMENT = re.compile(r"Element name '(?P<name>[^']*)', id (?P<id>-?\d+)(, line (?P<line>\d+))?")
 _FILE_IN_MESSAGE = re.compile(r"file '(?P<file>[^']+)'")
@@ -76,10 +74,19 @@ def _parsed(source: Source) -> tuple[mujoco.MjSpec, str, str, list[str]]:
                 f"model source is {kind}: expected a path, an XML string, a MjSpec or a menagerie name"
             )
         return source.copy(), "", _labels.get(source, f"model {source.modelname!r}"), []
-    path, text, label = _read(source)
-    check_text(text, path.parent if path else Path(), label)
+    read = read_source(source)
+    text, label = read.text, read.label
+    if is_urdf(text):
+        with naming(label):
+            text = ready_urdf(text, read.folder)
+    included = check_text(text, read.folder, label)
     with caught_warnings() as caught, _named(label, text):
-        spec = mujoco.MjSpec.from_string(text) if path is None else mujoco.MjSpec.from_file(str(path))
+        if read.path is None:
+            spec = mujoco.MjSpec.from_string(text)
+        else:
+            # MuJoCo knows one suffix only, and is given the text that was checked.
+            called = str(read.path.with_suffix(".xml"))
+            spec = mujoco.MjSpec.from_file(called, include={**included, called: text.encode()})
     return spec, text, label, caught
 
 
@@ -90,33 +97,6 @@ def _named(label: str, text: str) -> Iterator[None]:
         yield
     except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
         raise ValueError(_readable(str(error), label, text)) from None
-
-
-def _read(source: str | Path) -> tuple[Path | None, str, str]:
-    """Return the path (None for an XML string), the XML text, and how to call the source in messages."""
-    if isinstance(source, str):
-        if not source.strip():
-            raise ValueError(
-                "model source is an empty string: expected a path, an XML string or a menagerie name"
-            )
-        if source.lstrip().startswith("<"):
-            return None, source, "XML string"
-        if _MENAGERIE_NAME.fullmatch(source) and not Path(source).exists():
-            source = model_path(source)
-    path = Path(source)
-    if path.is_dir() or not path.exists():
-        raise ValueError(f"model file {str(path)!r}: {'is a folder' if path.is_dir() else 'no such file'}")
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"model file {str(path)!r}: expected a name that ends in {', '.join(SUFFIXES)}")
-    try:
-        text = read_bytes(path, limit=MOST_MODEL_BYTES, follows_links=True).decode()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"model file {str(path)!r} is not UTF-8 text: byte {error.start}") from None
-    except ValueError as error:
-        raise ValueError(f"model file {error}") from None
-    if not text.strip():
-        raise ValueError(f"model file {str(path)!r} is empty")
-    return path, text, str(path)
 
 
 def _readable(message: str, label: str, text: str) -> str:
@@ -180,48 +160,3 @@ def caught_warnings() -> Iterator[list[str]]:
             keep(str(warning.message))
     finally:
         mujoco.set_mju_user_warning(previous)
-
-
-def model_path(name: str) -> Path:
-    """Return the file of a robot: "unitree_go1" (its scene), or "unitree_go1/go1" (one of its entry points).
-
-    Looks under the folder that the environment variable MENAGERIE_ROOT names, else in the cache of the package
-    `mujoco-menagerie`, which downloads a robot on first use.
-    """
-    robot, _, entry = name.partition("/")
-    root = os.environ.get("MENAGERIE_ROOT")
-    return _in_folder(Path(root), robot, entry) if root else _from_package(robot, entry)
-
-
-def _in_folder(root: Path, robot: str, entry: str) -> Path:
-    if not (root / robot).is_dir():
-        found = [path.name for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
-        raise ValueError(
-            f"menagerie model {robot!r} is not under MENAGERIE_ROOT={root}: {near(robot, found)}; copy its "
-            "folder there, or unset MENAGERIE_ROOT to download it with the package mujoco-menagerie"
-        )
-    stem = entry or "scene"
-    path = root / robot / f"{stem}.xml"
-    if not path.is_file():
-        found = [path.stem for path in (root / robot).glob("*.xml")]
-        raise ValueError(f"menagerie model {robot!r} has no entry point {stem!r}: {near(stem, found)}")
-    return path
-
-
-def _from_package(robot: str, entry: str) -> Path:
-    try:
-        import mujoco_menagerie
-    except ImportError:
-        raise ValueError(
-            f"menagerie model {robot!r} is not here: with a network, `pip install mujoco-menagerie` (it downloads the "
-            "model on first use); without one, copy the folder and set MENAGERIE_ROOT to its parent"
-        ) from None
-    try:
-        return mujoco_menagerie.get(robot).xml(entry or None)
-    except LookupError as error:
-        raise ValueError(f"menagerie: {error}") from None
-    except (mujoco_menagerie.MenagerieError, OSError) as error:
-        raise ValueError(
-            f"menagerie model {robot!r} could not be downloaded ({error}): with a network, try again; without one, "
-            "copy its folder from github.com/google-deepmind/mujoco_menagerie and set MENAGERIE_ROOT to its parent"
-        ) from None

@@ -1,5 +1,6 @@
 """A model that a few words make enormous is refused here, before MuJoCo spends minutes or all memory on it."""
 
+import codecs
 import html
 import math
 import os
@@ -9,6 +10,7 @@ from pathlib import Path
 
 from ksim_rl.checks import naming
 from ksim_rl.files.reading import MOST_DATA_BYTES, MOST_MODEL_BYTES, check_regular, read_bytes
+from ksim_rl.files.xml_text import decode_xml
 
 VARIABLE = "KSIM_RL_LARGEST_MODEL"
 LARGEST = 10**8
@@ -44,11 +46,17 @@ class _Files:
     folders: set[Path] = field(default_factory=set)
     below: set[str] = field(default_factory=lambda: {""})  # folders of assets, as any of the texts has them
     named: set[str] = field(default_factory=set)
+    recoded: dict[str, bytes] = field(default_factory=dict)  # UTF-8, by the path under which MuJoCo looks
 
-    def text(self, path: Path) -> str:
-        """Read a file that is included or attached."""
+    def text(self, path: Path, called: str) -> str:
+        """Read a file that is included or attached, which MuJoCo looks for under `called`."""
         with naming(self.label):
-            return read_bytes(path, limit=MOST_MODEL_BYTES, follows_links=True).decode(errors="replace")
+            data = read_bytes(path, limit=MOST_MODEL_BYTES, follows_links=True)
+        with naming(f"{self.label}: included file {str(path)!r}"):
+            text = decode_xml(data)
+        if text.encode() not in (data, data.removeprefix(codecs.BOM_UTF8)):
+            self.recoded[called] = text.encode()
+        return text
 
     def check_assets(self) -> None:
         """Refuse pipes and devices, at which MuJoCo would wait or never end, and files that are too large."""
@@ -66,10 +74,11 @@ class _Files:
                             check_regular(path, limit=MOST_DATA_BYTES)
 
 
-def check_text(text: str, folder: Path, label: str) -> None:
+def check_text(text: str, folder: Path, label: str) -> dict[str, bytes]:
     """Refuse an XML text that comes to too much with its replicas, grids and surfaces, and the files it includes.
 
     The files that it names, of meshes, pictures and height fields too, are regular ones of limited size, or refused.
+    Return the included files that MuJoCo cannot decode, as UTF-8, by the path under which it looks for them.
     """
     read = _Files(label=label, folder=folder)
     elements, numbers = _count(text, folder, read, ())
@@ -84,6 +93,7 @@ def check_text(text: str, folder: Path, label: str) -> None:
             "would spend minutes or all memory on: make it smaller, or raise the environment variable "
             f"{VARIABLE} to {most}, the larger of the elements squared and the numbers (now {given})"
         )
+    return read.recoded
 
 
 def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> tuple[int, int]:
@@ -122,10 +132,10 @@ def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> t
                 )
             if path not in read.counts:
                 # What is no file, a pipe among them, is refused; one that is missing MuJoCo names with its line.
-                counts = (
-                    _count(read.text(path), path.parent, read, (*within, path)) if path.exists() else (0, 0)
-                )
-                read.counts[path] = counts
+                read.counts[path] = 0, 0
+                if path.exists():
+                    included = read.text(path, str(folder / attributes["file"]))
+                    read.counts[path] = _count(included, path.parent, read, (*within, path))
             inner = read.counts[path]
             if tag == "model":
                 largest_model = max(largest_model, inner)

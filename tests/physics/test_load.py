@@ -65,7 +65,9 @@ def test_sources_that_are_none(source, words):
 def test_files_that_are_none(tmp_path: Path):
     for name, content, words in (
         ("empty.xml", b"", "is empty"),
-        ("binary.xml", b"\xff\xfe<mujoco/>", "is not UTF-8"),
+        ("binary.xml", b"\xff\xfe<mujoco/>", "is not utf-16 text"),
+        ("latin.xml", "<!-- b\xe4r --><mujoco/>".encode("latin-1"), "is not UTF-8 text: byte 6; save it as"),
+        ("klingon.xml", b'<?xml version="1.0" encoding="klingon"?><mujoco/>', "'klingon' is not known"),
         ("model.mjb", b"\x00\x01", "ends in .xml"),
     ):
         (tmp_path / name).write_bytes(content)
