@@ -88,6 +88,7 @@ TESTS = {
         "loosen_measured": SINGLE_MODELS,
         "shifted_time": SINGLE_MODELS,
         "sparse_velocity": SINGLE_MODELS,
+        "spread_columns": SINGLE_MODELS,
         "take_the_law_of_priority": SINGLE_MODELS,
     },
     "physics/nan_guard/guard.py": {"keep_rows": EQUAL_WORLDS, "mark_failed": EQUAL_WORLDS},

@@ -155,6 +155,13 @@ def copy_columns(columns: wp.array[int], source: wp.array2d[float], target: wp.a
 
 
 @wp.kernel(enable_backward=False)
+def spread_columns(columns: wp.array[int], source: wp.array2d[float], target: wp.array2d[float]):
+    """Copy each world's row into some columns of a longer one."""
+    world, place = wp.tid()
+    target[world, columns[place]] = source[world, place]
+
+
+@wp.kernel(enable_backward=False)
 def gather_controls(
     ctrladr: wp.array[int],
     ctrlnum: wp.array[int],

@@ -31,17 +31,23 @@ from mujoco_warp._src.collision_gjk import support as support
 # The law of a constraint row.
 from mujoco_warp._src.constraint import _efc_row as efc_row  # noqa: F401
 
-# What `forward` does between the stages that it shows.
+# What an implicit integrator subtracts from the inertia matrix.
+from mujoco_warp._src.derivative import deriv_smooth_vel as derivative_of_smooth_forces  # noqa: F401
+
+# How it ends, and what `forward` does between the stages that it shows.
+from mujoco_warp._src.forward import _advance as advance  # noqa: F401
 from mujoco_warp._src.forward import _energy_pos as energy_of_position  # noqa: F401
 from mujoco_warp._src.forward import _energy_vel as energy_of_velocity  # noqa: F401
 from mujoco_warp._src.forward import _launch_discrete_free_gyro as turn_free_bodies
+from mujoco_warp._src.forward import implicit_free_body as solve_for_lone_bodies  # noqa: F401
 from mujoco_warp._src.math import make_frame as make_frame
 from mujoco_warp._src.math import mul_quat as mul_quat
 from mujoco_warp._src.math import quat_to_mat as quat_to_mat
 from mujoco_warp._src.math import rot_vec_quat as rot_vec_quat
 from mujoco_warp._src.sleep import update_sleep, wake
 
-# What a step adds to the inertia matrix and to the bias forces for tendons.
+# How it solves, and what a step adds to the inertia matrix and to the bias forces for tendons.
+from mujoco_warp._src.smooth import factor_solve_i as factor_and_solve  # noqa: F401
 from mujoco_warp._src.smooth import tendon_armature as tendon_armature
 from mujoco_warp._src.smooth import tendon_bias as tendon_bias
 

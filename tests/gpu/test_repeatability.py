@@ -159,8 +159,10 @@ DRIVEN = """
       <geom size="0.1" pos="0.2 0 0" contype="0" conaffinity="0"/></body>
     <body name="ball" pos="2 0 0.099"><joint name="lift" type="slide" axis="0 0 1"/>
       <geom name="ball" size="0.1" adhesion="1"/></body>
+    <body pos="0 2 1"><freejoint name="drone"/><geom size="0.1"/></body>
   </worldbody>
   <actuator>
+    <position joint="drone" kp="2" kv="1" gear="1 0 1 0 0.5 0"/>
     <intvelocity joint="arm" group="1" kp="5" actrange="-1 1"/>
     <general joint="arm" gaintype="affine" gainprm="1 0 -0.1" ctrllimited="true" ctrlrange="-0.1 0.1"/>
     <position joint="arm" kp="2" delay="0.004" nsample="3"/><adhesion body="ball" ctrlrange="0 1"/>

@@ -31,6 +31,32 @@ HINGE = (
 )
 SLOWED = '<general joint="h" gaintype="affine" gainprm="1 0 -3" ctrllimited="true" ctrlrange="-0.05 0.05"/>'
 
+# Inertia matrices of such bodies are diagonal, and what acts on them couples their degrees of freedom.
+SIMPLE_BODY = """
+<mujoco>
+  <option timestep="0.01" integrator="{integrator}"/>
+  <worldbody>
+    <body>{joints}<geom type="box" size="0.1 0.05 0.03" mass="1"/><site name="grip" pos="0.1 0.05 0.02"/></body>
+    <site name="post" pos="0.3 0.2 0.5"/>
+  </worldbody>
+  {acts}
+</mujoco>
+"""
+JOINTS_OF_SIMPLE_BODIES = {
+    "free": '<freejoint name="x"/>',
+    "slides": '<joint name="x" type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>',
+}
+ACTS_ON_BODIES = {
+    "tendon": '<tendon><spatial damping="10"><site site="grip"/><site site="post"/></spatial></tendon>',
+    "site": (
+        '<actuator><position site="grip" refsite="post" kp="6" kv="3" gear="1 0.5 0.7 0.3 0.4 0.2"/></actuator>'
+    ),
+    "joint": '<actuator><position joint="x" kp="6" kv="3" gear="1 0.5 0.7 0.3 0.4 0.2"/></actuator>',
+    "gain": (
+        '<actuator><general joint="x" gaintype="affine" gainprm="1 0.3 -3" gear="1 0.5 0.7 0.3 0.4 0.2" '
+        'ctrlrange="-0.5 0.5"/></actuator>'
+    ),
+}
 WITH_ACTUATORS = (
     '<mujoco><option timestep="0.01" integrator="{integrator}"/><worldbody>'
     + HINGE
@@ -61,6 +87,19 @@ def test_such_a_gain_beside_a_motor_of_several_controls_is_refused() -> None:
     with pytest.raises(ValueError, match="DC motor has several controls.*choose integrator='euler'"):
         started(xml, KERNELS["our solver"])
     step_and_check(xml.replace("implicitfast", "Euler"), KERNELS["our solver"])
+
+
+@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize("integrator", IMPLICIT)
+@pytest.mark.parametrize("acts", ACTS_ON_BODIES)
+@pytest.mark.parametrize("joints", JOINTS_OF_SIMPLE_BODIES)
+def test_what_acts_on_a_body_as_a_whole_is_implicit(
+    joints: str, acts: str, integrator: str, kernels: str
+) -> None:
+    xml = SIMPLE_BODY.format(
+        integrator=integrator, joints=JOINTS_OF_SIMPLE_BODIES[joints], acts=ACTS_ON_BODIES[acts]
+    )
+    step_and_check(xml, KERNELS[kernels], speed=3.0)
 
 
 def test_runge_kutta_leaves_the_rates_of_its_last_stage() -> None:

@@ -5,6 +5,8 @@ What its implicit integrators leave out is given back by a shallow variant of th
 * Without actuation, or without dampers, they take no derivative at all. C drops the derivative of what is disabled.
 * They multiply a gain that depends on velocity by controls out of their range, and by those of another actuator where
   one has several controls or none.
+* Of simple bodies, and of those with a free joint alone, they leave out what couples degrees of freedom; see
+  `full_rows`.
 
 And an activation of a disabled actuator is put back, and where trees may sleep what the substep read: MuJoCo Warp then
 computes velocities, passive forces and forces of bodies once more, of the state that it reached.
@@ -12,6 +14,7 @@ computes velocities, passive forces and forces of bodies once more, of the state
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
@@ -20,6 +23,7 @@ import warp as wp
 
 from ksim_rl.physics import kernels
 from ksim_rl.physics.actuators.disabled_actuators import still_activations
+from ksim_rl.physics.integration.full_rows import full_rows_matter, implicit_with_full_rows
 from ksim_rl.physics.integration.runge_kutta import mended_runge_kutta
 
 _KINDS = mjw.IntegratorType
@@ -100,16 +104,24 @@ def _implicit(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
 ) -> Callable[[mjw.Model], None]:
     of_integration = _with_all_derivatives(warp_model)
+    gathered_E = warp_data_E
+    gather = _nothing
     inputs = _inputs_of_gains(mj_model, warp_model, warp_data_E)
-    if inputs is None:
-        return lambda substep_warp_model: mjw.implicit(of_integration, warp_data_E)
-    gather, gathered_E = inputs
+    if inputs is not None:
+        gather, gathered_E = inputs
+    launch = partial(mjw.implicit, of_integration, gathered_E)
+    if full_rows_matter(mj_model, of_integration):
+        launch = implicit_with_full_rows(mj_model, of_integration, gathered_E)
 
     def integrate(substep_warp_model: mjw.Model) -> None:
         gather()
-        mjw.implicit(of_integration, gathered_E)
+        launch()
 
     return integrate
+
+
+def _nothing() -> None:
+    """Launch nothing."""
 
 
 def _with_all_derivatives(warp_model: mjw.Model) -> mjw.Model:
