@@ -18,6 +18,7 @@ usage: ksim-rl <command> [arguments]
            from its weights:        ksim-rl train checkpoint=RUN
   resume   continue a run:          ksim-rl resume RUN
   eval     evaluate a policy:       ksim-rl eval RUN --episodes 100
+           in MuJoCo's C engine:    ksim-rl eval RUN task.sim.engine=c
            how often it follows its motion: ksim-rl eval RUN --trials 1024
   play     record a video:          ksim-rl play RUN --seconds 10
            watch and drive it:      ksim-rl play RUN --live

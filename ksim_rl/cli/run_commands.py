@@ -1,6 +1,7 @@
 """This module holds the commands that take no Hydra overrides: resume, eval, play, envs, robot."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -20,6 +21,7 @@ from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.build import build_evaluator, solved_at
 from ksim_rl.trainers.metrics import losses_of
+from ksim_rl.trainers.other_physics import ENGINE, check_physics_alone, judged_by, trained_with
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.trainers.run_folder import FOLDERS, policy_of
 from ksim_rl.trainers.sources import check_sources
@@ -90,7 +92,10 @@ def evaluate(arguments: list[str]) -> int:
     number.add_argument("--trials", type=int, help="of a tracking run: how many follow the motion to its end")
     parser.add_argument("--pushes", action="store_true", help="of trials: push the robot as in training")
     parser.add_argument("--seed", type=int, help="of the initial states; default: the run's evaluation seed")
-    options = parser.parse_args(arguments)
+    parser.add_argument(
+        "overrides", nargs="*", metavar="field=value", help="of the physics: task.sim.engine=c"
+    )
+    options = parser.parse_intermixed_args(arguments)
     for name in ("episodes", "trials"):
         if getattr(options, name) is not None:
             check_count(f"--{name}", getattr(options, name))
@@ -98,8 +103,10 @@ def evaluate(arguments: list[str]) -> int:
         raise ValueError("--pushes: it is of trials: give their number, --trials 1024")
     with shown_working("evaluating"):
         run = locate(options.run, note=say)
-        policy = policy_of(checkpoint.load_latest(run, note=say), device=options.device)
-        judged = f"{policy.cfg.task_name}, iteration {policy.iteration}"
+        saved = checkpoint.load_latest(run, note=say)
+        cfg, physics = _in_physics(saved, options.overrides, device=options.device)
+        policy = policy_of(saved, device=options.device, cfg=cfg)
+        judged = f"{policy.cfg.task_name}, iteration {policy.iteration}{physics}"
         if options.trials is not None:
             how = {"trials": options.trials, "seed": options.seed, "pushes": options.pushes, "note": say}
             show(f"{judged}: {run_trials(policy.cfg, policy.actor, **how)}")
@@ -115,6 +122,24 @@ def evaluate(arguments: list[str]) -> int:
     threshold = solved_at(policy.cfg)
     show(f"{judged}: {verdict(evaluation, threshold)}")
     return 0 if threshold is None or evaluation.return_mean >= threshold else 1
+
+
+def _in_physics(
+    saved: checkpoint.Checkpoint, overrides: Sequence[str], *, device: str
+) -> tuple[RunCfg | None, str]:
+    """Return a run's config with overrides of its physics, None without, and what the verdict says about them."""
+    if not overrides:
+        return None, ""
+    fields = conf.fields_of(overrides)
+    check_physics_alone(fields, "eval")
+    check_run_tree(saved.config, saved.path, given=fields)
+    cfg = conf.changed({**saved.config, "device": device}, saved.path, overrides)
+    trained = trained_with(saved.config)
+    # Whoever sets a tolerance alone asks for nothing more.
+    if ENGINE not in fields:
+        return cfg, f", with {' '.join(overrides)}"
+    cfg, physics = judged_by(cfg, trained=trained, given=fields)
+    return cfg, f", {physics}"
 
 
 def list_envs(arguments: list[str]) -> int:

@@ -20,7 +20,7 @@ from ksim_rl.conf import choices
 from ksim_rl.config import plain_data, plugins, upstream
 from ksim_rl.files.reading import read_bytes
 from ksim_rl.runs.listing import CONFIG
-from ksim_rl.trainers.run_cfg import check_run_tree, without_env_size
+from ksim_rl.trainers.run_cfg import check_run_tree, up_to_date, without_env_size
 
 MODULE, NAME = "ksim_rl.conf", "train"
 RUN_AGAIN, RUN_CONFIG = "run_again", CONFIG
@@ -87,7 +87,7 @@ def store_run(tree: Mapping[str, Any], path: Path) -> None:
     task = tree.get("task")
     if not isinstance(task, dict) or not isinstance(task.get("scene"), dict):
         raise ValueError(f"{path}: task={task!r}: expected the config of an env, as a run writes it")
-    plain = without_env_size(tree)
+    plain = without_env_size(up_to_date(tree))
     ConfigStore.instance().store(name=RUN_AGAIN, node={**plain, "defaults": ["launch", "_self_"]})
 
 

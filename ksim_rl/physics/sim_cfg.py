@@ -26,6 +26,7 @@ class SimCfg(Checked):
         ccd_iterations: most iterations of convex collision detection.
         njmax: most constraint rows of one world; `None` probes the model, and a run raises it where its env needs more.
         nconmax: contacts (and candidate pairs) per world. They share one pool of `num_envs * nconmax`; `None` as above.
+            Both are the room of MuJoCo Warp: the C engine takes what it needs.
         engine: "warp" simulates on MuJoCo Warp, with our kernels, on GPU or CPU. "c" simulates on MuJoCo's C engine, on
             all cores of the CPU, in float64: it judges the first, compiles nothing at the first start, and has no
             limits of contacts and rows. Cameras that see all worlds need "warp".

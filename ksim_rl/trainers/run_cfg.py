@@ -295,4 +295,8 @@ def up_to_date(tree: Mapping[str, Any]) -> dict[str, Any]:
     # Up to 0.1 an objective without a class was that of PPO.
     if isinstance(objective, Mapping) and "_target_" not in objective:
         tree["objective"] = {"_target_": "ksim_rl.objectives.PPOCfg", **objective}
+    task = tree.get("task")
+    # Before there were two engines, all was made by Warp.
+    if isinstance(task, Mapping) and isinstance(task.get("sim"), Mapping):
+        tree["task"] = {**task, "sim": {"engine": "warp", **task["sim"]}}
     return tree

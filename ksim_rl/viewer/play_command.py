@@ -20,6 +20,7 @@ from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, record_video
 from ksim_rl.trainers.build import build_env
+from ksim_rl.trainers.other_physics import ENGINE, judged_by, trained_with
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.trainers.run_folder import policy_of, without_nan_guard
 from ksim_rl.trainers.video import FPS
@@ -177,15 +178,20 @@ def _find(options: argparse.Namespace) -> Played:
             )
         return _without_policy(conf.compose([*options.what, f"device={options.device}"]), options.agent)
     changed = None
+    physics = ""
     saved = checkpoint.load_latest(locate(first))
     if overrides:
-        check_run_tree(saved.config, saved.path, given=conf.fields_of(overrides))
+        fields = conf.fields_of(overrides)
+        check_run_tree(saved.config, saved.path, given=fields)
         changed = conf.changed({**saved.config, "device": options.device}, saved.path, overrides)
         changed = dataclasses.replace(changed, device=options.device)
+        if ENGINE in fields:
+            changed, words = judged_by(changed, trained=trained_with(saved.config), given=fields)
+            physics = f", {words}"
     policy = policy_of(saved, device=options.device, cfg=changed)
     if options.agent is not None:
         return _without_policy(policy.cfg, options.agent)
-    title = f"{policy.cfg.task_name}, iteration {policy.iteration}"
+    title = f"{policy.cfg.task_name}, iteration {policy.iteration}{physics}"
     return Played(cfg=policy.cfg, title=title, folder=saved.run_folder, actor=policy.actor)
 
 

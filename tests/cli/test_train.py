@@ -74,6 +74,28 @@ def test_eval_repeats_the_evaluation_of_the_run(trained, capsys):
     assert f"return {figures['return_mean']:.1f} +- {figures['return_std']:.1f}" in capsys.readouterr().out
 
 
+def test_eval_in_the_c_engine_says_which_physics_judges(trained, capsys):
+    _, folder = trained
+    assert run("eval", str(folder), "task.sim.engine=c", "--episodes", "4") == 1
+    assert "on MuJoCo's C engine (trained on MuJoCo Warp): evaluation over 4" in capsys.readouterr().out
+    assert run("eval", str(folder), "task.decimation=2") == 2
+    assert "task.decimation: `ksim-rl eval` changes only how worlds" in capsys.readouterr().err
+
+
+def test_a_run_that_the_c_engine_trained_is_judged_in_other_physics(trained, tmp_path, capsys):
+    saved = checkpoint.load_latest(trained[1])
+    task = saved.config["task"]
+    by_c = {**saved.config, "task": {**task, "sim": {**task["sim"], "engine": "c"}}}
+    checkpoint.save(tmp_path / "checkpoint", saved.state, iteration=saved.iteration, config=by_c)
+    said = "which trained it, with integrator euler instead of implicitfast, with a time step of 0.005 s"
+    assert run("eval", str(tmp_path), "task.sim.engine=c", "--episodes", "4") == 1
+    assert said in capsys.readouterr().out
+    words = ("--seconds", "0.1", "--output", str(tmp_path / "clip.gif"))
+    assert run("play", str(tmp_path), "task.sim.engine=c", *words) in (0, 3)
+    output = capsys.readouterr().out
+    assert said in output or "no video" in output
+
+
 def test_play_records_a_video_or_says_why_not(trained, capsys, tmp_path):
     _, folder = trained
     code = run("play", str(folder), "--seconds", "0.1", "--fps", "50", "--output", str(tmp_path / "clip.gif"))

@@ -56,7 +56,7 @@ def test_all_succeed_whom_no_limit_ends(short_clip):
 def test_the_command_says_how_many_succeed(short_clip, monkeypatch, capsys):
     policy = Policy(cfg=run_cfg(short_clip, distance=10.0), actor=still(), iteration=7)
     monkeypatch.setattr(run_commands.checkpoint, "load_latest", lambda path, note: None)
-    monkeypatch.setattr(run_commands, "policy_of", lambda saved, device: policy)
+    monkeypatch.setattr(run_commands, "policy_of", lambda saved, device, cfg: policy)
     code, output = run(capsys, "eval", "some_run", "--trials", "6")
     assert code == 0 and "g1_track_walk, iteration 7: 100.0% of 6 trials succeed" in output.out
     for words, message in (

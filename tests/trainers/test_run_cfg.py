@@ -1,6 +1,7 @@
 """The config of a run: plain data and back, refused with the full path of what is wrong."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
@@ -22,6 +23,16 @@ def cfg():
 
 def test_plain_data_rebuilds_an_equal_config(cfg):
     assert RunCfg.from_tree(cfg.to_tree()) == cfg
+
+
+def test_a_run_names_its_engine_and_one_that_does_not_was_made_by_warp(cfg):
+    tree = cfg.to_tree()
+    named = tree["task"]["sim"].pop("engine")
+    assert named == cfg.task.sim.engine
+    assert RunCfg.from_tree(tree).task.sim.engine == "warp"
+    # An override of the field finds it there.
+    changed = conf.changed(tree, Path("config.yaml"), ["task.sim.engine=c"])
+    assert changed.task.sim.engine == "c"
 
 
 @pytest.mark.parametrize(

@@ -362,11 +362,6 @@ def _check_suits(sim: SimCfg, device: torch.device) -> None:
         raise ValueError(
             "sim.one_kernel_dynamics=True asks for kernels of ours, and sim.engine='c' has none: leave one of them out"
         )
-    for name in ("njmax", "nconmax"):
-        if getattr(sim, name) is not None:
-            raise ValueError(
-                f"sim.{name} limits MuJoCo Warp's room, and sim.engine='c' has no such limit: leave it out"
-            )
 
 
 @contextmanager

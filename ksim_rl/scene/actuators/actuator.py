@@ -105,6 +105,8 @@ class Actuator(Checked, ABC):
     """
 
     is_explicit: ClassVar[bool] = False
+    counts_substeps: ClassVar[bool] = False
+    """Whether it remembers so many substeps, which are another time where the time step is another one."""
     takes: ClassVar[frozenset[TargetKind]] = frozenset()
     """The kinds of target that have an effect."""
 

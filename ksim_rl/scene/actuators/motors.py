@@ -87,6 +87,7 @@ class DelayedActuator(Actuator):
     """
 
     is_explicit: ClassVar[bool] = True  # built-in actuators too get their control before each substep
+    counts_substeps: ClassVar[bool] = True
 
     actuator: Actuator
     min_lag: WholeNumber = 0

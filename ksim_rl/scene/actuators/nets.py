@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -90,6 +90,8 @@ class NetActuator(ExplicitActuator, takes=frozenset({"pos"})):
         position_scale, velocity_scale: multiply position errors (target - position, rad or m) and velocities (rad/s or
             m/s) on their way in, `effort_scale` the output, which gives N m or N. None: the file's metadata, else 1.
     """
+
+    counts_substeps: ClassVar[bool] = True
 
     file: str
     sha256: str | None = None

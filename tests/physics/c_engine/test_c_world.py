@@ -250,16 +250,15 @@ def test_a_world_that_fails_is_kept_for_replay(tmp_path):
     assert len(report.files) == 1
 
 
-@pytest.mark.parametrize(
-    ("sim", "match"),
-    [
-        (SimCfg(engine="c", one_kernel_dynamics=True), "one_kernel_dynamics=True"),
-        (SimCfg(engine="c", njmax=40), "sim.njmax limits"),
-    ],
-)
-def test_settings_of_warp_alone_are_refused(sim, match):
-    with pytest.raises(ValueError, match=match):
-        World(quadruped(), num_envs=1, sim=sim)
+def test_settings_of_our_kernels_are_refused_and_those_of_room_mean_nothing():
+    with pytest.raises(ValueError, match="one_kernel_dynamics=True"):
+        World(quadruped(), num_envs=1, sim=SimCfg(engine="c", one_kernel_dynamics=True))
+    narrow = thrown(sim=SimCfg(engine="c", njmax=4, nconmax=2))
+    roomy = thrown()
+    for world in (narrow, roomy):
+        for _ in range(10):
+            world.step(SUBSTEPS)
+    assert torch.equal(narrow.qpos_EL, roomy.qpos_EL)
 
 
 def test_what_the_engine_has_not_is_refused_by_name():

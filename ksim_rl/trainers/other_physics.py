@@ -1,0 +1,83 @@
+"""This module says in which physics a trained policy is judged, and how that differs from its training."""
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import mujoco
+
+from ksim_rl.envs import ManagerBasedRlEnvCfg
+from ksim_rl.scene.scene import build_spec
+from ksim_rl.trainers.run_cfg import RunCfg
+
+ENGINES = {"warp": "MuJoCo Warp", "c": "MuJoCo's C engine"}
+PREFIX = "task.sim."
+ENGINE = f"{PREFIX}engine"
+# The integrator by which a run of another one is judged.
+_OTHER_INTEGRATOR = {"euler": "implicitfast", "discrete": "implicitfast"}
+
+
+def trained_with(tree: Mapping[str, Any]) -> str:
+    """Return the engine that made a run, from its tree of config; those that name none were made by Warp."""
+    sim: Any = tree.get("task", {}).get("sim", {})
+    return sim.get("engine", "warp")
+
+
+def check_physics_alone(fields: Collection[str], command: str) -> None:
+    """Refuse fields that change more of a run's config than how its worlds are simulated."""
+    for field in fields:
+        if not field.startswith(PREFIX):
+            raise ValueError(
+                f"{field}: `ksim-rl {command}` changes only how worlds are simulated, {PREFIX}*: see the policy "
+                f"under another config by ksim-rl play RUN {field}=..."
+            )
+
+
+def judged_by(cfg: RunCfg, *, trained: str, given: Collection[str] = ()) -> tuple[RunCfg, str]:
+    """Return the config by which `cfg.task.sim.engine` judges a run, and words that say which physics that is.
+
+    The C engine judges a run of MuJoCo Warp as it is configured. A run that the C engine itself trained would meet what
+    it knows: it is judged with another integrator, and with half the time step and twice the substeps, unless `given`,
+    the fields that the user sets, have these.
+    """
+    engine = cfg.task.sim.engine
+    if engine != trained or engine != "c":
+        return cfg, f"on {ENGINES[engine]} (trained on {ENGINES[trained]})"
+    changes, words = _changes(cfg.task, given)
+    sim = dataclasses.replace(cfg.task.sim, **changes)
+    decimation = cfg.task.decimation
+    if "timestep" in changes:
+        decimation = 2 * decimation
+    task = dataclasses.replace(cfg.task, sim=sim, decimation=decimation)
+    said = ", ".join(words) or "with the integrator and the time step that were given"
+    return dataclasses.replace(cfg, task=task), f"on {ENGINES[engine]}, which trained it, {said}"
+
+
+def _changes(task: ManagerBasedRlEnvCfg, given: Collection[str]) -> tuple[dict[str, Any], list[str]]:
+    """Return the fields of `SimCfg` to change, and how to say that."""
+    spec = build_spec(task.scene)
+    task.sim.apply_to(spec)
+    changes: dict[str, Any] = {}
+    words: list[str] = []
+    if f"{PREFIX}integrator" not in given:
+        own = mujoco.mjtIntegrator(spec.option.integrator).name.removeprefix("mjINT_").lower()
+        changes["integrator"] = _OTHER_INTEGRATOR.get(own, "euler")
+        words.append(f"with integrator {changes['integrator']} instead of {own}")
+    timestep = float(spec.option.timestep)
+    if f"{PREFIX}timestep" in given:
+        return changes, words
+    if _counts_substeps(task):
+        words.append(f"with its time step of {timestep:g} s, in which its actuators count their lags")
+        return changes, words
+    changes["timestep"] = 0.5 * timestep
+    words.append(f"with a time step of {changes['timestep']:g} s instead of {timestep:g} s")
+    return changes, words
+
+
+def _counts_substeps(task: ManagerBasedRlEnvCfg) -> bool:
+    """Whether an actuator would mean another time by as many substeps."""
+    for robot in task.scene.entities.values():
+        for actuator in getattr(robot, "actuators", ()):
+            if actuator.counts_substeps:
+                return True
+    return False
