@@ -56,7 +56,7 @@ def is_locked(folder: Path) -> bool:
     """Whether a living process writes a run folder."""
     try:
         with open_regular(folder / LOCK, limit=MOST_LETTERS) as file:
-            return not _try_lock(file)
+            return not try_lock(file)
     except (ValueError, OSError):  # there is none, it is none of ours, or there can be none
         return False
 
@@ -65,7 +65,7 @@ def _take(folder: Path) -> IO[str]:
     for attempt in itertools.count():
         file = open_own(folder / LOCK)
         try:
-            if _try_lock(file):
+            if try_lock(file):
                 with suppress(FileNotFoundError):  # whoever had it may have removed it meanwhile
                     if os.path.samestat(os.fstat(file.fileno()), os.stat(folder / LOCK)):
                         return file
@@ -80,7 +80,8 @@ def _take(folder: Path) -> IO[str]:
     raise AssertionError
 
 
-def _try_lock(file: IO[Any]) -> bool:
+def try_lock(file: IO[Any]) -> bool:
+    """Lock an open file, and return False where another process, or another opening of the file, has the lock."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from subprocess import STDOUT, Popen
-from typing import Any
+from typing import IO, Any
 
 import torch
 
@@ -68,9 +68,10 @@ class Runs:
                         process.kill()
                 for slot, gpu in enumerate(gpus):
                     if slot not in running:
-                        job = self._next(waiting, elsewhere, note)
-                        if job is not None:
-                            running[slot] = job, self._start(job, gpu)
+                        taken = self._next(waiting, elsewhere, note)
+                        if taken is not None:
+                            job, log = taken
+                            running[slot] = job, self._start(job, gpu, log)
                 for slot, (job, process) in list(running.items()):
                     if (code := process.poll()) is not None:
                         del running[slot]
@@ -88,31 +89,56 @@ class Runs:
                 process.wait()
         return left
 
-    def _next(self, waiting: list[Job], elsewhere: set[Job], note: Callable[[str], None]) -> Job | None:
-        """Take a job that no other process does now, or None; what another has done meanwhile is not done again."""
+    def _next(
+        self, waiting: list[Job], elsewhere: set[Job], note: Callable[[str], None]
+    ) -> tuple[Job, IO[str]] | None:
+        """Take a job that no other process does now, with its log, or None; what another has done is not done again."""
         for job in list(waiting):
-            if run_lock.is_locked(self._run(job)):
+            log = self._claimed(job)
+            if log is None:
                 elsewhere.add(job)
                 continue
             waiting.remove(job)
-            if job in elsewhere and job[1] in self.results()[job[0]]:
+            # The results that count in a smoke test are those of its own time.
+            if (job in elsewhere or not self.smoke) and job[1] in self.results()[job[0]]:
                 note(f"{job[0]}, seed {job[1]}: done by another process")
+                log.close()
                 continue
-            return job
+            return job, log
         return None
 
-    def _start(self, job: Job, gpu: str) -> Popen[bytes]:
-        (name, seed), log = job, self._log(job)
+    def _claimed(self, job: Job) -> IO[str] | None:
+        """Open a job's log and lock it, or return None where another process does the job.
+
+        The job's process inherits the lock with its output, and holds it until it ends, whatever becomes of this one.
+        Its run folder is locked later, once it has imported all, so that two processes would begin the same job.
+        """
+        if run_lock.is_locked(self._run(job)):
+            return None
+        path = self._log(job)
+        make_folder(path.parent, below=self.run_folder.parent)
+        log = open_own(path)
+        try:
+            if run_lock.try_lock(log):
+                return log
+        except OSError as error:
+            if error.errno in run_lock.WITHOUT_LOCKS:
+                return log
+            raise
+        log.close()
+        return None
+
+    def _start(self, job: Job, gpu: str, log: IO[str]) -> Popen[bytes]:
+        name, seed = job
         result = self.folder / name / f"seed_{seed}.json"
         words = [self.table.source, name, seed, result, self._run(job), "cuda" if gpu else "cpu"]
         command = ["-m", "ksim_rl.tables.measure", *map(str, words), "smoke" * self.smoke]
-        make_folder(log.parent, below=self.run_folder.parent)
         make_folder(result.parent, below=self.folder.parent)
         result.unlink(missing_ok=True)
         environment = {"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}
-        with open_own(log) as file:
-            file.truncate()
-            return start_python(command, environment=environment, stdout=file, stderr=STDOUT)
+        with log:
+            log.truncate()
+            return start_python(command, environment=environment, stdout=log, stderr=STDOUT)
 
     def _run(self, job: Job) -> Path:
         return self._log(job).with_suffix("")

@@ -129,7 +129,7 @@ def signals_as_python_has_them(patch):
 
 @sabotage("lock")
 def no_lock(patch):
-    patch.setattr(run_lock, "_try_lock", lambda file: True)
+    patch.setattr(run_lock, "try_lock", lambda file: True)
 
 
 @sabotage("clock")

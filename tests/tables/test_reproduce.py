@@ -40,7 +40,8 @@ def reproduce(monkeypatch, tmp_path):
     """Run the command where each job is a process that writes a result, or fails; return code, jobs and table."""
     started, processes = [], []
 
-    def start(self, job, gpu):
+    def start(self, job, gpu, log):
+        log.close()
         started.append(job)
         row = self.table.rows[job[0]]
         result = {
@@ -171,6 +172,31 @@ def test_a_job_that_another_process_took_first_is_no_failure(reproduce, monkeypa
     monkeypatch.setattr(runner.run_lock, "is_locked", is_locked)
     code, started, _ = reproduce("--rows", "ppo/Balance", "--seeds", "1", fail=("ppo/Balance", 1))
     assert started == [("ppo/Balance", 1)] * 2 and code == 1  # it fails again, and nobody else does it
+
+
+def test_a_job_belongs_to_who_has_its_log_until_that_process_ends(reproduce, tmp_path):
+    reproduce("--rows", "ppo/Balance", "--seeds", "1")
+    job = ("ppo/Balance", 1)
+    path = str(reproduce.folder.parent / "poles.yaml")
+    first, second = (
+        runner.Runs(load(path), tmp_path / "new", tmp_path / "new_runs", smoke=False) for _ in range(2)
+    )
+    taken, log = first._next([job], set(), print)
+    assert taken == job
+    sleeper = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, stdout=log)
+    log.close()
+    elsewhere = set()
+    assert second._next([job], elsewhere, print) is None and elsewhere == {job}
+    sleeper.communicate(b"\n")
+    assert second._next([job], elsewhere, print)[0] == job
+
+
+def test_what_another_process_has_done_meanwhile_is_kept(reproduce, tmp_path, capsys):
+    reproduce("--rows", "ppo/Balance", "--seeds", "1")
+    path = str(reproduce.folder.parent / "poles.yaml")
+    runs = runner.Runs(load(path), reproduce.folder / "poles", tmp_path / "runs" / "poles", smoke=False)
+    assert runs._next([("ppo/Balance", 1)], set(), print) is None
+    assert "ppo/Balance, seed 1: done by another process" in capsys.readouterr().out
 
 
 def test_without_time_nothing_runs_and_the_table_is_of_what_is_there(reproduce):
