@@ -83,8 +83,7 @@ with [one protocol](tables.md#the-protocol).
 [Learning](learning.md#how-well-they-learn) compares algorithms, and says how far Go1 gets on
 [each kind of rough ground](learning.md#rough-ground). Its levels rise as training goes on, so rewards say little there.
 The two rough tasks have no row below: they have not been trained since a foot on a height field touches each prism
-under it, as in the C engine. The run of `arm_push` is of before free bodies moved as in C on GPUs; one since came to a
-return of 24.5 (`benchmarks/results/before_and_now.json`).
+under it, as in the C engine.
 """
 LEARNED_COLUMNS = ("task", "objective", "env states", "seconds", "return", "asked for", "reached", "seeds")
 
