@@ -4,29 +4,38 @@
     python -m benchmarks.sim2sim task=go1_velocity_flat policy=zoo:go1
     python -m benchmarks.sim2sim policy=runs/large task.sim.timestep=0.005 task.decimation=4 label=trained_at_10_ms
 
-The policy is that of a run folder or of the zoo, or "standing": zero actions, which ask for the default pose. Starts,
-model parameters, commands and pushes are the recorded ones; with noise=true the sensors' noise is drawn anew, which a
-policy that is about to fall amplifies. Other words are overrides of the run's config, for both engines. Figures go to
-benchmarks/results/sim2sim.json: those of a run under the task's name, those of zero actions under <task>/standing,
-without noise under .../without_noise, and with a `label` under it.
+The policy is that of a run folder or of the zoo, or "standing": zero actions, which ask for the default pose. The same
+env runs on both engines: starts, model parameters, commands, pushes and, with noise=true, the sensors' noise are the
+same draws. A run that C itself trained is judged with another integrator and half the time step, and the words say so.
+Other words are overrides of the run's config, for both engines. Figures go to benchmarks/results/sim2sim.json: those of
+a run under the task's name, those of zero actions under <task>/standing, without noise under .../without_noise, and
+with a `label` under it.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import sys
-import tempfile
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from benchmarks import command_line, report
 from ksim_rl import conf
 from ksim_rl.checks import check_choice
-from ksim_rl.export import export_policy, sim2sim
-from ksim_rl.trainers import checkpoint
+from ksim_rl.envs.contract import part
+from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.export.sim2sim import ratio_error
+from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.algorithm import make_policy
-from ksim_rl.trainers.build import build_env
+from ksim_rl.trainers.build import build_env, build_evaluator
+from ksim_rl.trainers.evaluation import Evaluator
+from ksim_rl.trainers.other_physics import judged_by
 from ksim_rl.trainers.run_folder import Policy, policy_of
 from ksim_rl.zoo import locate
 
@@ -40,60 +49,156 @@ OPTIONS = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class Episodes:
+    """What came of episodes: return, steps, and whether each ended by a fall, [N]."""
+
+    return_N: np.ndarray
+    length_N: np.ndarray
+    fell_N: np.ndarray
+
+
+class EpisodeRunner(Evaluator):
+    """Runs one episode in each env, and remembers which of them ended other than by time."""
+
+    def __init__(self, base: ManagerBasedRlEnv, **parts: Any) -> None:
+        super().__init__(**parts)
+        self._base = base
+        self._fell_E = torch.zeros_like(self._running_E)
+
+    def episodes(self) -> Episodes:
+        """Run them."""
+        self()
+        return Episodes(
+            return_N=self._return_E.cpu().numpy(),
+            length_N=self.length_E.cpu().numpy(),
+            fell_N=self._fell_E.cpu().numpy(),
+        )
+
+    def _start(self) -> None:
+        super()._start()
+        self._fell_E.zero_()
+
+    def _count_one_step(self) -> None:
+        began_E = self._running_E.clone()
+        super()._count_one_step()
+        # The root of the next step belongs to the next episode; the view still says how this one ended.
+        self._fell_E.logical_or_(began_E & ~self._running_E & self._base.view.terminated_E)
+
+
 def main() -> int:
-    """Export, compare, print the table and write the figures."""
+    """Run both, print the table and write the figures; the code is 1 where returns differ by more than chance."""
     options, overrides = command_line.split(sys.argv[1:], OPTIONS)
-    check_choice("noise", options["noise"], ("true", "false"))
-    episodes, noise = (
-        command_line.whole_number("episodes", options["episodes"], least=2),
-        options["noise"] == "true",
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        exported = Path(folder)
-        if options["policy"] == "standing":
-            policy = standing([f"task={options['task']}", *overrides])
-        else:
-            policy = trained(locate(options["policy"]), overrides, device=options["device"])
-        export_policy(policy, exported, episodes=episodes, noise=noise)
-        found = sim2sim(exported, episodes=episodes)
-    print(found.table())
-    group = found.task + "/standing" * (options["policy"] == "standing") + "/without_noise" * (not noise)
-    group += f"/{options['label']}" * bool(options["label"])
-    figures = {
-        "return_ratio": found.return_ratio,
-        "standard_error": found.standard_error,
-        "episodes": episodes,
-        "return": found.ours["return"],
-        "return_c_engine": found.theirs["return"],
-        "fell": found.ours["fell"],
-        "causes": len(found.causes),
-    }
+    figures, words = measure(options, overrides)
+    print(words)
+    for name in ("return", "length", "fell"):
+        print(f"{name:<10}{figures[name]:>12.4g}{figures[f'{name}_c_engine']:>12.4g}")
+    print(f"return ratio {figures['return_ratio']:.4f} +- {figures['standard_error']:.4f} (standard error)")
+    where = group(options)
     path = report.write(
         "sim2sim",
-        figures={f"{group}/{name}": value for name, value in figures.items()},
+        figures={f"{where}/{name}": value for name, value in figures.items()},
         device=torch.device(options["device"]),
         module="benchmarks.sim2sim",
     )
     print(f"written to {path}")
-    return 1 if found.causes else 0
+    return int(differs(figures))
 
 
-def trained(run: Path, overrides: list[str], *, device: str) -> Policy:
+def measure(options: dict[str, str], overrides: list[str]) -> tuple[dict[str, float], str]:
+    """Run the policy that the options name on both engines; return the figures, and words that say which physics."""
+    check_choice("noise", options["noise"], ("true", "false"))
+    noise = options["noise"] == "true"
+    count = command_line.whole_number("episodes", options["episodes"], least=2)
+    ours = _policy(options, overrides)
+    options["task"] = ours.cfg.task_name
+    in_c, words = _in_c(ours.cfg, conf.fields_of(overrides))
+    theirs = _policy(options, overrides, cfg=in_c)
+    own = run(ours, episodes=count, noise=noise)
+    other = run(theirs, episodes=count, noise=noise)
+    return compared(own, other), f"{ours.cfg.task_name}, iteration {ours.iteration}, judged {words}"
+
+
+def run(policy: Policy, *, episodes: int, noise: bool) -> Episodes:
+    """Run whole episodes of a policy, one in each env, with or without the sensors' noise."""
+    built = build_evaluator(policy.cfg, policy.actor, episodes=episodes, note=print)
+    # Evaluations leave the noise out.
+    built.env.train(noise)
+    base = part(built.env, ManagerBasedRlEnv)
+    assert base is not None  # the env of a config is ours
+    parts = {"env": built.env, "policy": policy.actor, "max_steps": built.max_steps, "seed": built.seed}
+    found = EpisodeRunner(base, **parts).episodes()
+    built.env.close(raise_if_closed=False)
+    return found
+
+
+def compared(own: Episodes, other: Episodes) -> dict[str, float]:
+    """Return the figures of pairs of episodes that began alike."""
+    ratio = float("nan")
+    if own.return_N.mean():
+        ratio = float(other.return_N.mean() / own.return_N.mean())
+    return {
+        "return_ratio": ratio,
+        "standard_error": ratio_error(own.return_N, other.return_N),
+        "episodes": len(own.return_N),
+        "return": float(own.return_N.mean()),
+        "return_c_engine": float(other.return_N.mean()),
+        "length": float(own.length_N.mean()),
+        "length_c_engine": float(other.length_N.mean()),
+        "fell": float(own.fell_N.mean()),
+        "fell_c_engine": float(other.fell_N.mean()),
+    }
+
+
+def differs(figures: dict[str, float]) -> bool:
+    """Whether returns differ by more than chance, three standard errors and a thousandth."""
+    return abs(figures["return_ratio"] - 1.0) > 3.0 * figures["standard_error"] + 1e-3
+
+
+def group(options: dict[str, str]) -> str:
+    """Return where the figures stand."""
+    found = options["task"]
+    if options["policy"] == "standing":
+        found += "/standing"
+    if options["noise"] == "false":
+        found += "/without_noise"
+    if options["label"]:
+        found += f"/{options['label']}"
+    return found
+
+
+def _policy(options: dict[str, str], overrides: list[str], *, cfg: RunCfg | None = None) -> Policy:
+    """Return the policy that the options name, with its own config, as overrides change it, or with another one."""
+    if options["policy"] != "standing":
+        return trained(locate(options["policy"]), overrides, device=options["device"], cfg=cfg)
+    own = command_line.compose([f"task={options['task']}", *overrides, f"device={options['device']}"])
+    return Policy(cfg=cfg or own, actor=standing(cfg or own), iteration=0)
+
+
+def _in_c(cfg: RunCfg, given: list[str]) -> tuple[RunCfg, str]:
+    """Return the config by which the C engine judges, and the words for that."""
+    sim = dataclasses.replace(cfg.task.sim, engine="c", one_kernel_dynamics=None)
+    in_c = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, sim=sim), device="cpu")
+    return judged_by(in_c, trained=cfg.task.sim.engine, given=given)
+
+
+def trained(run_folder: Path, overrides: list[str], *, device: str, cfg: RunCfg | None = None) -> Policy:
     """Return the policy of a run, with its config as the overrides change it."""
-    saved = checkpoint.load_latest(run)
-    return policy_of(saved, cfg=conf.changed({**saved.config, "device": device}, saved.path, overrides))
+    saved = checkpoint.load_latest(run_folder)
+    if cfg is None:
+        cfg = conf.changed({**saved.config, "device": device}, saved.path, overrides)
+    return policy_of(saved, cfg=cfg)
 
 
-def standing(overrides: list[str]) -> Policy:
-    """Return a policy whose actions are all zero."""
-    cfg = command_line.compose([*overrides, "num_envs=4", "device=cpu"])
-    env = build_env(cfg, num_envs=4, seed=cfg.seed)
+def standing(cfg: RunCfg) -> TensorDictModuleBase:
+    """Return an actor whose actions are all zero."""
+    env = build_env(cfg, num_envs=1, seed=cfg.seed)
     actor = make_policy(cfg, env)
     env.close(raise_if_closed=False)
     last = [module for module in actor.modules() if isinstance(module, nn.Linear)][-1]
     for parameter in last.parameters():
         nn.init.zeros_(parameter)
-    return Policy(cfg=cfg, actor=actor, iteration=0)
+    return actor
 
 
 if __name__ == "__main__":
