@@ -45,8 +45,6 @@ REFRESHED = (
     "subtree_angmom",
     "qfrc_bias",
 )
-# Of Runge-Kutta, C leaves the forces of another of its four evaluations than the state's.
-NOT_OF_RUNGE_KUTTA = (*LAST, *OF_BODIES)
 # What reads contacts, or distances of the collision pass.
 KEPT = [
     int(kind) for kind in (*COLLISION_SENSORS, mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtSensor.mjSENS_TOUCH)
@@ -71,8 +69,6 @@ def run(
     mujoco.mj_forward(mj_model, before)
     mujoco.mj_rnePostConstraint(mj_model, before)
     found |= {name: np.array(getattr(before, name)) for name in OF_BODIES}
-    if mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        found = {name: value for name, value in found.items() if name not in NOT_OF_RUNGE_KUTTA}
     last = mj_data.sensordata.copy()
     after = mujoco.MjData(mj_model)
     mujoco.mj_copyData(after, mj_model, mj_data)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import xml.etree.ElementTree as ET
+from collections import Counter
+from functools import cache
 
 import mujoco
 import numpy as np
@@ -127,8 +129,8 @@ FOREIGN = (
     *("equality.connect", "equality.weld", "equality.tendon", "integrator.RK4", "integrator.discrete"),
     *("jacobian.dense",),
 )
-# How many features each model is asked for; the others come by chance.
-DEALT = 16
+# A feature that fewer models of a hunt have is rare, and asked for: of so many in a model at most.
+SHARE, DEALT = 0.08, 16
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -149,10 +151,58 @@ class Generated:
     fields: tuple[str, ...]
 
 
+class _Hunt:
+    """The models of a seed, in order: each is asked for what is rare among the ones before it."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._models: list[Generated] = []
+        self._counts: Counter[str] = Counter()
+
+    def wishes(self, number: int) -> tuple[str, ...]:
+        """Return what a model is asked for: of the features that it may have, those that are rare before it."""
+        self._draw(number)
+        counts = Counter(self._counts)
+        for found in self._models[number:]:
+            counts.subtract(found.features)
+        enough = SHARE * (number + 1)
+        rare = [name for name in allowed_of(number) if counts[name] < enough]
+        # Of those that are equally rare, any.
+        shuffled = np.random.default_rng((self._seed, number)).permutation(rare)
+        rarest = sorted(shuffled, key=lambda name: counts[name])
+        return tuple(str(name) for name in rarest[:DEALT])
+
+    def model(self, number: int) -> Generated:
+        """Return the model of a number."""
+        self._draw(number + 1)
+        return self._models[number]
+
+    def _draw(self, count: int) -> None:
+        for number in range(len(self._models), count):
+            found = compiled(self._seed, number, self.wishes(number))
+            self._models.append(found)
+            self._counts.update(found.features)
+
+
+@cache
+def _hunt(seed: int) -> _Hunt:
+    return _Hunt(seed)
+
+
 def generate(seed: int, number: int) -> Generated:
-    """Draw the model of a number in a hunt, from its seed: one that MuJoCo compiles."""
+    """Return the model of a number in the hunt of a seed."""
+    return _hunt(seed).model(number)
+
+
+def dealt(seed: int, number: int) -> tuple[str, ...]:
+    """Return the features that a model of a hunt is asked for: those that are rare among the ones before it."""
+    return _hunt(seed).wishes(number)
+
+
+def compiled(seed: int, number: int, wishes: tuple[str, ...]) -> Generated:
+    """Draw a model that MuJoCo compiles, with these features where it can have them."""
     for attempt in range(20):
-        found = _drawn(seed, number, attempt)
+        found = _drawn(seed, number, attempt, wishes)
         with caught_warnings() as warned:
             try:
                 mj_model = mujoco.MjModel.from_xml_string(found.xml)
@@ -181,19 +231,10 @@ def barred(number: int) -> tuple[str, ...]:
     return FOREIGN if number % 2 else ()
 
 
-def dealt(seed: int, number: int) -> tuple[str, ...]:
-    """Return the features that a model of a hunt is asked for: each feature has its turn as often as any other.
-
-    Models with and without what is foreign to our kernels have turns of their own.
-    """
-    features = [name for name in FEATURES if not name.startswith(barred(number) or ("none",))]
-    first = number // 2 * DEALT
-    found: list[str] = []
-    for place in range(first, first + DEALT):
-        turn = place // len(features)
-        order = np.random.default_rng((seed, number % 2, turn)).permutation(len(features))
-        found.append(features[order[place % len(features)]])
-    return tuple(found)
+def allowed_of(number: int) -> list[str]:
+    """Return the features that a model of a hunt may have."""
+    without = barred(number)
+    return [name for name in FEATURES if not name.startswith(without)]
 
 
 def implied(features: tuple[str, ...]) -> frozenset[str]:
@@ -206,8 +247,8 @@ def implied(features: tuple[str, ...]) -> frozenset[str]:
     return frozenset(found)
 
 
-def _drawn(seed: int, number: int, attempt: int) -> Generated:
-    draw = Draw(np.random.default_rng((seed, number, attempt)), implied(dealt(seed, number)), barred(number))
+def _drawn(seed: int, number: int, attempt: int, wishes: tuple[str, ...]) -> Generated:
+    draw = Draw(np.random.default_rng((seed, number, attempt)), implied(wishes), barred(number))
     scene = Scene()
     add_bodies(scene, draw)
     add_tendons(scene, draw)

@@ -155,6 +155,8 @@ def figures(outcomes: Sequence[Outcome]) -> dict[str, float]:
         "refused": len(outcomes) - len(ran),
         "refused_share": (len(outcomes) - len(ran)) / max(1, len(outcomes)),
         "worse": sum(outcome.fails for outcome in ran),
+        "compiled_worlds": sum(outcome.verdict.compiled for outcome in ran),
+        "short_of_room": sum(outcome.verdict.short_of_room for outcome in ran),
         "overflows_told": sum(bool(outcome.verdict.overflow) for outcome in ran),
         "least_of_a_feature": min(features[name] for name in FEATURES),
         "touching_share": sum(outcome.verdict.touching for outcome in ran) / max(1, len(ran)),

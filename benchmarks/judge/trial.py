@@ -11,6 +11,7 @@ import torch
 
 from benchmarks.judge import accepted, c_engine
 from benchmarks.judge.comparison import Finding, differences, scales_of
+from benchmarks.judge.small_room import untold_overflow
 from benchmarks.judge.worlds import Arrays, drawn_state, give_fields, put_all, put_rows, state_of
 from ksim_rl.physics import SimCfg, load_model
 from ksim_rl.physics.warp_world import WarpWorld
@@ -50,6 +51,8 @@ class Verdict:
         accepted: how many of them had contacts that may differ, and were judged by their depths.
         unsteady: how many of them C itself did not come through.
         touching: whether any world had a contact.
+        compiled: how many worlds had fields that C compiled from XML.
+        short_of_room: whether worlds with less room than they needed were looked at.
         overflow: what the worlds had no room for, and said so.
     """
 
@@ -60,6 +63,8 @@ class Verdict:
     accepted: int = 0
     unsteady: int = 0
     touching: bool = False
+    compiled: int = 0
+    short_of_room: bool = False
     overflow: tuple[str, ...] = ()
 
 
@@ -83,12 +88,13 @@ def judge(
     except ValueError as error:
         return Verdict(refused=reason(str(error)))
     assert isinstance(world, WarpWorld), "the settings name this engine"
-    trial = _Trial(world, tuple(fields), seed=seed, forces=forces)
+    trial = _Trial(world, tuple(fields), xml=xml, sim=sim, seed=seed, forces=forces)
     for substeps, sensors in calls:
         trial.compare(substeps, sensors)
     trial.compare(2, "last", hook=_nothing)
     if trial.verdict.findings == () and not trial.verdict.overflow:
         trial.compare_reset(sim, device)
+        trial.compare_small_room(sim, device)
     world.close()
     return trial.verdict
 
@@ -108,17 +114,28 @@ def _nothing() -> None:
 class _Trial:
     """The worlds of a model, C's models of them, and the states that they are in."""
 
-    def __init__(self, world: WarpWorld, fields: tuple[str, ...], *, seed: int, forces: bool) -> None:
-        self.world, self.fields, self.seed = world, fields, seed
+    def __init__(
+        self,
+        world: WarpWorld,
+        fields: tuple[str, ...],
+        *,
+        xml: str,
+        sim: SimCfg,
+        seed: int,
+        forces: bool,
+    ) -> None:
+        self.world = world
+        self.fields = fields
+        self.seed = seed
         rng = np.random.default_rng(seed)
-        self.models = give_fields(world, fields, rng)
+        self.models, compiled = give_fields(world, fields, rng, xml, sim)
         self.states = [drawn_state(mj_model, rng, forces=forces) for mj_model in self.models]
         names = (*c_engine.REACHED, *c_engine.LAST, *c_engine.OF_BODIES, *c_engine.REFRESHED)
         self.views = {name: world.view(name) for name in names}
         kernels = "ours" if world.one_kernel_dynamics_unavailable is None else "our solver"
         if world.one_kernel_unavailable is not None:
             kernels = "theirs"
-        self.verdict = Verdict(kernels=kernels)
+        self.verdict = Verdict(kernels=kernels, compiled=compiled)
         self._check_constants()
 
     def _add(self, **changes: object) -> None:
@@ -237,6 +254,14 @@ class _Trial:
                 error = float((same.double() - new.double()).abs().max())
                 self._find(f"reset {name}", error, 0.0, 0, "reset(mask)")
         fresh.close()
+
+    def compare_small_room(self, sim: SimCfg, device: str) -> None:
+        """Look whether worlds that have too little room say so."""
+        # With a world's own fields C's rows would be others than these worlds make.
+        models = [self.models[0]] * NUM_WORLDS
+        found = untold_overflow(self.world.mj_model, models, self.states, sim=sim, device=device)
+        if found is not None:
+            self._add(short_of_room=True, findings=(*self.verdict.findings, *found))
 
 
 def rows(view: torch.Tensor) -> np.ndarray:

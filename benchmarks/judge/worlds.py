@@ -7,7 +7,8 @@ import mujoco
 import numpy as np
 import torch
 
-from ksim_rl.physics import World, poses
+from benchmarks.judge.compiled import compiled_with
+from ksim_rl.physics import SimCfg, World, poses
 from ksim_rl.physics.fields import GRAVITY, write_fields
 from ksim_rl.physics.load import caught_warnings
 
@@ -66,27 +67,75 @@ def drawn_field(mj_model: mujoco.MjModel, name: str, rng: np.random.Generator) -
     return values * rng.uniform(0.8, 1.2, size=values.shape)
 
 
-def give_fields(world: World, fields: tuple[str, ...], rng: np.random.Generator) -> list[mujoco.MjModel]:
-    """Draw fields of all worlds but the first, and return C's model of each world."""
+def sayable(mj_model: mujoco.MjModel, name: str, values: np.ndarray) -> np.ndarray:
+    """Return values of a field, in C's layout, as XML can say them: what it has no word for is as in the model."""
+    own = np.array(getattr(mj_model, name), dtype=np.float64) if name != GRAVITY else values
+    if name in ("body_pos", "body_quat"):
+        values[0] = own[0]
+        starts = mj_model.body_jntadr[mj_model.body_jntnum > 0]
+        is_free = mj_model.jnt_type[starts] == mujoco.mjtJoint.mjJNT_FREE
+        # The compiler takes it for where the body starts.
+        floating = mj_model.jnt_bodyid[starts[is_free]]
+        values[floating] = own[floating]
+    if name.startswith("dof_"):
+        # All degrees of freedom of a joint have one value.
+        return values[mj_model.jnt_dofadr[mj_model.dof_jntid]]
+    if name == "jnt_pos":
+        is_free = mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+        values[is_free] = own[is_free]
+    if name == "geom_size":
+        is_made = np.isin(mj_model.geom_type, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD))
+        values[is_made] = own[is_made]
+    if name in ("qpos0", "qpos_spring"):
+        is_scalar = np.isin(mj_model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
+        places = mj_model.jnt_qposadr[is_scalar]
+        own[places] = values[places]
+        return own
+    return values
+
+
+def give_fields(
+    world: World, fields: tuple[str, ...], rng: np.random.Generator, xml: str = "", sim: SimCfg | None = None
+) -> tuple[list[mujoco.MjModel], int]:
+    """Draw fields of all worlds but the first.
+
+    Args:
+        world: whose worlds they are.
+        fields: names of them.
+        rng: from which they are drawn.
+        xml: what the model was compiled from; empty where that is not known.
+        sim: what was laid over its options.
+
+    Returns:
+        C's model of each world, and how many of them C compiled from XML that has the fields.
+    """
     for row in range(1, world.num_envs):
         for name in fields:
             field = world.field(name)
-            drawn = torch.from_numpy(drawn_field(world.mj_model, name, rng))
-            field[row] = drawn.reshape(field[row].shape)
+            drawn = drawn_field(world.mj_model, name, rng)
+            # Of three worlds two are such that C can compile them.
+            if row % 2:
+                drawn = sayable(world.mj_model, name, drawn)
+            field[row] = torch.from_numpy(drawn).reshape(field[row].shape)
     if fields:
         world.set_const(fields)
     models = []
+    compiled = 0
     for row in range(world.num_envs):
         mj_model = copy.copy(world.mj_model)
         if fields:
             values = {name: world.field(name)[row].numpy(force=True).astype(np.float64) for name in fields}
             write_fields(mj_model, values)
+        if fields and row and xml and sim is not None:
+            by_compiler = compiled_with(xml, sim, mj_model)
+            compiled += by_compiler is not None
+            mj_model = by_compiler or mj_model
         # Both engines solve the constraints as well as they can.
         mj_model.opt.tolerance = 0.0
         mj_model.opt.iterations = 100
         mj_model.opt.ls_iterations = 100
         models.append(mj_model)
-    return models
+    return models, compiled
 
 
 def drawn_state(mj_model: mujoco.MjModel, rng: np.random.Generator, *, forces: bool) -> Arrays:
