@@ -143,18 +143,24 @@ def told(outcome: Outcome) -> list[str]:
     return lines
 
 
+def stepped(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Return the outcomes of models that were built and stepped."""
+    return [outcome for outcome in outcomes if outcome.verdict.states > 0]
+
+
 def figures(outcomes: Sequence[Outcome]) -> dict[str, float]:
-    """Return the figures of a hunt by name."""
-    ran = [outcome for outcome in outcomes if not outcome.verdict.refused]
+    """Return the figures of a hunt by name: `models` were built and stepped, and what raised is worse, too."""
+    ran = stepped(outcomes)
+    refused = sum(bool(outcome.verdict.refused) for outcome in outcomes)
     features = Counter(name for outcome in ran for name in outcome.generated.features)
     states = sum(outcome.verdict.states for outcome in ran)
     by = Counter(outcome.verdict.kernels for outcome in ran)
     return {
         "models": len(ran),
         "states": states,
-        "refused": len(outcomes) - len(ran),
-        "refused_share": (len(outcomes) - len(ran)) / max(1, len(outcomes)),
-        "worse": sum(outcome.fails for outcome in ran),
+        "refused": refused,
+        "refused_share": refused / max(1, len(outcomes)),
+        "worse": sum(outcome.fails for outcome in outcomes),
         "compiled_worlds": sum(outcome.verdict.compiled for outcome in ran),
         "short_of_room": sum(outcome.verdict.short_of_room for outcome in ran),
         "overflows_told": sum(bool(outcome.verdict.overflow) for outcome in ran),
@@ -176,7 +182,7 @@ def refusals(outcomes: Sequence[Outcome]) -> dict[str, int]:
 
 def features_of(outcomes: Sequence[Outcome]) -> dict[str, int]:
     """Return in how many models that ran each feature was."""
-    ran = [outcome for outcome in outcomes if not outcome.verdict.refused]
+    ran = stepped(outcomes)
     counts = Counter(name for outcome in ran for name in outcome.generated.features)
     return {name: counts[name] for name in sorted(FEATURES)}
 
