@@ -40,7 +40,7 @@ from ksim_rl.checks import unknown_name
 from ksim_rl.device.streams import checked_device
 from ksim_rl.envs.contract import SimulatedWorld, part
 from ksim_rl.physics import SimCfg, World, load_model, load_spec
-from ksim_rl.physics.load import SUFFIXES
+from ksim_rl.physics.model_files.source import SUFFIXES
 
 FAILURES = Path("build/judge")
 SMOOTH_LIMIT = 1e-4

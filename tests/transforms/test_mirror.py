@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
-from ksim_rl.physics.load import model_path
+from ksim_rl.physics.model_files.menagerie import model_path
 from ksim_rl.scene.robots.own_robots import Humanoid
 from ksim_rl.testing import CounterEnv
 from ksim_rl.transforms import (
