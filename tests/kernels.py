@@ -62,7 +62,7 @@ TESTS = {
     },
     "physics/actuators/adhesion.py": {
         "_gather_moments": SINGLE_MODELS,
-        "_hide_measured_pairs": SINGLE_MODELS,
+        "_hide_rowless": SINGLE_MODELS,
         "_scatter_moments": SINGLE_MODELS,
     },
     "physics/collision/box_distances.py": {
@@ -85,7 +85,7 @@ TESTS = {
         "drop_upper_corners": SINGLE_MODELS,
         "gather_controls": SINGLE_MODELS,
         "leave_out_rows": SINGLE_MODELS,
-        "loosen_measured": SINGLE_MODELS,
+        "loosen_rowless": SINGLE_MODELS,
         "shifted_time": SINGLE_MODELS,
         "sparse_velocity": SINGLE_MODELS,
         "spread_columns": SINGLE_MODELS,

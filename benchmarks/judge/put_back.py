@@ -119,7 +119,7 @@ FAULTS = {
     ),
     "adhesion of geoms": Fault(
         what="geoms stick through sensors of distances",
-        place=("contacts", "loose_measures"),
+        place=("contacts", "loose_contacts"),
         instead=nothing,
         needs=("geom_adhesion", "sensor.distance"),
     ),

@@ -21,15 +21,21 @@ class Mending:
     Attributes:
         always: append contacts that MuJoCo Warp does not find, and change those of everyone.
         of_theirs: change what MuJoCo Warp's narrow phase has written, of the pairs that the model lists.
+        at_last: change what the others have left.
     """
 
     always: tuple[Hook, ...]
     of_theirs: tuple[Hook, ...]
+    at_last: tuple[Hook, ...]
 
     def __call__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-        """Launch both."""
-        for hook in (*self.always, *self.of_theirs):
+        """Launch all of them."""
+        for hook in self.hooks():
             hook(warp_model, warp_data_E)
+
+    def hooks(self) -> tuple[Hook, ...]:
+        """Return all of them, in their order."""
+        return (*self.always, *self.of_theirs, *self.at_last)
 
 
 def follow_the_c_engine(warp_model: mjw.Model) -> None:
@@ -41,12 +47,15 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
     upstream.take_pairs_as_written(warp_model)
     upstream.measure_without_contacts(warp_model)
     # The next one takes pairs away.
-    ways = (take_over_height_fields, take_over_measured_boxes, rows_left_out, loose_measures)
-    always = [hook for hook in (way(warp_model) for way in ways) if hook]
+    ways = (take_over_height_fields, take_over_measured_boxes, rows_left_out)
+    always = tuple(hook for hook in (way(warp_model) for way in ways) if hook)
     of_theirs = corrections(warp_model, warp_model.nxn_geom_pair_filtered, warp_model.nxn_pairid_filtered)
-    if always or of_theirs:
+    loosen = loose_contacts(warp_model)
+    at_last = () if loosen is None else (loosen,)
+    mending = Mending(always=always, of_theirs=of_theirs, at_last=at_last)
+    if mending.hooks():
         # MuJoCo Warp calls it after its own collision pass.
-        warp_model.callback.contactfilter = Mending(always=tuple(always), of_theirs=of_theirs)
+        warp_model.callback.contactfilter = mending
 
 
 def corrections(warp_model: mjw.Model, pairs: wp.array, pair_ids: wp.array) -> tuple[Hook, ...]:
@@ -115,24 +124,31 @@ def rows_left_out(warp_model: mjw.Model) -> Hook | None:
 
     def leave_out(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
         contact, nacon = warp_data_E.contact, warp_data_E.nacon
-        inputs, outputs = [of_geoms, contact.geom, nacon], [contact.includemargin]
+        inputs, outputs = [of_geoms, contact.geom, nacon], [contact.includemargin, contact.adhesion]
         wp.launch(kernels.leave_out_rows, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
 
     return leave_out
 
 
-def loose_measures(warp_model: mjw.Model) -> Hook | None:
-    """Return what keeps geoms from sticking where a sensor measures their distance; None where nothing could stick.
+def has_rowless_contacts(warp_model: mjw.Model) -> bool:
+    """Return whether contacts may have no rows: what sensors of distances measure, and upper corners of boxes."""
+    pairs, pair_ids = upstream.geom_pairs(warp_model)
+    return warp_model.nsensorcollision > 0 or _have_boxes_on_planes(warp_model, pairs, pair_ids)
 
-    MuJoCo Warp has a contact for each distance that it measures, and lets geoms with adhesion pull at it from afar.
+
+def loose_contacts(warp_model: mjw.Model) -> Hook | None:
+    """Return what keeps geoms from sticking at contacts without rows; None where nothing could stick there.
+
+    MuJoCo Warp has a contact for each distance that it measures, and each corner of a box on a plane, and lets geoms
+    with adhesion pull at all of them.
     """
-    if not (warp_model.flg_adhesion and warp_model.nsensorcollision):
+    if not (warp_model.flg_adhesion and has_rowless_contacts(warp_model)):
         return None
 
     def loosen(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
         contact = warp_data_E.contact
         inputs, outputs = [contact.type, warp_data_E.nacon], [contact.adhesion]
-        wp.launch(kernels.loosen_measured, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
+        wp.launch(kernels.loosen_rowless, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
 
     return loosen
 

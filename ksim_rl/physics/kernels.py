@@ -28,7 +28,10 @@ def align_steep_capsules(
     nacon: wp.array[int],
     frame: wp.array[wp.mat33],
 ):
-    """Let the first tangent of a contact of plane and capsule follow the capsule, however steep it stands."""
+    """Let the first tangent of a contact of plane and capsule follow the capsule, however steep it stands.
+
+    Of an upright one, which has no direction to follow, C takes the first axis of the world.
+    """
     contact = wp.tid()
     if contact >= nacon[0]:
         return
@@ -38,10 +41,15 @@ def align_steep_capsules(
     turn, normal = geom_xmat[world[contact], capsule], frame[contact][0]
     axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
     tangent = axis - wp.dot(axis, normal) * normal
-    length = wp.length(tangent)
-    # MuJoCo Warp does so itself from a length of 0.5 on; an upright capsule has no direction to follow.
-    if length < 0.5 and length > UPRIGHT:
-        tangent = tangent / length
+    # MuJoCo Warp does so itself from a length of 0.5 on.
+    if wp.length(tangent) >= 0.5:
+        return
+    if wp.length(tangent) <= UPRIGHT:
+        first = wp.vec3(1.0, 0.0, 0.0)
+        tangent = first - wp.dot(first, normal) * normal
+    # On a wall that faces that axis there is none left.
+    if wp.length(tangent) > UPRIGHT:
+        tangent = wp.normalize(tangent)
         frame[contact] = wp.matrix_from_rows(normal, tangent, wp.cross(normal, tangent))
 
 
@@ -102,19 +110,24 @@ def leave_out_rows(
     geom: wp.array[wp.vec2i],
     nacon: wp.array[int],
     includemargin: wp.array[float],
+    adhesion: wp.array[float],
 ):
-    """Let contacts within one rigid body be out of reach of constraint rows, as contacts in a gap are."""
+    """Let contacts within one rigid body be out of reach of constraint rows, as contacts in a gap are.
+
+    Those that stick have rows in a gap, too.
+    """
     contact = wp.tid()
     if contact >= nacon[0]:
         return
     a, b = geom[contact][0], geom[contact][1]
     if a >= 0 and b >= 0 and rigid_body[a] == rigid_body[b]:
         includemargin[contact] = NO_ROWS
+        adhesion[contact] = 0.0
 
 
 @wp.kernel(enable_backward=False)
-def loosen_measured(kind: wp.array[int], nacon: wp.array[int], adhesion: wp.array[float]):
-    """Let contacts that only a sensor of distances needs not stick: they are out of reach."""
+def loosen_rowless(kind: wp.array[int], nacon: wp.array[int], adhesion: wp.array[float]):
+    """Let contacts without rows not stick: only a sensor of distances needs them, or they are dropped."""
     contact = wp.tid()
     if contact < nacon[0] and (kind[contact] & HAS_ROWS) == 0:
         adhesion[contact] = 0.0

@@ -38,6 +38,45 @@ def test_pairs_that_a_sensor_measures_are_no_contacts(integrator: str, kernels: 
     step_and_check(STUCK.format(integrator=integrator, more=""), KERNELS[kernels], **CALM)
 
 
+# All corners of a flat box are within the margin, and those above its centre make no contacts.
+FLAT = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1" margin="0.05" adhesion="3"/>
+    <body name="box" pos="1 0 0.01"><joint axis="1 1 0" pos="0.3 0 0"/>
+      <geom type="box" size="0.1 0.1 0.01" mass="1" adhesion="{adhesion}"/></body>
+  </worldbody>
+  <actuator><adhesion body="box" ctrlrange="0 10" gain="3"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize("integrator", ("implicitfast", "RK4"))
+def test_upper_corners_of_boxes_do_not_stick(integrator: str, kernels: str) -> None:
+    names = ("qpos", "qvel", "qacc", "qfrc_passive", "actuator_velocity")
+    for adhesion in (0.0, 1.0):
+        xml = FLAT.format(adhesion=adhesion).replace("<option", f'<option integrator="{integrator}"')
+        step_and_check(xml, KERNELS[kernels], names=names, **CALM)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_a_pair_of_one_rigid_body_does_not_stick(kernels: str) -> None:
+    xml = """
+<mujoco>
+  <worldbody>
+    <body><joint axis="0 1 0" pos="0.3 0 0"/><geom name="a" size="0.1"/>
+      <body><geom name="b" size="0.1" pos="0.1 0 0.1"/></body></body>
+    <geom name="post" size="0.1" pos="0 0.1 0.19"/><geom name="floor" type="plane" pos="0 0 -0.09" size="1 1 1"/>
+  </worldbody>
+  <contact><pair geom1="a" geom2="b" adhesion="4"/><pair geom1="post" geom2="floor" adhesion="4"/></contact>
+  <sensor><contact geom1="a" geom2="b" data="found force"/><contact body1="world" data="found force" num="3"/></sensor>
+</mujoco>
+"""
+    step_and_check(xml, KERNELS[kernels], names=("qpos", "qvel", "qacc", "qfrc_passive"), **CALM)
+
+
 @pytest.mark.parametrize("more", ("", '<body mocap="true"/>'), ids=("own reset", "their reset"))
 def test_a_reset_of_one_world_leaves_the_adhesion_of_another(more: str) -> None:
     world, mj_data, in_c = started(STUCK.format(integrator="Euler", more=more), KERNELS["ours"], **CALM)

@@ -81,13 +81,22 @@ def check_contacts(turned: str, device: str = "cpu") -> None:
     assert several >= 5 and steep >= 5
 
 
-def test_an_upright_rod_keeps_a_frame():
+@pytest.mark.parametrize("one_kernel", [True, False])
+def test_an_upright_rod_has_the_frame_of_the_c_engine(one_kernel: bool):
     mj_model = load_model(THINGS.format(turned=""))
-    world = World(mj_model, num_envs=1, sim=SimCfg(njmax=120, nconmax=24))
+    sim = SimCfg(njmax=120, nconmax=24, one_kernel_dynamics=one_kernel)
+    world = World(mj_model, num_envs=1, sim=sim)
     world.qpos_EL[0, 16] = 0.12
+    mj_data = mujoco.MjData(mj_model)
+    mj_data.qpos[:] = world.qpos_EL[0].double().numpy()
+    mujoco.mj_forward(mj_model, mj_data)
     world.step()
-    frame = world.last_substep("contact.frame")[0].double()
-    torch.testing.assert_close(frame @ frame.T, torch.eye(3, dtype=torch.float64))
+    expected = mj_data.contact.frame[(np.array(mj_data.contact.geom) == [3, 2]).all(-1)]
+    count = int(world.last_substep("nacon").item())
+    geoms, frames = world.last_substep("contact.geom")[:count], world.last_substep("contact.frame")[:count]
+    found = frames[(geoms == torch.tensor([3, 2])).all(-1)].reshape(-1, 9).double()
+    torch.testing.assert_close(found, torch.from_numpy(expected))
+    assert len(expected) == 1
 
 
 # Of each pair one geom has priority, and one gives stiffness and damping directly; the last pair has a law of its own.

@@ -1,7 +1,8 @@
 """This module computes the transmissions of actuators that adhere to a body, whose moments its contacts decide.
 
 Such an actuator pulls along the mean of the normals of a body's contacts. MuJoCo Warp counts the pairs of geoms whose
-distance a sensor reads among the contacts, so that the pull is weaker than C's: here they are hidden from it. And no
+distance a sensor reads among the contacts, and upper corners of boxes on planes, so that the pull is weaker than C's:
+here they are hidden from it. And no
 refresh looks for contacts, so that these moments stay as the last substep left them; rows that reset read zero.
 """
 
@@ -15,13 +16,14 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.physics import kernels, upstream
+from ksim_rl.physics.contacts import has_rowless_contacts
 
 CONSTRAINT = int(upstream.ContactType.CONSTRAINT)
 
 
 def miscounts_contacts(warp_model: mjw.Model) -> bool:
-    """Whether MuJoCo Warp's transmissions count pairs of geoms that a sensor measures as contacts of a body."""
-    return warp_model.nacttrnbody > 0 and warp_model.nsensorcollision > 0
+    """Whether MuJoCo Warp's transmissions count what has no rows as contacts of a body."""
+    return warp_model.nacttrnbody > 0 and has_rowless_contacts(warp_model)
 
 
 def transmissions_of_contacts(warp_model: mjw.Model, warp_data_E: mjw.Data) -> Callable[[], None]:
@@ -33,7 +35,7 @@ def transmissions_of_contacts(warp_model: mjw.Model, warp_data_E: mjw.Data) -> C
     inputs = [contact.geom, contact.type, d.nacon]
 
     def launch() -> None:
-        wp.launch(_hide_measured_pairs, dim=d.naconmax, inputs=inputs, outputs=[geom])
+        wp.launch(_hide_rowless, dim=d.naconmax, inputs=inputs, outputs=[geom])
         mjw.transmission(warp_model, hiding)
         # In a stage of Runge-Kutta they have been found already, by the wrong moments.
         pattern = (d.moment_rownnz, d.moment_rowadr, d.moment_colind)
@@ -81,10 +83,10 @@ def _scatter_moments(
 
 
 @wp.kernel(enable_backward=False)
-def _hide_measured_pairs(
+def _hide_rowless(
     geom: wp.array[wp.vec2i], kind: wp.array[int], nacon: wp.array[int], shown: wp.array[wp.vec2i]
 ):
-    """Copy the geoms of contacts; those of measured pairs become -1, which MuJoCo Warp passes over."""
+    """Copy the geoms of contacts; without rows they become -1, which MuJoCo Warp passes over."""
     contact = wp.tid()
     if contact >= nacon[0]:
         return

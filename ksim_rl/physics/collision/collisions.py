@@ -104,7 +104,7 @@ def collisions(
         if isinstance(hook, Mending):
             # Our own contacts need no corrections.
             own_hook = dataclasses.replace(hook, of_theirs=of_theirs)
-            hook = own_hook if own_hook.always or own_hook.of_theirs else None
+            hook = own_hook if own_hook.hooks() else None
         lists.are_appended = not others.size and hook is None
         if others.size:
             d.ncollision.zero_()

@@ -57,6 +57,11 @@ auto frame_of = [](const vec3& normal, const vec3& wanted) {
         normal[0], normal[1], normal[2], tangent[0], tangent[1], tangent[2], last[0], last[1], last[2]
     );
 };
+// What a capsule on a plane has for that: its own direction, and where it stands upright the first axis of the world.
+auto direction_of = [&](int capsule, const vec3& normal) {
+    const vec3 along = axis(turns[capsule], 2);
+    return wp::length(wp::cross(along, normal)) > 1e-6f ? along : vec3(1.0f, 0.0f, 0.0f);
+};
 auto write = [&](const Found& found, int place, bool is_listed) {
     const int a = pairs[found.pair][0], b = pairs[found.pair][1], pair = HAS_PAIRS ? pair_ids[found.pair][0] : -1;
     const bool follows = problem.geom_type.data[a] == PLANE && problem.geom_type.data[b] == CAPSULE;
@@ -109,7 +114,7 @@ auto write = [&](const Found& found, int place, bool is_listed) {
     const Touch& touch = found.touch;
     problem.contact_dist.data[place] = touch.distance;
     problem.contact_pos.data[place] = touch.position;
-    problem.contact_frame.data[place] = frame_of(touch.normal, follows ? axis(turns[b], 2) : vec3());
+    problem.contact_frame.data[place] = frame_of(touch.normal, follows ? direction_of(b, touch.normal) : vec3());
     problem.contact_includemargin.data[place] = margin;
     problem.contact_dim.data[place] = adhesion != 0.0f && touch.distance >= margin ? 1 : dim;
     problem.contact_geom.data[place] = wp::vec2i(a, b);

@@ -25,7 +25,8 @@ auto wrench_of = [=](int contact) {
             along[0] += plus + minus;
             along[axis] = (plus - minus) * friction[axis - 1];
         }
-    along[0] -= problem.contact_adhesion.data[contact];
+    if (dim > 0)
+        along[0] -= problem.contact_adhesion.data[contact];
     return Wrench{vec3(along[0], along[1], along[2]), vec3(along[3], along[4], along[5])};
 };
 auto axis_of = [=](int contact, int axis) {
