@@ -16,6 +16,7 @@ from functools import cache
 import torch
 import warp as wp
 
+from ksim_rl.device.kernel_cache import mend_damages
 from ksim_rl.device.upstream import ABSENT_DRIVER, current_stream_handle
 
 CPU_LOCK = threading.RLock()
@@ -48,6 +49,7 @@ def start_warp() -> None:
     finally:
         os.close(stderr)
     sys.stderr.writelines(line for line in lines if ABSENT_DRIVER not in line)
+    mend_damages()
 
 
 def checked_device(device: str | torch.device) -> torch.device:

@@ -5,10 +5,13 @@ that a new version moved.
 """
 
 import ctypes
+import functools
+import itertools
 import re
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,6 +28,9 @@ ALLOCATION_REFUSALS = (
 COMPILED_LINE = re.compile(r"^\s*Module (?P<module>\S+).* took (?P<ms>[\d.]+) ms\s+\(compiled\)")
 # Warp 1.19 writes this from native code when it starts without a driver, and has no setting against it.
 ABSENT_DRIVER = "Could not find or load the NVIDIA CUDA driver"
+
+# Warp 1.19 raises a bare exception with these words where the file of a compiled module is none.
+UNLOADABLE = "Failed to load "
 
 
 def current_stream_handle(device: torch.device) -> int:
@@ -76,6 +82,33 @@ def put_apart(kernels: Collection[wp.Kernel]) -> None:
         # Last, as another thread may launch one meanwhile.
         for kernel in some:
             kernel.module = own
+
+
+def watch_loads(mend: Callable[[Path, Exception, int], None]) -> None:
+    """Call `mend(folder, error, attempt)` where files of the cache cannot be read, and load that module once more.
+
+    Warp takes what lies in its cache as it is, and has no setting for another attempt. Replaces `wp.Module.load`,
+    checked with Warp 1.19.
+    """
+    load = wp.Module.load
+
+    @functools.wraps(load)
+    def load_or_mend(
+        self: wp.Module, device: Any, block_dim: int | None = None, *given: Any, **named: Any
+    ) -> Any:
+        for attempt in itertools.count(1):
+            try:
+                return load(self, device, block_dim, *given, **named)
+            except Exception as error:
+                folder = Path(wp.config.kernel_cache_dir) / self.get_module_identifier(block_dim)
+                # What is no JSON or no text is a ValueError; what does not compile is none of these.
+                is_read = folder.exists() and (isinstance(error, ValueError) or UNLOADABLE in str(error))
+                if given or named or not (is_read or isinstance(error, OSError)):
+                    raise
+                mend(folder, error, attempt)
+        raise AssertionError
+
+    wp.Module.load = load_or_mend
 
 
 _diversion = threading.Lock()

@@ -50,6 +50,15 @@ def test_modules_list_their_kernels_and_what_is_loaded_and_take_others() -> None
     assert module.kernels == {take_pair.key: take_pair}, "warp.Module.kernels is something else"
 
 
+def test_modules_load_by_device_and_block_from_a_folder_of_the_cache() -> None:
+    parameters = list(inspect.signature(inspect.unwrap(wp.Module.load)).parameters)
+    assert parameters[:3] == ["self", "device", "block_dim"], "warp.Module.load takes other arguments"
+    wp.init()
+    assert isinstance(wp.config.kernel_cache_dir, str), "warp.config.kernel_cache_dir is something else"
+    folder = take_pair.module.get_module_identifier(1)
+    assert folder.startswith("wp_"), "warp.Module.get_module_identifier names something else"
+
+
 def test_diversion_ends_with_its_block() -> None:
     before, seen = wp.launch, []
     with upstream.launches_diverted(lambda kernel, dim, block_dim: seen.append((kernel, dim, block_dim))):
