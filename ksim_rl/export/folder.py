@@ -271,6 +271,7 @@ def _metadata(
         "metrics": described("metrics", means),
         "left_out": left_out,
         "scale_rewards_by_dt": cfg.scale_rewards_by_dt,
+        "engine": ours.world.sim.engine,
         "physics_dt": ours.physics_dt,
         "decimation": cfg.decimation,
         "step_dt": ours.step_dt,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from ksim_rl.checks import MISFITS, OneLineParser
@@ -16,6 +17,7 @@ from ksim_rl.export.folder import export, runner_source
 from ksim_rl.export.standalone.files import check_closed, read_arrays, read_json
 from ksim_rl.physics import load_spec
 from ksim_rl.terminal import printable, show
+from ksim_rl.trainers.other_physics import half_time_step, other_integrator, same_time_step
 
 TABLE = ("return", "length", "fell", "reward/", "metric/", "torque/", "contact/")
 
@@ -34,6 +36,7 @@ class Report:
     standard_error: float
     causes: Sequence[Cause]
     left_out: Sequence[str]
+    physics: str = ""  # how it differs from the recorded one, where C made that, too
 
     @property
     def return_ratio(self) -> float:
@@ -43,6 +46,8 @@ class Report:
     def table(self) -> str:
         """Return the report as text."""
         lines = [f"{self.task}: {self.episodes} episodes on MuJoCo's C engine, beside the recorded ones"]
+        if self.physics:
+            lines.append(f"which trained it: {self.physics}; single steps are compared in the same physics")
         lines.append(f"{'':<44}{'recorded':>12}{'C engine':>12}{'difference':>12}")
         for name, value in self.theirs.items():
             if name in self.ours:
@@ -74,13 +79,13 @@ def sim2sim(
     meta = read_json(folder / "export.json")
     ours = _recorded(meta, folder)
     check_closed(folder / "robot.xml")
-    load_spec(folder / "robot.xml")
+    physics, words = _other_physics(meta, load_spec(folder / "robot.xml").option)
     note(f"running {episodes} episodes")
     with tempfile.TemporaryDirectory() as temporary:
         program, output, replay = (Path(temporary) / name for name in ("runner.py", "out.json", "replay.npz"))
         program.write_text(runner_source())
         arguments = [str(folder.absolute()), "--episodes", str(episodes), "--seed", str(seed)]
-        arguments += ["--output", str(output), "--replay", str(replay)]
+        arguments += ["--output", str(output), "--replay", str(replay), *physics]
         # Isolated: PYTHONPATH adds no modules either, as the runner needs none of this library.
         done = run_python(["-I", str(program), *arguments])
         if done.returncode:
@@ -106,7 +111,22 @@ def sim2sim(
         standard_error=ratio_error(own["return"], theirs["return"]),
         causes=causes,
         left_out=[str(name) for name in meta.get("left_out", ())],
+        physics=words,
     )
+
+
+def _other_physics(meta: Mapping[str, Any], option: mujoco.MjOption) -> tuple[list[str], str]:
+    """Return the runner's arguments by which the C engine judges an export, and how to say what they mean."""
+    # Warp is other physics already.
+    if meta.get("engine") != "c":
+        return [], ""
+    integrator, words = other_integrator(option)
+    laws = meta.get("actuators")
+    late = isinstance(laws, list) and any(isinstance(law, dict) and law.get("delay") for law in laws)
+    if late:
+        return ["--integrator", integrator], f"{words}, {same_time_step(option.timestep)}"
+    arguments = ["--integrator", integrator, "--refine", "2"]
+    return arguments, f"{words}, {half_time_step(option.timestep)}"
 
 
 def _recorded(meta: Mapping[str, Any], folder: Path) -> dict[str, np.ndarray]:

@@ -53,6 +53,23 @@ def judged_by(cfg: RunCfg, *, trained: str, given: Collection[str] = ()) -> tupl
     return dataclasses.replace(cfg, task=task), f"on {ENGINES[engine]}, which trained it, {said}"
 
 
+def other_integrator(option: mujoco.MjOption) -> tuple[str, str]:
+    """Return the integrator by which a run of this one is judged, and how to say that."""
+    own = mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_").lower()
+    other = _OTHER_INTEGRATOR.get(own, "euler")
+    return other, f"with integrator {other} instead of {own}"
+
+
+def half_time_step(timestep: float) -> str:
+    """Say that a run with this time step is judged with half of it."""
+    return f"with a time step of {0.5 * timestep:g} s instead of {timestep:g} s"
+
+
+def same_time_step(timestep: float) -> str:
+    """Say why a run is judged with its own time step."""
+    return f"with its time step of {timestep:g} s, in which its actuators count their lags"
+
+
 def _changes(task: ManagerBasedRlEnvCfg, given: Collection[str]) -> tuple[dict[str, Any], list[str]]:
     """Return the fields of `SimCfg` to change, and how to say that."""
     spec = build_spec(task.scene)
@@ -60,17 +77,16 @@ def _changes(task: ManagerBasedRlEnvCfg, given: Collection[str]) -> tuple[dict[s
     changes: dict[str, Any] = {}
     words: list[str] = []
     if f"{PREFIX}integrator" not in given:
-        own = mujoco.mjtIntegrator(spec.option.integrator).name.removeprefix("mjINT_").lower()
-        changes["integrator"] = _OTHER_INTEGRATOR.get(own, "euler")
-        words.append(f"with integrator {changes['integrator']} instead of {own}")
+        changes["integrator"], said = other_integrator(spec.option)
+        words.append(said)
     timestep = float(spec.option.timestep)
     if f"{PREFIX}timestep" in given:
         return changes, words
     if _counts_substeps(task):
-        words.append(f"with its time step of {timestep:g} s, in which its actuators count their lags")
+        words.append(same_time_step(timestep))
         return changes, words
     changes["timestep"] = 0.5 * timestep
-    words.append(f"with a time step of {changes['timestep']:g} s instead of {timestep:g} s")
+    words.append(half_time_step(timestep))
     return changes, words
 
 

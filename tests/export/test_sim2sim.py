@@ -86,6 +86,21 @@ def test_cartpole_earns_the_same_from_the_folder_alone(cartpole):
     assert float(stored["step_dt"]) == pytest.approx(0.01)
 
 
+def test_what_the_c_engine_trained_is_judged_in_other_physics(tmp_path):
+    def change(cfg):
+        return dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, engine="c"))
+
+    folder = exported("cartpole_balance", tmp_path / "export", change=change)
+    assert json.loads((folder / "export.json").read_text())["engine"] == "c"
+    report = report_of(folder, episodes=4)
+    said = "with integrator euler instead of implicitfast, with a time step of 0.005 s instead of 0.01 s"
+    assert said in report.table()
+    # Single steps are those of training; whole episodes are not.
+    assert report.causes == []
+    assert report.return_ratio == pytest.approx(1.0, abs=0.02)
+    assert report.return_ratio != pytest.approx(1.0, abs=1e-9)
+
+
 FULL = ("arm_push", "cheetah_run", "hopper_stand", "pendulum_swingup", "quadruped_get_up")
 
 

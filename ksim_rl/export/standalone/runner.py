@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from ksim_rl.export.standalone.files import Array, check_record, read, read_arrays
-from ksim_rl.export.standalone.signals import Lag, Noise, Signals
+from ksim_rl.export.standalone.signals import INTEGRATORS, Lag, Noise, Signals
 
 RECORD = "episodes.npz"
 KINDS = ("pos", "vel", "effort")
@@ -368,8 +368,9 @@ class Runner(Signals):
 _own: list[Any] = []
 
 
-def _begin(folder: str, seed: int) -> None:
+def _begin(folder: str, seed: int, integrator: str, refine: int) -> None:
     runner = Runner(folder, seed)
+    runner.change_physics(integrator, refine)
     _own[:] = [runner, _record(runner), seed]
 
 
@@ -407,6 +408,8 @@ def main() -> None:
     parser.add_argument("folder", nargs="?", default=str(Path(__file__).parent))
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0, help="of noise and lags")
+    parser.add_argument("--integrator", choices=INTEGRATORS, default="", help="default: the model's own")
+    parser.add_argument("--refine", type=int, default=1, help="so many substeps in place of one")
     parser.add_argument("--output", help="a JSON file; without it the means are printed")
     parser.add_argument("--replay", help="an .npz file for what each recorded step of trace.npz gives here")
     options = parser.parse_args()
@@ -433,8 +436,8 @@ def _run_all(options: argparse.Namespace) -> list[dict[str, float]]:
     if options.replay:
         _replay(runner, Path(options.replay))
     cores = min(len(os.sched_getaffinity(0)), options.episodes)
-    how: dict[str, Any] = {"mp_context": multiprocessing.get_context("spawn"), "initializer": _begin}
-    with ProcessPoolExecutor(cores, initargs=(options.folder, options.seed), **how) as pool:
+    arguments = (options.folder, options.seed, options.integrator, options.refine)
+    with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn"), _begin, arguments) as pool:
         return list(pool.map(_run, range(options.episodes)))
 
 

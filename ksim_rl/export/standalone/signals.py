@@ -12,6 +12,9 @@ from ksim_rl.export.standalone.files import Array, check_count, read_json, read_
 
 Value = Callable[[], Array]
 MOST_DEPTH, MOST_NODES = 40, 100_000
+INTEGRATORS = {
+    name.removeprefix("mjINT_").lower(): kind for name, kind in mujoco.mjtIntegrator.__members__.items()
+}
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     name: getattr(np, name)
     for name in (
@@ -185,6 +188,14 @@ class Signals:
     def step_dt(self) -> float:
         """Seconds of one env step."""
         return self.model.opt.timestep * self.decimation
+
+    def change_physics(self, integrator: str, refine: int) -> None:
+        """Integrate by another of MuJoCo's integrators, "" for the model's own, in `refine` times as many substeps."""
+        option = self.model.opt
+        if integrator:
+            option.integrator = int(INTEGRATORS[integrator])
+        option.timestep /= refine
+        self.decimation *= refine
 
     def value(self, node: Any, depth: int = 0) -> Value:
         """Return what computes a description; a ValueError says what is no description."""
