@@ -1,4 +1,4 @@
-"""What docs/learning.md says about settings of the peer is what benchmarks/results/peer_settings.json has.
+"""What docs/notes/go1.md says about settings of the peer is what benchmarks/results/peer_settings.json has.
 
 To write it anew: python -m tests.docs.test_peer_settings.
 """
@@ -15,7 +15,7 @@ from benchmarks.peer_settings import LEVELS, TASK, VARIANTS, median_of
 from tests.docs.committed import last_on_gpu, results
 from tests.docs.guide import DOCS
 
-PAGE = DOCS / "learning.md"
+PAGE = DOCS / "notes" / "go1.md"
 BEGIN = "<!-- peer settings: python -m tests.docs.test_peer_settings writes what follows -->"
 END = "<!-- end of peer settings -->"
 UNKNOWN = "How much of the difference in env states each of them makes was not measured."
@@ -49,7 +49,7 @@ def text(saved: Mapping[str, Any]) -> str:
             "",
             f"`{command}`",
             "",
-            "![Go1 with our settings and with mjlab's](../benchmarks/results/peer_settings.png)",
+            "![Go1 with our settings and with mjlab's](../../benchmarks/results/peer_settings.png)",
         ]
     )
 

@@ -81,7 +81,7 @@ with [one protocol](tables.md#the-protocol).
   the two rewards have a time, it is the median of the seeds'.
 
 [Learning](learning.md#how-well-they-learn) compares algorithms, and says how far Go1 gets on
-[each kind of rough ground](learning.md#rough-ground). Its levels rise as training goes on, so rewards say little there.
+[each kind of rough ground](notes/rough_ground.md). Its levels rise as training goes on, so rewards say little there.
 The two rough tasks have no row below: they have not been trained since a foot on a height field touches each prism
 under it, as in the C engine.
 """

@@ -11,7 +11,7 @@ from ksim_rl.tasks.velocity import PATCHES
 from tests.docs.committed import last_run, results
 from tests.docs.guide import DOCS
 
-PAGE = DOCS / "learning.md"
+PAGE = DOCS / "notes" / "rough_ground.md"
 TASKS = ("go1_velocity_rough", "g1_velocity_rough")
 BEGIN, END = "<!-- table: python -m tests.docs.test_terrain_course -->", "<!-- end of the table -->"
 
