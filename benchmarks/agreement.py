@@ -2,6 +2,7 @@
 
     python -m benchmarks.agreement [--device cpu] [--worlds 64] [--models quadruped go1_velocity_flat robot.xml ...]
     python -m benchmarks.agreement --generated 400 [--seed 0] [--jobs 2] [--minutes 15] [--shrink]
+    python -m benchmarks.agreement --registered [--jobs 2] [--minutes 15]
 
 Models are small ones, robots of the menagerie (where MENAGERIE_ROOT is set), the flat tasks, or any MJCF file. Both
 engines start from the same float32 states without a warm start, run the same substeps, and are compared after the last
@@ -13,7 +14,8 @@ Each model runs twice: with its own solver tolerance, and as worlds train: with 
 the settings of the task. The C engine iterates until its own tolerance in both.
 
 `--generated` draws random models instead (`benchmarks/judge`), and compares all that a view can name. Those that fail
-are written to build/judge, with `--shrink` made small.
+are written to build/judge, with `--shrink` made small. `--registered` judges the models of all registered tasks and all
+robot files in the same way; what comes from a package that is not installed is left out, and named.
 """
 
 import argparse
@@ -34,7 +36,7 @@ from benchmarks import command_line, report
 from benchmarks.agreement_errors import COMPARED, CONTACT_LIMIT, FAR_LIMIT, Errors, compare
 from benchmarks.agreement_models import CARTPOLE, DOUBLE_PENDULUM, QUADRUPED, SPINNING_BODY
 from benchmarks.agreement_states import States, anywhere, in_contact, thrown
-from benchmarks.judge import hunt
+from benchmarks.judge import hunt, registered
 from ksim_rl import envs
 from ksim_rl.checks import unknown_name
 from ksim_rl.device.streams import checked_device
@@ -263,6 +265,25 @@ def hunt_generated(options: argparse.Namespace, device: torch.device) -> int:
     return 1 if figures[f"{prefix}/worse"] else 0
 
 
+def judge_registered(options: argparse.Namespace, device: torch.device) -> int:
+    """Judge the models of registered tasks and robot files, write what was found, and return 1 if any differs."""
+    names, not_here = registered.tasks_of_models(envs.names())
+    if not_here:
+        print(f"not installed: {', '.join(not_here)}", flush=True)
+    tasks = [registered.Registered(name=name, is_task=True, device=options.device) for name in names]
+    for path in registered.robot_files():
+        tasks.append(registered.Registered(name=path, is_task=False, device=options.device))
+    outcomes = registered.judge_all(tasks, jobs=options.jobs, most_minutes=options.minutes)
+    prefix = f"{report.device_label(device)}/registered"
+    figures = {f"{prefix}/{name}": value for name, value in registered.figures(outcomes).items()}
+    figures[f"{prefix}/not_judged"] = len(not_here) + len(tasks) - len(outcomes)
+    for name, value in figures.items():
+        print(f"{name:40s}{value:g}")
+    path = report.write("agreement", figures=figures, device=device, module="benchmarks.agreement")
+    print(f"written: {path}")
+    return 1 if figures[f"{prefix}/worse"] else 0
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Print the table, write the results, and return 1 if anything disagrees."""
     parser = argparse.ArgumentParser(
@@ -274,6 +295,9 @@ def main(arguments: list[str] | None = None) -> int:
         "--models", nargs="+", metavar="MODEL", help="names of models or tasks, or MJCF files"
     )
     parser.add_argument("--generated", type=int, default=0, metavar="N", help="judge N random models instead")
+    parser.add_argument(
+        "--registered", action="store_true", help="judge all registered tasks and robot files"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the random models")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes for random models")
     parser.add_argument("--minutes", type=float, default=math.inf, help="begin no further model after these")
@@ -282,6 +306,8 @@ def main(arguments: list[str] | None = None) -> int:
     device = checked_device(options.device)
     if options.generated:
         return hunt_generated(options, device)
+    if options.registered:
+        return judge_registered(options, device)
     cases = chosen_cases(options.models)
     label = report.device_label(device)
     figures, all_agree = {}, True

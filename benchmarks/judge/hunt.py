@@ -130,17 +130,22 @@ def told(outcome: Outcome) -> list[str]:
     ]
     if outcome.error:
         lines.append(outcome.error)
-    first: dict[str, Finding] = {}
-    for finding in verdict.findings:
-        first.setdefault(finding.kind, finding)
-    for finding in list(first.values())[:SHOWN]:
-        lines.append(
-            f"    {finding.quantity}: {finding.error:.3g} apart, allowed {finding.limit:.3g}, in world "
-            f"{finding.world} after {finding.when}"
-        )
+    lines += told_of(verdict.findings)
     if outcome.smallest is not None:
         lines += [outcome.smallest[0], f"    fields {outcome.smallest[1]}"]
     return lines
+
+
+def told_of(findings: Sequence[Finding]) -> list[str]:
+    """Return a line for the first finding of each kind."""
+    first: dict[str, Finding] = {}
+    for finding in findings:
+        first.setdefault(finding.kind, finding)
+    return [
+        f"    {finding.quantity}: {finding.error:.3g} apart, allowed {finding.limit:.3g}, in world "
+        f"{finding.world} after {finding.when}"
+        for finding in list(first.values())[:SHOWN]
+    ]
 
 
 def stepped(outcomes: Sequence[Outcome]) -> list[Outcome]:

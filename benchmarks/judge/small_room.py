@@ -7,37 +7,36 @@ import mujoco
 
 from benchmarks.judge.comparison import Finding
 from benchmarks.judge.worlds import Arrays, put, put_all
-from ksim_rl.physics import SimCfg
 from ksim_rl.physics.warp_world import WarpWorld
 
 # Rows and contacts that there is room for, and so many rows more are surely needed: few models need none.
 ROWS, CONTACTS, MORE = 5, 2, 4
 
 
-def rows_of(models: Sequence[mujoco.MjModel], states: Sequence[Arrays]) -> list[int]:
-    """Return how many constraint rows C makes in each world's state."""
+def rows_of(mj_model: mujoco.MjModel, states: Sequence[Arrays]) -> list[int]:
+    """Return how many constraint rows C makes in each state."""
     needed = []
-    for mj_model, state in zip(models, states, strict=True):
+    for state in states:
         mj_data = put(state, mj_model)
         mujoco.mj_forward(mj_model, mj_data)
         needed.append(mj_data.nefc)
     return needed
 
 
-def untold_overflow(
-    mj_model: mujoco.MjModel,
-    models: Sequence[mujoco.MjModel],
-    states: Sequence[Arrays],
-    *,
-    sim: SimCfg,
-    device: str,
-) -> tuple[Finding, ...] | None:
-    """Step worlds with little room, and return what they did not say; None where they need no more than that."""
-    needed = rows_of(models, states)
+def untold_overflow(beside: WarpWorld, states: Sequence[Arrays]) -> tuple[Finding, ...] | None:
+    """Step worlds with little room, and return what they did not say; None where they need no more than that.
+
+    Args:
+        beside: worlds with the same model and settings, which have room.
+        states: of the worlds.
+    """
+    # Without fields of their own, in which C would find other rows.
+    mj_model = beside.mj_model
+    needed = rows_of(mj_model, states)
     if max(needed) < ROWS + MORE:
         return None
-    small = dataclasses.replace(sim, njmax=ROWS, nconmax=CONTACTS)
-    world = WarpWorld(mj_model, num_envs=len(states), device=device, sim=small)
+    small = dataclasses.replace(beside.sim, njmax=ROWS, nconmax=CONTACTS)
+    world = WarpWorld(mj_model, num_envs=len(states), device=beside.device, sim=small)
     put_all(world, list(states))
     world.step(1)
     report = world.overflow_report()

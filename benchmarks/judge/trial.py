@@ -31,7 +31,8 @@ SETTINGS: dict[Kernels, SimCfg] = {
 # Of what accelerates more, in m/s^2 or rad/s^2, C says nothing that float32 could repeat.
 MOST_QACC = 1e5
 # Substeps of a call, and the sensors that it computes on the way.
-CALLS: tuple[tuple[int, Literal["last", "contacts", "every"]], ...] = (
+Call = tuple[int, Literal["last", "contacts", "every"]]
+CALLS: tuple[Call, ...] = (
     (1, "last"),
     (2, "every"),
     (4, "last"),
@@ -68,6 +69,23 @@ class Verdict:
     overflow: tuple[str, ...] = ()
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Given:
+    """What worlds are given.
+
+    Args:
+        fields: in which they differ.
+        models: C's model of each world.
+        states: in which they start.
+        compiled: how many of the models C compiled from XML that has the fields.
+    """
+
+    fields: tuple[str, ...] = ()
+    models: list[mujoco.MjModel]
+    states: list[Arrays]
+    compiled: int = 0
+
+
 def judge(
     xml: str,
     *,
@@ -76,7 +94,7 @@ def judge(
     forces: bool = True,
     seed: int = 0,
     device: str = "cpu",
-    calls: Sequence[tuple[int, Literal["last", "contacts", "every"]]] = CALLS,
+    calls: Sequence[Call] = CALLS,
 ) -> Verdict:
     """Run both engines and compare all that a view can name."""
     sim = SETTINGS[kernels]
@@ -87,14 +105,22 @@ def judge(
         )
     except ValueError as error:
         return Verdict(refused=reason(str(error)))
-    assert isinstance(world, WarpWorld), "the settings name this engine"
-    trial = _Trial(world, tuple(fields), xml=xml, sim=sim, seed=seed, forces=forces)
+    rng = np.random.default_rng(seed)
+    models, compiled = give_fields(world, tuple(fields), rng, xml, sim)
+    states = [drawn_state(each, rng, forces=forces) for each in models]
+    given = Given(fields=tuple(fields), models=models, states=states, compiled=compiled)
+    return judge_worlds(world, given, seed=seed, calls=calls)
+
+
+def judge_worlds(world: WarpWorld, given: Given, *, seed: int, calls: Sequence[Call] = CALLS) -> Verdict:
+    """Compare worlds that have their fields with C's models of them, and close them."""
+    trial = _Trial(world, given, seed=seed)
     for substeps, sensors in calls:
         trial.compare(substeps, sensors)
     trial.compare(2, "last", hook=_nothing)
     if trial.verdict.findings == () and not trial.verdict.overflow:
-        trial.compare_reset(sim, device)
-        trial.compare_small_room(sim, device)
+        trial.compare_reset()
+        trial.compare_small_room()
     world.close()
     return trial.verdict
 
@@ -114,28 +140,18 @@ def _nothing() -> None:
 class _Trial:
     """The worlds of a model, C's models of them, and the states that they are in."""
 
-    def __init__(
-        self,
-        world: WarpWorld,
-        fields: tuple[str, ...],
-        *,
-        xml: str,
-        sim: SimCfg,
-        seed: int,
-        forces: bool,
-    ) -> None:
+    def __init__(self, world: WarpWorld, given: Given, *, seed: int) -> None:
         self.world = world
-        self.fields = fields
+        self.fields = given.fields
+        self.models = given.models
+        self.states = given.states
         self.seed = seed
-        rng = np.random.default_rng(seed)
-        self.models, compiled = give_fields(world, fields, rng, xml, sim)
-        self.states = [drawn_state(mj_model, rng, forces=forces) for mj_model in self.models]
         names = (*c_engine.REACHED, *c_engine.LAST, *c_engine.OF_BODIES, *c_engine.REFRESHED)
         self.views = {name: world.view(name) for name in names}
         kernels = "ours" if world.one_kernel_dynamics_unavailable is None else "our solver"
         if world.one_kernel_unavailable is not None:
             kernels = "theirs"
-        self.verdict = Verdict(kernels=kernels, compiled=compiled)
+        self.verdict = Verdict(kernels=kernels, compiled=given.compiled)
         self._check_constants()
 
     def _add(self, **changes: object) -> None:
@@ -231,20 +247,24 @@ class _Trial:
                 self._find(f"depth {kinds}", error, limit, row, when)
         return True
 
-    def compare_reset(self, sim: SimCfg, device: str) -> None:
+    def compare_reset(self) -> None:
         """Compare worlds that were reset, beside others that were not, with new ones; the bits must be equal."""
         world = self.world
         fresh = WarpWorld(
-            world.mj_model, num_envs=NUM_WORLDS, device=device, sim=sim, per_world_fields=self.fields
+            world.mj_model,
+            num_envs=world.num_envs,
+            device=world.device,
+            sim=world.sim,
+            per_world_fields=self.fields,
         )
         for name, field in fresh.per_world_fields().items():
             field.copy_(world.per_world_fields()[name])
         put_all(fresh, self.states)
-        some = torch.arange(NUM_WORLDS, device=world.device) % 2 == 0
+        some = torch.arange(world.num_envs, device=world.device) % 2 == 0
         put_all(world, self.states)
         world.step(3)
         world.reset(some)
-        put_rows(world, self.states, [row for row in range(NUM_WORLDS) if some[row]])
+        put_rows(world, self.states, [row for row in range(world.num_envs) if some[row]])
         for each in (fresh, world):
             each.step(2, sensors="every")
             each.refresh()
@@ -255,11 +275,9 @@ class _Trial:
                 self._find(f"reset {name}", error, 0.0, 0, "reset(mask)")
         fresh.close()
 
-    def compare_small_room(self, sim: SimCfg, device: str) -> None:
+    def compare_small_room(self) -> None:
         """Look whether worlds that have too little room say so."""
-        # With a world's own fields C's rows would be others than these worlds make.
-        models = [self.models[0]] * NUM_WORLDS
-        found = untold_overflow(self.world.mj_model, models, self.states, sim=sim, device=device)
+        found = untold_overflow(self.world, self.states)
         if found is not None:
             self._add(short_of_room=True, findings=(*self.verdict.findings, *found))
 

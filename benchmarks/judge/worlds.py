@@ -130,12 +130,16 @@ def give_fields(
             by_compiler = compiled_with(xml, sim, mj_model)
             compiled += by_compiler is not None
             mj_model = by_compiler or mj_model
-        # Both engines solve the constraints as well as they can.
-        mj_model.opt.tolerance = 0.0
-        mj_model.opt.iterations = 100
-        mj_model.opt.ls_iterations = 100
-        models.append(mj_model)
+        models.append(solved_well(mj_model))
     return models, compiled
+
+
+def solved_well(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """Let C solve the constraints of a model as well as it can, and return the model."""
+    mj_model.opt.tolerance = 0.0
+    mj_model.opt.iterations = 100
+    mj_model.opt.ls_iterations = 100
+    return mj_model
 
 
 def drawn_state(mj_model: mujoco.MjModel, rng: np.random.Generator, *, forces: bool) -> Arrays:
@@ -168,6 +172,17 @@ def state_of(mj_data: mujoco.MjData) -> Arrays:
     # Time is a sum of steps, which float32 rounds at each.
     state["time"] = np.zeros(())
     return state
+
+
+def state_of_row(world: World, row: int) -> Arrays:
+    """Return the state of one world in C's layout."""
+    mj_data = mujoco.MjData(world.mj_model)
+    for name in STATE:
+        target = np.asarray(getattr(mj_data, name))
+        # Time begins at zero.
+        if name != "time" and target.size:
+            target[:] = world.view(name)[row].numpy(force=True).reshape(target.shape)
+    return state_of(mj_data)
 
 
 def perturbed(state: Mapping[str, np.ndarray], rng: np.random.Generator) -> Arrays:

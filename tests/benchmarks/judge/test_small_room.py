@@ -27,7 +27,8 @@ SIM = SETTINGS["theirs"]
 def looked_at(xml: str) -> object:
     mj_model = load_model(xml, SIM)
     state = state_of(mujoco.MjData(mj_model))
-    return untold_overflow(mj_model, [mj_model] * 2, [state] * 2, sim=SIM, device="cpu")
+    beside = WarpWorld(mj_model, num_envs=2, device="cpu", sim=SIM)
+    return untold_overflow(beside, [state] * 2)
 
 
 def test_a_box_that_rests_needs_more_rows_and_says_so():
