@@ -1,0 +1,28 @@
+"""The page and the drawing of the architecture show every room of the package."""
+
+import re
+
+from tests.docs.guide import DOCS, REPOSITORY
+
+PACKAGE = REPOSITORY / "ksim_rl"
+
+
+def rooms() -> set[str]:
+    """Return the folders directly under the package."""
+    return {file.parent.name for file in PACKAGE.glob("*/__init__.py")}
+
+
+def test_the_tables_have_each_room_once() -> None:
+    page = (DOCS / "architecture.md").read_text()
+    rows = [line.split(" | ")[0] for line in page.splitlines() if line.startswith("| [`")]
+    linked = [name for row in rows for name in re.findall(r"\]\(\.\./ksim_rl/(\w+)\)", row)]
+    assert len(linked) == len(set(linked))
+    assert set(linked) == rooms()
+
+
+def test_the_drawing_has_each_room() -> None:
+    drawn = set(re.findall(r'class="room"[^>]*>(\w+)<', (DOCS / "rooms.svg").read_text()))
+    # Modules of one file stand beside the folders.
+    modules = {file.stem for file in PACKAGE.glob("*.py")}
+    assert rooms() <= drawn
+    assert drawn <= rooms() | modules
