@@ -36,7 +36,7 @@ class ManagerBasedRlEnvCfg(Checked):
     scene: SceneCfg
     observations: Mapping[str, ObservationGroupCfg] = field(default_factory=dict)
     actions: Mapping[str, ActionTerm] = field(default_factory=dict)
-    events: Mapping[str, EventTerm] | None = None  # `ResetToDefault`; {} leaves rows at `qpos0`
+    events: Mapping[str, EventTerm] | None = None  # `ResetToDefault`; {}: the default state
     seed: Seed = None  # None draws one; the env stores the seed that it used in its own `cfg`
     sim: SimCfg = field(default_factory=SimCfg)
     viewer: ViewerCfg = field(default_factory=ViewerCfg)  # the camera of `render()`

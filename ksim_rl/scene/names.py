@@ -82,6 +82,13 @@ def actuators_of_joint(mj_model: mujoco.MjModel, joint: int) -> list[int]:
     return [int(a) for a in np.flatnonzero(on_joints & (mj_model.actuator_trnid[:, 0] == joint))]
 
 
+def drives_scalar_joint(mj_model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator drives a hinge or a slide."""
+    if int(mj_model.actuator_trntype[actuator]) not in TO_JOINTS:
+        return False
+    return int(mj_model.jnt_type[mj_model.actuator_trnid[actuator, 0]]) in SCALAR_JOINTS
+
+
 def as_index(ids: Sequence[int], device: torch.device) -> Index:
     """Return a slice for contiguous increasing ids (no copy when indexing), else an int64 tensor."""
     ids = [int(i) for i in ids]

@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 from typing import Annotated, Protocol, runtime_checkable
 
 import mujoco
-import numpy as np
 
 from ksim_rl.checked import Checked, Count, Filled, NonNegative, Share
 from ksim_rl.checks import near
 from ksim_rl.physics import load_model, load_spec
 from ksim_rl.scene.actuators import Actuator, set_actuators
+from ksim_rl.scene.keyframes import add_joined, complete_keyframes, move_keyframe
 from ksim_rl.scene.sensors import Sensor
+from ksim_rl.scene.state.default_state import default_data
 from ksim_rl.scene.terrains import Terrain
 
 
@@ -28,7 +29,7 @@ class Placement(Checked):
             raise ValueError(f"quat={self.quat!r}: expected a unit quaternion (w, x, y, z)")
 
     def move(self, spec: mujoco.MjSpec) -> None:
-        """Move all that stands in the spec's world, and the free joints of its keyframes."""
+        """Move all that stands in the spec's world, and what its keyframes say of that."""
         model = load_model(spec)
         world = spec.worldbody
         loose = [
@@ -41,12 +42,7 @@ class Placement(Checked):
         for element in loose:
             element.set_frame(frame)
         for key in spec.keys:
-            qpos = np.array(key.qpos)
-            for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-                pose = qpos[model.jnt_qposadr[joint] :][:7]
-                pos, quat = pose[:3].copy(), pose[3:].copy()
-                mujoco.mju_mulPose(pose[:3], pose[3:], np.array(self.pos), np.array(self.quat), pos, quat)
-            key.qpos = qpos
+            move_keyframe(key, model, self.pos, self.quat)
 
 
 @runtime_checkable
@@ -58,7 +54,7 @@ class Robot(Protocol):
     """
 
     def spec(self) -> mujoco.MjSpec:
-        """Return a new spec of the robot; its first keyframe, if any, is the default pose."""
+        """Return a new spec of the robot; its first keyframe, if any, is the default state, which resets restore."""
         ...
 
 
@@ -116,6 +112,8 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     entities = {name: robot.spec() for name, robot in cfg.entities.items()}
     for name, placement in cfg.placements.items():
         placement.move(entities[name])
+    for entity in entities.values():
+        complete_keyframes(entity)
     spec = _joined(entities) if len(entities) > 1 else next(iter(entities.values()))
     if cfg.terrain is not None:
         cfg.terrain.add_to(spec)
@@ -125,15 +123,14 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
 
 
 def _joined(entities: Mapping[str, mujoco.MjSpec]) -> mujoco.MjSpec:
-    """Put entities into one spec, with one keyframe that holds the default pose of each."""
+    """Put entities into one spec, with one keyframe that holds what the first one of each holds."""
     spec = mujoco.MjSpec()
     first = next(iter(entities.values()))
     spec.option = first.option
-    pose: list[float] = []
+    starts: list[mujoco.MjData] = []
     for name, entity in entities.items():
         entity.option = first.option
-        model = load_model(entity)
-        pose += list(model.key_qpos[0] if model.nkey else model.qpos0)
+        starts.append(default_data(load_model(entity)))
         # An attached keyframe would cover its own entity only.
         for key in list(entity.keys):
             entity.delete(key)
@@ -141,5 +138,5 @@ def _joined(entities: Mapping[str, mujoco.MjSpec]) -> mujoco.MjSpec:
         for number, body in enumerate(entity.worldbody.bodies):
             body.name = body.name or f"body{number}"
         spec.attach(entity, prefix=f"{name}/", frame=spec.worldbody.add_frame())
-    spec.add_key(name="default", qpos=pose)
+    add_joined(spec, "default", starts)
     return spec

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from ksim_rl.checked import Checked, NonNegative, Positive
 from ksim_rl.scene.names import Patterns, as_index
-from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
+from ksim_rl.scene.state.joint_control import TargetKind
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget
 from ksim_rl.scene.state.simulation import Simulation
 from ksim_rl.scene.state.world_view import WorldView
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.scene.actuators.actuator import Actuator, Drive, Law
+from ksim_rl.scene.keyframes import compile_keyframes, let_new_servos_hold
 from ksim_rl.scene.names import SCALAR_JOINTS, TO_JOINTS, as_patterns, match_names
 from ksim_rl.scene.state.simulation import Simulation
 from ksim_rl.scene.state.world_view import WorldView
@@ -16,12 +17,15 @@ def set_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
     """Give each matching joint one actuator, named as its joint, in the order of `actuators`.
 
     Actuators of the model that drive the same joints are replaced, and their sensors read the new ones; the model's
-    other actuators stay, in front.
+    other actuators stay, in front. Keyframes keep the controls and activations of these, and new servos hold the poses.
     """
     joints = {joint.name: joint for joint in spec.joints if joint.type in SCALAR_JOINTS}
     driven = driven_joints(actuators, list(joints))
     new_names = {name for _, names in driven for name in names}
     replaced: dict[str, str] = {}
+    says_controls = bool(driven) and any(len(key.ctrl) or len(key.act) for key in spec.keys)
+    if says_controls:
+        compile_keyframes(spec)
     for old in list(spec.actuators):
         if old.trntype in TO_JOINTS and old.target in new_names:
             replaced[old.name] = old.target
@@ -33,6 +37,8 @@ def set_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
         for name in names:
             new = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             actuator.configure(new, joints[name])
+    if says_controls:
+        let_new_servos_hold(spec, new_names)
 
 
 def driven_joints(

@@ -12,7 +12,8 @@ from torch import Tensor
 from ksim_rl.checked import NonNegative, Positive, WholeNumber
 from ksim_rl.scene.actuators.actuator import Actuator, Drive, ExplicitActuator, Law, SubstepRing
 from ksim_rl.scene.names import Patterns
-from ksim_rl.scene.state.joint_targets import JointState, JointTarget, TargetKind
+from ksim_rl.scene.state.joint_control import TargetKind
+from ksim_rl.scene.state.joint_targets import JointState, JointTarget
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,7 +26,7 @@ from ksim_rl.scene.robots.anatomy import Anatomy, dissect, posed, rounded
 from ksim_rl.scene.robots.edit import Site
 from ksim_rl.scene.robots.legged_robot import ModelRobot
 from ksim_rl.scene.robots.stance import find_stance, on_plane, stand
-from ksim_rl.scene.state.joint_targets import control_kind
+from ksim_rl.scene.state.joint_control import joint_control
 
 FREQUENCY, DAMPING_RATIO = 10.0, 2.0
 """Of a joint's motor alone under its servo, Hz; as in BeyondMimic (Liao et al., 2025)."""
@@ -314,11 +314,12 @@ def _drive(mj_model: mujoco.MjModel, joint: int) -> tuple[str, tuple[float, floa
     if mj_model.jnt_actfrclimited[joint]:
         limits.append(np.abs(mj_model.jnt_actfrcrange[joint]).max())
     for a in actuators_of_joint(mj_model, joint):
-        gear, bias = abs(mj_model.actuator_gear[a, 0]), mj_model.actuator_biasprm[a]
-        target = control_kind(mj_model.actuator_biastype[a], bias, mj_model.actuator_dyntype[a])
+        gear = abs(mj_model.actuator_gear[a, 0])
+        control = joint_control(mj_model, a)
+        target = control.kind
         kind = {"pos": "position", "vel": "velocity", "effort": "motor"}[target]
         if target != "effort":
-            gains = abs(float(bias[1])), abs(float(bias[2]))
+            gains = abs(control.stiffness), abs(control.damping)
         if mj_model.actuator_forcelimited[a]:
             limits.append(gear * np.abs(mj_model.actuator_forcerange[a]).max())
         elif mj_model.actuator_ctrllimited[a] and target == "effort":

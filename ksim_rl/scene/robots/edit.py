@@ -10,7 +10,7 @@ import mujoco
 from ksim_rl.checks import check_known
 from ksim_rl.physics.load import caught_warnings
 from ksim_rl.scene.names import SCALAR_JOINTS, match_names
-from ksim_rl.scene.state.joint_targets import control_kind
+from ksim_rl.scene.state.joint_control import control_of_spec
 
 Vector = tuple[float, ...]
 
@@ -222,10 +222,11 @@ def set_keyframe(
     for key in list(spec.keys):
         spec.delete(key)
     qpos = [*init_pos, *init_quat, *(joint_pos[joint.name] for joint in _single_dof_joints(spec))]
-    ctrl = [
-        joint_pos[a.target] if control_kind(a.biastype, a.biasprm, a.dyntype) == "pos" else 0.0
-        for a in spec.actuators
-    ]
+    ctrl: list[float] = []
+    for actuator in spec.actuators:
+        control = control_of_spec(actuator)
+        holds = control.kind == "pos" and not control.refusal
+        ctrl.append(control.of(joint_pos[actuator.target]) if holds else 0.0)
     spec.add_key(name=name, qpos=qpos, ctrl=ctrl)
 
 

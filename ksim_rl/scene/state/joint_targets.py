@@ -1,19 +1,27 @@
-"""This module holds what joints are asked for, and writes it to the controls of actuators that take it as it is."""
+"""This module holds what joints are asked for, and writes it to the controls of MuJoCo's own actuators."""
 
 from collections.abc import Collection, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
-import mujoco
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checks import near
 from ksim_rl.physics import World
-from ksim_rl.scene.names import Index, NameResolver, Patterns, as_index, as_patterns, scalar_joint_ids
+from ksim_rl.scene.names import (
+    Index,
+    NameResolver,
+    Patterns,
+    as_index,
+    as_patterns,
+    drives_scalar_joint,
+    scalar_joint_ids,
+)
 from ksim_rl.scene.state.buffers import Buffers
-
-TargetKind = Literal["pos", "vel", "effort"]
+from ksim_rl.scene.state.default_state import DefaultState
+from ksim_rl.scene.state.joint_control import JointControl, TargetKind, joint_control
 
 
 class JointState(NamedTuple):
@@ -31,20 +39,29 @@ class JointTarget(NamedTuple):
     effort_EN: Float[Tensor, "E N"]
 
 
+ROUNDING = 1e-12
+"""Up to here a keyframe's control asks for its own pose: rad, m, or per second."""
 _WORDS = {"pos": "a position", "vel": "a velocity", "effort": "an effort"}
 
 
-def control_kind(biastype: int, biasprm: Sequence[float], dyntype: int) -> TargetKind:
-    """Return what the control of a MuJoCo actuator is a target for.
+class _Driven(NamedTuple):
+    """An actuator of a joint, and what its control means."""
 
-    A bias that pulls back in proportion to the position makes a position servo (with an integrator in front of it,
-    one whose control is a velocity), one that is proportional to the velocity alone a velocity servo.
-    """
-    if biastype != mujoco.mjtBias.mjBIAS_AFFINE:
-        return "effort"
-    if biasprm[1] != 0.0:
-        return "vel" if dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR else "pos"
-    return "vel" if biasprm[2] != 0.0 else "effort"
+    actuator: int
+    control: JointControl
+
+
+class _Line(NamedTuple):
+    """The controls of some targets, `scale_K * target + offset_K`; None where all of the numbers are 1 or 0."""
+
+    scale_K: Float[Tensor, " K"] | None
+    offset_K: Float[Tensor, " K"] | None
+
+    def of(self, target_EK: Float[Tensor, "E K"]) -> Float[Tensor, "E K"]:
+        """Return the controls; of plain servos the targets themselves, bit for bit."""
+        if self.scale_K is not None:
+            target_EK = target_EK * self.scale_K
+        return target_EK if self.offset_K is None else target_EK + self.offset_K
 
 
 class _Route(NamedTuple):
@@ -53,15 +70,16 @@ class _Route(NamedTuple):
     joints: Index
     ctrl: Index | None
     columns: Index
+    line: _Line
     limits_K2: Float[Tensor, "K 2"] | None
 
 
 class JointTargets:
-    """Targets of all hinges and slides, in the model's order; rows that reset are asked for the default pose, at rest.
+    """Targets of all hinges and slides, in the model's order; rows that reset are asked for what the keyframe asks for.
 
-    A target of a built-in actuator is its control and is written there too; a motor model reads it before each substep.
-    An actuator takes the kind of target that its gains make of its control (see `control_kind`), so that a position
-    never ends up as the torque of a plain motor. Efforts of the MJCF's motors are their controls, before gear and gain.
+    A target of a built-in actuator becomes its control (`JointControl`); a motor model reads it before each substep.
+    An actuator takes the kind of target that its gains make of its control, so that a position never ends up as the
+    torque of a plain motor. Efforts of the MJCF's motors are their controls, before gear and gain.
     """
 
     def __init__(
@@ -71,29 +89,27 @@ class JointTargets:
         buffers: Buffers,
         *,
         default_joint_pos_EL: Float[Tensor, "E L"],
+        default_state: DefaultState,
     ) -> None:
         model, num_joints = world.mj_model, default_joint_pos_EL.shape[1]
         self._world, self._resolver = world, resolver
         self.pos_EL = buffers.get("joint_pos_target_EL", num_joints, initial=default_joint_pos_EL)
         self.vel_EL = buffers.get("joint_vel_target_EL", num_joints)
         self.effort_EL = buffers.get("joint_effort_target_EL", num_joints)
+        self._default_joint_pos_EL = default_joint_pos_EL
+        self._default_state = default_state
         self._buffers = {"pos": self.pos_EL, "vel": self.vel_EL, "effort": self.effort_EL}
         self._driven_by_law: dict[int, Collection[TargetKind]] = {}
         self._routes: dict[tuple[TargetKind, tuple[str, ...]], _Route] = {}
 
         joint_of = {joint: number for number, joint in enumerate(scalar_joint_ids(model))}
-        self._actuators: dict[int, list[tuple[int, TargetKind]]] = {}
+        self._actuators: dict[int, list[_Driven]] = {}
         for actuator in range(model.nu):
-            joint = joint_of.get(int(model.actuator_trnid[actuator, 0]))
-            of_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
-            if not of_joint or joint is None:
+            if not drives_scalar_joint(model, actuator):
                 continue
-            kind = control_kind(
-                model.actuator_biastype[actuator],
-                model.actuator_biasprm[actuator],
-                model.actuator_dyntype[actuator],
-            )
-            self._actuators.setdefault(joint, []).append((actuator, kind))
+            joint = joint_of[int(model.actuator_trnid[actuator, 0])]
+            driven = _Driven(actuator, joint_control(model, actuator))
+            self._actuators.setdefault(joint, []).append(driven)
         self._find_servos()
 
     def motor(self, joint: int) -> int:
@@ -105,7 +121,7 @@ class JointTargets:
                 f"joint {name!r} has {len(found)} actuators in the model, but an entry in its robot's `actuators`: "
                 "call `set_actuators(spec, self.actuators)` in the robot's spec()"
             )
-        return found[0][0]
+        return found[0].actuator
 
     def leave_to_law(self, joints: Sequence[int], takes: Collection[TargetKind]) -> None:
         """Keep the targets of these joints away from the controls: a law reads them, and writes those itself."""
@@ -120,7 +136,7 @@ class JointTargets:
             value_EK = torch.clamp(value_EK, route.limits_K2[:, 0], route.limits_K2[:, 1])
         self._buffers[kind][:, route.joints] = value_EK
         if route.ctrl is not None:
-            self._world.ctrl_EL[:, route.ctrl] = value_EK[:, route.columns]
+            self._world.ctrl_EL[:, route.ctrl] = route.line.of(value_EK[:, route.columns])
 
     def limits(self, kind: TargetKind, patterns: Patterns) -> Float[Tensor, "K 2"] | None:
         """Return what targets of joints are clamped to, (low, high); None if nothing limits them."""
@@ -136,22 +152,66 @@ class JointTargets:
                 )
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
-        """Let the position servos of the rows of `mask_E` hold the default pose, until an action says otherwise."""
-        if self._servo_ctrl is None:
-            return
-        ctrl_EL, held_EL = self._world.ctrl_EL, self.pos_EL[:, self._servo_joints]
-        ctrl_EL[:, self._servo_ctrl] = torch.where(mask_E[:, None], held_EL, ctrl_EL[:, self._servo_ctrl])
+        """Let the rows of `mask_E` be asked for what the keyframe's controls say, until an action says otherwise.
+
+        Without a keyframe position servos hold the default pose. They follow a default pose that events have moved.
+        """
+        rows_E1 = mask_E[:, None]
+        for kind, beyond_L in self._asked_beyond.items():
+            target_EL = self._buffers[kind]
+            asked_EL = beyond_L + self._default_joint_pos_EL if kind == "pos" else beyond_L
+            target_EL.copy_(torch.where(rows_E1, asked_EL, target_EL))
+        ctrl_EL = self._world.ctrl_EL
+        if self._start_ctrl_L is not None:
+            ctrl_EL.copy_(torch.where(rows_E1, self._start_ctrl_L, ctrl_EL))
+        if self._servo_ctrl is not None:
+            held_EL = self._servo_line.of(self.pos_EL[:, self._servo_joints])
+            ctrl_EL[:, self._servo_ctrl] = torch.where(rows_E1, held_EL, ctrl_EL[:, self._servo_ctrl])
 
     def _find_servos(self) -> None:
-        servos = [
-            (actuator, joint)
-            for joint, found in self._actuators.items()
-            for actuator, kind in found
-            if kind == "pos" and joint not in self._driven_by_law
-        ]
+        """Find the position servos, which follow the default pose, and what the default state asks for beyond it."""
+        device, start = self._world.device, self._default_state
+        num_joints = self.pos_EL.shape[1]
+        addresses = self._world.mj_model.jnt_qposadr[scalar_joint_ids(self._world.mj_model)]
+        beyond = {kind: np.zeros(num_joints) for kind in self._buffers}
+        servos: list[tuple[int, _Driven]] = []
+        other_ctrl_L = start.ctrl_L.copy()
+        for joint, found in self._actuators.items():
+            if joint in self._driven_by_law:
+                continue
+            for driven in found:
+                if driven.control.refusal:
+                    continue
+                asked = driven.control.target(float(start.ctrl_L[driven.actuator]))
+                if driven.control.kind == "pos":
+                    asked -= float(start.qpos_L[addresses[joint]])
+                    servos.append((joint, driven))
+                    other_ctrl_L[driven.actuator] = 0.0
+                if abs(asked) > ROUNDING:
+                    beyond[driven.control.kind][joint] = asked
+        self._asked_beyond = {
+            kind: torch.tensor(numbers, device=device, dtype=torch.float32)
+            for kind, numbers in beyond.items()
+            if numbers.any()
+        }
+        # What the world's own reset leaves at zero.
+        self._start_ctrl_L = None
+        if other_ctrl_L.any():
+            self._start_ctrl_L = torch.tensor(other_ctrl_L, device=device, dtype=torch.float32)
+        self._servo_ctrl = as_index([driven.actuator for _, driven in servos], device) if servos else None
+        self._servo_joints = as_index([joint for joint, _ in servos], device)
+        self._servo_line = self._line([driven.control for _, driven in servos])
+
+    def _line(self, controls: Sequence[JointControl]) -> _Line:
+        """Return the controls of targets, without what changes nothing."""
+        scale = [control.scale for control in controls]
+        offset = [control.offset for control in controls]
         device = self._world.device
-        self._servo_ctrl = as_index([actuator for actuator, _ in servos], device) if servos else None
-        self._servo_joints = as_index([joint for _, joint in servos], device)
+        is_scaled, is_shifted = any(number != 1.0 for number in scale), any(offset)
+        return _Line(
+            torch.tensor(scale, device=device, dtype=torch.float32) if is_scaled else None,
+            torch.tensor(offset, device=device, dtype=torch.float32) if is_shifted else None,
+        )
 
     def _route_of(self, kind: TargetKind, patterns: Patterns) -> _Route:
         key = (kind, as_patterns(patterns))
@@ -161,17 +221,21 @@ class JointTargets:
 
     def _route(self, kind: TargetKind, patterns: tuple[str, ...]) -> _Route:
         joints = self._resolver.ids("joint", patterns)
-        ctrl, columns = [], []
+        ctrl: list[int] = []
+        columns: list[int] = []
+        controls: list[JointControl] = []
         for column, joint in enumerate(joints):
             if joint in self._driven_by_law:
                 if kind not in self._driven_by_law[joint]:
                     raise self._refusal(kind, joint, self._driven_by_law[joint])
                 continue
             found = self._actuators.get(joint, [])
-            fitting = [actuator for actuator, of_kind in found if of_kind == kind]
+            fitting = [driven for driven in found if driven.control.kind == kind]
             if not fitting:
-                raise self._refusal(kind, joint, {of_kind for _, of_kind in found})
-            ctrl.append(fitting[0])
+                raise self._refusal(kind, joint, {driven.control.kind for driven in found})
+            self._check_meaning(joint, fitting[0])
+            ctrl.append(fitting[0].actuator)
+            controls.append(fitting[0].control)
             columns.append(column)
         model, device = self._world.mj_model, self._world.device
         limits_K2 = None
@@ -184,8 +248,20 @@ class JointTargets:
             joints=self._resolver.index("joint", patterns),
             ctrl=as_index(ctrl, device) if ctrl else None,
             columns=as_index(columns, device),
+            line=self._line(controls),
             limits_K2=limits_K2,
         )
+
+    def _check_meaning(self, joint: int, driven: _Driven) -> None:
+        """Refuse an actuator whose control no target can be turned into, by a ValueError that names both."""
+        if driven.control.refusal:
+            joint_name = self._resolver.names("joint")[joint]
+            name = self._resolver.names("actuator")[driven.actuator] or driven.actuator
+            raise ValueError(
+                f"joint {joint_name!r} is asked for {_WORDS[driven.control.kind]}, but no control of actuator "
+                f"{name!r} means that: {driven.control.refusal}; use ActuatorAction for its control, or give the robot "
+                "another actuator (`actuators`, such as IdealPDActuator)"
+            )
 
     def _refusal(self, kind: TargetKind, joint: int, takes: Collection[TargetKind]) -> ValueError:
         name = self._resolver.names("joint")[joint]

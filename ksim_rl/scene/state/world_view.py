@@ -14,6 +14,7 @@ from ksim_rl.physics import World
 from ksim_rl.scene.motions.motion import ReferenceMotion, load_motion
 from ksim_rl.scene.names import NameResolver, Patterns, as_index, as_patterns, scalar_joint_ids
 from ksim_rl.scene.state.buffers import ActuatorParams
+from ksim_rl.scene.state.default_state import DefaultState
 from ksim_rl.scene.state.elements import Bodies, Body, Joints, JointTables, Site, Sites
 from ksim_rl.scene.state.entity import Entity
 from ksim_rl.scene.state.ground import Ground
@@ -64,14 +65,19 @@ class WorldView:
         slices = (slice(first, first + size) for first, size in places)
         self._sensor_slices = dict(zip(self.resolver.names("sensor"), slices, strict=True))
 
-        pose = model.key_qpos[0] if model.nkey else model.qpos0
-        self.default_qpos_L = torch.tensor(pose, device=self.device, dtype=torch.float32)
+        self.default_state = DefaultState(simulation)
+        self.default_qpos_L = torch.tensor(self.default_state.qpos_L, device=self.device, dtype=torch.float32)
+        self.default_qvel_L = torch.tensor(self.default_state.qvel_L, device=self.device, dtype=torch.float32)
         default_joint_pos_L = self.default_qpos_L[as_index(model.jnt_qposadr[joints].tolist(), self.device)]
         self.default_joint_pos_EL = self.buffers.get(
             "default_joint_pos_EL", self.num_joints, keep=True, initial=default_joint_pos_L
         )
         self.targets = JointTargets(
-            self.world, self.resolver, self.buffers, default_joint_pos_EL=self.default_joint_pos_EL
+            self.world,
+            self.resolver,
+            self.buffers,
+            default_joint_pos_EL=self.default_joint_pos_EL,
+            default_state=self.default_state,
         )
         self.joint_pos_target_EL, self.joint_vel_target_EL = self.targets.pos_EL, self.targets.vel_EL
         self.joint_effort_target_EL = self.targets.effort_EL
@@ -262,6 +268,12 @@ class WorldView:
         return self._simulation.next_keys()
 
     # -- writes --------------------------------------------------------------------------------------------------
+
+    def restore_default(self, mask_E: Bool[Tensor, " E"]) -> None:
+        """Put the rows of `mask_E` into the default state, on a terrain at their envs' origins; not their controls."""
+        self.default_state.restore(mask_E)
+        if not self.terrain.is_flat:
+            self.write_qpos(mask_E, self.at_origins(self.default_qpos_L.expand(self.num_envs, -1)))
 
     def write_qpos(self, mask_E: Bool[Tensor, " E"], qpos_EL: Float[Tensor, "E L"]) -> None:
         """Set all generalized positions, MuJoCo's layout, in the rows of `mask_E`."""

@@ -292,9 +292,11 @@ def test_robots_of_one_scene_have_their_own_entries():
         decimation=1,
     )
     env.reset()
+    knees = env.view.joints(("law/knee", "servo/knee"))
+    law, servo = knees.pos_EL[0].tolist()
     step(env, torch.tensor([[0.5, 0.7]]).expand(E, 2).contiguous())
     forces = env.world.actuator_force_EL[0].tolist()
-    assert forces == pytest.approx([3.0 * 0.7, 3.0 * 0.5])
+    assert forces == pytest.approx([3.0 * (0.7 - law), 3.0 * (0.5 - servo)], rel=1e-5)
 
 
 def test_actuators_go_through_a_config_tree(folder):

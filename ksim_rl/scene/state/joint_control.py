@@ -1,0 +1,131 @@
+"""This module says what the control of a joint's actuator means: the target at the joint that it stands for.
+
+MuJoCo's actuator on a hinge or slide with gear r has length r q, and exerts the effort r (g u + b0 + b1 r q + b2 r q')
+on the joint, with its gain g, its bias (b0, b1, b2), and its control u (behind dynamics: its activation). The control
+that rests at a target is where that effort vanishes.
+"""
+
+from typing import Literal, NamedTuple
+
+import mujoco
+import numpy as np
+
+TargetKind = Literal["pos", "vel", "effort"]
+SMOOTHED = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+"""Dynamics whose activation comes to rest at the control."""
+
+
+class JointControl(NamedTuple):
+    """How an actuator's control follows from the target of its joint: `control = scale * target + offset`.
+
+    `kind` is what the control is a target for, `refusal` why no target can be turned into it, or empty. `stiffness`
+    (N m / rad or N / m) and `damping` (N m s / rad or N s / m) are what the joint feels, behind the gear. An activation
+    that `follows` rests at `activation_scale * position + activation_offset`. Motors have the scale 1: an effort is
+    their control, before gear and gain.
+    """
+
+    kind: TargetKind
+    scale: float = 1.0
+    offset: float = 0.0
+    stiffness: float = 0.0
+    damping: float = 0.0
+    follows: bool = False
+    activation_scale: float = 0.0
+    activation_offset: float = 0.0
+    refusal: str = ""
+
+    def of(self, target: float) -> float:
+        """Return the control for a target, rad, m, or per second."""
+        return self.scale * target + self.offset
+
+    def target(self, control: float) -> float:
+        """Return the target that a control stands for; the inverse of `of`."""
+        return (control - self.offset) / self.scale
+
+
+def joint_control(mj_model: mujoco.MjModel, actuator: int) -> JointControl:
+    """Return what the control of an actuator of a hinge or slide means."""
+    return _control(
+        gear=float(mj_model.actuator_gear[actuator, 0]),
+        gain=(int(mj_model.actuator_gaintype[actuator]), mj_model.actuator_gainprm[actuator]),
+        bias=(int(mj_model.actuator_biastype[actuator]), mj_model.actuator_biasprm[actuator]),
+        dyntype=int(mj_model.actuator_dyntype[actuator]),
+    )
+
+
+def control_of_spec(actuator: mujoco.MjsActuator) -> JointControl:
+    """Return what the control of an actuator means that is not compiled yet."""
+    return _control(
+        gear=float(actuator.gear[0]),
+        gain=(int(actuator.gaintype), np.asarray(actuator.gainprm)),
+        bias=(int(actuator.biastype), np.asarray(actuator.biasprm)),
+        dyntype=int(actuator.dyntype),
+    )
+
+
+def _control(
+    *, gear: float, gain: tuple[int, np.ndarray], bias: tuple[int, np.ndarray], dyntype: int
+) -> JointControl:
+    """Return what a control means; a bias against the position makes a position servo, one against the velocity alone
+    a velocity servo, and an integrator before a position servo makes its control a velocity.
+    """
+    gaintype, gainprm = gain
+    biastype, biasprm = bias
+    is_affine = biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    if not is_affine or (biasprm[1] == 0.0 and biasprm[2] == 0.0):
+        return JointControl("effort", refusal=_no_motor(gaintype, biastype))
+    constant, per_length, per_speed = (float(number) for number in biasprm[:3])
+    force = float(gainprm[0])
+    integrates = dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
+    kind: TargetKind = "pos" if per_length != 0.0 and not integrates else "vel"
+    refusal = _no_servo(gaintype, force, gear, per_length, per_speed, dyntype)
+    if refusal:
+        return JointControl(kind, refusal=refusal)
+    # Zeros without a sign, and products of ones, leave the numbers of plain servos as they are, bit for bit.
+    per_position = per_length * gear / -force + 0.0
+    at_rest = constant / -force + 0.0
+    holds_position = per_length != 0.0
+    return JointControl(
+        kind,
+        scale=per_position if holds_position else per_speed * gear / -force + 0.0,
+        # Behind an integrator the constant moves the activation, and not its speed.
+        offset=0.0 if integrates else at_rest,
+        stiffness=-per_length * gear * gear + 0.0,
+        damping=-per_speed * gear * gear + 0.0,
+        follows=holds_position and dyntype != mujoco.mjtDyn.mjDYN_NONE,
+        activation_scale=per_position,
+        activation_offset=at_rest,
+    )
+
+
+def _no_motor(gaintype: int, biastype: int) -> str:
+    """Return why an actuator is no motor whose control is its effort, or nothing."""
+    plain_gains = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
+    plain_biases = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+    if gaintype in plain_gains and biastype in plain_biases:
+        return ""
+    if gaintype not in plain_gains:
+        named = mujoco.mjtGain(gaintype).name.removeprefix("mjGAIN_")
+    else:
+        named = mujoco.mjtBias(biastype).name.removeprefix("mjBIAS_")
+    return f"its kind is {named.lower()}, whose control is no effort"
+
+
+def _no_servo(
+    gaintype: int, force: float, gear: float, per_length: float, per_speed: float, dyntype: int
+) -> str:
+    """Return why no control of a servo rests at a target, or nothing."""
+    integrates = dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
+    if gaintype != mujoco.mjtGain.mjGAIN_FIXED:
+        return "its gain is not fixed"
+    if force == 0.0 or gear == 0.0:
+        return "its gain or gear is 0"
+    if dyntype not in SMOOTHED and not integrates:
+        return f"its dynamics are {mujoco.mjtDyn(dyntype).name.removeprefix('mjDYN_').lower()}"
+    if per_length > 0.0:
+        return "its bias pushes away from the position"
+    if per_length == 0.0 and integrates:
+        return "it integrates its control into a velocity"
+    if per_length == 0.0 and per_speed > 0.0:
+        return "its bias pushes along the velocity"
+    return ""
