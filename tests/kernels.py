@@ -23,7 +23,7 @@ TESTS = {
     },
     "device/quick_launch.py": {"kernel": EQUAL_WORLDS},
     "device/random.py": {"_launch": "gpu/test_transforms.py::test_draws_are_the_hash_that_they_say_they_are"},
-    "device/running_moments.py": {
+    "ranks/running_moments.py": {
         "_quick": (
             "gpu/test_repeatability.py::"
             "test_moments_of_equal_rows_are_equal_and_those_of_two_passes_in_float64"

@@ -7,10 +7,10 @@ from contextlib import AbstractContextManager, nullcontext
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from ksim_rl.compiled.compiled_step import CompiledStep
-from ksim_rl.compiled.graph_step import GraphStep
+from ksim_rl.collectors.compiled_step import CompiledStep
+from ksim_rl.collectors.graph_step import GraphStep
+from ksim_rl.collectors.step_check import StepCheck
 from ksim_rl.compiled.python_watch import Change, listed
-from ksim_rl.compiled.step_check import StepCheck
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.streams import waiting_allowed
 from ksim_rl.envs.contract import SimulatedWorld, part

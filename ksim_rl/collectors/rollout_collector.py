@@ -18,8 +18,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ksim_rl import dims
 from ksim_rl.checked import Checked, Count
 from ksim_rl.checks import check_count
+from ksim_rl.collectors.compiled_step import CompiledStep
 from ksim_rl.collectors.recording import Policy, Recording
-from ksim_rl.compiled.compiled_step import CompiledStep
 from ksim_rl.device.capture import Captured, eagerly
 from ksim_rl.device.copying import copy_rows
 from ksim_rl.device.state_tree import copy_into

@@ -21,7 +21,7 @@ import warp as wp
 from jaxtyping import Float32, Int, Int64
 from torch import Tensor
 
-from ksim_rl import ranks
+from ksim_rl.device import group
 from ksim_rl.device.quick_launch import QuickLaunch, arguments_of, as_operator, source_of
 
 DRAWS = source_of("ksim_rl.device", "draws")
@@ -58,7 +58,7 @@ def row_keys(
     Two streams (see `stream_id`) never share numbers. The counter has shape [] (all rows at the same count) or [E].
     What is `shared` is drawn alike by all ranks.
     """
-    return RowKeys(seed, stream, counter, num_rows, 0 if shared else ranks.first_row(num_rows))
+    return RowKeys(seed, stream, counter, num_rows, 0 if shared else group.first_row(num_rows))
 
 
 def uniform(

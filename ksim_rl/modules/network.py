@@ -13,9 +13,9 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.device.running_moments import RunningMoments, publish
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 from ksim_rl.modules.upstream import TensorModule
+from ksim_rl.ranks.running_moments import RunningMoments, publish
 
 ObservationKey = str | tuple[str, ...]
 _NestedKey = Annotated[tuple[Name, ...], Filled("expected a name, or a list of names for a nested key")]

@@ -20,9 +20,9 @@ from torchrl.objectives import LossModule
 from ksim_rl import ranks
 from ksim_rl.checked import Share, check_value
 from ksim_rl.checks import check_in_range
-from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.objectives.algorithm_cfg import ValueReduction
 from ksim_rl.objectives.distributional import compare, mean_returns
+from ksim_rl.ranks.running_moments import RunningMoments
 
 
 @contextmanager

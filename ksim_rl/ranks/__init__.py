@@ -4,8 +4,8 @@ All numbers are drawn by an env's place among those of all ranks, means are over
 that was not started so is one of one, for which nothing here does anything.
 """
 
+from ksim_rl.device.group import first_row, rank, size
 from ksim_rl.ranks.draws import exponential, rand, randint, randn
-from ksim_rl.ranks.group import first_row, rank, size
 from ksim_rl.ranks.heartbeat import at
 from ksim_rl.ranks.reduce import any_of, combined, gather, mean_, merged, most_of, sum_
 from ksim_rl.ranks.shards import dealt, gathered, share_of

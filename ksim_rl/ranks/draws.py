@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.ranks.group import first_row, size
+from ksim_rl.device.group import first_row, size
 
 
 def rand(shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped[Tensor, "*shape"]:

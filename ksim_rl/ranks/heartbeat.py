@@ -10,7 +10,7 @@ import time
 from contextlib import suppress
 from typing import Protocol
 
-from ksim_rl.ranks import group
+from ksim_rl.device import group
 from ksim_rl.terminal import show
 
 # Between beats; a rank whose thread is silent for so long is dead or stopped, and one that says to be in the same

@@ -11,7 +11,7 @@ import torch.distributed as dist
 from jaxtyping import Bool, Float, Num, Shaped
 from torch import Tensor
 
-from ksim_rl.ranks.group import size
+from ksim_rl.device.group import size
 
 
 def sum_(tensor: Num[Tensor, "*shape"]) -> None:

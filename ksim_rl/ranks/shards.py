@@ -13,7 +13,7 @@ import torch.distributed as dist
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.ranks.group import rank, size
+from ksim_rl.device.group import rank, size
 
 Tensors = dict[str, Shaped[Tensor, "*?leaf"]]
 # Below it, `ReplayRing` keeps rows in the order of places and, in each place, of envs.

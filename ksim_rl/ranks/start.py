@@ -12,7 +12,8 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from ksim_rl.ranks import group, heartbeat, store
+from ksim_rl.device import group
+from ksim_rl.ranks import heartbeat, store
 
 # What torchrun sets; `python -m torch.distributed.run` is the same.
 VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")

@@ -4,8 +4,8 @@ import time
 
 import torch
 
+from ksim_rl.device.group import rank, size
 from ksim_rl.ranks import heartbeat
-from ksim_rl.ranks.group import rank, size
 
 
 class Timing:

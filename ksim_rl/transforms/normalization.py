@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, Unbounded
 
 from ksim_rl import checks, ranks
-from ksim_rl.device.running_moments import RunningMoments, publish
+from ksim_rl.ranks.running_moments import RunningMoments, publish
 from ksim_rl.transforms import upstream
 from ksim_rl.transforms.row_transform import Keys, RowTransform
 from ksim_rl.transforms.specs import Device

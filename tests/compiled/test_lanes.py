@@ -5,10 +5,10 @@ import re
 import pytest
 import torch
 
+from ksim_rl.collectors.compiled_step import CompiledStep
 from ksim_rl.compiled import lanes, tape
-from ksim_rl.compiled.compiled_step import CompiledStep
 from ksim_rl.device import recording
-from tests.compiled.test_compiled_step import made
+from tests.collectors.test_compiled_step import made
 from tests.compiled.test_tape import CASES, E, floats, whole
 
 NUMBER = 3

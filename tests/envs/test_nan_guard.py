@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from ksim_rl.physics import NanGuardCfg, SimCfg
-from ksim_rl.physics.nan_guard import guard as nan_file
+from ksim_rl.physics.nan_guard import failures as nan_file
 from ksim_rl.physics.nan_guard import replay
 from tests.envs.probe_env import DECIMATION, puck_env, push
 

@@ -46,7 +46,7 @@ OTHERS = {
     "export/sim2sim.py": {"output.read_text"},
     "export/standalone/files.py": {"np.load", "mujoco.MjModel.from_xml_path"},
     "physics/load.py": {"mujoco.MjSpec.from_file"},
-    "physics/nan_guard/guard.py": {"open", "safe_open"},
+    "physics/nan_guard/failures.py": {"open", "safe_open"},
     "runs/csv_table.py": {"open"},
     "runs/record.py": {"processors.read_text"},
     "trainers/checkpoint.py": {"open"},

@@ -9,7 +9,7 @@ import torch
 
 from ksim_rl.envs import CameraSensor, ContactSensor, ImuSensor
 from ksim_rl.physics import Captured, NanGuardCfg, SimCfg
-from ksim_rl.physics.nan_guard import guard as nan_file
+from ksim_rl.physics.nan_guard import failures as nan_file
 from tests.gpu.no_syncs import no_syncs
 from tests.physics import test_nan_guard as sleds
 from tests.scene.sensors.bench import SUBSTEPS, SensorBench

@@ -14,7 +14,7 @@ from ksim_rl.physics import (
     World,
     load_model,
 )
-from ksim_rl.physics.nan_guard import guard as nan_file
+from ksim_rl.physics.nan_guard import failures as nan_file
 from ksim_rl.physics.nan_guard import replay
 
 HISTORY, SUBSTEPS = 5, 4

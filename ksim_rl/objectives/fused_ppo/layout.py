@@ -13,8 +13,8 @@ from jaxtyping import Float, Int32
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from ksim_rl.device.running_moments import RunningMoments
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
+from ksim_rl.ranks.running_moments import RunningMoments
 
 # The smallest dim that a tensor core multiplies.
 MIN_WIDTH = 16

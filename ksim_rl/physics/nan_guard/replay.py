@@ -16,7 +16,7 @@ import numpy as np
 
 from ksim_rl.physics.fields import write_fields
 from ksim_rl.physics.load import caught_warnings
-from ksim_rl.physics.nan_guard.guard import Failure, read
+from ksim_rl.physics.nan_guard.failures import Failure, read
 from ksim_rl.terminal import show
 
 # The C engine sets all controls to zero if one exceeds 1e10 or is not finite.

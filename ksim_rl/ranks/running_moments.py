@@ -7,9 +7,10 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ksim_rl import ranks
 from ksim_rl.checks import check_in_range
+from ksim_rl.device import group
 from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator, source_of
+from ksim_rl.ranks.reduce import merged
 
 # Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows. Short ones hold up
 # little of what else a GPU does. Then those of so many parts are merged, and at last those of all these groups.
@@ -21,7 +22,7 @@ _quick = QuickLaunch(
         (wp.int64, "until"),
         (wp.uint64, "values valid counts moments count mean squares"),
     ),
-    f"constexpr int GROUP = {GROUP};\n" + source_of("ksim_rl.device", "moments"),
+    f"constexpr int GROUP = {GROUP};\n" + source_of("ksim_rl.ranks", "moments"),
 )
 
 
@@ -38,7 +39,7 @@ def _count(
     moments = torch.empty((2 * dim + 1) * (parts + groups) + 1, dtype=torch.float64, device=count.device)
     at = [address(own) for own in (values_NL, valid_N, counts_N, moments, count, mean_L, squares_L)]
     for stage, size in enumerate(((num_rows, dim // span), (parts, dim), (groups, dim), (1, dim))):
-        _quick(count.device, size, stage, num_rows, dim, rows, parts, groups, ranks.size(), span, until, *at)
+        _quick(count.device, size, stage, num_rows, dim, rows, parts, groups, group.size(), span, until, *at)
     count.copy_(moments[-1])
 
 
@@ -120,7 +121,7 @@ def publish(every: Sequence[RunningMoments]) -> None:
         return
     dims = [own.dim for own in every]
     own_L = [(own.count.expand(own.dim), own.exact_mean, own.exact_sum_of_squares) for own in every]
-    count_L, mean_L, squares_L = ranks.merged(*map(torch.cat, zip(*own_L, strict=True)))
+    count_L, mean_L, squares_L = merged(*map(torch.cat, zip(*own_L, strict=True)))
     var_L = torch.where(count_L > 0, squares_L / count_L.clamp_min(1), 1.0)
     torch._foreach_copy_([own.mean for own in every], mean_L.split(dims))
     torch._foreach_copy_([own.var for own in every], var_L.split(dims))

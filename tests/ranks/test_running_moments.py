@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ksim_rl.device.running_moments import RunningMoments, publish
+from ksim_rl.ranks.running_moments import RunningMoments, publish
 
 
 def test_merged_batches_equal_two_passes():

@@ -2,8 +2,8 @@
 
 import torch
 
-from ksim_rl.compiled.graph_step import GraphStep
-from tests.compiled.test_compiled_step import made
+from ksim_rl.collectors.graph_step import GraphStep
+from tests.collectors.test_compiled_step import made
 
 
 def test_making_and_comparing_leave_env_and_root_as_they_were():

@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.compiled.step_check import StepCheck
+from ksim_rl.collectors.step_check import StepCheck
 from ksim_rl.device.capture import Captured
 
 

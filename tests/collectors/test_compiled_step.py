@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from ksim_rl import envs
-from ksim_rl.collectors import CollectorCfg, RolloutCollector
-from ksim_rl.compiled import compiled_step
-from ksim_rl.compiled.compiled_step import CompiledStep
+from ksim_rl.collectors import CollectorCfg, RolloutCollector, compiled_step
+from ksim_rl.collectors.compiled_step import CompiledStep
 from ksim_rl.envs.term import RewardTerm
 from tests.absent_models import skipped_without_models
 from tests.envs.probe_env import puck_cfg

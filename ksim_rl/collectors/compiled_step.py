@@ -9,7 +9,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.compiled.step_check import StepCheck
+from ksim_rl.collectors.step_check import StepCheck
 from ksim_rl.compiled.tape import Tape
 from ksim_rl.device.copying import copy_rows
 from ksim_rl.device.recording import recorded
