@@ -132,6 +132,19 @@ def no_lock(patch):
     patch.setattr(run_lock, "try_lock", lambda file: True)
 
 
+@sabotage("killed_commands")
+def locks_outlive_their_process(patch):
+    @contextlib.contextmanager
+    def locked(folder, note):
+        if (folder / run_lock.LOCK).exists():
+            raise ValueError(f"{folder}: another process writes this run")
+        (folder / run_lock.LOCK).write_text("")
+        yield
+        (folder / run_lock.LOCK).unlink()
+
+    patch.setattr(run_folder, "locked", locked)
+
+
 @sabotage("clock")
 def wall_clock(patch):
     patch.setattr(progress.time, "monotonic", lambda: progress.time.time())
