@@ -31,16 +31,19 @@ class GymnasiumVectorEnv(VectorEnv):
     """
 
     def __init__(self, env: EnvBase, *, keys: Keys = None, tensors: bool = False) -> None:
-        self.env, self.tensors = env, tensors
+        self.env = env
+        self.tensors = tensors
         self._stepper = Stepper(env, keys)
-        self.num_envs, self.render_mode = self._stepper.num_envs, self._stepper.render_mode
+        self.num_envs = self._stepper.num_envs
+        self.render_mode = self._stepper.render_mode
         clock = part(env, EpisodeClock)
         self.metadata = {
             "autoreset_mode": AutoresetMode.SAME_STEP,
             "render_modes": [mode for mode in (self.render_mode,) if mode],
             "render_fps": round(1.0 / clock.step_dt) if clock else 1,
         }
-        dims, spec = self._stepper.batch_dims, env.full_observation_spec
+        dims = self._stepper.batch_dims
+        spec = env.full_observation_spec
         self.single_observation_space = spaces.Dict(
             {name: space_of(spec[key], batch_dims=dims) for name, key in self._stepper.keys.items()}
         )
@@ -57,7 +60,8 @@ class GymnasiumVectorEnv(VectorEnv):
         """
         if options:
             raise ValueError(f"options={options!r}: this env has no reset options; use seed=")
-        seed = seed if seed is None or isinstance(seed, int) else _one_seed(seed, self.num_envs)
+        if not (seed is None or isinstance(seed, int)):
+            seed = _one_seed(seed, self.num_envs)
         super().reset(seed=seed)
         return self._out(self._stepper.reset(seed)), {}
 
@@ -73,7 +77,10 @@ class GymnasiumVectorEnv(VectorEnv):
         elif bool(done_E.any()):
             infos = _final_obs(to_numpy(step.final_obs), done_E.cpu().numpy())
         flags = (step.reward_E, step.terminated_E, step.truncated_E)
-        reward, terminated, truncated = flags if self.tensors else (value.cpu().numpy() for value in flags)
+        if self.tensors:
+            reward, terminated, truncated = flags
+        else:
+            reward, terminated, truncated = (value.cpu().numpy() for value in flags)
         return self._out(step.obs), reward, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:

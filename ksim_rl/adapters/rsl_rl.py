@@ -35,12 +35,16 @@ class RslRlVecEnv(VecEnv):
             )
         if log_interval < 1:
             raise ValueError(f"log_interval={log_interval}: expected at least 1")
-        self.env, self.unwrapped = env, base_env
-        self.num_envs, self.device, self.cfg = base_env.num_envs, base_env.device, base_env.cfg
+        self.env = env
+        self.unwrapped = base_env
+        self.num_envs = base_env.num_envs
+        self.device = base_env.device
+        self.cfg = base_env.cfg
         self.num_actions = int(env.full_action_spec[env.action_key].shape[-1])
         self.max_episode_length = base_env.max_episode_length
         self._stepper = Stepper(env, keys)
-        self._log_interval, self._steps = log_interval, 0
+        self._log_interval = log_interval
+        self._steps = 0
 
     @property
     def episode_length_buf(self) -> Int64[Tensor, " E"]:

@@ -64,7 +64,9 @@ class SkrlWrapper(Wrapper):
     @property
     def state_space(self) -> spaces.Box | None:
         """The space of one row of `state`, if there is any."""
-        return self._joined_space(self._seen) if self._seen else None
+        if self._seen:
+            return self._joined_space(self._seen)
+        return None
 
     @property
     def action_space(self) -> spaces.Space:
@@ -89,7 +91,9 @@ class SkrlWrapper(Wrapper):
 
     def state(self) -> Float[Tensor, "E L"] | None:
         """Return what critics see beside the observations of the last `reset` or `step`."""
-        return self._joined(self._current or self._stepper.reset(), self._seen) if self._seen else None
+        if self._seen:
+            return self._joined(self._current or self._stepper.reset(), self._seen)
+        return None
 
     def render(self, *args: Any, **kwargs: Any) -> np.ndarray | None:
         """Return the picture of the envs that `cfg.viewer` shows, or None without a render mode."""

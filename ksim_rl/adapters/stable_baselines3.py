@@ -35,11 +35,16 @@ class StableBaselines3VecEnv(VecEnv):
 
     def __init__(self, env: EnvBase, *, keys: Keys = None, action_limit: float = 1.0) -> None:
         check_in_range("action_limit", action_limit, low=0.0, low_open=True)
-        self.env, self._stepper = env, Stepper(env, keys)
+        self.env = env
+        self._stepper = Stepper(env, keys)
         self.render_mode = self._stepper.render_mode
-        dims, spec = self._stepper.batch_dims, env.full_observation_spec
+        dims = self._stepper.batch_dims
+        spec = env.full_observation_spec
         boxes = {name: space_of(spec[key], batch_dims=dims) for name, key in self._stepper.keys.items()}
-        self._single = next(iter(boxes)) if len(boxes) == 1 else None
+        if len(boxes) == 1:
+            self._single = next(iter(boxes))
+        else:
+            self._single = None
         action = space_of(self._stepper.action_spec, batch_dims=dims)
         if isinstance(action, spaces.Box):
             low = np.where(np.isfinite(action.low), action.low, -action_limit)
@@ -67,8 +72,10 @@ class StableBaselines3VecEnv(VecEnv):
         """Step all envs."""
         if self._action is None:
             raise RuntimeError("step_wait without actions: call step_async first")
-        step, self._action = self._stepper.step(self._action), None
-        done_E, terminated_E = step.done_E.cpu().numpy(), step.terminated_E.cpu().numpy()
+        step = self._stepper.step(self._action)
+        self._action = None
+        done_E = step.done_E.cpu().numpy()
+        terminated_E = step.terminated_E.cpu().numpy()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done_E.any():
             final = to_numpy(step.final_obs)
@@ -112,4 +119,6 @@ class StableBaselines3VecEnv(VecEnv):
 
     def _out(self, obs: Observations) -> np.ndarray | dict[str, np.ndarray]:
         arrays = to_numpy(obs)
-        return arrays if self._single is None else arrays[self._single]
+        if self._single is None:
+            return arrays
+        return arrays[self._single]

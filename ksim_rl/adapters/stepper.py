@@ -58,7 +58,9 @@ class Stepper:
     def __init__(self, env: EnvBase, keys: Keys = None) -> None:
         if len(env.batch_size) > 1:
             raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E], or none")
-        self.env, self.batch_dims, self._signals = env, env.batch_dims, signal_keys(env)
+        self.env = env
+        self.batch_dims = env.batch_dims
+        self._signals = signal_keys(env)
         self.device = env.device or torch.device("cpu")
         self.keys = _named(env, keys)
         self.num_envs = env.batch_size.numel()
@@ -67,13 +69,17 @@ class Stepper:
                 f"{self._signals.reward!r} has several numbers per row: adapters take one reward each"
             )
         self.pictures = part(env, Pictures)
-        self.render_mode = self.pictures.render_mode if self.pictures else None
+        if self.pictures:
+            self.render_mode = self.pictures.render_mode
+        else:
+            self.render_mode = None
         self._root: TensorDictBase | None = None
         self._out: dict[str, TensorDictBase] = {}
         self.action_spec = env.full_action_spec[env.action_key]
         self._action = self.action_spec.zero()
         self._run = Captured(self._step, device=self.device)
-        self._followed, self._steps = FollowedGraph(env, self._run), 0
+        self._followed = FollowedGraph(env, self._run)
+        self._steps = 0
 
     @property
     def root(self) -> TensorDictBase:
@@ -133,19 +139,24 @@ class Stepper:
             self.env.last_root = root
         keys = self._signals
         reward_E, done_E, terminated_E = (next_E.get(key).flatten().clone() for key in keys[:3])
-        cut_E = (
-            done_E & ~terminated_E if keys.truncated is None else next_E.get(keys.truncated).flatten().clone()
-        )
+        if keys.truncated is None:
+            cut_E = done_E & ~terminated_E
+        else:
+            cut_E = next_E.get(keys.truncated).flatten().clone()
         return Step(self.read(root), self.read(next_E), reward_E.float(), terminated_E, cut_E)
 
     def read(self, tensordict: TensorDictBase) -> Observations:
         """Return copies of the observations by name."""
         leaves = {name: tensordict.get(key).clone() for name, key in self.keys.items()}
-        return leaves if self.batch_dims else {name: leaf.unsqueeze(0) for name, leaf in leaves.items()}
+        if self.batch_dims:
+            return leaves
+        return {name: leaf.unsqueeze(0) for name, leaf in leaves.items()}
 
     def picture(self) -> np.ndarray | None:
         """Return a picture of the envs that `cfg.viewer` shows, or None without a render mode."""
-        return self.pictures.render() if self.pictures else None
+        if self.pictures:
+            return self.pictures.render()
+        return None
 
     def _step(self) -> None:
         assert self._root is not None
@@ -162,7 +173,10 @@ def _named(env: EnvBase, keys: Keys) -> dict[str, NestedKey]:
     if keys is None:
         flat = [key for key in present if isinstance(key, str)]
         keys = flat or present
-    named = dict(keys) if isinstance(keys, Mapping) else {_flat(key): key for key in keys}
+    if isinstance(keys, Mapping):
+        named = dict(keys)
+    else:
+        named = {_flat(key): key for key in keys}
     for key in named.values():
         if key not in present:
             raise ValueError(
@@ -172,4 +186,6 @@ def _named(env: EnvBase, keys: Keys) -> dict[str, NestedKey]:
 
 
 def _flat(key: NestedKey) -> str:
-    return key if isinstance(key, str) else ".".join(map(str, key))
+    if isinstance(key, str):
+        return key
+    return ".".join(map(str, key))

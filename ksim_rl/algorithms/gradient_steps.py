@@ -72,8 +72,11 @@ class RolloutUpdate(ABC):
         device: torch.device | str = "cpu",
         signals: SignalKeys = STANDARD,
     ) -> None:
-        self.device, self.networks, self.signals = torch.device(device), networks, signals
-        self.guard, self._means = StepGuard(device=self.device), StepMeans(logged)
+        self.device = torch.device(device)
+        self.networks = networks
+        self.signals = signals
+        self.guard = StepGuard(device=self.device)
+        self._means = StepMeans(logged)
         self._max_skipped_steps = max_skipped_steps
         self._rollout_ET: TensorDictBase | None = None
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
@@ -97,7 +100,10 @@ class RolloutUpdate(ABC):
         """
         kept = state_tree.join(*state_tree.split(self.state_dict()))
         self._rollout_ET = rollout_ET
-        devices = [self.device] if self.device.type == "cuda" else []
+        if self.device.type == "cuda":
+            devices = [self.device]
+        else:
+            devices = []
         with torch.random.fork_rng(devices), self._watched.watched():
             for work in self._work:
                 for _ in range(work.warmup + 1):
@@ -109,7 +115,8 @@ class RolloutUpdate(ABC):
     def check(self, metrics: Mapping[str, float]) -> None:
         """Raise NonFiniteStepsError where `metrics()`, on the host, say that too many steps in a row were skipped."""
         # Not the guard, which knows only of those since the last step that was made.
-        in_a_row, limit = int(metrics["update/skipped_in_a_row"]), self._max_skipped_steps
+        in_a_row = int(metrics["update/skipped_in_a_row"])
+        limit = self._max_skipped_steps
         if in_a_row >= limit:
             raise NonFiniteStepsError(in_a_row, limit=limit, skipped=int(metrics["update/skipped_steps"]))
 
@@ -166,7 +173,8 @@ class DatasetUpdate(RolloutUpdate):
         **shared: Any,
     ) -> None:
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **shared)
-        self.cfg, self.loss = cfg, loss
+        self.cfg = cfg
+        self.loss = loss
         self.num_env_states = data.num_env_states
         self.optimizer = make_optimizer(cfg, *networks.values())
         self._recurrent = recurrent_modules(*networks.values())
@@ -226,7 +234,8 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> state_tree.State:
 
 def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], *, what: str) -> None:
     """Continue where `optimizer_state` was taken, at the same addresses; a ValueError names what does not fit."""
-    group, parameters = optimizer.param_groups[0], optimizer.param_groups[0]["params"]
+    group = optimizer.param_groups[0]
+    parameters = optimizer.param_groups[0]["params"]
     moments = {int(index): entry for index, entry in state["moments"].items()}
     if set(moments) != set(range(len(parameters))):
         raise ValueError(

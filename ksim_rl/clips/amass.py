@@ -75,7 +75,8 @@ def _read(path: Path) -> tuple[Array, Array, float]:
     if missing or not rate:
         lacks = (missing or [_RATES[0]])[0]
         raise refused(path, f"no array {lacks!r}", f"it has {', '.join(arrays) or 'none'}")
-    poses_FC, root_F3 = arrays["poses"], arrays["trans"]
+    poses_FC = arrays["poses"]
+    root_F3 = arrays["trans"]
     if arrays[rate].size != 1 or any(
         array.dtype.kind not in "fiu" for array in (poses_FC, root_F3, arrays[rate])
     ):

@@ -27,7 +27,8 @@ class _Words:
     """The words of a file, which know their line."""
 
     def __init__(self, path: Path, text: str) -> None:
-        self.path, self.line = path, 0
+        self.path = path
+        self.line = 0
         self._words = self._split(text)
 
     def _split(self, text: str) -> Iterator[str]:
@@ -39,7 +40,10 @@ class _Words:
     def next(self, expected: str = "") -> str:
         word = next(self._words, "")
         if not word or (expected and word.upper() != expected.upper()):
-            said = repr(word) if word else "the end of the file"
+            if word:
+                said = repr(word)
+            else:
+                said = "the end of the file"
             raise self.wrong(f"{said} in place of {expected or 'a word'}")
         return word
 
@@ -67,7 +71,8 @@ def read_bvh(path: Path, *, scale: float = 0.01, y_up: bool = True) -> Recording
         text = read_bytes(path, limit=MOST_TEXT_BYTES, follows_links=True).decode()
     except UnicodeDecodeError:
         raise refused(path, "it is no text", "give a BVH file") from None
-    words, skeleton = _Words(path, text), _Skeleton()
+    words = _Words(path, text)
+    skeleton = _Skeleton()
     words.next("HIERARCHY")
     words.next("ROOT")
     _read_joint(words, skeleton, parent=-1)
@@ -132,7 +137,8 @@ def _turns(skeleton: _Skeleton, table_FC: Array) -> tuple[Array, Array]:
     """Return how each joint turns in its parent's frame, and where the root is; only the root's place may change."""
     turns_FN4 = np.zeros((len(table_FC), len(skeleton.names), 4))
     turns_FN4[..., 0] = 1.0
-    root_F3, column = np.tile(np.array(skeleton.offsets[0]), (len(table_FC), 1)), 0
+    root_F3 = np.tile(np.array(skeleton.offsets[0]), (len(table_FC), 1))
+    column = 0
     for joint, channels in enumerate(skeleton.channels):
         for channel in channels:
             axis = "XYZ".index(channel[0])

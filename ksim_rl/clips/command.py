@@ -34,16 +34,18 @@ def motion(arguments: Sequence[str]) -> int:
     options = _parser().parse_args(arguments)
     model = model_of(options.robot)
     if options.kind == "csv":
-        joints = options.joints.split(",") if options.joints else None
+        if options.joints:
+            joints = options.joints.split(",")
+        else:
+            joints = None
         qpos_FL = read_csv(
             options.source, model, fps=options.source_fps, wanted_fps=options.fps, joints=joints
         )
     else:
-        recording = (
-            read_bvh(options.source, scale=options.unit, y_up=not options.z_up)
-            if options.kind == "bvh"
-            else read_amass(options.source, height=options.height)
-        )
+        if options.kind == "bvh":
+            recording = read_bvh(options.source, scale=options.unit, y_up=not options.z_up)
+        else:
+            recording = read_amass(options.source, height=options.height)
         qpos_FL = retargeted(recording, model, read_retarget(options.pairs), fps=options.fps)
     write_motion(options.motion, model, qpos_FL, options.fps)
     show(f"{options.motion}: {len(qpos_FL)} frames, {(len(qpos_FL) - 1) / options.fps:.2f} s")

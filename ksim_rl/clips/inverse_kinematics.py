@@ -66,10 +66,12 @@ class InverseKinematics:
     """A solver for one model whose first joint may be free; positions stay within the joints' ranges."""
 
     def __init__(self, mj_model: mujoco.MjModel, cfg: SolverCfg | None = None) -> None:
-        self.mj_model, self.mj_data = mj_model, mujoco.MjData(mj_model)
+        self.mj_model = mj_model
+        self.mj_data = mujoco.MjData(mj_model)
         self.cfg = cfg or SolverCfg()
         limited = np.flatnonzero(mj_model.jnt_limited)
-        self._limited_qpos, self._limited_dof = mj_model.jnt_qposadr[limited], mj_model.jnt_dofadr[limited]
+        self._limited_qpos = mj_model.jnt_qposadr[limited]
+        self._limited_dof = mj_model.jnt_dofadr[limited]
         self._low, self._high = mj_model.jnt_range[limited].T
         sites = {mj_model.site(i).name: (i, True) for i in range(mj_model.nsite)}
         bodies = {mj_model.body(i).name: (i, False) for i in range(mj_model.nbody)}
@@ -94,16 +96,21 @@ class InverseKinematics:
         `posture_L` (None: the start) is the qpos that coordinates return to where goals do not say otherwise, with a
         weight per degree of freedom.
         """
-        model, data, cfg = self.mj_model, self.mj_data, self.cfg
+        model = self.mj_model
+        data = self.mj_data
+        cfg = self.cfg
         data.qpos[:] = start_L
-        posture_L = start_L if posture_L is None else posture_L
+        if posture_L is None:
+            posture_L = start_L
         pull_M = np.broadcast_to(np.asarray(posture_weight_M, float) ** 2, model.nv)
-        away_M, step_M = np.zeros(model.nv), np.zeros(model.nv)
+        away_M = np.zeros(model.nv)
+        step_M = np.zeros(model.nv)
         for _ in range(cfg.iterations):
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             rows, errors = zip(*(self._linear(goal) for goal in goals), strict=True)
-            jacobian_NM, error_N = np.concatenate(rows), np.concatenate(errors)
+            jacobian_NM = np.concatenate(rows)
+            error_N = np.concatenate(errors)
             mujoco.mj_differentiatePos(model, away_M, 1.0, data.qpos, posture_L)
             hessian_MM = jacobian_NM.T @ jacobian_NM + np.diag(pull_M + cfg.damping**2)
             gradient_M = jacobian_NM.T @ error_N + pull_M * away_M
@@ -123,14 +130,17 @@ class InverseKinematics:
 
     def _held(self, step_M: Array) -> Array:
         """Return the degrees of freedom that are at an end of their range and would be moved beyond it."""
-        at_L, by_L = self.mj_data.qpos[self._limited_qpos], step_M[self._limited_dof]
+        at_L = self.mj_data.qpos[self._limited_qpos]
+        by_L = step_M[self._limited_dof]
         beyond = ((at_L <= self._low) & (by_L < 0.0)) | ((at_L >= self._high) & (by_L > 0.0))
         return self._limited_dof[beyond]
 
     def _linear(self, goal: PoseGoal | ComGoal) -> tuple[Array, Array]:
         """Return weighted rows of the Jacobian, and the weighted errors that a step should undo."""
-        model, data = self.mj_model, self.mj_data
-        move_3M, turn_3M = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        model = self.mj_model
+        data = self.mj_data
+        move_3M = np.zeros((3, model.nv))
+        turn_3M = np.zeros((3, model.nv))
         if isinstance(goal, ComGoal):
             mujoco.mj_jacSubtreeCom(model, data, move_3M, 0)
             count = len(goal.pos_N)
@@ -139,15 +149,18 @@ class InverseKinematics:
         number, is_site = self._points[goal.name]
         if is_site:
             mujoco.mj_jacSite(model, data, move_3M, turn_3M, number)
-            pos_3, quat_4 = data.site_xpos[number], np.empty(4)
+            pos_3 = data.site_xpos[number]
+            quat_4 = np.empty(4)
             mujoco.mju_mat2Quat(quat_4, data.site_xmat[number])
         else:
             mujoco.mj_jacBody(model, data, move_3M, turn_3M, number)
-            pos_3, quat_4 = data.xpos[number], data.xquat[number]
+            pos_3 = data.xpos[number]
+            quat_4 = data.xquat[number]
         weight_3 = np.broadcast_to(goal.weight, 3)
         away_3 = np.where(weight_3 > 0.0, goal.pos_3 - pos_3, 0.0)
         away_3 = away_3 * min(1.0, self.cfg.reach / max(float(np.linalg.norm(away_3)), 1e-12))
-        rows, errors = weight_3[:, None] * move_3M, weight_3 * away_3
+        rows = weight_3[:, None] * move_3M
+        errors = weight_3 * away_3
         if goal.quat_4 is None:
             return rows, errors
         turn_3 = goal.turn_weight * _turn_between(quat_4, goal.quat_4)
@@ -156,7 +169,9 @@ class InverseKinematics:
 
 def _turn_between(first_4: Array, second_4: Array) -> Array:
     """Return the rotation vector, world frame, rad, that turns one orientation into another."""
-    back_4, between_4, turn_3 = np.empty(4), np.empty(4), np.empty(3)
+    back_4 = np.empty(4)
+    between_4 = np.empty(4)
+    turn_3 = np.empty(3)
     mujoco.mju_negQuat(back_4, first_4)
     mujoco.mju_mulQuat(between_4, second_4, back_4)
     mujoco.mju_quat2Vel(turn_3, between_4, 1.0)

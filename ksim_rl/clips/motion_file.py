@@ -14,9 +14,11 @@ Array = np.ndarray
 
 def velocities(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float) -> Float[Array, "F M"]:
     """Return qvel by central differences, one-sided at the ends; angular velocities come from quaternions."""
-    last, qvel_FM = len(qpos_FL) - 1, np.zeros((len(qpos_FL), mj_model.nv))
+    last = len(qpos_FL) - 1
+    qvel_FM = np.zeros((len(qpos_FL), mj_model.nv))
     for frame in range(len(qpos_FL)):
-        before, after = max(frame - 1, 0), min(frame + 1, last)
+        before = max(frame - 1, 0)
+        after = min(frame + 1, last)
         seconds = (after - before) / fps
         mujoco.mj_differentiatePos(mj_model, qvel_FM[frame], seconds, qpos_FL[before], qpos_FL[after])
     # The angular velocity is of the body frame at the first of the two frames; turn it to the frame's own.
@@ -26,10 +28,13 @@ def velocities(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: floa
 def _turned_to_own_frame(mj_model: mujoco.MjModel, qpos_FL: Array, qvel_FM: Array) -> Array:
     free = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     for joint in free:
-        quat, turn = int(mj_model.jnt_qposadr[joint]) + 3, int(mj_model.jnt_dofadr[joint]) + 3
+        quat = int(mj_model.jnt_qposadr[joint]) + 3
+        turn = int(mj_model.jnt_dofadr[joint]) + 3
         for frame in range(len(qpos_FL)):
-            before_4, own_4 = qpos_FL[max(frame - 1, 0), quat : quat + 4], qpos_FL[frame, quat : quat + 4]
-            world_3, back_4 = np.empty(3), np.empty(4)
+            before_4 = qpos_FL[max(frame - 1, 0), quat : quat + 4]
+            own_4 = qpos_FL[frame, quat : quat + 4]
+            world_3 = np.empty(3)
+            back_4 = np.empty(4)
             mujoco.mju_rotVecQuat(world_3, qvel_FM[frame, turn : turn + 3].copy(), before_4)
             mujoco.mju_negQuat(back_4, own_4)
             mujoco.mju_rotVecQuat(qvel_FM[frame, turn : turn + 3], world_3, back_4)

@@ -48,7 +48,8 @@ def slerp(
 ) -> Float[Array, "*batch 4"]:
     """Return unit quaternions on the shorter arc between two, at an even speed."""
     cosine = (first * second).sum(-1, keepdims=True)
-    second, cosine = np.where(cosine < 0.0, -second, second), np.abs(cosine)
+    second = np.where(cosine < 0.0, -second, second)
+    cosine = np.abs(cosine)
     angle = np.arccos(np.clip(cosine, 0.0, 1.0))
     sine = np.sin(angle)
     is_small = sine < 1e-6
@@ -61,7 +62,10 @@ def slerp(
 
 def multiply(a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
     """Return the Hamilton product of quaternions (w, x, y, z)."""
-    aw, au, bw, bu = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    aw = a[..., :1]
+    au = a[..., 1:]
+    bw = b[..., :1]
+    bu = b[..., 1:]
     scalar = aw * bw - (au * bu).sum(-1, keepdims=True)
     return np.concatenate((scalar, aw * bu + bw * au + np.cross(au, bu)), axis=-1)
 
@@ -89,7 +93,8 @@ def chain(
 
     Parents come before their children; the root's parent is -1, and the root is at `root_F3`.
     """
-    pos_FN3, quat_FN4 = np.zeros((*turns_FN4.shape[:2], 3)), turns_FN4.copy()
+    pos_FN3 = np.zeros((*turns_FN4.shape[:2], 3))
+    quat_FN4 = turns_FN4.copy()
     for joint, parent in enumerate(parents):
         if parent < 0:
             pos_FN3[:, joint] = root_F3
@@ -102,7 +107,9 @@ def chain(
 
 def of_robot(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float) -> Recording:
     """Return where the bodies of a robot are in a motion of it, by the C engine."""
-    data, pos, quat = mujoco.MjData(mj_model), [], []
+    data = mujoco.MjData(mj_model)
+    pos = []
+    quat = []
     for qpos in qpos_FL:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(mj_model, data)

@@ -110,7 +110,10 @@ def _goals(played: Recording, cfg: Retarget, frame: int) -> list[PoseGoal]:
     goals: list[PoseGoal] = []
     for pair in cfg.pairs:
         point = played.names.index(pair.point)
-        quat_4 = multiply(played.quat_FN4[frame, point], np.array(pair.quat)) if pair.turn_weight else None
+        if pair.turn_weight:
+            quat_4 = multiply(played.quat_FN4[frame, point], np.array(pair.quat))
+        else:
+            quat_4 = None
         goals.append(
             PoseGoal(
                 name=pair.to,
@@ -136,14 +139,16 @@ def _facing(rest_L: Array, first: PoseGoal) -> Array:
 
 def _between(mj_model: mujoco.MjModel, from_L: Array, to_L: Array, share_M: Array) -> Array:
     """Return the qpos that lies part of the way from one to another, by a share for each degree of freedom."""
-    way_M, between_L = np.zeros(mj_model.nv), from_L.copy()
+    way_M = np.zeros(mj_model.nv)
+    between_L = from_L.copy()
     mujoco.mj_differentiatePos(mj_model, way_M, 1.0, from_L, to_L)
     mujoco.mj_integratePos(mj_model, between_L, way_M * share_M, 1.0)
     return between_L
 
 
 def _low_height(mj_model: mujoco.MjModel, qpos_FL: Array, soles: Sequence[str]) -> float:
-    data, lowest = mujoco.MjData(mj_model), []
+    data = mujoco.MjData(mj_model)
+    lowest = []
     sites = {mj_model.site(i).name for i in range(mj_model.nsite)}
     for qpos in qpos_FL:
         data.qpos[:] = qpos

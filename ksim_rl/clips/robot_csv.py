@@ -48,7 +48,10 @@ def read_csv(
             f"line {line}, columns 4 to 7: a quaternion of length {norm_F[line - 1]:.3g}",
             "expected unit quaternions (x, y, z, w) behind the root's position",
         )
-    rest_L = mj_model.key_qpos[0] if mj_model.nkey else mj_model.qpos0
+    if mj_model.nkey:
+        rest_L = mj_model.key_qpos[0]
+    else:
+        rest_L = mj_model.qpos0
     qpos_FL = np.tile(rest_L, (len(table_FC), 1))
     qpos_FL[:, :3] = table_FC[:, :3]
     qpos_FL[:, 3:7] = (table_FC[:, 3:7] / norm_F[:, None])[:, [3, 0, 1, 2]]

@@ -94,5 +94,8 @@ class CompiledStep:
     def _refuse(found: list[str]) -> None:
         if found:
             names = ", ".join(found[:3])
-            more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+            if len(found) > 3:
+                more = f" and {len(found) - 3} more"
+            else:
+                more = ""
             raise RuntimeError(f"the compiled step gives another {names}{more} than the env")

@@ -35,20 +35,30 @@ class Recording:
     """
 
     def __init__(self, env: EnvBase, policy: Policy, *, compiles: bool, graph: Captured) -> None:
-        self._env, self._compiles, self._graph = env, compiles, graph
+        self._env = env
+        self._compiles = compiles
+        self._graph = graph
         self._has_graph = graph.device.type == "cuda" and not graph.is_eager
         inner = part(env, ManagerBasedRlEnv)
-        self._by_term = dict if inner is None else inner.values_by_term
+        if inner is None:
+            self._by_term = dict
+        else:
+            self._by_term = inner.values_by_term
         # Other envs cannot be put back to where they were before a comparison.
         self._can_return = part(env, SimulatedWorld) is not None
         # On CUDA the graph of a rollout holds what the policy does in Python, too.
-        others = {"policy": policy} if self._has_graph else {}
+        if self._has_graph:
+            others = {"policy": policy}
+        else:
+            others = {}
         self._python = RecordedPython(env, others, is_compared=compiles or self._can_return)
         self.compiled_step: CompiledStep | None = None
         self._graph_step: GraphStep | None = None
-        self._times, self._waiting = 0, 0
+        self._times = 0
+        self._waiting = 0
         # Since the last recording.
-        self._rollouts, self._agreed_after = 0, 0
+        self._rollouts = 0
+        self._agreed_after = 0
 
     @property
     def wants_kernels(self) -> bool:
@@ -163,7 +173,10 @@ class Recording:
                 warnings.warn(f"they have made the last {suspects} rollouts", RuntimeWarning, stacklevel=4)
                 return
         names = ", ".join(found[:3])
-        more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+        if len(found) > 3:
+            more = f" and {len(found) - 3} more"
+        else:
+            more = ""
         raise FrozenPythonError(
             f"the env's own step gives another {names}{more} than what was recorded of it {self._rollouts} rollouts "
             f"ago, though no Python value has changed that can be seen (it may be in a file or a library): the last "

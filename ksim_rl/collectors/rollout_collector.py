@@ -102,12 +102,17 @@ class RolloutCollector:
         if len(env.batch_size) != 1:
             raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E]")
         cfg = cfg or CollectorCfg()
-        self._clock = part(env, EpisodeClock) if cfg.stagger_episodes else None
+        if cfg.stagger_episodes:
+            self._clock = part(env, EpisodeClock)
+        else:
+            self._clock = None
         if cfg.stagger_episodes and self._clock is None:
             raise ValueError(
                 f"stagger_episodes=True, but {type(env).__name__} has no EpisodeClock: set it to False"
             )
-        self.env, self.policy, self.rollout_length = env, policy, rollout_length
+        self.env = env
+        self.policy = policy
+        self.rollout_length = rollout_length
         self._keys = None if keys is None else list(keys)
         self._root: TensorDict | None = None
         self._transforms: list[Transform] = []  # those that the running episodes have begun with
@@ -280,7 +285,8 @@ class RolloutCollector:
         Who reads rollouts may hold on to their memory, and was made for leaves of these shapes.
         """
         assert self._storage_TE is not None
-        present, wanted = _kinds(self._storage_TE[0]), _kinds(kept_E)
+        present = _kinds(self._storage_TE[0])
+        wanted = _kinds(kept_E)
         for key in present.keys() & wanted.keys():
             if present[key] != wanted[key]:
                 raise ValueError(

@@ -48,7 +48,9 @@ class StepCheck:
         tensordict: TensorDictBase,
         by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
     ) -> None:
-        self._env, self._root_E, self._by_term = env, root_E, by_term
+        self._env = env
+        self._root_E = root_E
+        self._by_term = by_term
         self._root_keys = list(root_E.keys(True, True))
         self._tensordict = tensordict.copy()
         self.given: dict[NestedKey, Tensor] = {}
@@ -130,7 +132,9 @@ class StepCheck:
 
 
 def _nudged(value: Any, generator: torch.Generator) -> Any:
-    return nudged(value, generator) if isinstance(value, Tensor) else value
+    if isinstance(value, Tensor):
+        return nudged(value, generator)
+    return value
 
 
 def _spelled(tree: str, key: NestedKey) -> str:

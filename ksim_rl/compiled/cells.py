@@ -69,7 +69,10 @@ class Cells:
         if tensor.device != self.device:
             return literal(tensor.item(), CTYPES[tensor.dtype])
         indices = ([""] if self.rows else []) + list(place)
-        indices = indices[len(indices) - tensor.ndim :] if tensor.ndim else []
+        if tensor.ndim:
+            indices = indices[len(indices) - tensor.ndim :]
+        else:
+            indices = []
         name, offset, has_all_rows = self.address(tensor)
         terms = [str(offset)] if offset else []
         distance = 0

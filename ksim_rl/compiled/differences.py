@@ -76,9 +76,13 @@ def _error(found: Tensor, true: Tensor, num_rows: int) -> Float[Tensor, " rows"]
 def _scale(true: Tensor) -> Tensor:
     """Return the largest finite number in each column, of a tensor without rows in all of it."""
     sizes = torch.where(true.isfinite(), true.abs(), 0.0)
-    return sizes.amax(0, keepdim=True) if true.ndim > 1 else sizes.amax()
+    if true.ndim > 1:
+        return sizes.amax(0, keepdim=True)
+    return sizes.amax()
 
 
 def _rows(values: Tensor, num_rows: int) -> Tensor:
     has_rows = values.ndim > 0 and values.shape[0] == num_rows
-    return values.reshape(num_rows, -1) if has_rows else values.reshape(1, -1)
+    if has_rows:
+        return values.reshape(num_rows, -1)
+    return values.reshape(1, -1)

@@ -42,12 +42,10 @@ FILES = frozenset({"listdir", "open", "pread", "read", "scandir", "stat", "urand
 _DATES = frozenset({"now", "today", "utcnow"})
 _ENVIRONMENT = type(os.environ).__getitem__.__code__
 
-CLOCK, RANDOM, FILE, ENVIRONMENT = (
-    "a clock",
-    "random numbers of the host",
-    "a file",
-    "an environment variable",
-)
+CLOCK = "a clock"
+RANDOM = "random numbers of the host"
+FILE = "a file"
+ENVIRONMENT = "an environment variable"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +113,10 @@ class _Tracer:
 
     def _begin(self, frame: types.FrameType) -> None:
         code = frame.f_code
-        owner = frame.f_locals.get(code.co_varnames[0]) if code.co_argcount else None
+        if code.co_argcount:
+            owner = frame.f_locals.get(code.co_varnames[0])
+        else:
+            owner = None
         name = self._names.get(id(owner))
         if name is not None:
             # What was drawn before this was drawn by whoever called it.
@@ -128,13 +129,18 @@ class _Tracer:
 
     @property
     def _part(self) -> str:
-        return self._running[-1][1] if self._running else ""
+        if self._running:
+            return self._running[-1][1]
+        return ""
 
     def _look_at_numpy(self, part: str) -> None:
         now = _numpy_state()
         if now != self._numpy:
             self._numpy = now
-            place = _place(self._running[-1][0]) if self._running else "an unknown place"
+            if self._running:
+                place = _place(self._running[-1][0])
+            else:
+                place = "an unknown place"
             self._add(HostCall(what=RANDOM, name="numpy.random", place=place, part=part))
 
     def _take(self, what: str, name: str, frame: types.FrameType | None) -> None:
@@ -167,7 +173,9 @@ def _asked(function: Any) -> str | None:
             return FILE
         return None
     if isinstance(owner, type):
-        return CLOCK if issubclass(owner, datetime.date) and name in _DATES else None
+        if issubclass(owner, datetime.date) and name in _DATES:
+            return CLOCK
+        return None
     # `type`, because `isinstance` would ask proxies that warn when they are looked at.
     kind = type(owner)
     if issubclass(kind, (random.Random, np.random.Generator, np.random.RandomState)):
@@ -181,7 +189,10 @@ def _spelled(function: Any) -> str:
     owner = getattr(function, "__self__", None)
     if isinstance(owner, types.ModuleType):
         return f"{owner.__name__}.{function.__name__}"
-    kind = owner if isinstance(owner, type) else type(owner)
+    if isinstance(owner, type):
+        kind = owner
+    else:
+        kind = type(owner)
     return f"{kind.__name__}.{function.__name__}"
 
 

@@ -31,7 +31,8 @@ DEAL = """
     #endif
 """
 # Every lane has its own, or those of a row share it, or it is one number at each place that a lane is at.
-_LONE, SHARED = "{ctype} {name}[1];", "ARRAY({ctype}, {name}, {size})"
+_LONE = "{ctype} {name}[1];"
+SHARED = "ARRAY({ctype}, {name}, {size})"
 _PRIVATE = "struct {{ {ctype} x; auto& operator[](int) {{ return x; }} }} {name};"
 
 
@@ -122,7 +123,8 @@ def _nest(shape: Sequence[int]) -> str:
 
 
 def _deal(shape: Sequence[int]) -> str:
-    head, rest = f"deal({prod(shape)}, [&](int i, int turn) {{", "i"
+    head = f"deal({prod(shape)}, [&](int i, int turn) {{"
+    rest = "i"
     for k, size in reversed(list(enumerate(shape))):
         head += f" const int i{k} = {f'{rest} % {size}' if k else rest};"
         rest += f" / {size}"
@@ -136,7 +138,10 @@ def _loads(works: Sequence[Work], read: Mapping[str, str]) -> Iterator[str]:
         for _, _, array, text in sorted(work.loop.elements, key=lambda element: -len(element.text)):
             if text not in work.body or not set(re.findall(r"\b(?!row|i\d)[a-z]\w*", text)) <= read.keys():
                 continue
-            shape = work.shape if re.search(r"\bi\d", text) else ()
+            if re.search(r"\bi\d", text):
+                shape = work.shape
+            else:
+                shape = ()
             if (text, shape) not in known:
                 name = known[text, shape] = f"c{len(known)}"
                 yield f"{read[array]} {name}[({prod(shape)} + LANES - 1) / LANES];"

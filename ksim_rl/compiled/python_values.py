@@ -151,7 +151,10 @@ class _Search:
         values = read()
         if (id(owner), what) not in self.found:
             # What reads all of a table gives the table itself.
-            pick = None if values is table else _picking(tuple(values))
+            if values is table:
+                pick = None
+            else:
+                pick = _picking(tuple(values))
             self.found[id(owner), what] = Held(owner, read, spell, [], table, pick)
         self.found[id(owner), what].paths.append(path)
         for key, value in values.items():
@@ -397,7 +400,10 @@ def _names_of_bases(cls: type) -> frozenset[str]:
         if not is_library(package_of(base.__module__)):
             continue
         for value in vars(base).values():
-            function = value.fget if isinstance(value, property) else value
+            if isinstance(value, property):
+                function = value.fget
+            else:
+                function = value
             if inspect.isfunction(function):
                 names |= {*_names_in(function.__code__), *_texts_in(function.__code__)}
     names |= set(vars(nn.Module()))

@@ -38,7 +38,8 @@ class Change:
         where = " and ".join(self.names[:3])
         if len(self.names) > 3:
             where += f" and {len(self.names) - 3} more"
-        before, now = _shown(self.before), _shown(self.now)
+        before = _shown(self.before)
+        now = _shown(self.now)
         if before == now:
             return f"{where} is another object"
         return f"{where} was {before} and is {now}"
@@ -66,10 +67,12 @@ class PythonWatch:
         for remembered in self._held:
             if remembered.is_the_same():
                 continue
-            held, before = remembered.held, remembered.before
+            held = remembered.held
+            before = remembered.before
             now = held.read()
             for key in dict.fromkeys((*before, *now)):
-                old, new = before.get(key, ABSENT), now.get(key, ABSENT)
+                old = before.get(key, ABSENT)
+                new = now.get(key, ABSENT)
                 if _is_same(old, new):
                     continue
                 names = tuple(held.spell(path, key) for path in held.paths)
@@ -89,12 +92,16 @@ class _Remembered:
     @classmethod
     def of(cls, held: Held) -> "_Remembered":
         before = dict(held.read())
-        size = -1 if held.table is None else len(held.table)
+        if held.table is None:
+            size = -1
+        else:
+            size = len(held.table)
         return cls(held, before, list(before.values()), size)
 
     def is_the_same(self) -> bool:
         """Whether each value is the same as before; False also where that takes a closer look."""
-        table, pick = self.held.table, self.held.pick
+        table = self.held.table
+        pick = self.held.pick
         if table is None or len(table) != self.size:
             now = self.held.read()
             # Numbers that are worked out are other objects each time.
@@ -110,7 +117,10 @@ class _Remembered:
 def listed(changes: Iterable[Change], *, most: int = 4) -> str:
     """Return the changes as one text."""
     texts = list(dict.fromkeys(map(str, changes)))
-    more = f"; and {len(texts) - most} more" if len(texts) > most else ""
+    if len(texts) > most:
+        more = f"; and {len(texts) - most} more"
+    else:
+        more = ""
     return "; ".join(texts[:most]) + more
 
 
@@ -129,4 +139,6 @@ def _shown(value: Any) -> str:
     if not issubclass(type(value), (*PLAIN, list, dict, tuple, set)):
         return f"a {type(value).__name__}"
     text = value if value is ABSENT else repr(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    if len(text) <= LONGEST:
+        return text
+    return f"{text[: LONGEST - 3]}..."

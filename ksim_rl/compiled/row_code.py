@@ -133,7 +133,9 @@ PRELUDE = r"""
 
 def write(operation: Operation, cells: Cells) -> None:
     """Write an operation as loops of the cells; a NotARowError where there is no C++ of it."""
-    args, kwargs, outs = operation.args, operation.kwargs, [*operation.made, *operation.written]
+    args = operation.args
+    kwargs = operation.kwargs
+    outs = [*operation.made, *operation.written]
     name = operation.name
     if name.endswith("_") and not name.startswith("_"):
         name = name.removesuffix("_")
@@ -157,7 +159,9 @@ def write(operation: Operation, cells: Cells) -> None:
 
 def _inner(tensor: Tensor, cells: Cells) -> list[int]:
     """Return the shape of a result without its rows."""
-    return list(tensor.shape[1:]) if cells.rows else list(tensor.shape)
+    if cells.rows:
+        return list(tensor.shape[1:])
+    return list(tensor.shape)
 
 
 def _fill(out: Tensor, value: Any, cells: Cells) -> None:
@@ -176,7 +180,10 @@ def _pointwise(
     operands = list(args)
     if name in ("_to_copy", "clone", "nan_to_num", "_unsafe_view", "round"):
         operands = operands[:1]
-    masks = [operands.pop({"where": 0, "masked_fill": 1}[name])] if name in ("where", "masked_fill") else []
+    if name in ("where", "masked_fill"):
+        masks = [operands.pop({"where": 0, "masked_fill": 1}[name])]
+    else:
+        masks = []
     if name == "clamp":
         operands += [kwargs.get("min"), kwargs.get("max")][len(operands) - 1 :]
         expression = {(True, True): "a", (False, True): "high(a, b)", (True, False): "low(a, c)"}.get(
@@ -189,7 +196,10 @@ def _pointwise(
     if name in _TESTS:
         computed = tensors[0].dtype
         for operand in operands[1:]:
-            other = operand.dtype if isinstance(operand, Tensor) else type(operand)
+            if isinstance(operand, Tensor):
+                other = operand.dtype
+            else:
+                other = type(operand)
             if isinstance(operand, Tensor):
                 computed = torch.result_type(tensors[0], operand)
             elif other is float and not computed.is_floating_point:
@@ -201,7 +211,10 @@ def _pointwise(
     for letter, operand in zip("abc", operands, strict=False):
         if operand is None:
             continue
-        value = cells.at(operand, place) if isinstance(operand, Tensor) else literal(operand, ctype)
+        if isinstance(operand, Tensor):
+            value = cells.at(operand, place)
+        else:
+            value = literal(operand, ctype)
         if not isinstance(operand, (Tensor, int, float, bool)):
             raise NotARowError(f"an operand {operand!r}")
         body.append(f"const {ctype} {letter} = ({ctype}){value};")
@@ -241,7 +254,10 @@ def _dims(function: Any, args: Sequence[Any], kwargs: dict[str, Any], ndim: int)
     dims = given.get("dim")
     if given.get("ord", 2) != 2:
         raise NotARowError("another norm")
-    dims = range(ndim) if dims is None or dims == [] else [dims] if isinstance(dims, int) else dims
+    if dims is None or dims == []:
+        dims = range(ndim)
+    elif isinstance(dims, int):
+        dims = [dims]
     return sorted(dim % ndim for dim in dims), bool(given.get("keepdim", False))
 
 
@@ -259,9 +275,18 @@ def _reduce(
     kept = [k for k in range(first, source.ndim) if k not in dims]
     names = dict(zip(kept, names_of(len(kept)), strict=True)) | {k: f"k{k}" for k in dims}
     names = dict(sorted(names.items()))
-    place = ["0" if k in dims else names[k] for k in names] if keeps else [names[k] for k in kept]
-    ctype = "bool" if name in ("any", "all") else CTYPES[out.dtype]
-    element = "bool" if name in ("any", "all") else ctype
+    if keeps:
+        place = ["0" if k in dims else names[k] for k in names]
+    else:
+        place = [names[k] for k in kept]
+    if name in ("any", "all"):
+        ctype = "bool"
+    else:
+        ctype = CTYPES[out.dtype]
+    if name in ("any", "all"):
+        element = "bool"
+    else:
+        element = ctype
     count = math.prod(source.shape[k] for k in dims)
     inner = f"const {element} e = ({element}){cells.at(source, list(names.values()))}; {step};"
     over = " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in dims)
@@ -305,9 +330,11 @@ def _picked(index: Tensor, names: Sequence[str], size: int, cells: Cells) -> str
 def _index(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     source, indices = args[:2]
     dim = _one_index(indices)
-    index, first = indices[dim], int(bool(cells.rows))
+    index = indices[dim]
+    first = int(bool(cells.rows))
     shape = _inner(out, cells)
-    names, at = names_of(len(shape)), dim - first
+    names = names_of(len(shape))
+    at = dim - first
     if dim < first:  # each row picks from a table that all have
         picked = _picked(index, names[: index.ndim - 1], source.shape[0], cells)
         place = [picked, *names[index.ndim - 1 :]]
@@ -328,7 +355,8 @@ def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: 
     if len(args) > 3 and args[3]:
         raise NotARowError("index_put that adds")
     dim = _one_index(indices)
-    index, first = indices[dim], int(bool(cells.rows))
+    index = indices[dim]
+    first = int(bool(cells.rows))
     if dim < first or target is not out:
         raise NotARowError("rows are written")
     at = dim - first
@@ -341,7 +369,8 @@ def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: 
 
 def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     source, dim, index = args[:3]
-    dim, first = dim % source.ndim, int(bool(cells.rows))
+    dim = dim % source.ndim
+    first = int(bool(cells.rows))
     if dim < first:
         raise NotARowError("rows are gathered")
     names = names_of(out.ndim - first)
@@ -382,8 +411,12 @@ def _bmm(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells)
 def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
     seed, stream, counter, _, first_row, n, kind, low, high, start, span = args
     plain = cells.uniform
-    count = cells.at(counter, []) if counter.ndim else plain.at(counter, [])
-    low_, width = literal(low, "float"), f"({literal(high, 'float')} - {literal(low, 'float')})"
+    if counter.ndim:
+        count = cells.at(counter, [])
+    else:
+        count = plain.at(counter, [])
+    low_ = literal(low, "float")
+    width = f"({literal(high, 'float')} - {literal(low, 'float')})"
     value = (f"{low_} + unit(b) * {width}", "normal(b)", f"{start}LL + (long long)((b * {span}ull) >> 32)")[
         kind
     ]

@@ -55,15 +55,19 @@ class _Memory:
                     made.setdefault(_storage(tensor), tensor)
         used = [tensor for one in operations for tensor in (*one.read(), *one.made) if tensor.numel()]
         starts: dict[tuple[int, int], int] = {}
-        start, end = 0, 0
+        start = 0
+        end = 0
         for first, last in sorted({extent(tensor) for tensor in used if _storage(tensor) not in made}):
-            start, end = first if first >= end else start, max(end, last)
+            start = first if first >= end else start
+            end = max(end, last)
             starts[first, last] = start
         return cls(made=made, starts=starts)
 
     def place(self, tensor: Tensor) -> int:
         storage = _storage(tensor)
-        return storage if storage in self.made or not tensor.numel() else self.starts[extent(tensor)]
+        if storage in self.made or not tensor.numel():
+            return storage
+        return self.starts[extent(tensor)]
 
     def width(self, place: int) -> int:
         """Return how many numbers a storage of the recording has."""
@@ -93,7 +97,8 @@ class _Use:
             is_written = place in self.written or place in other.written
             if is_written and len(distances | self.distances.get(place, set())) > 1:
                 return False
-        mine, theirs = self.distances.keys() - self.counted, other.distances.keys() - other.counted
+        mine = self.distances.keys() - self.counted
+        theirs = other.distances.keys() - other.counted
         return self.counted.isdisjoint(theirs) and other.counted.isdisjoint(mine)
 
 
@@ -120,7 +125,8 @@ class Tape:
     def __init__(
         self, recorder: Recorder, *, num_rows: int, returned: Sequence[Shaped[Tensor, "*?shape"]]
     ) -> None:
-        self._num_rows, self._device = num_rows, returned[0].device
+        self._num_rows = num_rows
+        self._device = returned[0].device
         self._memory = _Memory.of([entry for entry in recorder.entries if isinstance(entry, Operation)])
         self.parts: list[Kernel | Operation | Callable[[], None]] = []
         for entry in recorder.entries:
@@ -157,7 +163,10 @@ class Tape:
             self.parts.append(operation)
             return
         fits = isinstance(last, Kernel) and len(last.operations) < MOST_OPERATIONS and last.use.allows(use)
-        kernel = last if isinstance(last, Kernel) and fits else Kernel()
+        if isinstance(last, Kernel) and fits:
+            kernel = last
+        else:
+            kernel = Kernel()
         alone = {place for place in use.written if 0 in use.distances[place]}
         if not alone <= kernel.use.made | use.made:
             self.parts.append(operation)  # each row would write numbers that are there for all
@@ -171,7 +180,8 @@ class Tape:
         """Return how an operation uses memory; a NotARowError where it does not keep to its row."""
         cells = Cells(rows=rows, address=lambda _: ("", 0, True), device=self._device)
         row_code.write(operation, cells)
-        use, counts = _Use(), operation.name in _COUNTS
+        use = _Use()
+        counts = operation.name in _COUNTS
         for tensor, distance, _, _ in (element for loop in cells.loops for element in loop.elements):
             root = self._memory.made.get(_storage(tensor))
             if root is not None and root.dtype != tensor.dtype:
@@ -181,7 +191,12 @@ class Tape:
             use.distances.setdefault(self._memory.place(tensor), set()).add(distance)
         use.made = {self._memory.place(tensor) for tensor in operation.made}
         outs = use.made | {self._memory.place(tensor) for tensor in operation.written}
-        use.counted, use.written = (outs, set()) if counts else (set(), outs)
+        if counts:
+            use.counted = outs
+            use.written = set()
+        else:
+            use.counted = set()
+            use.written = outs
         if rows and any(0 in use.distances[place] for place in use.written):
             raise NotARowError("all rows write the same numbers")
         return use
@@ -190,7 +205,10 @@ class Tape:
         """Return the memory that one kernel alone uses, which need not exist outside of it."""
         users: dict[int, list[object]] = {}
         for part in self.parts:
-            inside = [one for one, _ in part.operations] if isinstance(part, Kernel) else [part]
+            if isinstance(part, Kernel):
+                inside = [one for one, _ in part.operations]
+            else:
+                inside = [part]
             for operation in inside:
                 if isinstance(operation, Operation):
                     for tensor in (*operation.read(), *operation.made):
@@ -206,11 +224,14 @@ class Tape:
 
     def _own_width(self, kernel: Kernel, place: int) -> int:
         """Return how many numbers of a storage a row of a kernel uses; 0 where that cannot be a piece of its own."""
-        width, distances = self._memory.width(place), kernel.use.distances.get(place, {0})
+        width = self._memory.width(place)
+        distances = kernel.use.distances.get(place, {0})
         if distances == {0}:
             return width if width <= MOST_SHARED else 0
         width, rest = divmod(width, self._num_rows)
-        return width if distances == {width} and not rest else 0
+        if distances == {width} and not rest:
+            return width
+        return 0
 
     def _compiled(self, kernel: Kernel) -> tuple[wp.Module, int] | None:
         """Give a kernel its launch, and return what is to be compiled; None where nobody sees what it computes."""
@@ -221,7 +242,8 @@ class Tape:
         ends: list[Loop] = []
 
         def address(tensor: Tensor) -> tuple[str, int, bool]:
-            place, ctype = self._memory.place(tensor), CTYPES[tensor.dtype]
+            place = self._memory.place(tensor)
+            ctype = CTYPES[tensor.dtype]
             is_own = self._own.get(place) is kernel
             is_shared = place in kernel.use.made and kernel.use.distances[place] == {0}
             if place not in names:
@@ -254,7 +276,8 @@ class Tape:
         kinds = schedule(works, own)
         on_chip = sum(one.size * one.bytes for one in own if kinds[one.name] == SHARED)
         lanes = LANES[self._device.type]
-        lanes = lanes if lanes and BLOCK // lanes * on_chip <= MOST_BYTES else 0
+        if not (lanes and BLOCK // lanes * on_chip <= MOST_BYTES):
+            lanes = 0
         read = {name: ctype for name, ctype in pointed.items() if name not in changed}
         # No two of them overlap, so that numbers may be read ahead of what is written, unless by another lane.
         kept = "" if lanes else "__restrict__"

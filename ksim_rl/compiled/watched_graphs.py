@@ -21,7 +21,8 @@ class WatchedGraphs:
     """
 
     def __init__(self, graphs: Sequence[Captured], parts: Mapping[str, Any], device: torch.device) -> None:
-        self._graphs, self._parts = graphs, parts
+        self._graphs = graphs
+        self._parts = parts
         self._watch = PythonWatch(device)
         self._num_ready = self._times = 0
 
@@ -43,7 +44,10 @@ class WatchedGraphs:
         self._times += 1
         self._num_ready = 0
         runs_python = self._times >= MOST_RECORDINGS
-        what = "Python runs from now on, which is SLOWER" if runs_python else "they are recorded anew"
+        if runs_python:
+            what = "Python runs from now on, which is SLOWER"
+        else:
+            what = "they are recorded anew"
         warnings.warn(
             f"{changes} since CUDA graphs were recorded: {what}. What changes often belongs in a tensor that is "
             "written in place",

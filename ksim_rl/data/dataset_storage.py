@@ -108,7 +108,8 @@ class DatasetStorage(TensorStorage):
         stored: dict[Any, Tensor] = dict(self._storage.items(include_nested=True, leaves_only=True))
         del stored[MASK_KEY]
         if stored.keys() != leaves.keys():
-            missing, extra = list(stored.keys() - leaves.keys()), list(leaves.keys() - stored.keys())
+            missing = list(stored.keys() - leaves.keys())
+            extra = list(leaves.keys() - stored.keys())
             raise ValueError(
                 f"the data must have the leaves of the first write: missing {missing}, new {extra}"
             )
@@ -146,7 +147,10 @@ def _finite_rows(leaves_D: Iterable[Tensor]) -> Tensor:
     for leaf_D in leaves_D:
         if leaf_D.is_floating_point():
             leaf_finite_D1 = leaf_D.isfinite().reshape(leaf_D.shape[0], -1).all(1, keepdim=True)
-            finite_D1 = leaf_finite_D1 if finite_D1 is None else finite_D1 & leaf_finite_D1
+            if finite_D1 is None:
+                finite_D1 = leaf_finite_D1
+            else:
+                finite_D1 = finite_D1 & leaf_finite_D1
     if finite_D1 is None:
         raise ValueError("the data has no floating-point leaf: nothing to learn from")
     return finite_D1

@@ -43,8 +43,11 @@ class EpochSampler(Sampler):
         shards: int = 1,
         num_minibatches: int = 1,
     ) -> None:
-        self.seed, self.shuffle, self.drop_last = seed, shuffle, drop_last
-        self.shards, self.num_minibatches = shards, num_minibatches
+        self.seed = seed
+        self.shuffle = shuffle
+        self.drop_last = drop_last
+        self.shards = shards
+        self.num_minibatches = num_minibatches
         self._size = self._position = self._first_epoch = 0
         # Device tensors: epochs started so far, and the order of the present one.
         self._epoch: Tensor | None = None
@@ -64,7 +67,8 @@ class EpochSampler(Sampler):
 
     def restart(self) -> None:
         """Leave the present epoch: the next sample is the first of a new one."""
-        self._position, self.ran_out = 0, False
+        self._position = 0
+        self.ran_out = False
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
         """Return the indices of the next minibatch [B] and an empty info dict."""
@@ -100,7 +104,10 @@ class EpochSampler(Sampler):
         self.ran_out = left <= 0 or (self.drop_last and left < batch_size)
         if self.ran_out:
             self._position = 0
-        self._remaining_batches = left // batch_size if self.drop_last else -(-left // batch_size)
+        if self.drop_last:
+            self._remaining_batches = left // batch_size
+        else:
+            self._remaining_batches = -(-left // batch_size)
         return index
 
     def _orders(self, epochs: Tensor, size: int) -> Tensor:
@@ -118,16 +125,23 @@ class EpochSampler(Sampler):
 
     def state_dict(self) -> dict[str, int]:
         """Return the integers from which the orders continue exactly (reads the epoch counter on the host)."""
-        epoch = self._first_epoch if self._epoch is None else int(self._epoch)
+        if self._epoch is None:
+            epoch = self._first_epoch
+        else:
+            epoch = int(self._epoch)
         return {"seed": self.seed, "epoch": epoch, "size": self._size, "position": self._position}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue where `state_dict` was taken."""
         self.seed = int(state_dict["seed"])
         self._first_epoch = int(state_dict["epoch"])
-        self._size, self._position = int(state_dict["size"]), int(state_dict["position"])
+        self._size = int(state_dict["size"])
+        self._position = int(state_dict["position"])
         self.ran_out = False
-        device = torch.device("cpu") if self._epoch is None else self._epoch.device
+        if self._epoch is None:
+            device = torch.device("cpu")
+        else:
+            device = self._epoch.device
         if self._epoch is not None:
             self._epoch.fill_(self._first_epoch)
         if self._position > 0:
@@ -193,7 +207,9 @@ class SequenceSampler(EpochSampler):
         num_minibatches: int = 1,
     ) -> None:
         super().__init__(seed=seed, shuffle=shuffle, shards=shards, num_minibatches=num_minibatches)
-        self.sequence_length, self.burn_in, self.rollout_length = sequence_length, burn_in, rollout_length
+        self.sequence_length = sequence_length
+        self.burn_in = burn_in
+        self.rollout_length = rollout_length
 
     def begin(self, batch_size_ET: torch.Size, *, batch_size: int) -> None:
         """Take T from a rollout that a storage of one dim takes in, and check the sizes before anything is sampled."""
@@ -209,7 +225,10 @@ class SequenceSampler(EpochSampler):
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
         """Return the indices [S, k + L] of the next minibatch, and the info dict, which is empty without burn-in."""
         size = stored(storage)
-        steps = storage.shape[0] if storage.ndim > 1 else self.rollout_length
+        if storage.ndim > 1:
+            steps = storage.shape[0]
+        else:
+            steps = self.rollout_length
         if steps is None:
             raise ValueError("the storage has one dim: pass rollout_length, the steps of each env in it")
         if size % steps:
@@ -240,7 +259,8 @@ def sequence_length(
     rollout_length: int, length: int | None = None, *, batch_size: int, burn_in: int = 0
 ) -> int:
     """Return L, `length` or T, once it divides rollouts and minibatches and is no shorter than the burn-in."""
-    length = rollout_length if length is None else length
+    if length is None:
+        length = rollout_length
     if rollout_length % length:
         raise ValueError(
             f"sequence_length={length}: rollouts have {rollout_length} steps, which are no whole number of such "

@@ -32,12 +32,15 @@ class ReplaySampler(Stateless, Sampler):
 
     def __init__(self, *, tries: int = 4, shards: int = 1, minibatch: int = 1) -> None:
         check_count("tries", tries)
-        self.tries, self.shards, self.minibatch = tries, shards, minibatch
+        self.tries = tries
+        self.shards = shards
+        self.minibatch = minibatch
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
         """Return indices [B] and an empty info dict."""
         assert isinstance(storage, ReplayStorage)
-        shape, device = (self.tries, batch_size), storage.device
+        shape = (self.tries, batch_size)
+        device = storage.device
         env = ranks.randint(storage.num_envs // self.shards, shape, dim=1, device=device)
         if self.shards > 1:
             first_S = torch.arange(0, storage.num_envs, storage.num_envs // self.shards, device=device)
@@ -80,7 +83,9 @@ class PrioritySampler(SavedByStateDict, Sampler):
         check_in_range("alpha", alpha, low=0.0)
         check_in_range("beta", beta, low=0.0)
         check_in_range("eps", eps, low=0.0, low_open=True)
-        self.alpha, self.beta, self.eps = alpha, beta, eps
+        self.alpha = alpha
+        self.beta = beta
+        self.eps = eps
         self._priority_N = torch.zeros(max_capacity, device=device)
         self._highest = torch.zeros((), device=device)
 
@@ -126,7 +131,10 @@ class PrioritySampler(SavedByStateDict, Sampler):
         # (priority + eps)^alpha of what is stored, and 0 elsewhere.
         score_N = (self._priority_N.to(torch.float64) + self.eps).pow(self.alpha)
         is_ring = isinstance(storage, ReplayStorage)
-        score_N = torch.where(storage.available, score_N, 0.0) if is_ring else score_N[: stored(storage)]
+        if is_ring:
+            score_N = torch.where(storage.available, score_N, 0.0)
+        else:
+            score_N = score_N[: stored(storage)]
         # Whole numbers, whose sum has no order: a GPU adds floats up otherwise each time. One takes up to 2^62 / N.
         unit = score_N.amax().clamp_min(1e-300) * (score_N.shape[0] / 2.0**62)
         upto_N = (score_N / unit).to(torch.int64).cumsum(0)
@@ -253,7 +261,8 @@ class ReplayRing(ReplayBuffer):
         With priorities they have "priority_weight" and "index", and each is drawn when it is asked for, by the
         priorities of that moment.
         """
-        read, size = read or self._ring.get, self.cfg.num_env_states_per_minibatch
+        read = read or self._ring.get
+        size = self.cfg.num_env_states_per_minibatch
         if not self.cfg.prioritized:
             # One gather for all minibatches: a fraction of the kernels.
             index, _ = self.sampler.sample(self._ring, count * size)

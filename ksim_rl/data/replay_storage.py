@@ -63,7 +63,9 @@ class ReplayStorage(SavedByStateDict, Storage):
     ) -> None:
         self.places = capacity + 1
         super().__init__(self.places * num_envs)
-        self.num_envs, self.n_step, self.gamma = num_envs, n_step, gamma
+        self.num_envs = num_envs
+        self.n_step = n_step
+        self.gamma = gamma
         self.device = torch.device(device)
         self.observations = list(observations)
         self.content: TensorDict | None = None
@@ -184,7 +186,10 @@ class ReplayStorage(SavedByStateDict, Storage):
 
     @torch.no_grad()
     def _empty(self) -> None:
-        content: Any = () if self.content is None else self.content.values(True, True)
+        if self.content is None:
+            content: Any = ()
+        else:
+            content = self.content.values(True, True)
         for tensor in (self.available, self.head_E, self.filled_E, *content):
             tensor.zero_()
 
@@ -230,7 +235,9 @@ class ReplayStorage(SavedByStateDict, Storage):
         """Return the sum of rewards, done, terminated and the number of steps until what follows, each [B]."""
         assert self.content is not None
         rewards, dones, ends = (self.content.get(key).reshape(-1) for key in _LEAVES)
-        reward_B, done_B, terminated_B = rewards[start_B], dones[start_B], ends[start_B]
+        reward_B = rewards[start_B]
+        done_B = dones[start_B]
+        terminated_B = ends[start_B]
         steps_B = torch.ones_like(start_B)
         going_B = self.available[start_B] & ~done_B
         for step in range(1, self.n_step):

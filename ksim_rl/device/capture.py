@@ -141,7 +141,10 @@ class Captured:
             self.device, require_graphs=require_graphs
         )
         # One for all: temporaries belong to the stream that they were made on.
-        self._stream = None if self._eager_for_ever else _capture_stream(self.device)
+        if self._eager_for_ever:
+            self._stream = None
+        else:
+            self._stream = _capture_stream(self.device)
 
     @property
     def ready(self) -> bool:
@@ -187,7 +190,8 @@ class Captured:
         # What the eager calls took: graphs have a pool of their own, and would take it again.
         upstream.free_cublas_workspaces()
         torch.cuda.empty_cache()
-        graph, others = torch.cuda.CUDAGraph(), _graphs.setdefault(self.device, WeakSet())
+        graph = torch.cuda.CUDAGraph()
+        others = _graphs.setdefault(self.device, WeakSet())
         pool = next((other.pool() for other in others), None)
         with (
             no_collection(),
@@ -230,7 +234,10 @@ class WarpGraphs:
         self._warm: set[Hashable] = set()
         self._joined: list[wp.Graph | None] = []
         # The default stream cannot record, so graphs are recorded on a stream of our own and launched on any.
-        self._stream = wp.Stream(warp_device(device)) if device.type == "cuda" else None
+        if device.type == "cuda":
+            self._stream = wp.Stream(warp_device(device))
+        else:
+            self._stream = None
 
     def run(self, key: Hashable, launches: Callable[[], None], *, live: bool = False) -> None:
         """Run `launches`, in order with torch's current stream. `key` names what it does.
@@ -250,7 +257,10 @@ class WarpGraphs:
                     launches()
                     return
                 self._graphs[key] = self._record(launches)
-            stream = None if self._stream is None else warp_stream(torch.cuda.current_stream(self.device))
+            if self._stream is None:
+                stream = None
+            else:
+                stream = warp_stream(torch.cuda.current_stream(self.device))
             wp.capture_launch(self._graphs[key], stream=stream)
 
     def clear(self) -> None:

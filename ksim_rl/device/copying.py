@@ -32,7 +32,10 @@ def copy_rows(
             size = own.element_size()
             sizes = own[0].nbytes, own.stride(0) * size, new.stride(0) * size
             pair = own.data_ptr(), new.data_ptr()
-            unit = 1 if any(number % 4 for number in (*sizes, *pair)) else 4
+            if any(number % 4 for number in (*sizes, *pair)):
+                unit = 1
+            else:
+                unit = 4
             addresses += pair
             width, stride, stride_of_new = (number // unit for number in sizes)
             layouts.append((unit, width, stride, stride_of_new))
@@ -45,7 +48,8 @@ def _launcher(layouts: tuple[tuple[int, int, int, int], ...]) -> QuickLaunch:
     """Return the copy of tensors, each in units of so many bytes: of a row, and from row to row in both."""
     lines = [f"constexpr int LANES = {LANES};", _COPY]
     for place, (unit, *sizes) in enumerate(layouts):
-        kind, numbers = "int" if unit == 4 else "char", ", ".join(map(str, sizes))
+        kind = "int" if unit == 4 else "char"
+        numbers = ", ".join(map(str, sizes))
         lines.append(f"copy(({kind}*)a.to_{place}, (const {kind}*)a.from_{place}, {numbers});")
     fields = " ".join(f"to_{place} from_{place}" for place in range(len(layouts)))
     return QuickLaunch(arguments_of((wp.uint64, fields)), "\n".join(lines))

@@ -5,12 +5,16 @@ import torch.distributed as dist
 
 def size() -> int:
     """Return how many ranks train together."""
-    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+    if dist.is_available() and dist.is_initialized():
+        return dist.get_world_size()
+    return 1
 
 
 def rank() -> int:
     """Return which of the ranks this process is, from 0 on."""
-    return dist.get_rank() if dist.is_available() and dist.is_initialized() else 0
+    if dist.is_available() and dist.is_initialized():
+        return dist.get_rank()
+    return 0
 
 
 def first_row(num_rows: int) -> int:

@@ -50,7 +50,8 @@ class CompileLogger:
             return
         now = time.monotonic()
         if now - self.last_time > BURST_GAP_S:
-            self.count, self.seconds = 0, 0.0
+            self.count = 0
+            self.seconds = 0.0
         self.last_time = now
         self.count += 1
         self.seconds += float(match["ms"]) / 1000.0
@@ -84,7 +85,8 @@ if upstream.has_default_logger():  # one that the program set itself stays
 @contextmanager
 def compile_notice(hook: CompileHook) -> Iterator[None]:
     """Call `hook` with one line of text after each kernel module that Warp compiles in this block, counted from 1."""
-    saved, _logger.hook = _logger.hook, hook
+    saved = _logger.hook
+    _logger.hook = hook
     _logger.last_time = -BURST_GAP_S
     try:
         yield
@@ -102,7 +104,10 @@ def loaded_together(device: torch.device) -> Iterator[None]:
     found: dict[tuple[wp.Kernel, int | None], None] = {}
 
     def note(kernel: wp.Kernel, dim: Any, block_dim: int | None) -> None:
-        size = dim if isinstance(dim, (tuple, list)) else (dim,)
+        if isinstance(dim, (tuple, list)):
+            size = dim
+        else:
+            size = (dim,)
         if all(size) and not kernel.is_generic:
             found[kernel, None if device.type == "cpu" else block_dim] = None
 
@@ -116,6 +121,7 @@ def loaded_together(device: torch.device) -> Iterator[None]:
 
 def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) -> None:
     """Compile and load modules, side by side, for launches of the block sizes beside them; of any on the CPU."""
-    of_cpu, load_one = device.type == "cpu", partial(wp.force_load, warp_device(device), max_workers=0)
+    of_cpu = device.type == "cpu"
+    load_one = partial(wp.force_load, warp_device(device), max_workers=0)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
         list(pool.map(lambda found: load_one([found[0]], None if of_cpu else found[1]), modules))

@@ -38,17 +38,24 @@ def memory_for(
         asked = refused_bytes(error) or refused_bytes(error.__cause__)
         if asked is None:
             raise
-        taken = 0 if free is None else max(0, free - (free_bytes(device) or 0))
+        if free is None:
+            taken = 0
+        else:
+            taken = max(0, free - (free_bytes(device) or 0))
         per_env = max(1, (taken + asked) // num_envs)
         if isinstance(error, TooManyEnvsError):  # raised nearer to it, before anything was given back
             per_env = max(per_env, error.per_env)
-        most, fits = num_envs, ""
+        most = num_envs
+        fits = ""
         if free is not None:
             most = free // per_env
             fits = f" of {free / 1e9:.1f} GB that were free: at most {most} fit"
         _give_back(error, device)
         halves = [num_envs >> times for times in range(1, num_envs.bit_length())]
-        found = first_that_fits(half for half in halves if half <= most) if first_that_fits else None
+        if first_that_fits:
+            found = first_that_fits(half for half in halves if half <= most)
+        else:
+            found = None
         if found is not None:
             fits += f"; num_envs={found} was tried and fits"
         raise TooManyEnvsError(
@@ -83,4 +90,6 @@ def refused_bytes(error: BaseException | None) -> int | None:
 
 def free_bytes(device: torch.device) -> int | None:
     """Return how much of a GPU's memory is free; None of a CPU."""
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else None
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    return None

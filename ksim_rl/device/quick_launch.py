@@ -61,7 +61,9 @@ class QuickLaunch:
             index_0, index_1 = wp.tid()
             run(index_0, index_1, a)
 
-        self._kernel, self._arguments, self._block_dim = kernel, arguments, block_dim
+        self._kernel = kernel
+        self._arguments = arguments
+        self._block_dim = block_dim
         self.loadable: tuple[wp.Module, int] = kernel.module, block_dim  # what is compiled, for which blocks
         self._recorded: dict[tuple[torch.device, tuple[int, int]], tuple[wp.Launch, ctypes.Structure]] = {}
         self._packer = struct.Struct("")
@@ -75,9 +77,11 @@ class QuickLaunch:
             return
         assert not recording.is_recording(), "a kernel that is no operator of torch cannot be recorded"
         if device.type == "cpu":
-            lock, stream = CPU_LOCK, None
+            lock = CPU_LOCK
+            stream = None
         else:
-            lock, stream = self._lock, current_warp_stream(device)
+            lock = self._lock
+            stream = current_warp_stream(device)
         with lock:
             launch, packed = self._recorded.get((device, dim)) or self._record(device, dim)
             self._packer.pack_into(packed, 0, *values)

@@ -128,15 +128,27 @@ def _draw_now(
     start: int,
     span: int,
 ) -> Tensor:
-    counts = counter.numel() if kind == _ORDER else num_rows
-    stride = num_rows // counts if kind == _ORDER else counter.ndim
+    if kind == _ORDER:
+        counts = counter.numel()
+    else:
+        counts = num_rows
+    if kind == _ORDER:
+        stride = num_rows // counts
+    else:
+        stride = counter.ndim
     if seed.dtype != torch.int64 or counter.dtype != torch.int64 or counter.shape not in ((), (counts,)):
         raise ValueError(
             f"seed is {seed.dtype}, counter is {counter.dtype} of shape {tuple(counter.shape)}: expected torch.int64, "
             f"and a counter of shape () or ({counts},)"
         )
-    out_EL, counter = _empty(seed, num_rows, n, kind), counter.contiguous()
-    rows, columns = (num_rows, n) if seed.device.type == "cpu" else (1, 1)
+    out_EL = _empty(seed, num_rows, n, kind)
+    counter = counter.contiguous()
+    if seed.device.type == "cpu":
+        rows = num_rows
+        columns = n
+    else:
+        rows = 1
+        columns = 1
     dim = (num_rows // max(rows, 1), n // max(columns, 1))
     layout = rows, columns, n, kind, low, high, start, span, stream, stride, first_row
     _launch(seed.device, dim, *layout, seed.data_ptr(), counter.data_ptr(), out_EL.data_ptr())

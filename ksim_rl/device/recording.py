@@ -35,7 +35,9 @@ def is_recording() -> bool:
 def paused() -> AbstractContextManager[None]:
     """Write nothing down in this block, if this thread writes down anything at all."""
     recorder = _recording.recorder
-    return nullcontext() if recorder is None else recorder.paused()
+    if recorder is None:
+        return nullcontext()
+    return recorder.paused()
 
 
 def launched(launch: Callable[[], None]) -> bool:
@@ -137,7 +139,10 @@ def written_by(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list
     written: list[Tensor] = []
     for place, argument in enumerate(func._schema.arguments):
         if argument.alias_info is not None and argument.alias_info.is_write:
-            given = args[place] if place < len(args) else kwargs.get(argument.name)
+            if place < len(args):
+                given = args[place]
+            else:
+                given = kwargs.get(argument.name)
             written += _tensors(given)
     return written
 

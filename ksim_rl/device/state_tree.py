@@ -64,7 +64,8 @@ def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: Mapping[str, 
         if name not in live:
             raise ValueError(f"{what}: the checkpoint's {name!r} is unknown to this run")
     for name, tensor in live.items():  # in the order of the layers, which a file does not keep
-        have, want = _describe(saved[name]), _describe(tensor)
+        have = _describe(saved[name])
+        want = _describe(tensor)
         # The zoo keeps matrices as float16, and each of these numbers is one of float32.
         if have not in (want, want.replace("float32", "float16")):
             raise ValueError(f"{what}: {name!r} is {have} in the checkpoint and {want} in this run")

@@ -68,7 +68,10 @@ def checked_device(device: str | torch.device) -> torch.device:
             f"device={device!r}: no CUDA device is available to torch and Warp; use device='cpu', or install an "
             "NVIDIA driver and a CUDA build of torch"
         )
-    index = torch.cuda.current_device() if checked.index is None else checked.index
+    if checked.index is None:
+        index = torch.cuda.current_device()
+    else:
+        index = checked.index
     if index >= torch.cuda.device_count():
         raise ValueError(f"device={device!r}: this machine has {torch.cuda.device_count()} CUDA devices")
     return torch.device("cuda", index)

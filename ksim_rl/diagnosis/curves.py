@@ -53,7 +53,10 @@ class Curves:
         """Return a number of the config by dotted path, or the default where there is none."""
         value: Any = self.config
         for name in path.split("."):
-            value = value.get(name) if isinstance(value, Mapping) else None
+            if isinstance(value, Mapping):
+                value = value.get(name)
+            else:
+                value = None
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         return float(value) if is_number else default
 
@@ -63,7 +66,9 @@ class Curves:
 
 
 def _median(values: Sequence[float]) -> float | None:
-    return statistics.median(values) if len(values) >= 3 else None
+    if len(values) >= 3:
+        return statistics.median(values)
+    return None
 
 
 def read_run(folder: Path) -> Curves:
@@ -77,7 +82,10 @@ def read_run(folder: Path) -> Curves:
         raise ValueError(
             f"{folder}: there is no {METRICS}: name the folder of a run whose logger wrote one (logger.csv=true)"
         )
-    config = plain_data.read_yaml(found / CONFIG) if (found / CONFIG).is_file() else {}
+    if (found / CONFIG).is_file():
+        config = plain_data.read_yaml(found / CONFIG)
+    else:
+        config = {}
     return Curves(columns=_columns(found / METRICS), config=config if isinstance(config, Mapping) else {})
 
 

@@ -90,7 +90,10 @@ def _look_at_caches(report: Report) -> bool:
     """Report the caches, and return whether Warp starts, which makes its own at once."""
     home = os.environ.get("HOME")
     if not home or not os.access(home, os.W_OK):
-        stands = "is not set" if not home else f"is {home}, where nothing can be written"
+        if not home:
+            stands = "is not set"
+        else:
+            stands = f"is {home}, where nothing can be written"
         report.say("HOME", f"{stands}: set it to a folder of yours, where caches are kept", wrong=True)
     wrong = None
     try:
@@ -159,25 +162,24 @@ def _look_at_gpus(report: Report) -> None:
     for device in gpus:
         about = torch.cuda.get_device_properties(device)
         free, total = torch.cuda.mem_get_info(device)
-        driver, needs = wp.get_cuda_driver_version(), "needs a driver for CUDA 12.4 or newer"
+        driver = wp.get_cuda_driver_version()
+        needs = "needs a driver for CUDA 12.4 or newer"
         report.say(
             f"GPU {device.index}",
             f"{about.name}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free, driver for CUDA {driver}, torch "
             f"for CUDA {torch.version.cuda}",
         )
         pool = wp.is_mempool_enabled(warp_device(device))
-        text = (
-            "available"
-            if pool
-            else "unavailable, and training about 13 times slower: Warp's memory pool is off"
-        )
+        if pool:
+            text = "available"
+        else:
+            text = "unavailable, and training about 13 times slower: Warp's memory pool is off"
         report.say(f"graphs on GPU {device.index}", text, wrong=not pool)
         loops = wp.is_conditional_graph_supported()
-        text = (
-            "available"
-            if loops
-            else f"unavailable, and physics slower: the graph's conditional nodes {needs}"
-        )
+        if loops:
+            text = "available"
+        else:
+            text = f"unavailable, and physics slower: the graph's conditional nodes {needs}"
         report.say(f"loops in graphs on GPU {device.index}", text, wrong=not loops)
 
 
@@ -190,7 +192,10 @@ def _look_at_opengl(report: Report) -> None:
         return
     try:
         tried = run_python(["-c", _DRAWS], environment={"MUJOCO_GL": platform}, seconds=_DRAW_SECONDS)
-        said = "" if tried.returncode == 0 else (tried.stderr.strip().splitlines() or ["failed"])[-1]
+        if tried.returncode == 0:
+            said = ""
+        else:
+            said = (tried.stderr.strip().splitlines() or ["failed"])[-1]
     except TimeoutExpired:
         said = f"no answer in {_DRAW_SECONDS} s"
     if not said:
@@ -226,4 +231,6 @@ def _user() -> str:
 def _without_user(text: str) -> str:
     home = os.path.expanduser("~")
     text = " ".join(text.split())
-    return text.replace(home, "~") if len(home) > 1 else text
+    if len(home) > 1:
+        return text.replace(home, "~")
+    return text

@@ -23,7 +23,9 @@ def std_at_floor(curves: Curves) -> str | None:
     std = curves.late("policy/std")
     floor = max(MIN_STD, math.exp(curves.setting("modules.actor.log_std_min", -math.inf)))
     # Three times the bound, since it is a mean over actions, some of which may lie above.
-    return f"policy/std is {std:.2g}, and its bound {floor:.2g}" if _below(std, 3.0 * floor) else None
+    if _below(std, 3.0 * floor):
+        return f"policy/std is {std:.2g}, and its bound {floor:.2g}"
+    return None
 
 
 def entropy_collapsed(curves: Curves) -> str | None:
@@ -32,8 +34,12 @@ def entropy_collapsed(curves: Curves) -> str | None:
     Raise objective.entropy_coeff, or lower objective.learning_rate or objective.desired_kl.
     """
     # The entropy of densities has no zero to compare with, but their std has; that of choices is never negative.
-    name = "policy/std" if curves.values("policy/std") else "loss/entropy"
-    first, last = curves.early(name), curves.late(name)
+    if curves.values("policy/std"):
+        name = "policy/std"
+    else:
+        name = "loss/entropy"
+    first = curves.early(name)
+    last = curves.late(name)
     if first is None or last is None or first <= 0.0 or not 0.0 <= last <= 0.1 * first:
         return None
     return f"{name} fell from {first:.3g} to {last:.2g}"
@@ -67,7 +73,9 @@ def negative_explained_variance(curves: Curves) -> str | None:
     modules.critic.output_gain, or lower objective.gamma.
     """
     share = curves.late("update/explained_variance")
-    return f"update/explained_variance is {share:.2g}" if _below(share, -0.2) else None
+    if _below(share, -0.2):
+        return f"update/explained_variance is {share:.2g}"
+    return None
 
 
 def kl_far_off(curves: Curves) -> str | None:
@@ -76,8 +84,11 @@ def kl_far_off(curves: Curves) -> str | None:
     Use objective.schedule=adaptive, lower objective.learning_rate (and objective.learning_rate_min), or raise the size
     of a minibatch.
     """
-    kl, desired = curves.late("update/kl"), curves.setting("objective.desired_kl", 0.01)
-    return f"update/kl is {kl:.2g} nats, {desired:.2g} desired" if _above(kl, 10.0 * desired) else None
+    kl = curves.late("update/kl")
+    desired = curves.setting("objective.desired_kl", 0.01)
+    if _above(kl, 10.0 * desired):
+        return f"update/kl is {kl:.2g} nats, {desired:.2g} desired"
+    return None
 
 
 def most_ratios_clipped(curves: Curves) -> str | None:
@@ -86,7 +97,9 @@ def most_ratios_clipped(curves: Curves) -> str | None:
     Raise objective.clip_epsilon (0.2 is usual), or lower objective.num_epochs or objective.learning_rate.
     """
     share = curves.late("update/clip_fraction")
-    return f"update/clip_fraction is {share:.0%}" if _above(share, 0.5) else None
+    if _above(share, 0.5):
+        return f"update/clip_fraction is {share:.0%}"
+    return None
 
 
 def episodes_end_at_once(curves: Curves) -> str | None:
@@ -99,7 +112,10 @@ def episodes_end_at_once(curves: Curves) -> str | None:
         return None
     ends = {name: curves.late(name) or 0.0 for name in curves.names("termination")}
     worst = max(ends, key=lambda name: ends[name], default=None)
-    cause = "" if worst is None else f"; {ends[worst]:.0%} by {worst.removeprefix('termination/')}"
+    if worst is None:
+        cause = ""
+    else:
+        cause = f"; {ends[worst]:.0%} by {worst.removeprefix('termination/')}"
     return f"episode/length is {length:.2g} steps{cause}"
 
 
@@ -123,7 +139,9 @@ def saturated_actions(curves: Curves) -> str | None:
     modules.actor.distribution=tanh_gaussian.
     """
     share = curves.last("rollout/saturated_actions")
-    return f"rollout/saturated_actions is {share:.0%}" if _above(share, 0.95) else None
+    if _above(share, 0.95):
+        return f"rollout/saturated_actions is {share:.0%}"
+    return None
 
 
 def dead_units(curves: Curves) -> str | None:
@@ -133,7 +151,9 @@ def dead_units(curves: Curves) -> str | None:
     observations (obs_normalization=true).
     """
     share = curves.last("policy/dead_units")
-    return f"policy/dead_units is {share:.0%}" if _above(share, 0.5) else None
+    if _above(share, 0.5):
+        return f"policy/dead_units is {share:.0%}"
+    return None
 
 
 def stale_normalizer(curves: Curves) -> str | None:
@@ -144,7 +164,9 @@ def stale_normalizer(curves: Curves) -> str | None:
     """
     size = curves.last("policy/observation_rms")
     off = size is not None and not 0.2 < size < 4.0
-    return f"policy/observation_rms is {size:.2g}" if off else None
+    if off:
+        return f"policy/observation_rms is {size:.2g}"
+    return None
 
 
 FAULTS: tuple[Fault, ...] = (

@@ -63,10 +63,15 @@ def _heard(network: nn.Module, ranges: list[Tensor], squares: list[Tensor]) -> E
     def note_square(_module: nn.Module, _inputs: Any, output: Tensor) -> None:
         squares.append(output.square().mean())
 
-    stack, kinds = ExitStack(), tuple(ACTIVATIONS.values())
+    stack = ExitStack()
+    kinds = tuple(ACTIVATIONS.values())
     for module in network.modules():
-        hook: Callable[..., None] | None = note_range if isinstance(module, kinds) else None
-        hook = note_square if isinstance(module, ObservationNormalizer) else hook
+        if isinstance(module, kinds):
+            hook: Callable[..., None] | None = note_range
+        else:
+            hook = None
+        if isinstance(module, ObservationNormalizer):
+            hook = note_square
         if hook is not None:
             stack.callback(module.register_forward_hook(hook).remove)
     return stack
@@ -78,7 +83,8 @@ def _saturated(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Tensor]:
     alone = list(spec.keys(True, True)) == ["action"] and isinstance(spec["action"], Bounded)
     if not alone or action_ET is None or not action_ET.is_floating_point():
         return {}
-    low, high = spec["action"].space.low, spec["action"].space.high
+    low = spec["action"].space.low
+    high = spec["action"].space.high
     if not bool((high - low).isfinite().all()):
         return {}
     margin = BOUND_SHARE * (high - low)

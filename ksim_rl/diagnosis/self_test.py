@@ -14,7 +14,8 @@ from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg, StepGuard, make_loss, make_optimizer, ppo_step
 from ksim_rl.physics import World
 
-NUM_ENVS, NUM_STEPS = 4, 50
+NUM_ENVS = 4
+NUM_STEPS = 50
 # float32 against float64 over half a second of a pole that swings.
 MOST_DIFFERENCE = 1e-4
 
@@ -40,7 +41,8 @@ def try_device(device: torch.device) -> list[tuple[str, str | None]]:
 
 
 def _physics(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
-    world, data = _pushed(mj_model, device), mujoco.MjData(mj_model)
+    world = _pushed(mj_model, device)
+    data = mujoco.MjData(mj_model)
     data.ctrl[:] = 0.5
     for _ in range(NUM_STEPS):
         world.step(1)
@@ -60,10 +62,8 @@ def _graphs(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
         graphed.step(1)
         total.add_(graphed.qpos_EL.sum())
 
-    captured, expected = (
-        Captured(step, device=device, require_graphs=device.type == "cuda"),
-        torch.zeros_like(total),
-    )
+    captured = Captured(step, device=device, require_graphs=device.type == "cuda")
+    expected = torch.zeros_like(total)
     for _ in range(5):
         captured()
         with live_launches():
@@ -72,7 +72,9 @@ def _graphs(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
     difference = float((total - expected).abs())
     graphed.close()
     live.close()
-    return None if difference < 1e-6 else f"what a graph computes differs by {difference:.2g}"
+    if difference < 1e-6:
+        return None
+    return f"what a graph computes differs by {difference:.2g}"
 
 
 def _update(device: torch.device) -> str | None:
@@ -81,7 +83,8 @@ def _update(device: torch.device) -> str | None:
     def draw(size: int) -> torch.Tensor:
         return torch.randn(64, size, generator=generator).to(device)
 
-    cfg, spec = PPOCfg(), Unbounded(torch.Size([2]), device=device)
+    cfg = PPOCfg()
+    spec = Unbounded(torch.Size([2]), device=device)
     actor = make_actor(ActorCfg(hidden_dims=(16,)), obs_dim=3, action_dim=2, action_spec=spec, device=device)
     critic = make_critic(CriticCfg(hidden_dims=(16,)), obs_dim=3, device=device)
     minibatch_B = actor(
@@ -89,10 +92,13 @@ def _update(device: torch.device) -> str | None:
     ).detach()
     minibatch_B.update({"advantage": draw(1), "value_target": draw(1), "state_value": draw(1)})
     before = [parameter.clone() for parameter in actor.parameters()]
-    optimizer, guard = make_optimizer(cfg, actor, critic), StepGuard(device=device)
+    optimizer = make_optimizer(cfg, actor, critic)
+    guard = StepGuard(device=device)
     ppo_step(make_loss(cfg, actor, critic), optimizer, minibatch_B, cfg=cfg, guard=guard)
     moved = any(not torch.equal(old, new) for old, new in zip(before, actor.parameters(), strict=True))
-    return None if moved and not int(guard.skipped) else "a gradient step changed nothing"
+    if moved and not int(guard.skipped):
+        return None
+    return "a gradient step changed nothing"
 
 
 def _pushed(mj_model: mujoco.MjModel, device: torch.device) -> World:

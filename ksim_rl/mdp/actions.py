@@ -42,13 +42,17 @@ class JointAction(ActionTerm):
         return len(view.joints(self.joints))
 
     def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
-        return None if self.clip is None else constant(self.clip, view.device).expand(self.size(view), 2)
+        if self.clip is None:
+            return None
+        return constant(self.clip, view.device).expand(self.size(view), 2)
 
     def shaped(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> Float[Tensor, "E K"]:
         """Return the action after clip, tanh, scale, filter and offset."""
         scaled_EK = self.scaled(view, action_EK, "scale", self.scale)
         offset = per_joint(view, "offset", self.offset, self.joints)
-        return scaled_EK if isinstance(offset, float) and offset == 0.0 else scaled_EK + offset
+        if isinstance(offset, float) and offset == 0.0:
+            return scaled_EK
+        return scaled_EK + offset
 
     def scaled(
         self, view: EnvView, action_EK: Float[Tensor, "E K"], field: str, scale: PerJoint
@@ -109,13 +113,16 @@ class JointEffortAction(JointAction):
     joints: Patterns = ".*"
 
     def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
-        own_K2, limits_K2 = super().bounds(view), view.targets.limits("effort", self.joints)
+        own_K2 = super().bounds(view)
+        limits_K2 = view.targets.limits("effort", self.joints)
         if limits_K2 is None or self.tanh:
             return own_K2
         scale = per_joint(view, "scale", self.scale, self.joints)
         offset = per_joint(view, "offset", self.offset, self.joints)
         range_K2 = ((limits_K2.T - offset) / scale).T.sort(dim=-1).values
-        return range_K2 if own_K2 is None else range_K2.clamp(own_K2[:, :1], own_K2[:, 1:])
+        if own_K2 is None:
+            return range_K2
+        return range_K2.clamp(own_K2[:, :1], own_K2[:, 1:])
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         view.write_joint_effort_target(self.joints, self.shaped(view, action_EK))

@@ -41,7 +41,10 @@ class OfTarget(InFrame):
     def offset(self, view: EnvView) -> Float[Tensor, "E 3"]:
         """Return the commanded position minus where the body or site is, world frame, m; position stage."""
         target_E3, _ = target_pose_w(view, view.command(self.command), frame=self.frame, entity=self.entity)
-        point = view.body(self.body) if self.body is not None else view.site(str(self.site))
+        if self.body is not None:
+            point = view.body(self.body)
+        else:
+            point = view.site(str(self.site))
         return target_E3 - point.pos_EL
 
     def distance(self, view: EnvView) -> Float[Tensor, " E"]:
@@ -56,7 +59,11 @@ def target_pose_w(
 
     `target_EK` is a position [E, 3], or position and quaternion (w, x, y, z) [E, 7], in the frame of `InFrame`.
     """
-    pos_E3, quat_E4 = target_EK[:, :3], target_EK[:, 3:] if target_EK.shape[1] == 7 else None
+    pos_E3 = target_EK[:, :3]
+    if target_EK.shape[1] == 7:
+        quat_E4 = target_EK[:, 3:]
+    else:
+        quat_E4 = None
     if frame == "world":
         return pos_E3, quat_E4
     root = view.entity(entity)
@@ -81,7 +88,8 @@ class HeldCommand(CommandTerm):
         """Return new values for all rows."""
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        drawn_EK, held_EK = self.draw(view), self.held(view)
+        drawn_EK = self.draw(view)
+        held_EK = self.held(view)
         held_EK.copy_(torch.where(mask_E[:, None], drawn_EK, held_EK))
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
@@ -119,7 +127,8 @@ class JointPositionCommand(HeldCommand, drawn=("offset",)):
 
     def draw(self, view: EnvView) -> Float[Tensor, "E N"]:
         joints = view.joints(self.joints)
-        default_EN, limits_N2 = joints.default_pos_EL, joints.soft_limits_L2
+        default_EN = joints.default_pos_EL
+        limits_N2 = joints.soft_limits_L2
         offset_EN = view.uniform(default_EN.shape[1], *self.shared_ranges(view).unbind(0))
         return torch.clamp(default_EN + offset_EN, limits_N2[:, 0], limits_N2[:, 1])
 
@@ -180,7 +189,9 @@ class StartPoseCommand(OfEntity, CommandTerm):
         self._is_due(view).logical_or_(mask_E)
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
-        robot, is_due_E, held_E7 = view.entity(self.entity), self._is_due(view), view.buffer("pose_E7", 7)
+        robot = view.entity(self.entity)
+        is_due_E = self._is_due(view)
+        held_E7 = view.buffer("pose_E7", 7)
         pose_E7 = torch.cat((robot.root_pos_EL, robot.root_quat_EL), dim=-1)
         held_E7.copy_(torch.where(is_due_E[:, None], pose_E7, held_E7))
         is_due_E.zero_()
@@ -242,12 +253,14 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
         velocity_E3 = torch.where(is_kind_E3[:, 2:], forward_E3, target_E4[:, :3])
 
         drawn_E4 = torch.cat((velocity_E3, target_E4[:, 3:]), dim=-1)
-        held_E4, held_E2 = self._target(view), self._kind(view)
+        held_E4 = self._target(view)
+        held_E2 = self._kind(view)
         held_E4.copy_(torch.where(mask_E[:, None], drawn_E4, held_E4))
         held_E2.copy_(torch.where(mask_E[:, None], is_kind_E3[:, :2], held_E2))
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
-        target_E4, kind_E2 = self._target(view), self._kind(view)
+        target_E4 = self._target(view)
+        kind_E2 = self._kind(view)
         error_E = quaternion.wrap_to_pi(target_E4[:, 3] - view.entity(self.entity).heading_E)
         steer_E = (self.heading_stiffness * error_E).clamp(*self.shared_ranges(view)[:, 2].unbind())
         wz_E = torch.where(kind_E2[:, 1], steer_E, target_E4[:, 2])
@@ -258,7 +271,8 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
         """Draw the commanded (green) and the actual (blue) planar velocity above the root, 0.5 m per m/s."""
         robot = view.entity(self.entity)
         above = robot.root_pos_EL[env_index] + constant((0.0, 0.0, 0.3), view.device)
-        command_E3, actual_E3 = self(view), robot.root_lin_vel_b_EL
+        command_E3 = self(view)
+        actual_E3 = robot.root_lin_vel_b_EL
         for velocity_E3, rgba in ((command_E3, _COMMANDED), (actual_E3, _REACHED)):
             planar_E3 = torch.cat((velocity_E3[:, :2], torch.zeros_like(velocity_E3[:, :1])), dim=-1)
             arrow_E3 = 0.5 * quaternion.rotate(robot.root_quat_EL, planar_E3)

@@ -40,7 +40,9 @@ def index_constant(ids: Sequence[int], device: torch.device) -> Int[Tensor, " N"
 def _index_constant(ids: tuple[int, ...], device: torch.device) -> Index:
     with torch.inference_mode(False):
         index = as_index(ids, device)
-    return as_constant(index) if isinstance(index, Tensor) else index
+    if isinstance(index, Tensor):
+        return as_constant(index)
+    return index
 
 
 def values_by_name(field: str, table: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:

@@ -125,7 +125,9 @@ class SaturationLevel(SteppedLevel):
     def score(self, view: EnvView) -> Float[Tensor, " E"]:
         check_known("reward", self.reward, view.episode_rewards)
         sum_E = view.episode_rewards[self.reward]
-        return sum_E if view.max_episode_length == 0 else sum_E / (_longest_E(view) * view.step_dt)
+        if view.max_episode_length == 0:
+            return sum_E
+        return sum_E / (_longest_E(view) * view.step_dt)
 
 
 def _longest_E(view: EnvView) -> Tensor:
@@ -150,7 +152,8 @@ class TerrainLevels(OfCommand, OfEntity, CurriculumTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         terrain = view.terrain
-        level_E, top = terrain.levels_E, terrain.num_levels - 1
+        level_E = terrain.levels_E
+        top = terrain.num_levels - 1
         distance_E = distance_from_origin(view, self.entity)
         speed_E = torch.linalg.vector_norm(view.command(self.command)[:, :2], dim=-1)
         asked_E = speed_E * (view.max_episode_length * view.step_dt)
@@ -249,7 +252,8 @@ class CommandRangesByLevel(OfCommand, CurriculumTerm):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         changes = ranks.any_of(mask_E)
         for field, held_2 in _ranges_of(view, self.command, self.start).items():
-            start_2, end_2 = constant(self.start[field], view.device), constant(self.end[field], view.device)
+            start_2 = constant(self.start[field], view.device)
+            end_2 = constant(self.end[field], view.device)
             held_2.copy_(torch.where(changes, by_level(start_2, end_2, view.level), held_2))
         return view.level.clone()
 

@@ -64,7 +64,8 @@ class ResetJoints(JointReset):
         self._write(view, mask_E, pos_EL, self._draw(view, count, self.velocity_range))
 
     def _draw(self, view: EnvView, count: int, pair: tuple[float, float]) -> Float[Tensor, "E L"]:
-        first, second = float(pair[0]), float(pair[1])
+        first = float(pair[0])
+        second = float(pair[1])
         if second == (0.0 if self.distribution == "gaussian" else first):
             return constant([first] * count, view.device).expand(view.num_envs, count)
         if self.distribution == "gaussian":
@@ -168,7 +169,8 @@ class PushByForce(EventTerm, mode="interval"):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Begin a push in the rows of `mask_E`, and go on with or end those of the others; once per env step."""
-        held_E6, applied_E6 = view.buffer("wrench_E6", 6), view.buffer("applied_E6", 6)
+        held_E6 = view.buffer("wrench_E6", 6)
+        applied_E6 = view.buffer("applied_E6", 6)
         left_E = view.buffer("left_s_E")
         drawn_E6 = draw_by_axis(view, self.wrench_range)
         duration_E = view.uniform(1, *self.duration_s)[:, 0].clamp(min=view.step_dt)

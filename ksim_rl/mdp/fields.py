@@ -82,7 +82,8 @@ class OfFeet(OfSites, OfSensor):
 
     def contact(self, view: EnvView) -> ContactState:
         """Return the state of the contact sensor; one element alone would count for all feet, and is refused."""
-        contact, num_feet = view.contact(self.sensor), len(view.sites(self.sites))
+        contact = view.contact(self.sensor)
+        num_feet = len(view.sites(self.sites))
         if contact.found_EN.shape[-1] != num_feet:
             raise ValueError(
                 f"sensor={self.sensor!r} has {contact.found_EN.shape[-1]} elements, and sites={self.sites!r} are "
@@ -157,7 +158,8 @@ def contact_force(view: EnvView, sensor: str) -> Float[Tensor, "E N"]:
 
 def commanded_speed(view: EnvView, command: str) -> Float[Tensor, " E"]:
     """Return |c_xy| + |c_z| of the command (vx, vy, wz), m/s and rad/s added as numbers."""
-    cache, key = view.command_cache, f"speed of {command}"
+    cache = view.command_cache
+    key = f"speed of {command}"
     if key not in cache:
         command_EK = view.command(command)
         cache[key] = torch.linalg.vector_norm(command_EK[:, :2], dim=-1) + command_EK[:, 2].abs()
@@ -166,7 +168,8 @@ def commanded_speed(view: EnvView, command: str) -> Float[Tensor, " E"]:
 
 def is_commanded(view: EnvView, command: str, threshold: float) -> Float[Tensor, " E"]:
     """Return 1 where the commanded speed exceeds the threshold, else 0."""
-    cache, key = view.command_cache, f"speed of {command} > {threshold}"
+    cache = view.command_cache
+    key = f"speed of {command} > {threshold}"
     if key not in cache:
         cache[key] = (commanded_speed(view, command) > threshold).to(torch.float32)
     return cache[key]

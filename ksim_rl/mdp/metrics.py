@@ -100,11 +100,13 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm, reduce="last"):
     min_distance: Positive = 0.1
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        robot, model = view.entity(self.entity), view.world.mj_model
+        robot = view.entity(self.entity)
+        model = view.world.mj_model
         weight = float(model.body_subtreemass[robot.root.id] * np.linalg.norm(model.opt.gravity))
         if weight == 0.0:
             raise ValueError("CostOfTransport without gravity: a weight of 0 N has no cost of transport")
-        energy_E, distance_E = view.buffer("energy_E"), view.buffer("distance_E")
+        energy_E = view.buffer("energy_E")
+        distance_E = view.buffer("distance_E")
         energy_E.add_(mechanical_power(view, self.joints) * view.step_dt)
         distance_E.add_(torch.linalg.vector_norm(robot.root_lin_vel_w_EL[:, :2], dim=-1) * view.step_dt)
         return energy_E / (weight * distance_E.clamp(min=self.min_distance))

@@ -52,7 +52,8 @@ def mirror_maps(
     episode. A history repeats the map of its term. A ValueError names a term whose image is not known (register it with
     `term_mirror.register`), and joints, a default pose or an action scale that are not symmetric.
     """
-    inner, specs = part(env, ManagerBasedRlEnv), group_specs(env)
+    inner = part(env, ManagerBasedRlEnv)
+    specs = group_specs(env)
     if inner is None:
         raise ValueError(
             f"mirror_maps of a {type(env).__name__}: needs a ManagerBasedRlEnv, whose terms it reads"
@@ -134,8 +135,12 @@ def _(term: mdp.HeightScan, env: ManagerBasedRlEnv) -> MirrorMap:
 @term_mirror.register
 def _(term: JointAction, env: ManagerBasedRlEnv) -> MirrorMap:
     relative = isinstance(term, mdp.JointPositionAction) and term.use_default_offset
-    mirror = _relative_joints(env, term.joints) if relative else _joints(env, term.joints)
-    view, (source, signs) = env.view, mirror.tensors(env.view.device)
+    if relative:
+        mirror = _relative_joints(env, term.joints)
+    else:
+        mirror = _joints(env, term.joints)
+    view = env.view
+    (source, signs) = mirror.tensors(env.view.device)
     scale = per_joint(view, "scale", term.scale, term.joints)
     if isinstance(scale, Tensor) and source is not None:
         _check_symmetric("scale", scale, scale[source])
@@ -190,7 +195,12 @@ def _of_names(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
         names = contact.elements(resolver.names("geom" if contact.kind == "geom" else "body"))
     else:
         is_body = isinstance(term, tuple(_BODIES))
-        kind, patterns = ("body", term.bodies) if is_body else ("site", term.sites)
+        if is_body:
+            kind = "body"
+            patterns = term.bodies
+        else:
+            kind = "site"
+            patterns = term.sites
         names = [resolver.names(kind)[i] for i in resolver.ids(kind, patterns)]
     return mirror_by_name(names, next(image for kind, image in _BY_NAME.items() if isinstance(term, kind)))
 

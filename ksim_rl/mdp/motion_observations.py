@@ -45,7 +45,8 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L
         raise ValueError(
             f"observe_motion of a {type(env).__name__}: needs a ManagerBasedRlEnv, whose terms it runs"
         )
-    cfg, device = base.cfg, base.device
+    cfg = base.cfg
+    device = base.device
     assert device is not None
     duration_s = load_motion(file, base.world.mj_model, torch.device("cpu")).duration_s
     # The least bit more, so that rounding does not cost the last frame.
@@ -54,7 +55,10 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L
         raise ValueError(
             f"motion {file}: lasts {duration_s:g} s, less than an env step of {base.step_dt:g} s"
         )
-    ground = PlaneTerrain() if cfg.scene.terrain is not None else None
+    if cfg.scene.terrain is not None:
+        ground = PlaneTerrain()
+    else:
+        ground = None
     played = dataclasses.replace(
         cfg,
         scene=dataclasses.replace(cfg.scene, num_envs=frames, terrain=ground),

@@ -144,7 +144,8 @@ class ResetToMotion(OfMotion, EventTerm):
     start_range: Annotated[tuple[float, float], Within(low=0.0, high=1.0, ordered=True)] = (0.0, 1.0)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        motion, start_E = view.motion(self.file), motion_start_time(view, self.file)
+        motion = view.motion(self.file)
+        start_E = motion_start_time(view, self.file)
         start_E.copy_(torch.where(mask_E, self.draw_share(view) * motion.duration_s, start_E))
         qpos_EL, qvel_EL = motion.sample(start_E)
         view.write_qpos(mask_E, qpos_EL if motion_shift(view) is None else view.at_origins(qpos_EL))

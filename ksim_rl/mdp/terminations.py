@@ -113,7 +113,8 @@ class JointLimitViolated(OfJoints, TerminationTerm):
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         joints = view.joints(self.joints)
-        pos_EN, limits_N2 = joints.pos_EL, joints.soft_limits_L2
+        pos_EN = joints.pos_EL
+        limits_N2 = joints.soft_limits_L2
         beyond_EN = torch.maximum(limits_N2[:, 0] - pos_EN, pos_EN - limits_N2[:, 1])
         return (beyond_EN > self.margin).any(-1)
 

@@ -87,17 +87,25 @@ class GaussianHead(nn.Module):
 
     def __init__(self, cfg: ActorCfg, feature_dim: int, action_dim: int, *, device: Device = None) -> None:
         super().__init__()
-        self.std_type, self.min_std, init_std = cfg.std_type, cfg.min_std, cfg.init_std
+        self.std_type = cfg.std_type
+        self.min_std = cfg.min_std
+        init_std = cfg.init_std
         self.loc = linear(feature_dim, action_dim, gain=cfg.output_gain, device=device)
         self.std_layer: nn.Linear | None = None
         self.std: nn.Parameter | None = None
         if cfg.state_dependent_std:
             # softplus(x) = init_std at x = log(exp(init_std) - 1).
-            offset = math.log(init_std) if cfg.std_type == "log" else math.log(math.expm1(init_std))
+            if cfg.std_type == "log":
+                offset = math.log(init_std)
+            else:
+                offset = math.log(math.expm1(init_std))
             self.std_layer = linear(feature_dim, action_dim, gain=0.0, device=device)
             nn.init.constant_(self.std_layer.bias, offset)
         else:
-            start = math.log(init_std) if cfg.std_type == "log" else init_std
+            if cfg.std_type == "log":
+                start = math.log(init_std)
+            else:
+                start = init_std
             self.std = nn.Parameter(torch.full((action_dim,), start, device=device))
 
     def forward(
@@ -114,10 +122,16 @@ class GaussianHead(nn.Module):
         """Return the `scale`, [action_dim] where it does not depend on the state, whose features are not read then."""
         if self.std_layer is None:
             assert self.std is not None
-            scale = self.std.exp() if self.std_type == "log" else self.std
+            if self.std_type == "log":
+                scale = self.std.exp()
+            else:
+                scale = self.std
         else:
             raw = self.std_layer(features)
-            scale = raw.exp() if self.std_type == "log" else functional.softplus(raw)
+            if self.std_type == "log":
+                scale = raw.exp()
+            else:
+                scale = functional.softplus(raw)
         # A std that the optimizer pushes to zero or below would give NaN log-probabilities. The gradient
         # passes the bound (a plain clamp stops it), so that a std below it can come back.
         return scale + (scale.clamp_min(self.min_std) - scale).detach()
@@ -167,7 +181,8 @@ class TruncatedGaussianHead(TanhGaussianHead):
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
         """Return `(loc, scale)`."""
         loc, scale = super().forward(features)
-        center, half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
+        center = (self.high + self.low) / 2
+        half_range = (self.high - self.low) / 2
         return center + half_range * torch.tanh(loc), half_range * scale
 
 
@@ -267,7 +282,10 @@ def make_head(
         raise ValueError(f"distribution={cfg.distribution!r}, but {names} is discrete: use 'categorical'")
     heads: dict[NestedKey, nn.Module] = {}
     for key, (leaf, shape) in leaves.items():
-        make = _choosing if isinstance(leaf, DISCRETE) else _continuous
+        if isinstance(leaf, DISCRETE):
+            make = _choosing
+        else:
+            make = _continuous
         heads[key] = make(cfg, key, leaf, tuple(shape), feature_dim=feature_dim, device=device)
     keys = list(heads)
     return (heads[keys[0]] if len(keys) == 1 else MixedHead(heads)), keys
@@ -279,7 +297,10 @@ def _leaves(action_spec: TensorSpec) -> dict[NestedKey, tuple[TensorSpec, torch.
         batch_dims = len(action_spec.shape)
         return {key: (leaf, leaf.shape[batch_dims:]) for key, leaf in action_spec.items(True, True)}
     # An index has no dim of its own.
-    own_dims = 0 if type(action_spec) is specs.Categorical else 1
+    if type(action_spec) is specs.Categorical:
+        own_dims = 0
+    else:
+        own_dims = 1
     return {"action": (action_spec, action_spec.shape[len(action_spec.shape) - own_dims :])}
 
 
@@ -297,7 +318,10 @@ def _choosing(
         sizes = (int(leaf.space.n),) * shape[0]
     else:
         raise ValueError(f"action {key!r} has shape {shape}: expected an index or one dim of them")
-    num_options = sum(sizes) if sizes is not None else int(leaf.space.n)
+    if sizes is not None:
+        num_options = sum(sizes)
+    else:
+        num_options = int(leaf.space.n)
     return CategoricalHead(
         cfg, num_options=num_options, sizes=sizes, one_hot=one_hot, dtype=leaf.dtype, **layer
     )
@@ -359,7 +383,10 @@ def make_actor(
         if action_dim is None:
             raise ValueError("make_actor needs action_spec, or action_dim")
         action_spec = Unbounded(action_dim)
-    feature_dim = cfg.hidden_dims[-1] if cfg.hidden_dims else obs_dim
+    if cfg.hidden_dims:
+        feature_dim = cfg.hidden_dims[-1]
+    else:
+        feature_dim = obs_dim
     # Drawn after the layers below it, so that one seed gives the same network whatever the head.
     network = PolicyNetwork(cfg, obs_dim=obs_dim, head=nn.Identity(), device=device)
     network.head, action_keys = make_head(cfg, action_spec, feature_dim, device=device)

@@ -77,7 +77,8 @@ class DeterministicPolicy(BoundedActor):
 
     def forward(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch action_dim"]:
         """Return the action, in [low, high]."""
-        center, half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
+        center = (self.high + self.low) / 2
+        half_range = (self.high - self.low) / 2
         return center + half_range * self.output(obs).tanh()
 
 
@@ -93,7 +94,8 @@ class SquashedPolicy(BoundedActor):
         """Return `(loc, scale)`."""
         loc, raw = self.output(obs).chunk(2, dim=-1)
         # A tanh instead of a clamp: the gradient never vanishes wholly at a bound.
-        low, high = self.cfg.log_std_min, self.cfg.log_std_max
+        low = self.cfg.log_std_min
+        high = self.cfg.log_std_max
         return loc, (low + 0.5 * (high - low) * (raw.tanh() + 1.0)).exp()
 
 

@@ -39,8 +39,10 @@ class ExploringPolicy(TensorDictModuleBase):
         self.actor = actor
         self.in_keys: Any = list(actor.in_keys)
         self.out_keys: Any = ["action"]
-        self.noise_min, self.noise_max = noise_min, noise_max
-        self._low_L, self._high_L = low_L, high_L
+        self.noise_min = noise_min
+        self.noise_max = noise_max
+        self._low_L = low_L
+        self._high_L = high_L
         self.register_buffer("random", torch.ones((), dtype=torch.bool, device=low_L.device))
         self.register_buffer("noise_scale_E1", self._draw_scales(num_envs))
 
@@ -91,7 +93,9 @@ class MixedPolicy(TensorDictModuleBase):
         explores: bool = True,
     ) -> None:
         super().__init__()
-        self.student, self.teacher, self.explores = student, teacher, explores
+        self.student = student
+        self.teacher = teacher
+        self.explores = explores
         self._teacher_keys = list(teacher_keys)
         self.in_keys: Any = list(dict.fromkeys((*student.in_keys, *self._teacher_keys)))
         self.out_keys: Any = list(student.out_keys)

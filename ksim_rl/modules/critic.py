@@ -88,7 +88,9 @@ class QNetwork(ObservingNetwork):
         features = torch.cat((self.observe(obs), action), dim=-1)
         batch = features.shape[:-1]
         out = self.layers(features.reshape(1, -1, features.shape[-1])).transpose(0, 1).unflatten(0, batch)
-        return out.squeeze(-1) if self.support is None else out
+        if self.support is None:
+            return out.squeeze(-1)
+        return out
 
 
 def make_q_network(
@@ -99,7 +101,10 @@ def make_q_network(
     It writes "state_action_value" [..., N], or with atoms "state_action_logits" [..., N, A].
     """
     network = QNetwork(cfg, obs_dim=obs_dim, action_dim=action_dim, device=device)
-    out_key = "state_action_value" if cfg.num_atoms == 1 else "state_action_logits"
+    if cfg.num_atoms == 1:
+        out_key = "state_action_value"
+    else:
+        out_key = "state_action_logits"
     return TensorModule(network, in_keys=["critic", "action"], out_keys=[out_key])
 
 

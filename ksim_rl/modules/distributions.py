@@ -135,7 +135,8 @@ class TanhGaussian(BoundedDistribution):
 
     def _prepare(self, low: Any, high: Any) -> None:
         self.base = DiagonalGaussian(self.loc, self.scale)
-        self._center, self._half_range = (high + low) / 2, (high - low) / 2
+        self._center = (high + low) / 2
+        self._half_range = (high - low) / 2
 
     @property
     def median(self) -> Float[Tensor, "*batch L"]:
@@ -182,7 +183,10 @@ class TanhGaussian(BoundedDistribution):
     def _log_density(self, latent: Tensor) -> Tensor:
         log_slope = 2.0 * (math.log(2.0) - latent - functional.softplus(-2.0 * latent))
         half_range = self._half_range
-        log_half_range = half_range.log() if isinstance(half_range, Tensor) else math.log(half_range)
+        if isinstance(half_range, Tensor):
+            log_half_range = half_range.log()
+        else:
+            log_half_range = math.log(half_range)
         terms = self.base.log_densities(latent) - log_slope - log_half_range
         if torch.compiler.is_compiling():
             # The compiler would compute what a sum adds up by few, long threads. No product rounds float64.
@@ -207,11 +211,13 @@ class TruncatedGaussian(BoundedDistribution):
     """
 
     def _prepare(self, low: Any, high: Any) -> None:
-        left, right = (low - self.loc) / self.scale, (high - self.loc) / self.scale
+        left = (low - self.loc) / self.scale
+        right = (high - self.loc) / self.scale
         mirrored = left + right > 0.0
         self._sign = torch.where(mirrored, -1.0, 1.0).to(self.loc.dtype)
         # The bounds in standard deviations from loc, in the mirror image where that is taken.
-        self._a, self._b = torch.where(mirrored, -right, left), torch.where(mirrored, -left, right)
+        self._a = torch.where(mirrored, -right, left)
+        self._b = torch.where(mirrored, -left, right)
         self._log_cdf_a, self._log_cdf_b = log_ndtr(self._a), log_ndtr(self._b)
         self._log_mass = self._log_cdf_b + (-torch.expm1(self._log_cdf_a - self._log_cdf_b)).log()
 
@@ -235,7 +241,8 @@ class TruncatedGaussian(BoundedDistribution):
         """Draw; the gradients are those of the value at a fixed probability (Figurnov et al., arXiv 1805.08498)."""
         shape = torch.Size(sample_shape) + self.loc.shape
         with torch.no_grad():
-            a, b = self._a, self._b
+            a = self._a
+            b = self._b
             eps = torch.finfo(self.loc.dtype).eps
             share = ranks.rand(shape, dim=len(sample_shape), dtype=self.loc.dtype, device=self.loc.device)
             share = share.clamp_min(eps)
@@ -286,7 +293,8 @@ def _inverse_log_ndtr(log_cdf: Tensor) -> Tensor:
 def _kl_truncated(p: TruncatedGaussian, q: TruncatedGaussian) -> Tensor:
     # The bounds have to be the same: what p can give and q cannot would make it infinite.
     first, second = p._moments()
-    gap, ratio = (p.loc - q.loc) / q.scale, p.scale / q.scale
+    gap = (p.loc - q.loc) / q.scale
+    ratio = p.scale / q.scale
     error = gap.square() + 2.0 * gap * ratio * (p._sign * first) + ratio.square() * second
     return (q._log_mass - p._log_mass - ratio.log() + 0.5 * (error - second)).sum(-1)
 
@@ -314,14 +322,20 @@ class Categorical(Distribution):
         if sizes is not None and sum(sizes) != logits.shape[-1]:
             raise ValueError(f"sizes={tuple(sizes)}: they must sum to the {logits.shape[-1]} logits")
         self.logits = logits
-        self.sizes = None if sizes is None else tuple(sizes)
+        if sizes is None:
+            self.sizes = None
+        else:
+            self.sizes = tuple(sizes)
         self.one_hot = one_hot
         self.dtype = dtype or (torch.bool if one_hot else torch.int64)
         parts = logits.split(list(self.sizes or logits.shape[-1:]), -1)
         smallest = torch.finfo(logits.dtype).min
         # An option that a logit of minus infinity rules out has probability zero: a finite logarithm keeps it no NaN.
         self._log_probs = [functional.log_softmax(part, -1).clamp_min(smallest) for part in parts]
-        event = logits.shape[-1:] if one_hot else torch.Size(() if self.sizes is None else (len(parts),))
+        if one_hot:
+            event = logits.shape[-1:]
+        else:
+            event = torch.Size(() if self.sizes is None else (len(parts),))
         # Argument checks compare all values and read the answer on the host.
         super().__init__(logits.shape[:-1], event, validate_args=False)
 
@@ -385,14 +399,19 @@ class Categorical(Distribution):
                 for index, log_probs in zip(indices, self._log_probs, strict=True)
             ]
             return torch.cat(marks, -1).to(self.dtype)
-        value = indices[0] if self.sizes is None else torch.stack(tuple(indices), -1)
+        if self.sizes is None:
+            value = indices[0]
+        else:
+            value = torch.stack(tuple(indices), -1)
         return value.to(self.dtype)
 
     def _as_indices(self, value: Tensor) -> list[Tensor]:
         if self.one_hot:
             widths = [log_probs.shape[-1] for log_probs in self._log_probs]
             return [marks.to(torch.uint8).argmax(-1) for marks in value.split(widths, -1)]
-        return [value.long()] if self.sizes is None else list(value.long().unbind(-1))
+        if self.sizes is None:
+            return [value.long()]
+        return list(value.long().unbind(-1))
 
 
 @register_kl(Categorical, Categorical)

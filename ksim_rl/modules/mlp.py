@@ -54,8 +54,13 @@ def mlp(
     layer: Callable[..., nn.Module] = linear
     norm: Callable[..., nn.Module] = nn.LayerNorm
     if num_networks is not None:
-        layer, norm = partial(EnsembleLinear, num_networks), partial(EnsembleLayerNorm, num_networks)
-    layers, width = nn.Sequential() if num_networks is None and not layer_norm else Layers(), input_dim
+        layer = partial(EnsembleLinear, num_networks)
+        norm = partial(EnsembleLayerNorm, num_networks)
+    if num_networks is None and not layer_norm:
+        layers = nn.Sequential()
+    else:
+        layers = Layers()
+    width = input_dim
     for hidden_dim in hidden_dims:
         layers.append(layer(width, hidden_dim, gain=math.sqrt(2.0), device=device))
         if layer_norm:
@@ -137,7 +142,10 @@ class Layers(nn.Sequential):
         from ksim_rl.modules.norm_kernels import FUSED, Normalized
 
         alone = not isinstance(self[0], EnsembleLinear)
-        out = features.reshape(1, -1, features.shape[-1]) if alone else features
+        if alone:
+            out = features.reshape(1, -1, features.shape[-1])
+        else:
+            out = features
         parts: list[Any] = list(self)
         weights = [part.weight for part in parts if isinstance(part, nn.Linear | EnsembleLinear)]
         rounded = [own.mT[None] if alone else own for own in _rounded(weights)]
@@ -152,10 +160,15 @@ class Layers(nn.Sequential):
                 continue
             norm = parts.pop(0)
             kind = type(parts[0]) if parts else None
-            known = FUSED.index(kind) + 1 if kind in FUSED else 0
+            if kind in FUSED:
+                known = FUSED.index(kind) + 1
+            else:
+                known = 0
             out = Normalized.apply(out, layer.bias, norm.weight, norm.bias, known)
             del parts[: bool(known)]
-        return out.reshape(*features.shape[:-1], -1) if alone else out
+        if alone:
+            return out.reshape(*features.shape[:-1], -1)
+        return out
 
 
 def rounds(features: Float[Tensor, "*batch L"]) -> bool:
@@ -192,7 +205,8 @@ class _Product(Function):
         d_features = d_weight = None
         if ctx.needs_input_grad[0]:
             d_features = torch.bmm(d_out, rounded.mT)[..., :fan_in].to(ctx.dtype)
-            d_features = d_features.sum(0, keepdim=True) if ctx.is_shared else d_features
+            if ctx.is_shared:
+                d_features = d_features.sum(0, keepdim=True)
         if ctx.needs_input_grad[1]:
             networks, rows = features.shape[:2]
             splits = math.gcd(SPLITS * max(OUTPUTS // rounded.numel(), 1), rows)
@@ -219,4 +233,6 @@ def _rounded(weights: list[Tensor]) -> list[Tensor]:
 
 def _padded(features: Tensor, columns: int) -> Tensor:
     features = features.to(torch.bfloat16)
-    return functional.pad(features, (0, columns)) if columns else features
+    if columns:
+        return functional.pad(features, (0, columns))
+    return features

@@ -33,7 +33,9 @@ def observation_dim(spec: Composite, keys: Sequence[ObservationKey]) -> int:
 
 def side_by_side(observations: Sequence[Float[Tensor, "*batch ?L"]]) -> Float[Tensor, "*batch L"]:
     """Join observations along their last dim."""
-    return observations[0] if len(observations) == 1 else torch.cat(tuple(observations), -1)
+    if len(observations) == 1:
+        return observations[0]
+    return torch.cat(tuple(observations), -1)
 
 
 class ObservationNormalizer(RunningMoments):
@@ -136,12 +138,17 @@ class ObservingNetwork(nn.Module):
     def __init__(self, cfg: NetworkCfg, *, obs_dim: int, device: Device = None) -> None:
         super().__init__()
         self.obs_dim = obs_dim
-        self.normalizer = ObservationNormalizer(obs_dim, device=device) if cfg.obs_normalization else None
+        if cfg.obs_normalization:
+            self.normalizer = ObservationNormalizer(obs_dim, device=device)
+        else:
+            self.normalizer = None
 
     def observe(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
         """Return what the first layer reads: observations side by side, normalized."""
         obs = self.joined(*observations)
-        return obs if self.normalizer is None else self.normalizer(obs)
+        if self.normalizer is None:
+            return obs
+        return self.normalizer(obs)
 
     def joined(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
         """Return observations side by side; a ValueError for another number than the network was built for."""

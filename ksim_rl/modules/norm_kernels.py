@@ -19,7 +19,8 @@ FUSED = (nn.ReLU, nn.SiLU)
 EPS = tl.constexpr(1e-5)  # torch's
 # What a thread has at once of a chunk of three, and of two, which leave it more registers; and how many programs there
 # are on the way there. On the way back, where threads need all registers that they can have, half as many run at once.
-ELEMENTS, PROGRAMS = {3: 8, 2: 16}, 2048
+ELEMENTS = {3: 8, 2: 16}
+PROGRAMS = 2048
 # Columns that a program of `sum_parts` adds up: two sectors of memory, and as many programs as a GPU has room for.
 SUMMED = 16
 ON_GPU = tl.constexpr(torch.cuda.is_available())
@@ -182,7 +183,8 @@ class Normalized(Function):
         """Return the rows."""
         features = features_NBL.contiguous()
         networks, rows, width = features.shape
-        out, moments_NB2 = torch.empty_like(features), bias.new_empty(networks, rows, 2)
+        out = torch.empty_like(features)
+        moments_NB2 = bias.new_empty(networks, rows, 2)
         programs, tile = _cut(networks, rows, width, PROGRAMS)
         launch: Any = normalize_rows[programs, networks]
         launch(features, bias, gain, offset, out, moments_NB2, rows, activation, **tile)
@@ -214,8 +216,14 @@ class Normalized(Function):
 def _cut(networks: int, rows: int, width: int, most: int) -> tuple[int, dict[str, int]]:
     """Return how many programs take the rows of a network, some `most` for all of them, and their tiles."""
     power = max(1 << (width - 1).bit_length(), 4)
-    chunks, lanes = (3, power // 4) if 4 * width <= 3 * power else (2, power // 2)
-    tall, warps = max(32 * ELEMENTS[chunks] // lanes, 1), max(lanes // (32 * ELEMENTS[3]), 1)
+    if 4 * width <= 3 * power:
+        chunks = 3
+        lanes = power // 4
+    else:
+        chunks = 2
+        lanes = power // 2
+    tall = max(32 * ELEMENTS[chunks] // lanes, 1)
+    warps = max(lanes // (32 * ELEMENTS[3]), 1)
     steps = -(-rows * networks // (tall * most))
     tile = {"STEPS": steps, "ROWS": tall, "WIDTH": width, "CHUNKS": chunks, "LANES": lanes}
     return -(-rows // (tall * steps)), {**tile, "num_warps": warps}

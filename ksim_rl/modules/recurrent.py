@@ -38,10 +38,16 @@ class RecurrentStatePrimer(TensorDictPrimer):
         self.state_keys: list[Any] = list(primers.keys(True, True))
 
     def _reset_func(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> Any:
-        mask = None if tensordict is None else tensordict.get(self.reset_key, None)
+        if tensordict is None:
+            mask = None
+        else:
+            mask = tensordict.get(self.reset_key, None)
         for key in self.state_keys:
             zero = self.primers[key].zero()  # pyright: ignore[reportOptionalSubscript]
-            before = None if tensordict is None else tensordict.get(key, None)
+            if tensordict is None:
+                before = None
+            else:
+                before = tensordict.get(key, None)
             if mask is not None and before is not None:
                 zero = torch.where(mask.reshape(*zero.shape[:-2], 1, 1), zero, before)
             tensordict_reset.set(key, zero)
@@ -50,14 +56,19 @@ class RecurrentStatePrimer(TensorDictPrimer):
 
 def recurrent_transforms(env: EnvBase, *primers: TensorDictPrimer) -> list[Transform]:
     """Return what an env needs to carry recurrent states: `is_init` where it has none yet, and the primers."""
-    tracker = [] if "is_init" in env.observation_spec.keys() else [InitTracker()]
+    if "is_init" in env.observation_spec.keys():
+        tracker = []
+    else:
+        tracker = [InitTracker()]
     return [*tracker, *primers]
 
 
 # What the state of each kind consists of, and how many gates it has.
 STATES = {"lstm": ("h", "c"), "gru": ("h",)}
 _NUM_GATES = {"lstm": 4, "gru": 3}
-STATE_KEY, FEATURE_KEY, RESET_KEY = "recurrent_state", "recurrent_features", "is_init"
+STATE_KEY = "recurrent_state"
+FEATURE_KEY = "recurrent_features"
+RESET_KEY = "is_init"
 
 AnyModule = TypeVar("AnyModule", bound=TensorDictModuleBase)
 AnyCfg = TypeVar("AnyCfg", ActorCfg, CriticCfg)
@@ -84,7 +95,10 @@ class RecurrentNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.cfg = cfg
-        self.normalizer = ObservationNormalizer(obs_dim, device=device) if obs_normalization else None
+        if obs_normalization:
+            self.normalizer = ObservationNormalizer(obs_dim, device=device)
+        else:
+            self.normalizer = None
         for layer in range(cfg.num_layers):
             input_dim = cfg.hidden_dim if layer else obs_dim
             for name, value in _layer_parameters(cfg, input_dim).items():
@@ -100,7 +114,10 @@ class RecurrentNetwork(nn.Module):
 
         Where `reset_TB1` marks the begin of an episode, the step starts from zeros.
         """
-        features_TBH = obs_TBL if self.normalizer is None else self.normalizer(obs_TBL)
+        if self.normalizer is None:
+            features_TBH = obs_TBL
+        else:
+            features_TBH = self.normalizer(obs_TBL)
         states_N: list[tuple[Tensor, ...]] = []
         for layer in range(self.cfg.num_layers):
             state_BH = tuple(part_BNH[:, layer] for part_BNH in state_BNH)
@@ -155,14 +172,16 @@ class RecurrentModule(TensorDictModule):
         device: Device = None,
     ) -> None:
         network = RecurrentNetwork(cfg, obs_dim=obs_dim, obs_normalization=obs_normalization, device=device)
-        self.obs_keys, self.state_keys = list(in_keys), state_keys(cfg, name)
+        self.obs_keys = list(in_keys)
+        self.state_keys = state_keys(cfg, name)
         self.feature_key = (FEATURE_KEY, name)
         super().__init__(
             network,
             in_keys=[*self.obs_keys, RESET_KEY, *self.state_keys],
             out_keys=[self.feature_key, *(("next", *key) for key in self.state_keys)],
         )
-        self.cfg, self.name = cfg, name
+        self.cfg = cfg
+        self.name = name
 
     def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
         """Write features and next state into `tensordict`, and return it.
@@ -177,7 +196,10 @@ class RecurrentModule(TensorDictModule):
                 f"the data has no {self.state_keys}: give the env `recurrent_transforms`, which begin episodes with a "
                 "state of zeros, before the first reset"
             )
-        run = self._sequences if recurrent_mode() else self._steps
+        if recurrent_mode():
+            run = self._sequences
+        else:
+            run = self._steps
         outputs = run(obs, reset, state, tensordict.batch_size)
         for key, value in zip(self.out_keys, outputs, strict=True):
             tensordict.set(key, value)
@@ -188,7 +210,10 @@ class RecurrentModule(TensorDictModule):
     ) -> tuple[Tensor, ...]:
         # One row per step: a sequence of length 1.
         obs_1B = obs.reshape(1, -1, obs.shape[-1])
-        reset_1B1 = None if reset is None else reset.reshape(1, -1, 1)
+        if reset is None:
+            reset_1B1 = None
+        else:
+            reset_1B1 = reset.reshape(1, -1, 1)
         features_1B, states_1B = self.module(
             obs_1B, tuple(part.reshape(-1, *part.shape[-2:]) for part in state), reset_1B1
         )
@@ -276,7 +301,8 @@ def _made_behind(
 
 def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:
     """Draw the parameters of one layer, on the CPU, so that one seed gives the same network on every device."""
-    gates, hidden = _NUM_GATES[cfg.kind], cfg.hidden_dim
+    gates = _NUM_GATES[cfg.kind]
+    hidden = cfg.hidden_dim
     bias_hh = torch.zeros(gates, hidden)
     if cfg.kind == "lstm":
         bias_hh[1] = 1.0
@@ -329,7 +355,8 @@ class CarriedState:
     def end_(self, rollout_ET: TensorDictBase) -> None:
         """Write the state before each step, and keep the last; those after each step lie under "next"."""
         for key in self.keys:
-            after_ET, state_E = rollout_ET.get(("next", *key)), self._state_E[key]
+            after_ET = rollout_ET.get(("next", *key))
+            state_E = self._state_E[key]
             before_ET = torch.cat([state_E.unsqueeze(1), after_ET[:, :-1]], 1)
             rollout_ET.set(key, before_ET.masked_fill_(rollout_ET.get(RESET_KEY).unsqueeze(-1), 0.0))
             state_E.copy_(after_ET[:, -1])

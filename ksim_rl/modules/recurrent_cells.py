@@ -34,7 +34,8 @@ class LSTM(Function):
         reset_TB1: Bool[Tensor, "T B 1"] | None,
     ) -> tuple[Float[Tensor, "T B H"], ...]:
         """Return h and c after each step."""
-        h0_BH, c0_BH = h_BH, c_BH
+        h0_BH = h_BH
+        c0_BH = c_BH
         steps: list[tuple[Tensor, Tensor, Tensor]] = []
         for t, gates_BG in enumerate(gates_TBG.unbind(0)):
             h_BH, c_BH = (_kept(state_BH, reset_TB1, t) for state_BH in (h_BH, c_BH))
@@ -53,11 +54,14 @@ class LSTM(Function):
         """Return the gradients."""
         weight_hh_GH, h0_BH, c0_BH, h_TBH, c_TBH, activations_TBG, reset_TB1 = ctx.saved_tensors
         c_before_TBH = _before(c0_BH, c_TBH, reset_TB1)
-        dh_BH, dc_BH = torch.zeros_like(h0_BH), torch.zeros_like(c0_BH)
+        dh_BH = torch.zeros_like(h0_BH)
+        dc_BH = torch.zeros_like(c0_BH)
         dgates_TBG = torch.empty_like(activations_TBG)
         for t in reversed(range(h_TBH.shape[0])):
-            dh_BH = dh_BH if grad_h_TBH is None else dh_BH + grad_h_TBH[t]
-            dc_BH = dc_BH if grad_c_TBH is None else dc_BH + grad_c_TBH[t]
+            if grad_h_TBH is not None:
+                dh_BH = dh_BH + grad_h_TBH[t]
+            if grad_c_TBH is not None:
+                dc_BH = dc_BH + grad_c_TBH[t]
             dgates_BG, dc_BH = _lstm_step_backward(
                 dh_BH, dc_BH, c_before_TBH[t], c_TBH[t], activations_TBG[t]
             )
@@ -107,20 +111,25 @@ class GRU(Function):
             dinput.append(dinput_BG)
             drecurrent.append(drecurrent_BG)
             dh_BH = _kept(torch.addmm(dh_BH, drecurrent_BG, weight_hh_GH), reset_TB1, t)
-        dinput_TBG, drecurrent_TBG = torch.stack(dinput[::-1]), torch.stack(drecurrent[::-1])
+        dinput_TBG = torch.stack(dinput[::-1])
+        drecurrent_TBG = torch.stack(drecurrent[::-1])
         dweight_hh_GH = _outer(drecurrent_TBG, _before(h0_BH, h_TBH, reset_TB1))
         return dinput_TBG, dweight_hh_GH, drecurrent_TBG.sum((0, 1)), dh_BH, None
 
 
 def _kept(state_BH: Tensor, reset_TB1: Tensor | None, t: int) -> Tensor:
     # A fill instead of a product: an old state that is NaN must not survive the reset.
-    return state_BH if reset_TB1 is None else state_BH.masked_fill(reset_TB1[t], 0.0)
+    if reset_TB1 is None:
+        return state_BH
+    return state_BH.masked_fill(reset_TB1[t], 0.0)
 
 
 def _before(first_BH: Tensor, after_TBH: Tensor, reset_TB1: Tensor | None) -> Tensor:
     """Return the state that each step began with, from those that the steps ended with."""
     before_TBH = torch.cat([first_BH.unsqueeze(0), after_TBH[:-1]])
-    return before_TBH if reset_TB1 is None else before_TBH.masked_fill(reset_TB1, 0.0)
+    if reset_TB1 is None:
+        return before_TBH
+    return before_TBH.masked_fill(reset_TB1, 0.0)
 
 
 def _outer(left_TBH: Tensor, right_TBH: Tensor) -> Tensor:
@@ -135,7 +144,10 @@ def _lstm_step(gates_BG: Tensor, recurrent_BG: Tensor, c_BH: Tensor) -> tuple[Te
     if gates_BG.is_cuda:
         return upstream.fused_lstm_cell(gates_BG, recurrent_BG, c_BH)
     i_BH, f_BH, g_BH, o_BH = (gates_BG + recurrent_BG).chunk(4, -1)
-    i_BH, f_BH, g_BH, o_BH = i_BH.sigmoid(), f_BH.sigmoid(), g_BH.tanh(), o_BH.sigmoid()
+    i_BH = i_BH.sigmoid()
+    f_BH = f_BH.sigmoid()
+    g_BH = g_BH.tanh()
+    o_BH = o_BH.sigmoid()
     c_BH = f_BH * c_BH + i_BH * g_BH
     return o_BH * c_BH.tanh(), c_BH, torch.cat([i_BH, f_BH, g_BH, o_BH], -1)
 
@@ -165,8 +177,10 @@ def _gru_step(gates_BG: Tensor, recurrent_BG: Tensor, h_BH: Tensor) -> tuple[Ten
     """Return h after the step, and what the backward step needs."""
     if gates_BG.is_cuda:
         return upstream.fused_gru_cell(gates_BG, recurrent_BG, h_BH)
-    (rx_BH, zx_BH, nx_BH), (rh_BH, zh_BH, nh_BH) = gates_BG.chunk(3, -1), recurrent_BG.chunk(3, -1)
-    r_BH, z_BH = (rx_BH + rh_BH).sigmoid(), (zx_BH + zh_BH).sigmoid()
+    (rx_BH, zx_BH, nx_BH) = gates_BG.chunk(3, -1)
+    (rh_BH, zh_BH, nh_BH) = recurrent_BG.chunk(3, -1)
+    r_BH = (rx_BH + rh_BH).sigmoid()
+    z_BH = (zx_BH + zh_BH).sigmoid()
     n_BH = (nx_BH + r_BH * nh_BH).tanh()
     return n_BH + z_BH * (h_BH - n_BH), torch.cat([r_BH, z_BH, n_BH, h_BH, nh_BH], -1)
 

@@ -26,7 +26,10 @@ class TensorModule(TensorDictModule):
         self, tensordict: Any, tensors: Any, tensordict_out: Any = None, out_keys: Any = None
     ) -> Any:
         assert self.inplace is True, "networks write into what they read"
-        into = tensordict if tensordict_out is None else tensordict_out
+        if tensordict_out is None:
+            into = tensordict
+        else:
+            into = tensordict_out
         for key, tensor in zip(self.out_keys_source if out_keys is None else out_keys, tensors, strict=True):
             into.set(key, tensor)
         return into

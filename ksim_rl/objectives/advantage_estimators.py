@@ -77,7 +77,8 @@ class RolloutEstimator(ValueEstimatorBase):
         value_network: TensorDictModule | None = None,
         **options: Any,
     ) -> None:
-        critic = value_network if critic is None else critic
+        if critic is None:
+            critic = value_network
         if device is None and critic is not None:
             device = next((parameter.device for parameter in critic.parameters()), None)
         super().__init__(
@@ -87,7 +88,8 @@ class RolloutEstimator(ValueEstimatorBase):
             device=None if device is None else torch.device(device),
             **options,
         )
-        self.normalize_advantage, self.min_advantage_std = normalize_advantage, min_advantage_std
+        self.normalize_advantage = normalize_advantage
+        self.min_advantage_std = min_advantage_std
 
     @abstractmethod
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -139,7 +141,10 @@ class RolloutEstimator(ValueEstimatorBase):
         following: TensorDictBase = tensordict.get("next")
         critic: Any = self.value_network
         if critic is not None:
-            next_params = params if target_params is None else target_params
+            if target_params is None:
+                next_params = params
+            else:
+                next_params = target_params
             if carries_state(critic):
                 tensordict.set(keys.value, self._unrolled_values(tensordict, params))
             else:
@@ -188,7 +193,10 @@ class RolloutEstimator(ValueEstimatorBase):
             return network(inputs)
         # Rows are taken in the order of the memory, which saves a copy of all observations.
         leaf = next(iter(inputs.values(include_nested=True, leaves_only=True)))
-        first = time_dim if leaf.movedim(time_dim, 0).is_contiguous() else 0
+        if leaf.movedim(time_dim, 0).is_contiguous():
+            first = time_dim
+        else:
+            first = 0
         last_dim = inputs.batch_dims - 1
         rows = inputs.apply(
             lambda leaf: leaf.movedim(first, 0).flatten(0, last_dim), batch_size=[inputs.numel()]
@@ -219,7 +227,9 @@ def carries_state(network: TensorDictModuleBase) -> bool:
 def steps_of(network: TensorDictModuleBase) -> AbstractContextManager[Any]:
     """Let a recurrent network take each element of a batch as one step, even inside a loss."""
     # Not for others: the compiler cannot follow it.
-    return set_recurrent_mode(False) if carries_state(network) else nullcontext()
+    if carries_state(network):
+        return set_recurrent_mode(False)
+    return nullcontext()
 
 
 def discounted_sum(
@@ -325,16 +335,23 @@ class VTrace(RolloutEstimator, value.VTrace):
     def in_keys(self) -> list[NestedKey]:
         """What the data must have, or the arguments of a call without a TensorDict."""
         # Written out: the compiler cannot follow TorchRL's, which asks its base class for a property.
-        keys, actor, critic = self.tensor_keys, self.actor_network, self.value_network
-        observed = [keys.value] if critic is None else list(critic.in_keys)
+        keys = self.tensor_keys
+        actor = self.actor_network
+        critic = self.value_network
+        if critic is None:
+            observed = [keys.value]
+        else:
+            observed = list(critic.in_keys)
         read = [*observed, *actor.in_keys, *actor.dist_sample_keys, keys.sample_log_prob]
         flags = [keys.reward, keys.done, keys.terminated]
         return list(dict.fromkeys([*read, *(("next", key) for key in [*observed, *flags])]))
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        time_dim, value_ET_t_plus_1 = signals.time_dim, signals.value_ET_t_plus_1
+        time_dim = signals.time_dim
+        value_ET_t_plus_1 = signals.value_ET_t_plus_1
         ratio_ET = self._ratio(tensordict, signals)
-        rho_ET, c_ET = ratio_ET.clamp_max(self.rho_thresh), self.lmbda * ratio_ET.clamp_max(self.c_thresh)
+        rho_ET = ratio_ET.clamp_max(self.rho_thresh)
+        c_ET = self.lmbda * ratio_ET.clamp_max(self.c_thresh)
         _, target_ET, finite_ET = _discounted_errors(signals, self.gamma, c_ET, rho_ET)
         # Past the end of an episode, of the rollout, or a step that is not finite there is the value only.
         known_ET = ~signals.done_ET & _shifted(finite_ET, torch.zeros_like(finite_ET), time_dim)
@@ -344,7 +361,8 @@ class VTrace(RolloutEstimator, value.VTrace):
         return rho_ET * (signals.reward_ET + bootstrap_ET - signals.value_ET_t), target_ET, finite_ET
 
     def _ratio(self, tensordict: TensorDictBase, signals: Signals) -> Tensor:
-        actor, keys = self.actor_network, [*self.actor_network.in_keys, *self.actor_network.dist_sample_keys]
+        actor = self.actor_network
+        keys = [*self.actor_network.in_keys, *self.actor_network.dist_sample_keys]
         with steps_of(actor):
             log_prob = self._in_rows(self._log_prob, tensordict.select(*keys), signals.time_dim)
         old_log_prob = tensordict.get(self.tensor_keys.sample_log_prob, None)

@@ -75,7 +75,8 @@ class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
     anneal_learning_rate: bool = False
 
     def _check_fields(self) -> None:
-        low, high = self.learning_rate_min, self.learning_rate_max
+        low = self.learning_rate_min
+        high = self.learning_rate_max
         if low > high:
             raise ValueError(f"learning_rate_min={low!r} exceeds learning_rate_max={high!r}")
         if self.schedule == "adaptive" and not low <= self.learning_rate <= high:

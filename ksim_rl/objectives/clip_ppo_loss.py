@@ -60,13 +60,17 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
                     f"clip_value=True takes the radius from clip_epsilon={clip_epsilon!r}, which has two: pass a number"
                 )
             clip_value = float(clip_epsilon)
-        self.clip_value = float(clip_value) if clip_value else None
+        if clip_value:
+            self.clip_value = float(clip_value)
+        else:
+            self.clip_value = None
         self.log_ratio_statistics = log_ratio_statistics
 
     @property
     def dataset_keys(self) -> list[NestedKey]:
         """The leaves that a dataset needs for this loss, advantages already estimated."""
-        keys, actor = self.tensor_keys, self.actor_network
+        keys = self.tensor_keys
+        actor = self.actor_network
         wanted = [
             *observation_keys(actor),
             *_as_list(keys.action),
@@ -103,7 +107,10 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             # The ratio of a row that is left out may be infinite, and zero times that is a gradient of NaN.
             log_weight_B = torch.where(mask_B, log_weight_B, 0.0)
         # The clipping acts on the ratio to the proximal policy; the gain is weighted by that to the collecting one.
-        log_behavior_weight_B = log_weight_B if log_is_weight_B is None else log_weight_B + log_is_weight_B
+        if log_is_weight_B is None:
+            log_behavior_weight_B = log_weight_B
+        else:
+            log_behavior_weight_B = log_weight_B + log_is_weight_B
         log_clipped_B = log_weight_B.clamp(*self._clip_bounds)
         clipped_B = log_clipped_B != log_weight_B
         if log_is_weight_B is not None:
@@ -113,7 +120,10 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         losses = {"loss_objective": -gain_B}
         logged = {"clip_fraction": clipped_B.to(gain_B.dtype), "kl_approx": kl_approx_B}
         with torch.no_grad():
-            exact_B = None if dist_old is None else policy_kl(dist_old, dist)
+            if dist_old is None:
+                exact_B = None
+            else:
+                exact_B = policy_kl(dist_old, dist)
             logged["kl"] = estimated_kl(log_behavior_weight_B) if exact_B is None else exact_B.unsqueeze(-1)
         out = TensorDict({})
         if self.entropy_bonus:
@@ -193,7 +203,8 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         mask_B = self._mask(tensordict, advantage)
         if self.normalize_advantage_exclude_dims or mask_B is None and ranks.size() == 1:
             return super()._standardize_advantage(advantage, tensordict)
-        mask_B = torch.ones_like(advantage, dtype=torch.bool) if mask_B is None else mask_B
+        if mask_B is None:
+            mask_B = torch.ones_like(advantage, dtype=torch.bool)
         # The bound is that of TorchRL.
         return standardized(advantage, mask_B, lowest_std=torch.finfo(torch.float32).resolution)
 
@@ -214,12 +225,16 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
 
 
 def _entropy_key(key: NestedKey) -> NestedKey:
-    return f"{key}_entropy" if isinstance(key, str) else (*key[:-1], f"{key[-1]}_entropy")
+    if isinstance(key, str):
+        return f"{key}_entropy"
+    return (*key[:-1], f"{key[-1]}_entropy")
 
 
 def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
     assert keys is not None
-    return list(keys) if isinstance(keys, list) else [keys]
+    if isinstance(keys, list):
+        return list(keys)
+    return [keys]
 
 
 def _ratio_statistics(log_weight: Tensor) -> dict[str, Tensor]:

@@ -29,10 +29,14 @@ def discriminator_loss(
     pairs where it is True count.
     """
     reference_CL = reference_CL.detach().requires_grad_()
-    reference_C, policy_B = judge(reference_CL), judge(policy_BL)
+    reference_C = judge(reference_CL)
+    policy_B = judge(policy_BL)
     # Its gradient is a part of the loss, so it has to have one itself.
     (slope_CL,) = torch.autograd.grad(reference_C.sum(), reference_CL, create_graph=True)
-    mean: Judge = torch.mean if mask_B is None else partial(masked_mean, mask=mask_B)
+    if mask_B is None:
+        mean: Judge = torch.mean
+    else:
+        mean = partial(masked_mean, mask=mask_B)
     penalty = mean(slope_CL.square().sum(-1))
     loss = mean((reference_C - 1.0).square()) + mean((policy_B + 1.0).square())
     loss = loss + 0.5 * gradient_penalty * penalty

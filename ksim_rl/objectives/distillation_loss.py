@@ -98,10 +98,16 @@ class DistillationLoss(nn.Module):
                 )
             loss_B = divergence_B
         with torch.no_grad():
-            moved_B = None if before is None else policy_kl(before, student)
+            if before is None:
+                moved_B = None
+            else:
+                moved_B = policy_kl(before, student)
         mask_B = mask_of(minibatch_B, loss_B)
         mean = masked_mean(loss_B, mask_B)
-        kl = torch.zeros_like(mean) if moved_B is None else masked_mean(moved_B, mask_B)
+        if moved_B is None:
+            kl = torch.zeros_like(mean)
+        else:
+            kl = masked_mean(moved_B, mask_B)
         return TensorDict({"loss_distillation": mean, "kl": kl.detach()})
 
 

@@ -101,14 +101,17 @@ class Compared(Function):
         """Return both, and keep the gradient."""
         logits = logits_BNA.transpose(0, 1).contiguous()
         networks, rows, count = logits.shape
-        slope, given, lowest = torch.empty_like(logits), [logits, logits, logits], False
+        slope = torch.empty_like(logits)
+        given = [logits, logits, logits]
+        lowest = False
         loss_NB, mean_NB = (support_A.new_empty(networks, rows) for _ in range(2))
         if targets:
             following_BNA, *moves, lowest = targets
             given = following_BNA.transpose(0, 1), *(move.expand(rows, 1) for move in moves)
         given = logits, *(own.contiguous() for own in given), support_A, loss_NB, mean_NB, slope
         lanes = triton.next_power_of_2(count)
-        tall, warps = max(LANES // lanes, 2), max(lanes // LANES, 1)
+        tall = max(LANES // lanes, 2)
+        warps = max(lanes // LANES, 1)
         launch: Any = compare_rows[-(-rows // tall), networks]
         launch(*given, rows, len(targets) > 0, lowest, networks, count, tall, lanes, num_warps=warps)
         ctx.save_for_backward(slope)

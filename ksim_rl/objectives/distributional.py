@@ -29,7 +29,8 @@ def compare(
         return loss_BN, mean_BN.detach()
     logits_BNA = _exact(logits_BNA)
     with torch.no_grad():
-        probs_BNA, moves = _exact(following_BNA).softmax(-1), (reward_B1[:, None], discount_B1[:, None])
+        probs_BNA = _exact(following_BNA).softmax(-1)
+        moves = (reward_B1[:, None], discount_B1[:, None])
         target_BNA = project_distribution(probs_BNA, *moves, support_A)
         if reduction == "min":
             lowest_B11 = mean_of(target_BNA, support_A).argmin(-1)[:, None, None]
@@ -68,7 +69,9 @@ def project_distribution(
     the ends it goes to the last atom (algorithm 1 of Bellemare et al., arXiv 1707.06887). `support_A` has the values of
     the atoms, evenly spaced, rising.
     """
-    low, high, count = support_A[0], support_A[-1], support_A.shape[0]
+    low = support_A[0]
+    high = support_A[-1]
+    count = support_A.shape[0]
     spacing = (high - low) / (count - 1)
     position = ((reward + discount * support_A).clamp(low, high) - low) / spacing
     # The last atom itself counts as the upper neighbour of the one before, so that no index runs over the end.

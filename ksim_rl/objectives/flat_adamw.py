@@ -34,7 +34,8 @@ class FlatAdamW(torch.optim.Optimizer):
         device = learning[0].device
         rates = {"lr": torch.tensor(learning_rate, device=device), "initial_lr": learning_rate}
         super().__init__(learning, rates)
-        self._cfg, self._learning = cfg, learning
+        self._cfg = cfg
+        self._learning = learning
         self._gaps = [own.new_zeros(-own.numel() % ALIGNMENT) for own in learning]
         self._flat, self._target = self._end_to_end(learning), self._end_to_end(list(target))
         self._moments = torch.zeros_like(self._flat), torch.zeros_like(self._flat)
@@ -53,7 +54,10 @@ class FlatAdamW(torch.optim.Optimizer):
         return [part for own, gap in pairs for part in (own.reshape(-1), gap)]
 
     def _end_to_end(self, parameters: list[nn.Parameter]) -> Tensor:
-        flat = torch.cat(self._pieces([own.detach() for own in parameters])) if parameters else torch.empty(0)
+        if parameters:
+            flat = torch.cat(self._pieces([own.detach() for own in parameters]))
+        else:
+            flat = torch.empty(0)
         for parameter, part in zip(parameters, self._parts(flat) if parameters else (), strict=True):
             parameter.data = part
         return flat

@@ -56,7 +56,10 @@ def clip_and_guard(
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm = nn.utils.get_total_norm(gradients)
-    finite = norm.isfinite() if loss is None else norm.isfinite() & loss.isfinite()
+    if loss is None:
+        finite = norm.isfinite()
+    else:
+        finite = norm.isfinite() & loss.isfinite()
     if max_grad_norm is not None:
         torch._foreach_mul_(gradients, (max_grad_norm / (norm + 1e-6)).clamp_max(1.0))
     return norm, 1.0 - finite.to(torch.float32)
@@ -145,7 +148,10 @@ def go_back(
         learnt = [parameter.grad for name in losses for parameter in _parameters(optimizers[name])]
         gradients = [gradient for gradient in learnt if gradient is not None]
         values = [value.detach() for value in (*losses.values(), *beside)]
-        weight = torch.ones_like(values[0]) if mask is None else mask.to(torch.float32).mean()
+        if mask is None:
+            weight = torch.ones_like(values[0])
+        else:
+            weight = mask.to(torch.float32).mean()
         ranks.mean_([*gradients, *values], weight=weight)
 
 

@@ -15,7 +15,9 @@ MASK_KEY: NestedKey = ("collector", "mask")
 def mask_of(env_states: TensorDictBase, like_B: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
     """Return the mask of env states in the shape of `like_B`; all take part where there is none."""
     mask = env_states.get(MASK_KEY, None)
-    return torch.ones_like(like_B, dtype=torch.bool) if mask is None else mask.reshape(like_B.shape)
+    if mask is None:
+        return torch.ones_like(like_B, dtype=torch.bool)
+    return mask.reshape(like_B.shape)
 
 
 def masked_mean(values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"]) -> Float[Tensor, ""]:
@@ -28,7 +30,8 @@ def standardized(
     values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"], *, lowest_std: float
 ) -> Float[Tensor, "*batch"]:
     """Shift and scale to mean 0 and standard deviation 1, or divide by `lowest_std`, over all that masks mark."""
-    count, own_mean = mask.sum(), masked_mean(values, mask)
+    count = mask.sum()
+    own_mean = masked_mean(values, mask)
     own_squares = torch.where(mask, values - own_mean, 0.0).square().sum()
     count, mean, squares = ranks.merged(count, own_mean, own_squares)
     std = (squares / (count - 1).clamp_min(1)).sqrt().clamp_min(lowest_std)

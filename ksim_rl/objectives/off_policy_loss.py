@@ -83,12 +83,14 @@ class OffPolicyLoss(LossModule):
         super().__init__()
         check_value("gamma", gamma, Share)
         check_value("value_reduction", value_reduction, ValueReduction)
-        self.actor_network, self.critic_network = actor_network, critic_network
+        self.actor_network = actor_network
+        self.critic_network = critic_network
         # Running statistics are shared: both networks see observations on the same scale at any time.
         shared: Any = {id(own): own for own in critic_network.modules() if isinstance(own, RunningMoments)}
         # Under a name that `parameters()` leaves out.
         self._target_critic = copy.deepcopy(critic_network, memo=shared).requires_grad_(False)
-        self.support_A, self.gamma = support_A, gamma
+        self.support_A = support_A
+        self.gamma = gamma
         self.value_reduction: ValueReduction = value_reduction
         self.reduction, self._selected = "mean", list[Any](self._written)
 
@@ -111,7 +113,8 @@ class OffPolicyLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
         """What a minibatch must have."""
-        keys, observed = self.tensor_keys, self.observation_keys
+        keys = self.tensor_keys
+        observed = self.observation_keys
         following = [*observed, keys.reward, keys.terminated]
         return [*observed, keys.action, *(unravel_key(("next", key)) for key in following)]
 
@@ -152,7 +155,8 @@ class OffPolicyLoss(LossModule):
     @torch.no_grad()
     def update_target_(self, tau: float) -> None:
         """Move the target critics by a share `tau` towards the critics, in a few kernels."""
-        target, network = self._target_critic, self.critic_network
+        target = self._target_critic
+        network = self.critic_network
         torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
 
     def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
@@ -163,14 +167,21 @@ class OffPolicyLoss(LossModule):
         keys = [key for key in critic.in_keys if key != self.tensor_keys.action]
         inputs = observed.select(*keys).set(self.tensor_keys.action, action)
         out = critic(inputs).get(critic.out_keys[0])
-        return out.to(torch.promote_types(out.dtype, torch.float32)) if self.support_A is None else out
+        if self.support_A is None:
+            return out.to(torch.promote_types(out.dtype, torch.float32))
+        return out
 
     def _value(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """Return the value of an action [B], which the actor climbs; no gradients reach the critics."""
         with frozen(self.critic_network):
             predicted = self._predict(self.critic_network, tensordict, action)
-        values_BN = predicted if self.support_A is None else mean_returns(predicted, self.support_A)
-        return values_BN.amin(-1) if self.value_reduction == "min" else values_BN.mean(-1)
+        if self.support_A is None:
+            values_BN = predicted
+        else:
+            values_BN = mean_returns(predicted, self.support_A)
+        if self.value_reduction == "min":
+            return values_BN.amin(-1)
+        return values_BN.mean(-1)
 
     def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
         """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
@@ -181,7 +192,10 @@ class OffPolicyLoss(LossModule):
             reward_B1 = following.get(keys.reward)
             going_B1 = 1.0 - following.get(keys.terminated).to(reward_B1.dtype)
             steps_B1 = tensordict.get(keys.steps_to_next_obs, None)
-            discount_B1 = self.gamma * going_B1 if steps_B1 is None else self.gamma**steps_B1 * going_B1
+            if steps_B1 is None:
+                discount_B1 = self.gamma * going_B1
+            else:
+                discount_B1 = self.gamma**steps_B1 * going_B1
             if next_bonus_B is not None:
                 reward_B1 = reward_B1 + discount_B1 * next_bonus_B[:, None]
             next_predicted = self._predict(self._target_critic, following, next_action)
@@ -192,7 +206,8 @@ class OffPolicyLoss(LossModule):
                 if self.value_reduction == "min":
                     target_BN = target_BN.amin(-1, keepdim=True)
             error_BN = predicted - target_BN
-            values_BN, loss_B = predicted, error_BN.square().sum(-1)
+            values_BN = predicted
+            loss_B = error_BN.square().sum(-1)
             td_error_B = error_BN.detach().abs().amax(-1)
         else:
             given = next_predicted, reward_B1, discount_B1, self.value_reduction
@@ -209,7 +224,10 @@ class OffPolicyLoss(LossModule):
     def _mean(self, column_B: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Return the mean over the env states that take part, weighed by their priority weights."""
         weight_B = tensordict.get(self.tensor_keys.priority_weight, None)
-        weight_B = torch.ones_like(column_B) if weight_B is None else weight_B.reshape(column_B.shape)
+        if weight_B is None:
+            weight_B = torch.ones_like(column_B)
+        else:
+            weight_B = weight_B.reshape(column_B.shape)
         for key in self._loss_mask_keys():
             mask = tensordict.get(key, None)
             if mask is not None:
@@ -297,8 +315,10 @@ class TD3Loss(OffPolicyLoss):
         super().__init__(actor_network, critic_network, **options)
         check_in_range("target_noise", target_noise, low=0.0)
         check_in_range("target_noise_clip", target_noise_clip, low=0.0)
-        self.low_L, self.high_L = low_L, high_L
-        self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
+        self.low_L = low_L
+        self.high_L = high_L
+        self.target_noise = target_noise
+        self.target_noise_clip = target_noise_clip
 
     def _next_action(self, following: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         action = self.actor_network(following).get(self.tensor_keys.action)

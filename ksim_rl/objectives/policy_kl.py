@@ -35,8 +35,12 @@ def gaussian_parameters(
 
     The divergence between two that squash their samples in the same way is that of the gaussians beneath them.
     """
-    base = dist if hasattr(dist, "loc") else getattr(dist, "base_dist", dist)
-    loc, scale = getattr(base, "loc", None), getattr(base, "scale", None)
+    if hasattr(dist, "loc"):
+        base = dist
+    else:
+        base = getattr(dist, "base_dist", dist)
+    loc = getattr(base, "loc", None)
+    scale = getattr(base, "scale", None)
     if isinstance(loc, Tensor) and isinstance(scale, Tensor):
         return loc, scale
     return None
@@ -75,14 +79,18 @@ def policy_kl(old: Distribution, new: Distribution) -> Float[Tensor, "*batch"] |
         known = [
             part.flatten(dims).sum(-1) if part.ndim > dims else part for part in parts if part is not None
         ]
-        return reduce(add, known) if len(known) == len(parts) else None
+        if len(known) == len(parts):
+            return reduce(add, known)
+        return None
     if isinstance(old, TransformedDistribution):
         # torch compares the two maps on the host. They are those of one policy.
         parameters = gaussian_parameters(old), gaussian_parameters(new)
         if parameters[0] is None or parameters[1] is None:
             return None
         return kl_divergence(*parameters[0], *parameters[1])
-    return distributions.kl_divergence(old, new) if has_analytic_kl(old, new) else None
+    if has_analytic_kl(old, new):
+        return distributions.kl_divergence(old, new)
+    return None
 
 
 def estimated_kl(log_ratio: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

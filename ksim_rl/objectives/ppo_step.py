@@ -24,8 +24,13 @@ from ksim_rl.transforms import MirrorMap
 
 def with_precision_of(cfg: PPOCfg, device: torch.device | str) -> PPOCfg:
     """Return `cfg` with the precision that "auto" stands for on a device: "bfloat16" on CUDA, else "float32"."""
-    resolved = "bfloat16" if torch.device(device).type == "cuda" else "float32"
-    return dataclasses.replace(cfg, precision=resolved) if cfg.precision == "auto" else cfg
+    if torch.device(device).type == "cuda":
+        resolved = "bfloat16"
+    else:
+        resolved = "float32"
+    if cfg.precision == "auto":
+        return dataclasses.replace(cfg, precision=resolved)
+    return cfg
 
 
 def in_precision(loss: Loss, precision: str, *, device: torch.device | str) -> Loss:
@@ -35,7 +40,8 @@ def in_precision(loss: Loss, precision: str, *, device: torch.device | str) -> L
     """
     if precision == "float32":
         return loss
-    dtype, kind = getattr(torch, precision), torch.device(device).type
+    dtype = getattr(torch, precision)
+    kind = torch.device(device).type
 
     def rounded(minibatch_B: TensorDictBase) -> TensorDictBase:
         with torch.autocast(kind, dtype):
@@ -124,7 +130,8 @@ def ppo_step(
     mask = minibatch_B.get(MASK_KEY, None)
     go_back({"loss": total}, {"loss": optimizer}, mask=mask, beside=measured.values())
     if cfg.schedule == "adaptive":
-        low, high = cfg.learning_rate_min, cfg.learning_rate_max
+        low = cfg.learning_rate_min
+        high = cfg.learning_rate_max
         if cfg.anneal_learning_rate:
             low, high = rate_bounds(cfg, optimizer)
         adapt_learning_rate_(

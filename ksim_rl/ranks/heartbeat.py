@@ -15,7 +15,8 @@ from ksim_rl.terminal import show
 
 # Between beats; a rank whose thread is silent for so long is dead or stopped, and one that says to be in the same
 # place for `KSIM_RL_RANK_TIMEOUT_S` hangs: compiling kernels and evaluating take less.
-BEAT_S, SILENT_S = 2.0, 40.0
+BEAT_S = 2.0
+SILENT_S = 40.0
 HUNG_S = 600.0
 FAILED = 3
 
@@ -44,7 +45,8 @@ class Heartbeat:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._hung_s = float(os.environ.get("KSIM_RL_RANK_TIMEOUT_S", HUNG_S))
-        self._stop, self._lock = threading.Event(), threading.Lock()
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def __enter__(self) -> "Heartbeat":
@@ -69,7 +71,9 @@ class Heartbeat:
     def _read(self, what: str, rank: int) -> str | None:
         key = f"{what}/{rank}"
         with self._lock:
-            return self._store.get(key).decode() if self._store.check([key]) else None
+            if self._store.check([key]):
+                return self._store.get(key).decode()
+            return None
 
     def _run(self) -> None:
         others = set(range(group.size())) - {group.rank()}

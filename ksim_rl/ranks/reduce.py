@@ -31,7 +31,8 @@ def mean_(tensors: Sequence[Float[Tensor, "*?shape"]], *, weight: Float[Tensor, 
         return
     share = weight / size()
     flat = torch.cat([*(tensor.reshape(-1) for tensor in tensors), share.reshape(1)])
-    means, total = flat[:-1], flat[-1]
+    means = flat[:-1]
+    total = flat[-1]
     means.mul_(share)  # before they are added, so that sums of large gradients stay finite
     dist.all_reduce(flat)
     means.div_(total.clamp_min(torch.finfo(flat.dtype).tiny))
@@ -76,7 +77,9 @@ def any_of(mask: Bool[Tensor, "*rows"]) -> Bool[Tensor, ""]:
 
 def most_of(number: Num[Tensor, ""]) -> Num[Tensor, ""]:
     """Return the largest of all ranks' numbers."""
-    return number if size() == 1 else torch.stack(gather(number)).amax()
+    if size() == 1:
+        return number
+    return torch.stack(gather(number)).amax()
 
 
 def combined(
@@ -87,6 +90,9 @@ def combined(
     values_RM = torch.stack(gather(values_M))
     whole = {}
     for name, column_R in zip(metrics, values_RM.unbind(1), strict=True):
-        largest_or_mean = column_R.amax() if name.startswith(most) else column_R.mean()
+        if name.startswith(most):
+            largest_or_mean = column_R.amax()
+        else:
+            largest_or_mean = column_R.mean()
         whole[name] = column_R.sum() if name.startswith(added) else largest_or_mean
     return whole

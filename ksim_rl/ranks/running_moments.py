@@ -14,7 +14,9 @@ from ksim_rl.ranks.reduce import merged
 
 # Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows. Short ones hold up
 # little of what else a GPU does. Then those of so many parts are merged, and at last those of all these groups.
-MOST_PARTS, LEAST_ROWS, GROUP = 2048, 16, 32
+MOST_PARTS = 2048
+LEAST_ROWS = 16
+GROUP = 32
 # Stages 0 to 3 are of an element (which rows count), of a column of a part, of a group, and of the batch.
 _quick = QuickLaunch(
     arguments_of(
@@ -107,7 +109,10 @@ class RunningMoments(nn.Module):
                 f"valid has shape {tuple(valid.shape)}: expected one element per row of obs, "
                 f"whose shape is {tuple(values.shape)}"
             )
-        valid_N = None if valid is None else valid.reshape(-1).contiguous()
+        if valid is None:
+            valid_N = None
+        else:
+            valid_N = valid.reshape(-1).contiguous()
         until = -1 if self.until is None else self.until
         exact = self.count, self.exact_mean, self.exact_sum_of_squares
         if len(values_NL):

@@ -21,7 +21,9 @@ _RING = "/replay/ring/"
 # What each rank counts of its own, and metrics add up.
 _COUNTERS = ("/non_finite_count", "/non_finite_env_states")
 # The parts of `RunningMoments`: of the observations that a rank has seen itself.
-_COUNT, _MEAN, _SQUARES = "count", "exact_mean", "exact_sum_of_squares"
+_COUNT = "count"
+_MEAN = "exact_mean"
+_SQUARES = "exact_sum_of_squares"
 
 
 def gathered(own: Mapping[str, Shaped[Tensor, "*?leaf"]]) -> dict[str, Any]:
@@ -41,7 +43,10 @@ def gathered(own: Mapping[str, Shaped[Tensor, "*?leaf"]]) -> dict[str, Any]:
     if not differing:
         return found
     flat = torch.cat([_bytes(own[name]) for name in differing])
-    flats = [torch.empty_like(flat) for _ in range(size())] if rank() == 0 else None
+    if rank() == 0:
+        flats = [torch.empty_like(flat) for _ in range(size())]
+    else:
+        flats = None
     dist.gather(flat, flats, dst=0)
     for index, other in enumerate(flats or ()):
         if index:
@@ -111,11 +116,9 @@ def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
     stem = leaf.rpartition(".")[0]
     prefix = f"{room}/{stem}." if stem else f"{room}/"
     if all(f"{prefix}{part}" in parts[0] for part in (_COUNT, _MEAN, _SQUARES)):
-        return (
-            _merged_moments(prefix, parts)[name.removeprefix(prefix)]
-            if name.startswith(prefix)
-            else tensors[0]
-        )
+        if name.startswith(prefix):
+            return _merged_moments(prefix, parts)[name.removeprefix(prefix)]
+        return tensors[0]
     return tensors[0]
 
 
@@ -128,7 +131,8 @@ def _merged_moments(prefix: str, parts: list[Tensors]) -> Tensors:
         zeros = {name: torch.zeros_like(merged[name]) for name in (_COUNT, _MEAN, _SQUARES)}
         return merged | zeros
     for part in parts[1:]:
-        count, added = merged[_COUNT].double(), part[f"{prefix}{_COUNT}"].double()
+        count = merged[_COUNT].double()
+        added = part[f"{prefix}{_COUNT}"].double()
         share = added / (count + added).clamp_min(1)
         delta = part[f"{prefix}{_MEAN}"] - merged[_MEAN]
         merged[_SQUARES] = merged[_SQUARES] + part[f"{prefix}{_SQUARES}"] + delta.square() * share * count

@@ -27,7 +27,9 @@ def launched() -> bool:
 
 def device(name: str) -> str:
     """Return a device's name as this rank's own: "cuda" is the GPU of its local rank."""
-    return f"cuda:{os.environ['LOCAL_RANK']}" if group.size() > 1 and name.startswith("cuda") else name
+    if group.size() > 1 and name.startswith("cuda"):
+        return f"cuda:{os.environ['LOCAL_RANK']}"
+    return name
 
 
 @contextmanager
@@ -49,7 +51,9 @@ def joined(command: str) -> Iterator[None]:
         raise ValueError(
             f"WORLD_SIZE is set and {missing[0]} is not: start the ranks by torchrun, which sets both"
         )
-    backend, rank, size = _backend(), int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+    backend = _backend()
+    rank = int(os.environ["RANK"])
+    size = int(os.environ["WORLD_SIZE"])
     _runs[:] = [store.of_run(store.connected(serves=store.is_served_by_rank()))]
     try:
         _attempts[:] = [store.attempt(_runs[0], rank=rank, size=size)]
@@ -84,7 +88,8 @@ def check_same(values: Mapping[str, Any], *, what: str) -> None:
     dist.all_gather_object(parts, own, group=_on_host())
     for rank, part in enumerate(parts):
         for name in {**parts[0], **part}:
-            ours, theirs = parts[0].get(name, "nothing"), part.get(name, "nothing")
+            ours = parts[0].get(name, "nothing")
+            theirs = part.get(name, "nothing")
             if ours != theirs:
                 raise ValueError(
                     f"rank {rank} has another {what}: {name} is {theirs} there and {ours} on rank 0; "
@@ -150,7 +155,8 @@ def _on_host() -> Any:
 def _backend() -> str:
     if not torch.cuda.is_available():
         return "gloo"
-    local, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+    local = int(os.environ["LOCAL_RANK"])
+    count = torch.cuda.device_count()
     if local >= count:
         raise ValueError(
             f"rank {os.environ['RANK']} has no GPU of its own: this machine has {count}, and torchrun started at least "

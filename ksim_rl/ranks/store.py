@@ -20,7 +20,8 @@ def connected(*, serves: bool = False) -> dist.TCPStore:
 
     Raises ValueError where the port is in use, RuntimeError where nobody answers.
     """
-    host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    host = os.environ["MASTER_ADDR"]
+    port = int(os.environ["MASTER_PORT"])
     try:
         return dist.TCPStore(
             host, port, is_master=serves, wait_for_workers=False, timeout=timedelta(seconds=JOIN_S)
@@ -57,7 +58,8 @@ def attempt(run: dist.Store, *, rank: int, size: int) -> int:
         run.set(f"heard/{number}/{rank}", "")
         return number
     number = run.add("attempts", 1)
-    waiting, until = set(range(1, size)), time.monotonic() + JOIN_S
+    waiting = set(range(1, size))
+    until = time.monotonic() + JOIN_S
     while waiting:
         for other in tuple(waiting):
             if run.check([f"asks/{other}"]):

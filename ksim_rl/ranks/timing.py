@@ -12,7 +12,8 @@ class Timing:
     """Times blocks, on CUDA by events, whose times are read by `slowest` only when they have passed."""
 
     def __init__(self, device: torch.device) -> None:
-        self._device, self._passed = device, [0.0]
+        self._device = device
+        self._passed = [0.0]
         self._events: list[tuple[torch.cuda.Event, torch.cuda.Event]] = []
 
     def begin(self, iteration: int) -> None:

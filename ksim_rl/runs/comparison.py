@@ -20,7 +20,8 @@ PANELS = (
     ("Episode length (env steps)", ("episode/length",), STEP),
     ("Env states per second", ("throughput/env_states_per_s",), STEP),
 )
-MOST_FIELDS, MOST_LETTERS = 60, 60
+MOST_FIELDS = 60
+MOST_LETTERS = 60
 
 
 def names(folders: Sequence[Path]) -> list[str]:

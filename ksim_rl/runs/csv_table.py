@@ -13,7 +13,8 @@ from ksim_rl.files.writing import check_own, whole_file
 
 STEP = "env_states"
 # Of a table in memory: more columns are refused, and of more cells only each second, fourth ... row is kept.
-MOST_COLUMNS, MOST_CELLS = 10_000, 4_000_000
+MOST_COLUMNS = 10_000
+MOST_CELLS = 4_000_000
 MOST_LETTERS = 2**22  # of a line
 T = TypeVar("T")
 
@@ -46,12 +47,16 @@ class CsvTable:
         self._rows.append(row)
         self._columns += new_columns
         # None until the row is written, so that after a failure the next row copies the table.
-        begins, self._last_begins = self._last_begins, None
+        begins = self._last_begins
+        self._last_begins = None
         if new_columns or begins is None:
             begins = self._copy()
         else:
             with open(self.path, "r+", newline="") as file:
-                begins = file.seek(begins) if same_row else file.seek(0, io.SEEK_END)
+                if same_row:
+                    begins = file.seek(begins)
+                else:
+                    begins = file.seek(0, io.SEEK_END)
                 self._writer(file).writerow(row)
                 file.truncate()
         self._last_begins = begins
@@ -85,7 +90,8 @@ def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     open_regular(path, limit=MOST_TEXT_BYTES).close()  # which says that there is none
     kept: list[dict[str, str]] = []
     last: dict[str, str] = {}
-    every, cells = 1, 0
+    every = 1
+    cells = 0
     try:
         with _opened(path) as (columns, rows):
             for number, row in enumerate(rows):
@@ -95,7 +101,8 @@ def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
                 kept.append(last)
                 cells += len(last)
                 while cells > MOST_CELLS and len(kept) > 1:
-                    kept, every = kept[::2], 2 * every
+                    kept = kept[::2]
+                    every = 2 * every
                     cells = sum(map(len, kept))
     except csv.Error as error:
         raise ValueError(f"{path}: damaged: {error}") from error
@@ -107,7 +114,10 @@ def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[list[str], Iterator[dict[str, str]]]]:
     """Give the columns of a table, and its whole rows one by one; of no file, those of a new table."""
-    content = open_regular(path, limit=MOST_TEXT_BYTES) if path.exists() else io.BytesIO()
+    if path.exists():
+        content = open_regular(path, limit=MOST_TEXT_BYTES)
+    else:
+        content = io.BytesIO()
     with io.TextIOWrapper(content, errors="replace", newline="") as file:
         lines = iter(lambda: file.readline(MOST_LETTERS), "")
         head = next(lines, "")

@@ -14,7 +14,8 @@ from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import STEP, read_table
 from ksim_rl.terminal import printable
 
-CONFIG, METRICS = "config.yaml", "metrics.csv"
+CONFIG = "config.yaml"
+METRICS = "metrics.csv"
 _TASK = re.compile(r"^task_name: *['\"]?([\w.+-]+)", re.MULTILINE)
 # Rows of metrics that the speed is the median of: the first ones compile.
 LATEST = 50
@@ -79,12 +80,16 @@ def summarize(folder: Path) -> Summary:
         sessions = record.read(folder)
         began = sessions[0].began if sessions else "?"
         text = read_bytes(folder / CONFIG, limit=MOST_CONFIG_BYTES).decode(errors="replace")
-        task = found[1] if (found := _TASK.search(text)) else "?"
+        if found := _TASK.search(text):
+            task = found[1]
+        else:
+            task = "?"
         rows = metric_rows(folder)
     except (ValueError, csv.Error) as error:
         faults.append(printable(str(error)))
     speeds = numbers(rows[-LATEST:], "throughput/env_states_per_s")
-    iteration, env_states = last(rows, "iteration"), last(rows, STEP)
+    iteration = last(rows, "iteration")
+    env_states = last(rows, STEP)
     return Summary(
         folder=folder,
         task=task,
@@ -102,7 +107,9 @@ def summarize(folder: Path) -> Summary:
 
 def metric_rows(folder: Path) -> list[dict[str, str]]:
     """Return the rows of a run's metrics; none where it has not written any."""
-    return read_table(folder / METRICS)[1] if (folder / METRICS).exists() else []
+    if (folder / METRICS).exists():
+        return read_table(folder / METRICS)[1]
+    return []
 
 
 def numbers(rows: Sequence[dict[str, str]], name: str) -> list[float]:
@@ -124,9 +131,10 @@ def _number(text: str | None) -> float:
 
 def line(summary: Summary, *, name: str) -> list[str]:
     """Return a run as the cells of a table with the columns `HEADS`."""
-    status = (
-        f"{summary.status} ({summary.why})" if summary.why and summary.status != "done" else summary.status
-    )
+    if summary.why and summary.status != "done":
+        status = f"{summary.status} ({summary.why})"
+    else:
+        status = summary.status
     return [
         printable(name),
         summary.task,
@@ -143,7 +151,9 @@ def line(summary: Summary, *, name: str) -> list[str]:
 
 def written(value: float | None, pattern: str) -> str:
     """Write a figure, "-" where there is none."""
-    return "-" if value is None else format(value, pattern)
+    if value is None:
+        return "-"
+    return format(value, pattern)
 
 
 def duration(seconds: float | None) -> str:

@@ -129,7 +129,9 @@ def status(folder: Path) -> tuple[str, str]:
 def _text(value: Any) -> Any:
     if isinstance(value, dict):
         return {printable(str(name)): _text(entry) for name, entry in value.items()}
-    return printable(value) if isinstance(value, str) else value
+    if isinstance(value, str):
+        return printable(value)
+    return value
 
 
 def _write(folder: Path, sessions: Sequence[Session]) -> None:
@@ -152,7 +154,10 @@ def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
         seen.add(top)
         found[name] = {"commit": commit}
         if changes := ask_git(top, "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD"):
-            kept = f"{name}.diff" if session == 1 else f"{name}.{session}.diff"
+            if session == 1:
+                kept = f"{name}.diff"
+            else:
+                kept = f"{name}.{session}.diff"
             if len(changes) <= MOST_DIFF_BYTES:
                 write_whole(folder / kept, changes)
             found[name]["changed"] = kept if len(changes) <= MOST_DIFF_BYTES else "too much to keep"

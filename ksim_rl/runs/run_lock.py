@@ -16,7 +16,8 @@ from typing import IO, Any
 from ksim_rl.files.reading import open_regular
 from ksim_rl.files.writing import open_own
 
-LOCK, MOST_LETTERS = ".lock", 1000
+LOCK = ".lock"
+MOST_LETTERS = 1000
 # What some file systems of clusters answer.
 WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 def watch(run_folder: Path, *, holds: str, note: Callable[[str], None]) -> Callable[[], None]:
     """Return a check that raises OSError once the folder, or the file in it, is gone; read-only is noted once."""
-    begun, said = run_folder.stat(), []
+    begun = run_folder.stat()
+    said = []
 
     def check() -> None:
         try:
@@ -37,7 +38,8 @@ def threads_that_fail(note: Callable[[str], None]) -> Iterator[None]:
         name = getattr(failed.thread, "name", "a thread")
         note(f"warning: {name} ended: {failed.exc_type.__name__}: {failed.exc_value}")
 
-    previous, threading.excepthook = threading.excepthook, say
+    previous = threading.excepthook
+    threading.excepthook = say
     try:
         yield
     finally:

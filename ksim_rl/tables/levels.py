@@ -42,7 +42,8 @@ def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:
 
 def is_reached(row: Row, results: Sequence[Mapping[str, Any]]) -> bool | None:
     """Return whether a row reaches all its goals; None where it has none."""
-    value, found = value_of(row, results), []
+    value = value_of(row, results)
+    found = []
     if row.goal is not None:
         is_good = value is not None and (value <= row.goal if row.measure == "seconds" else value >= row.goal)
         found.append(is_good)

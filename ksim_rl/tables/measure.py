@@ -53,8 +53,14 @@ def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -
             "train that row with ksim-rl train"
         )
     per_iteration = cfg.num_envs * cfg.data.rollout_length(cfg.num_envs)
-    num_iterations = 2 if smoke else max(1, int(row.env_states // per_iteration))
-    quick = {"compile": False} if smoke and hasattr(cfg.objective, "compile") else {}
+    if smoke:
+        num_iterations = 2
+    else:
+        num_iterations = max(1, int(row.env_states // per_iteration))
+    if smoke and hasattr(cfg.objective, "compile"):
+        quick = {"compile": False}
+    else:
+        quick = {}
     compiles = getattr(cfg.objective, "compile", False) and not smoke
     trainer = replace(cfg.trainer, num_iterations=num_iterations, video=False, warm_up=compiles)
     return replace(cfg, trainer=trainer, objective=replace(cfg.objective, **quick))
@@ -74,16 +80,25 @@ class _Judge(Hook):
     interval = 0
 
     def __init__(self, cfg: RunCfg, row: Row, *, trials: int) -> None:
-        self._cfg, self._trials = cfg, trials if row.measure == "success" else 0
+        self._cfg = cfg
+        if row.measure == "success":
+            self._trials = trials
+        else:
+            self._trials = 0
         self.found: dict[str, Any] = {"trials": None, "means": {}}
-        self.seconds_in_all, self.ended = 0.0, 0.0
+        self.seconds_in_all = 0.0
+        self.ended = 0.0
 
     def at_end(self, trainer: Trainer) -> None:
-        self.ended, self.seconds_in_all = time.monotonic(), trainer.clock.total
+        self.ended = time.monotonic()
+        self.seconds_in_all = trainer.clock.total
         assert (evaluator := trainer.evaluator) is not None
         too_early_E = evaluator.length_E < evaluator.max_steps
         self.found["falls"] = round(float(too_early_E.double().mean()), 5)
-        sums = episodes.episode_log() if (episodes := part(evaluator.env, EpisodeSums)) else {}
+        if episodes := part(evaluator.env, EpisodeSums):
+            sums = episodes.episode_log()
+        else:
+            sums = {}
         metrics = {name: float(sums[name] / sums["episodes"]) for name in sums if name.startswith("metric/")}
         self.found["means"] = {f"evaluation/{name}": round(mean, 4) for name, mean in metrics.items()}
         if self._trials:
@@ -95,7 +110,8 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
     """Train and judge; return plain data. An interrupted run raises, so that it leaves no result."""
     cfg = run_cfg(row, seed, device=device, smoke=smoke)
     judge = _Judge(cfg, row, trials=8 if smoke else row.episodes)
-    progress, began = RunProgress(cfg.trainer.num_iterations), time.monotonic()
+    progress = RunProgress(cfg.trainer.num_iterations)
+    began = time.monotonic()
     with compile_notice(progress.status):
         outcome = run(cfg, run_folder, progress=progress, hooks=[judge])
     if outcome.interrupted_by is not None or outcome.evaluation is None:
@@ -103,7 +119,10 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
     names = ("env_states", "seconds", "episode/return", "episode/length", *row.levels)
     _, lines = read_table(run_folder / METRICS)
     points = [{n: float(line[n]) for n in names if line.get(n)} for line in lines if line.get("seconds")]
-    end = reached(points, row.levels) if row.levels else None
+    if row.levels:
+        end = reached(points, row.levels)
+    else:
+        end = None
     last = [point for point in points if point["env_states"] >= points[-1]["env_states"] - HELD_STATES]
     session = record.read(run_folder)[-1]
     code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})

@@ -18,7 +18,9 @@ def draw(table: Table, rows: Mapping[str, Sequence[Mapping[str, Any]]], path: Pa
     """Draw one panel per group; `rows` has the results of those rows that are complete."""
     groups = [(group, [n for n in names if n in rows]) for group, names in table.groups().items()]
     groups = [(group, names) for group, names in groups if names]
-    down, across, most = -(-len(groups) // 3), min(len(groups), 3), max(len(names) for _, names in groups)
+    down = -(-len(groups) // 3)
+    across = min(len(groups), 3)
+    most = max(len(names) for _, names in groups)
     figure = Figure(figsize=(6.0 * across, (1.8 + 0.27 * most) * down), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle("\n".join(wrap(table.title, 60 * across)), fontsize=12)

@@ -26,7 +26,8 @@ def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
     """
     figures = {}
     for name, results in rows.items():
-        value, key = value_of(table.rows[name], results), f"{table.name}/{name}"
+        value = value_of(table.rows[name], results)
+        key = f"{table.name}/{name}"
         if table.rows[name].measure == "seconds":
             figures[f"{key}/falls"] = max(result["falls"] for result in results)
         key += {"return": ""}.get(table.rows[name].measure, f"/{table.rows[name].measure}")
@@ -102,9 +103,16 @@ def _markdown(table: Table, rows: Mapping[str, Results], tree: Mapping[str, Any]
 def _cells(row: Row, results: Results) -> list[str]:
     if not results:
         return ["", "0", "", "", "not run"]
-    value, returns = value_of(row, results), [r["evaluation"]["return_mean"] for r in results]
-    spread = f" ± {statistics.stdev(returns):.0f}" if len(returns) > 1 else ""
-    ours = "" if value is None else f"{value:.0f}{spread}"
+    value = value_of(row, results)
+    returns = [r["evaluation"]["return_mean"] for r in results]
+    if len(returns) > 1:
+        spread = f" ± {statistics.stdev(returns):.0f}"
+    else:
+        spread = ""
+    if value is None:
+        ours = ""
+    else:
+        ours = f"{value:.0f}{spread}"
     for level in row.levels if row.measure == "return" else ():
         worst = min(r["means"].get(level, float("-inf")) for r in results)
         ours += f", {level.rpartition('/')[2]} {worst:.2f}"

@@ -20,7 +20,9 @@ from ksim_rl.terminal import show
 def reproduce(arguments: Sequence[str]) -> int:
     """Run the command; the code is 1 where a row does not reach its goal or has no result, 0 else."""
     options = _parser().parse_args(arguments)
-    began, smoke, table = time.monotonic(), options.smoke, load(options.table)
+    began = time.monotonic()
+    smoke = options.smoke
+    table = load(options.table)
     seeds = [int(word) for word in options.seeds.split(",") if word]
     rows = {name: row for name, row in table.rows.items() if re.fullmatch(options.rows, name)}
     known = sorted({seed for row in rows.values() for seed in row.seeds})
@@ -35,10 +37,16 @@ def reproduce(arguments: Sequence[str]) -> int:
             f"--per-gpu {options.per_gpu}: runs that share a GPU wait for each other, and {timed[0]} measures seconds; "
             "leave it out, or choose other --rows"
         )
-    default = "benchmarks/results/tables" if Path("benchmarks/results").is_dir() else "tables"
+    if Path("benchmarks/results").is_dir():
+        default = "benchmarks/results/tables"
+    else:
+        default = "tables"
     output = (options.output or Path(default)) / ("smoke" if smoke else "")
     run_folder = options.runs / ("smoke" if smoke else "") / table.name
-    device = options.device if torch.cuda.is_available() else "cpu"
+    if torch.cuda.is_available():
+        device = options.device
+    else:
+        device = "cpu"
     runs = Runs(table, output / table.name, run_folder, smoke=smoke)
 
     def write(said: str) -> None:

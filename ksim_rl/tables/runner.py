@@ -27,8 +27,11 @@ class Runs:
     """The runs of one table: results in `folder`/<row>/seed_<n>.json, run folders and logs below `run_folder`."""
 
     def __init__(self, table: Table, folder: Path, run_folder: Path, *, smoke: bool) -> None:
-        self.table, self.folder, self.run_folder = table, folder, run_folder
-        self.smoke, self._of = smoke, cache(lambda name: run_cfg(table.rows[name], 1, smoke=smoke))
+        self.table = table
+        self.folder = folder
+        self.run_folder = run_folder
+        self.smoke = smoke
+        self._of = cache(lambda name: run_cfg(table.rows[name], 1, smoke=smoke))
 
     def results(self) -> dict[str, dict[int, dict[str, Any]]]:
         """Return the results that count, by row and seed: those of the settings that the row has now."""
@@ -36,13 +39,17 @@ class Runs:
         for name, row in self.table.rows.items():
             paths = {seed: self.folder / name / f"seed_{seed}.json" for seed in row.seeds}
             present = {seed: _result(path) for seed, path in paths.items() if path.exists()}
-            own = settings(row, self._of(name)) if present else ""
+            if present:
+                own = settings(row, self._of(name))
+            else:
+                own = ""
             found[name] = {seed: result for seed, result in present.items() if result["settings"] == own}
         return found
 
     def complete(self, seeds: Sequence[int]) -> dict[str, list[dict[str, Any]]]:
         """Return the results of the rows of which each of `seeds` (none: all of the row) is there."""
-        rows, found = self.table.rows, {}
+        rows = self.table.rows
+        found = {}
         for name, results in self.results().items():
             wanted = [seed for seed in rows[name].seeds if not seeds or seed in seeds]
             if wanted and set(wanted) <= results.keys():
@@ -56,14 +63,16 @@ class Runs:
 
         A GPU that is named twice takes two at a time; "" stands for the CPU.
         """
-        waiting, left = list(jobs), 0
+        waiting = list(jobs)
+        left = 0
         running: dict[int, tuple[Job, Popen[bytes]]] = {}
         elsewhere: set[Job] = set()
         try:
             while waiting or running:
                 is_over = time.monotonic() > until
                 if is_over:
-                    left, waiting = left + len(waiting), []
+                    left = left + len(waiting)
+                    waiting = []
                     for _, process in running.values():
                         process.kill()
                 for slot, gpu in enumerate(gpus):
@@ -79,7 +88,10 @@ class Runs:
                             waiting.append(job)  # the other was faster
                             continue
                         last = "".join(self._said(job).splitlines()[-1:])
-                        why = "no time left" if is_over else f"exit code {code}, {last} ({self._log(job)})"
+                        if is_over:
+                            why = "no time left"
+                        else:
+                            why = f"exit code {code}, {last} ({self._log(job)})"
                         note(f"{job[0]}, seed {job[1]}: " + (why if code else "done"))
                         left += bool(code)
                 time.sleep(POLL_S)
@@ -135,7 +147,10 @@ class Runs:
         command = ["-m", "ksim_rl.tables.measure", *map(str, words), "smoke" * self.smoke]
         make_folder(result.parent, below=self.folder.parent)
         result.unlink(missing_ok=True)
-        environment = {"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}
+        if gpu:
+            environment = {"CUDA_VISIBLE_DEVICES": gpu}
+        else:
+            environment = {}
         with log:
             log.truncate()
             return start_python(command, environment=environment, stdout=log, stderr=STDOUT)
@@ -157,5 +172,8 @@ def _result(path: Path) -> dict[str, Any]:
 def gpus_for(device: str, *, per_gpu: int) -> list[str]:
     """Return the GPUs of jobs, as `CUDA_VISIBLE_DEVICES` names them, each `per_gpu` times; [""] on the CPU."""
     every = ",".join(str(index) for index in range(torch.cuda.device_count()))
-    named = [""] if device == "cpu" else (os.environ.get("CUDA_VISIBLE_DEVICES") or every).split(",")
+    if device == "cpu":
+        named = [""]
+    else:
+        named = (os.environ.get("CUDA_VISIBLE_DEVICES") or every).split(",")
     return named * per_gpu if named != [""] else named

@@ -104,11 +104,17 @@ def shipped() -> list[str]:
 
 def load(name: str) -> Table:
     """Read a table of the package by name, or a file of yours by path; a ValueError says what is wrong."""
-    path = Path(name) if name.endswith(SUFFIX) else FOLDER / f"{name}{SUFFIX}"
+    if name.endswith(SUFFIX):
+        path = Path(name)
+    else:
+        path = FOLDER / f"{name}{SUFFIX}"
     if path.parent == FOLDER and path.stem not in shipped():
         raise unknown_name("table", name, shipped())
     tree = plain_data.read_yaml(path)
-    groups = tree.pop("groups", None) if isinstance(tree, dict) else None
+    if isinstance(tree, dict):
+        groups = tree.pop("groups", None)
+    else:
+        groups = None
     with naming(str(path)):
         rows = _rows(groups)
     table = from_tree(Table, {"name": path.stem, **tree, "source": name, "rows": rows}, str(path))
@@ -119,7 +125,10 @@ def load(name: str) -> Table:
 
 def _rows(groups: Any) -> dict[str, Any]:
     """Return the fields of each row by `<group>/<name>`, with those of its group."""
-    found = groups if isinstance(groups, dict) else {"": {}}
+    if isinstance(groups, dict):
+        found = groups
+    else:
+        found = {"": {}}
     rows = {}
     for group, fields in found.items():
         if not isinstance(fields, dict) or not isinstance(fields.get("rows"), dict):

@@ -14,10 +14,12 @@ from ksim_rl.testing.replays import Replays
 SUBSTEPS = 20
 # Of the scale of a velocity, after these substeps: float32 and a solver that stops early stay far below; a field or an
 # option that one engine does not know of goes far beyond.
-MEDIAN_TOLERANCE, TOLERANCE = 1e-3, 1e-2
+MEDIAN_TOLERANCE = 1e-3
+TOLERANCE = 1e-2
 # How far, relatively, states are moved to see what becomes of rounding and of contacts that just begin in the C engine
 # itself, and by how much more a row may differ.
-MOVED, ALLOWANCE = 1e-5, 10.0
+MOVED = 1e-5
+ALLOWANCE = 10.0
 # Iterations after which the C engine has solved a step: with those of a model it may be the one that stops early.
 SOLVED = 100
 # m: the C engine finds several contacts of a geom with neighbouring triangles of a height field where we find the one

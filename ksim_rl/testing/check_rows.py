@@ -36,7 +36,8 @@ def check_partial_reset(env: EnvBase, num_steps: int) -> None:
     for index in range(num_steps):
         _, root = replays.step(root, index)
     # `TensorDict.clone` adds zero to what lies on a device, which takes the sign of a negative one.
-    before, root_before = _rows_of_state(env), root.apply(torch.clone)
+    before = _rows_of_state(env)
+    root_before = root.apply(torch.clone)
     assert root_before is not None
     root = reset_rows(env, root, [0])
     after = _rows_of_state(env)
@@ -50,7 +51,8 @@ def check_partial_reset(env: EnvBase, num_steps: int) -> None:
     )
     if env.device is not None and env.device.type != "cpu":
         return
-    undisturbed, disturbed = replays.run(), replays.run(reset_at=num_steps // 2, rows=[0])
+    undisturbed = replays.run()
+    disturbed = replays.run(reset_at=num_steps // 2, rows=[0])
     for step, (one, other) in enumerate(zip(undisturbed, disturbed, strict=True)):
         _refuse(
             differing(one, other, others),
@@ -76,7 +78,8 @@ def _check_end(next_E: TensorDictBase, root: TensorDictBase, keys: list[NestedKe
     ended_E = next_E.get("done").flatten()
     going = (~ended_E).nonzero().flatten().tolist()
     ended = ended_E.nonzero().flatten().tolist()
-    next_obs, root_obs = next_E.select(*keys), root.select(*keys)
+    next_obs = next_E.select(*keys)
+    root_obs = root.select(*keys)
     _refuse(
         differing(next_obs, root_obs, going),
         "differ between `next` and the next root in rows that go on. Compute each observation once per step: noise, "
@@ -114,5 +117,8 @@ def _rows_of_state(env: EnvBase) -> dict[str, Tensor]:
 
 def _refuse(keys: list[NestedKey] | list[str], message: str) -> None:
     if keys:
-        more = f", ... ({len(keys)} in all)" if len(keys) > 5 else ""
+        if len(keys) > 5:
+            more = f", ... ({len(keys)} in all)"
+        else:
+            more = ""
         raise AssertionError(f"{', '.join(map(repr, keys[:5]))}{more} {message}")

@@ -44,7 +44,8 @@ class CounterEnv(EnvBase):
         }
         for name, held in {**counters, "offset_L": torch.tensor([0.0, 100.0, 200.0])}.items():
             self.register_buffer(name, held.to(device))
-        scalar, flag = Unbounded(1), Binary(1, dtype=torch.bool)
+        scalar = Unbounded(1)
+        flag = Binary(1, dtype=torch.bool)
         specs = {
             "observation": {
                 **{name: scalar.clone() for name in ("count", "episode", "row")},
@@ -90,8 +91,14 @@ class CounterEnv(EnvBase):
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask_E = torch.ones_like(self.count_E, dtype=torch.bool) if mask is None else mask.reshape(-1)
+        if tensordict is None:
+            mask = None
+        else:
+            mask = tensordict.get("_reset", None)
+        if mask is None:
+            mask_E = torch.ones_like(self.count_E, dtype=torch.bool)
+        else:
+            mask_E = mask.reshape(-1)
         self.count_E.copy_(torch.where(mask_E, 0, self.count_E))
         self.episode_E.add_(mask_E)
         flag = torch.zeros((*self.batch_size, 1), dtype=torch.bool, device=self.device)

@@ -21,7 +21,8 @@ class Replays:
     """
 
     def __init__(self, env: EnvBase, num_steps: int) -> None:
-        self.env, self.num_steps = env, num_steps
+        self.env = env
+        self.num_steps = num_steps
         # Some transforms' states begin with the first reset.
         env.reset()
         self._state = {key: copy_of(value) for key, value in env.state_dict().items()}
@@ -41,7 +42,8 @@ class Replays:
 
     def run(self, *, reset_at: int = -1, rows: Sequence[int] = ()) -> list[TensorDictBase]:
         """Run all steps, and return a copy of each EnvState; `rows` are reset before step `reset_at`."""
-        root, env_states = self.start(), []
+        root = self.start()
+        env_states = []
         for index in range(self.num_steps):
             if index == reset_at:
                 root = reset_rows(self.env, root, rows)
@@ -67,7 +69,9 @@ def end_episodes_at_next_step(env: EnvBase) -> None:
 
 def copy_of(value: Any) -> Any:
     """Return a copy of a tensor; anything else as it is."""
-    return value.clone() if isinstance(value, Tensor) else value
+    if isinstance(value, Tensor):
+        return value.clone()
+    return value
 
 
 def differing(one: TensorDictBase, other: TensorDictBase, rows: Sequence[int]) -> list[NestedKey]:
@@ -80,4 +84,6 @@ def differing(one: TensorDictBase, other: TensorDictBase, rows: Sequence[int]) -
 
 
 def _bits(value: Tensor) -> Tensor:
-    return value.contiguous().view(torch.int32) if value.dtype == torch.float32 else value
+    if value.dtype == torch.float32:
+        return value.contiguous().view(torch.int32)
+    return value

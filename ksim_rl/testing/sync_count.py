@@ -112,7 +112,9 @@ def _why_it_syncs(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> s
         return "copy to another device"
     if name == "aten::copy_" and isinstance(args[1], Tensor) and _differs(args[0].device, args[1].device):
         into_pinned = len(args) > 2 and args[2] and args[0].is_cpu and args[0].is_pinned()
-        return None if into_pinned else "copy between devices"
+        if into_pinned:
+            return None
+        return "copy between devices"
     return None
 
 

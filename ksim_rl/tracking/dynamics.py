@@ -49,13 +49,20 @@ def demand(
     """
     qvel_FM = velocities(mj_model, qpos_FL, fps)
     qacc_FM = np.gradient(qvel_FM, 1.0 / fps, axis=0)
-    model, data = mj_model, mujoco.MjData(mj_model)
-    flags, model_flags = model.opt.disableflags, mujoco.mjtDisableBit
+    model = mj_model
+    data = mujoco.MjData(mj_model)
+    flags = model.opt.disableflags
+    model_flags = mujoco.mjtDisableBit
     model.opt.disableflags |= int(model_flags.mjDSBL_CONTACT) | int(model_flags.mjDSBL_CONSTRAINT)
-    zmp, com, force, torque = [], [], [], []
+    zmp = []
+    com = []
+    force = []
+    torque = []
     try:
         for qpos, qvel, qacc, planted in zip(qpos_FL, qvel_FM, qacc_FM, planted_FN, strict=True):
-            data.qpos[:], data.qvel[:], data.qacc[:] = qpos, qvel, qacc
+            data.qpos[:] = qpos
+            data.qvel[:] = qvel
+            data.qacc[:] = qacc
             mujoco.mj_inverse(model, data)
             force_3, zmp_2, spin = _ground_wrench(data)
             zmp.append(zmp_2)
@@ -71,7 +78,8 @@ def demand(
 
 def _ground_wrench(data: mujoco.MjData) -> tuple[Array, Array, float]:
     """Return the ground's force, the point at z = 0 about which its moment is vertical, and that moment."""
-    force_3, moment_3 = data.qfrc_inverse[:3].copy(), np.empty(3)
+    force_3 = data.qfrc_inverse[:3].copy()
+    moment_3 = np.empty(3)
     mujoco.mju_rotVecQuat(moment_3, data.qfrc_inverse[3:6], data.qpos[3:7])
     about_origin_3 = moment_3 + np.cross(data.qpos[:3], force_3)
     # The root's wrench belongs to the ground: p x f with p on the ground has these horizontal moments.
@@ -99,7 +107,8 @@ def _joint_torques(
         shares = np.array([1.0 - second, second])
     beside_2 = zmp_2 - shares @ places_N3[:, :2]
     torque_M = data.qfrc_inverse.copy()
-    jacobian_3M, turn_3M = np.zeros((3, mj_model.nv)), np.zeros((3, mj_model.nv))
+    jacobian_3M = np.zeros((3, mj_model.nv))
+    turn_3M = np.zeros((3, mj_model.nv))
     for foot, place_3, share in zip(standing, places_N3, shares, strict=True):
         point_3 = np.append(place_3[:2] + beside_2, 0.0)
         mujoco.mj_jac(mj_model, data, jacobian_3M, turn_3M, point_3, int(mj_model.site(foot).bodyid[0]))
@@ -109,7 +118,8 @@ def _joint_torques(
 
 def self_contacts(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"]) -> list[str]:
     """Return which geoms of a robot that is alone in its model run into each other, and in which frame first."""
-    data, found = mujoco.MjData(mj_model), {}
+    data = mujoco.MjData(mj_model)
+    found = {}
     for frame, qpos in enumerate(qpos_FL):
         data.qpos[:] = qpos
         mujoco.mj_fwdPosition(mj_model, data)

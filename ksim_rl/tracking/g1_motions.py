@@ -14,7 +14,8 @@ from ksim_rl.clips.motion_file import write_motion
 from ksim_rl.scene.robots.unitree_g1 import JOINTS, UnitreeG1
 from ksim_rl.tracking.keyframes import Choreography, Figure, FootMove, Keys, perform
 
-ROBOT, FPS = UnitreeG1(), 50.0
+ROBOT = UnitreeG1()
+FPS = 50.0
 STAND = 0.76
 """m: the root's height in the default pose."""
 _WIDTH = 0.1185
@@ -76,8 +77,13 @@ def _arms_out(begin_s: float, end_s: float, by: float) -> dict[str, Keys]:
 
 def walk() -> Choreography:
     """Return twelve steps straight ahead."""
-    begin_s, step_s, both_s, stride, count = 0.9, 0.54, 0.1, 0.24, 12
-    moves, at = [], [_MIDDLE, _MIDDLE]
+    begin_s = 0.9
+    step_s = 0.54
+    both_s = 0.1
+    stride = 0.24
+    count = 12
+    moves = []
+    at = [_MIDDLE, _MIDDLE]
     for number in range(count):
         foot = number % 2
         last = number == count - 1
@@ -107,10 +113,16 @@ def walk() -> Choreography:
 
 def squat() -> Choreography:
     """Return four squats with the arms raised ahead at the bottom."""
-    begin_s, cycle_s, count = 0.6, 1.85, 4
-    height, lean, arms, elbows = [(begin_s, STAND)], [(begin_s, 0.0)], [(begin_s, 0.0)], [(begin_s, 0.0)]
+    begin_s = 0.6
+    cycle_s = 1.85
+    count = 4
+    height = [(begin_s, STAND)]
+    lean = [(begin_s, 0.0)]
+    arms = [(begin_s, 0.0)]
+    elbows = [(begin_s, 0.0)]
     for number in range(count):
-        down, up = begin_s + (number + 0.45) * cycle_s, begin_s + (number + 1) * cycle_s
+        down = begin_s + (number + 0.45) * cycle_s
+        up = begin_s + (number + 1) * cycle_s
         for keys, low in ((height, 0.47), (lean, 0.35), (arms, -1.4), (elbows, 0.5)):
             rest = STAND if keys is height else 0.0
             keys += [(down, low), (down + 0.1 * cycle_s, low), (up, rest)]
@@ -128,7 +140,10 @@ def squat() -> Choreography:
 
 def turn() -> Choreography:
     """Return a full turn to the left on the spot, in steps."""
-    begin_s, step_s, both_s, count = 0.9, 0.5, 0.12, 14
+    begin_s = 0.9
+    step_s = 0.5
+    both_s = 0.12
+    count = 14
     moves = []
     turn_by = 2.0 * math.pi / (count // 2)
     headings = [0.0, 0.0]
@@ -136,10 +151,12 @@ def turn() -> Choreography:
         foot = number % 2
         other = headings[1 - foot]
         headings[foot] = other + turn_by if foot == 0 else other
-        heading, side = headings[foot], (1 - 2 * foot) * _WIDTH
+        heading = headings[foot]
+        side = (1 - 2 * foot) * _WIDTH
         x = _MIDDLE * math.cos(heading) - side * math.sin(heading)
         y = _MIDDLE * math.sin(heading) + side * math.cos(heading)
-        start, swing_s = begin_s + number * step_s, step_s - both_s
+        start = begin_s + number * step_s
+        swing_s = step_s - both_s
         moves.append(
             FootMove(
                 foot=foot,
@@ -164,9 +181,12 @@ def turn() -> Choreography:
 
 def kick() -> Choreography:
     """Return two kicks with the right leg, then two with the left, each pair on the other leg alone."""
-    raise_s, kick_s, rest_s = 0.45, 0.42, 0.35
+    raise_s = 0.45
+    kick_s = 0.42
+    rest_s = 0.35
     alone_s = raise_s + 4 * kick_s + rest_s
-    moves, begin_s = [], 1.2
+    moves = []
+    begin_s = 1.2
     arms: dict[str, list[tuple[float, float]]] = {name: [(0.6, 0.0)] for name in ("left", "right")}
     for foot in (1, 0):
         out = [raise_s + (number + 0.5) * 2 * kick_s for number in range(2)]

@@ -190,11 +190,14 @@ def perform(
     paths_FN5, planted_FN = foot_paths(plan, time_F)
     zmp_F2 = smoothed(zmp_plan(paths_FN5, planted_FN, shift_frames=round(shift_s * fps)), 1.5)
     posture_FL, weight_M = _posture(mj_model, figure, plan, time_F)
-    root_F, lean_F = eased(plan.root_height, time_F), eased(plan.lean, time_F)
+    root_F = eased(plan.root_height, time_F)
+    lean_F = eased(plan.lean, time_F)
     heading_F = smoothed(paths_FN5[:, :, 3].mean(1, keepdims=True), 0.1 * fps)[:, 0]
     solver = InverseKinematics(mj_model)
-    height_F, aim_F2 = root_F - 0.09, zmp_F2.copy()
-    qpos_FL, asked = posture_FL, None
+    height_F = root_F - 0.09
+    aim_F2 = zmp_F2.copy()
+    qpos_FL = posture_FL
+    asked = None
     for _ in range(rounds + 1):
         com_F2 = pendulum(aim_F2, height_F, fps)
         qpos_FL = _solved(solver, figure, paths_FN5, com_F2, root_F, lean_F, heading_F, posture_FL, weight_M)
@@ -230,7 +233,8 @@ def _solved(
     posture_FL: Array,
     weight_M: Array,
 ) -> Array:
-    qpos_L, found = posture_FL[0].copy(), []
+    qpos_L = posture_FL[0].copy()
+    found = []
     for frame, posture_L in enumerate(posture_FL):
         goals: list[PoseGoal | ComGoal] = [ComGoal(pos_N=com_F2[frame])]
         for foot, (x, y, z, heading, pitch) in zip(figure.feet, paths_FN5[frame], strict=True):
@@ -256,6 +260,7 @@ def _solved(
 def turned(heading: float, pitch: float) -> Float[Array, " 4"]:
     """Return the orientation that is pitched about y, then turned about z, rad, as (w, x, y, z)."""
     heading_4 = np.array((np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)))
-    pitch_4, both_4 = np.array((np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0)), np.empty(4)
+    pitch_4 = np.array((np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0))
+    both_4 = np.empty(4)
     mujoco.mju_mulQuat(both_4, heading_4, pitch_4)
     return both_4

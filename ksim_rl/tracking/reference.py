@@ -52,7 +52,8 @@ class OfAlignedBodies(OfAnchor, OfMotionBodies):
         """Return where the bodies are in the aligned motion; position stage, computed once per state."""
         key = f"motion/{self.file}.aligned {self.bodies} with {self.anchor}"
         if key not in view.cache:
-            own, (pos_E3, quat_E4) = view.body(self.anchor), self.wanted(view)
+            own = view.body(self.anchor)
+            (pos_E3, quat_E4) = self.wanted(view)
             turn_E = quaternion.yaw(quaternion.multiply(own.quat_EL, quaternion.conjugate(quat_E4)))
             half_E1 = 0.5 * turn_E[:, None]
             zero_E2 = torch.zeros_like(quat_E4[:, :2])
@@ -73,7 +74,8 @@ def motion_velocities(
     """
     key = f"motion/{file}.velocity of {bodies}"
     if key not in view.cache:
-        motion, table_FN6 = view.motion(file), _velocity_table(view, file, bodies)
+        motion = view.motion(file)
+        table_FN6 = _velocity_table(view, file, bodies)
         last = table_FN6.shape[0] - 1
         frame_E = (motion_time(view, file) * motion.fps).clamp(0.0, float(last))
         low_E = frame_E.floor().long().clamp(max=last - 1)
@@ -83,10 +85,13 @@ def motion_velocities(
 
 
 def _velocity_table(view: EnvView, file: str, bodies: Patterns) -> Tensor:
-    tables, key = _VELOCITIES.setdefault(view, {}), (file, view.bodies(bodies).ids)
+    tables = _VELOCITIES.setdefault(view, {})
+    key = (file, view.bodies(bodies).ids)
     if key not in tables:
-        motion, model = view.motion(file), view.world.mj_model
-        qpos_FL, qvel_FM = motion.qpos_FL.cpu().numpy(), motion.qvel_FL.cpu().numpy()
+        motion = view.motion(file)
+        model = view.world.mj_model
+        qpos_FL = motion.qpos_FL.cpu().numpy()
+        qvel_FM = motion.qvel_FL.cpu().numpy()
         found_FN6 = body_velocities(model, qpos_FL, qvel_FM, key[1])
         # Outside of inference mode: the table outlives the mode of the call that happens to come first.
         with torch.inference_mode(False):
@@ -101,10 +106,12 @@ def body_velocities(
     bodies: tuple[int, ...],
 ) -> Float[np.ndarray, "F N 6"]:
     """Return linear, then angular velocities of body frames, world axes, m/s and rad/s, by the C engine."""
-    data, found_FN6 = mujoco.MjData(mj_model), np.zeros((len(qpos_FL), len(bodies), 6))
+    data = mujoco.MjData(mj_model)
+    found_FN6 = np.zeros((len(qpos_FL), len(bodies), 6))
     turn_and_move = np.empty(6)
     for frame, (qpos, qvel) in enumerate(zip(qpos_FL, qvel_FM, strict=True)):
-        data.qpos[:], data.qvel[:] = qpos, qvel
+        data.qpos[:] = qpos
+        data.qvel[:] = qvel
         mujoco.mj_kinematics(mj_model, data)
         mujoco.mj_comPos(mj_model, data)
         mujoco.mj_comVel(mj_model, data)

@@ -50,9 +50,11 @@ class StartInMotion(ResetToMotion):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         super().__call__(view, mask_E)
-        robot, joints = view.robot, view.joints()
+        robot = view.robot
+        joints = view.joints()
         # Velocities are those in the world, as in the motion: they do not turn with the error of the root's pose.
-        lin_vel_E3, ang_vel_E3 = robot.root_lin_vel_w_EL, robot.root_ang_vel_w_EL
+        lin_vel_E3 = robot.root_lin_vel_w_EL
+        ang_vel_E3 = robot.root_ang_vel_w_EL
         moved_E6, kick_E6 = (draw_by_axis(view, ranges) for ranges in (self.pose_range, self.velocity_range))
         quat_E4 = quaternion.multiply(
             quaternion.from_euler_xyz(*moved_E6[:, 3:].unbind(-1)), robot.root_quat_EL

@@ -39,7 +39,8 @@ BODIES = (
 )
 ENDS = tuple(f"{side}_{link}_link" for side in SIDES for link in ("ankle_roll", "wrist_yaw"))
 """Feet and hands."""
-HEIGHT_LIMIT, UPRIGHT_LIMIT = 0.25, 0.8
+HEIGHT_LIMIT = 0.25
+UPRIGHT_LIMIT = 0.8
 """m, of the anchor and of feet and hands; and the difference of the vertical parts of the anchors' z axes."""
 KICK: mdp.Ranges = {
     "x": (-0.5, 0.5),
@@ -86,7 +87,8 @@ def observations(file: str) -> dict[str, ObservationGroupCfg]:
 def rewards(file: str) -> dict[str, RewardTerm]:
     """Return the rewards: how near anchor and bodies are to the motion, and what smooth and safe motion asks for."""
     anchor = {"file": file, "anchor": ANCHOR}
-    aligned, bodies = {**anchor, "bodies": BODIES}, {"file": file, "bodies": BODIES}
+    aligned = {**anchor, "bodies": BODIES}
+    bodies = {"file": file, "bodies": BODIES}
     return {
         "anchor_pos": terms.TrackAnchorPos(weight=0.5, std=0.3, **anchor),
         "anchor_quat": terms.TrackAnchorQuat(weight=0.5, std=0.4, **anchor),

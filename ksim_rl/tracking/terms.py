@@ -38,7 +38,8 @@ class MotionAnchorPos(OfAnchor, ObservationTerm):
     """Where the motion's anchor is, seen from the robot's, in its frame, m, [E, 3]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
-        own, (pos_E3, _) = view.body(self.anchor), self.wanted(view)
+        own = view.body(self.anchor)
+        (pos_E3, _) = self.wanted(view)
         return quaternion.rotate_inverse(own.quat_EL, pos_E3 - own.pos_EL)
 
 
@@ -47,7 +48,8 @@ class MotionAnchorAxes(OfAnchor, ObservationTerm):
     """The x and y axes of the motion's anchor in the frame of the robot's, [E, 6]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
-        own, (_, quat_E4) = view.body(self.anchor), self.wanted(view)
+        own = view.body(self.anchor)
+        (_, quat_E4) = self.wanted(view)
         return first_axes(quaternion.multiply(quaternion.conjugate(own.quat_EL), quat_E4)[:, None])
 
 
@@ -60,7 +62,8 @@ class BodiesFromAnchor(ObservationTerm):
     part: Literal["positions", "axes"] = "positions"
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
-        anchor, bodies = view.body(self.anchor), view.bodies(self.bodies)
+        anchor = view.body(self.anchor)
+        bodies = view.bodies(self.bodies)
         turn_EN4 = anchor.quat_EL[:, None]
         if self.part == "positions":
             away_EN3 = bodies.pos_EN3 - anchor.pos_EL[:, None]
@@ -79,7 +82,8 @@ class JointPositionAroundMotion(OfMotion, JointAction):
     """
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
-        joints, time_E = view.joints(self.joints), motion_time(view, self.file) + view.step_dt
+        joints = view.joints(self.joints)
+        time_E = motion_time(view, self.file) + view.step_dt
         pos_EK, _ = view.motion(self.file).sample_joints(time_E, joints.index)
         wrong_EK = joints.default_pos_EL - view.default_qpos_L[joints.qpos]
         view.write_joint_pos_target(self.joints, pos_EK + wrong_EK + self.shaped(view, action_EK))

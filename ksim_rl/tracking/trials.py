@@ -47,7 +47,8 @@ class TrialRunner(Evaluator):
     def __init__(self, base: ManagerBasedRlEnv, **parts: Any) -> None:
         super().__init__(**parts)
         self._base = base
-        device, num_envs = self.length_E.device, self.length_E.shape[0]
+        device = self.length_E.device
+        num_envs = self.length_E.shape[0]
         self.ended_well_E = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.errors_EM = torch.zeros(num_envs, len(base.cfg.metrics), dtype=torch.float64, device=device)
 
@@ -59,7 +60,8 @@ class TrialRunner(Evaluator):
     def _count_one_step(self) -> None:
         began_E = self._running_E.clone()
         super()._count_one_step()
-        view, metrics = self._base.view, self._base.cfg.metrics.values()
+        view = self._base.view
+        metrics = self._base.cfg.metrics.values()
         ended_well_E = view.truncated_E & ~view.terminated_E
         self.ended_well_E.logical_or_(began_E & ~self._running_E & ended_well_E)
         # Where a trial has just ended, the next one's start is there to be seen.
@@ -99,7 +101,8 @@ def run_trials(
 
     `note` is told of room that worlds get, and of contacts and constraints that they lose.
     """
-    seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
+    if seed is None:
+        seed = cfg.seed + EVALUATION_SEED_OFFSET
     of_trials = dataclasses.replace(cfg, task=trial_cfg(cfg.task, pushes=pushes))
     env = with_room(partial(build_env, of_trials, num_envs=trials, seed=seed), note=note)
     base = part(env, ManagerBasedRlEnv)

@@ -95,8 +95,13 @@ class HasProgress(Protocol):
 def notes_of(update: Update, *, warm_up: bool) -> list[str]:
     """Return what is to be said of an update at the start of a run, one line each."""
     lacks = f"trainer.warm_up=true does nothing here: {type(update).__name__} has no warm_up(rollout_ET)"
-    own = update.notes if isinstance(update, HasNotes) else ()
-    return [*own, lacks] if warm_up and not isinstance(update, HasWarmUp) else [*own]
+    if isinstance(update, HasNotes):
+        own = update.notes
+    else:
+        own = ()
+    if warm_up and not isinstance(update, HasWarmUp):
+        return [*own, lacks]
+    return [*own]
 
 
 @dataclass(frozen=True, kw_only=True)

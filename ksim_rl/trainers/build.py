@@ -96,7 +96,9 @@ def build(
 
 def default_threads(device: torch.device) -> int:
     """Return torch's threads on the CPU: beside CUDA all cores but one; one on the CPU, whose sums depend on them."""
-    return max(1, min((os.cpu_count() or 1) - 1, MOST_THREADS_BESIDE_CUDA)) if device.type == "cuda" else 1
+    if device.type == "cuda":
+        return max(1, min((os.cpu_count() or 1) - 1, MOST_THREADS_BESIDE_CUDA))
+    return 1
 
 
 def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None = None) -> EnvBase:
@@ -109,7 +111,10 @@ def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None 
     env = envs.build(task, device=cfg.resolved_device(), render_mode=render_mode)
     if cfg.modules.recurrent:
         actor = cfg.modules.recurrent_actor
-        primers = [] if actor is None else [RecurrentStatePrimer(state_spec(actor, "actor"))]
+        if actor is None:
+            primers = []
+        else:
+            primers = [RecurrentStatePrimer(state_spec(actor, "actor"))]
         for transform in recurrent_transforms(env, *primers):
             env.append_transform(transform)
     return env
@@ -128,11 +133,15 @@ def build_evaluator(
     Weights and ranges are those of the config, whatever curricula have come to in training. With a `note`, which is
     told so, the worlds get room as those of training do, which they have already in the process of a run.
     """
-    seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
+    if seed is None:
+        seed = cfg.seed + EVALUATION_SEED_OFFSET
     cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, curriculum={}))
     all_ranks = episodes or cfg.trainer.eval_episodes
     make = partial(build_env, cfg, num_envs=-(-all_ranks // ranks.size()), seed=seed)
-    env = make() if note is None else envs.with_room(make, note=note)
+    if note is None:
+        env = make()
+    else:
+        env = envs.with_room(make, note=note)
     env.eval()
     clock = part(env, EpisodeClock)
     max_steps = (clock and clock.max_episode_length) or UNLIMITED_EPISODE_STEPS
@@ -142,4 +151,6 @@ def build_evaluator(
 
 def solved_at(cfg: RunCfg) -> float | None:
     """Return the evaluation return that counts as solved, or None where the task has no such figure."""
-    return envs.task(cfg.task_name).solved_at if cfg.task_name in envs.names() else None
+    if cfg.task_name in envs.names():
+        return envs.task(cfg.task_name).solved_at
+    return None

@@ -27,7 +27,8 @@ from ksim_rl.files.reading import MOST_TENSOR_BYTES, read_bytes
 from ksim_rl.files.writing import WRITING
 from ksim_rl.trainers import checkpoint_formats
 
-MANIFEST, TENSORS = "manifest.json", "tensors.safetensors"
+MANIFEST = "manifest.json"
+TENSORS = "tensors.safetensors"
 _DISCARDED = ".discarded-"
 RANKS = "ranks"  # of a state: what the other ranks have
 _MAX_MANIFEST_BYTES = 16 * 2**20
@@ -216,8 +217,10 @@ def check_columns(saved: Columns, own: Columns) -> None:
     """Refuse, by name, terms or columns other than the checkpoint's; both are group -> term -> range."""
     faults = []
     for group in dict.fromkeys([*saved, *own]):
-        theirs, ours = saved.get(group, {}), own.get(group, {})
-        surplus, missing = [n for n in theirs if n not in ours], [n for n in ours if n not in theirs]
+        theirs = saved.get(group, {})
+        ours = own.get(group, {})
+        surplus = [n for n in theirs if n not in ours]
+        missing = [n for n in ours if n not in theirs]
         moved = [name for name in theirs if name in ours and list(theirs[name]) != list(ours[name])]
         if surplus:
             faults.append(f"group {group!r}: only the checkpoint has {', '.join(surplus)}")
@@ -247,11 +250,17 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path / MANIFEST}: damaged: {type(error).__name__}: {error}") from error
     if not intact:
         raise CheckpointError(f"{path / MANIFEST}: damaged: its SHA-256 does not match its content")
-    version = manifest.get("format_version") if isinstance(manifest, dict) else None
+    if isinstance(manifest, dict):
+        version = manifest.get("format_version")
+    else:
+        version = None
     if reason := checkpoint_formats.refusal(version):
         raise UnknownFormatError(f"{path}: {reason}")
     files = manifest.get("files")
-    of_tensors = files.get(TENSORS) if isinstance(files, dict) and len(files) == 1 else None
+    if isinstance(files, dict) and len(files) == 1:
+        of_tensors = files.get(TENSORS)
+    else:
+        of_tensors = None
     if not (
         _has(manifest, iteration=int, config=dict, values=dict) and _has(of_tensors, bytes=int, sha256=str)
     ):
@@ -295,7 +304,8 @@ def _order(name: str) -> tuple[int, int] | None:
 
 
 def _unused_name(folder: Path, iteration: int) -> str:
-    name, repeat = f"{iteration:08d}", 0
+    name = f"{iteration:08d}"
+    repeat = 0
     while (folder / name).exists():
         repeat += 1
         name = f"{iteration:08d}_{repeat}"

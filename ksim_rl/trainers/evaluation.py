@@ -34,9 +34,13 @@ class Evaluator:
     """
 
     def __init__(self, env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int, seed: int) -> None:
-        self.env, self.policy, self._signals = env, policy, signal_keys(env)
-        self.max_steps, self.seed = max_steps, seed
-        num_envs, device = env.batch_size[0], env.device or torch.device("cpu")
+        self.env = env
+        self.policy = policy
+        self._signals = signal_keys(env)
+        self.max_steps = max_steps
+        self.seed = seed
+        num_envs = env.batch_size[0]
+        device = env.device or torch.device("cpu")
         self._return_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
         self.length_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
         self._running_E = torch.ones(num_envs, dtype=torch.bool, device=device)

@@ -21,7 +21,8 @@ from ksim_rl.runs.csv_table import CsvTable
 from ksim_rl.runs.listing import METRICS
 
 # What MLflow takes in one request, and how long a value may be.
-_MAX_PARAMS, _MAX_LETTERS = 100, 6000
+_MAX_PARAMS = 100
+_MAX_LETTERS = 6000
 
 
 class MetricLogger(Protocol):
@@ -110,7 +111,10 @@ def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> 
         os.environ["MLFLOW_RUN_ID"] = kept_id(run_folder, "mlflow")
     own = f"sqlite:///{(folder / 'mlflow.db').resolve()}"
     uri = cfg.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or own
-    artifacts = (folder / "artifacts").resolve().as_uri() if uri == own else None
+    if uri == own:
+        artifacts = (folder / "artifacts").resolve().as_uri()
+    else:
+        artifacts = None
     logger = _Run(cfg.experiment, uri, artifact_location=artifacts)
     if not resumes:
         write_whole(path, logger.experiment.info.run_id)

@@ -14,9 +14,11 @@ from torchrl.envs import EnvBase
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeSums, SimulatedWorld, part
 from ksim_rl.envs.signal_keys import signal_keys
 
-_OVERFLOW, _NAN = "overflow/", "nan/worlds"
+_OVERFLOW = "overflow/"
+_NAN = "nan/worlds"
 # Over the ranks these are added up, or the most of them counts; of all others it is the mean.
-ADDED, MOST = ("sum/", _NAN, "update/non_finite_env_states", "replay/"), (_OVERFLOW,)
+ADDED = ("sum/", _NAN, "update/non_finite_env_states", "replay/")
+MOST = (_OVERFLOW,)
 
 
 @dataclass(frozen=True)

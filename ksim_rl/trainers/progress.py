@@ -59,13 +59,16 @@ class RunProgress:
     def __init__(
         self, total: int, *, done: int = 0, console: Console | None = None, enabled: bool = True
     ) -> None:
-        self.total, self.done = total, done
+        self.total = total
+        self.done = done
         self.console = console or _OwnConsole(highlight=False)
         self._enabled = enabled and ranks.rank() == 0
         self._status = ""
         self._metrics: dict[str, float] = {}
         self._live: Live | None = None
-        self._doing, self._since, self._moved = "", 0.0, 0.0
+        self._doing = ""
+        self._since = 0.0
+        self._moved = 0.0
         self._spoken = time.monotonic()
         self._watched = False
         self._open = ExitStack()
@@ -96,10 +99,14 @@ class RunProgress:
 
     def update(self, iteration: int, metrics: Mapping[str, float], *, seconds_left: float | None) -> None:
         """Show the state after `iteration`."""
-        self.done, self._moved = iteration, time.monotonic()
+        self.done = iteration
+        self._moved = time.monotonic()
         self._metrics |= metrics
         self._status = ""
-        left = "?" if seconds_left is None else clock(seconds_left)
+        if seconds_left is None:
+            left = "?"
+        else:
+            left = clock(seconds_left)
         self._bar.update(self._task, completed=iteration, left=left)
         if self._live is not None:
             self._live.update(self._panel())
@@ -128,7 +135,8 @@ class RunProgress:
     def busy(self, text: str) -> Iterator[None]:
         """Show what a block does while it takes its time; without a text, that iterations go on."""
         before = self._doing, self._since
-        self._doing, self._since = text, time.monotonic()
+        self._doing = text
+        self._since = time.monotonic()
         with ExitStack() as shown:
             if self._live is not None and text:
                 self.status(text)
@@ -143,14 +151,18 @@ class RunProgress:
     @contextmanager
     def _watch(self) -> Iterator[None]:
         """Break the silence of a pipe."""
-        done, self._watched = threading.Event(), True
+        done = threading.Event()
+        self._watched = True
 
         def speak() -> None:
             while not done.wait(SILENCE_S / 15.0):
                 now = time.monotonic()
                 if now - self._spoken >= SILENCE_S:
                     text = self._doing or f"iteration {self.done + 1}/{self.total}"
-                    since = self._since if self._doing else max(self._since, self._moved)
+                    if self._doing:
+                        since = self._since
+                    else:
+                        since = max(self._since, self._moved)
                     self.note(f"{text}: {now - since:.0f} s so far")
 
         watcher = threading.Thread(target=speak, daemon=True)
@@ -184,7 +196,8 @@ class RunClock:
 
     def begin(self) -> None:
         """Begin the first iteration now."""
-        self._created, self._last = time.monotonic(), None
+        self._created = time.monotonic()
+        self._last = None
 
     def lap(self) -> float:
         """End an iteration, and return its seconds."""
@@ -218,4 +231,6 @@ def clock(seconds: float) -> str:
     """Write a duration as h:mm:ss or m:ss."""
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)
-    return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"
+    if hours:
+        return f"{hours}:{minute:02d}:{second:02d}"
+    return f"{minute}:{second:02d}"

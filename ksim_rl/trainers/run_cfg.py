@@ -113,7 +113,10 @@ class ModulesCfg(Checked):
 
     def observation_keys(self, *names: str) -> list[ObservationKey]:
         """Return what the networks read of an EnvState; given "actor" or "critic", what that one reads."""
-        shared = () if self.trunk is None else self.trunk.in_keys
+        if self.trunk is None:
+            shared = ()
+        else:
+            shared = self.trunk.in_keys
         own = [key for name in names or ("actor", "critic") for key in self._read_by(name)]
         return [key for key in dict.fromkeys((*shared, *own)) if key != FEATURES]
 
@@ -232,11 +235,16 @@ class RunCfg(TrainingCfg):
         """
         tree = without_env_size(to_tree(self, type(self)))
         needed = [*plugins.named(), *(target.split(".")[0] for target in class_paths.foreign(tree))]
-        return {**tree, PLUGINS: list(dict.fromkeys(needed))} if needed else tree
+        if needed:
+            return {**tree, PLUGINS: list(dict.fromkeys(needed))}
+        return tree
 
     def resolved_device(self) -> torch.device:
         """Return the device that "auto" stands for here, with several ranks the own GPU of this one."""
-        auto = "cuda" if torch.cuda.is_available() else "cpu"
+        if torch.cuda.is_available():
+            auto = "cuda"
+        else:
+            auto = "cpu"
         return torch.device(ranks.device(auto if self.device == "auto" else self.device))
 
 
@@ -265,7 +273,10 @@ def reaching_outside(tree: Mapping[str, Any], *, given: Collection[str] = ()) ->
     for path in WRITTEN:
         value: Any = tree
         for name in path.split("."):
-            value = value.get(name) if isinstance(value, Mapping) else None
+            if isinstance(value, Mapping):
+                value = value.get(name)
+            else:
+                value = None
         own = any(f"{path}.".startswith(f"{field}.") for field in given)
         reaches = value is not None and value is not False
         if reaches and not own and value != os.environ.get(VOUCHED_BY.get(path, "")):

@@ -34,7 +34,9 @@ from ksim_rl.transforms import observation_columns
 
 # Folders in a run folder that a run writes to.
 FOLDERS = ("checkpoint", "tensorboard", "wandb", "mlflow")
-EVALUATION, CURVES, VIDEO = "evaluation.json", "curves.png", "video.mp4"
+EVALUATION = "evaluation.json"
+CURVES = "curves.png"
+VIDEO = "video.mp4"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,7 +64,10 @@ def run(
     """
     ranks.check_same({**cfg.to_tree(), "device": cfg.resolved_device().type}, what="config")
     # The graphs that the first iterations record take memory as well. Several ranks cannot try on their own.
-    few = None if ranks.size() > 1 else partial(first_that_fits, cfg, note=progress.note)
+    if ranks.size() > 1:
+        few = None
+    else:
+        few = partial(first_that_fits, cfg, note=progress.note)
     explained = memory_for(cfg.num_envs, cfg.resolved_device(), few)
     make = partial(build, cfg, run_folder=run_folder, hooks=hooks, resume_from=resume_from)
     if ranks.rank():  # rank 0 writes for all
@@ -131,7 +136,8 @@ def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()
 
 def policy_of(saved: checkpoint.Checkpoint, *, device: str = "auto", cfg: RunCfg | None = None) -> Policy:
     """Rebuild the policy of a checkpoint that was read; see `load_policy`. A `cfg` stands in for the run's own."""
-    cfg = RunCfg.from_tree({**saved.config, "device": device}) if cfg is None else cfg
+    if cfg is None:
+        cfg = RunCfg.from_tree({**saved.config, "device": device})
     cfg = without_nan_guard(cfg)
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
     actor = make_policy(cfg, env)
@@ -183,7 +189,10 @@ def _draw_curves(
 ) -> None:
     table = run_folder / METRICS
     if not table.exists():
-        reason = "which has no rows yet" if cfg.logger.csv else "which needs logger.csv=true"
+        if cfg.logger.csv:
+            reason = "which has no rows yet"
+        else:
+            reason = "which needs logger.csv=true"
         note(f"no learning curves: they are drawn from metrics.csv, {reason}")
         return
     from ksim_rl.runs import curves  # Matplotlib takes half a second to import

@@ -37,7 +37,11 @@ def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
 
 def check_targets(cfg: RunCfg, measured: Iterable[str] | None = None) -> None:
     """Refuse names in `stop_at` that no metric will have; its algorithm names what it has `measured`."""
-    task, measured = cfg.task, None if measured is None else list(measured)
+    task = cfg.task
+    if measured is None:
+        measured = None
+    else:
+        measured = list(measured)
     known = [*ALWAYS, *(f"episode/{name}" for name in EPISODE)]
     # A term of weight 0 is not computed.
     known += [f"reward/{name}" for name, term in task.rewards.items() if term.weight != 0.0]

@@ -34,6 +34,7 @@ from ksim_rl.trainers.metrics import (
 )
 from ksim_rl.trainers.outcome import Outcome
 from ksim_rl.trainers.progress import RunClock, RunProgress
+from ksim_rl.trainers.restoring import load_env_state, load_networks, load_random_state, random_state
 from ksim_rl.trainers.run_cfg import TrainerCfg
 from ksim_rl.trainers.suspect_iterations import with_iterations
 from ksim_rl.transforms import observation_columns
@@ -81,7 +82,8 @@ class EvaluationHook(Hook):
     """Judges the policy in envs of its own, probes the networks in the last rollout, and logs the figures."""
 
     def __init__(self, evaluator: Evaluator, *, interval: int) -> None:
-        self.evaluator, self.interval = evaluator, interval
+        self.evaluator = evaluator
+        self.interval = interval
         self._evaluated_at: int | None = None
 
     def __call__(self, trainer: "Trainer") -> None:
@@ -93,7 +95,8 @@ class EvaluationHook(Hook):
             return
         for text in losses_of(self.evaluator.env):
             trainer.progress.note(f"warning: evaluation at iteration {trainer.iteration}: {text}")
-        trainer.evaluation, self._evaluated_at = evaluation, trainer.iteration
+        trainer.evaluation = evaluation
+        self._evaluated_at = trainer.iteration
         figures = {f"evaluation/{name}": value for name, value in asdict(evaluation).items()}
         trainer.log(figures | probed(trainer.update, trainer.collector.env, trainer.rollout_ET))
 
@@ -157,10 +160,16 @@ class Trainer:
         config: Mapping[str, Any] | None = None,
         notes: Sequence[str] = (),
     ) -> None:
-        self.cfg, self.collector, self.update = cfg, collector, update
-        self.evaluator, self.solved_at = evaluator, solved_at
-        self.loggers, self.folder, self.config = loggers, folder, dict(config or {})
-        self.iteration, self.saved_at = 0, -1
+        self.cfg = cfg
+        self.collector = collector
+        self.update = update
+        self.evaluator = evaluator
+        self.solved_at = solved_at
+        self.loggers = loggers
+        self.folder = folder
+        self.config = dict(config or {})
+        self.iteration = 0
+        self.saved_at = -1
         self.metrics: dict[str, float] = {}
         self.rollout_ET: Any = None  # the last one
         self.warm_up_s = 0.0  # of compiling and capturing before training; not in `clock.total`
@@ -171,9 +180,14 @@ class Trainer:
         self.watch: Callable[[], None] = lambda: None  # called in each iteration, before anything is written
         self._notes = tuple(notes)
         self._own_hooks = tuple(hooks)
-        judge = [EvaluationHook(evaluator, interval=cfg.eval_interval)] if evaluator is not None else []
-        self._hooks = (*judge, *hooks, CheckpointHook(interval=cfg.checkpoint_interval))
-        self._overlaps = update.device.type == "cuda" if cfg.overlap is None else cfg.overlap
+        self._hooks: list[Hook] = [*hooks, CheckpointHook(interval=cfg.checkpoint_interval)]
+        if evaluator is not None:
+            # Judged first, so that a checkpoint of the same iteration has the evaluation.
+            self._hooks.insert(0, EvaluationHook(evaluator, interval=cfg.eval_interval))
+        if cfg.overlap is None:
+            self._overlaps = update.device.type == "cuda"
+        else:
+            self._overlaps = cfg.overlap
         self._unread: list[tuple[int, PendingMetrics]] = []
         self.collecting = ranks.Timing(update.device)
         self._target_met = False
@@ -194,7 +208,9 @@ class Trainer:
     @property
     def interrupted(self) -> bool:
         """Whether a signal asks to stop; with several ranks, whether all of them know of one."""
-        return self._told_to_end if ranks.size() > 1 else bool(self.interrupt)
+        if ranks.size() > 1:
+            return self._told_to_end
+        return bool(self.interrupt)
 
     @property
     def solved(self) -> bool | None:
@@ -300,7 +316,8 @@ class Trainer:
             self._report_iteration(iteration, pending.read())
 
     def _report_iteration(self, iteration: int, read: dict[str, float]) -> None:
-        env, seconds = self.collector.env, self.clock.lap()
+        env = self.collector.env
+        seconds = self.clock.lap()
         if read.pop(INTERRUPTED, 0.0):
             self._told_to_end = True
             self.interrupt.signal = self.interrupt.signal or signal.SIGTERM
@@ -310,7 +327,10 @@ class Trainer:
             self.progress.note(f"NaN guard: {text}")
         self._warn(physics.lost, read, iteration)
         self.update.check(read)
-        longest_s = 0.0 if clock is None else clock.max_episode_length_s
+        if clock is None:
+            longest_s = 0.0
+        else:
+            longest_s = clock.max_episode_length_s
         self.metrics = episode_means(read, max_episode_length_s=longest_s)
         self.metrics |= physics.metrics | {
             "iteration": iteration,
@@ -338,7 +358,8 @@ class Trainer:
         try:
             call(*arguments)
         except Exception as error:
-            name, reason = type(logger).__name__, " ".join(f"{type(error).__name__}: {error}".split())
+            name = type(logger).__name__
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
             self._warn_once(
                 name,
                 f"the logger {name} failed at iteration {self.iteration}: {reason}; the run goes on (said once)",
@@ -393,21 +414,10 @@ class Trainer:
         """Start from the networks and normalizers of a checkpoint of any task, if they fit here; all else stays new."""
         state = checkpoint.load_latest(path).state
         checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
-        try:
-            self.update.load_weights(state["update"])
-        except KeyError as error:
-            raise ValueError(f"{path}: of another algorithm: it has no network {error}") from error
-        except ValueError as error:
-            raise ValueError(
-                f"{path}: its networks are others: {error}; choose objective and modules as the "
-                "config.yaml of its run has them"
-            ) from error
+        load_networks(self.update, state["update"], path)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next iteration depends on: tensors and plain data, nested."""
-        device, random = self.update.device, {"cpu": torch.get_rng_state()}
-        if device.type == "cuda":
-            random["cuda"] = torch.cuda.get_rng_state(device)
         return {
             "iteration": self.iteration,
             "seconds": self.clock.total,
@@ -415,7 +425,7 @@ class Trainer:
             "collector": self.collector.state_dict(),
             "env": dict(self.collector.env.state_dict()),
             "observation_columns": observation_columns(self.collector.env),
-            "random": random,
+            "random": random_state(self.update.device),
             "hooks": {str(index): hook.state_dict() for index, hook in enumerate(self._own_hooks)},
         }
 
@@ -427,23 +437,13 @@ class Trainer:
         self.collector.reset()
         state = checkpoint.own_part(state, self.state_dict)
         self.update.load_state_dict(state["update"])
-        try:
-            self.collector.env.load_state_dict(state["env"])
-        except (RuntimeError, ValueError) as error:  # torch raises the first for names and shapes
-            reason = " ".join(str(error).split()).rstrip(".")
-            raise ValueError(
-                f"the checkpoint is of another env, or of one that an earlier ksim_rl built: {reason}. Its networks "
-                "may still fit: ksim-rl train checkpoint=RUN"
-            ) from error
+        load_env_state(self.collector.env, state["env"])
         self.collector.load_state_dict(state["collector"])
         for hook, own in hooks:
             hook.load_state_dict(own)
         self.iteration = self.saved_at = int(state["iteration"])
         self.clock.total = float(state["seconds"])
-        # A run that moves to another kind of device keeps that one's present state.
-        torch.set_rng_state(state["random"]["cpu"])
-        if self.update.device.type == "cuda" and "cuda" in state["random"]:
-            torch.cuda.set_rng_state(state["random"]["cuda"], self.update.device)
+        load_random_state(state["random"], self.update.device)
 
 
 def _keeps(hook: Hook) -> bool:

@@ -42,7 +42,10 @@ def first_that_fits(cfg: RunCfg, numbers: Iterable[int], *, note: Callable[[str]
         if ended.returncode == FITS:
             return num_envs
         # Behind the exit without a teardown, helpers of Python still write to stderr.
-        said = ended.stdout if ended.returncode == DOES_NOT else ended.stderr
+        if ended.returncode == DOES_NOT:
+            said = ended.stdout
+        else:
+            said = ended.stderr
         note(f"num_envs={num_envs} does not train: {(said.strip() or 'no reason').splitlines()[-1]}")
         if ended.returncode > 0 and ended.returncode != DOES_NOT:
             break  # the config cannot even be built there, and nobody knows whether memory suffices

@@ -55,7 +55,10 @@ def record(
             current_E = env.reset()
             for step in range(steps):
                 if step % every == 0:
-                    frame = None if (pictures := part(env, Pictures)) is None else pictures.render()
+                    if (pictures := part(env, Pictures)) is None:
+                        frame = None
+                    else:
+                        frame = pictures.render()
                     if frame is None:
                         raise VideoUnavailableError(
                             "the env has no render mode: build it with render_mode='rgb_array'"
@@ -84,7 +87,10 @@ def record(
 def _write(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], *, fps: float) -> Path:
     # H.264 wants even sides; with macro_block_size=2 imageio pads only odd ones.
     h264 = {"fps": fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
-    options = {"duration": 1000 / fps, "loop": 0} if path.suffix == ".gif" else h264
+    if path.suffix == ".gif":
+        options = {"duration": 1000 / fps, "loop": 0}
+    else:
+        options = h264
     with whole_file(path) as temporary:
         writer: Any = imageio.get_writer(temporary, **options)
         with writer:

@@ -31,7 +31,8 @@ def _whole(vectors: list[Tensor]) -> Tensor | None:
     owner = upstream.base_of(vectors[0])
     if owner is None:
         return None
-    width, offset = vectors[0].stride(0), 0
+    width = vectors[0].stride(0)
+    offset = 0
     for vector in vectors:
         placed = upstream.base_of(vector) is owner and vector.storage_offset() == offset
         if not placed or vector.dtype != owner.dtype or vector.stride() != (width, 1):

@@ -84,7 +84,10 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
             return
         self.step_count.add_(1)
         # A shared lag is drawn once: a single row broadcasts over all.
-        age = self.age_E + 1 if delay.per_env else self.shared_age.add_(1)
+        if delay.per_env:
+            age = self.age_E + 1
+        else:
+            age = self.shared_age.add_(1)
         due = age % delay.resample_every == 0
         if delay.hold_probability:
             chance = random.uniform(self._step_keys("step/hold", shared=not delay.per_env), 1)[:, 0]

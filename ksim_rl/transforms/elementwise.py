@@ -203,7 +203,9 @@ class RewardScale(FollowsLevel, RewardMap):
         for name, value in (("scale", scale), ("offset", offset), ("first_scale", first_scale)):
             if value is not None:
                 checks.check_in_range(name, value)
-        self.scale, self.offset, self.first_scale = scale, offset, first_scale
+        self.scale = scale
+        self.offset = offset
+        self.first_scale = first_scale
         self._register_level(is_used=first_scale is not None)
 
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
@@ -214,8 +216,13 @@ class RewardScale(FollowsLevel, RewardMap):
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
-        scale = self.scale if self.first_scale is None else by_level(self.first_scale, self.scale, self.level)
-        return value * scale + self.offset if self.offset else value * scale
+        if self.first_scale is None:
+            scale = self.scale
+        else:
+            scale = by_level(self.first_scale, self.scale, self.level)
+        if self.offset:
+            return value * scale + self.offset
+        return value * scale
 
 
 class ActionScale(ActionMap):
@@ -243,7 +250,8 @@ class ActionScale(ActionMap):
             if 0 in (scale if isinstance(scale, Sequence) else [scale]):
                 raise ValueError(f"scale={scale!r}: expected numbers other than 0")
         check_scale("offset", offset)
-        self.scale, self.offset = scale, offset
+        self.scale = scale
+        self.offset = offset
         for index in range(len(self.in_keys_inv)):
             self.register_buffer(f"scale_{index}", None, persistent=False)
             self.register_buffer(f"offset_{index}", None, persistent=False)
@@ -251,14 +259,17 @@ class ActionScale(ActionMap):
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
         scale, offset = self._affine(index, spec)
         if self._buffers[f"scale_{index}"] is None:
-            self._buffers[f"scale_{index}"], self._buffers[f"offset_{index}"] = scale, offset
+            self._buffers[f"scale_{index}"] = scale
+            self._buffers[f"offset_{index}"] = offset
         ends = [(end - offset) / scale for end in bounds(spec)]
-        low, high = torch.minimum(*ends), torch.maximum(*ends)
+        low = torch.minimum(*ends)
+        high = torch.maximum(*ends)
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def _affine(self, index: int, spec: TensorSpec) -> tuple[Tensor, Tensor]:
         """Return scale and offset, one per element of the last dim, or per element of all dims from bounds."""
-        key, leaf = self.in_keys_inv[index], spec.shape[self.batch_dims_inv[index] :]
+        key = self.in_keys_inv[index]
+        leaf = spec.shape[self.batch_dims_inv[index] :]
         if self.scale is None:
             low, high = bounds(spec)
             if not bool((torch.isfinite(low) & torch.isfinite(high) & (low < high)).all()):
@@ -279,7 +290,8 @@ class ActionScale(ActionMap):
         return tensordict_reset
 
     def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
-        scale, offset = self._buffers[f"scale_{index}"], self._buffers[f"offset_{index}"]
+        scale = self._buffers[f"scale_{index}"]
+        offset = self._buffers[f"offset_{index}"]
         if scale is None or offset is None:
             raise RuntimeError("ActionScale knows its numbers once an env holds it and has made its specs")
         return torch.addcmul(offset, value, scale)

@@ -50,14 +50,16 @@ class RingTransform(RowTransform):
         """Make one ring [E, M, ...] per signal, or with `joins` one for all signals where they are of one dtype."""
         self._size_rows(specs)
         self._size_buffer("age_E", torch.int64)
-        shapes, dtypes = [leaf.shape[specs.ndim :] for leaf in leaves], [leaf.dtype for leaf in leaves]
+        shapes = [leaf.shape[specs.ndim :] for leaf in leaves]
+        dtypes = [leaf.dtype for leaf in leaves]
         self._is_joined = joins and len(shapes) > 1 and len(set(dtypes)) == 1
         if self._is_joined:
             sizes = [shape.numel() for shape in shapes]
             if self.num_frames > 1:
                 part_bytes = torch.tensor([size * dtypes[0].itemsize for size in sizes], dtype=torch.int32)
                 self._buffers["part_bytes"] = part_bytes.to(self._row_device)
-            shapes, dtypes = [torch.Size([sum(sizes)])], dtypes[:1]
+            shapes = [torch.Size([sum(sizes)])]
+            dtypes = dtypes[:1]
         self._num_rings = len(shapes)
         for index, (shape, dtype) in enumerate(zip(shapes, dtypes, strict=True)):
             self._size_buffer(f"ring_{index}", dtype, (self.num_slots, *shape))
@@ -78,10 +80,17 @@ class RingTransform(RowTransform):
     def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
         """Write this step's value [E, ...] and return what is due, [E, N * L]; masked rows begin with it."""
         buffers: dict[str, Any] = self._buffers
-        ring_EM, age_E = buffers[f"ring_{index}"], buffers["age_E"]
-        value_E = value if value.ndim == ring_EM.ndim - 1 else value.reshape(-1, *ring_EM.shape[2:])
+        ring_EM = buffers[f"ring_{index}"]
+        age_E = buffers["age_E"]
+        if value.ndim == ring_EM.ndim - 1:
+            value_E = value
+        else:
+            value_E = value.reshape(-1, *ring_EM.shape[2:])
         begins = mask_E is not None
-        draws = self._draws(index) if begins else ring.NO_DRAWS
+        if begins:
+            draws = self._draws(index)
+        else:
+            draws = ring.NO_DRAWS
         layout = self.num_frames, self.stride, buffers["part_bytes"], begins or index == self._num_rings - 1
         return ring.turn(ring_EM, age_E, value_E, buffers.get("lag_E"), mask_E, *layout, *draws)
 
@@ -91,7 +100,9 @@ class RingTransform(RowTransform):
 
     def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
         """Return what comes out in the shape that the env emits."""
-        return found_EL if found_EL.shape == value.shape else found_EL.reshape(value.shape)
+        if found_EL.shape == value.shape:
+            return found_EL
+        return found_EL.reshape(value.shape)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +130,8 @@ class ObservationHistory(RingTransform):
         super().__init__(in_keys, out_keys)
         self._register_rings()
         self.num_frames = self.length = length
-        self.stride, self.flat = stride, flat
+        self.stride = stride
+        self.flat = flat
         self.num_slots = (length - 1) * stride + 1
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -130,7 +142,8 @@ class ObservationHistory(RingTransform):
         return observation_spec
 
     def _repeated(self, spec: TensorSpec, batch_dims: int) -> TensorSpec:
-        batch, leaf = spec.shape[:batch_dims], spec.shape[batch_dims:]
+        batch = spec.shape[:batch_dims]
+        leaf = spec.shape[batch_dims:]
         stacked = spec.unsqueeze(batch_dims).expand(*batch, self.num_frames, *leaf)
         if not self.flat:
             return stacked.clone()
@@ -141,10 +154,13 @@ class ObservationHistory(RingTransform):
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
-        outer, inner = len(batch_size), self.batch_dims[index]
+        outer = len(batch_size)
+        inner = self.batch_dims[index]
         if self.flat and outer == inner == 1:
             return found_EL
         stacked = found_EL.reshape(*batch_size, self.num_frames, *value.shape[outer:])
         if inner > outer:  # each frame of the env has one of each agent, say
             stacked = stacked.movedim(outer, inner)
-        return stacked.flatten(inner) if self.flat else stacked
+        if self.flat:
+            return stacked.flatten(inner)
+        return stacked

@@ -40,7 +40,8 @@ class ActionLowPass(RowTransform):
             checks.check_in_range("initial", initial)
         super().__init__(in_keys_inv=in_keys_inv, out_keys_inv=out_keys_inv)
         self._register_rows("fresh_E", *self._per_key("filtered"))
-        self.alpha, self.initial = alpha, initial
+        self.alpha = alpha
+        self.initial = initial
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         leaves = self._replace_leaves(action_spec, is_inverse=True, is_floating=True)
@@ -60,7 +61,10 @@ class ActionLowPass(RowTransform):
             action = checked_action(tensordict, out_key, filtered_E.shape[1:], filtered_E.dtype)
             action_E = action.reshape(filtered_E.shape)
             fresh_E = self.fresh_E.reshape(-1, *[1] * (action_E.ndim - 1))
-            before_E = action_E if self.initial is None else self.initial
+            if self.initial is None:
+                before_E = action_E
+            else:
+                before_E = self.initial
             filtered_E.copy_(torch.where(fresh_E, before_E, filtered_E)).lerp_(action_E, self.alpha)
             # In memory of its own: the kept one changes in place.
             tensordict.set(key, filtered_E.clone().reshape(action.shape))

@@ -47,7 +47,8 @@ class ObservationNormalization(RowTransform):
         if until is not None:
             checks.check_in_range("until", until, low=1)
         super().__init__(in_keys, out_keys)
-        self.eps, self.until = eps, until
+        self.eps = eps
+        self.until = until
         self._wanted = self._collective = enabled
         self.moments = nn.ModuleList()
         self.register_buffer("updating", torch.tensor(enabled), persistent=False)

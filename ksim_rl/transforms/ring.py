@@ -22,7 +22,8 @@ _ARGUMENTS = arguments_of(
     (wp.uint64, "seed draw_count age lag mask parts value ring out"),
 )
 _quick = QuickLaunch(_ARGUMENTS, DRAWS + source_of("ksim_rl.transforms", "ring"))
-_LANES, _MANY_LANES = 32, 256
+_LANES = 32
+_MANY_LANES = 256
 """Threads that share a row on the GPU: a warp, or a block for large rows."""
 NO_DRAWS = None, None, 0, 0, 0
 """The last arguments of `turn`, from `seed` on, where no row draws a lag."""
@@ -59,17 +60,35 @@ def _launch(
     if value_E.ndim > 2 or value_E.ndim == 2 and value_E.stride(1) != 1:
         value_E = value_E.contiguous()
     num_rows, num_slots, *leaf = ring_EM.shape
-    device, item_size = value_E.device, value_E.element_size()
-    size = leaf[0] if len(leaf) == 1 else math.prod(leaf)
+    device = value_E.device
+    item_size = value_E.element_size()
+    if len(leaf) == 1:
+        size = leaf[0]
+    else:
+        size = math.prod(leaf)
     out_EL = torch.empty((num_rows, num_frames * size), dtype=value_E.dtype, device=device)
-    num_bytes, value_stride, value = size * item_size, value_E.stride(0) * item_size, value_E.data_ptr()
+    num_bytes = size * item_size
+    value_stride = value_E.stride(0) * item_size
+    value = value_E.data_ptr()
     num_parts = 1 if parts is None else parts.shape[0]
     if device.type == "cpu":
-        width, lanes = 0, 1
+        width = 0
+        lanes = 1
     else:
-        bits = num_bytes | value_stride | value if parts is None else item_size
-        width = 16 if bits % 16 == 0 else 4 if bits % 4 == 0 else 1
-        lanes = _LANES if num_frames * num_bytes <= 32 * _LANES * width * num_parts else _MANY_LANES
+        if parts is None:
+            bits = num_bytes | value_stride | value
+        else:
+            bits = item_size
+        if bits % 16 == 0:
+            width = 16
+        elif bits % 4 == 0:
+            width = 4
+        else:
+            width = 1
+        if num_frames * num_bytes <= 32 * _LANES * width * num_parts:
+            lanes = _LANES
+        else:
+            lanes = _MANY_LANES
     layout = width, lanes, num_bytes, value_stride, num_slots, num_frames, stride, num_parts, counts
     first_row = ranks.first_row(num_rows)
     draws = first_row, stream, lowest, highest - lowest + 1, address(seed), address(draw_count_E)

@@ -44,7 +44,8 @@ class CheckedKeys(Transform):
         *,
         is_paired: bool = True,
     ) -> None:
-        keys, keys_inv = as_keys(in_keys or []), as_keys(in_keys_inv or [])
+        keys = as_keys(in_keys or [])
+        keys_inv = as_keys(in_keys_inv or [])
         out = checked_out_keys(keys, out_keys, is_paired)
         super().__init__(keys, out, keys_inv, checked_out_keys(keys_inv, out_keys_inv, is_paired))
 
@@ -79,9 +80,11 @@ class CheckedKeys(Transform):
         `new_spec` takes the index of a key and its spec. The specs of actions (`is_inverse`) move to where the policy
         writes. Raises ValueError where `is_floating` and a spec is of another dtype.
         """
-        in_keys, out_keys = self.in_keys, self.out_keys
+        in_keys = self.in_keys
+        out_keys = self.out_keys
         if is_inverse:
-            in_keys, out_keys = self.in_keys_inv, self.out_keys_inv
+            in_keys = self.in_keys_inv
+            out_keys = self.out_keys_inv
         found = [leaf_spec(specs, key, type(self).__name__) for key in in_keys]
         for key, spec in zip(in_keys, found, strict=True):
             if is_floating:
@@ -123,11 +126,13 @@ class RowTransform(CheckedKeys, ABC):
 
     def _size_rows(self, specs: Composite) -> None:
         """Take note of the number of rows; bases make their buffers here."""
-        self.num_rows, self._row_device = specs.shape.numel(), specs.device
+        self.num_rows = specs.shape.numel()
+        self._row_device = specs.device
 
     def _size_buffer(self, name: str, dtype: torch.dtype, leaf: Sequence[int] = ()) -> None:
         """Make a zero buffer [E, *leaf], unless there is one of that shape and dtype already."""
-        present, shape = self._buffers[name], (self.num_rows, *leaf)
+        present = self._buffers[name]
+        shape = (self.num_rows, *leaf)
         if present is None or present.shape != shape or present.dtype != dtype:
             self._buffers[name] = torch.zeros(shape, dtype=dtype, device=self._row_device)
 
@@ -206,7 +211,9 @@ class RowTransform(CheckedKeys, ABC):
 def _per_row(mask: Tensor, num_rows: int) -> Tensor:
     flat = mask.reshape(num_rows, -1)
     # Kernels read it by address.
-    return flat[:, 0].contiguous() if flat.shape[1] == 1 else flat.any(-1)
+    if flat.shape[1] == 1:
+        return flat[:, 0].contiguous()
+    return flat.any(-1)
 
 
 class KeyedTransform(RowTransform):
@@ -235,7 +242,10 @@ class KeyedTransform(RowTransform):
         super().__init__(*keys, **others)  # pyright: ignore[reportArgumentType]
         self._register_rows("reset_count_E")
         every = (self.in_keys, self.out_keys, self.in_keys_inv, self.out_keys_inv)
-        self.stream = type(self).__name__ + "".join(map(str, every)) if stream is None else stream
+        if stream is None:
+            self.stream = type(self).__name__ + "".join(map(str, every))
+        else:
+            self.stream = stream
         self._stream_ids = {name: random.stream_id(f"{self.stream}/{name}") for name in self.purposes}
         self._is_seeded = seed is not None
         self.register_buffer("seed_value", torch.tensor(_NO_SEED if seed is None else seed))
@@ -277,7 +287,8 @@ class KeyedTransform(RowTransform):
         return mask_E
 
     def _step_keys(self, purpose: str, *, shared: bool = False) -> random.RowKeys:
-        stream, rows = self._stream_ids[purpose], 1 if shared else self.num_rows
+        stream = self._stream_ids[purpose]
+        rows = 1 if shared else self.num_rows
         return random.row_keys(self.seed_value, stream, self.step_count, rows, shared=shared)
 
     def _reset_keys(self, purpose: str) -> random.RowKeys:
@@ -346,7 +357,10 @@ def by_level(
 
 def as_keys(keys: Keys) -> list[NestedKey]:
     """Return a list of keys from one key or a list of them; a tuple is one key, and ("a",) is "a"."""
-    listed: list[NestedKey] = [keys] if isinstance(keys, str | tuple) else list(keys)
+    if isinstance(keys, str | tuple):
+        listed: list[NestedKey] = [keys]
+    else:
+        listed = list(keys)
     return [key[0] if isinstance(key, tuple) and len(key) == 1 else key for key in listed]
 
 
@@ -354,7 +368,10 @@ def checked_out_keys(
     in_keys: Sequence[NestedKey], out_keys: Keys | None, is_paired: bool = True
 ) -> list[NestedKey]:
     """Return out keys, by default the in keys; a ValueError where their number differs (if paired) or one repeats."""
-    out = list(in_keys) if out_keys is None else as_keys(out_keys)
+    if out_keys is None:
+        out = list(in_keys)
+    else:
+        out = as_keys(out_keys)
     if is_paired and len(out) != len(in_keys):
         raise ValueError(f"out_keys={out} has {len(out)} keys for the {len(in_keys)} of in_keys={in_keys}")
     if len(set(out)) != len(out):

@@ -16,12 +16,16 @@ Device = torch.device | str | int | None
 
 def spell(key: NestedKey) -> str:
     """Return a key as one string."""
-    return key if isinstance(key, str) else "/".join(map(str, key))
+    if isinstance(key, str):
+        return key
+    return "/".join(map(str, key))
 
 
 def path_of(key: NestedKey) -> tuple[Any, ...]:
     """Return the names that lead to a leaf."""
-    return (key,) if isinstance(key, str) else tuple(key)
+    if isinstance(key, str):
+        return (key,)
+    return tuple(key)
 
 
 def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> TensorSpec:

@@ -45,10 +45,17 @@ def _tally(
     """
     if reward_E is not None:
         reward_E = reward_E.contiguous()
-    step_out_E, total_out_E = torch.empty_like(step_E), torch.empty_like(total_E)
-    device, num_rows = step_E.device, step_E.numel()
+    step_out_E = torch.empty_like(step_E)
+    total_out_E = torch.empty_like(total_E)
+    device = step_E.device
+    num_rows = step_E.numel()
     # One thread does all on the CPU, in vector instructions.
-    dim, rows = ((1, 1), num_rows) if device.type == "cpu" else ((num_rows, 1), 1)
+    if device.type == "cpu":
+        dim = (1, 1)
+        rows = num_rows
+    else:
+        dim = (num_rows, 1)
+        rows = 1
     read = address(mask_E), address(reward_E), total_E.data_ptr(), step_E.data_ptr()
     _quick_tally(device, dim, rows, *read, total_out_E.data_ptr(), step_out_E.data_ptr())
     return step_out_E, total_out_E

@@ -63,9 +63,13 @@ class EpisodeTracker(_Tracker):
         *,
         length_key: NestedKey | None = "episode_length",
     ) -> None:
-        in_keys, returns = as_keys(in_keys), as_keys(out_keys)
+        in_keys = as_keys(in_keys)
+        returns = as_keys(out_keys)
         checked_out_keys(in_keys, returns)
-        lengths: list[NestedKey] = [] if length_key is None else [length_key]
+        if length_key is None:
+            lengths: list[NestedKey] = []
+        else:
+            lengths = [length_key]
         super().__init__(in_keys, returns + lengths, is_paired=False)
         self._register_rows("step_E", *self._per_key("return"))
         self.length_key = length_key
@@ -73,7 +77,8 @@ class EpisodeTracker(_Tracker):
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         output_spec = output_spec.clone()
-        rewards, observations = output_spec["full_reward_spec"], output_spec["full_observation_spec"]
+        rewards = output_spec["full_reward_spec"]
+        observations = output_spec["full_observation_spec"]
         leaves = [leaf_spec(rewards, key, type(self).__name__) for key in self.in_keys]
         for key, spec in zip(self.in_keys, leaves, strict=True):
             if spec.dtype == torch.bool:
@@ -140,7 +145,8 @@ class SuccessTracker(_Tracker):
         checks.check_choice("reduce", reduce, ("any", "last"))
         super().__init__(in_keys, out_keys)
         self._register_rows(*self._per_key("success"))
-        self.threshold, self.reduce = threshold, reduce
+        self.threshold = threshold
+        self.reduce = reduce
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         output_spec = output_spec.clone()
@@ -194,10 +200,14 @@ class TimeAwareObservation(_Tracker):
             checks.check_count("horizon", horizon)
         super().__init__([], keys, is_paired=False)
         self._register_rows("step_E")
-        self.horizon, self.normalize = horizon, normalize
+        self.horizon = horizon
+        self.normalize = normalize
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        high = 1.0 if self.normalize else float(self._horizon())
+        if self.normalize:
+            high = 1.0
+        else:
+            high = float(self._horizon())
         shape = torch.Size([*observation_spec.shape, 1])
         spec = Bounded(0.0, high, shape, device=observation_spec.device, dtype=torch.float32)
         set_leaf_spec(observation_spec, self.out_keys[0], spec)
@@ -211,7 +221,10 @@ class TimeAwareObservation(_Tracker):
             if self.container is None:
                 raise ValueError("horizon=None asks the env for its horizon: use the transform in an env")
             env = innermost(self.container)
-            found = env.max_episode_length if isinstance(env, EpisodeLimit) else upstream.gym_horizon(env)
+            if isinstance(env, EpisodeLimit):
+                found = env.max_episode_length
+            else:
+                found = upstream.gym_horizon(env)
             if not found:
                 raise ValueError(
                     f"horizon=None, but the episodes of {type(env).__name__} never time out: give it"

@@ -138,7 +138,9 @@ def _as_data(annotation: Any) -> Any:
     options = [
         option for option in (typing.get_args(annotation) if is_union else (annotation,)) if _is_data(option)
     ]
-    return functools.reduce(operator.or_, options) if options else Any
+    if options:
+        return functools.reduce(operator.or_, options)
+    return Any
 
 
 def _listed(value: Any, annotation: Any) -> Any:
@@ -148,7 +150,9 @@ def _listed(value: Any, annotation: Any) -> Any:
         typing.get_origin(option) in (Sequence, list) and NestedKey in typing.get_args(option)
         for option in options
     )
-    return [value] if takes_keys and isinstance(value, tuple) else value
+    if takes_keys and isinstance(value, tuple):
+        return [value]
+    return value
 
 
 def _is_data(option: Any) -> bool:

@@ -36,7 +36,10 @@ def is_in_env(transform: Transform) -> bool:
     A transform knows its env before it is part of it.
     """
     env = env_of(transform)
-    root = env._modules.get("_transform") if isinstance(env, TransformedEnv) else None
+    if isinstance(env, TransformedEnv):
+        root = env._modules.get("_transform")
+    else:
+        root = None
     return root is not None and any(module is transform for module in root.modules())
 
 
@@ -45,7 +48,8 @@ class _SetSeed:
 
     def __init__(self, env: TransformedEnv, seed_transforms: Callable[[TransformedEnv, int], None]) -> None:
         # A strong reference would be a cycle: an env of worker processes would not be closed with its last user.
-        self.env, self.seed_transforms = weakref.ref(env), seed_transforms
+        self.env = weakref.ref(env)
+        self.seed_transforms = seed_transforms
 
     def __call__(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         env = self.env()
@@ -84,11 +88,19 @@ def fresh_seed() -> int:
     told = [given[name] for name in ("worker_idx", "idx") if given.get(name) is not None]
     place = (*process._identity[:-1], *(told[:1] or process._identity[-1:]))
     is_forked = not place or type(process).__name__ == "ForkProcess"
-    generator = None if is_forked or torch.initial_seed() != _SEED_AT_IMPORT else _generator_of_worker
+    if is_forked or torch.initial_seed() != _SEED_AT_IMPORT:
+        generator = None
+    else:
+        generator = _generator_of_worker
     return int(torch.randint(1 << 31, (), generator=generator)) << 31 | zlib.crc32(repr(place).encode()) >> 1
 
 
 def gym_horizon(env: EnvBase) -> int | None:
     """Return the number of steps after which Gymnasium cuts an episode; None where it does not, or in another env."""
-    gym_env: Any = env._env if isinstance(env, GymWrapper) else None
-    return None if gym_env is None or gym_env.spec is None else gym_env.spec.max_episode_steps
+    if isinstance(env, GymWrapper):
+        gym_env: Any = env._env
+    else:
+        gym_env = None
+    if gym_env is None or gym_env.spec is None:
+        return None
+    return gym_env.spec.max_episode_steps

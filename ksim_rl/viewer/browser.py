@@ -54,7 +54,8 @@ class BrowserViewer:
         """Show a session from now on."""
         self._session = session
         self._notice.remove()
-        server, cfg = self.server, session.ours.cfg.viewer
+        server = self.server
+        cfg = session.ours.cfg.viewer
         _aim(server, cfg)
         self._panel = Panel(server.gui, session)
         # No tab: charts that are made while they are hidden stay empty.
@@ -78,13 +79,15 @@ class BrowserViewer:
         with self.server.atomic():
             if session.built != self._built:
                 self.server.scene.reset()
-                self._built, self._env_scene = session.built, SceneOfEnv(session.ours)
+                self._built = session.built
+                self._env_scene = SceneOfEnv(session.ours)
                 self._scene = BrowserScene(self.server.scene, self._env_scene.mj_model)
             assert self._scene is not None
             self._env_scene.fill(session.env_index, drawn=self._panel.drawn, contacts=self._panel.contacts)
-            center = (
-                self._env_scene.center(session.ours.cfg.viewer.body) if self._panel.follows else np.zeros(3)
-            )
+            if self._panel.follows:
+                center = self._env_scene.center(session.ours.cfg.viewer.body)
+            else:
+                center = np.zeros(3)
             self._scene.show(self._env_scene.mjv, center=center)
             self._panel.show(ignored=self.ignored)
             self._plots.show()
@@ -117,7 +120,8 @@ class BrowserViewer:
 
 def _aim(server: viser.ViserServer, cfg: ViewerCfg) -> None:
     """Look from where the pictures of videos are taken."""
-    azimuth, elevation = np.radians(cfg.azimuth), np.radians(cfg.elevation)
+    azimuth = np.radians(cfg.azimuth)
+    elevation = np.radians(cfg.elevation)
     ahead = np.array(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )

@@ -45,7 +45,8 @@ class SceneOfEnv:
         self.option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = contacts
         if contacts:
             mujoco.mj_collision(self.mj_model, self.data)
-        everything, nothing = mujoco.mjtCatBit.mjCAT_ALL.value, (mujoco.MjvPerturb(), mujoco.MjvCamera())
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        nothing = (mujoco.MjvPerturb(), mujoco.MjvCamera())
         mujoco.mjv_updateScene(self.mj_model, self.data, self.option, *nothing, everything, self.mjv)
         visualizer = DebugVisualizer(self.mj_model, self.mjv)
         self._env.update_visualizers(visualizer, env_index, drawn=drawn)
@@ -53,7 +54,12 @@ class SceneOfEnv:
     def center(self, body: str | None) -> np.ndarray:
         """Return where a camera looks that follows a body, by default the first that moves: m, world frame."""
         moving = np.flatnonzero(self.mj_model.body_weldid)
-        index = self.mj_model.body(body).id if body is not None else int(moving[0]) if moving.size else 0
+        if body is not None:
+            index = self.mj_model.body(body).id
+        elif moving.size:
+            index = int(moving[0])
+        else:
+            index = 0
         return self.data.xpos[index].copy()
 
 
@@ -64,7 +70,8 @@ class BrowserScene:
     """
 
     def __init__(self, scene: viser.SceneApi, mj_model: mujoco.MjModel) -> None:
-        self._scene, self._mj_model = scene, mj_model
+        self._scene = scene
+        self._mj_model = mj_model
         self._root = scene.add_frame("/env", show_axes=False)
         self._batches: dict[tuple[Any, ...], tuple[viser.BatchedMeshHandle, dict[str, np.ndarray]]] = {}
         self._labels: list[viser.LabelHandle] = []
@@ -164,8 +171,16 @@ class BrowserScene:
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, np.asarray(geom.mat, dtype=np.float64).ravel())
         # MuJoCo moves the picture of an infinite plane about with the camera.
-        position = self._mj_model.geom_pos[geom.objid] if infinite else geom.pos
-        width, height = (40.0, 40.0) if infinite else (2 * float(geom.size[0]), 2 * float(geom.size[1]))
+        if infinite:
+            position = self._mj_model.geom_pos[geom.objid]
+        else:
+            position = geom.pos
+        if infinite:
+            width = 40.0
+            height = 40.0
+        else:
+            width = 2 * float(geom.size[0])
+            height = 2 * float(geom.size[1])
         place = {"wxyz": quat, "position": np.asarray(position, dtype=np.float64)}
         extent = {"width": width, "height": height, "infinite_grid": infinite, "fade_distance": 30.0}
         grid = self._scene.add_grid(f"/env/plane_{geom.objid}", **extent, **_GROUND, **place)
@@ -191,7 +206,8 @@ def _scale(kind: int, size: np.ndarray) -> tuple[float, float, float]:
 
 def mesh_of_model(mj_model: mujoco.MjModel, mesh: int) -> Mesh:
     """Return a mesh with a vertex for each normal at a corner, so that edges stay as sharp as they are."""
-    first, count = mj_model.mesh_faceadr[mesh], mj_model.mesh_facenum[mesh]
+    first = mj_model.mesh_faceadr[mesh]
+    count = mj_model.mesh_facenum[mesh]
     corners = mj_model.mesh_face[first : first + count].reshape(-1)
     normals = mj_model.mesh_facenormal[first : first + count].reshape(-1)
     pairs, faces = np.unique(np.stack([corners, normals], axis=1), axis=0, return_inverse=True)
@@ -201,7 +217,8 @@ def mesh_of_model(mj_model: mujoco.MjModel, mesh: int) -> Mesh:
 
 def height_field_mesh(mj_model: mujoco.MjModel, field: int) -> Mesh:
     """Return the surface of a height field as triangles, m, in the frame of its geom."""
-    rows, columns = int(mj_model.hfield_nrow[field]), int(mj_model.hfield_ncol[field])
+    rows = int(mj_model.hfield_nrow[field])
+    columns = int(mj_model.hfield_ncol[field])
     half_x, half_y, rise, _ = mj_model.hfield_size[field]
     start = mj_model.hfield_adr[field]
     height = mj_model.hfield_data[start : start + rows * columns] * rise

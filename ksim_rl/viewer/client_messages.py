@@ -10,7 +10,8 @@ from typing import Any
 import msgspec
 import viser
 
-CAMERA, UPDATE = "ViewerCameraMessage", "GuiUpdateMessage"
+CAMERA = "ViewerCameraMessage"
+UPDATE = "GuiUpdateMessage"
 # Bytes of a message; the longest that the page sends has a few hundred.
 MOST_BYTES = 16 * 1024
 _MOST_NUMBERS = 4
@@ -35,7 +36,8 @@ def checked(raw: str | bytes, widgets: Mapping[str, Any]) -> bytes | None:
         return raw if all(map(_is_pose, entries)) else None
     if kind != UPDATE or message.keys() != {"type", "uuid", "updates"}:
         return None
-    uuid, updates = message["uuid"], message["updates"]
+    uuid = message["uuid"]
+    updates = message["updates"]
     if not isinstance(uuid, str) or not isinstance(updates, dict) or updates.keys() != {"value"}:
         return None
     value = _allowed(updates["value"], widgets.get(uuid))
@@ -71,7 +73,11 @@ def _allowed(value: Any, widget: Any) -> Any:
     if isinstance(widget, viser.GuiButtonHandle | viser.GuiCheckboxHandle):
         return value if isinstance(value, bool) else None
     if isinstance(widget, viser.GuiDropdownHandle | viser.GuiButtonGroupHandle):
-        return value if isinstance(value, str) and value in widget.options else None
+        if isinstance(value, str) and value in widget.options:
+            return value
+        return None
     if isinstance(widget, viser.GuiSliderHandle | viser.GuiNumberHandle):
-        return clamped(value, widget.min, widget.max) if is_number(value) else None
+        if is_number(value):
+            return clamped(value, widget.min, widget.max)
+        return None
     return None

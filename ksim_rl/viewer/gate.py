@@ -33,8 +33,10 @@ class Gate:
     """
 
     def __init__(self, host: str) -> None:
-        self.token, self.ignored = secrets.token_urlsafe(16), 0
-        self._host, self._count = host, threading.Lock()
+        self.token = secrets.token_urlsafe(16)
+        self.ignored = 0
+        self._host = host
+        self._count = threading.Lock()
         self._names = {"localhost", host.lower()}
         self._is_local = _is_address(host, local=True) or host == "localhost"
         if not self._is_local:
@@ -43,7 +45,10 @@ class Gate:
 
     def address(self, port: int) -> str:
         """Return what a browser of this machine opens."""
-        name = "localhost" if self._host in _EVERYWHERE else self._host
+        if self._host in _EVERYWHERE:
+            name = "localhost"
+        else:
+            name = self._host
         return f"http://{f'[{name}]' if ':' in name else name}:{port}/{self.token}"
 
     def ignore(self) -> None:
@@ -54,7 +59,8 @@ class Gate:
     def refusal(self, request: Request) -> Response | None:
         """Return the answer to a request that is not let in, or None."""
         try:
-            host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+            host = request.headers.get("Host", "")
+            origin = request.headers.get("Origin")
         except MultipleValuesError:
             return _forbidden("expected one Host and one Origin")
         if not self._is_own(host):

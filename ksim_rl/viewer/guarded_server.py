@@ -16,7 +16,8 @@ from ksim_rl.viewer.client_messages import MOST_BYTES, checked
 from ksim_rl.viewer.gate import MESSAGES_PER_S, MOST_CLIENTS, Gate
 
 # Messages of one client that wait for viser, and how many may come at once before their pace counts.
-_MOST_WAITING, _BURST_S = 16, 0.5
+_MOST_WAITING = 16
+_BURST_S = 0.5
 _serve = websockets.asyncio.server.serve
 _one_at_a_time = threading.Lock()
 
@@ -89,7 +90,8 @@ def _gated(gate: Gate) -> Iterator[list[_Clients]]:
     made: list[_Clients] = []
 
     def serve(handler: Any, *where: Any, **options: Any) -> Any:
-        clients, own = _Clients(gate), options["process_request"]
+        clients = _Clients(gate)
+        own = options["process_request"]
         made[:] = [clients]
 
         def answer(connection: ServerConnection, request: Request) -> Response | None:

@@ -29,27 +29,34 @@ from ksim_rl.viewer.play_command import Played, addresses, check_viser, session_
 
 # Seconds between two policies that are given away: a hook lets the host wait for the device, so these are rare.
 PERIOD_S = 2.0
-CONFIG, WEIGHTS = "config.json", "weights.pt"
-_SOME, _NOBODY = "watched", "alone"
+CONFIG = "config.json"
+WEIGHTS = "weights.pt"
+_SOME = "watched"
+_NOBODY = "alone"
 
 
 class GiveWeights(Hook):
     """Writes the actor's weights for the viewer every `PERIOD_S`, while somebody watches."""
 
     def __init__(self, folder: Path) -> None:
-        self.is_watched, self._every, self._path = False, 1, folder / WEIGHTS
+        self.is_watched = False
+        self._every = 1
+        self._path = folder / WEIGHTS
         self._last: tuple[float, int] | None = None
 
     @property
     def interval(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Iterations between two calls. Another thread says whether there are any, so it is never 0, as in `%`."""
-        return self._every if self.is_watched else sys.maxsize
+        if self.is_watched:
+            return self._every
+        return sys.maxsize
 
     def __call__(self, trainer: Trainer) -> None:
         """Write them, and find out in how many iterations it is time again."""
         now = time.monotonic()
         if self._last is not None:
-            seconds, iterations = now - self._last[0], trainer.iteration - self._last[1]
+            seconds = now - self._last[0]
+            iterations = trainer.iteration - self._last[1]
             self._every = max(1, round(PERIOD_S * iterations / max(seconds, 1e-3)))
         self._last = now, trainer.iteration
         state = {name: tensor.cpu() for name, tensor in trainer.update.actor.state_dict().items()}
@@ -118,7 +125,8 @@ def main(folder: Path) -> None:
     session = session_of(Played(cfg=cfg, title=cfg.task_name, folder=folder, actor=actor), num_envs=4, seed=0)
     viewer.open(session)
     print(*addresses(viewer.address, viewer.pad_address), sep="\n", flush=True)
-    read_at, said = 0, False
+    read_at = 0
+    said = False
 
     def follow() -> bool:
         nonlocal read_at, said

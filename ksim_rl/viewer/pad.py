@@ -36,7 +36,9 @@ class Pad:
     def __init__(
         self, panel: Panel, session: Session, gate: Gate, *, host: str, port: int, viewer_port: int
     ) -> None:
-        self._panel, self._session, self._gate = panel, session, gate
+        self._panel = panel
+        self._session = session
+        self._gate = gate
         self._places = threading.BoundedSemaphore(MOST_CLIENTS)
         self._page = PAGE.read_text().replace("VIEWER_PORT", str(viewer_port)).encode()
         self._server = self._bind(host, port)

@@ -23,8 +23,10 @@ class Panel:
     """
 
     def __init__(self, gui: viser.GuiApi, session: Session) -> None:
-        self._gui, self._session = gui, session
-        self.follows, self.contacts = True, False
+        self._gui = gui
+        self._session = session
+        self.follows = True
+        self.contacts = False
         self.drawn: set[str] = set()
         self._steering: dict[str, tuple[viser.GuiCheckboxHandle, dict[str, viser.GuiSliderHandle]]] = {}
         self._status = gui.add_html("")
@@ -61,11 +63,15 @@ class Panel:
     def show(self, *, ignored: int = 0) -> None:
         """Bring the widgets up to date; viser sends those that changed. `ignored` messages were not let in."""
         session = self._session
-        label, icon = (
-            ("Pause", viser.Icon.PLAYER_PAUSE) if session.playing else ("Play", viser.Icon.PLAYER_PLAY)
-        )
+        if session.playing:
+            label = "Pause"
+            icon = viser.Icon.PLAYER_PAUSE
+        else:
+            label = "Play"
+            icon = viser.Icon.PLAYER_PLAY
         if self._play.label != label:
-            self._play.label, self._play.icon = label, icon
+            self._play.label = label
+            self._play.icon = icon
         self._env.value = session.env_index
         self._status.content = self._status_html(ignored)
         self._error.content = self._error_html()
@@ -145,7 +151,10 @@ class Panel:
 
 
 def _at_share(share: float, low: float, high: float) -> float:
-    rest = 0.0 if low <= 0.0 <= high else (low + high) / 2
+    if low <= 0.0 <= high:
+        rest = 0.0
+    else:
+        rest = (low + high) / 2
     return rest + share * (high - rest if share > 0 else rest - low)
 
 

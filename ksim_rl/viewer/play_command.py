@@ -43,7 +43,9 @@ class Played:
 
     def policy(self, env: EnvBase) -> TensorDictModuleBase:
         """Return what acts in an env of `cfg`."""
-        return UntrainedAgent(self.agent, env) if self.actor is None else self.actor
+        if self.actor is None:
+            return UntrainedAgent(self.agent, env)
+        return self.actor
 
 
 def play(arguments: list[str]) -> int:
@@ -210,7 +212,10 @@ def _record(played: Played, options: argparse.Namespace, progress: RunProgress) 
     probe.close()
     how = {"note": progress.note, "seconds": options.seconds, "fps": options.fps or FPS, "seed": options.seed}
     with progress.console.status("drawing the video") as spinner:
-        status = spinner.update if progress.console.is_terminal else progress.status
+        if progress.console.is_terminal:
+            status = spinner.update
+        else:
+            status = progress.status
         written = record_video(played.cfg, actor, path, status=status, **how)
     if written is None:
         return 3

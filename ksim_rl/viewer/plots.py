@@ -24,7 +24,8 @@ class Curves:
     """A chart of named values over the last seconds of simulated time, with a table of what they are now."""
 
     def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, *, points: int) -> None:
-        self._gui, self._folder = gui, folder
+        self._gui = gui
+        self._folder = folder
         self._rows: deque[tuple[float, list[float]]] = deque(maxlen=points)
         self._names: tuple[str, ...] = ()
         self._chart: viser.GuiUplotHandle | None = None
@@ -68,7 +69,10 @@ class Curves:
             self._chart.data = data
         rows = []
         for column, name in enumerate(self._names):
-            color = COLORS[column % len(COLORS)] if column < MOST_CURVES else "inherit"
+            if column < MOST_CURVES:
+                color = COLORS[column % len(COLORS)]
+            else:
+                color = "inherit"
             rows.append(_row(name, color=color, value=y[-1, column]))
         self._table.content = (
             '<table style="width:100%;font-size:0.8em;font-variant-numeric:tabular-nums;padding:0 1em">'
@@ -91,7 +95,9 @@ class Plots:
     def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, session: Session) -> None:
         self._session = session
         points = max(2, round(SECONDS / session.ours.step_dt))
-        self._seconds, self._seen, self._shown_at = 0.0, session.steps, 0.0
+        self._seconds = 0.0
+        self._seen = session.steps
+        self._shown_at = 0.0
         gui.add_markdown("**Reward terms** (weighted, per step)")
         self._rewards = Curves(gui, folder, points=points)
         gui.add_markdown("**Observation**")

@@ -43,12 +43,14 @@ class Conditions:
 
     def apply(self, cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
         """Return the config of an env without what is switched off."""
-        replace, own = dataclasses.replace, (lambda delay: delay if self.delay else None)
+        replace = dataclasses.replace
         groups = {}
         for name, group in cfg.observations.items():
-            terms = {key: replace(term, delay=own(term.delay)) for key, term in group.terms.items()}
             noise = group.enable_noise and self.noise
-            groups[name] = replace(group, enable_noise=noise, delay=own(group.delay), terms=terms)
+            groups[name] = replace(group, enable_noise=noise)
+            if not self.delay:
+                terms = {key: replace(term, delay=None) for key, term in group.terms.items()}
+                groups[name] = replace(groups[name], delay=None, terms=terms)
         dropped = () if self.noise else (ObservationNoise,)
         dropped += () if self.delay else (ObservationDelay, ActionDelay)
         kept = [name for name, own in cfg.transforms.items() if not issubclass(own.transform, dropped)]
@@ -100,15 +102,22 @@ class Session:
         title: str = "",
         seed: int = 0,
     ) -> None:
-        self.title, self.seed, self.note = title, seed, ""
-        self._make_env, self._make_agent = make_env, make_agent
+        self.title = title
+        self.seed = seed
+        self.note = ""
+        self._make_env = make_env
+        self._make_agent = make_agent
         self.conditions = Conditions()
-        self.playing, self.speed, self.env_index = True, 1.0, 0
-        self.error, self.trace = "", ""
+        self.playing = True
+        self.speed = 1.0
+        self.env_index = 0
+        self.error = ""
+        self.trace = ""
         self.steps = 0
         self.built = 0  # how many envs there have been
         self.rewards: dict[str, float] = {}
-        self.episode_return, self.achieved_speed = 0.0, 0.0
+        self.episode_return = 0.0
+        self.achieved_speed = 0.0
         self._steered: dict[str, dict[str, float]] = {}
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue(MOST_REQUESTS)
         self.refused = 0
@@ -145,7 +154,10 @@ class Session:
 
     def play(self, playing: bool = True) -> None:
         """Go on, or pause; an error is forgotten."""
-        self.playing, self.error, self.trace, self._last = playing, "", "", None
+        self.playing = playing
+        self.error = ""
+        self.trace = ""
+        self._last = None
 
     def step_once(self) -> None:
         """Pause, and do a single env step."""
@@ -156,13 +168,16 @@ class Session:
         """Start new episodes in all envs."""
         with torch.no_grad():
             self._root_E = self.env.reset()
-        self.episode_return, self.rewards = 0.0, {}
+        self.episode_return = 0.0
+        self.rewards = {}
 
     def choose(self, env_index: int) -> None:
         """Show another env; a ValueError if there is none of this number."""
         if not 0 <= env_index < self.ours.num_envs:
             raise ValueError(f"env {env_index}: expected 0 to {self.ours.num_envs - 1}")
-        self.env_index, self.episode_return, self.rewards = env_index, 0.0, {}
+        self.env_index = env_index
+        self.episode_return = 0.0
+        self.rewards = {}
 
     def push(self, speed: float, direction: float | None = None) -> None:
         """Add a horizontal velocity (m/s) in a direction (rad, world frame; None draws one) to the shown env's robot.
@@ -174,7 +189,10 @@ class Session:
         if direction is not None:
             check_in_range("direction", direction)
         ours = self.ours
-        angle = torch.rand(()) * 2.0 * torch.pi if direction is None else torch.tensor(direction)
+        if direction is None:
+            angle = torch.rand(()) * 2.0 * torch.pi
+        else:
+            angle = torch.tensor(direction)
         robot = ours.view.entity("")
         if robot.free_root:
             first = robot.root_qvel.start
@@ -193,7 +211,8 @@ class Session:
         the term's own, such as which envs stand still, then fall on the last choice, that of none.
         """
         ours = self.ours
-        term, driver = ours.cfg.commands[command], ours.driver
+        term = ours.cfg.commands[command]
+        driver = ours.driver
         own = torch.tensor(list(term.ranges.values()), dtype=torch.float32).T
         with driver.scope(f"commands/{command}", draws="step"):
             shared_2N = term.shared_ranges(ours.view)
@@ -229,7 +248,9 @@ class Session:
             changed = True
         now = time.monotonic()
         if self._last is None or not self.playing:
-            self._last, self._due, self._paces = now, 0.0, [(now, self.steps)]
+            self._last = now
+            self._due = 0.0
+            self._paces = [(now, self.steps)]
         self._due += min(now - self._last, MOST_LAG_S) * self.speed / self.ours.step_dt
         self._last = now
         # No display is kept waiting for long by steps that take longer than they last.
@@ -240,8 +261,12 @@ class Session:
             after_step()
         self._due = min(self._due, 1.0)
         self._paces = [*self._paces[-60:], (now, self.steps)]
-        (start, first), (end, last) = self._paces[0], self._paces[-1]
-        self.achieved_speed = (last - first) * self.ours.step_dt / (end - start) if end > start else 0.0
+        (start, first) = self._paces[0]
+        (end, last) = self._paces[-1]
+        if end > start:
+            self.achieved_speed = (last - first) * self.ours.step_dt / (end - start)
+        else:
+            self.achieved_speed = 0.0
         return changed
 
     def close(self) -> None:
@@ -277,5 +302,8 @@ class Session:
             reward, done = (float(next_E.get(key)[self.env_index]) for key in ("reward", "done"))
             self._root_E = self.env.maybe_reset(self.env.step_mdp(stepped_E))
         self.rewards = dict(zip(self.ours.reward_manager.names, rewards_R, strict=True))
-        self.episode_return = 0.0 if done else self.episode_return + reward
+        if done:
+            self.episode_return = 0.0
+        else:
+            self.episode_return = self.episode_return + reward
         self.steps += 1

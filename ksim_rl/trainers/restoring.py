@@ -1,0 +1,60 @@
+"""Puts parts of a checkpoint back, and says in one line what does not fit."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.envs import EnvBase
+
+from ksim_rl.trainers.algorithm import Update
+
+
+def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
+    """Continue an env where its state was taken.
+
+    Raises:
+        ValueError: if the state is of another env, with what differs.
+    """
+    try:
+        env.load_state_dict(state)
+    except (RuntimeError, ValueError) as error:
+        # torch raises a RuntimeError for names and shapes, in several lines.
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise ValueError(
+            f"the checkpoint is of another env, or of one that an earlier ksim_rl built: {reason}. Its networks "
+            "may still fit: ksim-rl train checkpoint=RUN"
+        ) from error
+
+
+def load_networks(update: Update, state: Mapping[str, Any], path: Path) -> None:
+    """Start from the networks and normalizers of a checkpoint; optimizers and counts stay new.
+
+    Raises:
+        ValueError: if the networks are others, with the path of the checkpoint.
+    """
+    try:
+        update.load_weights(state)
+    except KeyError as error:
+        raise ValueError(f"{path}: of another algorithm: it has no network {error}") from error
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: its networks are others: {error}; choose objective and modules as the "
+            "config.yaml of its run has them"
+        ) from error
+
+
+def random_state(device: torch.device) -> dict[str, Any]:
+    """Return the states of torch's generators that a run on a device draws from."""
+    states = {"cpu": torch.get_rng_state()}
+    if device.type == "cuda":
+        states["cuda"] = torch.cuda.get_rng_state(device)
+    return states
+
+
+def load_random_state(states: Mapping[str, Any], device: torch.device) -> None:
+    """Put the states of torch's generators back."""
+    torch.set_rng_state(states["cpu"])
+    # A run that moves to another kind of device keeps that one's present state.
+    if device.type == "cuda" and "cuda" in states:
+        torch.cuda.set_rng_state(states["cuda"], device)
