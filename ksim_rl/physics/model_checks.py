@@ -196,6 +196,16 @@ def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) 
         )
 
 
+def check_asleep(mj_model: mujoco.MjModel) -> None:
+    """Refuse equalities of tendons where trees may sleep: MuJoCo ends the program that steps them."""
+    tied = np.flatnonzero(mj_model.eq_type == mujoco.mjtEq.mjEQ_TENDON)
+    if tied.size and mj_model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        raise ValueError(
+            f"{_element(mj_model, 'eq', int(tied[0]))} ties tendons, and <flag sleep='enable'/> lets trees sleep, "
+            "which MuJoCo does not support together: leave out one of the two"
+        )
+
+
 def _float_fields(mj_model: mujoco.MjModel) -> Iterator[tuple[str, float | np.ndarray]]:
     for name in dir(mj_model.opt):
         value = getattr(mj_model.opt, name)

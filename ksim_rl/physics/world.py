@@ -16,7 +16,7 @@ from ksim_rl.device.streams import checked_device
 from ksim_rl.physics import views
 from ksim_rl.physics.field_effects import check_effects, switch_on
 from ksim_rl.physics.fields import fields_to_expand
-from ksim_rl.physics.model_checks import check_not_simple
+from ksim_rl.physics.model_checks import check_asleep, check_not_simple
 from ksim_rl.physics.nan_guard.guard import NanReport
 from ksim_rl.physics.overflow import OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
@@ -80,6 +80,7 @@ class World(views.DataViews):
         self.mj_model = copy.copy(mj_model)
         self.sim.apply_to(self.mj_model)
         self._expanded = fields_to_expand(per_world_fields, self.mj_model)
+        check_asleep(self.mj_model)
         check_not_simple(self.mj_model, self._expanded)
         check_effects(self.mj_model, self._expanded)
         switch_on(self.mj_model, self._expanded)

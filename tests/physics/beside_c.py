@@ -56,7 +56,7 @@ def check(
     """Compare arrays of the second world with C's."""
     for name in names:
         found = world.view(name)[1].numpy()
-        expected = getattr(mj_data, name).reshape(found.shape)
+        expected = np.asarray(getattr(mj_data, name)).reshape(found.shape)
         scale = max(1.0, float(np.abs(expected).max(initial=0.0)))
         np.testing.assert_allclose(found, expected, atol=tolerance * scale, err_msg=name)
 

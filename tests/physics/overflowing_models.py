@@ -104,11 +104,11 @@ def felt_crowd() -> mujoco.MjModel:
 
 
 @functools.cache
-def bullet() -> mujoco.MjModel:
+def bullet(flags: str = "") -> mujoco.MjModel:
     """Return a ball that is in a thin plate only half-way through its first substep, by Runge-Kutta's method."""
     return load_model(
-        """<mujoco>
-          <option timestep="0.002" integrator="RK4" gravity="0 0 0"/>
+        f"""<mujoco>
+          <option timestep="0.002" integrator="RK4" gravity="0 0 0"><flag {flags}/></option>
           <worldbody>
             <geom type="box" size="0.1 0.1 0.001"/>
             <body pos="0 0 0.02"><freejoint/><geom type="sphere" size="0.005"/></body>

@@ -1,7 +1,11 @@
 """Where trees may sleep, what is read of a substep is the substep's, as in C."""
 
+from typing import Literal
+
+import mujoco
 import pytest
 
+from ksim_rl.physics import SimCfg, World
 from tests.physics.beside_c import KERNELS, step_and_check
 
 XML = """
@@ -22,3 +26,17 @@ READ = ("qpos", "qvel", "qacc", "qfrc_passive", "actuator_velocity", "cacc", "cf
 @pytest.mark.parametrize("integrator", ("Euler", "implicitfast"))
 def test_a_substep_is_read_as_in_c(integrator: str) -> None:
     step_and_check(XML.format(integrator=integrator), KERNELS["theirs"], substeps=3, names=READ)
+
+
+@pytest.mark.parametrize("engine", ("warp", "c"))
+def test_equalities_of_tendons_are_refused_where_trees_may_sleep(engine: Literal["warp", "c"]):
+    xml = """
+<mujoco>
+  <option><flag sleep="enable"/></option>
+  <worldbody><body><joint name="j" type="slide"/><geom size="0.1"/></body></worldbody>
+  <tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>
+  <equality><tendon name="tie" tendon1="t"/></equality>
+</mujoco>
+"""
+    with pytest.raises(ValueError, match="equality 'tie' ties tendons.*leave out one of the two"):
+        World(mujoco.MjModel.from_xml_string(xml), num_envs=1, sim=SimCfg(engine=engine))

@@ -20,6 +20,7 @@ ARM = """
     <intvelocity joint="a" group="3" actrange="-1 1" kp="5"/>
     <general joint="b" group="1" dyntype="filter" dynprm="0.1" gainprm="4" actearly="true"/>
     <velocity joint="b" kv="4" group="3"/>
+    <motor joint="b" group="1" forcerange="0.5 2"/>
     {more}
   </actuator>
   <sensor><actuatorfrc actuator="0"/></sensor>

@@ -1,8 +1,9 @@
 """MuJoCo Warp's integrators as `physics.integrators` and `physics.runge_kutta` launch them, beside the C engine."""
 
+import mujoco
 import pytest
 
-from tests.physics.beside_c import KERNELS, started, step_and_check
+from tests.physics.beside_c import KERNELS, check, started, step_and_check
 
 IMPLICIT = ("implicit", "implicitfast")
 DAMPED = """
@@ -108,6 +109,39 @@ def test_runge_kutta_leaves_the_rates_of_its_last_stage() -> None:
         '<general joint="h" dyntype="filter" dynprm="0.05" gainprm="2"/></actuator></mujoco>'
     )
     step_and_check(xml, KERNELS["ours"], names=("qpos", "qvel", "act", "act_dot"))
+
+
+def test_runge_kutta_leaves_the_forces_on_bodies_of_its_start() -> None:
+    world, mj_data, in_c = started(
+        f'<mujoco><option timestep="0.01" integrator="RK4"/><worldbody>{HINGE}</worldbody></mujoco>',
+        KERNELS["ours"],
+        speed=8.0,
+    )
+    names = ("cacc", "cfrc_int")
+    for name in names:
+        world.view(name)
+    world.step(1)
+    mujoco.mj_forward(in_c, mj_data)
+    mujoco.mj_rnePostConstraint(in_c, mj_data)
+    check(world, mj_data, names)
+
+
+@pytest.mark.parametrize("flag", ("", '<flag spring="disable" damper="disable" actuation="disable"/>'))
+def test_time_passes_as_ever_where_sensors_are_delayed(flag: str) -> None:
+    xml = (
+        f'<mujoco><option timestep="0.01" integrator="RK4">{flag}</option><worldbody>{HINGE}</worldbody>'
+        '<sensor><jointpos joint="h" delay="0.02" nsample="4"/></sensor></mujoco>'
+    )
+    step_and_check(xml, KERNELS["ours"], names=("time", "qpos", "qvel"), refreshes=False)
+
+
+@pytest.mark.parametrize("actuators", (SLOWED, SLOWED.replace("<general", '<general forcerange="1 2"')))
+def test_runge_kutta_leaves_out_what_is_disabled(actuators: str) -> None:
+    flag = '<flag spring="disable" damper="disable" actuation="disable"/>'
+    xml = WITH_ACTUATORS.format(integrator="RK4", actuators=actuators)
+    xml = xml.replace('integrator="RK4"/>', f'integrator="RK4">{flag}</option>')
+    names = ("qpos", "qvel", "qacc", "actuator_force", "actuator_length", "actuator_velocity")
+    step_and_check(xml, KERNELS["our solver"], names=names)
 
 
 @pytest.mark.parametrize("integrator", ("Euler", "implicitfast", "RK4"))

@@ -172,8 +172,9 @@ def test_each_bit_of_a_substep_is_told_even_if_the_world_resets_after_it(sim, bi
     assert world.overflow_report().ok
 
 
-def test_rows_that_did_not_fit_half_way_through_a_substep_are_told():
-    world = World(bullet(), num_envs=2, sim=SimCfg(njmax=1, nconmax=4))
+@pytest.mark.parametrize("flags", ("", 'spring="disable" damper="disable" actuation="disable"'))
+def test_rows_that_did_not_fit_half_way_through_a_substep_are_told(flags: str):
+    world = World(bullet(flags), num_envs=2, sim=SimCfg(njmax=1, nconmax=4))
     world.qvel_EL[:, 2] = -20.0
     world.step(1)
     assert int(world.last_substep("nefc").max()) == 0, "at the end there are no rows"

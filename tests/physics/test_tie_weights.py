@@ -1,7 +1,5 @@
 """Rows of connect and weld weigh the bodies that they tie, such as tool frames, which have no joints of their own."""
 
-import dataclasses
-
 import mujoco
 import numpy as np
 import pytest
@@ -76,16 +74,14 @@ def test_tied_bodies_without_joints_weigh_as_in_the_c_engine(ties, sim):
     "changes", [{"integrator": "rk4"}, {"integrator": "discrete"}, {"solver": "cg", "iterations": 200}]
 )
 @pytest.mark.parametrize(
-    "flag", ["", '<flag spring="disable" damper="disable"/>'], ids=("passive", "control")
+    "flag",
+    [
+        "",
+        '<flag spring="disable" damper="disable"/>',
+        '<flag spring="disable" damper="disable" actuation="disable"/>',
+    ],
+    ids=("passive", "control", "idle control"),
 )
 def test_so_they_do_within_steps_that_are_mujoco_warps_own(flag, changes):
     xml = ARMS.format(ties=TIES["weld"], flag=flag, jacobian="sparse")
     compare(xml, SimCfg(njmax=40, nconmax=4, **changes))
-
-
-def test_where_no_hook_is_left_runge_kutta_is_refused():
-    flag = '<flag spring="disable" damper="disable" actuation="disable"/>'
-    xml = ARMS.format(ties=TIES["weld"], flag=flag, jacobian="sparse")
-    compare(xml, NO_KERNEL)
-    with pytest.raises(ValueError, match="Enable one of the three"):
-        World(load_model(xml), num_envs=1, sim=dataclasses.replace(NO_KERNEL, integrator="rk4"))

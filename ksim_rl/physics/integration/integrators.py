@@ -9,11 +9,12 @@ What its implicit integrators leave out is given back by a shallow variant of th
   `full_rows`.
 
 And an activation of a disabled actuator is put back, and where trees may sleep what the substep read: MuJoCo Warp then
-computes velocities, passive forces and forces of bodies once more, of the state that it reached.
+computes velocities, passive forces and forces of bodies once more, of the state that it reached. So are the forces of
+bodies that stages of Runge-Kutta leave.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import mujoco
@@ -28,8 +29,10 @@ from ksim_rl.physics.integration.runge_kutta import mended_runge_kutta
 
 _KINDS = mjw.IntegratorType
 _IMPLICIT = (_KINDS.IMPLICIT, _KINDS.IMPLICITFAST)
-# What is read of the last substep, and computed once more where trees may sleep.
-_READ_ONCE = ("actuator_velocity", "qfrc_passive", "cacc", "cfrc_int")
+# What is read of the last substep, and computed once more where trees may sleep, and by each stage of Runge-Kutta. C
+# shows the other readings of the last stage.
+FORCES_OF_STAGES = ("cacc", "cfrc_int")
+READ_ONCE = ("actuator_velocity", "qfrc_passive", *FORCES_OF_STAGES)
 _DAMPING_FIELDS = (
     *("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
     *("actuator_damping", "actuator_dampingpoly"),
@@ -52,9 +55,11 @@ def integrator(
         integrate = _implicit(mj_model, warp_model, warp_data_E)
     else:
         integrate = _explicit(warp_model, warp_data_E, mend)
-    flags = warp_model.opt
-    if flags.enableflags & mjw.EnableBit.SLEEP and not flags.disableflags & mjw.DisableBit.ISLAND:
-        integrate = _keeping_readings(integrate, warp_data_E)
+    opt = warp_model.opt
+    if opt.enableflags & mjw.EnableBit.SLEEP and not opt.disableflags & mjw.DisableBit.ISLAND:
+        integrate = _keeping_readings(integrate, warp_data_E, READ_ONCE)
+    elif opt.integrator == _KINDS.RK4:
+        integrate = _keeping_readings(integrate, warp_data_E, FORCES_OF_STAGES)
     columns = still_activations(mj_model)
     if columns.size == 0:
         return integrate
@@ -71,10 +76,10 @@ def integrator(
 
 
 def _keeping_readings(
-    integrate: Callable[[mjw.Model], None], warp_data_E: mjw.Data
+    integrate: Callable[[mjw.Model], None], warp_data_E: mjw.Data, names: Sequence[str]
 ) -> Callable[[mjw.Model], None]:
-    """Return what launches an integrator and puts back what the substep read before it."""
-    arrays = [getattr(warp_data_E, name) for name in _READ_ONCE]
+    """Return what launches an integrator and puts back arrays that the substep read before it."""
+    arrays = [getattr(warp_data_E, name) for name in names]
     kept = [wp.empty_like(array) for array in arrays]
 
     def integrate_and_put_back(substep_warp_model: mjw.Model) -> None:

@@ -8,17 +8,19 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.physics import kernels
+from ksim_rl.physics.actuators.disabled_actuators import SWITCHED_OFF
 
 # When the stages after the first are, in timesteps from the beginning of the step.
 STAGE_TIMES = (0.5, 0.5, 1.0)
 
 
-def hook_after_rows(warp_model: mjw.Model) -> str | None:
-    """Return the callback that MuJoCo Warp calls between its rows and its solver, or None if its flags leave none."""
+def hook_after_rows(warp_model: mjw.Model) -> str:
+    """Return the callback that MuJoCo Warp calls between its rows and its solver.
+
+    It calls the second unless actuation is disabled: then a model takes its place whose actuators do nothing.
+    """
     flags, bits = int(warp_model.opt.disableflags), mjw.DisableBit
-    if not (flags & bits.SPRING and flags & bits.DAMPER):
-        return "passive"
-    return None if flags & bits.ACTUATION else "control"
+    return "control" if flags & bits.SPRING and flags & bits.DAMPER else "passive"
 
 
 def mended_runge_kutta(
@@ -28,7 +30,7 @@ def mended_runge_kutta(
 
     Rows that tie bodies are made a second time, when the velocities are those of the stage and not of the one before.
     It leaves the `act_dot` of the last stage, as C does, and not the mean of all four, and delayed controls are those
-    of the stage's own time. ValueError if the model's flags leave no callback by which `mend` could run.
+    of the stage's own time.
     """
     d = warp_data_E
     acts = not int(warp_model.opt.disableflags) & mjw.DisableBit.ACTUATION
@@ -37,32 +39,49 @@ def mended_runge_kutta(
     if warp_model.eq_connect_adr.size + warp_model.eq_wld_adr.size:
         # Rows of connect and weld read body velocities, which by the time of the hook are those of the stage.
         mends.insert(0, lambda: mjw.make_constraint(warp_model, warp_data_E))
+    hook = hook_after_rows(warp_model)
     if mends:
-        hook = hook_after_rows(warp_model)
-        if hook is None:
-            raise ValueError(
-                "integrator='rk4' with springs, dampers and actuation disabled: the rows or transmissions that MuJoCo "
-                "Warp has wrong in this model cannot be mended. Enable one of the three in <flag/>, or choose "
-                "integrator='implicitfast'"
-            )
         hooks.setdefault(hook, []).extend(mends)
     keeps_rate = acts and warp_model.na > 0
     last_rate_E = wp.zeros_like(d.act_dot)
     if keeps_rate:
         hooks.setdefault("act_dyn", []).append(lambda: wp.copy(last_rate_E, d.act_dot))
     clock = _StageClock(warp_model, warp_data_E)
-    if acts and warp_model.nhistory > 0:
+    # Without actuators nothing calls the second of these, and nothing is delayed that a stage reads.
+    if acts and warp_model.nactuator > 0 and warp_model.nhistory > 0:
         hooks.setdefault("control", []).append(clock.advance)
         hooks.setdefault("act_dyn", []).append(clock.put_back)
+
+    changes = _idle_actuators(warp_model) if hook == "control" and not acts else {}
 
     def launch(substep_warp_model: mjw.Model) -> None:
         clock.start()
         callback = _with_hooks(substep_warp_model.callback, hooks)
-        mjw.rungekutta4(dataclasses.replace(substep_warp_model, callback=callback), d)
+        mjw.rungekutta4(dataclasses.replace(substep_warp_model, callback=callback, **changes), d)
         if keeps_rate:
             wp.copy(d.act_dot, last_rate_E)
+        if not acts:
+            # C does not compute it then.
+            d.actuator_velocity.zero_()
 
     return launch
+
+
+def _idle_actuators(warp_model: mjw.Model) -> dict[str, Any]:
+    """Return the fields of a model whose actuators may act, and do nothing."""
+    m = warp_model
+    return {
+        "opt": dataclasses.replace(
+            m.opt, disableflags=int(m.opt.disableflags) & ~int(mjw.DisableBit.ACTUATION)
+        ),
+        "actuator_gaintype": wp.full_like(m.actuator_gaintype, SWITCHED_OFF),
+        "actuator_biastype": wp.full_like(m.actuator_biastype, SWITCHED_OFF),
+        "actuator_dyntype": wp.full_like(m.actuator_dyntype, int(mjw.DynType.NONE)),
+        "actuator_forcelimited": wp.zeros_like(m.actuator_forcelimited),
+        "jnt_actfrclimited": wp.zeros_like(m.jnt_actfrclimited),
+        "tendon_actfrclimited": wp.zeros_like(m.tendon_actfrclimited),
+        "jnt_actgravcomp": wp.zeros_like(m.jnt_actgravcomp),
+    }
 
 
 class _StageClock:

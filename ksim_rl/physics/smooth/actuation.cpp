@@ -40,9 +40,11 @@ each(NUM_ACTUATORS, [&](int actuator) {
         const auto bias = model_row(problem.actuator_biasprm)[actuator];
         found = (look_up(problem.actuator_gaintype, actuator) == AFFINE_GAIN ? affine(gain) : gain[0]) * input;
         found += look_up(problem.actuator_biastype, actuator) == AFFINE_BIAS ? affine(bias) : 0.0f;
+    }
+    // C keeps what is switched off within a range, too, which need not have 0 in it.
+    if (ACTUATORS_ACT && problem.actuator_forcelimited.data[actuator]) {
         const wp::vec2 range = model_row(problem.actuator_forcerange)[actuator];
-        if (problem.actuator_forcelimited.data[actuator])
-            found = wp::clamp(found, range[0], range[1]);
+        found = wp::clamp(found, range[0], range[1]);
     }
     row_of(problem.actuator_force)[actuator] = actuator_forces[actuator] = found;
 });
