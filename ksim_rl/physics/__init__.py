@@ -1,13 +1,48 @@
-"""This package turns a MuJoCo model into many worlds on the device, and steps, refreshes, resets and watches them."""
+"""Simulates many worlds of one MuJoCo model at once, whose states are torch tensors.
 
-from ksim_rl.device import capture
+This engine knows nothing of learning: it needs torch, numpy, jaxtyping, MuJoCo, MuJoCo Warp and Warp. `World` says how
+worlds are stepped, read, written and reset; the names below are all that a program needs:
+
+    model = load_model("robot.xml")
+    world = World(model, num_envs=4096, device="cuda", sim=SimCfg(timestep=0.002))
+    world.ctrl_EL[:] = ...       # a row for each world; views are changed in place
+    world.step(10)
+    world.qpos_EL                # the state that is reached
+    world.reset(fallen_E)        # puts the worlds back where the mask is true
+    world.refresh()              # makes poses and sensors those of the present state
+    world.overflow_report().ok   # whether no contact and no constraint was dropped
+
+With `SimCfg(engine="c")` MuJoCo's C engine computes the same worlds on the CPU, in float64. `examples/worlds.py` is a
+program of this kind.
+"""
+
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.kernel_loading import compile_notice
-from ksim_rl.physics import warp_world as warp_world
-from ksim_rl.physics.c_engine import c_world as c_world
+from ksim_rl.physics.c_engine.c_world import CWorld
 from ksim_rl.physics.fields import prepare_spec
 from ksim_rl.physics.load import load_model, load_spec
 from ksim_rl.physics.nan_guard.guard import NanGuardCfg, NanReport
 from ksim_rl.physics.overflow import OverflowReport
+from ksim_rl.physics.ray_casting import BatchCamera, RayBatch
 from ksim_rl.physics.sim_cfg import SimCfg
+from ksim_rl.physics.substep_plan import SubstepPlan
+from ksim_rl.physics.warp_world import WarpWorld
 from ksim_rl.physics.world import World
+
+__all__ = [
+    "BatchCamera",
+    "CWorld",
+    "Captured",
+    "NanGuardCfg",
+    "NanReport",
+    "OverflowReport",
+    "RayBatch",
+    "SimCfg",
+    "SubstepPlan",
+    "WarpWorld",
+    "World",
+    "compile_notice",
+    "load_model",
+    "load_spec",
+    "prepare_spec",
+]

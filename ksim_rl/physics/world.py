@@ -26,9 +26,11 @@ ENGINES: dict[str, type["World"]] = {}
 
 
 class World(views.DataViews):
-    """`num_envs` worlds of one model, which is copied; `sim` is laid over its settings, and names the engine.
+    """Worlds of one MuJoCo model that are stepped together; `World(...)` makes a `WarpWorld` or a `CWorld`.
 
-    `World(...)` makes a `WarpWorld`, or with `sim.engine` "c" a `CWorld`, which behave alike.
+    The two behave alike: `sim.engine` chooses, "warp" by default. Arrays of MuJoCo's data are torch tensors with a row
+    for each world: the attributes of `DataViews`, such as `qpos_EL` and `ctrl_EL`, and any other by `view(name)`.
+    Write `qpos_EL`, `qvel_EL`, `ctrl_EL` and applied forces in place, and call `step`.
 
     Position- and velocity-stage quantities (poses, velocities, their sensors) are those of the present state after
     `refresh`. Acceleration-stage ones (`qacc`, actuator and contact forces, contact sensors, accelerometers) belong to
@@ -37,6 +39,13 @@ class World(views.DataViews):
 
     The model fields named in `per_world_fields`, by MuJoCo's names, and gravity may differ between worlds, and with
     them what MuJoCo derives from them at compile time: call `set_const` after writing.
+
+    Args:
+        mj_model: as `load_model` returns it; it is copied.
+        num_envs: E, the number of worlds.
+        device: "cpu", "cuda" or "cuda:<index>".
+        sim: settings that are laid over those of the model; None leaves them.
+        per_world_fields: names of model fields that may differ between worlds, such as "body_mass".
 
     Attributes:
         mj_model: the copy of the model, with the settings of `sim`.
