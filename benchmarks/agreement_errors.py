@@ -1,4 +1,4 @@
-"""This module measures how far two runs of the same worlds are apart, per quantity, relative to its scale."""
+"""Measures how far two runs of the same worlds are apart, per quantity, relative to its scale."""
 
 import dataclasses
 

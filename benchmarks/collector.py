@@ -1,4 +1,4 @@
-"""This benchmark times the captured rollout beside TorchRL's own `Collector` on the same env.
+"""Times the captured rollout beside TorchRL's own `Collector` on the same env.
 
     python -m benchmarks.collector task=cartpole_balance num_envs=4096,64 device=cuda
 

@@ -1,4 +1,4 @@
-"""This benchmark records the metrics of healthy and of sabotaged runs, on which `ksim-rl diagnose` is tested.
+"""Records the metrics of healthy and of sabotaged runs, on which `ksim-rl diagnose` is tested.
 
     python -m benchmarks.diagnosis runs=healthy
     python -m benchmarks.diagnosis runs=faults

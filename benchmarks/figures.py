@@ -1,4 +1,4 @@
-"""This command lists the committed figures that are older than what they measure, and how to renew them.
+"""Lists the committed figures that are older than what they measure, and how to renew them.
 
     python -m benchmarks.figures
 

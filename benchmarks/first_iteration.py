@@ -1,4 +1,4 @@
-"""This benchmark times the start of Python to the end of the first iteration, without and with caches.
+"""Times the start of Python to the end of the first iteration, without and with caches.
 
     python -m benchmarks.first_iteration task=go1_velocity_flat num_envs=4096 device=cuda
 

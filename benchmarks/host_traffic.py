@@ -1,4 +1,4 @@
-"""This module counts the waits and copies of one iteration between host and GPU, as CUDA's profiler saw them."""
+"""Counts the waits and copies of one iteration between host and GPU, as CUDA's profiler saw them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""This benchmark trains a task with some seeds, and keeps the curves.
+"""Trains a task with some seeds, and keeps the curves.
 
     python -m benchmarks.learning_curve task=go1_velocity_flat seeds=1,2,3 env_states=30e6 num_envs=4096 device=cuda
 

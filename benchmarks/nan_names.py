@@ -1,4 +1,4 @@
-"""This benchmark times what names a term that gives NaN: the looks at the terms' values, beside a whole iteration.
+"""Times what names a term that gives NaN: the looks at the terms' values, beside a whole iteration.
 
     python -m benchmarks.nan_names task=go1_velocity_flat num_envs=4096 device=cuda
 

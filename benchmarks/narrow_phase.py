@@ -1,4 +1,4 @@
-"""This benchmark compares the contacts of each two kinds of geoms with those of MuJoCo's C engine.
+"""Compares the contacts of each pair of geom kinds with MuJoCo's C engine.
 
     python -m benchmarks.narrow_phase [worlds=256] [depth=0.005] [margin=1e-6] [poses=any] [device=cpu]
 

@@ -1,4 +1,4 @@
-"""This benchmark times one gradient step of FastSAC, with the sizes and settings of a task that has it.
+"""Times one gradient step of FastSAC, with the sizes and settings of a task that has it.
 
     python -m benchmarks.off_policy_update device=cuda task=g1_velocity_flat
 

@@ -1,4 +1,4 @@
-"""This benchmark says how much of Go1's learning with PPO comes from three settings in which ours differ from mjlab's.
+"""Says how much of Go1's learning with PPO comes from three settings in which ours differ from mjlab's.
 
     python -m benchmarks.peer_settings device=cuda seeds=1,2,3 at_once=5
 

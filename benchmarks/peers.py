@@ -1,4 +1,4 @@
-"""This benchmark times training beside mjlab's own training of the same task on the same machine.
+"""Times training beside mjlab's own training of the same task on the same machine.
 
     python -m benchmarks.peers --python OTHER_ENV/bin/python task=go1_velocity_flat num_envs=4096 device=cuda
 

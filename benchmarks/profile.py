@@ -1,4 +1,4 @@
-"""This benchmark shows on what an iteration of training spends its time.
+"""Shows where an iteration of training spends its time.
 
     python -m benchmarks.profile task=go1_velocity_flat num_envs=4096 device=cuda
 

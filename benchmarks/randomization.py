@@ -1,4 +1,4 @@
-"""This benchmark times the control step without domain randomization, with it at startup, and with it at each reset.
+"""Times the control step without domain randomization, with it at startup, and with it at each reset.
 
     python -m benchmarks.randomization task=go1_velocity_flat num_envs=4096 device=cuda episode_steps=100
 

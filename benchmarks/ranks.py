@@ -1,4 +1,4 @@
-"""This benchmark compares training on several GPUs of a machine with training on one.
+"""Compares training on several GPUs of a machine with training on one.
 
     python -m benchmarks.ranks
 

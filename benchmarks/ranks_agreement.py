@@ -1,4 +1,4 @@
-"""This benchmark shows that several ranks learn what one process learns, joined by gloo on the CPU.
+"""Shows that several ranks learn what one process learns, joined by gloo on the CPU.
 
     python -m benchmarks.ranks_agreement
 

@@ -1,4 +1,4 @@
-"""This benchmark times training, and the physics that it cannot do without, with more and more envs.
+"""Times training, and the raw physics inside of it, with more and more envs.
 
     python -m benchmarks.scaling task=go1_velocity_flat num_envs=1024,2048,4096,8192,16384,32768 device=cuda
 

@@ -1,4 +1,4 @@
-"""This benchmark compares a policy's return on MuJoCo's C engine with that in our physics, from the same starts.
+"""Compares a policy's return on MuJoCo's C engine and in our physics, from the same starts.
 
     python -m benchmarks.sim2sim task=go1_velocity_flat policy=standing noise=false
     python -m benchmarks.sim2sim task=go1_velocity_flat policy=zoo:go1

@@ -1,4 +1,4 @@
-"""This benchmark times the kernels of smooth dynamics and of integration beside the same stages of MuJoCo Warp.
+"""Times the kernels of smooth dynamics and of integration beside the same stages of MuJoCo Warp.
 
     python -m benchmarks.smooth_dynamics task=go1_velocity_flat num_envs=4096 device=cuda lanes=4,8,16,32
 

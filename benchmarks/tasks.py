@@ -1,4 +1,4 @@
-"""This benchmark checks and times each registered task: `check_env`, sizes, speed beside raw physics, host syncs.
+"""Checks and times each registered task: `check_env`, sizes, speed beside raw physics, host syncs.
 
     python -m benchmarks.tasks device=cuda num_envs=4096 [tasks=a,b] [shard=0/4] [check_device=cpu] [results=DIR]
 

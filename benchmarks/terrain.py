@@ -1,4 +1,4 @@
-"""This benchmark times the raw physics of a robot on each kind of rough ground, beside the same robot on a plane.
+"""Times the raw physics of a robot on each kind of rough ground, beside the same robot on a plane.
 
     python -m benchmarks.terrain task=go1_velocity_rough num_envs=4096 device=cuda variants=default,fine
 

@@ -1,4 +1,4 @@
-"""This benchmark lets a policy of a rough velocity task walk over a course that is the same for all policies.
+"""Lets a policy of a rough velocity task walk over a fixed course.
 
     python -m benchmarks.terrain_course run=RUN device=cuda num_envs=1000
 

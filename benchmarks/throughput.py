@@ -1,4 +1,4 @@
-"""This benchmark times training, beside the physics that it cannot do without.
+"""Times training, and the raw physics inside of it.
 
     python -m benchmarks.throughput task=go1_velocity_flat num_envs=4096 device=cuda
 

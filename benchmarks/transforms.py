@@ -1,4 +1,4 @@
-"""This benchmark times each transform beside the nearest one of TorchRL's own, and the usual chain in a control step.
+"""Times each transform beside the nearest one of TorchRL's own, and the usual chain in a control step.
 
     MENAGERIE_ROOT=... python -m benchmarks.transforms device=cuda num_envs=4096
 

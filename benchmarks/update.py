@@ -1,4 +1,4 @@
-"""This benchmark times one PPO update, beside the same update made of TorchRL's own parts.
+"""Times one PPO update, beside the same update made of TorchRL's own parts.
 
     python -m benchmarks.update device=cuda num_envs=4096,16384
     python -m benchmarks.update device=cuda num_envs=4096 hidden_dims=1024,512,256,128

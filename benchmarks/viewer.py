@@ -1,4 +1,4 @@
-"""This benchmark compares the speed of a run while a browser is connected with that of the same run without one.
+"""Compares the speed of a run with and without a connected browser.
 
     python -m benchmarks.viewer task=go1_velocity_flat num_envs=4096 device=cuda
 

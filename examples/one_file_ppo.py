@@ -1,4 +1,4 @@
-"""This program trains a policy with PPO in one file: collect, estimate advantages, update, in that order.
+"""Trains a policy with PPO in one file: collect, estimate advantages, update, in that order.
 
     python examples/one_file_ppo.py task=cartpole_balance
     python examples/one_file_ppo.py task=go1_velocity_flat device=cuda:0 num_iterations=500

@@ -1,3 +1,3 @@
-"""This package has TorchRL components for training robot policies in MuJoCo on the GPU."""
+"""TorchRL components for training robot policies in MuJoCo on the GPU."""
 
 __version__ = "0.2.0"

@@ -1,4 +1,4 @@
-"""This module shows text on a terminal, which obeys some letters: names from files may hold them."""
+"""Prints text without the control characters that a terminal obeys; names from files may hold them."""
 
 import sys
 import traceback

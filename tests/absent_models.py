@@ -1,4 +1,4 @@
-"""This module skips tests whose models are not on this machine and cannot be downloaded."""
+"""Skips tests whose models are not on this machine and cannot be downloaded."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

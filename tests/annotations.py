@@ -1,4 +1,4 @@
-"""This module checks one value against one annotation with axes, and binds the axes that it finds."""
+"""Checks one value against one annotation with axes, and binds the axes that it finds."""
 
 import inspect
 import types

@@ -1,4 +1,4 @@
-"""This module measures the package: `python -m tests.house` prints its rooms and fails where a limit is broken.
+"""Measures the package: `python -m tests.house` prints its rooms and fails where a limit is broken.
 
 `--root DIR` measures another checkout. The limits are those that CONTRIBUTING.md gives.
 """

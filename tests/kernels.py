@@ -1,4 +1,4 @@
-"""This module finds the kernels of the package, and has for each the test that compares its bits.
+"""Finds the kernels of the package, and has for each the test that compares its bits.
 
 Kernels are Triton functions that are launched, Warp's, and what `QuickLaunch` and `native.launcher` make of C++, by the
 function that makes them or the name that they get. Their bits are those of equal runs, of other numbers of lanes, or of

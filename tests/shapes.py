@@ -1,4 +1,4 @@
-"""This module checks the jaxtyping axes of ksim_rl's functions at each call, while the tests run.
+"""Checks the jaxtyping axes of ksim_rl's functions at each call, while the tests run.
 
 `install` puts a loader in front of ksim_rl's modules. It adds a decorator below all others to each function whose
 annotations name axes, so that properties, cached functions, quantities and registered implementations are checked

@@ -1,4 +1,4 @@
-"""This module reads the source of a package for the axes of its public functions, and for names that do not agree."""
+"""Reads the source of a package for the axes of its public functions, and for names that do not agree."""
 
 import ast
 import functools

@@ -1,4 +1,4 @@
-"""This program runs an exported policy at its own rate, with limits; the robot is MuJoCo's, where yours will stand.
+"""Runs an exported policy at its own rate, with limits; the robot is MuJoCo's, where yours will stand.
 
 python examples/deploy/loop.py RUN/export --seconds 10
 

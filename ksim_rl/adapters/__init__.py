@@ -1,1 +1,1 @@
-"""This room shows our envs as those of other libraries, one module each, which alone imports the library."""
+"""Shows our envs as those of other libraries, one module each, which alone imports the library."""

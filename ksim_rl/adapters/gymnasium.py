@@ -1,4 +1,4 @@
-"""This module shows an env as Gymnasium's `VectorEnv`, with NumPy arrays or with tensors that stay on the device."""
+"""Shows an env as Gymnasium's `VectorEnv`, with NumPy arrays or with tensors that stay on the device."""
 
 from collections.abc import Sequence
 from typing import Any

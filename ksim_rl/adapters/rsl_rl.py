@@ -1,4 +1,4 @@
-"""This module shows an env as rsl_rl's `VecEnv`, so that rsl_rl's runners train on it."""
+"""Shows an env as rsl_rl's `VecEnv`, so that rsl_rl's runners train on it."""
 
 from typing import Any
 

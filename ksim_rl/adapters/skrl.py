@@ -1,4 +1,4 @@
-"""This module shows an env as one that skrl has wrapped, so that skrl's agents and trainers run on it."""
+"""Shows an env as one that skrl has wrapped, so that skrl's agents and trainers run on it."""
 
 from typing import Any
 

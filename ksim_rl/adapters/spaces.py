@@ -1,4 +1,4 @@
-"""This module turns the TorchRL spec of one leaf into the Gymnasium space of one row."""
+"""Turns the TorchRL spec of one leaf into the Gymnasium space of one row."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""This module shows an env as stable-baselines3's `VecEnv`, so that its algorithms train on it."""
+"""Shows an env as stable-baselines3's `VecEnv`, so that its algorithms train on it."""
 
 from typing import Any
 

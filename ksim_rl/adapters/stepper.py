@@ -1,4 +1,4 @@
-"""This module drives an env by actions alone, for all adapters: it resets itself, and a step is one graph on CUDA."""
+"""Drives an env by actions alone, for all adapters: it resets itself, and a step is one graph on CUDA."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""This room holds the algorithms: each is a folder with its settings, wiring, update and defaults, found by name."""
+"""The algorithms: each is a folder with its settings, wiring, update and defaults, found by name."""
 
 from ksim_rl.algorithms.off_policy.update import OffPolicyUpdate
 from ksim_rl.algorithms.ppo.update import PPOUpdate

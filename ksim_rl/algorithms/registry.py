@@ -1,4 +1,4 @@
-"""This module finds the algorithms by name: ours, those of plug-ins, and those that a program registers itself."""
+"""Finds the algorithms by name: ours, those of plug-ins, and those that a program registers itself."""
 
 import importlib
 import pkgutil

@@ -1,4 +1,4 @@
-"""This room collects rollouts `["E","T"]` with a policy in an env."""
+"""Collects rollouts `["E","T"]` with a policy in an env."""
 
 from ksim_rl.collectors.rollout_collector import CollectorCfg, RolloutCollector
 

@@ -1,4 +1,4 @@
-"""This module compiles the step of an env, resets included, whatever terms and transforms it is made of."""
+"""Compiles the step of an env, resets included, whatever terms and transforms it is made of."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""This module collects rollouts of fixed length from all envs, as one CUDA graph where there is CUDA."""
+"""Collects rollouts of fixed length from all envs, on a GPU as one CUDA graph."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,1 +1,1 @@
-"""This room makes few kernels of what torch computes for the rows of a batch: recorded, written in C++, replayed."""
+"""Fuses recorded torch operations that act per env into a few C++ kernels, and replays them."""

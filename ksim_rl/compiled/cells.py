@@ -1,4 +1,4 @@
-"""This module names the elements of tensors in C++ that runs once per row of a batch."""
+"""Names the elements of tensors in C++ that runs once per row of a batch."""
 
 import math
 from collections.abc import Callable, Sequence

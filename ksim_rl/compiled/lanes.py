@@ -1,4 +1,4 @@
-"""This module deals the loops of a row out to a few lanes of a warp.
+"""Deals the loops of a row out to a few lanes of a warp.
 
 One thread per row leaves most of a GPU idle, and neighbours read far apart. Here lanes share the places of a loop, and
 wait only where one needs what another has made: loops of one level need nothing of each other, but for the same place

@@ -1,4 +1,4 @@
-"""This module writes operations of torch as C++ for one row of a batch; `tape` makes kernels of it.
+"""Writes torch operations as C++ for one row of a batch; `tape` makes kernels of it.
 
 Each function writes loops that read and write elements through `Cells`, which knows where a tensor lies: in the
 memory of the device, or in an array of the row's own. The operations are those of torch, with its rules for types and

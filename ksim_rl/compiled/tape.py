@@ -1,4 +1,4 @@
-"""This module makes few kernels of what torch computes for the rows of a batch, once that has been recorded.
+"""Fuses recorded torch operations that act per env into a few kernels.
 
 Operations that keep to their row, one after the other, become one kernel, in C++ of `row_code`, with a thread per row
 or a few `lanes`; what lives in one kernel only lives in a row's own memory. Other operations are run by torch as they

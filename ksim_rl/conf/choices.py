@@ -1,4 +1,4 @@
-"""This module makes the choices of the config groups from the dataclasses, and what each task sets over them."""
+"""Makes the choices of the config groups from the dataclasses, and what each task sets over them."""
 
 from collections.abc import Mapping
 from functools import partial

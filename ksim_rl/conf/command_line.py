@@ -1,4 +1,4 @@
-"""This module checks and composes a `ksim-rl train` command line as a whole, before anything is built or written."""
+"""Checks and composes a `ksim-rl train` command line as a whole, before anything is built or written."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""This module registers with Hydra what configs are composed of, and the config of a run that is made once more."""
+"""Registers with Hydra what configs are composed of, and the config of a run that is made once more."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""This module answers arguments that are spelled as other programs spell theirs."""
+"""Answers arguments that are spelled as other programs spell theirs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""This room has TorchRL replay buffers for the env states that an RL update learns from."""
+"""TorchRL replay buffers for the env states that an RL update learns from."""
 
 from ksim_rl.data.dataset_buffer import DatasetBuffer, DatasetCfg, rollout_length
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter

@@ -1,4 +1,4 @@
-"""This module has the dataset of one RL update, and the arithmetic between its size, minibatches and rollouts."""
+"""The dataset of one RL update, and the arithmetic between its size, minibatches and rollouts."""
 
 import math
 from collections.abc import Iterator, Sequence

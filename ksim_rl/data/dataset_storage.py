@@ -1,4 +1,4 @@
-"""This module stores one dataset in place, and lets no non-finite number in."""
+"""Stores one dataset in place, and lets no non-finite number in."""
 
 from collections.abc import Iterable
 from typing import Any, ClassVar

@@ -1,4 +1,4 @@
-"""This module samples env states, or sequences of them, without replacement, in an order that stays on the device."""
+"""Samples env states, or sequences of them, without replacement, in an order that stays on the device."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""This module has the replay of off-policy learning: it holds the last env states of each env, and draws of them."""
+"""The replay of off-policy learning: it holds the last env states of each env, and draws of them."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""This module keeps the last env states of each env in a ring, which stores each observation once."""
+"""Keeps the last env states of each env in a ring, which stores each observation once."""
 
 from typing import Any
 

@@ -1,1 +1,1 @@
-"""This package holds what work on a device shares: streams, graphs, keyed draws, moments and trees of state."""
+"""Streams, graphs, keyed draws, running moments and trees of state, for all work on a device."""

@@ -1,4 +1,4 @@
-"""This module compiles functions so that equal runs have equal bits."""
+"""Compiles functions so that equal runs have equal bits."""
 
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar

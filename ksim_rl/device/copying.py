@@ -1,4 +1,4 @@
-"""This module copies the rows of many tensors by one kernel; torch's takes several times as long where rows are few."""
+"""Copies the rows of many tensors with one kernel; torch takes several times as long where rows are few."""
 
 from collections.abc import Sequence
 from functools import cache

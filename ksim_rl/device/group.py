@@ -1,4 +1,4 @@
-"""This module says which of several processes this one is, and which rows of their envs and draws are its own."""
+"""Says which of several processes this one is, and which rows of their envs and draws are its own."""
 
 import torch.distributed as dist
 

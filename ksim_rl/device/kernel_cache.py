@@ -1,4 +1,4 @@
-"""This module mends Warp's cache, whose files a full disk, a crash or a copy may have left cut."""
+"""Mends Warp's cache, whose files a full disk, a crash or a copy may have left cut."""
 
 import shutil
 from functools import cache

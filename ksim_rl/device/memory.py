@@ -1,4 +1,4 @@
-"""This module explains a failed allocation by the number of envs that fit."""
+"""Explains a failed allocation by the number of envs that fit."""
 
 import gc
 import re

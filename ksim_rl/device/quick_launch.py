@@ -1,4 +1,4 @@
-"""This module launches Warp kernels at little cost from Python.
+"""Launches Warp kernels at little cost from Python.
 
 `wp.launch` packs every argument anew, which takes longer than most small kernels run. Warp can record a launch and
 issue it again; then only the bytes of its arguments are written, in one go.

@@ -1,4 +1,4 @@
-"""This module writes down what torch computes and Warp launches, operation by operation, so that it can be compiled."""
+"""Records torch operations and Warp launches one by one, so that they can be compiled."""
 
 import sys
 import threading

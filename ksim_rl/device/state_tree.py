@@ -1,4 +1,4 @@
-"""This module splits nested state into flat, plain parts: tensors by path, and JSON values by path.
+"""Splits nested state into flat, plain parts: tensors by path, and JSON values by path.
 
 A path joins the keys with `/`; a key's own `~` and `/` are written `~0` and `~1` (JSON Pointer, RFC 6901).
 """

@@ -1,4 +1,4 @@
-"""This module starts Warp, and sends its work to a device, in order with torch's current stream.
+"""Starts Warp, and sends its work to a device, in order with torch's current stream.
 
 On CUDA, Warp launches on the very stream that torch uses, so neither waits for the other. The wrappers of streams are
 kept for ever: a temporary one that dies unregisters the CUDA stream ("unknown stream"). On CPU, two threads that

@@ -1,4 +1,4 @@
-"""This module holds what `device` uses of torch and Warp beyond their documented interfaces.
+"""Undocumented interfaces of torch and Warp that `device` uses.
 
 Each part says why it is needed and with which version it was checked; `tests/device/test_upstream.py` names the part
 that a new version moved.

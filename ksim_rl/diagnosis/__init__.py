@@ -1,1 +1,1 @@
-"""This room finds faults: in how a run learns, by the metrics that it logs, and in the machine that it runs on."""
+"""Finds faults: in how a run learns, by the metrics that it logs, and in the machine that it runs on."""

@@ -1,4 +1,4 @@
-"""This module has a function for each fault of learning that metrics show: threshold, reason, and what to change.
+"""A function for each fault of learning that metrics show: threshold, reason, and what to change.
 
 A function takes the curves of a run and returns what it saw, or None. One whose metrics a run does not log, since its
 algorithm has no such thing, sees nothing. `EXPLAINS` says which faults follow from others.

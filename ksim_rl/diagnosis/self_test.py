@@ -1,4 +1,4 @@
-"""This module tries on each device what every run needs: physics as in MuJoCo's C engine, graphs, and an update."""
+"""Tries on each device what every run needs: physics as in MuJoCo's C engine, graphs, and an update."""
 
 from collections.abc import Callable
 from importlib.resources import files

@@ -1,4 +1,4 @@
-"""This module is all that trainers, collectors, evaluators and adapters may use of an env.
+"""The parts of an env that trainers, collectors, evaluators and adapters may use.
 
 An env is a TorchRL `EnvBase` of batch size [E] whose roots and steps are EnvStates: that alone trains. What is below
 are optional parts. An env has a part if it is an instance of its class, by inheritance or by `Part.register(MyEnv)`;

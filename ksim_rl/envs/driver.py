@@ -1,4 +1,4 @@
-"""This module is what an env and its managers drive terms with; terms themselves see the driver's view only."""
+"""Drives terms for an env and its managers; terms themselves see only the driver's view."""
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager

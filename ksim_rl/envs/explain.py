@@ -1,4 +1,4 @@
-"""This module writes what an env is made of as tables to read."""
+"""Writes the parts of an env as tables to read."""
 
 import dataclasses
 import io

@@ -1,4 +1,4 @@
-"""This module is the env: a TorchRL `EnvBase` over Warp-batched MuJoCo, made of terms."""
+"""The env: a TorchRL `EnvBase` over Warp-batched MuJoCo, made of terms."""
 
 import dataclasses
 import secrets

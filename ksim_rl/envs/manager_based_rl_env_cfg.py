@@ -1,4 +1,4 @@
-"""This module configures `ManagerBasedRlEnv`: one dataclass tree, in Python, YAML and Hydra alike."""
+"""Configures `ManagerBasedRlEnv`: one dataclass tree, in Python, YAML and Hydra alike."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

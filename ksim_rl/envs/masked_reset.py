@@ -1,4 +1,4 @@
-"""This module resets by masks: `step_and_maybe_reset` never syncs, and partial resets leave the other rows alone."""
+"""Resets by masks: `step_and_maybe_reset` never syncs, and partial resets leave the other rows alone."""
 
 import functools
 import random

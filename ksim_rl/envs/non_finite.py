@@ -1,4 +1,4 @@
-"""This module watches what terms give: what is not finite is named, with env and step."""
+"""Watches the values of terms: one that is not finite is named, with env and step."""
 
 from collections.abc import Sequence
 

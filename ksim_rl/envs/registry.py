@@ -1,4 +1,4 @@
-"""This module finds the tasks by name, for Python and for the Hydra config group `task`, and builds their envs."""
+"""Finds the tasks by name, for Python and for the Hydra config group `task`, and builds their envs."""
 
 import dataclasses
 import importlib

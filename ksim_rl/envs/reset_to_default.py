@@ -1,4 +1,4 @@
-"""This module has the event of an env whose config names none: it resets to the default pose."""
+"""The reset event of an env whose config names none: back to the default pose."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""This module finds the keys under which an env says what a step was worth and whether the episode ended."""
+"""Finds the keys under which an env says what a step was worth and whether the episode ended."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""This module makes the specs of an env: shapes, dtypes and dim names of what it takes and gives, `["E"]`."""
+"""Makes the specs of an env: shapes, dtypes and dim names of what it takes and gives, `["E"]`."""
 
 from collections.abc import Mapping
 

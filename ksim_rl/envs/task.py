@@ -1,4 +1,4 @@
-"""This module defines a task: an env config under a name, with what is known about training it."""
+"""Defines a task: an env config under a name, with what is known about training it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""This module holds what the envs use of TorchRL 0.14.1 and tensordict 0.14.3 beyond their documents.
+"""Undocumented interfaces of TorchRL 0.14.1 and tensordict 0.14.3 that the envs use.
 
 Beside that they override `_step_proc_data`, `_make_output_spec` and `_make_input_spec`, whose results they label.
 `tests/envs/test_upstream.py` names the part that a new version moved.

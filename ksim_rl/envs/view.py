@@ -1,4 +1,4 @@
-"""This module is what the terms of an env read: the worlds, and what sensors and managers have made of them."""
+"""The view that terms read: the worlds, and what sensors and managers have computed from them."""
 
 from collections.abc import Mapping
 from types import MappingProxyType

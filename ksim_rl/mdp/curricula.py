@@ -1,4 +1,4 @@
-"""This module has the curricula, which adapt difficulty and change what they change only when envs reset.
+"""The curricula: they adapt difficulty, and act only when envs reset.
 
 Some drive `view.level`, the one difficulty in [0, 1] that ranges, weights and noise may scale with; an env has at most
 one of them. Those that follow the level stand after it, if they are to follow it in the same reset. Others change

@@ -1,4 +1,4 @@
-"""This room has the networks: actor, critic and the parts that they are made of, each a TorchRL or torch module."""
+"""The networks: actor, critic and the parts that they are made of, each a TorchRL or torch module."""
 
 from ksim_rl.modules.actor import ActorCfg, PolicyNetwork, make_actor
 from ksim_rl.modules.bounded_actors import (

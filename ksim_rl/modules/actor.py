@@ -1,4 +1,4 @@
-"""This module builds stochastic policies: normalization, an MLP, and the last layer that an env's actions need."""
+"""Builds stochastic policies: normalization, an MLP, and the last layer that an env's actions need."""
 
 import math
 from collections.abc import Mapping

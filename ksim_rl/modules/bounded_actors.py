@@ -1,4 +1,4 @@
-"""This module builds policies whose actions lie in a box: TD3's deterministic one and SAC's squashed gaussian."""
+"""Builds policies whose actions lie in a box: TD3's deterministic one and SAC's squashed gaussian."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar

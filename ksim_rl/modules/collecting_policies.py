@@ -1,4 +1,4 @@
-"""This module has policies that collect: with noise for off-policy learning, or with a teacher's help."""
+"""Policies that collect: with noise for off-policy learning, or with a teacher's help."""
 
 from collections.abc import Sequence
 from typing import Any

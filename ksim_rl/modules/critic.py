@@ -1,4 +1,4 @@
-"""This module builds networks that judge: values of states and of actions, and transitions beside those of a motion."""
+"""Builds networks that judge: values of states and of actions, and transitions beside those of a motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

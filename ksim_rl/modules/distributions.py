@@ -1,4 +1,4 @@
-"""This module has the distributions of actions, free of host syncs: gaussians, with and without bounds, and choices."""
+"""The distributions of actions, free of host syncs: gaussians, with and without bounds, and choices."""
 
 import math
 from abc import ABC, abstractmethod

@@ -1,4 +1,4 @@
-"""This module builds the perceptrons of actors and critics, and runs their layers in half precision on CUDA."""
+"""Builds the perceptrons of actors and critics, and runs their layers in half precision on CUDA."""
 
 import math
 from collections.abc import Callable, Sequence

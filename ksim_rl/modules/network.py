@@ -1,4 +1,4 @@
-"""This module has what the networks share: what they observe, its normalization, fields of their configs, a trunk."""
+"""The parts that networks share: observations, their normalization, fields of configs, a trunk."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""This module has the Triton kernels that add a bias, normalize rows, and apply an activation, forward and back.
+"""The Triton kernels that add a bias, normalize rows, and apply an activation, forward and back.
 
 A program takes some rows of one of N networks, a tile at a time, in float32. To 768 columns it is one warp, which waits
 for no other. A row is two or three chunks of a power of two, as layers are that wide. Sums of columns are left in

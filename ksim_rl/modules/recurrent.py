@@ -1,4 +1,4 @@
-"""This module gives any network a recurrent state: it turns observations into features of the episode so far."""
+"""Gives any network a recurrent state: it turns observations into features of the episode so far."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

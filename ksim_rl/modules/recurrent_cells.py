@@ -1,4 +1,4 @@
-"""This module has LSTM and GRU layers over a sequence whose state starts anew where an episode does.
+"""LSTM and GRU layers over a sequence, whose state starts again with each episode.
 
 cuDNN's kernels cannot zero the state of single rows between two steps, and splitting sequences at the resets makes
 sizes that depend on data. Here the input projections of all steps come in as one product; each step is one recurrent

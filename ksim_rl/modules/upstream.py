@@ -1,4 +1,4 @@
-"""This module holds what `modules` uses of torch and tensordict beyond their documented interfaces.
+"""Undocumented interfaces of torch and tensordict that `modules` uses.
 
 `tests/modules/test_upstream.py` names the part that a new version moved.
 """

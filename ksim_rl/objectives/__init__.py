@@ -1,4 +1,4 @@
-"""This room estimates advantages from a rollout, and has the losses and gradient steps that improve the policy."""
+"""Estimates advantages from a rollout, and has the losses and gradient steps that improve the policy."""
 
 from ksim_rl.objectives.advantage_estimators import GAE, RolloutEstimator, TDLambda, VTrace
 from ksim_rl.objectives.algorithm_cfg import (

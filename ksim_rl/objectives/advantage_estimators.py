@@ -1,4 +1,4 @@
-"""This module estimates the advantages of a rollout, by GAE, lambda returns or V-trace, without host syncs."""
+"""Estimates the advantages of a rollout, by GAE, lambda returns or V-trace, without host syncs."""
 
 from abc import abstractmethod
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""This module holds the settings of all algorithms: of gradient steps, of PPO, AMP and distillation, of SAC and TD3."""
+"""The settings of all algorithms: of gradient steps, of PPO, AMP and distillation, of SAC and TD3."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

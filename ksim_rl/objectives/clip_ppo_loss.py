@@ -1,4 +1,4 @@
-"""This module has the clipped surrogate loss of PPO, free of host syncs."""
+"""The clipped surrogate loss of PPO, free of host syncs."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""This module has the loss of a discriminator of motions, and the reward that it gives."""
+"""The loss of a discriminator of motions, and the reward that it gives."""
 
 from collections.abc import Callable
 from functools import partial

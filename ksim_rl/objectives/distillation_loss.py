@@ -1,4 +1,4 @@
-"""This module has the loss that moves a student towards what its teacher does."""
+"""The loss that moves a student towards its teacher."""
 
 from typing import Any
 

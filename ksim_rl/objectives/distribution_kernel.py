@@ -1,4 +1,4 @@
-"""This module compares distributions of returns with their targets by one Triton kernel, gradients included."""
+"""Compares distributions of returns with their targets by one Triton kernel, gradients included."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""This module projects the targets of critics that predict a distribution of returns, and compares them."""
+"""Projects the targets of critics that predict a distribution of returns, and compares them."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""This module makes the gradient step of a network as one piece of memory: a few kernels, whatever its layers are."""
+"""Steps AdamW over a network's parameters as one piece of memory: a few kernels, whatever its layers are."""
 
 import math
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""This module makes gradient steps without host syncs, skips what is not finite, and adapts the learning rate."""
+"""Makes gradient steps without host syncs, skips those that are not finite, and adapts the learning rate."""
 
 import functools
 from collections.abc import Iterable, Mapping

@@ -1,4 +1,4 @@
-"""This module takes means over the env states that take part: those whose mask is True."""
+"""Takes means over the env states whose mask is True."""
 
 import torch
 from jaxtyping import Bool, Float

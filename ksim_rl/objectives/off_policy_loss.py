@@ -1,4 +1,4 @@
-"""This module has the losses of SAC and TD3, and the slow targets and distributed returns that they learn towards."""
+"""The losses of SAC and TD3, and the slow targets and distributed returns that they learn towards."""
 
 import copy
 import math

@@ -1,4 +1,4 @@
-"""This module computes how far a policy moved, whatever its distribution: exactly where there is a closed form."""
+"""Computes how far a policy moved, for any distribution: exactly where there is a closed form."""
 
 from functools import reduce
 from operator import add

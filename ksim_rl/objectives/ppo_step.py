@@ -1,4 +1,4 @@
-"""This module makes one gradient step of PPO, and builds what it needs from one config."""
+"""Makes one gradient step of PPO, and builds what it needs from one config."""
 
 import dataclasses
 from collections.abc import Mapping

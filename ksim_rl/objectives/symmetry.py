@@ -1,4 +1,4 @@
-"""This module learns from mirror images: for robots that are their own, by mirrored samples or by a loss."""
+"""Learns from mirror images: for robots that are their own, by mirrored samples or by a loss."""
 
 from collections.abc import Callable, Iterable, Mapping
 

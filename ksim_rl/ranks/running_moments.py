@@ -1,4 +1,4 @@
-"""This module keeps an exact running mean and variance, in one process or over all ranks."""
+"""Keeps an exact running mean and variance, in one process or over all ranks."""
 
 from collections.abc import Sequence
 

@@ -1,1 +1,1 @@
-"""This room holds what is in a run folder beside checkpoints: how it came about, how it goes, and how runs compare."""
+"""The record, metrics and curves of a run folder, and comparisons of runs."""

@@ -1,4 +1,4 @@
-"""This module keeps all metrics of a run in one CSV file, one row per logged iteration."""
+"""Keeps all metrics of a run in one CSV file, one row per logged iteration."""
 
 import csv
 import io

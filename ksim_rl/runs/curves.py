@@ -1,4 +1,4 @@
-"""This module draws the learning curves of a run as one picture."""
+"""Draws the learning curves of a run as one picture."""
 
 from pathlib import Path
 

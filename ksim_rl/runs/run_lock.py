@@ -1,4 +1,4 @@
-"""This module lets one process at a time write a run folder."""
+"""Lets one process at a time write a run folder."""
 
 import errno
 import fcntl

@@ -1,4 +1,4 @@
-"""This module watches what a run writes: its folder, and the threads of its loggers."""
+"""Watches the folder that a run writes, and the threads of its loggers."""
 
 import os
 import threading

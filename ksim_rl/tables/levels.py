@@ -1,4 +1,4 @@
-"""This module says when a learning curve has reached levels, what several seeds come to, and whether that suffices."""
+"""Finds when a learning curve reaches levels, and whether several seeds do so together."""
 
 import math
 import statistics

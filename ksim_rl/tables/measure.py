@@ -1,4 +1,4 @@
-"""This module trains one seed of a row, judges its final policy, and writes what came of it.
+"""Trains one seed of a row, judges its final policy, and writes the result.
 
     python -m ksim_rl.tables.measure TABLE ROW SEED RESULT RUN_FOLDER DEVICE [smoke]
 

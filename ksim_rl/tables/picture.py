@@ -1,4 +1,4 @@
-"""This module draws a table: each row's seeds and what they come to, beside what others report."""
+"""Draws a table: each row's seeds and their summary, beside what others report."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""This module writes a table: figures as JSON, rows as Markdown, and a picture."""
+"""Writes a table: figures as JSON, rows as Markdown, and a picture."""
 
 import json
 import statistics

@@ -1,4 +1,4 @@
-"""This module runs what a table lacks: a process for each row and seed, side by side where there are several GPUs."""
+"""Runs the results that a table lacks: a process for each row and seed, in parallel on several GPUs."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""This module reads a table: rows (task, objective, overrides, env states, seeds), what is measured, what others got.
+"""Reads a table: rows (task, objective, overrides, env states, seeds), what is measured, what others got.
 
 A file has groups, whose rows inherit the fields of their group; docs/tables.md shows one.
 """

@@ -1,4 +1,4 @@
-"""This module has small control tasks of dm_control's suite: a pole on a cart, a pendulum, an arm with two joints.
+"""Small control tasks of dm_control's suite: a pole on a cart, a pendulum, an arm with two joints.
 
 Tassa et al., "DeepMind Control Suite" (2018): rewards lie in [0, 1], and an episode has 1000 steps.
 """

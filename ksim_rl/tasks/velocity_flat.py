@@ -1,4 +1,4 @@
-"""This module has the tasks in which legged robots follow a velocity command on flat ground, two of them on rough too.
+"""The tasks in which legged robots follow a velocity command on flat ground, two of them on rough too.
 
 The figures of Go1 and G1 are those of mjlab 1.6.0's `Mjlab-Velocity-Flat-Unitree-Go1` and `-G1`. The quadruped and the
 humanoid are our own, with nothing to download; Go2's motors run PD control.

@@ -1,4 +1,4 @@
-"""This room checks envs and data, for our tests and for yours: begin with `check_env(env)`."""
+"""Checks envs and data, for our tests and for yours: begin with `check_env(env)`."""
 
 from ksim_rl.testing.check_env import check_env
 from ksim_rl.testing.check_specs import assert_dims, assert_leaf

@@ -1,4 +1,4 @@
-"""This module runs the checks that every env has to pass, ours and yours, and reports all findings at once."""
+"""Runs the checks that every env has to pass, ours and yours, and reports all findings at once."""
 
 import gc
 from collections.abc import Callable, Collection

@@ -1,4 +1,4 @@
-"""This module compares the physics of an env with MuJoCo's C engine, from states that random actions lead to."""
+"""Compares the physics of an env with MuJoCo's C engine, from states that random actions lead to."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""This module finds Python of an env that changes from step to step, which a recorded step would freeze."""
+"""Finds Python code of an env that changes from step to step, which a recorded step would freeze."""
 
 from torchrl.envs import EnvBase
 

@@ -1,4 +1,4 @@
-"""This module finds rows that do not repeat, that a reset of others changes, or whose last observation is lost."""
+"""Finds rows that do not repeat, that a reset of others changes, or whose last observation is lost."""
 
 import torch
 from tensordict import NestedKey, TensorDictBase

@@ -1,4 +1,4 @@
-"""This module finds wrong specs, dim names and values, and wrong actions that an env takes."""
+"""Finds wrong specs, dim names and values, and wrong actions that an env takes."""
 
 import torch
 from tensordict import TensorDictBase

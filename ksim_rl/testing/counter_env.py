@@ -1,4 +1,4 @@
-"""This module has a probe env whose every answer is known in closed form."""
+"""A probe env whose every answer is known in closed form."""
 
 from collections.abc import Sequence
 from typing import Any

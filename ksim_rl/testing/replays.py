@@ -1,4 +1,4 @@
-"""This module gives a check the same actions from the same start, as often as it needs them."""
+"""Gives a check the same actions from the same start, as often as it needs them."""
 
 from collections.abc import Sequence
 from typing import Any

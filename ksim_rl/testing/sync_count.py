@@ -1,4 +1,4 @@
-"""This module counts the operations that make the host wait for the device, on any machine."""
+"""Counts the operations that make the host wait for the device, on any machine."""
 
 import traceback
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""This module has the motions of Unitree G1 that come with the package, as keyframes: walk, squat, turn, kick."""
+"""The motions of Unitree G1 that come with the package, as keyframes: walk, squat, turn, kick."""
 
 import math
 import sys

@@ -1,4 +1,4 @@
-"""This module turns keyframes of a two-legged robot into a motion: feet stand without slip, and the balance is kept.
+"""Turns keyframes of a two-legged robot into a motion: feet stand without slip, and the balance is kept.
 
 The centre of mass moves as a pendulum of variable height over the zero-moment point that the feet allow (Kajita et al.,
 "Biped walking pattern generation by using preview control of zero-moment point", 2003; here the whole plan is known, so

@@ -1,4 +1,4 @@
-"""This module begins episodes inside of a reference motion, off its states, and more often where robots have failed."""
+"""Starts episodes inside of a reference motion, away from its states, and more often where robots have failed."""
 
 import math
 from dataclasses import dataclass, field

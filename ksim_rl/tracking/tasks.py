@@ -1,4 +1,4 @@
-"""This module has the tasks in which Unitree G1 follows the motions of `g1_motions` with its whole body.
+"""The tasks in which Unitree G1 follows the motions of `g1_motions` with its whole body.
 
 Observations, noise, rewards, limits, pushes and randomization are those of mjlab's tracking task for G1
 (src/mjlab/tasks/tracking at its commit 0eda4e7), so that both can be compared on the same work. Four things differ:

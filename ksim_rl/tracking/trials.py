@@ -1,4 +1,4 @@
-"""This module counts how often a policy follows a motion from its start to its end, over many trials in drawn worlds.
+"""Counts how often a policy follows a motion from its start to its end, over many trials in drawn worlds.
 
 `ksim-rl eval RUN --trials 1024` runs them. The protocol is that of mjlab 1.x's evaluation of tracking policies
 (src/mjlab/tasks/tracking/scripts/evaluate.py): sensor noise, drawn worlds and errors at the start are on, pushes are

@@ -1,4 +1,4 @@
-"""This room holds the training loop and what surrounds it: evaluation, checkpoints, logs, progress, pictures."""
+"""The training loop, with evaluation, checkpoints, logs, progress and pictures."""
 
 import importlib
 from typing import Any

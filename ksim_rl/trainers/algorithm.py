@@ -1,4 +1,4 @@
-"""This module says what a trainer asks of an algorithm, and finds that of a run's config."""
+"""The interface between trainer and algorithm, and the lookup of a run's algorithm."""
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence

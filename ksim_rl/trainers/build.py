@@ -1,4 +1,4 @@
-"""This module builds the objects of a run from its config."""
+"""Builds the objects of a run from its config."""
 
 import dataclasses
 import os

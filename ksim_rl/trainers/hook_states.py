@@ -1,4 +1,4 @@
-"""This module gives the hooks of a run that goes on what its checkpoint has kept for them."""
+"""Gives the hooks of a resumed run the states that its checkpoint has kept for them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar

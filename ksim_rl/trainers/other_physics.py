@@ -1,4 +1,4 @@
-"""This module says in which physics a trained policy is judged, and how that differs from its training."""
+"""Says in which physics a trained policy is judged, and how that differs from its training."""
 
 import dataclasses
 from collections.abc import Collection, Mapping

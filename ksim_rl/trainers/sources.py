@@ -1,4 +1,4 @@
-"""This module looks for what a run reads and names before anything is built: checkpoints, robots, targets."""
+"""Looks for the checkpoints, robots and targets that a run names, before anything is built."""
 
 from collections.abc import Iterable
 from dataclasses import fields

@@ -1,4 +1,4 @@
-"""This module trains the first iterations of a run in processes of their own, to find a number of envs that fits.
+"""Trains the first iterations of a run in child processes, to find a number of envs that fits.
 
 A process that ran out of GPU memory is no place to try again: torch, for one, never releases what a graph had taken
 that broke while it was recorded.

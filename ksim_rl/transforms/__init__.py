@@ -1,4 +1,4 @@
-"""This room holds transforms for any TorchRL env: noise, delay, history, limits, units, statistics, mirrors, groups.
+"""Transforms for any TorchRL env: noise, delay, history, limits, units, statistics, mirrors, groups.
 
 A transform is public once it is imported here.
 """

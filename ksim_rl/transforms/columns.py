@@ -1,4 +1,4 @@
-"""This module lays observations side by side, so that one kernel takes all of them, and splits them again."""
+"""Lays observations side by side, so that one kernel takes all of them, and splits them again."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""This module holds the base of transforms that remember the last values of signals, and histories of observations."""
+"""The base of transforms that remember the last values of signals, and histories of observations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""This module finds the env inside its wrappers, and defines the one thing that a transform may ask of it."""
+"""Finds the env inside its wrappers, and defines the one thing that a transform may ask of it."""
 
 from abc import ABC, abstractmethod
 from typing import Any

@@ -1,4 +1,4 @@
-"""This module keeps the last values of a signal in a ring of slots per env: one kernel, also a torch operator.
+"""Keeps the last values of a signal in a ring of slots per env: one kernel, also a torch operator.
 
 A step writes one value per env and reads the values of some steps ago; a reset writes the value that the masked rows
 begin with, and no lag reaches back beyond it. Where the ring of an env stands is its age, the steps since its reset,

@@ -1,4 +1,4 @@
-"""This module holds the bases of transforms with state per env: buffers, draws of their own, a level to follow."""
+"""The bases of transforms with state per env: buffers, draws of their own, a level to follow."""
 
 import functools
 from abc import ABC, abstractmethod

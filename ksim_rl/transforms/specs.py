@@ -1,4 +1,4 @@
-"""This module reads and writes leaf specs and their bounds."""
+"""Reads and writes leaf specs and their bounds."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""This module describes a transform as data, so that a config can name it and each env can build its own."""
+"""Describes a transform as data, so that a config can name it and each env can build its own."""
 
 import dataclasses
 import functools

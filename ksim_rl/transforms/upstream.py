@@ -1,4 +1,4 @@
-"""This module holds what transforms use of torch and TorchRL beyond their documents.
+"""Undocumented interfaces of torch and TorchRL that the transforms use.
 
 All was checked with torch 2.13.0 and TorchRL 0.14.1; `tests/transforms/test_upstream.py` names what moved.
 """

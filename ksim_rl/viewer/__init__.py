@@ -1,4 +1,4 @@
-"""This room shows what a policy does, while one watches and drives: in a browser, or in MuJoCo's own window.
+"""Shows a policy at work, to watch and to drive: in a browser, or in MuJoCo's own window.
 
 `Session` steps an env at the pace of the clock and takes requests; a display (`browser`, `native`) shows it.
 """

@@ -1,4 +1,4 @@
-"""This module makes an entry of the zoo out of a run folder."""
+"""Makes an entry of the zoo out of a run folder."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""This module reads and writes what the zoo consists of: a card, a checkpoint and an ONNX file for each policy.
+"""Reads and writes the entries of the zoo: a card, a checkpoint and an ONNX file for each policy.
 
 An entry is a folder `policies/<name>`: `card.json`, `policy.onnx`, and `checkpoint/<iteration>` with the actor alone.
 All of it is data, and is read by the rules for run folders of strangers: checked by hash, never executed.

@@ -1,4 +1,4 @@
-"""This module is the command `ksim-rl zoo`, which lists the policies that come with the package and adds one."""
+"""The command `ksim-rl zoo`, which lists the policies that come with the package and adds one."""
 
 import json
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""This module finds the run folder that a command names: one on this disk, of the zoo, or of Weights & Biases."""
+"""Finds the run folder that a command names: one on this disk, of the zoo, or of Weights & Biases."""
 
 import shutil
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""This module sends what a run leaves to Weights & Biases, and fetches it from there."""
+"""Sends the files of a run to Weights & Biases, and fetches them from there."""
 
 import re
 import tempfile

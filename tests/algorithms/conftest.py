@@ -1,4 +1,4 @@
-"""This module has the fixtures that tests of algorithms share."""
+"""The fixtures that tests of algorithms share."""
 
 import pytest
 

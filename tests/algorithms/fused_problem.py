@@ -1,4 +1,4 @@
-"""This module has networks, rollouts and updates that are small enough for Triton's interpreter."""
+"""Networks, rollouts and updates that are small enough for Triton's interpreter."""
 
 import copy
 import importlib

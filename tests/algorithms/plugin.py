@@ -1,4 +1,4 @@
-"""This file is a whole algorithm, REINFORCE with a mean baseline, which a test installs as a package of its own."""
+"""A whole algorithm, REINFORCE with a mean baseline, which a test installs as a package of its own."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""This module stands in for a machine with little memory: Warp's allocator on the CPU refuses what goes beyond."""
+"""Stands in for a machine with little memory: Warp's allocator on the CPU refuses what goes beyond."""
 
 from typing import Any
 

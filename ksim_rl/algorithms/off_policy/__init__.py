@@ -1,4 +1,4 @@
-"""This folder holds what the off-policy algorithms share: the update, its wiring, and the replays."""
+"""The update, wiring and replays that the off-policy algorithms share."""
 
 from ksim_rl.data import ReplayCfg
 

@@ -1,4 +1,4 @@
-"""This module builds SAC, TD3 and their fast variants for a run: networks, loss, exploration and update."""
+"""Builds SAC, TD3 and their fast variants for a run: networks, loss, exploration and update."""
 
 from collections.abc import Mapping
 from functools import partial

@@ -1,4 +1,4 @@
-"""This module says whether the gradient steps of a PPO run can be fused kernels, and builds these for it."""
+"""Decides whether the gradient steps of a PPO run can be fused kernels, and builds these for it."""
 
 import importlib.util
 from collections.abc import Iterator, Mapping

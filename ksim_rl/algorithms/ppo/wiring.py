@@ -1,4 +1,4 @@
-"""This module builds PPO for a run: actor and critic for what its env observes and does, and their update."""
+"""Builds PPO for a run: actor and critic for what its env observes and does, and their update."""
 
 from functools import partial
 from typing import Any

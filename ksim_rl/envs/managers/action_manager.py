@@ -1,4 +1,4 @@
-"""This module splits the action among its terms and remembers it."""
+"""Splits the action among its terms and remembers it."""
 
 import warnings
 from collections.abc import Mapping

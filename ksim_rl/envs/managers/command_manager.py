@@ -1,4 +1,4 @@
-"""This module keeps the commands: clocks, resampling, and the vectors that policy and rewards see."""
+"""Keeps the commands: clocks, resampling, and the vectors that policy and rewards see."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext

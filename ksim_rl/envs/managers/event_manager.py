@@ -1,4 +1,4 @@
-"""This module runs events: at startup, for rows that reset, by per-env clocks, and at every step."""
+"""Runs events: at startup, for rows that reset, by per-env clocks, and at every step."""
 
 from collections.abc import Mapping
 

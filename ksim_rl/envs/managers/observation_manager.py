@@ -1,4 +1,4 @@
-"""This module reads each observation term once, clean; what groups add is done by transforms."""
+"""Reads each observation term once, without noise; transforms add what groups ask for."""
 
 from collections.abc import Mapping
 from contextlib import nullcontext

@@ -1,4 +1,4 @@
-"""This module draws entries of a model field by one kernel, in the worlds of a mask.
+"""Draws entries of a model field by one kernel, in the worlds of a mask.
 
 At each step a few worlds reset, so that what counts is how many kernels a draw takes. Its numbers are those of
 `ksim_rl.device.random` at the same coordinates.

@@ -1,4 +1,4 @@
-"""This module lays out for the kernels what the gradient steps of an update read of a rollout."""
+"""Lays out a rollout in memory for the kernels of the gradient steps."""
 
 from collections.abc import Callable, Iterator
 from functools import reduce

@@ -1,4 +1,4 @@
-"""This module has the Triton kernels that read a rollout into observations, records and advantages."""
+"""The Triton kernels that read a rollout into observations, records and advantages."""
 
 import triton
 import triton.language as tl

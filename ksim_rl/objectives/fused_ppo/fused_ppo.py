@@ -1,4 +1,4 @@
-"""This module makes all gradient steps of a PPO update in a few Triton kernels each, for most runs' networks.
+"""Makes each gradient step of a PPO update in a few Triton kernels, for most networks.
 
 It computes what `GAE`, `ClipPPOLoss` and `ppo_step` compute for an actor and a critic of `FusedNetworks`, from the same
 config, in the same order of env states, and on the state of the same optimizer: a run can change from one to the other

@@ -1,4 +1,4 @@
-"""This module has the Triton kernels that run one layer of both networks at a time, for networks of any depth.
+"""The Triton kernels that run one layer of both networks at a time, for networks of any depth.
 
 They serve where the chained ones of `mlp_kernels` do not fit. A layer leaves, beside its outputs, the slopes of its
 activation where the gradient of the layer's outputs is written later; products are as in `mlp_kernels`.

@@ -1,4 +1,4 @@
-"""This module says where the parameters of fused networks are, how work is cut, and what cannot be fused."""
+"""Lays out the parameters of fused networks, cuts the work into parts, and says what cannot be fused."""
 
 import itertools
 import math

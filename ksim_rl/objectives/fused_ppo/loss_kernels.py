@@ -1,4 +1,4 @@
-"""This module has generalized advantages, and the clipped losses of PPO with their gradients, as Triton functions.
+"""Generalized advantages, and the clipped losses of PPO with their gradients, as Triton functions.
 
 The losses are those of `ClipPPOLoss`, for a diagonal gaussian, or for one that a tanh squashes: actions are then those
 before the tanh. The gradients are of the sum over the env states, not of the mean. `docs/fused_ppo.md` derives them.

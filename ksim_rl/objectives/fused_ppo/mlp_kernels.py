@@ -1,4 +1,4 @@
-"""This module has the Triton kernels that run a whole MLP, forward and back, for a block of env states at a time.
+"""The Triton kernels that run a whole MLP, forward and back, for a block of env states at a time.
 
 The widest hidden layer never exists as a whole: its columns are computed in chunks, and each chunk is multiplied into
 the next layer at once. Products take the weights' dtype (bfloat16, or float32, as TF32 on a GPU), sums float32.

@@ -1,4 +1,4 @@
-"""This module has the Triton kernels between a minibatch and the next: sums, statistics, learning rate, Adam.
+"""The Triton kernels between a minibatch and the next: sums, statistics, learning rate, Adam.
 
 What a gradient step measures is one row of `SUMMARY` columns.
 """

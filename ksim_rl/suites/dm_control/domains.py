@@ -1,4 +1,4 @@
-"""This module has the domains of the DeepMind Control Suite: their time steps, observations, starts and targets.
+"""The domains of the DeepMind Control Suite: their time steps, observations, starts and targets.
 
 Tassa et al., "DeepMind Control Suite" (2018), and the package `dm_control`; what MuJoCo Playground changes stands in
 `playground` of each domain, and in docs/suites.md.

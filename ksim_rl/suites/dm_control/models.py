@@ -1,4 +1,4 @@
-"""This module has the models of the DeepMind Control Suite, from the MJCF files of the package `dm_control`."""
+"""The models of the DeepMind Control Suite, from the MJCF files of the package `dm_control`."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""This module has the 25 tasks of the DeepMind Control Suite that MuJoCo Playground reports, each in two variants.
+"""The 25 tasks of the DeepMind Control Suite that MuJoCo Playground reports, each in two variants.
 
 `dm_control_<domain>_<task>` is the task as dm_control has it, `playground_<domain>_<task>` as Playground changes it.
 Episodes have 1000 control steps and rewards lie in [0, 1], so that returns lie in [0, 1000]; only time ends an episode.

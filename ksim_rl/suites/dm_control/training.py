@@ -1,4 +1,4 @@
-"""This module has the settings that the tasks of the DeepMind Control Suite are trained with: one set by algorithm."""
+"""The settings that the tasks of the DeepMind Control Suite are trained with: one set by algorithm."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""This module has the scenes of the tasks, and terms that place a free body and say when it is lost."""
+"""The scenes of the tasks, and terms that place a free body and say when it is lost."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

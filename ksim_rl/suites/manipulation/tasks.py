@@ -1,4 +1,4 @@
-"""This module has the manipulation tasks with the settings that they are trained with.
+"""The manipulation tasks with the settings that they are trained with.
 
 MuJoCo Playground's are in `config/manipulation_params.py` of its commit d5e6b47. With these a Panda lifts its first
 cubes later, and a hand turns its cube about half as often after the same seconds; see docs/suites.md.

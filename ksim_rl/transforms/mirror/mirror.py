@@ -1,4 +1,4 @@
-"""This module describes left-right mirror images, and shows episodes and samples in them."""
+"""Describes left-right mirror images, and shows episodes and samples in them."""
 
 import functools
 from collections.abc import Mapping, Sequence

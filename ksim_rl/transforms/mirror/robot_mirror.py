@@ -1,4 +1,4 @@
-"""This module finds the left-right symmetry of a robot in its names and joint axes."""
+"""Finds the left-right symmetry of a robot in its names and joint axes."""
 
 import itertools
 import re

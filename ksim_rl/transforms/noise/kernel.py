@@ -1,4 +1,4 @@
-"""This module adds noise to all observations of a transform by one kernel, which is also a torch operator.
+"""Adds noise to all observations of a transform by one kernel, which is also a torch operator.
 
 Each column's draws are those of `ksim_rl.device.random` at (seed, stream, counter, row, column).
 """
