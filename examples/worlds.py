@@ -7,6 +7,7 @@ This needs the engine alone: torch, MuJoCo, MuJoCo Warp and Warp. E is the numbe
 """
 
 import argparse
+from typing import Literal
 
 import torch
 from jaxtyping import Float32
@@ -34,7 +35,7 @@ SUBSTEPS = 5  # steps of physics between two commands: 100 commands a second
 
 
 def reach(
-    *, engine: str = "warp", num_worlds: int = 256, seconds: float = 3.0, device: str = "cpu"
+    *, engine: Literal["warp", "c"] = "warp", num_worlds: int = 256, seconds: float = 3.0, device: str = "cpu"
 ) -> tuple[Float32[Tensor, " E"], Float32[Tensor, " E"]]:
     """Return the mass of each world's arm, in kg, and by how many rad it stays below the target."""
     mj_model = load_model(MODEL)
