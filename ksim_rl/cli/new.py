@@ -17,7 +17,8 @@ from ksim_rl.files.reading import MOST_MODEL_BYTES, read_bytes
 from ksim_rl.files.writing import write_whole
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.robots import analyse
-from ksim_rl.scene.robots.analysis import TRIAL_S, robot_name
+from ksim_rl.scene.robots.analysis import TRIAL_S
+from ksim_rl.scene.robots.strangers_model import robot_name
 from ksim_rl.terminal import show
 
 MODEL = "@model@"

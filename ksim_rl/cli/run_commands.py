@@ -158,9 +158,17 @@ def list_envs(arguments: list[str]) -> int:
         show(ours.explain(), end="")
         return 0
     rows = []
+    broken = []
     for name in envs.names():
         task = envs.task(name)
-        cfg = task.cfg()
+        try:
+            cfg = task.cfg()
+        except Exception as error:  # of a plug-in, or of its robot's file: the other tasks are listed
+            broken.append(name)
+            say(
+                f"task {name!r} is left out of the list: {' '.join(str(error).split()) or type(error).__name__}"
+            )
+            continue
         rows.append(
             [
                 name,
@@ -172,7 +180,7 @@ def list_envs(arguments: list[str]) -> int:
             ]
         )
     print_table(("task", "robot", "episode", "observations", "solved at", "description"), rows)
-    return 0
+    return 1 if broken else 0
 
 
 def robot(arguments: list[str]) -> int:
@@ -184,13 +192,16 @@ def robot(arguments: list[str]) -> int:
     parser.add_argument(
         "model", metavar="PATH", help="an MJCF or URDF file, or a menagerie name: unitree_a1/a1"
     )
+    parser.add_argument(
+        "--pose", metavar="NAME", help='the keyframe to stand in, or "qpos0"; default: the first that stands'
+    )
     parser.add_argument("--code", action="store_true", help="print Python to paste, in place of the table")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw the stance into this file")
     options = parser.parse_args(arguments)
     if options.picture is not None and options.picture.suffix != ".png":
         raise ValueError(f"--picture {options.picture}: expected a file that ends in .png")
     with shown_working(f"analysing {options.model}"):
-        found = analyse(options.model)
+        found = analyse(options.model, pose=options.pose)
     show(found.code() if options.code else found.table(), end="")
     if options.picture is not None:
         found.draw(options.picture)

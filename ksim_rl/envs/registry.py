@@ -13,7 +13,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from ksim_rl.checks import check_known
+from ksim_rl.checks import check_known, naming
 from ksim_rl.config import plugins, upstream
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.config.overrides import check_overrides
@@ -63,6 +63,12 @@ def task(name: str) -> Task:
     return tasks[name]
 
 
+def cfg_of(name: str) -> ManagerBasedRlEnvCfg:
+    """Return a task's config as it is registered; a ValueError names the task, as where its robot cannot be read."""
+    with naming(f"task {name!r}"):
+        return task(name).cfg()
+
+
 def register_configs() -> None:
     """Store each task's config tree in Hydra's config group `task`."""
     _register(tuple(names()))
@@ -76,7 +82,7 @@ def _register(names: tuple[str, ...]) -> None:
 
 
 def _tree(name: str) -> dict[str, Any]:
-    return to_tree(task(name).cfg(), ManagerBasedRlEnvCfg)
+    return to_tree(cfg_of(name), ManagerBasedRlEnvCfg)
 
 
 def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
@@ -85,7 +91,7 @@ def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
     A ValueError names the task or field that does not exist, or the value that is not valid, before models compile.
     """
     if not overrides:
-        return task(name).cfg()
+        return cfg_of(name)
     check_overrides({"task": _tree(name)}, overrides)
     register_configs()
     with initialize(version_base="1.3", config_path=None):

@@ -29,8 +29,9 @@ from ksim_rl.physics import SimCfg
 from ksim_rl.physics.load import Source
 from ksim_rl.scene import terrains
 from ksim_rl.scene.robots import stance
-from ksim_rl.scene.robots.analysis import RobotAnalysis, analyse, robot_name
+from ksim_rl.scene.robots.analysis import RobotAnalysis, analyse
 from ksim_rl.scene.robots.legged_robot import LeggedRobot, ModelRobot
+from ksim_rl.scene.robots.strangers_model import robot_name
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.sensors import ContactSensor, Sensor
 from ksim_rl.scene.viewer_cfg import ViewerCfg
@@ -300,17 +301,23 @@ class VelocityTask(Task):
 
     @classmethod
     def for_robot(
-        cls, robot: Source | ModelRobot, *, name: str = "", num_iterations: int = 3_000
+        cls,
+        robot: Source | ModelRobot,
+        *,
+        name: str = "",
+        num_iterations: int = 3_000,
+        pose: str | None = None,
     ) -> "VelocityTask":
         """Return the task of a model with all that `robots.analyse` proposes for it, or of an edited proposal.
 
-        The robot is analysed when the config is first asked for. `name` is "<robot>_velocity_flat" by default.
+        The robot is analysed when the config is first asked for, from the keyframe `pose` where one is named. `name` is
+        "<robot>_velocity_flat" by default.
         """
         own = robot.name if isinstance(robot, ModelRobot) else robot_name(robot)
 
         @functools.cache
         def analysis() -> RobotAnalysis:
-            return analyse(robot.spec() if isinstance(robot, ModelRobot) else robot)
+            return analyse(robot.spec() if isinstance(robot, ModelRobot) else robot, pose=pose)
 
         return cls(
             name=name or f"{own}_velocity_flat",

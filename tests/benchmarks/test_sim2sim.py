@@ -27,7 +27,8 @@ def test_figures_stand_where_the_options_say():
 
 
 @pytest.mark.parametrize(
-    ("engine", "said"), [("warp", "(trained on MuJoCo Warp)"), ("c", "which trained it, with integrator euler")]
+    ("engine", "said"),
+    [("warp", "(trained on MuJoCo Warp)"), ("c", "which trained it, with integrator euler")],
 )
 def test_both_engines_run_the_same_episodes(engine, said):
     options = {**OPTIONS, "task": "cartpole_balance", "episodes": "4"}

@@ -28,6 +28,11 @@ class ModelText:
         return self.path.parent if self.path else Path()
 
 
+def is_xml(source: str | Path) -> bool:
+    """Return whether a source is the text of a model itself."""
+    return isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<")
+
+
 def model_file(source: str | Path) -> Path | None:
     """Return the path that a source names, with `~` for the home folder; None for an XML string.
 
@@ -38,7 +43,7 @@ def model_file(source: str | Path) -> Path | None:
             raise ValueError(
                 "model source is an empty string: expected a path, an XML string or a menagerie name"
             )
-        if source.lstrip("\ufeff \t\r\n").startswith("<"):
+        if is_xml(source):
             return None
         if _MENAGERIE_NAME.fullmatch(source) and not Path(source).exists():
             source = model_path(source)

@@ -15,7 +15,6 @@ from rich.pretty import pretty_repr
 from rich.table import Table
 
 from ksim_rl.files.writing import whole_file
-from ksim_rl.physics import load_model, load_spec
 from ksim_rl.physics.capacity import probe
 from ksim_rl.physics.load import Source
 from ksim_rl.scene.actuators import PositionActuator
@@ -25,7 +24,10 @@ from ksim_rl.scene.rendering.visualizer import visible_groups
 from ksim_rl.scene.robots.anatomy import Anatomy, dissect, posed, rounded
 from ksim_rl.scene.robots.edit import Site
 from ksim_rl.scene.robots.legged_robot import ModelRobot
+from ksim_rl.scene.robots.passive import passive_joints
 from ksim_rl.scene.robots.stance import find_stance, on_plane, stand
+from ksim_rl.scene.robots.starting_poses import StartingPose, starting_poses
+from ksim_rl.scene.robots.strangers_model import StrangersModel, read_model
 from ksim_rl.scene.state.joint_control import joint_control
 
 FREQUENCY, DAMPING_RATIO = 10.0, 2.0
@@ -36,6 +38,8 @@ SOFTEST, MOST_SAG = 0.25, 0.1
 """rad: from which error on a servo may saturate whatever its armature, and what the load in the stance may bend it."""
 LEAST_SCALE, MOST_SCALE = 0.15, 0.5
 """rad per unit action: stiff servos saturate within less than a step, soft ones only beyond what legs can do."""
+MOST_EFFORT = 1000.0
+"""Times weight and height of the centre of mass: where a file says more, its author meant that nothing limits it."""
 TRIAL_S, TRIALS, STIFFER = 5.0, 6, 1.5
 """The legs' stiffness is multiplied until the robot stands that long and straight, so often at most."""
 GRAVITY = 9.81
@@ -76,7 +80,9 @@ class RobotAnalysis:
         ankle_stiffness_ratio: of all ankles about y, over m g h; a biped needs more than 1 to stand without a policy.
         knee_sag: rad, the most that a pitch joint gives way.
         stands_s, drift: s until it falls with zero actions in MuJoCo's C engine (at most 5), and m that it moves.
-        notes: what was assumed.
+        pose: the keyframe that the stance was found from, or "qpos0".
+        passive_joints: those without a motor, in the model and in what is proposed.
+        notes: what was assumed, changed or left out.
     """
 
     robot: ModelRobot
@@ -93,11 +99,13 @@ class RobotAnalysis:
     drift: float
     njmax: int
     nconmax: int
+    pose: str
+    passive_joints: tuple[str, ...]
     notes: tuple[str, ...]
 
     def by_joint(self, pitch: float, legs: float, others: float) -> dict[str, float]:
         """Return a value by joint pattern: for the legs' joints that turn about y, their others, and all others."""
-        values = dict.fromkeys(self.robot.joint_names, others) | dict.fromkeys(self.leg_joints, legs)
+        values = dict.fromkeys(self.robot.default_joint_pos, others) | dict.fromkeys(self.leg_joints, legs)
         return {re.escape(j): pitch if j in self.pitch_joints else value for j, value in values.items()}
 
     def table(self) -> str:
@@ -107,7 +115,8 @@ class RobotAnalysis:
         lines = [
             f"{robot.name}: {self.mass:.2f} kg, {self.height:.2f} m, root {robot.root_body}",
             f"feet: {', '.join(self.foot_bodies)}",
-            f"stance: root {robot.init_pos[2]:.3f} m, centre of mass {self.com_height:.3f} m over the soles{ankles}",
+            f"stance from {self.pose}: root {robot.init_pos[2]:.3f} m, centre of mass {self.com_height:.3f} m over the "
+            f"soles{ankles}",
             f"zero actions: stands {self.stands_s:g} s, moves {self.drift:.3f} m, knees sag {self.knee_sag:.3f} rad",
             f"collisions: {len(robot.collision_geoms)} geoms, njmax={self.njmax}, nconmax={self.nconmax}",
             *(f"note: {note}" for note in self.notes),
@@ -151,30 +160,58 @@ TASK = velocity.VelocityTask.for_robot({name})
             picture.save(temporary)
 
 
-def analyse(source: Source) -> RobotAnalysis:
+def analyse(source: Source, *, pose: str | None = None) -> RobotAnalysis:
     """Analyse a legged robot from what `physics.load_spec` takes: a file, a menagerie name, XML or a spec.
+
+    Keyframes and the model's own pose, "qpos0", are tried in this order, but for those in which the robot lies; the
+    first from which it stands is taken, or else that from which it stands longest. `pose` names the one to take.
 
     Gains follow from armature and `FREQUENCY`, for motors and position servos alike: a `PositionActuator` is a torque
     motor under PD control. They are raised where the load would bend a joint by more than `MOST_SAG`, to twice what
     keeps all that a joint carries from toppling over it, and in the legs until the robot stands.
     """
-    spec = load_spec(source)
-    mj_model = load_model(spec)
-    given = mj_model.key_qpos[0] if mj_model.nkey else mj_model.qpos0
+    model = read_model(source)
+    found: list[RobotAnalysis] = []
+    refused: list[ValueError] = []
+    for start in starting_poses(model.mj_model, pose):
+        try:
+            found.append(_analyse_from(model, start))
+        except ValueError as error:
+            refused.append(error)
+            continue
+        if found[-1].stands_s >= TRIAL_S:
+            return found[-1]
+    if not found:
+        raise refused[0]
+    return max(found, key=lambda analysis: analysis.stands_s)
+
+
+def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
+    """Analyse a robot that stands upright in a pose."""
+    model, given = model.turned_upright(start.qpos)
+    mj_model = model.mj_model
     anatomy = dissect(mj_model, given)
     legs, biped = anatomy.legs, len(anatomy.legs) == 2
-    data = posed(mj_model, find_stance(mj_model, legs, given))
-    names = {j: mj_model.joint(j).name for j in scalar_joint_ids(mj_model)}
-    of_legs = list(dict.fromkeys(j for leg in legs for j in leg.joints))
+    passive = passive_joints(mj_model)
+    data = posed(mj_model, find_stance(mj_model, legs, given, passive=passive))
+    names = {j: mj_model.joint(j).name for j in scalar_joint_ids(mj_model) if j not in passive}
+    of_legs = [j for j in dict.fromkeys(j for leg in legs for j in leg.joints) if j in names]
     dof, com_height = mj_model.jnt_dofadr, float(data.subtree_com[0, 2])
+    if com_height <= 0.0:
+        raise ValueError(
+            f"in pose {start.name!r} the soles lie over the centre of mass: the robot does not stand in it"
+        )
     weight = float(mj_model.body_subtreemass[0]) * GRAVITY
     # What holds the pose while all feet carry the same weight.
     load, jacobian = data.qfrc_bias.copy(), np.zeros((3, mj_model.nv))
     for leg in legs:
         mujoco.mj_jac(mj_model, data, jacobian, None, leg.points(data).mean(0), data.body(leg.foot).id)
         load -= jacobian[2] * weight / len(legs)
-    given_drives = {j: _drive(mj_model, j) for j in names}
-    efforts = {j: limit or round(0.5 * weight * com_height, 1) for j, (_, _, limit) in given_drives.items()}
+    most = MOST_EFFORT * weight * com_height
+    given_drives = {j: _drive(mj_model, j, most=most) for j in names}
+    usual = 0.5 * weight * com_height
+    usual = round(usual, 1) if usual > 1.0 else _short(usual)
+    efforts = {j: limit or usual for j, (_, _, limit) in given_drives.items()}
     inertias = {j: _short(mj_model.dof_armature[dof[j]] or ARMATURE_PER_EFFORT * efforts[j]) for j in names}
     gains = {}
     for j in names:
@@ -184,10 +221,11 @@ def analyse(source: Source) -> RobotAnalysis:
         topples = share * mj_model.body_subtreemass[over] * GRAVITY * lever
         own = min(inertias[j] * (2.0 * math.pi * FREQUENCY) ** 2, efforts[j] / SOFTEST)
         gains[j] = max(own, abs(load[dof[j]]) / MOST_SAG, 2.0 * topples)
-    for alike in zip(*(leg.joints for leg in legs), strict=False):
-        gains |= dict.fromkeys(alike, max(gains[j] for j in alike))
+    for joints in zip(*(leg.joints for leg in legs), strict=False):
+        alike = [j for j in joints if j in gains]
+        gains |= dict.fromkeys(alike, max((gains[j] for j in alike), default=0.0))
 
-    pitch, trials = [list(leg.pitch_joints(data)) for leg in legs], []
+    pitch, trials = [[j for j in leg.pitch_joints(data) if j in names] for leg in legs], []
     while not trials or (trials[-1][:2] < (TRIAL_S, -1.5 * MOST_SAG) and len(trials) < TRIALS):
         stiffer = {j: STIFFER ** len(trials) if j in of_legs else 1.0 for j in names}
         servos = {}
@@ -195,7 +233,7 @@ def analyse(source: Source) -> RobotAnalysis:
             kp = _short(kp * stiffer[j])
             kd = _short(2.0 * DAMPING_RATIO * math.sqrt(kp * inertias[j]))
             servos[j] = {"stiffness": kp, "damping": kd, "effort_limit": efforts[j], "armature": inertias[j]}
-        robot = _robot(spec, source, data, anatomy, servos)
+        robot = _robot(model, data, anatomy, servos)
         mj_stand = on_plane(robot.spec())
         standing = stand(mj_stand, seconds=TRIAL_S)
         sag = max((abs(standing.sag[names[j]]) for joints in pitch for j in joints), default=0.0)
@@ -211,6 +249,10 @@ def analyse(source: Source) -> RobotAnalysis:
             names[j] for j in names if not mj_model.dof_armature[dof[j]]
         ],
     }
+    left_passive = tuple(mj_model.joint(j).name for j in passive)
+    notes = [f"no {what} is assumed: {', '.join(of)}" for what, of in assumed.items() if of]
+    if left_passive:
+        notes.append(f"no motor, and none is given: {', '.join(left_passive)}")
     njmax, nconmax = probe(mj_stand)
     return RobotAnalysis(
         robot=robot,
@@ -245,27 +287,20 @@ def analyse(source: Source) -> RobotAnalysis:
         drift=standing.drift,
         njmax=njmax,
         nconmax=nconmax,
-        notes=tuple(f"no {what} is assumed: {', '.join(of)}" for what, of in assumed.items() if of),
+        pose=start.name,
+        passive_joints=left_passive,
+        notes=(*notes, *model.notes),
     )
 
 
-def robot_name(source: Source, spec: mujoco.MjSpec | None = None) -> str:
-    """Return what a robot is called: its file without the suffix, or what the model calls itself."""
-    is_file = not isinstance(source, mujoco.MjSpec) and not str(source).lstrip().startswith("<")
-    stem = Path(source).stem if is_file else "scene"
-    called = (spec or load_spec(source)).modelname if stem == "scene" else stem
-    return re.sub(r"\W+", "_", called.lower()) or "robot"
-
-
 def _robot(
-    spec: mujoco.MjSpec,
-    source: Source,
-    data: mujoco.MjData,
-    anatomy: Anatomy,
-    servos: dict[int, dict[str, float]],
+    model: StrangersModel, data: mujoco.MjData, anatomy: Anatomy, servos: dict[int, dict[str, float]]
 ) -> ModelRobot:
     """Return the robot in the pose of `data` with servos by joint; what their hulls touch there is left to pass."""
     mj_model = data.model
+    every_joint = scalar_joint_ids(mj_model)
+    root_at = int(mj_model.jnt_qposadr[mj_model.jnt_type.argmin()])
+    w, x, y, z = (round(float(value), 6) + 0.0 for value in data.qpos[root_at + 3 : root_at + 7])
     alike: dict[tuple[float, ...], list[int]] = {}
     for j, servo in servos.items():
         alike.setdefault(tuple(servo.values()), []).append(j)
@@ -276,16 +311,21 @@ def _robot(
         foot = data.body(leg.foot)
         tread = (leg.points(data).mean(0) - foot.xpos) @ foot.xmat.reshape(3, 3)
         sites.append(Site(name=leg.foot, body=leg.foot, pos=rounded(tread)))
-    if not any(site.name == "imu" for site in spec.sites):
+    if not any(site.name == "imu" for site in model.spec.sites):
         sites.append(Site(name="imu", body=anatomy.root))
     robot = ModelRobot(
-        name=robot_name(source, spec),
-        model=_as_text(spec) if isinstance(source, mujoco.MjSpec) else str(source),
+        name=model.name,
+        model=model.source,
         root_body=anatomy.root,
         joint_names=tuple(names.values()),
         init_pos=(0.0, 0.0, round(float(data.body(anatomy.root).xpos[2]), 4)),
+        init_quat=(w, x, y, z),
         default_joint_pos=dict(
-            zip(names.values(), rounded(data.qpos[mj_model.jnt_qposadr[list(names)]]), strict=True)
+            zip(
+                (mj_model.joint(j).name for j in every_joint),
+                rounded(data.qpos[mj_model.jnt_qposadr[every_joint]]),
+                strict=True,
+            )
         ),
         action_scale={
             names[j]: round(
@@ -301,6 +341,8 @@ def _robot(
         foot_sites=tuple(leg.foot for leg in anatomy.legs),
         collision_geoms=(*anatomy.hulls, *soles),
         sites=tuple(sites),
+        free_root=model.frees_root,
+        root_turn=model.root_turn,
     )
     trial = robot.spec().compile()
     contacts = posed(trial, trial.key_qpos[0]).contact.geom
@@ -308,8 +350,13 @@ def _robot(
     return dataclasses.replace(robot, overlaps=tuple(sorted(touching)))
 
 
-def _drive(mj_model: mujoco.MjModel, joint: int) -> tuple[str, tuple[float, float], float | None]:
-    """Return what drives a joint in the model, its stiffness and damping, and the least of all limits of its effort."""
+def _drive(
+    mj_model: mujoco.MjModel, joint: int, *, most: float
+) -> tuple[str, tuple[float, float], float | None]:
+    """Return what drives a joint in the model, its stiffness and damping, and the least of all limits of its effort.
+
+    A limit above `most` is no limit.
+    """
     kind, gains, limits = "none", (0.0, 0.0), []
     if mj_model.jnt_actfrclimited[joint]:
         limits.append(np.abs(mj_model.jnt_actfrcrange[joint]).max())
@@ -326,16 +373,8 @@ def _drive(mj_model: mujoco.MjModel, joint: int) -> tuple[str, tuple[float, floa
             limits.append(
                 gear * np.abs(mj_model.actuator_gainprm[a, 0] * mj_model.actuator_ctrlrange[a]).max()
             )
-    return kind, gains, _short(min(limits)) if limits and min(limits) > 0.0 else None
-
-
-def _as_text(spec: mujoco.MjSpec) -> str:
-    """Return the spec as XML whose files are found from anywhere."""
-    spec = spec.copy()
-    spec.compile()
-    folder = Path(spec.modelfiledir or ".").resolve()
-    spec.meshdir, spec.texturedir = str(folder / spec.meshdir), str(folder / spec.texturedir)
-    return spec.to_xml()
+    limits = [limit for limit in limits if 0.0 < limit < most]
+    return kind, gains, _short(min(limits)) if limits else None
 
 
 def _short(number: float) -> float:

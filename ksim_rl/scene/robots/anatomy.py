@@ -10,8 +10,22 @@ from ksim_rl.scene.robots.edit import CollisionGeom, capsule, sphere
 
 SLAB = 0.01
 """m: what is so near to a foot's lowest point belongs to its sole."""
+RIDGE = 2 * SLAB
+"""m: a sole that is narrower has no room for two capsules."""
+MOST_LEVELLING, LEVELLING_STEP = 30, 2
+"""Degrees by which a foot may be tilted, and the step in which its sole is looked for."""
 LIMB = 0.15
 """Share of the robot's height from which on a limb is worth a hull."""
+NO_FREE_JOINT = (
+    "the model has 0 free joints: expected one, that of the robot's root body; where the file fixes a robot that walks "
+    "to the world, add <freejoint/> to its root body"
+)
+REACHES_GROUND = 0.08
+"""Share of the robot's height up to which an end of a chain counts as one at the ground."""
+ALIKE = 0.05
+"""Legs that are built alike differ by less than this share in mass and length."""
+ROUND = 0.1
+"""A wheel is round, and its axle in its middle, up to this share of its radius."""
 _HULL: dict[str, Any] = {"condim": 1, "priority": 1}
 
 
@@ -19,7 +33,7 @@ _HULL: dict[str, Any] = {"condim": 1, "priority": 1}
 class Leg:
     """The joints (model ids) from the root down to the body `foot`, and what that treads with.
 
-    That is a ball (one centre), or two capsules along the sole (their four ends): m in the foot's frame.
+    That is a ball (one centre), a capsule (its two ends), or two of them along the sole: m in the foot's frame.
     """
 
     foot: str
@@ -42,7 +56,7 @@ class Leg:
         name, foot = f"{self.foot}_sole", self.foot
         if len(self.centres_N3) == 1:
             return [sphere(name, foot, self.radius, rounded(self.centres_N3), priority=1)]
-        edges = (self.centres_N3[:2], self.centres_N3[2:])
+        edges = [self.centres_N3[first : first + 2] for first in range(0, len(self.centres_N3), 2)]
         return [
             capsule(f"{name}{n}", foot, self.radius, rounded(ends), priority=1)
             for n, ends in enumerate(edges, 1)
@@ -60,39 +74,42 @@ class Anatomy:
 
 
 def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
-    """Return the build of a robot that stands upright in `qpos`; its feet are the lowest of the ends of its chains."""
-    free = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    if len(free) != 1:
-        raise ValueError(
-            f"the model has {len(free)} free joints: expected one, that of the robot's root body"
-        )
-    root = int(mj_model.jnt_bodyid[free[0]])
+    """Return the build of a robot that stands upright in `qpos`; its feet are the lowest of the ends of its chains.
+
+    Ends of legs that are built like those of the feet are feet too, wherever the pose has them. A ValueError says what
+    is missing, or that a foot is a wheel.
+    """
+    root = _root_of(mj_model)
     # Bodies without joints are parts of the body that they are welded to.
     weld = mj_model.body_weldid
     moving = [b for b in range(root, mj_model.nbody) if weld[b] == b and mj_model.body_rootid[b] == root]
-    for kind, names in (
-        ("joint", {j: mj_model.joint(j).name for j in range(mj_model.njnt) if j != free[0]}),
-        ("body", {b: mj_model.body(b).name for b in moving}),
-    ):
-        for number, name in names.items():
-            if not name:
-                raise ValueError(f"{kind} {number} of the model has no name: give it one")
-    upright, flat = posed(mj_model, qpos), posed(mj_model, mj_model.qpos0)
+    upright = posed(mj_model, qpos)
     parts = {b: list(_points(mj_model, upright, b).values()) for b in moving}
     points = {b: np.concatenate(of_body) for b, of_body in parts.items() if of_body}
     if not points:
         raise ValueError("the model has no geoms: its feet cannot be found")
     heights = np.concatenate(list(points.values()))[:, 2]
     height, inner = float(np.ptp(heights)), {int(weld[mj_model.body_parentid[b]]) for b in moving}
-    feet = [
-        b
-        for b, of_body in points.items()
-        if b not in {root, *inner} and of_body[:, 2].min() < heights.min() + 0.08 * height
-    ]
-    if not feet:
+    ends = [b for b in points if b not in {root, *inner}]
+    lowest = [b for b in ends if points[b][:, 2].min() < heights.min() + REACHES_GROUND * height]
+    if not lowest:
         raise ValueError(
             "no chain of joints ends at the lowest point of the model: it has no feet to stand on"
         )
+    builds = {b: _build_of(mj_model, b, root) for b in ends}
+    feet = [b for b in ends if b in lowest or any(_alike(builds[b], builds[foot]) for foot in lowest)]
+    feet = list(dict.fromkeys(_foot_of(mj_model, points, toes, root) for toes in feet))
+    if len(feet) < 2:
+        raise ValueError(
+            f"only {mj_model.body(feet[0]).name!r} is at the ground: expected at least two feet, for a robot that walks"
+        )
+    for foot in feet:
+        if (axle := _axle(mj_model, foot)) is not None:
+            raise ValueError(
+                f"body {mj_model.body(foot).name!r} is a wheel, which turns about joint {axle!r}: velocity tasks are "
+                "of robots that walk on feet"
+            )
+    flat = posed(mj_model, _straight(mj_model, qpos))
     limbs = {
         b: (of_body - upright.xpos[b]) @ upright.xmat[b].reshape(3, 3)
         for b, of_body in points.items()
@@ -104,6 +121,92 @@ def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
         hulls=tuple(_hull(mj_model.body(b).name, of_body) for b, of_body in limbs.items()),
         height=height,
     )
+
+
+def _straight(mj_model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Return the pose with all joints at their references, and the root as it is in `qpos`."""
+    straight = mj_model.qpos0.copy()
+    first = int(mj_model.jnt_qposadr[mj_model.jnt_type.argmin()])
+    straight[first : first + 7] = qpos[first : first + 7]
+    return straight
+
+
+def _root_of(mj_model: mujoco.MjModel) -> int:
+    """Return the body with the only free joint."""
+    free = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    bodies = [mj_model.body(mj_model.jnt_bodyid[joint]).name for joint in free]
+    if len(free) == 1:
+        return int(mj_model.jnt_bodyid[free[0]])
+    if not bodies:
+        raise ValueError(NO_FREE_JOINT)
+    raise ValueError(
+        f"the model has {len(bodies)} free joints, of the bodies {', '.join(bodies)}: expected one, that of the "
+        "robot's root body; delete the others' bodies from a copy of the file"
+    )
+
+
+def _foot_of(mj_model: mujoco.MjModel, points: dict[int, np.ndarray], toes: int, root: int) -> int:
+    """Return the body that bears an end of a leg: where the body above toes treads too, that is the foot."""
+    above = int(mj_model.body_weldid[mj_model.body_parentid[toes]])
+    if above in (0, root) or above not in points:
+        return toes
+    treads = points[above][:, 2].min() < points[toes][:, 2].min() + SLAB
+    return above if treads else toes
+
+
+def _build_of(mj_model: mujoco.MjModel, end: int, root: int) -> np.ndarray:
+    """Return what tells kinds of chains apart, from the root to a body: joints, slides among them, m and kg."""
+    joints = _joints_above(mj_model, end, root)
+    body, length, mass = end, 0.0, 0.0
+    while body != root:
+        above = int(mj_model.body_parentid[body])
+        mass += float(mj_model.body_mass[body])
+        if above != root:  # where on the root a leg hangs says nothing of its build
+            length += float(np.linalg.norm(mj_model.body_pos[body]))
+        body = above
+    slides = int((mj_model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE).sum())
+    return np.array([len(joints), slides, length, mass])
+
+
+def _alike(build: np.ndarray, other: np.ndarray) -> bool:
+    counts_agree = bool((build[:2] == other[:2]).all())
+    return counts_agree and bool(np.allclose(build[2:], other[2:], rtol=ALIKE, atol=1e-6))
+
+
+def _axle(mj_model: mujoco.MjModel, body: int) -> str | None:
+    """Return the joint about which a body turns as a wheel, round about an axis without limits; None for a foot."""
+    last = int(mj_model.body_jntadr[body]) + int(mj_model.body_jntnum[body]) - 1
+    is_hinge = mj_model.jnt_type[last] == mujoco.mjtJoint.mjJNT_HINGE
+    if not is_hinge or mj_model.jnt_limited[last]:
+        return None
+    data = posed(mj_model, mj_model.qpos0)
+    points = np.concatenate(list(_points(mj_model, data, body).values())) - data.xanchor[last]
+    # Two axes across that of the joint.
+    across = np.linalg.svd(data.xaxis[last][None])[2][1:]
+    flat = points @ across.T
+    low, high = flat.min(0), flat.max(0)
+    radius = float((high - low).max() / 2)
+    is_centred = bool((np.abs(high + low) / 2 < ROUND * radius).all())
+    is_round = float((high - low).min() / 2) > (1.0 - ROUND) * radius
+    return mj_model.joint(last).name if is_centred and is_round else None
+
+
+def _joints_above(mj_model: mujoco.MjModel, body: int, root: int) -> list[int]:
+    """Return the joints from the root, without its own, down to a body."""
+    joints: list[int] = []
+    while body != root:
+        first = int(mj_model.body_jntadr[body])
+        count = int(mj_model.body_jntnum[body])
+        joints[:0] = range(first, first + count)
+        body = int(mj_model.body_weldid[mj_model.body_parentid[body]])
+    return joints
+
+
+def lowest_point(mj_model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """Return the height of the lowest point of all bodies that move, m."""
+    bodies = [b for b in range(mj_model.nbody) if mj_model.body_weldid[b] == b and b > 0]
+    lowest = [points[:, 2].min() for b in bodies for points in _points(mj_model, data, b).values()]
+    return float(min(lowest, default=0.0))
 
 
 def posed(mj_model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
@@ -120,27 +223,90 @@ def rounded(points: np.ndarray) -> tuple[float, ...]:
 
 
 def _leg(mj_model: mujoco.MjModel, data: mujoco.MjData, foot: int, root: int) -> Leg:
-    joints, body = [], foot
-    while body != root:
-        first = mj_model.body_jntadr[body]
-        joints[:0] = range(first, first + mj_model.body_jntnum[body])
-        body = int(mj_model.body_weldid[mj_model.body_parentid[body]])
     of_geoms = _points(mj_model, data, foot)
-    lowest = min(of_geoms, key=lambda g: of_geoms[g][:, 2].min())
     points = np.concatenate(list(of_geoms.values()))
-    sole = points[points[:, 2] < points[:, 2].min() + SLAB]
-    (x0, y0, z), (x1, y1, _) = sole.min(0), sole.max(0)
-    if mj_model.geom_type[lowest] == mujoco.mjtGeom.mjGEOM_SPHERE and mj_model.geom_size[lowest, 0] >= SLAB:
-        radius, centres = float(mj_model.geom_size[lowest, 0]), data.geom_xpos[lowest][None]
-    elif max(x1 - x0, y1 - y0) < 4 * SLAB:
-        radius = max(SLAB, float(x1 - x0 + y1 - y0) / 4)
-        centres = np.array([[(x0 + x1) / 2, (y0 + y1) / 2, z + radius]])
+    ground = float(points[:, 2].min())
+    treading = [g for g, of_geom in of_geoms.items() if of_geom[:, 2].min() < ground + SLAB]
+    lowest = min(of_geoms, key=lambda g: of_geoms[g][:, 2].min())
+    kind, radius = mj_model.geom_type[lowest], float(mj_model.geom_size[lowest, 0])
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE and radius >= SLAB:
+        centres = data.geom_xpos[lowest][None]
+    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE and radius >= SLAB and len(treading) == 1:
+        centres = _treading_ends(mj_model, data, lowest)
     else:
-        radius = round(min(1.5 * SLAB, float(min(x1 - x0, y1 - y0)) / 4), 4)
-        x0, x1, y0, y1, z = x0 + radius, x1 - radius, y0 + radius, y1 - radius, z + radius
-        centres = np.array([[x0, y0, z], [x1, y0, z], [x0, y1, z], [x1, y1, z]])
+        level = _levelling(points)
+        levelled = points @ level.T
+        centres, radius = _sole(levelled[levelled[:, 2] < levelled[:, 2].min() + SLAB])
+        centres = centres @ level
     local = (centres - data.xpos[foot]) @ data.xmat[foot].reshape(3, 3)
-    return Leg(foot=mj_model.body(foot).name, joints=tuple(joints), centres_N3=local, radius=radius)
+    joints = tuple(_joints_above(mj_model, foot, root))
+    return Leg(foot=mj_model.body(foot).name, joints=joints, centres_N3=local, radius=radius)
+
+
+def _treading_ends(mj_model: mujoco.MjModel, data: mujoco.MjData, capsule_id: int) -> np.ndarray:
+    """Return the centres of a capsule's two ends, or of the lower one where it does not lie: m, world frame, [N, 3]."""
+    half = data.geom_xmat[capsule_id].reshape(3, 3)[:, 2] * mj_model.geom_size[capsule_id, 1]
+    middle = data.geom_xpos[capsule_id]
+    ends = np.stack((middle - half, middle + half))
+    if abs(half[2]) * 2 < SLAB:
+        return ends
+    return ends[[ends[:, 2].argmin()]]
+
+
+def _levelling(points_N3: np.ndarray) -> np.ndarray:
+    """Return the rotation, of 30 degrees at most, that puts a foot on its largest face; none where it stands on one.
+
+    A foot whose ankle is not level in this pose shows its sole as an edge. The size of a face is that of the box about
+    what lies within a slab of it.
+    """
+    best, most = np.eye(3), 0.0
+    tilts = sorted(range(-MOST_LEVELLING, MOST_LEVELLING + 1, LEVELLING_STEP), key=abs)
+    if _has_face(points_N3):
+        return best
+    for pitch in tilts:
+        for roll in tilts:
+            turn = _about(1, np.radians(pitch)) @ _about(0, np.radians(roll))
+            turned = points_N3 @ turn.T
+            sole = turned[turned[:, 2] < turned[:, 2].min() + SLAB / 2]
+            area = float(np.prod(np.ptp(sole[:, :2], axis=0)))
+            # By a tenth, since of two tilts that differ by less the smaller one is meant.
+            if area > 1.1 * most:
+                best, most = turn, area
+    return best
+
+
+def _has_face(points_N3: np.ndarray) -> bool:
+    sole = points_N3[points_N3[:, 2] < points_N3[:, 2].min() + SLAB]
+    return float(np.ptp(sole[:, :2], axis=0).min()) >= RIDGE
+
+
+def _about(axis: int, angle: float) -> np.ndarray:
+    """Return the rotation matrix about a world axis."""
+    quat, matrix = np.zeros(4), np.zeros(9)
+    mujoco.mju_axisAngle2Quat(quat, np.eye(3)[axis], angle)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
+def _sole(points_N3: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the centres and the radius, m, of what treads in place of a sole with these lowest points, world frame."""
+    x0, y0, z = points_N3.min(0)
+    x1, y1, _ = points_N3.max(0)
+    length, width = x1 - x0, y1 - y0
+    middle_x, middle_y = (x0 + x1) / 2, (y0 + y1) / 2
+    if max(length, width) < 4 * SLAB:
+        radius = max(SLAB, float(length + width) / 4)
+        return np.array([[middle_x, middle_y, z + radius]]), radius
+    if min(length, width) < RIDGE:
+        # A ridge: one capsule along it, since the edges of such a sole lie on each other.
+        radius = SLAB
+        z = z + radius
+        if length > width:
+            return np.array([[x0 + radius, middle_y, z], [x1 - radius, middle_y, z]]), radius
+        return np.array([[middle_x, y0 + radius, z], [middle_x, y1 - radius, z]]), radius
+    radius = round(min(1.5 * SLAB, float(min(length, width)) / 4), 4)
+    x0, x1, y0, y1, z = x0 + radius, x1 - radius, y0 + radius, y1 - radius, z + radius
+    return np.array([[x0, y0, z], [x1, y0, z], [x0, y1, z], [x1, y1, z]]), radius
 
 
 def _hull(body: str, points_N3: np.ndarray) -> CollisionGeom:
@@ -158,7 +324,10 @@ def _hull(body: str, points_N3: np.ndarray) -> CollisionGeom:
 def _points(mj_model: mujoco.MjModel, data: mujoco.MjData, body: int) -> dict[int, np.ndarray]:
     """Return vertices of meshes, or corners of boxes about geoms, by geoms welded to a body (all, if none collides)."""
     geoms = np.flatnonzero(mj_model.body_weldid[mj_model.geom_bodyid] == body)
-    collide = [g for g in geoms if mj_model.geom_contype[g] or mj_model.geom_conaffinity[g]]
+    paired = {*mj_model.pair_geom1.tolist(), *mj_model.pair_geom2.tolist()}
+    collide = [
+        g for g in geoms if mj_model.geom_contype[g] or mj_model.geom_conaffinity[g] or int(g) in paired
+    ]
     found = {}
     for g in collide or geoms:
         centre, half = mj_model.geom_aabb[g].reshape(2, 3)

@@ -1,18 +1,22 @@
 """This module edits a robot's `MjSpec`: one general function per kind, fed with the tables of the robot's own file."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from ksim_rl.checks import check_known
 from ksim_rl.physics.load import caught_warnings
-from ksim_rl.scene.names import SCALAR_JOINTS, match_names
+from ksim_rl.scene.actuators.actuator import Actuator
+from ksim_rl.scene.actuators.joint_drives import driven_joints
+from ksim_rl.scene.names import SCALAR_JOINTS, TO_JOINTS, match_names
 from ksim_rl.scene.state.joint_control import control_of_spec
 
 Vector = tuple[float, ...]
+BALL_AT_REST = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,22 +139,59 @@ def reset_options(spec: mujoco.MjSpec) -> None:
     spec.option = mujoco.MjSpec().option
 
 
-def clear_joint_losses(spec: mujoco.MjSpec) -> None:
-    """Take damping and dry friction from every joint with one degree of freedom."""
-    for joint in _single_dof_joints(spec):
-        joint.damping = [0.0, 0.0, 0.0]
-        joint.frictionloss = 0.0
+def clear_joint_losses(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
+    """Take damping and dry friction from every joint that an actuator drives; those of passive joints stay."""
+    joints = {joint.name: joint for joint in _single_dof_joints(spec)}
+    for _, names in driven_joints(actuators, list(joints)):
+        for name in names:
+            joints[name].damping = [0.0, 0.0, 0.0]
+            joints[name].frictionloss = 0.0
+
+
+def drop_other_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
+    """Delete the model's actuators that none of `actuators` replaces: of tendons, sites, bodies and other joints."""
+    joints = [joint.name for joint in _single_dof_joints(spec)]
+    replaced = {name for _, names in driven_joints(actuators, joints) for name in names}
+    for actuator in list(spec.actuators):
+        if actuator.trntype not in TO_JOINTS or actuator.target not in replaced:
+            drop_references(spec, mujoco.mjtObj.mjOBJ_ACTUATOR, {actuator.name})
+            spec.delete(actuator)
+
+
+def drop_references(spec: mujoco.MjSpec, kind: mujoco.mjtObj, names: Collection[str]) -> None:
+    """Delete the sensors of elements that go, and the custom tuples that name them."""
+    for sensor in list(spec.sensors):
+        if (sensor.objtype == kind and sensor.objname in names) or (
+            sensor.reftype == kind and sensor.refname in names
+        ):
+            spec.delete(sensor)
+    for entry in list(spec.tuples):
+        named = zip(entry.objtype, entry.objname, strict=True)
+        if any(objtype == kind and objname in names for objtype, objname in named):
+            spec.delete(entry)
 
 
 def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom]) -> None:
-    """Delete all geoms that can collide and add `geoms`; visual geoms, masses and inertias of all bodies stay."""
+    """Delete all geoms that can collide and add `geoms`; visual geoms, masses and inertias of all bodies stay.
+
+    What a tendon wraps around stays too, and collides no more. Explicit pairs of geoms are contacts of the old ones,
+    and go with them, as sensors of the old ones do.
+    """
     bodies = {body.name: body for body in spec.bodies}
     for geom in geoms:
         check_known("body", geom.body, bodies)
-    deleted = [geom for geom in spec.geoms if geom.contype or geom.conaffinity]
-    _keep_inertia(spec, [geom.parent for geom in deleted])
-    for geom in deleted:
-        spec.delete(geom)
+    colliding = [geom for geom in spec.geoms if geom.contype or geom.conaffinity]
+    _keep_inertia(spec, [geom.parent for geom in colliding])
+    for pair in list(spec.pairs):
+        spec.delete(pair)
+    wrapped = _wrapped_geoms(spec)
+    deleted = {geom.name for geom in colliding if geom.name not in wrapped}
+    drop_references(spec, mujoco.mjtObj.mjOBJ_GEOM, deleted - {""})
+    for geom in colliding:
+        if geom.name in wrapped:
+            geom.contype = geom.conaffinity = 0
+        else:
+            spec.delete(geom)
     for geom in geoms:
         # Each attribute is written: the body's default class may hold others.
         attributes = {name: value for name, value in vars(geom).items() if name not in ("body", "fromto")}
@@ -158,6 +199,12 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
         placed = bodies[geom.body].add_geom(contype=1, conaffinity=1, mass=0.0, **attributes)
         if geom.fromto is not None:
             placed.fromto = geom.fromto
+
+
+def _wrapped_geoms(spec: mujoco.MjSpec) -> set[str]:
+    """Return the names of geoms that tendons wrap around."""
+    around = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
+    return {path.target.name for tendon in spec.tendons for path in tendon.path if path.type in around}
 
 
 def _keep_inertia(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody]) -> None:
@@ -171,17 +218,36 @@ def _keep_inertia(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody]) -> None
     inferred = [all_inferred or (body in bodies and not body.explicitinertial) for body in present]
     if not any(inferred):
         return
-    twin = spec.copy()
-    # Fused bodies have no inertia of their own, and the compiler scales what is written here once more.
-    twin.compiler.fusestatic, twin.compiler.settotalmass = False, -1
-    with caught_warnings():
-        mj_model = twin.compile()
+    mj_model = compiled_bodies(spec)
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-    for body, is_inferred, twin_body in zip(present, inferred, list(twin.bodies)[1:], strict=True):
-        if is_inferred and mj_model.body_mass[twin_body.id] > 0.0:
-            body.explicitinertial, body.fullinertia = True, [math.nan] + [0.0] * 5
-            body.mass, body.inertia = mj_model.body_mass[twin_body.id], mj_model.body_inertia[twin_body.id]
-            body.ipos, body.iquat = mj_model.body_ipos[twin_body.id], mj_model.body_iquat[twin_body.id]
+    for number, (body, is_inferred) in enumerate(zip(present, inferred, strict=True), 1):
+        if is_inferred and mj_model.body_mass[number] > 0.0:
+            ipos, iquat = mj_model.body_ipos[number], mj_model.body_iquat[number]
+            write_inertia(body, mj_model, number, ipos=ipos, iquat=iquat)
+
+
+def compiled_bodies(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Return the compiled model of a spec with each of its bodies, in the spec's order, and the masses it writes."""
+    twin = spec.copy()
+    # Fused bodies have no inertia of their own, and the compiler scales what is written down from here once more.
+    twin.compiler.fusestatic = False
+    twin.compiler.settotalmass = -1
+    with caught_warnings():
+        return twin.compile()
+
+
+def write_inertia(
+    body: mujoco.MjsBody, mj_model: mujoco.MjModel, number: int, *, ipos: np.ndarray, iquat: np.ndarray
+) -> None:
+    """Write down a body's mass and principal inertia, those of body `number`; the axes lie at `ipos` (m), `iquat`."""
+    body.explicitinertial = True
+    body.mass = mj_model.body_mass[number]
+    body.inertia = mj_model.body_inertia[number]
+    # Either of these would be read instead.
+    body.fullinertia = [math.nan] + [0.0] * 5
+    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.ipos = ipos
+    body.iquat = iquat
 
 
 def replace_sensors(spec: mujoco.MjSpec, sensors: Iterable[Sensor]) -> None:
@@ -217,15 +283,23 @@ def set_keyframe(
 ) -> None:
     """Replace all keyframes by one: the root pose, `joint_pos`, and the controls of servos that hold those joints.
 
-    Needs a robot whose first joint is free and whose other joints all have one degree of freedom.
+    Needs a robot with one free joint, that of its root; balls stand as the model has them.
     """
     for key in list(spec.keys):
         spec.delete(key)
-    qpos = [*init_pos, *init_quat, *(joint_pos[joint.name] for joint in _single_dof_joints(spec))]
+    qpos: list[float] = []
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+            qpos += [*init_pos, *init_quat]
+        elif joint.type == mujoco.mjtJoint.mjJNT_BALL:
+            qpos += BALL_AT_REST
+        else:
+            qpos.append(joint_pos[joint.name])
     ctrl: list[float] = []
     for actuator in spec.actuators:
         control = control_of_spec(actuator)
-        holds = control.kind == "pos" and not control.refusal
+        drives_joint = actuator.trntype in TO_JOINTS and actuator.target in joint_pos
+        holds = drives_joint and control.kind == "pos" and not control.refusal
         ctrl.append(control.of(joint_pos[actuator.target]) if holds else 0.0)
     spec.add_key(name=name, qpos=qpos, ctrl=ctrl)
 

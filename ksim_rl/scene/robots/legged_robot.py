@@ -10,6 +10,7 @@ from ksim_rl.checked import Checked, Share
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.actuators import Actuator, set_actuators
 from ksim_rl.scene.robots import edit
+from ksim_rl.scene.robots.upright_root import UPRIGHT, free_root, name_all, turn_root
 
 
 class LeggedRobot(Protocol):
@@ -65,12 +66,13 @@ class MenagerieRobot(Checked):
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh, editable model of the robot alone, with keyframe `init_state`.
 
-        Options, actuators, collision geoms, sensors and keyframes are replaced, and the joints' own damping and
-        friction removed; bodies, joints and visual geoms stay.
+        Options, actuators, collision geoms, sensors and keyframes are replaced, and damping and friction of the driven
+        joints removed; bodies, passive joints and visual geoms stay.
         """
         spec = load_spec(self.model)
+        self._ready(spec)
         edit.reset_options(spec)
-        edit.clear_joint_losses(spec)
+        edit.clear_joint_losses(spec, self.actuators)
         set_actuators(spec, self.actuators)
         edit.replace_collision_geoms(spec, self.collision_geoms)
         edit.set_sites(spec, self.sites)
@@ -80,10 +82,18 @@ class MenagerieRobot(Checked):
         edit.exclude_contacts(spec, self.overlaps)
         return spec
 
+    def _ready(self, spec: mujoco.MjSpec) -> None:
+        """Ready the model's own spec for the robot's facts; models of the menagerie need nothing."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelRobot(MenagerieRobot):
-    """The same with all facts as fields, such as `analyse` proposes them; `model` is what `load_spec` takes."""
+    """The same with all facts as fields, such as `analyse` proposes them; `model` is what `load_spec` takes.
+
+    Bodies and joints without a name are called by kind and place, such as "body3". `free_root` frees a base that the
+    model fixes to the world, and `root_turn` (w, x, y, z) turns the frame of the root, see `turn_root`. The model's
+    own actuators are replaced as a whole; joints that `actuators` leave out are passive.
+    """
 
     name: str
     root_body: str
@@ -95,3 +105,13 @@ class ModelRobot(MenagerieRobot):
     sites: tuple[edit.Site, ...]
     imu: str = "imu"
     overlaps: tuple[tuple[str, str], ...] = ()
+    free_root: bool = False
+    root_turn: tuple[float, float, float, float] = UPRIGHT
+
+    def _ready(self, spec: mujoco.MjSpec) -> None:
+        name_all(spec)
+        if self.free_root:
+            free_root(spec, self.root_body)
+        if self.root_turn != UPRIGHT:
+            turn_root(spec, self.root_body, self.root_turn)
+        edit.drop_other_actuators(spec, self.actuators)

@@ -1,6 +1,7 @@
 """This module makes robots stand: it finds a pose with the centre of mass over the soles, and holds it in C."""
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -8,28 +9,43 @@ import numpy as np
 from mujoco import minimize
 
 from ksim_rl.physics import SimCfg
+from ksim_rl.scene.names import SCALAR_JOINTS
 from ksim_rl.scene.robots.anatomy import Leg, posed
 from ksim_rl.scene.terrains import PlaneTerrain
 
 SIM = SimCfg(timestep=0.005, integrator="implicitfast", solver="newton", iterations=10, ls_iterations=20)
 """The physics of the velocity tasks."""
+OTHER_CONSTRAINTS = (
+    mujoco.mjtDisableBit.mjDSBL_CONTACT
+    | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+)
 BEND = np.array([-0.4, 0.8, -0.4])
 """rad about y by which hip, knee and ankle of straight legs are bent at first."""
 
 
-def find_stance(mj_model: mujoco.MjModel, legs: Sequence[Leg], qpos: np.ndarray) -> np.ndarray:
+def find_stance(
+    mj_model: mujoco.MjModel, legs: Sequence[Leg], qpos: np.ndarray, *, passive: Collection[int] = ()
+) -> np.ndarray:
     """Return the pose near `qpos` in which all soles are flat on z = 0 with the centre of mass above their middle.
 
     Inverse kinematics: a least-squares problem in the root's height and the joints of the legs, inside 90 % of their
-    ranges. Straight legs are bent, with the knees forward on two legs; others keep their crouch.
+    ranges. Straight legs are bent, with the knees forward on two legs; others keep their crouch. Springs, which are
+    `passive` joints, keep their length; rods of closed chains move with the rest, and hold together.
     """
     data, root = posed(mj_model, qpos), int(mj_model.jnt_type.argmin())
     first = int(mj_model.jnt_qposadr[root])
-    joints = list(dict.fromkeys(joint for leg in legs for joint in leg.joints))
+    closed = _closed_chains(mj_model)
+    of_legs = dict.fromkeys(joint for leg in legs for joint in leg.joints)
+    rods = [joint for joint in passive if closed is not None and mj_model.jnt_stiffness[joint] == 0.0]
+    joints = [
+        joint for joint in of_legs if joint not in passive and int(mj_model.jnt_type[joint]) in SCALAR_JOINTS
+    ]
+    joints += [joint for joint in rods if joint not in joints]
     columns = [first + 2, *mj_model.jnt_qposadr[joints]]
     given = [leg.points(data).mean(0)[:2] for leg in legs]
     for leg in legs:
-        pitch = leg.pitch_joints(data)
+        pitch = {joint: sign for joint, sign in leg.pitch_joints(data).items() if joint in joints}
         angles = data.qpos[mj_model.jnt_qposadr[list(pitch)]]
         if len(pitch) > 1 and np.abs(angles).max() < 0.2:
             bend = BEND[: len(pitch)] * (1.0 if len(legs) == 2 else -1.0)
@@ -54,7 +70,10 @@ def find_stance(mj_model: mujoco.MjModel, legs: Sequence[Leg], qpos: np.ndarray)
             (middles - given - (middles - given).mean(0)).ravel() / 0.02,
             (x - wanted) / np.array([0.05, *[0.5] * len(joints)]),
         )
-        return np.concatenate(parts)
+        if closed is None:
+            return np.concatenate(parts)
+        mujoco.mj_fwdPosition(closed, data)
+        return np.concatenate((*parts, data.efc_pos[: data.ne] / 0.001))
 
     x, _ = minimize.least_squares(
         wanted[:, None],
@@ -64,6 +83,15 @@ def find_stance(mj_model: mujoco.MjModel, legs: Sequence[Leg], qpos: np.ndarray)
     )
     data.qpos[columns], data.qpos[first : first + 2] = x.ravel(), 0.0
     return data.qpos.copy()
+
+
+def _closed_chains(mj_model: mujoco.MjModel) -> mujoco.MjModel | None:
+    """Return a model whose only constraints are those that hold chains together, or None where there are none."""
+    if not mj_model.neq:
+        return None
+    closed = copy.copy(mj_model)
+    closed.opt.disableflags |= OTHER_CONSTRAINTS
+    return closed
 
 
 class Standing(NamedTuple):
@@ -89,12 +117,19 @@ def stand(mj_model: mujoco.MjModel, *, seconds: float = 5.0) -> Standing:
     """Hold the keyframe for some seconds in MuJoCo's C engine."""
     data = mujoco.MjData(mj_model)
     mujoco.mj_resetDataKeyframe(mj_model, data, 0)
-    body = mj_model.jnt_bodyid[mj_model.jnt_type.argmin()]
-    height, fallen = data.qpos[2], False
+    mujoco.mj_kinematics(mj_model, data)
+    root = int(mj_model.jnt_type.argmin())
+    body = int(mj_model.jnt_bodyid[root])
+    first = int(mj_model.jnt_qposadr[root])
+    start = data.qpos[first : first + 3].copy()
+    up = data.xmat[body, 6:].copy()  # in the body's frame, which need not stand upright itself
+    fallen = False
     while data.time < seconds and not fallen:
         mujoco.mj_step(mj_model, data)
-        fallen = data.qpos[2] < 0.6 * height or data.xmat[body, 8] < np.sqrt(0.5)
+        sinks = data.qpos[first + 2] < 0.6 * start[2]
+        fallen = sinks or data.xmat[body, 6:] @ up < np.sqrt(0.5)
     driven = mj_model.actuator_trnid[:, 0]
     off = data.ctrl - data.qpos[mj_model.jnt_qposadr[driven]]
     sag = {mj_model.joint(joint).name: float(of_joint) for joint, of_joint in zip(driven, off, strict=True)}
-    return Standing(round(float(min(data.time, seconds)), 2), sag, float(np.hypot(*data.qpos[:2])))
+    drift = float(np.hypot(*(data.qpos[first : first + 2] - start[:2])))
+    return Standing(round(float(min(data.time, seconds)), 2), sag, drift)

@@ -138,11 +138,18 @@ def test_motors_and_servos_are_told_apart_with_their_limits():
       <motor joint="left_hip" gear="20" ctrlrange="-2 3" ctrllimited="true"/>
       <position joint="left_knee" kp="50" kv="2" forcerange="-40 40"/>
       <velocity joint="left_ankle" kv="3"/>"""
-    joints = {joint.name: joint for joint in analyse(biped(actuators=actuators)).joints}
+    found = analyse(biped(actuators=actuators))
+    joints = {joint.name: joint for joint in found.joints}
     assert (joints["left_hip"].actuator, joints["left_hip"].effort_limit) == ("motor", 60.0)
     assert (joints["left_knee"].actuator, joints["left_knee"].effort_limit) == ("position", 40.0)
     assert joints["left_knee"].gains == (50.0, 2.0) and joints["left_ankle"].gains == (0.0, 3.0)
-    assert joints["left_ankle"].actuator == "velocity" and joints["right_ankle"].actuator == "none"
+    assert joints["left_ankle"].actuator == "velocity"
+    # What no actuator moves has no motor, and gets none.
+    assert set(found.passive_joints) == {
+        f"right_{joint}" for joint in ("hip_roll", "hip", "knee", "ankle", "ankle_roll")
+    } | {"left_hip_roll", "left_ankle_roll"}
+    assert set(found.robot.joint_names) == set(joints) == {"left_hip", "left_knee", "left_ankle"}
+    assert "no motor, and none is given: left_hip_roll" in found.table()
 
 
 def test_what_is_no_legged_robot_is_refused_with_what_it_lacks():
@@ -151,8 +158,6 @@ def test_what_is_no_legged_robot_is_refused_with_what_it_lacks():
     ball = "<mujoco><worldbody><body name='ball'><freejoint/><geom size='1'/></body></worldbody></mujoco>"
     with pytest.raises(ValueError, match="no feet to stand on"):
         analyse(ball)
-    with pytest.raises(ValueError, match="joint 1 of the model has no name"):
-        analyse(biped().replace('name="left_hip_roll"', ""))
 
 
 def test_the_code_builds_the_robot_that_was_proposed():

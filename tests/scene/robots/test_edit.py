@@ -37,10 +37,12 @@ def spec():
     return mujoco.MjSpec.from_string(ROBOT)
 
 
-def test_passive_joints_lose_damping_and_friction(spec):
-    edit.clear_joint_losses(spec)
+def test_driven_joints_lose_damping_and_friction_and_passive_ones_keep_them(spec):
+    spec.body("arm").add_joint(name="loose", type=mujoco.mjtJoint.mjJNT_HINGE, damping=[2.0, 0.0, 0.0])
+    edit.clear_joint_losses(spec, (PositionActuator(joints="arm_joint", stiffness=1.0),))
     model = spec.compile()
-    assert not model.dof_damping.any() and not model.dof_frictionloss.any()
+    assert model.dof_damping.tolist() == [0.0] * 7 + [2.0]
+    assert model.dof_frictionloss[6] == 0.0 < model.dof_frictionloss[7]
 
 
 def test_replaced_geoms_ignore_default_classes_and_keep_looks_and_mass(spec):
