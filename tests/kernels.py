@@ -103,6 +103,7 @@ TESTS = {
             "gpu/test_constraint_rows.py::test_all_numbers_of_lanes_and_places_in_the_pool_give_the_same_bits"
         )
     },
+    "physics/rows/idle_ties.py": {"still_ties": SINGLE_MODELS},
     "physics/rows/second_limits.py": {"add_second_limits": SINGLE_MODELS},
     "physics/rows/tie_weights.py": {"weigh_ties": SINGLE_MODELS},
     "physics/rows/contact_lists.py": {"__init__": EQUAL_WORLDS},

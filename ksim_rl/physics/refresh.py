@@ -57,6 +57,9 @@ class Refresh:
         if dynamics is not None:
             # It sums the momenta itself.
             self._warp_model.sensor_subtree_vel = False
+        # A model with sensors of them computes them with these, unless it has none computed.
+        reads_sensors = not int(mj_model.opt.disableflags) & mujoco.mjtDisableBit.mjDSBL_SENSOR
+        self._sensors_sum_momenta = reads_sensors and bool(self._warp_model.sensor_subtree_vel)
         self._transmit = self._transmissions(warp_model, sensor_type)
         self._actuators_act = not int(mj_model.opt.disableflags) & mujoco.mjtDisableBit.mjDSBL_ACTUATION
         objects = (*mj_model.sensor_objtype, *mj_model.sensor_reftype)
@@ -101,8 +104,7 @@ class Refresh:
         if self._transmit is not None:
             self._transmit()
             self._launch_actuator_velocities()
-        # A model with sensors of them computes them with these.
-        if sums_momenta and self._dynamics is None and not m.sensor_subtree_vel:
+        if sums_momenta and self._dynamics is None and not self._sensors_sum_momenta:
             mjw.subtree_vel(m, d)
         self._limits.read_state(in_refresh=True)
         mjw.sensor_pos(m, d)

@@ -19,6 +19,7 @@ from ksim_rl.physics.newton import solver as newton
 from ksim_rl.physics.refresh import Refresh
 from ksim_rl.physics.rows.constraint_rows import constraint_rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
+from ksim_rl.physics.rows.idle_ties import stilling_of_ties
 from ksim_rl.physics.rows.second_limits import adding_of_second_limits
 from ksim_rl.physics.rows.tie_weights import BODY_EQUALITIES, weighing_of_ties
 from ksim_rl.physics.sensors.contact_sensors import ContactReadings
@@ -206,6 +207,7 @@ def _mending(
     """Return what launches the corrections of MuJoCo Warp's rows and transmissions, or None where they are right."""
     of_rows = (
         weighing_of_ties(mj_model, warp_model, warp_data_E),
+        stilling_of_ties(mj_model, warp_model, warp_data_E),
         adding_of_second_limits(warp_model, warp_data_E, expanded),
     )
     launches = [launch for launch in of_rows if launch is not None]

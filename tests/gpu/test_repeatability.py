@@ -195,10 +195,10 @@ VARIED = """
     <body pos="0 0 0.56"><freejoint/><geom size="0.1" mass="1"/>
       <body name="tool" pos="0.1 0 0"><geom size="0.02"/></body></body>
     <body name="arm" pos="1 0 1"><joint name="a" axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/></body>
-    <body pos="2 0 1"><joint name="b" type="slide" axis="0 0 1"/><geom size="0.1"/></body>
+    <body name="lift" pos="2 0 1"><joint name="b" type="slide" axis="0 0 1"/><geom size="0.1"/></body>
   </worldbody>
   <tendon><fixed><joint joint="a" coef="1"/><joint joint="b" coef="-1"/></fixed></tendon>
-  <equality><connect body1="tool" body2="arm" anchor="0 0 0"/></equality>
+  <equality><connect body1="tool" body2="arm" anchor="0 0 0"/><weld body1="lift"/></equality>
 </mujoco>
 """
 

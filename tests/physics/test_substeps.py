@@ -10,6 +10,7 @@ import torch
 import warp as wp
 
 from ksim_rl.physics import SimCfg, World, load_model
+from tests.physics.beside_c import KERNELS, check, started
 from tests.physics.models import forwarded, sensor
 
 PENDULUM = """
@@ -71,6 +72,27 @@ def test_refreshed_sensors_are_those_of_the_c_engine():
             np.testing.assert_allclose(
                 world.sensordata_EL[row, columns], expected.sensordata[columns], atol=1e-5, err_msg=name
             )
+
+
+@pytest.mark.parametrize("kernels", ("ours", "our solver"))
+@pytest.mark.parametrize("flag", ("", '<flag sensor="disable"/>'))
+def test_momenta_of_subtrees_are_there_with_and_without_sensors(flag: str, kernels: str):
+    xml = f"""
+<mujoco>
+  <option>{flag}</option>
+  <worldbody><body name="b"><joint axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/></body></worldbody>
+  <sensor><subtreeangmom body="b"/></sensor>
+</mujoco>
+"""
+    world, mj_data, in_c = started(xml, KERNELS[kernels])
+    names = ("subtree_linvel", "subtree_angmom")
+    for name in names:
+        world.view(name)
+    world.refresh()
+    mujoco.mj_fwdPosition(in_c, mj_data)
+    mujoco.mj_fwdVelocity(in_c, mj_data)
+    mujoco.mj_subtreeVel(in_c, mj_data)
+    check(world, mj_data, names)
 
 
 def test_sensors_that_read_the_last_collision_pass_are_left_alone():

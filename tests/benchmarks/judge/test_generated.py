@@ -13,8 +13,6 @@ SEED, FEW, MANY = 0, 16, 64
 # Models that differ from C, each by something that is not mended yet.
 KNOWN = {
     1: "forces of rows that cancel each other",
-    8: "velocities of subtrees in a refresh after Runge-Kutta",
-    42: "forces on bodies that a tie of sites pulls, with the integrator discrete",
 }
 
 
