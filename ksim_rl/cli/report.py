@@ -11,6 +11,7 @@ from ksim_rl import envs, ranks
 from ksim_rl.cli.errors import interruption
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.diagnosis.diagnose import one_line
+from ksim_rl.export.lacks import say_lacks
 from ksim_rl.terminal import printable
 from ksim_rl.trainers import (
     Checkpoint,
@@ -51,7 +52,14 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
         )
     try:
         with compile_notice(progress.status), watched(cfg, progress.note) as hooks:
-            outcome = run(cfg, folder, progress=progress, hooks=hooks, resume_from=resume_from)
+            outcome = run(
+                cfg,
+                folder,
+                progress=progress,
+                hooks=hooks,
+                resume_from=resume_from,
+                before=lambda trainer: say_lacks(cfg, trainer.collector.env, progress.note),
+            )
     except KeyboardInterrupt as stopped:
         number = interruption(stopped)
         progress.note(f"{number.name}: {_what_is_saved(folder)}")

@@ -16,6 +16,7 @@ from ksim_rl.scene.actuators import (
 )
 from ksim_rl.scene.actuators.builtin import BuiltinActuator
 from ksim_rl.scene.actuators.joint_drives import driven_joints
+from ksim_rl.scene.state.joint_control import TargetKind
 from ksim_rl.transforms import ActionClip, ActionDelay, ActionLowPass, DelayCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, history_cfg
 from ksim_rl.transforms.low_pass import smoothing
@@ -174,7 +175,8 @@ def actuators(env: ManagerBasedRlEnv) -> list[Plain]:
             if actuator.is_explicit:
                 found.append(_law(actuator, joints, view))
                 explicit |= set(joints)
-    for kind in ("pos", "vel", "effort"):
+    kinds: tuple[TargetKind, ...] = ("pos", "vel", "effort")
+    for kind in kinds:
         joints = [
             n
             for spec in actions(env)
@@ -184,7 +186,7 @@ def actuators(env: ManagerBasedRlEnv) -> list[Plain]:
         ]
         if joints:
             plain = {"kind": "builtin", "takes": [kind], "numbers": {}, "delay": None}
-            found.append({"joints": joints, "actuators": [actuator_of(view, n) for n in joints], **plain})
+            found.append({"joints": joints, **plain, **_of_actuators(view, joints, kind)})
     return found
 
 
@@ -203,9 +205,24 @@ def _law(actuator: Actuator, joints: list[str], view: EnvView) -> Plain:
     # JSON has no infinity.
     numbers = {n: [min(value, 1e30)] * len(joints) for n, value in actuator.params.items()}
     found = {"kind": kind, "joints": joints, "takes": sorted(actuator.takes), "numbers": numbers}
-    return {**found, "actuators": [actuator_of(view, n) for n in joints], "delay": delay}
+    return {**found, **_of_actuators(view, joints, None), "delay": delay}
 
 
-def actuator_of(view: EnvView, joint: str) -> str:
-    """Return the name of a joint's only actuator."""
-    return view.resolver.names("actuator")[view.targets.motor(joint_names(view, None).index(joint))]
+def _of_actuators(view: EnvView, joints: Sequence[str], kind: TargetKind | None) -> Plain:
+    """Return the names of the actuators that take this kind of target, and the lines that make controls of targets.
+
+    Without a kind they are the motors of laws, one of each joint, whose controls are the laws' own.
+    """
+    every, names = joint_names(view, None), view.resolver.names("actuator")
+    found: Plain = {"actuators": [], "scale": [], "offset": []}
+    for joint in joints:
+        number = every.index(joint)
+        if kind is None:
+            actuator, scale, offset = view.targets.motor(number), 1.0, 0.0
+        else:
+            actuator, control = view.targets.driven(kind, number)
+            scale, offset = control.scale, control.offset
+        found["actuators"].append(names[actuator])
+        found["scale"].append(scale)
+        found["offset"].append(offset)
+    return found

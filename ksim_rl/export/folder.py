@@ -19,14 +19,20 @@ from ksim_rl.export.robot import write_robot
 from ksim_rl.files.writing import check_folder, check_own, whole_folder
 from ksim_rl.physics import prepare_spec
 from ksim_rl.runs import record
+from ksim_rl.scene.keyframes import add_joined
+from ksim_rl.scene.names import drives_scalar_joint
 from ksim_rl.scene.scene import build_spec
 from ksim_rl.scene.sensors import ContactSensor
+from ksim_rl.scene.state.default_state import default_data
+from ksim_rl.scene.state.joint_control import joint_control
 from ksim_rl.terminal import show
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, UNLIMITED_EPISODE_STEPS, build_env
 from ksim_rl.trainers.run_folder import Policy, policy_of
 
 STANDALONE = Path(__file__).parent / "standalone"
+PARTS = ("files", "signals", "network", "runner")
+"""The modules of `runner.py`, in this order."""
 TRACED, TRACED_STEPS = 4, 60
 FILES = (
     "policy.onnx",
@@ -134,7 +140,7 @@ def _fill(
     assert ours is not None  # the env of a config is ours
     groups: list[Any] = cfg.modules.observation_keys("actor")
     terms = {str(group): controls.observations(ours, [str(group)]) for group in groups}
-    meta = _metadata(ours, [term for of_group in terms.values() for term in of_group], note)
+    meta = metadata(ours, [term for of_group in terms.values() for term in of_group], note)
     columns = {
         group: [
             policy.Column(
@@ -162,6 +168,9 @@ def _fill(
     spec = build_spec(cfg.task.scene)
     cfg.task.sim.apply_to(spec)
     prepare_spec(spec, [])
+    if not len(spec.keys):
+        # What the env starts from without a keyframe: servos that hold the model's own pose.
+        add_joined(spec, "default", [default_data(ours.world.mj_model)])
     wanted = dict.fromkeys(by_joint.get(name, name) for name in asked)
     order = write_robot(spec, ours.world.mj_model, list(wanted), folder / "robot.xml")
     states = [dataclasses.asdict(state) for state in exported.states]
@@ -200,18 +209,19 @@ def _fill(
 
 def runner_source() -> str:
     """Return the text of `runner.py`: the modules of the folder `standalone` as one."""
-    files, signals, runner = (
-        (STANDALONE / f"{name}.py").read_text() for name in ("files", "signals", "runner")
-    )
+    *parts, runner = ((STANDALONE / f"{name}.py").read_text() for name in PARTS)
     doc, body = re.split(r'(?<=\n""")\n', runner, maxsplit=1)
-    inner = [re.sub(r'\A""".*?"""\n', "", text, flags=re.DOTALL) for text in (files, signals)]
+    inner = [re.sub(r'\A""".*?"""\n', "", text, flags=re.DOTALL) for text in parts]
     return doc + "\n" + re.sub(r"from ksim_rl[^\n]*\n", "", "\n\n".join([*inner, body]))
 
 
-def _metadata(
+def metadata(
     ours: ManagerBasedRlEnv, terms: list[dict[str, Any]], note: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Return what the env is made of; rewards, metrics and terminations without a description are left out."""
+    """Return what the env is made of; rewards, metrics and terminations without a description are left out.
+
+    `terms` are those that the policy observes. Raises NotDescribedError, naming the term, for an action or actuator.
+    """
     cfg, view = ours.cfg, ours.view
     actions, laws = controls.actions(ours), controls.actuators(ours)
     asked = list(dict.fromkeys(n for action in actions if action["kind"] != "ctrl" for n in action["names"]))
@@ -287,8 +297,8 @@ def _gains(
     model, found = ours.world.mj_model, dict.fromkeys(names, (0.0, 0.0))
     for law in laws:
         for k, (joint, actuator) in enumerate(zip(law["joints"], law["actuators"], strict=True)):
-            of_model = model.actuator(actuator)
-            stiffness, damping = float(-of_model.biasprm[1]), float(-of_model.biasprm[2])
+            control = joint_control(model, model.actuator(actuator).id)
+            stiffness, damping = control.stiffness, control.damping
             if "stiffness" in law["numbers"] and law["kind"] != "builtin":
                 stiffness, damping = (law["numbers"][name][k] for name in ("stiffness", "damping"))
             found[joint] = (stiffness, damping)
@@ -296,15 +306,19 @@ def _gains(
 
 
 def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> dict[str, Any]:
-    """Return soft limits of position, and the model's limits of effort, by joint; null where there is none."""
+    """Return soft limits of position, and of effort at the joint, behind the gear; null where there is none."""
     model, limits = (
         ours.world.mj_model,
         ours.view.joints(list(names)).soft_limits_L2.tolist() if names else [],
     )
-    effort = {}
+    effort: dict[str, float] = {}
     for i in range(model.nu):
-        if model.actuator_trntype[i] == 0 and model.actuator_forcelimited[i]:
-            effort[model.joint(int(model.actuator_trnid[i, 0])).name] = float(model.actuator_forcerange[i, 1])
+        if not drives_scalar_joint(model, i) or not model.actuator_forcelimited[i]:
+            continue
+        joint = int(model.actuator_trnid[i, 0])
+        effort[model.joint(joint).name] = float(
+            abs(model.actuator_gear[i, 0]) * model.actuator_forcerange[i, 1]
+        )
     finite = [[None if not np.isfinite(edge) else edge for edge in pair] for pair in limits]
     return {"position": finite, "effort": [effort.get(name) for name in names]}
 

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ksim_rl.envs import ManagerBasedRlEnv
+from ksim_rl.export.robot import activation_order
 from ksim_rl.export.standalone.files import CHOICE, FIELDS
 from ksim_rl.scene.sensors import ContactSensor
 
@@ -59,9 +60,7 @@ class Recording:
                 for self._now in range(steps):
                     if traces:
                         obs = torch.cat([current[group] for group in groups], -1)
-                        self._keep(
-                            "trace", {"obs": obs, "qpos": ours.world.qpos_EL, "qvel": ours.world.qvel_EL}
-                        )
+                        self._keep("trace", {"obs": obs, **self._state(order)})
                     stepped = env.step(actor(current.copy()))
                     self._add(stepped["next", "done"][:, 0])
                     if traces:
@@ -98,9 +97,19 @@ class Recording:
         for name, value in values.items():
             self._seen.setdefault(f"{kind}/{name}", []).append(value.detach().float().cpu().numpy().copy())
 
+    def _state(self, order: Sequence[int]) -> dict[str, Tensor]:
+        """Return what a step begins from, actuators in `order`."""
+        world = self._ours.world
+        found = {"qpos": world.qpos_EL, "qvel": world.qvel_EL}
+        if world.mj_model.na:
+            found["act"] = world.act_EL[:, activation_order(world.mj_model, order)]
+        return found
+
     def _start(self, order: Sequence[int], params: Sequence[str]) -> Arrays:
         view, world = self._ours.view, self._ours.world
-        found = {"qpos": world.qpos_EL, "qvel": world.qvel_EL}
+        found = self._state(order) | {"ctrl": world.ctrl_EL[:, list(order)]}
+        if world.mj_model.nmocap:
+            found |= {name: world.view(name) for name in ("mocap_pos", "mocap_quat")}
         by_joint = {"encoder_bias": view.encoder_bias_EL, "default_pos": view.default_joint_pos_EL}
         by_joint |= {f"actuator/{name}": view.actuator_param(name).clamp(max=1e30) for name in params}
         found |= {name: value[:, self._columns] for name, value in by_joint.items()}

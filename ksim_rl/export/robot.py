@@ -12,6 +12,8 @@ from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 
 EXACT = ("gainprm", "biasprm", "dynprm", "ctrlrange", "forcerange", "actrange")
 
+EXACT_OF_KEYS = ("qpos", "qvel", "act", "ctrl", "mpos", "mquat")
+
 
 def write_robot(spec: mujoco.MjSpec, mj_model: mujoco.MjModel, first: Sequence[str], path: Path) -> list[int]:
     """Write a spec that compiles to `mj_model`, and return its actuators' old ids in their new order.
@@ -35,15 +37,28 @@ def write_robot(spec: mujoco.MjSpec, mj_model: mujoco.MjModel, first: Sequence[s
                     values = getattr(mj_model, f"actuator_{field}")[i]
                     entries[i].set(field, " ".join(repr(float(value)) for value in values))
             section.append(entries[i])
-    for key in root.iter("key"):
+    for number, key in enumerate(root.iter("key")):
+        for field in EXACT_OF_KEYS:
+            if mj_model.nkey and key.get(field):
+                values = getattr(mj_model, f"key_{field}")[number].ravel()
+                key.set(field, " ".join(repr(float(value)) for value in values))
         if controls := key.get("ctrl"):
             key.set("ctrl", " ".join(np.array(controls.split())[order]))
-        if mj_model.na and key.get("act") and order != sorted(order):
-            raise ValueError("the keyframe's activations stand in another order: leave `act` out of it")
+        if activations := key.get("act"):
+            key.set("act", " ".join(np.array(activations.split())[activation_order(mj_model, order)]))
     _bring_files(root, Path(spec.modelfiledir), path.parent)
     ElementTree.indent(root)
     path.write_text(ElementTree.tostring(root, encoding="unicode") + "\n")
     return order
+
+
+def activation_order(mj_model: mujoco.MjModel, order: Sequence[int]) -> list[int]:
+    """Return the old places of activations in their new order, for actuators in theirs."""
+    found: list[int] = []
+    for actuator in order:
+        first = int(mj_model.actuator_actadr[actuator])
+        found += range(first, first + int(mj_model.actuator_actnum[actuator]))
+    return found
 
 
 def _bring_files(root: ElementTree.Element, source: Path, folder: Path) -> None:

@@ -113,6 +113,7 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     for name, placement in cfg.placements.items():
         placement.move(entities[name])
     for entity in entities.values():
+        _name_actuators(entity)
         complete_keyframes(entity)
     spec = _joined(entities) if len(entities) > 1 else next(iter(entities.values()))
     if cfg.terrain is not None:
@@ -120,6 +121,21 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     for name, sensor in cfg.sensors.items():
         sensor.add_to(spec, name)
     return spec
+
+
+def _name_actuators(spec: mujoco.MjSpec) -> None:
+    """Name actuators that a file leaves without a name as what they drive, so that terms and exports can name them."""
+    taken = {actuator.name for actuator in spec.actuators}
+    for number, actuator in enumerate(spec.actuators):
+        if actuator.name:
+            continue
+        name = actuator.target
+        if not name or name in taken:
+            name = f"actuator{number}"
+        while name in taken:
+            name += "_"
+        actuator.name = name
+        taken.add(name)
 
 
 def _joined(entities: Mapping[str, mujoco.MjSpec]) -> mujoco.MjSpec:

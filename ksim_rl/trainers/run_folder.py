@@ -55,12 +55,14 @@ def run(
     progress: RunProgress,
     hooks: Sequence[Hook] = (),
     resume_from: checkpoint.Checkpoint | None = None,
+    before: Callable[[Trainer], None] | None = None,
 ) -> Outcome:
     """Train, and leave in `run_folder` its record, config, metrics, checkpoints, evaluation, curves and a video.
 
-    What cannot be drawn (no OpenGL) is said in one line of `progress`. Raises ValueError when another process writes
-    the folder, the checkpoint to resume or start from belongs to another config, or memory does not suffice; OSError
-    when the folder is deleted or moved meanwhile, or the end cannot be saved.
+    What cannot be drawn (no OpenGL) is said in one line of `progress`. `before` is called when all is built. Raises
+    ValueError when another process writes the folder, the checkpoint to resume or start from belongs to another
+    config, or memory does not suffice; OSError when the folder is deleted or moved meanwhile, or the end cannot be
+    saved.
     """
     ranks.check_same({**cfg.to_tree(), "device": cfg.resolved_device().type}, what="config")
     # The graphs that the first iterations record take memory as well. Several ranks cannot try on their own.
@@ -79,20 +81,28 @@ def run(
     run_folder.mkdir(parents=True, exist_ok=True)
     try:
         with locked(run_folder, note=progress.note), threads_that_fail(progress.note), explained:
-            return _run_locked(cfg, run_folder, progress, make)
+            return _run_locked(cfg, run_folder, progress, make, before)
     except BaseException:
         with suppress(OSError):
             run_folder.rmdir()  # only where nothing is in it yet
         raise
 
 
-def _run_locked(cfg: RunCfg, run_folder: Path, progress: RunProgress, make: Callable[[], Trainer]) -> Outcome:
+def _run_locked(
+    cfg: RunCfg,
+    run_folder: Path,
+    progress: RunProgress,
+    make: Callable[[], Trainer],
+    before: Callable[[Trainer], None] | None,
+) -> Outcome:
     for note in loading_notes(cfg.to_tree()):
         progress.note(note)
     for folder in (run_folder, run_folder / "checkpoint"):
         checkpoint.remove_leftovers(folder)
     with progress.busy("building envs and networks"):
         trainer = make()
+    if before is not None:
+        before(trainer)
     write_whole(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
     trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
     with recorded(run_folder, note=progress.note) as ended:

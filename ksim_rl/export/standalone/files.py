@@ -134,10 +134,9 @@ def check_record(
 
     A model's field is one of `FIELDS`, of finite numbers and the model's own shape.
     """
-    joints, shapes = (
-        len(meta["joints"]["names"]),
-        {"qpos": (mj_model.nq,), "qvel": (mj_model.nv,), "gravity": (3,)},
-    )
+    joints = len(meta["joints"]["names"])
+    shapes = {"qpos": (mj_model.nq,), "qvel": (mj_model.nv,), "ctrl": (mj_model.nu,), "act": (mj_model.na,)}
+    shapes |= {"mocap_pos": (mj_model.nmocap, 3), "mocap_quat": (mj_model.nmocap, 4), "gravity": (3,)}
     shapes |= {"encoder_bias": (joints,), "default_pos": (joints,)}
     if "start/qpos" not in record or record["start/qpos"].ndim != 2 or not len(record["start/qpos"]):
         raise ValueError(f"{path}: no 'start/qpos' of [episodes, {mj_model.nq}] numbers")

@@ -21,48 +21,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, check_record, read, read_arrays
+from ksim_rl.export.standalone.files import Array, check_record, read_arrays
+from ksim_rl.export.standalone.network import Policy
 from ksim_rl.export.standalone.signals import INTEGRATORS, Lag, Noise, Signals
 
 RECORD = "episodes.npz"
 KINDS = ("pos", "vel", "effort")
-
-
-class Policy:
-    """The policy in `policy.onnx`, with what it carries from step to step."""
-
-    def __init__(self, folder: Path, meta: dict[str, Any]) -> None:
-        import onnxruntime
-
-        data = read(folder / "policy.onnx")
-        if b"\x0a\x08location" in data:
-            raise ValueError(
-                f"{folder / 'policy.onnx'}: weights outside of the file: expected all of them in it"
-            )
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        self.session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-        self.specs = meta["policy"]["states"]
-        self.states: list[Array] = []
-        self.outputs = ["actions", *(spec["output"] for spec in self.specs)]
-
-    def reset(self) -> None:
-        """Forget the episode."""
-        self.states = []
-
-    def __call__(self, obs: Array) -> Array:
-        """Return the action [A] for the newest frame [L]."""
-        frame = np.asarray(obs, np.float32)[None]
-        if not self.states:
-            self.states = [
-                np.zeros((1, *spec["shape"]), np.float32)
-                if spec["starts_with"] == "zeros"
-                else np.repeat(frame[:, None, slice(*spec["columns"])], spec["shape"][0], 1)
-                for spec in self.specs
-            ]
-        feed = {"obs": frame} | {s["input"]: v for s, v in zip(self.specs, self.states, strict=True)}
-        actions, *self.states = (np.asarray(value) for value in self.session.run(self.outputs, feed))
-        return actions[0].astype(np.float64)
+STATE = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
 
 
 class Runner(Signals):
@@ -177,6 +142,8 @@ class Runner(Signals):
         self.numbers = getattr(self, "numbers", []) + [(names, numbers)]
         lag = Lag(spec["delay"], self) if spec["delay"] else None
         self.lags += [lag] if lag else []
+        # Exports of before 0.2.0 say nothing of these: there all servos were plain.
+        scale, offset = np.asarray(spec.get("scale", 1.0)), np.asarray(spec.get("offset", 0.0))
 
         def law() -> None:
             target = {key: np.array([self.targets[key][n] for n in names]) for key in KINDS}
@@ -184,7 +151,7 @@ class Runner(Signals):
                 late = lag(np.concatenate([target[key] for key in takes]))
                 target |= dict(zip(takes, np.split(late, len(takes)), strict=True))
             if kind == "builtin":
-                self.data.ctrl[ctrl] = target[takes[0]]
+                self.data.ctrl[ctrl] = target[takes[0]] * scale + offset
                 return
             now, moves = self.data.qpos[pos], self.data.qvel[vel]
             effort = target["effort"] + numbers["stiffness"] * (target["pos"] - now)
@@ -224,7 +191,7 @@ class Runner(Signals):
 
     def _apply(self, name: str, value: Array) -> None:
         kind, _, field = name.partition("/")
-        if kind in ("qpos", "qvel"):
+        if kind in STATE:
             getattr(self.data, kind)[:] = value
         elif kind == "gravity":
             self.model.opt.gravity[:] = value
@@ -343,7 +310,9 @@ class Runner(Signals):
         for delay in self.lags:
             delay.lag = min(max(lag, int(delay.spec["min"])), delay.most)
         for t in range(len(trace["done"])):
-            self.data.qpos[:], self.data.qvel[:] = trace["qpos"][t], trace["qvel"][t]
+            for name in STATE:
+                if name in trace:
+                    getattr(self.data, name)[:] = trace[name][t]
             self.refresh()
             frame = self.observe() if t else self.frame
             action = self.policy(trace["obs"][t] if trace["obs"].shape[1] == len(frame) else frame)

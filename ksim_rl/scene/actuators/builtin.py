@@ -62,7 +62,17 @@ class PositionActuator(BuiltinActuator, takes=frozenset({"pos"})):
         actuator.set_to_position(kp=self.stiffness, kv=self.damping)
         if self.effort_limit is not None:
             reach = self.effort_limit / self.stiffness
-            actuator.ctrlrange = [joint.range[0] - reach, joint.range[1] + reach]
+            low, high = _range(joint)
+            actuator.ctrlrange = [low - reach, high + reach]
+
+
+def _range(joint: mujoco.MjsJoint) -> tuple[float, float]:
+    """Return the range of a joint that is not compiled yet, rad or m."""
+    low, high = (float(edge) for edge in joint.range)
+    # MuJoCo turns degrees into radians as it compiles, and only angles of joints, not the controls of their servos.
+    if joint.compiler.degree and joint.type != mujoco.mjtJoint.mjJNT_SLIDE:
+        return math.radians(low), math.radians(high)
+    return low, high
 
 
 @dataclass(frozen=True, kw_only=True)

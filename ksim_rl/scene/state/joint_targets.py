@@ -44,7 +44,7 @@ ROUNDING = 1e-12
 _WORDS = {"pos": "a position", "vel": "a velocity", "effort": "an effort"}
 
 
-class _Driven(NamedTuple):
+class Driven(NamedTuple):
     """An actuator of a joint, and what its control means."""
 
     actuator: int
@@ -103,12 +103,12 @@ class JointTargets:
         self._routes: dict[tuple[TargetKind, tuple[str, ...]], _Route] = {}
 
         joint_of = {joint: number for number, joint in enumerate(scalar_joint_ids(model))}
-        self._actuators: dict[int, list[_Driven]] = {}
+        self._actuators: dict[int, list[Driven]] = {}
         for actuator in range(model.nu):
             if not drives_scalar_joint(model, actuator):
                 continue
             joint = joint_of[int(model.actuator_trnid[actuator, 0])]
-            driven = _Driven(actuator, joint_control(model, actuator))
+            driven = Driven(actuator, joint_control(model, actuator))
             self._actuators.setdefault(joint, []).append(driven)
         self._find_servos()
 
@@ -122,6 +122,22 @@ class JointTargets:
                 "call `set_actuators(spec, self.actuators)` in the robot's spec()"
             )
         return found[0].actuator
+
+    def driven(self, kind: TargetKind, joint: int) -> Driven:
+        """Return the actuator of a joint that takes this kind of target; a ValueError where no control means it."""
+        found = self._actuators.get(joint, [])
+        fitting = [driven for driven in found if driven.control.kind == kind]
+        if not fitting:
+            raise self._refusal(kind, joint, {driven.control.kind for driven in found})
+        chosen = fitting[0]
+        if chosen.control.refusal:
+            name = self._resolver.names("actuator")[chosen.actuator] or chosen.actuator
+            raise ValueError(
+                f"joint {self._resolver.names('joint')[joint]!r} is asked for {_WORDS[kind]}, but no control of "
+                f"actuator {name!r} means that: {chosen.control.refusal}; use ActuatorAction for its control, or give "
+                "the robot another actuator (`actuators`, such as IdealPDActuator)"
+            )
+        return chosen
 
     def leave_to_law(self, joints: Sequence[int], takes: Collection[TargetKind]) -> None:
         """Keep the targets of these joints away from the controls: a law reads them, and writes those itself."""
@@ -174,7 +190,7 @@ class JointTargets:
         num_joints = self.pos_EL.shape[1]
         addresses = self._world.mj_model.jnt_qposadr[scalar_joint_ids(self._world.mj_model)]
         beyond = {kind: np.zeros(num_joints) for kind in self._buffers}
-        servos: list[tuple[int, _Driven]] = []
+        servos: list[tuple[int, Driven]] = []
         other_ctrl_L = start.ctrl_L.copy()
         for joint, found in self._actuators.items():
             if joint in self._driven_by_law:
@@ -229,13 +245,9 @@ class JointTargets:
                 if kind not in self._driven_by_law[joint]:
                     raise self._refusal(kind, joint, self._driven_by_law[joint])
                 continue
-            found = self._actuators.get(joint, [])
-            fitting = [driven for driven in found if driven.control.kind == kind]
-            if not fitting:
-                raise self._refusal(kind, joint, {driven.control.kind for driven in found})
-            self._check_meaning(joint, fitting[0])
-            ctrl.append(fitting[0].actuator)
-            controls.append(fitting[0].control)
+            driven = self.driven(kind, joint)
+            ctrl.append(driven.actuator)
+            controls.append(driven.control)
             columns.append(column)
         model, device = self._world.mj_model, self._world.device
         limits_K2 = None
@@ -251,17 +263,6 @@ class JointTargets:
             line=self._line(controls),
             limits_K2=limits_K2,
         )
-
-    def _check_meaning(self, joint: int, driven: _Driven) -> None:
-        """Refuse an actuator whose control no target can be turned into, by a ValueError that names both."""
-        if driven.control.refusal:
-            joint_name = self._resolver.names("joint")[joint]
-            name = self._resolver.names("actuator")[driven.actuator] or driven.actuator
-            raise ValueError(
-                f"joint {joint_name!r} is asked for {_WORDS[driven.control.kind]}, but no control of actuator "
-                f"{name!r} means that: {driven.control.refusal}; use ActuatorAction for its control, or give the robot "
-                "another actuator (`actuators`, such as IdealPDActuator)"
-            )
 
     def _refusal(self, kind: TargetKind, joint: int, takes: Collection[TargetKind]) -> ValueError:
         name = self._resolver.names("joint")[joint]

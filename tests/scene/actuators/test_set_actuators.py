@@ -14,6 +14,7 @@ from ksim_rl.scene.actuators import (
     MotorActuator,
     PositionActuator,
     VelocityActuator,
+    set_actuators,
 )
 
 BODY = """
@@ -208,3 +209,17 @@ def test_the_servos_control_range_says_what_can_still_change_the_effort():
     data.ctrl[index] = 100.0
     mujoco.mj_forward(model, data)
     assert data.actuator_force[index] == 5.0, "the force is clamped, the target is not"
+
+
+@pytest.mark.parametrize("angle", ["degree", "radian"])
+def test_the_control_range_is_in_radians_and_metres_whatever_the_files_unit(angle):
+    edge = 90.0 if angle == "degree" else math.radians(90.0)
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><compiler angle="{angle}"/><worldbody><body><geom size="0.1"/>
+        <joint name="hinge" range="{-edge} {edge}"/><joint name="slide" type="slide" axis="1 0 0" range="-1 2"/>
+        </body></worldbody></mujoco>"""
+    )
+    servo = PositionActuator(joints=".*", stiffness=20.0, effort_limit=10.0)
+    set_actuators(spec, (servo,))
+    ranges = spec.compile().actuator_ctrlrange
+    np.testing.assert_allclose(ranges, [[-math.pi / 2 - 0.5, math.pi / 2 + 0.5], [-1.5, 2.5]])

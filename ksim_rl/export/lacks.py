@@ -1,0 +1,23 @@
+"""This module says before a training what an export of its policy will lack, when there is time to mend it."""
+
+from collections.abc import Callable
+
+from torchrl.envs import EnvBase
+
+from ksim_rl.envs import ManagerBasedRlEnv
+from ksim_rl.envs.contract import part
+from ksim_rl.export import controls
+from ksim_rl.export.folder import metadata
+from ksim_rl.trainers.run_cfg import RunCfg
+
+
+def say_lacks(cfg: RunCfg, env: EnvBase, note: Callable[[str], None]) -> None:
+    """Say in one line each what `export` will refuse or leave out of a policy that is trained in this env."""
+    ours = part(env, ManagerBasedRlEnv)
+    if ours is None:
+        return
+    groups = [str(group) for group in cfg.modules.observation_keys("actor")]
+    try:
+        metadata(ours, controls.observations(ours, groups), note)
+    except ValueError as error:
+        note(f"`ksim-rl export` will refuse this run: {error}")
