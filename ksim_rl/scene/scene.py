@@ -11,9 +11,9 @@ from ksim_rl.checked import Checked, Count, Filled, NonNegative, Share
 from ksim_rl.checks import near
 from ksim_rl.physics import load_model, load_spec
 from ksim_rl.scene.actuators import Actuator, set_actuators
-from ksim_rl.scene.keyframes import add_joined, complete_keyframes, move_keyframe
+from ksim_rl.scene.joining import joined
+from ksim_rl.scene.keyframes import complete_keyframes, move_keyframe
 from ksim_rl.scene.sensors import Sensor
-from ksim_rl.scene.state.default_state import default_data
 from ksim_rl.scene.terrains import Terrain
 
 
@@ -115,7 +115,7 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     for entity in entities.values():
         _name_actuators(entity)
         complete_keyframes(entity)
-    spec = _joined(entities) if len(entities) > 1 else next(iter(entities.values()))
+    spec = joined(entities) if len(entities) > 1 else next(iter(entities.values()))
     if cfg.terrain is not None:
         cfg.terrain.add_to(spec)
     for name, sensor in cfg.sensors.items():
@@ -136,23 +136,3 @@ def _name_actuators(spec: mujoco.MjSpec) -> None:
             name += "_"
         actuator.name = name
         taken.add(name)
-
-
-def _joined(entities: Mapping[str, mujoco.MjSpec]) -> mujoco.MjSpec:
-    """Put entities into one spec, with one keyframe that holds what the first one of each holds."""
-    spec = mujoco.MjSpec()
-    first = next(iter(entities.values()))
-    spec.option = first.option
-    starts: list[mujoco.MjData] = []
-    for name, entity in entities.items():
-        entity.option = first.option
-        starts.append(default_data(load_model(entity)))
-        # An attached keyframe would cover its own entity only.
-        for key in list(entity.keys):
-            entity.delete(key)
-        # The view knows whose a body is by the name of its outermost ancestor.
-        for number, body in enumerate(entity.worldbody.bodies):
-            body.name = body.name or f"body{number}"
-        spec.attach(entity, prefix=f"{name}/", frame=spec.worldbody.add_frame())
-    add_joined(spec, "default", starts)
-    return spec

@@ -207,3 +207,49 @@ def test_values_out_of_range_name_the_field(fields, message):
 def test_negative_friction_is_refused():
     with pytest.raises(ValueError, match=r"friction\[1\]=-0\.1"):
         PlaneTerrain(friction=(1.0, -0.1, 0.0))
+
+
+PENDULUM = """
+<mujoco><compiler {settings}/><option timestep="0.001"/>
+  <worldbody><geom name="post" size="0.05" contype="0" conaffinity="0"/>
+    <body name="a"><joint axis="0 1 0"/><geom size="0.1" pos="0.3 0 0" contype="0" conaffinity="0"/>
+      <body name="b" pos="0.5 0 0"><joint axis="0 1 0"/>
+        <geom type="box" size="0.1 0.2 0.3" pos="0.1 0 0" contype="0" conaffinity="0"/></body></body></worldbody>
+  <keyframe><key qpos="0.3 -0.7"/></keyframe></mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    "settings",
+    ['settotalmass="7"', 'boundmass="90"', 'boundinertia="3"', 'settotalmass="7" inertiafromgeom="true"'],
+)
+def test_a_part_weighs_beside_others_what_it_weighs_alone(settings):
+    text = PENDULUM.format(settings=settings)
+    alone = mujoco.MjModel.from_xml_string(text)
+    together = scene(robots={"cart": MjcfRobot(source=CART), "arm": MjcfRobot(source=text)})
+    together.opt.gravity = (0.0, 0.0, -9.81)
+    ids = [together.body(f"arm/{name}").id for name in "ab"]
+    np.testing.assert_allclose(together.body_mass[ids], alone.body_mass[1:], rtol=1e-12)
+    np.testing.assert_allclose(together.body_inertia[ids], alone.body_inertia[1:], rtol=1e-12)
+    data, own = mujoco.MjData(together), mujoco.MjData(alone)
+    mujoco.mj_resetDataKeyframe(together, data, 0)
+    mujoco.mj_resetDataKeyframe(alone, own, 0)
+    for _ in range(500):
+        mujoco.mj_step(together, data)
+        mujoco.mj_step(alone, own)
+    np.testing.assert_allclose(data.qpos[2:], own.qpos, rtol=1e-9)
+
+
+def test_a_field_that_a_joined_model_would_change_is_refused(monkeypatch):
+    attach = mujoco.MjSpec.attach
+
+    def attach_heavier(spec, entity, **places):
+        entity.body("cart").gravcomp = 0.5
+        return attach(spec, entity, **places)
+
+    monkeypatch.setattr(mujoco.MjSpec, "attach", attach_heavier)
+    robots = {name: MjcfRobot(source=CART) for name in ("left", "right")}
+    with pytest.raises(
+        ValueError, match=r"body_gravcomp of body number 1 of 'left' is 0.0 alone and 0.5 beside"
+    ):
+        scene(robots=robots)
