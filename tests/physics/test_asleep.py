@@ -40,3 +40,32 @@ def test_equalities_of_tendons_are_refused_where_trees_may_sleep(engine: Literal
 """
     with pytest.raises(ValueError, match="equality 'tie' ties tendons.*leave out one of the two"):
         World(mujoco.MjModel.from_xml_string(xml), num_envs=1, sim=SimCfg(engine=engine))
+
+
+@pytest.mark.parametrize("tolerance", ("1e-9", "0.05", "0.2"))
+def test_trees_fall_asleep_as_in_c(tolerance: str):
+    xml = f"""
+<mujoco>
+  <option timestep="0.004" sleep_tolerance="{tolerance}"><flag sleep="enable"/></option>
+  <worldbody>
+    <body><joint name="alone" axis="0 1 0" damping="0.03"/><geom type="capsule" size="0.03 0.1"/></body>
+    <body pos="1 0 0"><joint name="driven" axis="0 1 0" damping="0.3"/><geom type="capsule" size="0.03 0.1"/></body>
+  </worldbody>
+  <actuator><motor joint="driven"/></actuator>
+</mujoco>
+"""
+    mj_model = mujoco.MjModel.from_xml_string(xml)
+    mj_data = mujoco.MjData(mj_model)
+    mj_data.qvel[:] = 0.3
+    world = World(mj_model, num_envs=1)
+    world.qvel_EL.fill_(0.3)
+    asleep = []
+    for _ in range(20):
+        mujoco.mj_step(mj_model, mj_data, 5)
+        world.step(5)
+        expected = [float(speed) == 0.0 for speed in mj_data.qvel]
+        assert (world.qvel_EL[0] == 0.0).tolist() == expected
+        asleep.append(expected)
+    # What an actuator drives never sleeps, and the other tree does by the tolerance.
+    assert not any(driven for _, driven in asleep)
+    assert any(alone for alone, _ in asleep) == (tolerance != "1e-9")
