@@ -215,7 +215,9 @@ class PatchedGround(Ground):
         for name, field in self._fields.items():
             row = field[:, self._geom]
             mask = mask_E.view(-1, *[1] * (row.ndim - 1))
-            row.copy_(torch.where(mask, self._of_patch[name][patch_E], row))
+            # The engines lay a box out in two rows of three numbers, or in one of six.
+            of_patch = self._of_patch[name][patch_E].reshape(row.shape)
+            row.copy_(torch.where(mask, of_patch, row))
 
 
 def _geom_fields(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:

@@ -55,11 +55,13 @@ ROOM = SimCfg(njmax=120, nconmax=40)
 class GroundBench:
     """Worlds, their view and their ground; `mj_model(row)` is the C engine's model of one of them."""
 
-    def __init__(self, grid: TerrainGrid = GRID, num_envs: int = NUM_ENVS, things: str = THINGS) -> None:
+    def __init__(
+        self, grid: TerrainGrid = GRID, num_envs: int = NUM_ENVS, things: str = THINGS, sim: SimCfg = ROOM
+    ) -> None:
         spec = mujoco.MjSpec.from_string(things)
         grid.add_to(spec)
         self.world = World(
-            load_model(spec), num_envs=num_envs, sim=ROOM, per_world_fields=grid.per_world_fields
+            load_model(spec), num_envs=num_envs, sim=sim, per_world_fields=grid.per_world_fields
         )
         self.driver = EnvDriver(self.world, step_dt=0.02, max_episode_length=500)
         self.view = self.driver.view

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from ksim_rl.physics import SimCfg
 from ksim_rl.scene.terrains import Ground
 from tests.scene.terrains.ground_bench import (
     EDGE,
@@ -51,6 +52,14 @@ def test_model_fields_are_those_that_mujoco_compiles_for_the_height_field(bench,
         for name in FIELDS:
             ours = bench.world.field(name)[row, bench.geom].numpy().ravel()
             assert np.allclose(ours, getattr(mj_model, name)[bench.geom], atol=1e-5), (row, name)
+
+
+def test_the_c_engine_takes_the_same_fields(mj_models):
+    on_c = GroundBench(sim=SimCfg(engine="c"))
+    for row, mj_model in enumerate(mj_models):
+        for name in FIELDS:
+            ours = on_c.world.field(name)[row, on_c.geom].numpy().ravel()
+            assert np.allclose(ours, getattr(mj_model, name)[on_c.geom], atol=1e-5), (row, name)
 
 
 def test_heights_are_where_rays_of_the_c_engine_hit(bench, mj_models):
