@@ -49,8 +49,12 @@ def check_in_range(
     field: str, value: object, *, low: float | None = None, high: float | None = None, low_open: bool = False
 ) -> None:
     """Refuse a number that is not finite or lies outside `[low, high]` (`(low, high]` with `low_open`)."""
-    bounds = f"{'(' if low_open or low is None else '['}{'-inf' if low is None else low}, "
-    bounds += f"{'inf' if high is None else high}{')' if high is None else ']'}"
+    # As intervals are written: a bound that is not part of the interval has a round bracket.
+    start = "(-inf" if low is None else f"[{low}"
+    if low_open:
+        start = start.replace("[", "(")
+    end = "inf)" if high is None else f"{high}]"
+    bounds = f"{start}, {end}"
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f"{field}={value!r}: expected a number in {bounds}")
     # Not as a float, which would take a large int for its neighbour.

@@ -38,7 +38,8 @@ class SkrlWrapper(Wrapper):
         super().__init__(env)
         self._stepper = Stepper(env, list(dict.fromkeys((*keys, *state_keys))))
         names = {key: name for name, key in self._stepper.keys.items()}
-        self._observed, self._seen = ([names[key] for key in group] for group in (keys, state_keys))
+        self._observed = [names[key] for key in keys]
+        self._seen = [names[key] for key in state_keys]
         self._current: Observations = {}
         self._spaces = {
             name: space_of(env.full_observation_spec[key], batch_dims=self._stepper.batch_dims)

@@ -24,7 +24,11 @@ from ksim_rl.objectives import NonFiniteStepsError, StepGuard, anneal_learning_r
 
 def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[Tensor, " steps"]]:
     """Return what steps measured, each quantity as a tensor [steps]."""
-    return {name: torch.stack([step[name].detach() for step in steps]) for name in steps[0]}
+    columns = {}
+    for name in steps[0]:
+        measured = [step[name].detach() for step in steps]
+        columns[name] = torch.stack(measured)
+    return columns
 
 
 def public_objects(owner: Any) -> dict[str, Any]:

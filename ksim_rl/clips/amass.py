@@ -54,8 +54,13 @@ def read_amass(
     up, and the pelvis is there. `offsets` replaces those of joints from their parents, m: x left, y up, z ahead.
     """
     poses_FC, root_F3, fps = _read(path)
-    parents = [JOINTS.index(parent) if parent else -1 for _, parent, _ in _SKELETON]
-    offsets_N3 = height * np.array([offset for _, _, offset in _SKELETON])
+    parents = []
+    own_offsets = []
+    for _, parent, offset in _SKELETON:
+        # The pelvis hangs from nothing.
+        parents.append(JOINTS.index(parent) if parent else -1)
+        own_offsets.append(offset)
+    offsets_N3 = height * np.array(own_offsets)
     for name, offset_3 in (offsets or {}).items():
         if name not in JOINTS:
             raise refused(path, f"offsets: no joint {name!r}", f"one of {', '.join(JOINTS)}")

@@ -153,5 +153,9 @@ def _low_height(mj_model: mujoco.MjModel, qpos_FL: Array, soles: Sequence[str]) 
     for qpos in qpos_FL:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(mj_model, data)
-        lowest.append(min((data.site(n).xpos if n in sites else data.body(n).xpos)[2] for n in soles))
+        heights = []
+        for name in soles:
+            sole = data.site(name) if name in sites else data.body(name)
+            heights.append(sole.xpos[2])
+        lowest.append(min(heights))
     return float(np.percentile(lowest, 5.0))

@@ -260,9 +260,15 @@ class RolloutCollector:
     def _store(self, t: int, env_state_E: TensorDictBase) -> None:
         if not self._is_allocated:
             self._allocate(env_state_E)
-        held = [(leaf_TE[t], env_state_E.get(key, None)) for key, leaf_TE in self._leaves]
-        pairs = [(kept, value) for kept, value in held if value is not None]
-        copy_rows([kept for kept, _ in pairs], [value for _, value in pairs])
+        kept = []
+        values = []
+        for key, leaf_TE in self._leaves:
+            value = env_state_E.get(key, None)
+            if value is not None:
+                kept.append(leaf_TE[t])
+                values.append(value)
+        # One kernel copies all leaves.
+        copy_rows(kept, values)
 
     def _allocate(self, env_state_E: TensorDictBase) -> None:
         produced = list(env_state_E.keys(True, True))

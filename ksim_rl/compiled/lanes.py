@@ -60,7 +60,10 @@ class Work:
 
     def __post_init__(self) -> None:
         self.shape, self.body, elements = self.loop
-        self.texts = {name: {one.text for one in elements if one.name == name} for _, _, name, _ in elements}
+        # At which places an array is used, as C++ spells them.
+        self.texts: dict[str, set[str]] = {}
+        for element in elements:
+            self.texts.setdefault(element.name, set()).add(element.text)
 
     def shares(self, name: str, other: "Work") -> bool:
         """Whether both use an array at the same place in the same lane."""
@@ -80,8 +83,11 @@ class Work:
 
 def schedule(works: Sequence[Work], own: Sequence[Own]) -> dict[str, str]:
     """Give all works their levels, and return what kind of array each of `own` is."""
-    users = {one.name: [work for work in works if one.name in work.texts] for one in own}
-    kinds = {one.name: _LONE if one.size == 1 else SHARED for one in own}
+    users = {}
+    kinds = {}
+    for one in own:
+        users[one.name] = [work for work in works if one.name in work.texts]
+        kinds[one.name] = _LONE if one.size == 1 else SHARED
     for work in works:
         if prod(work.shape) > 1:
             kinds |= dict.fromkeys(work.written & kinds.keys(), SHARED)

@@ -77,7 +77,10 @@ class _Search:
     def __init__(self, parts: Mapping[str, Any], device: torch.device) -> None:
         self.found: dict[tuple[int, str], Held] = {}
         self._device = device
-        self._parts = {id(part.of if isinstance(part, Listed) else part) for part in parts.values()}
+        self._parts = set()
+        for part in parts.values():
+            owner = part.of if isinstance(part, Listed) else part
+            self._parts.add(id(owner))
         self._packages = packages_of(parts.values())
         self._seen: set[int] = set()
         self._reads_code = True

@@ -273,12 +273,16 @@ def _reduce(
     start, step, end = _REDUCTIONS[name]
     first = bool(cells.rows)
     kept = [k for k in range(first, source.ndim) if k not in dims]
-    names = dict(zip(kept, names_of(len(kept)), strict=True)) | {k: f"k{k}" for k in dims}
+    names = dict(zip(kept, names_of(len(kept)), strict=True))
+    # Where the result is: dims that are reduced have length 1 there, or are gone.
+    place = []
+    for k in range(first, source.ndim):
+        if k in kept:
+            place.append(names[k])
+        elif keeps:
+            place.append("0")
+    names |= {k: f"k{k}" for k in dims}
     names = dict(sorted(names.items()))
-    if keeps:
-        place = ["0" if k in dims else names[k] for k in names]
-    else:
-        place = [names[k] for k in kept]
     if name in ("any", "all"):
         ctype = "bool"
     else:

@@ -124,4 +124,9 @@ def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) 
     of_cpu = device.type == "cpu"
     load_one = partial(wp.force_load, warp_device(device), max_workers=0)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
-        list(pool.map(lambda found: load_one([found[0]], None if of_cpu else found[1]), modules))
+        waiting = []
+        for module, block_dim in modules:
+            # On the CPU a kernel is compiled for one thread whatever it is launched with.
+            waiting.append(pool.submit(load_one, [module], None if of_cpu else block_dim))
+        for one in waiting:
+            one.result()

@@ -74,7 +74,8 @@ class Operation:
         """Do it once more, in the same memory."""
         result = self.function(*self.args, **self.kwargs)
         if self.made:
-            again = [new for new in _tensors(result) if all(new is not old for old in self.written)]
+            written = {id(old) for old in self.written}
+            again = [new for new in _tensors(result) if id(new) not in written]
             for old, new in zip(self.made, again, strict=True):
                 old.copy_(new)
 

@@ -89,9 +89,14 @@ def read_run(folder: Path) -> Curves:
     return Curves(columns=_columns(found / METRICS), config=config if isinstance(config, Mapping) else {})
 
 
+def _number(text: str | None) -> float | None:
+    """Return the number in a cell of a table, and None for a cell that is empty."""
+    return float(text) if text else None
+
+
 def _columns(path: Path) -> dict[str, list[float | None]]:
     names, rows = read_table(path)
     try:
-        return {name: [float(text) if (text := row.get(name)) else None for row in rows] for name in names}
+        return {name: [_number(row.get(name)) for row in rows] for name in names}
     except ValueError as error:
         raise ValueError(f"{path}: damaged: {error}") from error

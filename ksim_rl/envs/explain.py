@@ -52,7 +52,9 @@ def explain(
             chain = _parameters(term_cfg, without=("term",))
             rows.append((name, str(shape), chain, _described(term_cfg.term)))
         # An image stands alone in its group; vectors are concatenated.
-        whole = widths[0] if len(widths) == 1 else (sum(shape[0] for shape in widths),)
+        whole = widths[0]
+        if len(widths) > 1:
+            whole = (sum(shape[0] for shape in widths),)
         show(f"observations/{group} {whole}", ("term", "shape", "chain", "parameters"), rows)
 
     rows = [(name, f"({action_sizes[name]},)", _described(term)) for name, term in cfg.actions.items()]

@@ -50,7 +50,10 @@ def let_none_keep_names() -> None:
     @functools.wraps(refine_names, assigned=("__name__", "__qualname__", "__doc__"))
     def keeping(self: TensorDictBase, *names: Any) -> TensorDictBase:
         if len(names) == self.batch_dims and Ellipsis not in names:
-            names = tuple(old if new is None else new for new, old in zip(names, self.names, strict=True))
+            refined = []
+            for new, old in zip(names, self.names, strict=True):
+                refined.append(old if new is None else new)
+            names = tuple(refined)
         return refine_names(self, *names)
 
     TensorDictBase.refine_names = keeping  # pyright: ignore[reportAttributeAccessIssue]

@@ -148,7 +148,10 @@ class Layers(nn.Sequential):
             out = features
         parts: list[Any] = list(self)
         weights = [part.weight for part in parts if isinstance(part, nn.Linear | EnsembleLinear)]
-        rounded = [own.mT[None] if alone else own for own in _rounded(weights)]
+        rounded = _rounded(weights)
+        if alone:
+            # As an ensemble of one network: inputs before outputs, networks in front.
+            rounded = [own.mT[None] for own in rounded]
         while parts:
             layer = parts.pop(0)
             if not isinstance(layer, nn.Linear | EnsembleLinear):

@@ -104,6 +104,14 @@ class NetworkCfg(Checked):
         check_choice("activation", self.activation, ACTIVATIONS)
 
 
+def _hashable(key: str | Sequence[str]) -> str | tuple[str, ...]:
+    """Return a key as a TensorDict has it: a text, or a tuple of two or more."""
+    if isinstance(key, str):
+        return key
+    parts = tuple(key)
+    return parts[0] if len(parts) == 1 else parts
+
+
 @dataclass(frozen=True, kw_only=True)
 class OnPolicyNetworkCfg(NetworkCfg):
     """The fields of networks that choose the observation groups they read, side by side; a list names a nested key."""
@@ -112,8 +120,7 @@ class OnPolicyNetworkCfg(NetworkCfg):
 
     def _check_fields(self) -> None:
         """Make the keys hashable, and refuse one that comes twice."""
-        names = [(key,) if isinstance(key, str) else tuple(key) for key in self.in_keys]
-        keys = tuple(parts[0] if len(parts) == 1 else parts for parts in names)
+        keys = tuple(_hashable(key) for key in self.in_keys)
         if len(set(keys)) < len(keys):
             raise ValueError(f"in_keys={keys!r}: each key can be read once")
         object.__setattr__(self, "in_keys", keys)

@@ -154,7 +154,9 @@ class RolloutEstimator(ValueEstimatorBase):
         places = [keys.value, *(("next", key) for key in signals)]
         read: list[Any] = [tensordict.get(place, None) for place in places]
         read[-1] = read[-2] if read[-1] is None else read[-1]
-        shapes = [None if signal is None else tuple(signal.shape) for signal in read]
+        shapes: list[tuple[int, ...] | None] = []
+        for signal in read:
+            shapes.append(None if signal is None else tuple(signal.shape))
         if None in shapes or len(set(shapes)) != 1:
             got = ", ".join(f"{place!r} {shape}" for place, shape in zip(places, shapes, strict=True))
             raise ValueError(

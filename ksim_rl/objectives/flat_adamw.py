@@ -68,7 +68,9 @@ class FlatAdamW(torch.optim.Optimizer):
 
         Returned are the norm of the gradient before clipping, and 1 if the step was skipped, else 0.
         """
-        gradients = [torch.zeros_like(own) if own.grad is None else own.grad for own in self._learning]
+        gradients = []
+        for own in self._learning:
+            gradients.append(torch.zeros_like(own) if own.grad is None else own.grad)
         changed = self._flat, *self._moments, self._steps, self._target
         given = self._pieces(gradients), loss.detach(), self.param_groups[0]["lr"]
         return self._change_(changed, *given, self._cfg)
@@ -85,7 +87,10 @@ def _change_(
     if cfg.max_grad_norm is not None:
         gradient = gradient * (cfg.max_grad_norm / (norm + 1e-6)).clamp_max(1.0)
     # 1 - beta^step loses most digits of float32 in the first steps; this does not.
-    unbias = [-torch.expm1((steps + 1.0) * (math.log(beta) if beta else -math.inf)) for beta in cfg.betas]
+    unbias = []
+    for beta in cfg.betas:
+        log_beta = math.log(beta) if beta else -math.inf
+        unbias.append(-torch.expm1((steps + 1.0) * log_beta))
     new_mean = mean.lerp(gradient, 1.0 - cfg.betas[0])
     new_variance = variance.lerp(gradient.square(), 1.0 - cfg.betas[1])
     change = new_mean / unbias[0] / ((new_variance / unbias[1]).sqrt() + cfg.adam_eps)

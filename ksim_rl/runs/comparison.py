@@ -48,8 +48,12 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
     ]
     rows.append(["best return", *(written(max(values, default=None), ".4g") for values in returns)])
     fields = dict.fromkeys(name for config in configs for name in config)
-    differing = [name for name in fields if len({config.get(name, "-") for config in configs}) > 1]
-    rows += [[name, *(config.get(name, "-") for config in configs)] for name in differing[:MOST_FIELDS]]
+    differing = []
+    for name in fields:
+        values = [config.get(name, "-") for config in configs]
+        if len(set(values)) > 1:
+            differing.append([name, *values])
+    rows += differing[:MOST_FIELDS]
     if len(differing) > MOST_FIELDS:
         rows.append([f"... and {len(differing) - MOST_FIELDS} more fields", *("" for _ in folders)])
     return rows
@@ -64,8 +68,12 @@ def draw(folders: Sequence[Path], picture: Path) -> None:
     for index, (title, metrics, over) in enumerate(PANELS):
         axes = figure.add_subplot(2, 2, index + 1)
         # Returns of evaluations and of training are not the same, and one evaluation is no curve.
-        curved = (m for m in metrics if all(len(numbers(rows, m)) > 1 for rows in tables))
-        metric = next(curved, metrics[-1])
+        metric = metrics[-1]
+        for candidate in metrics:
+            shortest = min(len(numbers(rows, candidate)) for rows in tables)
+            if shortest > 1:
+                metric = candidate
+                break
         for name, rows in zip(names(folders), tables, strict=True):
             points = [row for row in rows if numbers([row], over) and numbers([row], metric)]
             axes.plot(numbers(points, over), numbers(points, metric), label=printable(name), linewidth=1.6)

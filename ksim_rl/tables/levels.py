@@ -13,8 +13,12 @@ Point = Mapping[str, float]
 
 def means_of(points: Sequence[Point], names: Iterable[str]) -> dict[str, float]:
     """Return the means of metrics; one that a point lacks, as no episode ended then, counts in no mean."""
-    logged = {name: [point[name] for point in points if name in point] for name in names}
-    return {name: statistics.fmean(values) for name, values in logged.items() if values}
+    means = {}
+    for name in names:
+        values = [point[name] for point in points if name in point]
+        if values:
+            means[name] = statistics.fmean(values)
+    return means
 
 
 def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | None:
@@ -35,8 +39,12 @@ def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:
         return statistics.fmean(result["evaluation"]["return_mean"] for result in results)
     if row.measure == "success":
         return min(result["trials"]["success"] for result in results)
-    seconds = [result["seconds_to_levels"] for result in results]
-    middle = statistics.median(math.inf if value is None else value for value in seconds)
+    seconds = []
+    for result in results:
+        value = result["seconds_to_levels"]
+        # A seed that never came there is slower than all others.
+        seconds.append(math.inf if value is None else value)
+    middle = statistics.median(seconds)
     return middle if math.isfinite(middle) else None
 
 

@@ -118,7 +118,10 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
         raise KeyboardInterrupt
     names = ("env_states", "seconds", "episode/return", "episode/length", *row.levels)
     _, lines = read_table(run_folder / METRICS)
-    points = [{n: float(line[n]) for n in names if line.get(n)} for line in lines if line.get("seconds")]
+    points = []
+    for line in lines:
+        if line.get("seconds"):
+            points.append({name: float(line[name]) for name in names if line.get(name)})
     if row.levels:
         end = reached(points, row.levels)
     else:

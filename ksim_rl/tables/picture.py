@@ -16,8 +16,11 @@ OURS, OTHERS = "#3465a4", (("D", "#cc5500"), ("s", "#75507b"), ("^", "#4e9a06"),
 
 def draw(table: Table, rows: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -> None:
     """Draw one panel per group; `rows` has the results of those rows that are complete."""
-    groups = [(group, [n for n in names if n in rows]) for group, names in table.groups().items()]
-    groups = [(group, names) for group, names in groups if names]
+    groups = []
+    for group, names in table.groups().items():
+        complete = [name for name in names if name in rows]
+        if complete:
+            groups.append((group, complete))
     down = -(-len(groups) // 3)
     across = min(len(groups), 3)
     most = max(len(names) for _, names in groups)

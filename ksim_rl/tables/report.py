@@ -121,7 +121,8 @@ def _cells(row: Row, results: Results) -> list[str]:
         ours = f"{'not reached' if value is None else f'{value:.1f} s'}, {falls}"
     elif row.measure == "success" and value is not None:
         ours = f"{100 * value:.1f} % of trials succeed"
-    keys = "env_states", "seconds", "seconds_before"
-    states, seconds, before = (statistics.fmean(r[key] for r in results) for key in keys)
+    states = statistics.fmean(result["env_states"] for result in results)
+    seconds = statistics.fmean(result["seconds"] for result in results)
+    before = statistics.fmean(result["seconds_before"] for result in results)
     verdict = {True: "yes", False: "no", None: ""}[is_reached(row, results)]
     return [ours, str(len(results)), f"{states / 1e6:.1f} M", f"{seconds:.0f} + {before:.0f}", verdict]

@@ -113,7 +113,8 @@ DELAYED = _task(quadruped_velocity_delayed, "our quadruped", "with late actions"
 
 def _pose(moving: Mapping[str, tuple[float, float]]) -> velocity.PoseStd:
     """Return how far joints may stray: little while standing, else by pattern (while walking, while running)."""
-    walking, running = ({joints: pair[gait] for joints, pair in moving.items()} for gait in (0, 1))
+    walking = {joints: std for joints, (std, _) in moving.items()}
+    running = {joints: std for joints, (_, std) in moving.items()}
     return velocity.PoseStd(standing={".*": 0.05}, walking=walking, running=running)
 
 

@@ -124,5 +124,10 @@ def _differs(here: torch.device, there: torch.device | None) -> bool:
 
 def _place() -> str:
     """Return file:line of the innermost frames outside torch."""
-    frames = [f for f in traceback.extract_stack() if not any(part in f.filename for part in _INTERNAL)]
-    return " < ".join(f"{f.filename.rsplit('/', 1)[-1]}:{f.lineno}" for f in reversed(frames[-3:]))
+    places = []
+    for frame in traceback.extract_stack():
+        is_internal = any(part in frame.filename for part in _INTERNAL)
+        if not is_internal:
+            places.append(f"{frame.filename.rsplit('/', 1)[-1]}:{frame.lineno}")
+    innermost = places[-3:]
+    return " < ".join(reversed(innermost))

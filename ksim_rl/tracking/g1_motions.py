@@ -87,7 +87,11 @@ def walk() -> Choreography:
     for number in range(count):
         foot = number % 2
         last = number == count - 1
-        at[foot] = max(at) if last else max(at) + stride * (0.5 if number == 0 else 1.0)
+        # The first step is half as long, and the last one brings the feet together.
+        length = 0.5 * stride if number == 0 else stride
+        if last:
+            length = 0.0
+        at[foot] = max(at) + length
         start = begin_s + number * step_s
         swing_s = step_s - both_s
         moves.append(
@@ -189,11 +193,18 @@ def kick() -> Choreography:
     begin_s = 1.2
     arms: dict[str, list[tuple[float, float]]] = {name: [(0.6, 0.0)] for name in ("left", "right")}
     for foot in (1, 0):
-        out = [raise_s + (number + 0.5) * 2 * kick_s for number in range(2)]
-        back = [raise_s, *(raise_s + (number + 1) * 2 * kick_s for number in range(2))]
-        lift = sorted([(time, 0.22) for time in back] + [(time, 0.30) for time in out])
-        forward = sorted([(time, -0.12) for time in back] + [(time, 0.38) for time in out])
-        pitch = sorted([(time, 0.5) for time in back] + [(time, -0.5) for time in out])
+        # The foot is behind the hip at first, and is so again after each of two kicks.
+        lift = [(raise_s, 0.22)]
+        forward = [(raise_s, -0.12)]
+        pitch = [(raise_s, 0.5)]
+        swing = [(raise_s, 0.7)]
+        for number in range(2):
+            out_s = raise_s + (number + 0.5) * 2 * kick_s
+            back_s = raise_s + (number + 1) * 2 * kick_s
+            lift += [(out_s, 0.30), (back_s, 0.22)]
+            forward += [(out_s, 0.38), (back_s, -0.12)]
+            pitch += [(out_s, -0.5), (back_s, 0.5)]
+            swing += [(out_s, -0.7), (back_s, 0.7)]
         moves.append(
             FootMove(
                 foot=foot,
@@ -207,10 +218,7 @@ def kick() -> Choreography:
         )
         for side, sign in (("left", 1.0), ("right", -1.0)):
             toward = sign if foot == 1 else -sign
-            arms[side] += sorted(
-                [(begin_s + time, 0.7 * toward) for time in back]
-                + [(begin_s + time, -0.7 * toward) for time in out]
-            )
+            arms[side] += [(begin_s + time, angle * toward) for time, angle in swing]
             arms[side].append((begin_s + alone_s, 0.0))
         begin_s += alone_s + 1.0
     joints = _arms_out(0.2, begin_s, 0.3)

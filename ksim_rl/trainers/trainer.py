@@ -377,8 +377,7 @@ class Trainer:
         for name in targets:
             known = name in self.metrics or name.startswith("evaluation/")
             if not known and "episode/return" in self.metrics:
-                hint = near(name, self.metrics)
-                self._warn_once(name, f"stop_at names {name!r}, which no metric is called: {hint}")
+                self._warn_once(name, f"stop_at: {name!r} is no metric: {near(name, self.metrics)}")
 
     def _warn(self, losses: Sequence[str], metrics: Mapping[str, float], iteration: int) -> None:
         """Say what went wrong in this iteration, each kind once; the counts stay in the metrics."""
@@ -386,7 +385,8 @@ class Trainer:
         if (found := metrics.get("sum/non_finite_terms", 0.0)) > self._non_finite_terms:
             self._non_finite_terms = found
             terms = part(self.collector.env, EpisodeSums)
-            texts |= {line.split(":")[0]: line for line in (terms.non_finite_terms() if terms else ())}
+            for line in terms.non_finite_terms() if terms else ():
+                texts[line.split(":")[0]] = line
         for kind, text in texts.items():
             self._warn_once(kind, f"{text} (iteration {iteration}; said once)")
 

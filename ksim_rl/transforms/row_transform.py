@@ -90,7 +90,10 @@ class CheckedKeys(Transform):
             if is_floating:
                 self._check_floating(key, spec.dtype)
         # Of the TensorDict around each key: a nested one may have more than the env.
-        batch_dims = [(specs if isinstance(key, str) else specs[key[:-1]]).ndim for key in in_keys]
+        batch_dims = []
+        for key in in_keys:
+            around = specs if isinstance(key, str) else specs[key[:-1]]
+            batch_dims.append(around.ndim)
         if is_inverse:
             self.batch_dims_inv = batch_dims
         else:
@@ -196,7 +199,9 @@ class RowTransform(CheckedKeys, ABC):
     def clone(self) -> Self:
         """Copy with buffers of its own: TorchRL rebuilds parts of an env from clones and may run them."""
         copy = super().clone()
-        copy._buffers = {name: None if b is None else b.clone() for name, b in self._buffers.items()}
+        copy._buffers = {}
+        for name, buffer in self._buffers.items():
+            copy._buffers[name] = None if buffer is None else buffer.clone()
         return copy
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
@@ -361,7 +366,12 @@ def as_keys(keys: Keys) -> list[NestedKey]:
         listed: list[NestedKey] = [keys]
     else:
         listed = list(keys)
-    return [key[0] if isinstance(key, tuple) and len(key) == 1 else key for key in listed]
+    short = []
+    for key in listed:
+        # A key of one part is that part.
+        is_one = isinstance(key, tuple) and len(key) == 1
+        short.append(key[0] if is_one else key)
+    return short
 
 
 def checked_out_keys(

@@ -32,11 +32,10 @@ class Panel:
         self._status = gui.add_html("")
         self._error = gui.add_html("", visible=False)
         self._play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
-        self._play.on_click(lambda _: session.ask(lambda: session.play(not session.playing)))
+        self._play.on_click(lambda _: session.ask(session.toggle))
         runs = gui.add_button_group("Run", ("Step", "Reset"))
-        runs.on_click(
-            lambda event: session.ask(session.step_once if _value(event) == "Step" else session.reset)
-        )
+        calls = {"Step": session.step_once, "Reset": session.reset}
+        runs.on_click(lambda event: session.ask(calls[str(_value(event))]))
         self._speed = gui.add_button_group("Speed", tuple(_SPEED_NAMES))
         self._speed.on_click(lambda event: setattr(session, "speed", _SPEED_NAMES[str(_value(event))]))
         self._env = gui.add_number("Env", 0, min=0, max=session.ours.num_envs - 1, step=1)

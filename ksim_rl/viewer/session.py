@@ -159,6 +159,10 @@ class Session:
         self.trace = ""
         self._last = None
 
+    def toggle(self) -> None:
+        """Pause an env that plays, and let one go on that is paused."""
+        self.play(not self.playing)
+
     def step_once(self) -> None:
         """Pause, and do a single env step."""
         self.play(False)

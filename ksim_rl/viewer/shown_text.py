@@ -12,7 +12,10 @@ MOST_LETTERS = 20_000
 
 def as_html(text: str) -> str:
     """Return HTML that shows `text` as it stands, letter by letter; control characters become spaces."""
-    letters = [letter if letter == "\n" or letter.isprintable() else " " for letter in text[:MOST_LETTERS]]
+    letters = []
+    for letter in text[:MOST_LETTERS]:
+        is_shown = letter == "\n" or letter.isprintable()
+        letters.append(letter if is_shown else " ")
     return html.escape("".join(letters))
 
 

@@ -98,8 +98,9 @@ def fused_networks(
     layers = [*_layers(policy.trunk), head.loc], _layers(value.layers)
     activations = {type(part) for part in (*policy.trunk, *value.layers)} - {nn.Linear}
     if len(activations) != 1 or not activations <= {*ACTIVATIONS}:
-        names = [sorted(kind.__name__ for kind in kinds) for kinds in (activations, ACTIVATIONS)]
-        return f"the activations are {names[0]}, and not all one of {names[1]}"
+        present = sorted(kind.__name__ for kind in activations)
+        known = sorted(kind.__name__ for kind in ACTIVATIONS)
+        return f"the activations are {present}, and not all one of {known}"
     (activation,) = activations
     std: Any = {"std_A": head.std, "std_layer": head.std_layer, "log_std": head.std_type == "log"}
     return FusedNetworks(

@@ -70,8 +70,11 @@ class FusedNetworks:
         """All parameters, in the order of the flat form: of each layer weight and bias, of the actor then the std."""
         actor = [parameter for layer in self.actor for parameter in (layer.weight, layer.bias)]
         critic = [parameter for layer in self.critic for parameter in (layer.weight, layer.bias)]
-        layer = self.std_layer
-        std = [self.std_A] if self.std_A is not None else [layer.weight, layer.bias] if layer else []
+        std: list[Any] = []
+        if self.std_A is not None:
+            std = [self.std_A]
+        elif self.std_layer:
+            std = [self.std_layer.weight, self.std_layer.bias]
         return [*actor, *std, *critic]
 
     @property
@@ -116,7 +119,10 @@ class FusedLayout:
     def __init__(self, networks: FusedNetworks, *, chained: bool | None = None) -> None:
         self.chained = networks.chained if chained is None else chained
         pairs = zip(networks.actor[:-1], networks.critic[:-1], strict=True)
-        self.hidden = tuple(_multiple(max(layer.out_features for layer in pair)) for pair in pairs)
+        # Layers of actor and critic that lie side by side take the room of the wider one.
+        self.hidden = tuple(
+            _multiple(max(of_actor.out_features, of_critic.out_features)) for of_actor, of_critic in pairs
+        )
         self.actions = networks.actor[-1].out_features
         self.obs_dims = networks.actor[0].in_features, networks.critic[0].in_features
         self.stored = _multiple(max(*self.obs_dims, MIN_WIDTH))
@@ -218,10 +224,15 @@ class Tuning:
         if not layout.chained:
             return cls(block=64 if wide else 128, **wide)
         chunk = math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2])
-        lower, read = math.gcd(32 if wide else cls.lower, layout.hidden[0]), layout.head + layout.rest
+        lower = math.gcd(32 if wide else cls.lower, layout.hidden[0])
+        read = layout.head + layout.rest
         # Two programs of `lower_gradients` share a multiprocessor, where their sums fit into registers.
-        stages, warps = 3 if not wide and read <= 96 else 2, 4 if not wide and read <= 128 else 8
-        wide |= {"block": 32, "lower_depth": 16} if wide else {"depth": 32, "tile_stages": 6}
+        stages = 3 if not wide and read <= 96 else 2
+        warps = 4 if not wide and read <= 128 else 8
+        if wide:
+            wide |= {"block": 32, "lower_depth": 16}
+        else:
+            wide |= {"depth": 32, "tile_stages": 6}
         return cls(chunk=chunk, lower=lower, lower_stages=stages, lower_warps=warps, splits=16, **wide)
 
 
@@ -241,15 +252,19 @@ def why_not_fused(
             return f"{field}={getattr(cfg, field)!r}"
     if cfg.symmetry == "loss" and networks.squashed is not None:
         return "symmetry='loss', and the policy is squashed"
-    hidden = [[layer.out_features for layer in layers[:-1]] for layers in (networks.actor, networks.critic)]
-    if len(hidden[0]) != len(hidden[1]) or not hidden[0]:
-        return f"actor and critic have hidden layers of {hidden[0]} and {hidden[1]}, not one or more, and as many"
-    if max(map(max, hidden)) > MAX_WIDTH or networks.actor[-1].out_features > MAX_ACTIONS:
+    of_actor = [layer.out_features for layer in networks.actor[:-1]]
+    of_critic = [layer.out_features for layer in networks.critic[:-1]]
+    if len(of_actor) != len(of_critic) or not of_actor:
+        return (
+            f"actor and critic have hidden layers of {of_actor} and {of_critic}, not one or more, and as many"
+        )
+    widest = max(*of_actor, *of_critic)
+    if widest > MAX_WIDTH or networks.actor[-1].out_features > MAX_ACTIONS:
         return f"a hidden layer is wider than {MAX_WIDTH}, or there are more than {MAX_ACTIONS} actions"
     if cfg.precision == "float32":
         if torch.get_float32_matmul_precision() == "highest":
             return "precision='float32' with matmul_precision='highest', and the kernels multiply float32 as TF32"
-        if max(map(max, hidden)) > MAX_TF32_WIDTH:
+        if widest > MAX_TF32_WIDTH:
             return f"precision='float32', and a hidden layer is wider than {MAX_TF32_WIDTH}: torch is as fast there"
     layout = FusedLayout(networks)
     rows = num_env_states_per_minibatch * (1 if cfg.symmetry == "none" else 2)

@@ -72,7 +72,12 @@ class ObservationGroups(CheckedKeys):
                 raise ValueError(f"groups[{name!r}]={terms}: expected one or more distinct terms")
         every = list(dict.fromkeys(term for terms in self.groups.values() for term in terms))
         super().__init__(every, list(self.groups), is_paired=False)
-        self.drop = [] if drop is False else every if drop is True else as_keys(drop)
+        if drop is True:
+            self.drop = every
+        elif drop is False:
+            self.drop = []
+        else:
+            self.drop = as_keys(drop)
         self.group_specs: dict[NestedKey, GroupSpec] = {}
         # Groups whose terms are known to be vectors [E, L] already.
         self._concatenable: set[NestedKey] = set()

@@ -50,7 +50,9 @@ def _counterparts(word: str) -> list[str]:
     swapped += [a for a, b in _SIDES.items() if b == word.lower()]
     if word.isupper():
         return [other.upper() for other in swapped]
-    return [other.capitalize() for other in swapped] if word[0].isupper() else swapped
+    if word[0].isupper():
+        return [other.capitalize() for other in swapped]
+    return swapped
 
 
 def mirror_by_name(names: Sequence[str], each: MirrorMap | None = None) -> MirrorMap:
