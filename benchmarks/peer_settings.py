@@ -9,7 +9,7 @@ as TF32, so all three come twice: with products that are not cut (matmul_precisi
 Each run is a process of its own, `at_once` of them at a time, whose seconds are those of a run among so many. Other
 words are overrides of `ksim-rl train`; `variants=ours,discount` takes some of the variants. A level counts as reached
 where the table `velocity` says so. Figures and curves go to benchmarks/results/peer_settings.json, the picture beside
-it, and `python -m tests.docs.test_peer_settings` writes the table of docs/notes/go1.md.
+it, and `python -m benchmarks.pages` writes the table of docs/notes/go1.md.
 """
 
 from __future__ import annotations

@@ -1,79 +1,22 @@
 """The figures in README and docs/speed.md are those of benchmarks/results."""
 
 import json
-import math
-import statistics
 from typing import Any
 
 import pytest
 
-from benchmarks import determinism, report
+from benchmarks import report
 from tests.docs.guide import DOCS, REPOSITORY
 
 README = (REPOSITORY / "README.md").read_text()
 PAGE = (DOCS / "speed.md").read_text()
 GO1, G1 = "h200/go1_velocity_flat/4096/", "h200/g1_velocity_flat/4096/"
-ENV_STATES = {"env_step_ms": 4096, "physics_ms": 4096, "own_physics_ms": 4096}
-ROWS = {
-    "raw physics": "physics_ms",
-    "own substeps": "own_physics_ms",
-    "env step": "env_step_ms",
-    "rollout with policy": "rollout_ms",
-    "PPO update (": "update_ms",
-    "whole training iteration": "iteration_ms",
-}
 MEMORY = ("physics", "env_and_rollout", "update")
 ROOMS = ("physics", "terms", "update", "refresh", "resets", "policy")
 
 
 def results(name: str) -> Any:
     return json.loads((report.RESULTS / f"{name}.json").read_text())["figures"]
-
-
-@pytest.mark.parametrize("label", ROWS)
-def test_the_table_of_an_iteration(label: str) -> None:
-    figures, name = results("throughput"), ROWS[label]
-    (row,) = (line for line in PAGE.splitlines() if line.startswith(f"| {label}"))
-    ms, per_s, relative = (float(cell.replace(",", "")) for cell in row.strip("| ").split(" | ")[-3:])
-    assert ms == pytest.approx(figures[GO1 + name], rel=5e-3)
-    assert per_s == pytest.approx(1000 * ENV_STATES.get(name, 24 * 4096) / figures[GO1 + name], rel=1e-4)
-    assert relative == pytest.approx(per_s * figures[GO1 + "physics_ms"] / 4096 / 1000, rel=5e-3)
-
-
-@pytest.mark.parametrize("task", determinism.TASKS)
-def test_the_table_of_equal_runs(task: str) -> None:
-    name = task.removesuffix("_fast_sac")
-    starts = f"| `{name}`, `objective=fast_sac` |" if name != task else (f"| `{name}` |", f"| `{name}` (")
-    (row,) = (line for line in PAGE.splitlines() if line.startswith(starts) and "." not in line)
-    found = [results("determinism")[f"h200/{task}/{key}"] for key in ("tensors", "tensors_that_differ")]
-    assert [float(cell) for cell in row.strip("| ").split(" | ")[1:]] == found
-
-
-TRAINED = {
-    "base": "| 4 steps of 5 ms |",
-    "large": "| 2 steps of 10 ms |",
-    "discrete": "| the same, `task.sim.integrator=discrete` |",
-}
-
-
-@pytest.mark.parametrize("trained", TRAINED)
-def test_the_table_of_larger_time_steps(trained: str) -> None:
-    figures = results("sim2sim")
-
-    def of_seeds(name: str, figure: str) -> list[float]:
-        label = f"go1_velocity_flat/without_noise/{name}_seed_"
-        return [figures[f"{label}{seed}/{figure}"] for seed in (1, 2, 3)]
-
-    (row,) = (line for line in PAGE.splitlines() if line.startswith(TRAINED[trained]))
-    returned, fell = row.strip("| ").split(" | ")[1:]
-    (base, base_error), (mean, error) = (
-        (statistics.fmean(values), statistics.stdev(values) / math.sqrt(3))
-        for values in (of_seeds(name, "return_c_engine") for name in ("base", trained))
-    )
-    ratio = mean / base
-    share = f", or {ratio:.3f} ± {ratio * math.hypot(error / mean, base_error / base):.3f} of it"
-    assert returned == f"{mean:.1f}" + share * (trained != "base")
-    assert fell == f"{100 * statistics.fmean(of_seeds(trained, 'fell')):.1f} %"
 
 
 def in_rooms(prefix: str, figure: str) -> str:

@@ -1,10 +1,10 @@
-"""The table of terms says what the terms' docstrings say. To write it anew: python -m tests.docs.test_terms."""
+"""Makes docs/terms.md from the docstrings and fields of the terms."""
 
 import dataclasses
 import inspect
 import math
-from pathlib import Path
 
+from benchmarks.pages.table import table
 from ksim_rl import mdp
 from ksim_rl.envs.term import (
     ActionTerm,
@@ -17,7 +17,6 @@ from ksim_rl.envs.term import (
     TerminationTerm,
 )
 
-TERMS = Path(__file__).parents[2] / "docs" / "terms.md"
 KINDS = {
     "Observations": ObservationTerm,
     "Actions": ActionTerm,
@@ -56,31 +55,19 @@ def fields_of(term: type) -> str:
     return ", ".join(parts)
 
 
-def row(name: str) -> str:
-    """One line of a table. Bars would end a cell, so they are escaped."""
+def row(name: str) -> list[str]:
+    """Return the cells of a term: its name, the first paragraph of its docstring, and its fields."""
     term = getattr(mdp, name)
-    summary = " ".join(inspect.getdoc(term).split("\n\n")[0].split())
-    return (
-        "| " + " | ".join(cell.replace("|", r"\|") for cell in (f"`{name}`", summary, fields_of(term))) + " |"
-    )
+    text = inspect.getdoc(term) or ""
+    summary = text.split("\n\n")[0]
+    return [f"`{name}`", " ".join(summary.split()), fields_of(term)]
 
 
 def page() -> str:
+    """Return the page: a table for each kind of term."""
     parts = [HEAD]
     for title, kind in KINDS.items():
         names = [name for name in mdp.__all__ if issubclass(getattr(mdp, name), kind)]
-        parts.append(
-            "\n".join([f"## {title}", "", "| term | what | fields |", "|---|---|---|", *map(row, names)])
-        )
+        rows = [row(name) for name in names]
+        parts.append(f"## {title}\n\n{table(('term', 'what', 'fields'), rows)}")
     return "\n\n".join(part.strip() for part in parts) + "\n"
-
-
-def test_the_table_of_terms_lists_all_terms_as_they_are():
-    written = TERMS.read_text().splitlines()
-    names = [line.split("`")[1] for line in written if line.startswith("| `")]
-    assert sorted(names) == mdp.__all__
-    assert written == page().splitlines(), "docs/terms.md is out of date: python -m tests.docs.test_terms"
-
-
-if __name__ == "__main__":
-    TERMS.write_text(page())
