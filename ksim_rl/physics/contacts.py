@@ -68,7 +68,9 @@ def align_steep_capsules(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     """Launch what turns the contacts of steep capsules with planes, which our own narrow phase need not."""
     contact = warp_data_E.contact
     inputs = [warp_model.geom_type, warp_data_E.geom_xmat, contact.geom, contact.worldid, warp_data_E.nacon]
-    wp.launch(kernels.align_steep_capsules, dim=warp_data_E.naconmax, inputs=inputs, outputs=[contact.frame])
+    inputs.append(bool(warp_model.flg_surfacevel))
+    outputs = [contact.frame, contact.surfacevel]
+    wp.launch(kernels.align_steep_capsules, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
 
 
 def _have_capsules_on_planes(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray) -> bool:

@@ -26,11 +26,14 @@ def align_steep_capsules(
     geom: wp.array[wp.vec2i],
     world: wp.array[int],
     nacon: wp.array[int],
+    surfaces_move: bool,
     frame: wp.array[wp.mat33],
+    surfacevel: wp.array[wp.vec3],
 ):
     """Let the first tangent of a contact of plane and capsule follow the capsule, however steep it stands.
 
-    Of an upright one, which has no direction to follow, C takes the first axis of the world.
+    Of an upright one, which has no direction to follow, C takes the first axis of the world. The velocity of a surface
+    is along the tangents, and is turned with them.
     """
     contact = wp.tid()
     if contact >= nacon[0]:
@@ -48,9 +51,15 @@ def align_steep_capsules(
         first = wp.vec3(1.0, 0.0, 0.0)
         tangent = first - wp.dot(first, normal) * normal
     # On a wall that faces that axis there is none left.
-    if wp.length(tangent) > UPRIGHT:
-        tangent = wp.normalize(tangent)
-        frame[contact] = wp.matrix_from_rows(normal, tangent, wp.cross(normal, tangent))
+    if wp.length(tangent) <= UPRIGHT:
+        return
+    tangent = wp.normalize(tangent)
+    second = wp.cross(normal, tangent)
+    if surfaces_move:
+        along = surfacevel[contact]
+        glide = along[0] * frame[contact][1] + along[1] * frame[contact][2]
+        surfacevel[contact] = wp.vec3(wp.dot(glide, tangent), wp.dot(glide, second), along[2])
+    frame[contact] = wp.matrix_from_rows(normal, tangent, second)
 
 
 @wp.kernel(enable_backward=False)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from ksim_rl.physics import SimCfg, World, load_model
+from tests.physics.beside_c import KERNELS, step_and_check
 
 NUM_ENVS = 64
 # The plane is the last geom: contacts order geoms by their type, pairs by their number.
@@ -97,6 +98,22 @@ def test_an_upright_rod_has_the_frame_of_the_c_engine(one_kernel: bool):
     found = frames[(geoms == torch.tensor([3, 2])).all(-1)].reshape(-1, 9).double()
     torch.testing.assert_close(found, torch.from_numpy(expected))
     assert len(expected) == 1
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("cone", ("pyramidal", "elliptic"))
+def test_a_belt_carries_a_steep_rod_as_in_the_c_engine(cone: str, kernels: str):
+    xml = f"""
+<mujoco>
+  <option cone="{cone}"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1" surfacevel="0.5 -0.3 0 0 0 1"/>
+    <body pos="0 0 0.195" euler="10 5 0"><freejoint/>
+      <geom type="capsule" size="0.1 0.1" mass="1" condim="4" surfacevel="0.2 0 0.1 0 0.3 0"/></body>
+  </worldbody>
+</mujoco>
+"""
+    step_and_check(xml, KERNELS[kernels], spread=0.002, speed=0.1)
 
 
 # Of each pair one geom has priority, and one gives stiffness and damping directly; the last pair has a law of its own.
