@@ -8,7 +8,7 @@ It writes nothing that the view gives it: `term_rules` says what each kind may w
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -98,6 +98,10 @@ class EventTerm(Term):
     @property
     def per_world_fields(self) -> tuple[str, ...]:
         """The MuJoCo model fields that this event writes, which therefore become one array per world."""
+        return ()
+
+    def without_effect(self, view: EnvView) -> Sequence[str]:
+        """Return a line for each part of what this event writes that changes nothing in this model; a build warns."""
         return ()
 
     @abstractmethod

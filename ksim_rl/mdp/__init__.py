@@ -15,6 +15,7 @@ from ksim_rl.mdp.motion_tracking import *  # noqa: F403
 from ksim_rl.mdp.observations.bodies import *  # noqa: F403
 from ksim_rl.mdp.observations.robot import *  # noqa: F403
 from ksim_rl.mdp.randomization.bodies import *  # noqa: F403
+from ksim_rl.mdp.randomization.friction import *  # noqa: F403
 from ksim_rl.mdp.randomization.joints import *  # noqa: F403
 from ksim_rl.mdp.randomization.looks import *  # noqa: F403
 from ksim_rl.mdp.randomization.poses import *  # noqa: F403

@@ -1,5 +1,6 @@
 """Runs events: at startup, for rows that reset, by per-env clocks, and at every step."""
 
+import warnings
 from collections.abc import Mapping
 
 import torch
@@ -31,6 +32,9 @@ class EventManager:
         clocked = self._by_mode.get("interval", [])
         self._clocks = {scope: view.buffers.get(f"{scope}.time_left_E", owner=ENV) for scope, _ in clocked}
         self.rehearse()
+        for name, term in terms.items():
+            for line in term.without_effect(view):
+                warnings.warn(f"events.{name}: {line}", UserWarning, stacklevel=2)
 
     def rehearse(self) -> None:
         """Run each event for no row, which changes nothing."""

@@ -1,4 +1,4 @@
-"""These events draw gravity, mass and inertia of bodies that can exist, sizes of geoms, and friction."""
+"""These events draw gravity, mass and inertia of bodies that can exist, and sizes of geoms."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -158,20 +158,6 @@ NUM_SIZES = {
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: 3,
     mujoco.mjtGeom.mjGEOM_BOX: 3,
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class RandomizeGeomFriction(RandomizeModelField, field="geom_friction", columns=3, lowest=0.0):
-    """Friction of geoms; columns: 0 sliding, 1 torsional (m), 2 rolling (m)."""
-
-    geoms: Patterns
-
-
-@dataclass(frozen=True, kw_only=True)
-class RandomizePairFriction(RandomizeModelField, field="pair_friction", columns=5, lowest=0.0):
-    """Friction of contact pairs (`<pair name=...>`); columns: 0, 1 sliding, 2 torsional (m), 3, 4 rolling (m)."""
-
-    pairs: Patterns
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,9 @@ class RandomizeLightColor(RandomizeModelField, columns=3, lowest=0.0):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeMaterialColor(RandomizeModelField, field="mat_rgba", columns=4, lowest=0.0, highest=1.0):
+class RandomizeMaterialColor(
+    RandomizeModelField, field="mat_rgba", columns=4, lowest=0.0, highest=1.0, columns_of_one_pair=(0, 1, 2)
+):
     """Colour of materials, on all geoms that have them; columns red, green, blue, alpha, within [0, 1]."""
 
     materials: Patterns
@@ -55,7 +57,9 @@ class RandomizeMaterialShine(RandomizeModelField, lowest=0.0, highest=1.0):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomColor(RandomizeModelField, field="geom_rgba", columns=4, lowest=0.0, highest=1.0):
+class RandomizeGeomColor(
+    RandomizeModelField, field="geom_rgba", columns=4, lowest=0.0, highest=1.0, columns_of_one_pair=(0, 1, 2)
+):
     """Colour of geoms, in place of their material's; columns red, green, blue, alpha, within [0, 1]."""
 
     geoms: Patterns

@@ -140,12 +140,16 @@ class RandomizeField(Randomize):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeModelField(RandomizeField):
-    """Draw entries of a model field per world from `ranges`, by its columns, or one pair for every column."""
+    """Draw entries of a model field per world from `ranges`, by its columns, or one pair for every column.
+
+    Where columns mean different things, `columns_of_one_pair` are those that one pair is for.
+    """
 
     ranges: Pair | Mapping[int, Pair]
 
     lowest: ClassVar[float | None] = None  # what a value must at least be to make sense
     highest: ClassVar[float | None] = None  # and at most
+    columns_of_one_pair: ClassVar[tuple[int, ...]] = ()
 
     def _check_fields(self) -> None:
         if not isinstance(self.ranges, Mapping):
@@ -159,7 +163,7 @@ class RandomizeModelField(RandomizeField):
         """Return the ranges by column, in the order of the columns."""
         if isinstance(self.ranges, Mapping):
             return dict(sorted(self.ranges.items()))
-        return dict.fromkeys(range(self.columns), self.ranges)
+        return dict.fromkeys(self.columns_of_one_pair or range(self.columns), self.ranges)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids, pairs, nominal = self.ids(view), self.ranges_by_column(), self.nominal(view)
