@@ -20,6 +20,7 @@ from ksim_rl.terminal import show
 from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.build import build_evaluator, solved_at
+from ksim_rl.trainers.kept_models import with_kept_models
 from ksim_rl.trainers.metrics import losses_of
 from ksim_rl.trainers.other_physics import ENGINE, check_physics_alone, judged_by, trained_with
 from ksim_rl.trainers.run_cfg import check_run_tree
@@ -65,6 +66,7 @@ def resume(arguments: list[str]) -> int:
             f"trainer.num_iterations={cfg.trainer.num_iterations}: expected at least {saved.iteration}, those that are "
             "done"
         )
+    cfg = with_kept_models(cfg, folder, note=say)
     check_sources(cfg, resumes=True)
     return run_and_report(cfg, folder.resolve(), resume_from=saved)
 

@@ -5,7 +5,7 @@ import dataclasses
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ksim_rl import conf, ranks
-from ksim_rl.cli.errors import report
+from ksim_rl.cli.errors import report, say
 from ksim_rl.cli.report import run_and_report
 from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.runs.run_lock import is_locked
 from ksim_rl.trainers import RunCfg
+from ksim_rl.trainers.kept_models import with_kept_models
 from ksim_rl.trainers.run_cfg import reaching_outside
 from ksim_rl.trainers.run_folder import FOLDERS
 from ksim_rl.trainers.sources import check_sources
@@ -40,11 +41,12 @@ def train(arguments: list[str]) -> int:
     if unknown:
         raise conf.spelling.of_flag(unknown[0], arguments)
     name, own_config = _primary_config(flags)
+    began = Path(flags.config_dir) if name == conf.RUN_AGAIN else None
     if not (flags.help or flags.hydra_help or flags.shell_completion or own_config):
         builds = flags.cfg is None and flags.info is None
         multirun = flags.multirun or not builds
         for cfg in conf.check_command_line(flags.overrides, name=name, multirun=multirun, values=builds):
-            check_sources(cfg)
+            check_sources(_with_models_of(began, cfg, note=lambda _: None))
 
     groups = _folders_of_groups(flags, own_config)
     given = conf.fields_of(flags.overrides)
@@ -55,7 +57,7 @@ def train(arguments: list[str]) -> int:
     def job(config: DictConfig) -> None:
         sys.argv = own_command  # which the run's folder keeps
         try:
-            codes.append(_train_one(config, groups, given))
+            codes.append(_train_one(config, groups, given, began))
         except Exception as error:
             if os.getpid() != process:  # some launchers run jobs elsewhere; only Hydra can bring it here then
                 raise
@@ -124,7 +126,12 @@ def _folders_of_groups(flags: argparse.Namespace, own_config: bool) -> list[Path
     return searched
 
 
-def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str]) -> int:
+def _with_models_of(began: Path | None, cfg: RunCfg, *, note: Callable[[str], None]) -> RunCfg:
+    """Return the config of a run that is made once more with the models that the run in folder `began` began with."""
+    return cfg if began is None else with_kept_models(cfg, began, note=note)
+
+
+def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str], began: Path | None) -> int:
     plugins.load(())  # those of the environment, where a launcher runs the job in a process of its own
     plain: Any = OmegaConf.to_container(config, resolve=True)
     for path, value in reaching_outside(plain, given=given) if groups else ():
@@ -138,6 +145,7 @@ def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str])
     if cfg.checkpoint is not None:
         cfg = dataclasses.replace(cfg, checkpoint=str(Path(cfg.checkpoint).resolve()))
     cfg = dataclasses.replace(cfg, objective=cfg.objective.with_absolute_paths())
+    cfg = _with_models_of(began, cfg, note=say)
     launched = HydraConfig.get()
     folder = Path(launched.runtime.output_dir)
     # Where the user named the folder of a run that is under way, that run's lock says so.

@@ -5,6 +5,7 @@ import html
 import math
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -46,6 +47,7 @@ class _Files:
     folders: set[Path] = field(default_factory=set)
     below: set[str] = field(default_factory=lambda: {""})  # folders of assets, as any of the texts has them
     named: set[str] = field(default_factory=set)
+    included: list[Path] = field(default_factory=list)
     recoded: dict[str, bytes] = field(default_factory=dict)  # UTF-8, by the path under which MuJoCo looks
 
     def text(self, path: Path, called: str) -> str:
@@ -58,20 +60,25 @@ class _Files:
             self.recoded[called] = text.encode()
         return text
 
+    def assets(self) -> Iterator[Path]:
+        """Yield the files of meshes, pictures and height fields that the texts name, and that are there."""
+        # Which folder belongs to which name depends on the order of texts; so each is tried with each.
+        for start in sorted({self.folder, *self.folders}):
+            for below in sorted(self.below):
+                for name in sorted(self.named):
+                    path = start / below / name
+                    if os.path.exists(path) and not path.is_dir():
+                        yield path
+
     def check_assets(self) -> None:
         """Refuse pipes and devices, at which MuJoCo would wait or never end, and files that are too large."""
         if len(self.below) > MOST_FOLDERS:
             raise ValueError(
                 f"{self.label}: {len(self.below)} folders of assets: expected {MOST_FOLDERS} at most"
             )
-        # Which folder belongs to which name depends on the order of texts; so each is tried with each.
-        for start in {self.folder, *self.folders}:
-            for below in self.below:
-                for name in self.named:
-                    path = start / below / name
-                    if os.path.exists(path) and not path.is_dir():
-                        with naming(self.label):
-                            check_regular(path, limit=MOST_DATA_BYTES)
+        for path in self.assets():
+            with naming(self.label):
+                check_regular(path, limit=MOST_DATA_BYTES)
 
 
 def check_text(text: str, folder: Path, label: str) -> dict[str, bytes]:
@@ -94,6 +101,15 @@ def check_text(text: str, folder: Path, label: str) -> dict[str, bytes]:
             f"{VARIABLE} to {most}, the larger of the elements squared and the numbers (now {given})"
         )
     return read.recoded
+
+
+def files_named(text: str, folder: Path, label: str) -> list[Path]:
+    """Return the files that a text includes, attaches or names, each once, by absolute paths with links in them."""
+    read = _Files(label=label, folder=folder)
+    _count(text, folder, read, ())
+    read.check_assets()
+    found = [*read.included, *read.assets()]
+    return sorted({Path(os.path.abspath(path)) for path in found})
 
 
 def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> tuple[int, int]:
@@ -134,6 +150,7 @@ def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> t
                 # What is no file, a pipe among them, is refused; one that is missing MuJoCo names with its line.
                 read.counts[path] = 0, 0
                 if path.exists():
+                    read.included.append(folder / attributes["file"])
                     included = read.text(path, str(folder / attributes["file"]))
                     read.counts[path] = _count(included, path.parent, read, (*within, path))
             inner = read.counts[path]

@@ -22,7 +22,7 @@ from ksim_rl.runs.listing import CONFIG, METRICS
 from ksim_rl.runs.record import recorded
 from ksim_rl.runs.run_lock import locked
 from ksim_rl.runs.watch import threads_that_fail, watch
-from ksim_rl.trainers import checkpoint, video
+from ksim_rl.trainers import checkpoint, kept_models, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
 from ksim_rl.trainers.outcome import Outcome
@@ -33,7 +33,7 @@ from ksim_rl.trainers.trial import first_that_fits
 from ksim_rl.transforms import observation_columns
 
 # Folders in a run folder that a run writes to.
-FOLDERS = ("checkpoint", "tensorboard", "wandb", "mlflow")
+FOLDERS = ("checkpoint", kept_models.FOLDER, "tensorboard", "wandb", "mlflow")
 EVALUATION = "evaluation.json"
 CURVES = "curves.png"
 VIDEO = "video.mp4"
@@ -57,7 +57,7 @@ def run(
     resume_from: checkpoint.Checkpoint | None = None,
     before: Callable[[Trainer], None] | None = None,
 ) -> Outcome:
-    """Train, and leave in `run_folder` its record, config, metrics, checkpoints, evaluation, curves and a video.
+    """Train, and leave in `run_folder` record, config, models, metrics, checkpoints, evaluation, curves and a video.
 
     What cannot be drawn (no OpenGL) is said in one line of `progress`. `before` is called when all is built. Raises
     ValueError when another process writes the folder, the checkpoint to resume or start from belongs to another
@@ -103,6 +103,7 @@ def _run_locked(
         trainer = make()
     if before is not None:
         before(trainer)
+    kept_models.keep_models(cfg, run_folder, note=progress.note)
     write_whole(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
     trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
     with recorded(run_folder, note=progress.note) as ended:
@@ -145,10 +146,13 @@ def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()
 
 
 def policy_of(saved: checkpoint.Checkpoint, *, device: str = "auto", cfg: RunCfg | None = None) -> Policy:
-    """Rebuild the policy of a checkpoint that was read; see `load_policy`. A `cfg` stands in for the run's own."""
+    """Rebuild the policy of a checkpoint that was read; see `load_policy`. A `cfg` stands in for the run's own.
+
+    Its models are those that the run began with, see `kept_models`.
+    """
     if cfg is None:
         cfg = RunCfg.from_tree({**saved.config, "device": device})
-    cfg = without_nan_guard(cfg)
+    cfg = without_nan_guard(kept_models.with_kept_models(cfg, saved.run_folder))
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
     actor = make_policy(cfg, env)
     with checkpoint.fitting(saved.path):

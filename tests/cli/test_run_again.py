@@ -1,6 +1,8 @@
 """A run folder makes its run again, and starts others: `--config-dir RUN` and `checkpoint=RUN`."""
 
 import csv
+from contextlib import nullcontext
+from importlib.resources import files
 
 import pytest
 import torch
@@ -188,3 +190,28 @@ def test_a_sweep_runs_in_the_processes_of_another_launcher(tmp_path, seeds):
     assert run("--multirun", *launcher, *SMALL, f"seed={seeds}", f"hydra.sweep.dir={tmp_path}") == 0
     saved = [checkpoint.load_latest(f) for f in tmp_path.iterdir() if f.is_dir()]
     assert sorted(entry.config["seed"] for entry in saved) == [1, 2]
+
+
+def test_a_run_keeps_its_model_in_other_folders_and_after_edits(tmp_path, monkeypatch, capsys):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    robot = tmp_path / "robot.xml"
+    robot.write_text(files("ksim_rl.scene.robots").joinpath("cartpole.xml").read_text())
+    described = "{_target_:ksim_rl.scene.scene.MjcfRobot,source:robot.xml}"
+    own = ("task=cartpole_swingup", "~task.scene.robots.cartpole", f"+task.scene.robots.cartpole={described}")
+    assert run(*SMALL, *own, "hydra.run.dir=run") == 0
+    robot.write_text(robot.read_text().replace('mass="0.1"', 'mass="0.2"'))
+    capsys.readouterr()
+    assert run("--config-dir", "run", "hydra.run.dir=again") == 0
+    said = capsys.readouterr().err
+    assert said.count("robot.xml has changed since the run began: the run's own copy is used") == 1
+    assert rows(tmp_path / "again") == rows(tmp_path / "run")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for command in (["eval", "../run", "--episodes", "1"], ["resume", "../run", "--num-iterations", "3"]):
+        with (
+            pytest.warns(UserWarning) if command[0] == "eval" else nullcontext(),
+            pytest.raises(SystemExit) as stopped,
+        ):
+            main.main(command)
+        assert stopped.value.code in (0, 1)
+    assert len(rows(tmp_path / "run")) == 3

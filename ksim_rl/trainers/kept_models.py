@@ -1,0 +1,202 @@
+"""A run keeps the files of its models with their hashes, and who goes on with it is told where one has changed since.
+
+`models.json` of a run folder says of each robot and object whose model is a file: its path, the hash of all its files,
+and where in the folder `models` a copy lies. Models of the menagerie, and those that are too large, have a hash alone.
+"""
+
+import dataclasses
+import json
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ksim_rl.config.plain_data import check_links
+from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
+from ksim_rl.files.writing import whole_folder, write_whole
+from ksim_rl.physics.model_files.packing import ModelFiles, files_of_model
+from ksim_rl.scene.robots.legged_robot import MenagerieRobot, ModelRobot
+from ksim_rl.scene.scene import MjcfRobot
+from ksim_rl.terminal import printable
+from ksim_rl.trainers.run_cfg import RunCfg
+
+FOLDER, RECORD = "models", "models.json"
+MOST_KEPT_BYTES = 64 * 2**20
+"""Of a model with its meshes and pictures, of which a run keeps a copy."""
+KINDS = ("robots", "objects")
+
+
+class AbsolutePathError(ValueError):
+    """A model whose copy would still read files of another place."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeptModel:
+    """What a run says of a model: the path it was read from, its hash, and its copy's path below `models`, if any."""
+
+    source: str
+    sha256: str
+    copy: str = ""
+
+
+def keep_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None]) -> None:
+    """Write the models of a config's robots and objects into a run folder, but for those that are there already."""
+    earlier = read_record(run_folder)
+    record: dict[str, KeptModel] = {}
+    for name, source in _sources(cfg):
+        known = earlier.get(name)
+        if known is not None and (source == known.source or _is_copy(source, known)):
+            record[name] = known
+            continue
+        files = files_of_model(source)
+        if files is not None:
+            record[name] = _keep(name, source, files, run_folder, note)
+    if record != earlier:
+        plain = {name: dataclasses.asdict(kept) for name, kept in record.items()}
+        write_whole(run_folder / RECORD, json.dumps(plain, indent=2) + "\n")
+
+
+def with_kept_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None] | None = None) -> RunCfg:
+    """Return a run's config with the models that it began with.
+
+    Where a model's file is not there any more, or has changed, the run's own copy takes its place, and `note` (by
+    default a warning) says so. Where there is no copy, a changed file is warned of by name.
+    """
+    note = note or _warn
+    record = read_record(run_folder)
+    scene = cfg.task.scene
+    changed: dict[str, dict[str, Any]] = {kind: dict(getattr(scene, kind)) for kind in KINDS}
+    for name, source in _sources(cfg):
+        kept = record.get(name)
+        kind, _, entity = name.partition("/")
+        if kept is None:
+            continue  # a run of before there were copies
+        if _is_copy(source, kept):  # that of a run which went on with it, and may lie elsewhere by now
+            changed[kind][entity] = _with_source(
+                changed[kind][entity], str(_checked_copy(name, kept, run_folder))
+            )
+            continue
+        if source != kept.source:
+            continue  # another model, which was asked for
+        why = _difference(source, kept)
+        if not why:
+            continue
+        if not kept.copy:
+            note(
+                f"task.scene.{kind}.{entity}: {why}, and the run kept its hash alone: its policy may not fit any more"
+            )
+            continue
+        copy = _checked_copy(name, kept, run_folder)
+        note(f"task.scene.{kind}.{entity}: {why}: the run's own copy is used, {copy}")
+        changed[kind][entity] = _with_source(changed[kind][entity], str(copy))
+    scene = dataclasses.replace(scene, **changed)
+    return dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, scene=scene))
+
+
+def read_record(run_folder: Path) -> dict[str, KeptModel]:
+    """Return what a run says of its models, nothing for a run that kept none; a ValueError where it is no such file."""
+    path = run_folder / RECORD
+    if not os.path.lexists(path):
+        return {}
+    try:
+        plain = _dictionary(json.loads(read_bytes(path, limit=MOST_TEXT_BYTES)))
+        return {str(name): KeptModel(**_texts(entry)) for name, entry in plain.items()}
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path}: no record of a run's models: {printable(str(error))}") from error
+
+
+def _keep(
+    name: str, source: str, files: ModelFiles, run_folder: Path, note: Callable[[str], None]
+) -> KeptModel:
+    kept = KeptModel(source=source, sha256=files.sha256())
+    if not Path(source).expanduser().is_file():  # a name of the menagerie, which others have too
+        return kept
+    if files.size > MOST_KEPT_BYTES:
+        note(
+            f"task.scene.{name.replace('/', '.')}: {files.size / 2**20:.0f} MiB of model, of which the run keeps only "
+            f"the hash (copies end at {MOST_KEPT_BYTES // 2**20} MiB)"
+        )
+        return kept
+    place = name.replace("/", "_")
+    try:
+        with whole_folder(run_folder / FOLDER / place, below=run_folder) as unfinished:
+            for file in files.names:
+                (unfinished / file).parent.mkdir(parents=True, exist_ok=True)
+                write_whole(unfinished / file, files.contents(file))
+            copied = files_of_model(unfinished / files.main)
+            if copied is None or copied.sha256() != kept.sha256:
+                raise AbsolutePathError(f"{source} names files by absolute paths")
+    except AbsolutePathError as error:
+        note(f"task.scene.{name.replace('/', '.')}: {error}: the run keeps only its hash")
+        return kept
+    return dataclasses.replace(kept, copy=f"{place}/{files.main}")
+
+
+def _difference(source: str, kept: KeptModel) -> str:
+    """Return how the files of a model differ from those of when the run began; nothing if they do not."""
+    try:
+        files = files_of_model(source)
+    except ValueError as error:
+        return str(error)
+    if files is None or files.sha256() == kept.sha256:
+        return ""
+    return f"{source} has changed since the run began"
+
+
+def _is_copy(source: str, kept: KeptModel) -> bool:
+    """Return whether a path leads to a run's copy of a model, wherever the run's folder lay."""
+    return bool(kept.copy) and source.endswith(f"/{FOLDER}/{kept.copy}")
+
+
+def _checked_copy(name: str, kept: KeptModel, run_folder: Path) -> Path:
+    """Return the path of a run's copy of a model; a ValueError refuses one that is damaged, or reaches outside."""
+    check_links(run_folder, below=(FOLDER,))
+    inside = (run_folder / FOLDER).resolve()
+    path = Path(os.path.abspath(run_folder / FOLDER / kept.copy))
+    files = files_of_model(path)
+    assert files is not None
+    for file in files.names:
+        if not (files.folder / file).resolve().is_relative_to(inside):
+            raise ValueError(
+                f"{path}: the run's copy of {name} names {files.folder / file}, which lies outside of it"
+            )
+    if files.sha256() != kept.sha256:
+        raise ValueError(
+            f"{path}: damaged: not the model of {name} that the run began with, by its hash in {RECORD}"
+        )
+    return path
+
+
+def _sources(cfg: RunCfg) -> Iterator[tuple[str, str]]:
+    """Yield the models of a config that are files or names: "robots/NAME" or "objects/NAME", and the source."""
+    for kind in KINDS:
+        for name, entity in getattr(cfg.task.scene, kind).items():
+            if isinstance(entity, MjcfRobot):
+                yield f"{kind}/{name}", entity.source
+            elif isinstance(entity, MenagerieRobot):
+                yield f"{kind}/{name}", entity.model
+
+
+def _with_source(entity: Any, source: str) -> Any:
+    if isinstance(entity, MjcfRobot):
+        return dataclasses.replace(entity, source=source)
+    assert isinstance(entity, ModelRobot)  # others name a model of the menagerie, of which no copy is kept
+    return dataclasses.replace(entity, model=source)
+
+
+def _dictionary(plain: Any) -> dict[str, Any]:
+    if not isinstance(plain, dict):
+        raise ValueError("expected a mapping")
+    return plain
+
+
+def _texts(entry: Any) -> dict[str, str]:
+    if not all(isinstance(value, str) for value in _dictionary(entry).values()):
+        raise ValueError("expected texts")
+    return entry
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, UserWarning, stacklevel=3)
