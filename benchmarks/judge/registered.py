@@ -12,11 +12,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-import warp as wp
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from benchmarks.judge.hunt import MOST_SECONDS, told_of
+from benchmarks.judge.hunt import MOST_SECONDS, compile_quickly, told_of
 from benchmarks.judge.trial import NUM_WORLDS, SETTINGS, Given, Verdict, judge, judge_worlds, reason
 from benchmarks.judge.workers import in_processes
 from benchmarks.judge.worlds import solved_well, state_of_row
@@ -99,7 +98,7 @@ def robot_files() -> list[str]:
 
 def judged(task: Registered) -> RegisteredOutcome:
     """Judge a task's model or a robot file."""
-    wp.config.optimization_level = 0
+    compile_quickly(task.device)
     try:
         verdict = _judged_task(task) if task.is_task else _judged_file(task)
     except Exception:

@@ -1,0 +1,46 @@
+"""A trial sees what views, resets and hooks show, and fails where one of them is wrong."""
+
+import pytest
+import torch
+
+from benchmarks.judge.trial import judge
+from ksim_rl.physics.warp_world import WarpWorld
+
+XML = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="0 0 0.1"><joint name="j" type="slide" axis="0 0 1" damping="0.5"/><geom size="0.1"/></body>
+  </worldbody>
+  <sensor><jointpos joint="j" name="height"/></sensor>
+</mujoco>
+"""
+
+
+def test_a_model_that_is_right_is_judged_in_all_parts():
+    verdict = judge(XML, kernels="theirs", fields=("body_mass",))
+    assert verdict.findings == ()
+    assert verdict.states == 20
+    assert verdict.touching
+    assert verdict.reset
+    # Of the three worlds with another mass, two have one that XML says for certain.
+    assert verdict.compiled >= 2
+
+
+def test_a_reset_that_leaves_something_is_found(monkeypatch: pytest.MonkeyPatch):
+    true_reset = WarpWorld.reset
+
+    def leaving(world: WarpWorld, mask_E: torch.Tensor) -> None:
+        true_reset(world, mask_E)
+        if not bool(mask_E.all()):
+            world.view("qacc_warmstart")[0] += 100.0
+
+    monkeypatch.setattr(WarpWorld, "reset", leaving)
+    quantities = {finding.quantity for finding in judge(XML, kernels="theirs").findings}
+    assert "reset qacc" in quantities
+
+
+def test_a_refusal_is_no_finding():
+    verdict = judge(XML.replace("<worldbody>", '<option solver="PGS"/><worldbody>'))
+    assert "mjSOL_PGS" in verdict.refused
+    assert verdict.states == 0
