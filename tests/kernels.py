@@ -21,7 +21,7 @@ TESTS = {
     "device/copying.py": {
         "_launcher": "gpu/test_copying.py::test_copies_of_all_types_widths_and_layouts_are_exact"
     },
-    "device/quick_launch.py": {"kernel": EQUAL_WORLDS},
+    "device/native_kernel.py": {"kernel": EQUAL_WORLDS},
     "device/random.py": {"_launch": "gpu/test_transforms.py::test_draws_are_the_hash_that_they_say_they_are"},
     "ranks/running_moments.py": {
         "_quick": (

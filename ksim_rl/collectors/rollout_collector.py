@@ -20,8 +20,9 @@ from ksim_rl.checked import Checked, Count
 from ksim_rl.checks import check_count
 from ksim_rl.collectors.compiled_step import CompiledStep
 from ksim_rl.collectors.recording import Policy, Recording
-from ksim_rl.device.capture import Captured, eagerly
+from ksim_rl.device.capture import Captured
 from ksim_rl.device.copying import copy_rows
+from ksim_rl.device.eager import eagerly
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.envs.masked_reset import MaskedReset

@@ -20,7 +20,7 @@ from ksim_rl.compiled.cells import CTYPES, Cells, Element, Loop, NotARowError
 from ksim_rl.compiled.lanes import BLOCK, DEAL, LANES, SHARED, Own, Work, schedule, source
 from ksim_rl.device import kernel_loading, random
 from ksim_rl.device.extents import extent
-from ksim_rl.device.quick_launch import QuickLaunch, arguments_of
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, arguments_of
 from ksim_rl.device.recording import Operation, Recorder
 
 MOST_SHARED = 256
@@ -291,7 +291,7 @@ class Tape:
         sizes = f"#define LANES {max(lanes, 1)}\n#define BLOCK {BLOCK}"
         text = "\n".join([sizes, DEAL, random.DRAWS, row_code.PRELUDE, *body])
         fields = " ".join(names[place] for place in given)
-        launch = QuickLaunch(arguments_of((wp.uint64, fields)), text, block_dim=BLOCK)
+        launch = QuickLaunch(arguments_of((ADDRESS, fields)), text, block_dim=BLOCK)
         kernel.launch = partial(launch, self._device, (self._num_rows, max(lanes, 1)), *given)
         # What only the kernel knew is free from here on.
         self._kept += [

@@ -16,6 +16,7 @@ import warp as wp
 
 from ksim_rl.checks import check_count
 from ksim_rl.device import recording, upstream
+from ksim_rl.device.eager import runs_eagerly
 from ksim_rl.device.streams import checked_device, warp_device, warp_scope, warp_stream
 
 
@@ -25,7 +26,6 @@ class _Phase(threading.local):
     live = 0
     warming_up = 0
     capturing = 0
-    eager = 0
 
 
 _phase = _Phase()
@@ -36,11 +36,6 @@ _graphs: dict[torch.device, WeakSet[torch.cuda.CUDAGraph]] = {}
 @cache
 def _capture_stream(device: torch.device) -> torch.cuda.Stream:
     return torch.cuda.Stream(device)
-
-
-def runs_eagerly() -> bool:
-    """Whether this thread is in a block of `eagerly`."""
-    return _phase.eager > 0
 
 
 def is_capturing() -> bool:
@@ -96,16 +91,6 @@ def live_launches(*, warming_up: bool = False, capturing: bool = False) -> Itera
         _phase.live -= 1
         _phase.warming_up -= warming_up
         _phase.capturing -= capturing
-
-
-@contextmanager
-def eagerly(wanted: bool = True) -> Iterator[None]:
-    """Make each `Captured` that is made in this block one that never records a graph, where that is `wanted`."""
-    _phase.eager += wanted
-    try:
-        yield
-    finally:
-        _phase.eager -= wanted
 
 
 class Captured:

@@ -5,7 +5,7 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
-from ksim_rl.device.capture import runs_eagerly
+from ksim_rl.device.eager import runs_eagerly
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from functools import cache
 
-import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, arguments_of
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, arguments_of
 
 LANES = 32
 _COPY = """
@@ -52,4 +51,4 @@ def _launcher(layouts: tuple[tuple[int, int, int, int], ...]) -> QuickLaunch:
         numbers = ", ".join(map(str, sizes))
         lines.append(f"copy(({kind}*)a.to_{place}, (const {kind}*)a.from_{place}, {numbers});")
     fields = " ".join(f"to_{place} from_{place}" for place in range(len(layouts)))
-    return QuickLaunch(arguments_of((wp.uint64, fields)), "\n".join(lines))
+    return QuickLaunch(arguments_of((ADDRESS, fields)), "\n".join(lines))

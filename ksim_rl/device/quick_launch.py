@@ -1,34 +1,38 @@
-"""Launches Warp kernels at little cost from Python.
+"""Launches kernels in C++ at little cost from Python, on Warp, which is imported at the first launch.
 
 `wp.launch` packs every argument anew, which takes longer than most small kernels run. Warp can record a launch and
 issue it again; then only the bytes of its arguments are written, in one go.
 """
 
-import ctypes
-import struct
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, wraps
 from importlib.resources import files
 from inspect import signature
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 from weakref import WeakSet
 
 import torch
-import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.device import recording, upstream
-from ksim_rl.device.streams import CPU_LOCK, current_warp_stream, warp_scope
+from ksim_rl.device import recording
 
-MAX_RECORDED = 64
-"""Records that one kernel keeps, one per device and size; a batch size that never comes again must not pile up."""
+if TYPE_CHECKING:
+    import warp as wp
+
+    from ksim_rl.device.native_kernel import NativeKernel
+
+ADDRESS = "uint64"
+"""The type of a tensor's address among arguments, as wrapping a tensor takes longer than the launch."""
 
 
-def arguments_of(*fields: tuple[type, str]) -> Any:
-    """Return the struct of a `QuickLaunch` with these fields in order: types, each with names and blanks between."""
-    types = {name: kind for kind, names in fields for name in names.split()}
-    return wp.struct(type("Arguments", (), {"__annotations__": types}))
+def arguments_of(*fields: tuple[type | str, str]) -> dict[str, type | str]:
+    """Return the arguments of a `QuickLaunch` in order: types, each with names and blanks between.
+
+    A type is `int`, `float` or the name of one of Warp's.
+    """
+    return {name: kind for kind, names in fields for name in names.split()}
 
 
 def source_of(package: str, *parts: str) -> str:
@@ -39,36 +43,26 @@ def source_of(package: str, *parts: str) -> str:
 class QuickLaunch:
     """One kernel in C++ whose only argument, `a`, is a struct of numbers and addresses, launched on torch's stream.
 
-    Addresses are `wp.uint64`, as wrapping a tensor takes longer than the launch. The source runs for each pair of
-    `indices` within the launch's dim. The kernel has no gradients.
+    The source runs for each pair of `indices` within the launch's dim. The kernel has no gradients. It is made at the
+    first launch, so that a module with a kernel can be imported where there is no Warp.
     """
 
     existing: ClassVar[WeakSet["QuickLaunch"]] = WeakSet()
 
     def __init__(
         self,
-        arguments: type,
+        arguments: Mapping[str, type | str],
         source: str,
         indices: tuple[str, str] = ("row", "lane"),
         *,
         block_dim: int = 256,
     ) -> None:
-        @wp.func_native(f"const int {indices[0]} = index_0, {indices[1]} = index_1;\n{source}")
-        def run(index_0: int, index_1: int, a: arguments): ...  # type: ignore[valid-type]
-
-        @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-        def kernel(a: arguments):  # type: ignore[valid-type]
-            index_0, index_1 = wp.tid()
-            run(index_0, index_1, a)
-
-        self._kernel = kernel
         self._arguments = arguments
+        self._source = source
+        self._indices = indices
         self._block_dim = block_dim
-        self.loadable: tuple[wp.Module, int] = kernel.module, block_dim  # what is compiled, for which blocks
-        self._recorded: dict[tuple[torch.device, tuple[int, int]], tuple[wp.Launch, ctypes.Structure]] = {}
-        self._packer = struct.Struct("")
-        # The bytes are shared by all launches until the driver, or the kernel on the CPU, has read them.
-        self._lock = threading.Lock()
+        self._kernel: NativeKernel | None = None
+        self._making = threading.Lock()
         QuickLaunch.existing = WeakSet([*QuickLaunch.existing, self])  # a thread may go through the old one
 
     def __call__(self, device: torch.device, dim: tuple[int, int], *values: float) -> None:
@@ -76,52 +70,71 @@ class QuickLaunch:
         if 0 in dim:
             return
         assert not recording.is_recording(), "a kernel that is no operator of torch cannot be recorded"
-        if device.type == "cpu":
-            lock = CPU_LOCK
-            stream = None
-        else:
-            lock = self._lock
-            stream = current_warp_stream(device)
-        with lock:
-            launch, packed = self._recorded.get((device, dim)) or self._record(device, dim)
-            self._packer.pack_into(packed, 0, *values)
-            launch.launch(stream)
+        kernel = self._kernel or self._made()
+        kernel.launch(device, dim, values)
 
-    def _record(self, device: torch.device, dim: tuple[int, int]) -> tuple[wp.Launch, ctypes.Structure]:
-        if len(self._recorded) >= MAX_RECORDED:
-            self._recorded.clear()
-        with warp_scope(device):
-            launch = wp.launch(
-                self._kernel,
-                dim,
-                inputs=[self._arguments()],
-                device=str(device),
-                record_cmd=True,
-                block_dim=self._block_dim,
-            )
-        packed: Any = upstream.recorded_arguments(launch)
-        self._packer = struct.Struct("@" + "".join(kind._type_ for _, kind in packed._fields_))
-        self._recorded[device, dim] = launch, packed
-        return launch, packed
+    @property
+    def loadable(self) -> "tuple[wp.Module, int]":
+        """What Warp compiles, and for blocks of which size."""
+        kernel = self._kernel or self._made()
+        return kernel.loadable
+
+    def _made(self) -> "NativeKernel":
+        # Warp takes a second to import, and may be absent where nobody launches anything.
+        from ksim_rl.device.native_kernel import NativeKernel
+
+        with self._making:
+            if self._kernel is None:
+                self._kernel = NativeKernel(self._arguments, self._source, self._indices, self._block_dim)
+        return self._kernel
+
+
+@cache
+def has_warp() -> bool:
+    """Whether Warp is installed; where it is not, torch computes what operators do."""
+    try:
+        import warp  # noqa: F401
+    except ModuleNotFoundError as error:
+        if error.name != "warp":
+            raise
+        return False
+    return True
 
 
 def as_operator(
-    name: str, launch: Callable[..., Any], fake: Callable[..., Any], *, mutates: Sequence[str] = ()
+    name: str,
+    launch: Callable[..., Any],
+    fake: Callable[..., Any],
+    *,
+    mutates: Sequence[str] = (),
+    in_torch: Callable[..., Any] | None = None,
 ) -> Callable[..., Any]:
     """Return `launch` as a function that is a torch operator where code is traced.
 
     Eager code goes past torch's dispatcher, which takes longer than the launch. `fake` returns an empty result for the
-    arguments, of which those named in `mutates` are changed.
+    arguments, of which those named in `mutates` are changed. `in_torch` does the same without a kernel, where Warp is
+    not installed.
     """
     # torch 2.11 looks for each of these among the arguments that were given, without those that equal their defaults.
     defaults = {name for name, own in signature(launch).parameters.items() if own.default is not own.empty}
     assert not defaults & set(mutates), f"{name}: arguments that are changed have no default"
-    operator = torch.library.custom_op(f"ksim_rl::{name}", launch, mutates_args=mutates)
+    chosen = launch if in_torch is None else _by_kernel_or_torch(launch, in_torch)
+    operator = torch.library.custom_op(f"ksim_rl::{name}", chosen, mutates_args=mutates)
     operator.register_fake(fake)
 
     def run(*arguments: object) -> Any:
         is_traced = torch.compiler.is_compiling() or recording.is_recording()
-        return (operator if is_traced else launch)(*arguments)
+        return (operator if is_traced else chosen)(*arguments)
+
+    return run
+
+
+def _by_kernel_or_torch(launch: Callable[..., Any], in_torch: Callable[..., Any]) -> Callable[..., Any]:
+    # Its signature, which torch reads, is that of `launch`.
+    @wraps(launch)
+    def run(*arguments: Any) -> Any:
+        work = launch if has_warp() else in_torch
+        return work(*arguments)
 
     return run
 

@@ -17,12 +17,12 @@ import zlib
 from typing import NamedTuple
 
 import torch
-import warp as wp
 from jaxtyping import Float32, Int, Int64
 from torch import Tensor
 
+from ksim_rl.device import draws_in_torch as in_torch
 from ksim_rl.device import group
-from ksim_rl.device.quick_launch import QuickLaunch, arguments_of, as_operator, source_of
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, arguments_of, as_operator, source_of
 
 DRAWS = source_of("ksim_rl.device", "draws")
 """C++ of all kernels that draw: `key_of` once per row, `bits_of` per number, `unit` or `normal` of these bits."""
@@ -105,10 +105,10 @@ _launch = QuickLaunch(
     arguments_of(
         (int, "rows columns n kind"),
         (float, "low high"),
-        (wp.int64, "start span"),
-        (wp.uint32, "stream"),
+        ("int64", "start span"),
+        ("uint32", "stream"),
         (int, "counter_stride first_row"),
-        (wp.uint64, "seed counter out"),
+        (ADDRESS, "seed counter out"),
     ),
     DRAWS + source_of("ksim_rl.device", "draw"),
     indices=("part", "chunk"),
@@ -128,19 +128,11 @@ def _draw_now(
     start: int,
     span: int,
 ) -> Tensor:
-    if kind == _ORDER:
-        counts = counter.numel()
-    else:
-        counts = num_rows
+    counts = _number_of_counts(seed, counter, num_rows, kind)
     if kind == _ORDER:
         stride = num_rows // counts
     else:
         stride = counter.ndim
-    if seed.dtype != torch.int64 or counter.dtype != torch.int64 or counter.shape not in ((), (counts,)):
-        raise ValueError(
-            f"seed is {seed.dtype}, counter is {counter.dtype} of shape {tuple(counter.shape)}: expected torch.int64, "
-            f"and a counter of shape () or ({counts},)"
-        )
     out_EL = _empty(seed, num_rows, n, kind)
     counter = counter.contiguous()
     if seed.device.type == "cpu":
@@ -155,8 +147,56 @@ def _draw_now(
     return out_EL
 
 
+def _number_of_counts(seed: Tensor, counter: Tensor, num_rows: int, kind: int) -> int:
+    """Return how many counts a draw needs, where it has more than one; a ValueError where it has others."""
+    if kind == _ORDER:
+        counts = counter.numel()
+    else:
+        counts = num_rows
+    if seed.dtype != torch.int64 or counter.dtype != torch.int64 or counter.shape not in ((), (counts,)):
+        raise ValueError(
+            f"seed is {seed.dtype}, counter is {counter.dtype} of shape {tuple(counter.shape)}: expected torch.int64, "
+            f"and a counter of shape () or ({counts},)"
+        )
+    return counts
+
+
+def _draw_in_torch(
+    seed: Tensor,
+    stream: int,
+    counter: Tensor,
+    num_rows: int,
+    first_row: int,
+    n: int,
+    kind: int,
+    low: float,
+    high: float,
+    start: int,
+    span: int,
+) -> Tensor:
+    """Draw what the kernel draws; for orders, `start` is a number of bits and `span` one of rounds."""
+    counts = _number_of_counts(seed, counter, num_rows, kind)
+    if kind == _ORDER:
+        rows = num_rows // counts
+        orders = []
+        for count in counter.reshape(-1):
+            keys = in_torch.keys_of(seed, stream, count, num_rows=rows, first_row=first_row)
+            first_number_E = torch.arange(rows, device=seed.device)[:, None] * n
+            orders.append(first_number_E + in_torch.permuted(keys, n, start, span))
+        return torch.cat(orders)
+    keys = in_torch.keys_of(seed, stream, counter, num_rows=num_rows, first_row=first_row)
+    bits_EL = in_torch.bits_of(keys, torch.arange(n, device=seed.device))
+    if kind == _UNIFORM:
+        return low + in_torch.unit(bits_EL) * (high - low)
+    if kind == _NORMAL:
+        return in_torch.normal(bits_EL)
+    return in_torch.whole(bits_EL, start, span)
+
+
 def _empty(seed: Tensor, num_rows: int, n: int, kind: int) -> Tensor:
     return seed.new_empty((num_rows, n), dtype=torch.int64 if kind >= _INTEGER else torch.float32)
 
 
-_drawn = as_operator("draw", _draw_now, lambda *given: _empty(given[0], given[3], *given[5:7]))
+_drawn = as_operator(
+    "draw", _draw_now, lambda *given: _empty(given[0], given[3], *given[5:7]), in_torch=_draw_in_torch
+)

@@ -3,16 +3,15 @@
 from collections.abc import Sequence
 
 import torch
-import warp as wp
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator
 
 _NEVER = 2**62
 
 
-_ARGUMENTS = arguments_of((int, "width num_envs"), (wp.uint64, "table term_of_column step first count"))
+_ARGUMENTS = arguments_of((int, "width num_envs"), (ADDRESS, "table term_of_column step first count"))
 _quick = QuickLaunch(
     _ARGUMENTS,
     """

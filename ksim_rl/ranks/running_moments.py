@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 
 import torch
-import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.device import group
-from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator, source_of
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator, source_of
 from ksim_rl.ranks.reduce import merged
 
 # Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows. Short ones hold up
@@ -21,8 +20,8 @@ GROUP = 32
 _quick = QuickLaunch(
     arguments_of(
         (int, "stage num_rows dim rows parts groups ranks span"),
-        (wp.int64, "until"),
-        (wp.uint64, "values valid counts moments count mean squares"),
+        ("int64", "until"),
+        (ADDRESS, "values valid counts moments count mean squares"),
     ),
     f"constexpr int GROUP = {GROUP};\n" + source_of("ksim_rl.ranks", "moments"),
 )
@@ -45,7 +44,34 @@ def _count(
     count.copy_(moments[-1])
 
 
-_count_rows = as_operator("count_rows", _count, lambda *_: None, mutates=("count", "mean_L", "squares_L"))
+def _count_in_torch(
+    values_NL: Tensor, valid_N: Tensor | None, count: Tensor, mean_L: Tensor, squares_L: Tensor, until: int
+) -> None:
+    """Do what the kernel does: the moments of the batch by two passes, and their union with all before."""
+    counted_N = values_NL.isfinite().all(1)
+    if valid_N is not None:
+        counted_N &= valid_N.bool()
+    if until >= 0:
+        counted_N &= count * group.size() < until
+    weight = counted_N.sum().double()
+    own_NL = torch.where(counted_N[:, None], values_NL.double(), 0.0)
+    own_mean_L = own_NL.sum(0) / weight.clamp_min(1.0)
+    error_NL = torch.where(counted_N[:, None], own_NL - own_mean_L, 0.0)
+    total = count + weight
+    share = weight / total.clamp_min(1.0)
+    delta_L = own_mean_L - mean_L
+    squares_L += error_NL.square().sum(0) + delta_L.square() * share * count
+    mean_L += delta_L * share
+    count.copy_(total)
+
+
+_count_rows = as_operator(
+    "count_rows",
+    _count,
+    lambda *_: None,
+    mutates=("count", "mean_L", "squares_L"),
+    in_torch=_count_in_torch,
+)
 
 
 class RunningMoments(nn.Module):

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl import envs, ranks
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.device.capture import eagerly
+from ksim_rl.device.eager import eagerly
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
 from ksim_rl.trainers.algorithm import HasWarmUp, make_update

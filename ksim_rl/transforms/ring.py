@@ -8,18 +8,18 @@ which the kernel counts on the device, so that a captured step goes on correctly
 import math
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator, source_of
+from ksim_rl.device import draws_in_torch as in_torch
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator, source_of
 from ksim_rl.device.random import DRAWS
 
 _ARGUMENTS = arguments_of(
     (int, "width lanes num_bytes value_stride num_slots num_frames stride num_parts counts first_row"),
-    (wp.uint32, "stream"),
+    ("uint32", "stream"),
     (int, "lowest span"),
-    (wp.uint64, "seed draw_count age lag mask parts value ring out"),
+    (ADDRESS, "seed draw_count age lag mask parts value ring out"),
 )
 _quick = QuickLaunch(_ARGUMENTS, DRAWS + source_of("ksim_rl.transforms", "ring"))
 _LANES = 32
@@ -97,6 +97,75 @@ def _launch(
     return out_EL
 
 
+def _turn_in_torch(
+    ring_EM: Tensor,
+    age_E: Tensor,
+    value_E: Tensor,
+    lag_E: Tensor | None,
+    mask_E: Tensor | None,
+    num_frames: int,
+    stride: int,
+    parts: Tensor | None,
+    counts: bool,
+    seed: Tensor | None,
+    draw_count_E: Tensor | None,
+    stream: int,
+    lowest: int,
+    highest: int,
+) -> Tensor:
+    """Do what the kernel does: see `_launch`."""
+    num_rows = ring_EM.shape[0]
+    num_slots = ring_EM.shape[1]
+    ring_EML = ring_EM.view(num_rows, num_slots, -1)
+    value_EL = value_E.reshape(num_rows, -1)
+    if mask_E is None:
+        writes_E = torch.ones(num_rows, dtype=torch.bool, device=value_E.device)
+        now_E = age_E.reshape(-1) + 1
+        newest_E = torch.zeros_like(now_E) if lag_E is None else lag_E.reshape(-1)
+    else:
+        writes_E = mask_E.reshape(-1)
+        now_E = torch.zeros_like(age_E).reshape(-1)
+        newest_E = now_E
+        stride = 0
+        if seed is not None and draw_count_E is not None and lag_E is not None:
+            _draw_lags_in_torch(lag_E, writes_E, seed, draw_count_E, stream, lowest, highest)
+    slot_E = now_E % num_slots
+    age_N = torch.arange(num_frames - 1, -1, -1, device=value_E.device) * stride
+    # No frame reaches back beyond the reset.
+    lag_EN = torch.minimum(newest_E[:, None] + age_N, now_E[:, None])
+    place_EN = (slot_E[:, None] - lag_EN) % num_slots
+    kept_ENL = ring_EML.gather(1, place_EN[..., None].expand(-1, -1, value_EL.shape[1]))
+    frames_ENL = torch.where(lag_EN[..., None] == 0, value_EL[:, None], kept_ENL)
+    rows_E = torch.arange(num_rows, device=value_E.device)
+    ring_EML[rows_E, slot_E] = torch.where(writes_E[:, None], value_EL, ring_EML[rows_E, slot_E])
+    if counts:
+        age_E.copy_(torch.where(writes_E, now_E, age_E.reshape(-1)).view_as(age_E))
+    if parts is None:
+        return frames_ENL.reshape(num_rows, -1)
+    sizes = [size // value_E.element_size() for size in parts.tolist()]
+    columns = [part.reshape(num_rows, -1) for part in frames_ENL.split(sizes, dim=2)]
+    return torch.cat(columns, dim=1)
+
+
+def _draw_lags_in_torch(
+    lag_E: Tensor,
+    begins_E: Tensor,
+    seed: Tensor,
+    draw_count_E: Tensor,
+    stream: int,
+    lowest: int,
+    highest: int,
+) -> None:
+    num_rows = len(begins_E)
+    count_E = draw_count_E.reshape(-1) + 1
+    first_row = ranks.first_row(num_rows)
+    keys = in_torch.keys_of(seed, stream, count_E, num_rows=num_rows, first_row=first_row)
+    bits_E = in_torch.bits_of(keys, torch.zeros(1, dtype=torch.int64, device=seed.device))[:, 0]
+    drawn_E = in_torch.whole(bits_E, lowest, highest - lowest + 1)
+    draw_count_E += begins_E.view_as(draw_count_E)
+    lag_E.copy_(torch.where(begins_E, drawn_E, lag_E.reshape(-1)).view_as(lag_E))
+
+
 turn = as_operator(
     "ring",
     _launch,
@@ -104,4 +173,5 @@ turn = as_operator(
         (ring_EM.shape[0], num_frames * ring_EM.shape[2:].numel())
     ),
     mutates=("ring_EM", "age_E", "lag_E", "draw_count_E"),
+    in_torch=_turn_in_torch,
 )

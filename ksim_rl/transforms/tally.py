@@ -1,12 +1,11 @@
 """This kernel, also a torch operator, counts steps and rewards for trackers, per env: one launch counts and copies."""
 
 import torch
-import warp as wp
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator
 
-_ARGUMENTS = arguments_of((int, "rows"), (wp.uint64, "mask reward total step total_out step_out"))
+_ARGUMENTS = arguments_of((int, "rows"), (ADDRESS, "mask reward total step total_out step_out"))
 # Parameters are what the CPU's compiler believes not to overlap, so that loops become vector instructions.
 _quick_tally = QuickLaunch(
     _ARGUMENTS,
@@ -61,9 +60,24 @@ def _tally(
     return step_out_E, total_out_E
 
 
+def _tally_in_torch(
+    step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Do what the kernel does."""
+    if mask_E is not None:
+        step_E.masked_fill_(mask_E.view_as(step_E), 0)
+        total_E.masked_fill_(mask_E.view_as(total_E), 0.0)
+    else:
+        assert reward_E is not None, "a step has rewards"
+        step_E += 1
+        total_E += reward_E.view_as(total_E)
+    return step_E.clone(), total_E.clone()
+
+
 tally = as_operator(
     "tally",
     _tally,
     lambda step_E, total_E, *_: (torch.empty_like(step_E), torch.empty_like(total_E)),
     mutates=("step_E", "total_E"),
+    in_torch=_tally_in_torch,
 )

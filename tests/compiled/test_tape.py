@@ -4,12 +4,11 @@ import math
 
 import pytest
 import torch
-import warp as wp
 
 from ksim_rl.compiled import cells
 from ksim_rl.compiled.tape import Kernel, Tape
 from ksim_rl.device import random, recording
-from ksim_rl.device.quick_launch import QuickLaunch, arguments_of
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, arguments_of
 
 E = 7
 ODD = torch.tensor([math.nan, math.inf, -math.inf, -0.0, 0.0, 0.5, -1.5])
@@ -308,7 +307,7 @@ def test_draws_are_part_of_the_kernel_and_follow_their_counters():
 
 
 def test_a_kernel_that_is_no_operator_of_torch_is_refused():
-    quick = QuickLaunch(arguments_of((wp.uint64, "out")), "((float*)a.out)[row] = 1.0f;")
+    quick = QuickLaunch(arguments_of((ADDRESS, "out")), "((float*)a.out)[row] = 1.0f;")
     with pytest.raises(AssertionError, match="no operator"), recording.recorded():
         quick(torch.device("cpu"), (E, 1), torch.empty(E).data_ptr())
 

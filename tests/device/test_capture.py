@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from ksim_rl.device import capture
+from ksim_rl.device.eager import eagerly, runs_eagerly
 from ksim_rl.physics import Captured
 from tests.physics.models import standing_quadrupeds
 
@@ -31,13 +32,13 @@ def test_a_call_in_a_live_block_leaves_the_world_bit_identical():
 
 
 def test_what_is_made_in_a_block_of_eager_is_so_for_ever():
-    with capture.eagerly():
-        assert capture.runs_eagerly()
+    with eagerly():
+        assert runs_eagerly()
         eager = Captured(lambda: None, device="cpu")
-        with capture.eagerly(False):
-            assert capture.runs_eagerly()
+        with eagerly(False):
+            assert runs_eagerly()
     assert eager.is_eager and not Captured(lambda: None, device="cpu").is_eager
-    assert not capture.runs_eagerly()
+    assert not runs_eagerly()
 
 
 class FakeGraph:

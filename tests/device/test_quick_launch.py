@@ -4,27 +4,22 @@ import threading
 
 import pytest
 import torch
-import warp as wp
 
-from ksim_rl.device import quick_launch
-from ksim_rl.device.quick_launch import QuickLaunch, address, as_operator
+from ksim_rl.device import native_kernel
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator
 
 CPU = torch.device("cpu")
 
 
-@wp.struct
-class Line:
-    slope: float
-    offset: wp.int64
-    shift: wp.uint32
-    scale: int
-    out: wp.uint64
+LINE = arguments_of(
+    (float, "slope"), ("int64", "offset"), ("uint32", "shift"), (int, "scale"), (ADDRESS, "out")
+)
 
 
 @pytest.fixture
 def launch() -> QuickLaunch:
     return QuickLaunch(
-        Line,
+        LINE,
         "((double*)a.out)[i] = (double)a.slope * i + (double)a.offset + a.shift + a.scale;",
         ("i", "lane"),
     )
@@ -49,10 +44,10 @@ def test_no_size_no_launch(launch):
 
 
 def test_many_sizes_do_not_pile_up(launch, monkeypatch):
-    monkeypatch.setattr(quick_launch, "MAX_RECORDED", 3)
+    monkeypatch.setattr(native_kernel, "MAX_RECORDED", 3)
     for size in [*range(1, 12), 1, 2]:
         assert line(launch, size, 1.0, size, 0, 0) == [size + i for i in range(size)]
-    assert len(launch._recorded) <= 3
+    assert len(launch._kernel._recorded) <= 3
 
 
 def test_numbers_of_two_threads_do_not_mix(launch):

@@ -4,18 +4,17 @@ At each step a few worlds reset, so that what counts is how many kernels a draw 
 `ksim_rl.device.random` at the same coordinates.
 """
 
-import warp as wp
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator
 from ksim_rl.device.random import DRAWS
 
 _ARGUMENTS = arguments_of(
     (int, "elements columns shared kind operation"),
     (float, "cut"),
     (int, "lanes world_stride element_stride followers counter_stride first_row"),
-    (wp.uint32, "stream"),
-    (wp.uint64, "seed counter mask table field follower"),
+    ("uint32", "stream"),
+    (ADDRESS, "seed counter mask table field follower"),
 )
 # A follower is a field that grows in proportion to the only column that is drawn; it has as many elements.
 _quick = QuickLaunch(

@@ -4,11 +4,11 @@ Each column's draws are those of `ksim_rl.device.random` at (seed, stream, count
 """
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.device.quick_launch import QuickLaunch, address, arguments_of, as_operator, source_of
+from ksim_rl.device import draws_in_torch as draws
+from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator, source_of
 from ksim_rl.device.random import DRAWS
 
 GAUSSIAN, MULTIPLY, BIAS_GAUSSIAN, BIAS_MULTIPLY, BY_LEVEL, HOLD = (1 << bit for bit in range(6))
@@ -22,13 +22,18 @@ OFFSET, SPREAD, BIAS_OFFSET, BIAS_SPREAD, WALK_STD, RESOLUTION, DROPOUT = range(
 """The rows of the table of parameters."""
 NUM_PARAMETERS = 7
 
+BIAS_INDEX = 0x40000000
+WALK_INDEX = 0x80000000
+DROPOUT_INDEX = 0xC0000000
+"""Where the draws of biases, of drifts and of lost readings begin among those of a row, as in `noise.cpp`."""
+
 _MODES = {"forward": 0, "step": 1, "reset": 2}
 
 
 _ARGUMENTS = arguments_of(
     (int, "n mode features first_row"),
-    (wp.uint32, "stream"),
-    (wp.uint64, "seed counter enabled level mask table flags clean bias walk last out"),
+    ("uint32", "stream"),
+    (ADDRESS, "seed counter enabled level mask table flags clean bias walk last out"),
 )
 _LANES = 32
 """Threads that share a row on the GPU; the CPU has one, which takes the columns in vector instructions."""
@@ -88,9 +93,86 @@ def _launch(
     return out_EL
 
 
+def _noise_in_torch(
+    clean_EL: Tensor,
+    table_PL: Tensor,
+    flags_L: Tensor,
+    enabled: Tensor,
+    level: Tensor,
+    seed: Tensor,
+    bias_EL: Tensor | None,
+    walk_EL: Tensor | None,
+    last_EL: Tensor | None,
+    features: int,
+    moment: str,
+    mask_E: Tensor | None,
+    stream: int,
+    counter: Tensor,
+) -> Tensor:
+    """Do what the kernel does: see `_launch`."""
+    num_columns = flags_L.numel()
+    if not clean_EL.numel():
+        return torch.empty_like(clean_EL)
+    x_EL = clean_EL.reshape(-1, num_columns)
+    num_rows = len(x_EL)
+    if mask_E is None:
+        begins_E = torch.ones(num_rows, dtype=torch.bool, device=clean_EL.device)
+    else:
+        begins_E = mask_E.reshape(-1)
+    count = (counter + 1) if moment == "forward" else (counter.reshape(-1) + 1)
+    keys = draws.keys_of(seed, stream, count, num_rows=num_rows, first_row=ranks.first_row(num_rows))
+    if moment != "forward":
+        counter += begins_E.view_as(counter)
+    else:
+        features &= HAS_GAUSSIAN | HAS_RESOLUTION
+    column_L = torch.arange(num_columns, device=clean_EL.device)
+    strength_L = enabled.float() * torch.where(flags_L & BY_LEVEL > 0, level, 1.0)
+
+    def keep(state_EL: Tensor | None, new_EL: Tensor) -> None:
+        assert state_EL is not None, "what a feature keeps has memory"
+        rows_EL = state_EL.view(num_rows, num_columns)
+        rows_EL.copy_(torch.where(begins_E[:, None], new_EL, rows_EL))
+
+    def sample(first: int, parameter: int, is_normal_L: Tensor) -> Tensor:
+        bits_EL = draws.bits_of(keys, column_L + first)
+        drawn_EL = torch.where(is_normal_L, draws.normal(bits_EL), draws.unit(bits_EL))
+        return table_PL[parameter] + table_PL[parameter + 1] * drawn_EL
+
+    def applied(x_EL: Tensor, noise_EL: Tensor, multiplies_L: Tensor) -> Tensor:
+        scaled_EL = x_EL * (strength_L * noise_EL + (1.0 - strength_L))
+        return torch.where(multiplies_L, scaled_EL, x_EL + strength_L * noise_EL)
+
+    if features & HAS_BIAS and bias_EL is not None:
+        if moment == "reset":
+            keep(bias_EL, sample(BIAS_INDEX, BIAS_OFFSET, flags_L & BIAS_GAUSSIAN > 0))
+        x_EL = applied(x_EL, bias_EL.view(num_rows, num_columns), flags_L & BIAS_MULTIPLY > 0)
+    if features & HAS_WALK and walk_EL is not None:
+        drift_EL = torch.zeros_like(x_EL)
+        if moment != "reset":
+            steps_EL = draws.normal(draws.bits_of(keys, column_L + WALK_INDEX))
+            drift_EL = walk_EL.view(num_rows, num_columns) + table_PL[WALK_STD] * steps_EL
+        keep(walk_EL, drift_EL)
+        x_EL = x_EL + strength_L * drift_EL
+    x_EL = applied(x_EL, sample(0, OFFSET, flags_L & GAUSSIAN > 0), flags_L & MULTIPLY > 0)
+    if features & HAS_RESOLUTION:
+        step_L = strength_L * table_PL[RESOLUTION]
+        x_EL = torch.where(step_L > 0.0, (x_EL / step_L).round() * step_L, x_EL)
+    if features & HAS_DROPOUT and last_EL is not None:
+        if moment != "reset":
+            # One draw for all columns of an observation.
+            chance_EL = draws.unit(draws.bits_of(keys, (flags_L >> KEY_SHIFT).long() + DROPOUT_INDEX))
+            lost_EL = chance_EL < strength_L * table_PL[DROPOUT]
+            held_EL = torch.where(flags_L & HOLD > 0, last_EL.view(num_rows, num_columns), 0.0)
+            x_EL = torch.where(lost_EL, held_EL, x_EL)
+        keep(last_EL, x_EL)
+    noisy_EL = torch.where(begins_E[:, None], x_EL, clean_EL.reshape(-1, num_columns))
+    return noisy_EL.view(clean_EL.shape)
+
+
 add_noise = as_operator(
     "noise",
     _launch,
     lambda clean_EL, *_others: clean_EL.new_empty(clean_EL.shape),
     mutates=("bias_EL", "walk_EL", "last_EL", "counter"),
+    in_torch=_noise_in_torch,
 )
