@@ -4,19 +4,14 @@ import dataclasses
 import importlib
 import pkgutil
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import torch
-from hydra import compose, initialize
-from hydra.core.config_store import ConfigStore
-from hydra.errors import ConfigCompositionException
-from omegaconf import OmegaConf
 
 from ksim_rl.checks import check_known, naming
-from ksim_rl.config import plugins, upstream
+from ksim_rl.config import plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
-from ksim_rl.config.overrides import check_overrides
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
@@ -24,7 +19,6 @@ from ksim_rl.envs.task import Task
 from ksim_rl.transforms.groups.group_cfg import compile_groups
 from ksim_rl.transforms.row_transform import follow_level, seed_transforms
 
-_CONFIG = "ksim_rl_env"
 # Imported by name when tasks are first asked for: they stand above this room and import it.
 OWN_TASKS = ("ksim_rl.tasks", "ksim_rl.suites", "ksim_rl.tracking")
 
@@ -71,14 +65,10 @@ def cfg_of(name: str) -> ManagerBasedRlEnvCfg:
 
 def register_configs() -> None:
     """Store each task's config tree in Hydra's config group `task`."""
-    _register(tuple(names()))
+    # Hydra takes a while to load, which an env without overrides does not need.
+    from ksim_rl.envs import composed
 
-
-@cache
-def _register(names: tuple[str, ...]) -> None:
-    for name in names:
-        upstream.store_config("task", name, partial(_tree, name))
-    ConfigStore.instance().store(name=_CONFIG, node={"defaults": [{"task": "???"}, "_self_"]})
+    composed.register(tuple(names()), _tree)
 
 
 def _tree(name: str) -> dict[str, Any]:
@@ -92,14 +82,11 @@ def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
     """
     if not overrides:
         return cfg_of(name)
-    check_overrides({"task": _tree(name)}, overrides)
+    from ksim_rl.envs import composed
+
     register_configs()
-    with initialize(version_base="1.3", config_path=None):
-        try:
-            composed = compose(config_name=_CONFIG, overrides=[f"task={name}", *overrides])
-        except ConfigCompositionException as error:
-            raise ValueError(f"{error}: {error.__cause__}") from error
-    return from_tree(ManagerBasedRlEnvCfg, OmegaConf.to_container(composed.task, resolve=True), "task")
+    tree = composed.with_overrides(name, _tree, overrides)
+    return from_tree(ManagerBasedRlEnvCfg, tree, "task")
 
 
 def build(

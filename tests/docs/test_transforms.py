@@ -5,7 +5,7 @@ import re
 import pytest
 
 from tests.docs.guide import DOCS
-from tests.transforms.transform_checks import exported_transforms
+from tests.transforms.portable import exported_transforms
 
 PAGE = (DOCS / "transforms.md").read_text()
 EXAMPLES = dict(re.findall(r"<!-- example: (\w+) -->\n```python\n(.*?)```", PAGE, re.DOTALL))

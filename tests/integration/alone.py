@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,20 +13,26 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parents[2]
 OURS = "ksim_rl"
 
-# Refuses modules by name, before anything that is installed is asked for them.
+# Lets Python's finders find nothing of these names: then it is as if they were not installed.
 REFUSAL = """
 import sys
 
-class Absent:
-    def __init__(self, names):
+class Without:
+    def __init__(self, finder, names):
+        self.finder = finder
         self.names = names
+
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
 
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in self.names:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-        return None
+            return None
+        return self.finder.find_spec(name, path, target)
 
-sys.meta_path.insert(0, Absent(frozenset(%r)))
+absent = frozenset(ABSENT)
+assert not absent & set(sys.modules)
+sys.meta_path[:] = [Without(finder, absent) for finder in sys.meta_path]
 """
 
 
@@ -38,7 +43,7 @@ def run_with(packages: Sequence[str], program: str, *, without: Sequence[str] = 
     """
     absent = sorted(_modules_of_others(_with_requirements(packages)) | set(without))
     done = subprocess.run(
-        [sys.executable, "-c", REFUSAL % (absent,) + textwrap.dedent(program)],
+        [sys.executable, "-c", REFUSAL.replace("ABSENT", repr(absent)) + program],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         cwd=ROOT,
         capture_output=True,

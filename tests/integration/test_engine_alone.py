@@ -25,8 +25,8 @@ for path in [*files, here / "checked.py", here / "checks.py", here / "terminal.p
     importlib.import_module(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
 rooms = {name.split(".")[1] for name in sys.modules if name.startswith("ksim_rl.")}
 print(*sorted(rooms))
-print(*(name for name in %r if name in sys.modules))
-""" % (NOT_LOADED,)
+print(*(name for name in NOT_LOADED if name in sys.modules))
+""".replace("NOT_LOADED", repr(NOT_LOADED))
 
 WORLDS = """
 import runpy
@@ -42,7 +42,7 @@ from ksim_rl.physics import NanGuardCfg, SimCfg, World, load_model
 
 model = load_model("<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>")
 try:
-    World(model, num_envs=1, sim=SimCfg(engine="c", nan_guard=NanGuardCfg(folder=%r)))
+    World(model, num_envs=1, sim=SimCfg(engine="c", nan_guard=NanGuardCfg(folder=FOLDER)))
 except ValueError as error:
     print(error)
 """
@@ -64,7 +64,7 @@ def test_both_engines_step_worlds():
 
 
 def test_who_asks_for_files_of_the_nan_guard_learns_what_they_need(tmp_path):
-    assert "need the package safetensors" in run_with(PACKAGES, GUARD % (str(tmp_path),))
+    assert "need the package safetensors" in run_with(PACKAGES, GUARD.replace("FOLDER", repr(str(tmp_path))))
 
 
 def test_its_face_is_a_few_names_that_explain_themselves():

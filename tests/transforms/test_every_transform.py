@@ -13,14 +13,8 @@ from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.testing import CounterEnv, check_env, count_syncs
 from ksim_rl.transforms import KeyedTransform, ObservationGroups, ObservationNoise
 from tests.transforms.chains import VECTOR, actions, assert_same, copied, fixed_rollout, seed_all
-from tests.transforms.transform_checks import (
-    KINDS,
-    PORTABLE,
-    UNIFORM,
-    exported_transforms,
-    has_episodes,
-    masked,
-)
+from tests.transforms.portable import PORTABLE, UNIFORM, exported_transforms
+from tests.transforms.transform_checks import KINDS, has_episodes, masked
 
 every_kind = pytest.mark.parametrize("kind", KINDS)
 every_class = pytest.mark.parametrize("name", PORTABLE)

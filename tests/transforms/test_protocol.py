@@ -9,6 +9,7 @@ from torchrl.envs import TransformedEnv
 
 from ksim_rl.transforms import ActionScale, EpisodeTracker, Mirror, ObservationScale, TimeAwareObservation
 from tests.transforms.leaf_env import LeafEnv
+from tests.transforms.portable import exported_transforms
 from tests.transforms.protocol import (
     CHECKS,
     KINDS,
@@ -20,7 +21,6 @@ from tests.transforms.protocol import (
     outcome,
     transformed,
 )
-from tests.transforms.transform_checks import exported_transforms
 
 QUICK = ("specs_alone", "reset_and_steps", "samples_alone", "samples_from_a_buffer", "inverse_of_samples")
 

@@ -10,8 +10,9 @@ from torchrl.envs.transforms import Compose
 from ksim_rl.testing import CounterEnv
 from ksim_rl.transforms import ActionDelay, ActionLowPass, Mirror
 from tests.transforms.chains import assert_same
+from tests.transforms.portable import PORTABLE
 from tests.transforms.test_every_transform import samples, with_statistics
-from tests.transforms.transform_checks import PORTABLE, has_episodes
+from tests.transforms.transform_checks import has_episodes
 
 every_class = pytest.mark.parametrize("name", PORTABLE)
 every_buffer = pytest.mark.parametrize("kind", [ReplayBuffer, TensorDictReplayBuffer])

@@ -3,8 +3,8 @@
 import itertools
 import re
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from tensordict import NestedKey
 
@@ -12,12 +12,14 @@ from ksim_rl import checks
 from ksim_rl.transforms.groups.groups import GroupSpec, last_name
 from ksim_rl.transforms.mirror.mirror import MirrorMap, concatenate
 
+if TYPE_CHECKING:
+    import mujoco
+
 _SIDES = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br", "ml": "mr"}
 _SIDES |= {"lf": "rf", "lh": "rh", "lr": "rr", "lb": "rb", "lm": "rm"}
 # Between the words of a name: anything that is no letter, and the humps of CamelCase.
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[^A-Za-z]+")
 _ARM = re.compile(r"[A-Z][LR]")
-_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _TOLERANCE = 1e-3
 
 
@@ -69,7 +71,7 @@ def mirror_by_name(names: Sequence[str], each: MirrorMap | None = None) -> Mirro
     )
 
 
-def mirror_joints(mj_model: mujoco.MjModel, joints: Sequence[str] | None = None) -> MirrorMap:
+def mirror_joints(mj_model: "mujoco.MjModel", joints: Sequence[str] | None = None) -> MirrorMap:
     """Return the map of a vector with one number per joint: position, velocity, effort, target, action.
 
     The mirror is the plane y = 0 of the world, with the robot at `qpos0`. A hinge's sign is 1 if its counterpart
@@ -77,10 +79,14 @@ def mirror_joints(mj_model: mujoco.MjModel, joints: Sequence[str] | None = None)
     a pose that is its own mirror image. `joints` are hinges and slides in the order of the columns, None for all.
     Raises ValueError where a joint has no counterpart, or the two are no mirror images of each other.
     """
+    # Whoever has a model has MuJoCo; the other transforms need none.
+    import mujoco
+
     data = mujoco.MjData(mj_model)
     data.qpos[:] = mj_model.qpos0
     mujoco.mj_kinematics(mj_model, data)
-    scalar = (_HINGE, int(mujoco.mjtJoint.mjJNT_SLIDE))
+    hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
+    scalar = (hinge, int(mujoco.mjtJoint.mjJNT_SLIDE))
     valid = {mj_model.joint(i).name: i for i in range(mj_model.njnt) if mj_model.jnt_type[i] in scalar}
     names = list(valid) if joints is None else list(joints)
     for name in names:
@@ -89,15 +95,17 @@ def mirror_joints(mj_model: mujoco.MjModel, joints: Sequence[str] | None = None)
     for name in names:
         other = mirror_name(name, names)
         source.append(names.index(other))
-        signs.append(_sign(mj_model, data, valid[name], valid[other]))
+        signs.append(_sign(mj_model, data, valid[name], valid[other], hinge=hinge))
     return MirrorMap(source=tuple(source), signs=tuple(signs))
 
 
-def _sign(mj_model: mujoco.MjModel, data: mujoco.MjData, joint: int, other: int) -> float:
+def _sign(
+    mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: int, *, hinge: int
+) -> float:
     reflection = np.array([1.0, -1.0, 1.0])
     apart = np.abs(data.xanchor[joint] * reflection - data.xanchor[other]).max()
     # A rotation axis is a pseudovector: its mirror image turns the other way as well.
-    handed = -1.0 if mj_model.jnt_type[joint] == _HINGE else 1.0
+    handed = -1.0 if mj_model.jnt_type[joint] == hinge else 1.0
     agreement = float(handed * reflection * data.xaxis[joint] @ data.xaxis[other])
     extent = max(float(mj_model.stat.extent), _TOLERANCE)
     differs = mj_model.jnt_type[joint] != mj_model.jnt_type[other] or abs(abs(agreement) - 1) > _TOLERANCE

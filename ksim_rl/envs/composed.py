@@ -1,0 +1,36 @@
+"""Applies Hydra overrides to the config trees of tasks; Hydra is loaded with this module, when some are first given."""
+
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from typing import Any
+
+from hydra import compose, initialize
+from hydra.core.config_store import ConfigStore
+from hydra.errors import ConfigCompositionException
+from omegaconf import OmegaConf
+
+from ksim_rl.config import upstream
+from ksim_rl.config.overrides import check_overrides
+
+_CONFIG = "ksim_rl_env"
+
+MakeTree = Callable[[str], dict[str, Any]]
+
+
+@cache
+def register(names: tuple[str, ...], make_tree: MakeTree) -> None:
+    """Store the tree that is made of each task's name in Hydra's config group `task`."""
+    for name in names:
+        upstream.store_config("task", name, partial(make_tree, name))
+    ConfigStore.instance().store(name=_CONFIG, node={"defaults": [{"task": "???"}, "_self_"]})
+
+
+def with_overrides(name: str, make_tree: MakeTree, overrides: Sequence[str]) -> Any:
+    """Return the tree of a registered task with overrides applied; a ValueError names the one that is not valid."""
+    check_overrides({"task": make_tree(name)}, overrides)
+    with initialize(version_base="1.3", config_path=None):
+        try:
+            composed = compose(config_name=_CONFIG, overrides=[f"task={name}", *overrides])
+        except ConfigCompositionException as error:
+            raise ValueError(f"{error}: {error.__cause__}") from error
+    return OmegaConf.to_container(composed.task, resolve=True)
