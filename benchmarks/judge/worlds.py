@@ -37,6 +37,7 @@ _ADDED = {
     "dof_armature": 0.05,
     "dof_frictionloss": 0.1,
     "dof_damping": 0.2,
+    "actuator_armature": 0.05,
 }
 
 

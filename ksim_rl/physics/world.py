@@ -19,6 +19,7 @@ from ksim_rl.physics.fields import fields_to_expand
 from ksim_rl.physics.model_checks import check_asleep, check_not_simple
 from ksim_rl.physics.nan_guard.guard import NanReport
 from ksim_rl.physics.overflow import OverflowReport
+from ksim_rl.physics.sensors.sensor_checks import check_touched_sites
 from ksim_rl.physics.sim_cfg import SimCfg
 
 ENGINES: dict[str, type["World"]] = {}
@@ -90,6 +91,7 @@ class World(views.DataViews):
         self.sim.apply_to(self.mj_model)
         self._expanded = fields_to_expand(per_world_fields, self.mj_model)
         check_asleep(self.mj_model)
+        check_touched_sites(self.mj_model)
         check_not_simple(self.mj_model, self._expanded)
         check_effects(self.mj_model, self._expanded)
         switch_on(self.mj_model, self._expanded)

@@ -104,3 +104,34 @@ def test_delays_that_mujoco_warp_has_before_our_reading_are_refused(sensor: str,
     xml = THINGS.format(cone="pyramidal").replace("</sensor>", f"{sensor}</sensor>")
     with pytest.raises(ValueError, match=f"sensor {message}"):
         load_model(xml)
+
+
+MESH_SITES = """
+<mujoco>
+  <asset><mesh name="stone" vertex="0 0 0 0.1 0 0 0 0.1 0 0 0 0.1"/></asset>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body name="b" pos="0 0 0.009"><freejoint/><geom size="0.01"/><site name="t" type="mesh" mesh="stone"/></body>
+  </worldbody>
+  <sensor>{}</sensor>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        '<insidesite site="t" objtype="body" objname="b"/>',
+        '<contact site="t" data="found"/>',
+        '<touch site="t"/>',
+    ],
+)
+def test_what_is_in_a_site_with_a_mesh_is_refused(sensor: str):
+    with pytest.raises(ValueError, match="site 't', which has the shape of a mesh"):
+        World(mujoco.MjModel.from_xml_string(MESH_SITES.format(sensor)), num_envs=1)
+
+
+def test_frames_of_a_site_with_a_mesh_are_read():
+    world = World(load_model(MESH_SITES.format('<framepos objtype="site" objname="t"/>')), num_envs=1)
+    world.refresh()
+    torch.testing.assert_close(world.sensordata_EL[0], torch.tensor([0.0, 0.0, 0.009]))

@@ -8,7 +8,9 @@ DISTANCES = (
     mujoco.mjtSensor.mjSENS_GEOMNORMAL,
     mujoco.mjtSensor.mjSENS_GEOMFROMTO,
 )
-SDF = mujoco.mjtGeom.mjGEOM_SDF
+SDF, MESH = mujoco.mjtGeom.mjGEOM_SDF, mujoco.mjtGeom.mjGEOM_MESH
+SITE = mujoco.mjtObj.mjOBJ_SITE
+_OTHER_SHAPES = "make the site a sphere, capsule, ellipsoid, cylinder or box"
 GEOM, BODY, TREE = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
 
 
@@ -16,6 +18,7 @@ def check_sensors(mj_model: mujoco.MjModel) -> None:
     """Refuse sensors of distances or contacts that no kernel reads as MuJoCo's C engine does."""
     check_signed_distance_fields(mj_model)
     check_delayed(mj_model)
+    check_sites_of_meshes(mj_model)
     flags, bits = mj_model.opt.disableflags, mujoco.mjtDisableBit
     for sensor in np.flatnonzero(np.isin(mj_model.sensor_type, DISTANCES)):
         if flags & bits.mjDSBL_CONSTRAINT:
@@ -46,6 +49,34 @@ def check_delayed(mj_model: mujoco.MjModel) -> None:
             raise ValueError(
                 f"{_name(mj_model, sensor)} has a cutoff of {mj_model.sensor_cutoff[sensor]:g}, and its samples are "
                 "interpolated before it is applied: set cutoff='0' or interp='zoh'"
+            )
+
+
+def check_sites_of_meshes(mj_model: mujoco.MjModel) -> None:
+    """Refuse sensors of what is in a site with the shape of a mesh, of which MuJoCo Warp knows no inside."""
+    kinds = mujoco.mjtSensor
+    m = mj_model
+    for sensor in np.flatnonzero(np.isin(m.sensor_type, (kinds.mjSENS_CONTACT, kinds.mjSENS_INSIDESITE))):
+        # A sensor of what is inside names the site second.
+        is_second = m.sensor_type[sensor] == kinds.mjSENS_INSIDESITE
+        kind = m.sensor_reftype[sensor] if is_second else m.sensor_objtype[sensor]
+        site = int(m.sensor_refid[sensor] if is_second else m.sensor_objid[sensor])
+        if kind == SITE and m.site_type[site] == MESH:
+            raise ValueError(
+                f"{_name(m, int(sensor))} reads what is in site {m.site(site).name!r}, which has the shape of a mesh, "
+                f"and MuJoCo Warp knows no inside of it: {_OTHER_SHAPES}"
+            )
+
+
+def check_touched_sites(mj_model: mujoco.MjModel) -> None:
+    """Refuse touch sensors of sites with the shape of a mesh: MuJoCo ends the program that reads them."""
+    m = mj_model
+    for sensor in np.flatnonzero(m.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH):
+        site = int(m.sensor_objid[sensor])
+        if m.site_type[site] == MESH:
+            raise ValueError(
+                f"{_name(m, int(sensor))} feels touches in site {m.site(site).name!r}, which has the shape of a mesh, "
+                f"and MuJoCo cannot read it: {_OTHER_SHAPES}"
             )
 
 
