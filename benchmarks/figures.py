@@ -44,6 +44,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "randomization": STEP,
     "ranks": (*STEP, *LEARN, "ksim_rl/ranks"),
     "resume": (*STEP, *LEARN, "ksim_rl/trainers"),
+    "robots": ("ksim_rl/scene/robots", "ksim_rl/physics/model_files"),
     "rooms": (*STEP, *LEARN, *TASK),
     "scaling": (*STEP, *LEARN),
     "sim2sim": (*STEP, "ksim_rl/export"),

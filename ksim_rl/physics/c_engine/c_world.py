@@ -228,7 +228,7 @@ class CWorld(World):
 
     def overflow_counts(self, *, clear: bool = True) -> Int[Tensor, " N"]:
         """Return zeros: nothing overflows without an error."""
-        return torch.zeros(len(BIT_NAMES) + 3, dtype=torch.int32)
+        return torch.zeros(len(BIT_NAMES) + 3, dtype=torch.int64)
 
     def explain_overflow(self, numbers: Sequence[int]) -> OverflowReport:
         """Return a report without losses."""
