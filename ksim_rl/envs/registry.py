@@ -8,8 +8,10 @@ from functools import cache
 from typing import Any
 
 import torch
+from tensordict.utils import unravel_key
+from torchrl.envs.transforms import Transform
 
-from ksim_rl.checks import check_known, naming
+from ksim_rl.checks import check_known, naming, near
 from ksim_rl.config import plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
@@ -103,6 +105,7 @@ def build(
         transform = described.build(name)
         follow_level([transform], level)
         try:
+            _check_reads(transform, env)
             env.append_transform(transform)
             # Specs that are made show what does not fit.
             assert env.output_spec is not None and env.input_spec is not None
@@ -113,6 +116,16 @@ def build(
     assert seed is not None  # an env stores the seed that it drew
     seed_transforms(env, seed)  # alone: the base env has its seed already
     return env
+
+
+def _check_reads(transform: Transform, env: MaskedTransformedEnv) -> None:
+    """Refuse a transform that reads what the env does not emit, which TorchRL finds out in the first step."""
+    specs = (env.full_observation_spec, env.full_reward_spec, env.full_done_spec, env.full_action_spec)
+    known = {unravel_key(key) for spec in specs for key in spec.keys(True, True)}
+    for key in transform.in_keys or ():
+        if unravel_key(key) not in known:
+            names = sorted(str(one) for one in known)
+            raise ValueError(f"{type(transform).__name__} reads {key!r}: {near(str(key), names)}")
 
 
 def make(

@@ -261,6 +261,11 @@ def states_as_they_come(patch):
     patch.setattr(checkpoint, "fitting", contextlib.nullcontext)
 
 
+@sabotage("wrong_inputs")
+def errors_end_without_a_word(patch):
+    patch.setattr("ksim_rl.cli.main.report", lambda error: 3)
+
+
 @sabotage("caches")
 def errors_as_warp_raises_them(patch):
     program = (

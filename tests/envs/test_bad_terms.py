@@ -9,7 +9,7 @@ import torch
 from ksim_rl import conf, envs
 from ksim_rl.cli.errors import FAILED, report
 from ksim_rl.envs.step_counts import episode_steps
-from ksim_rl.envs.term import ObservationTerm, RewardTerm
+from ksim_rl.envs.term import CurriculumTerm, ObservationTerm, RewardTerm
 from ksim_rl.transforms import ObservationTermCfg
 from ksim_rl.transforms.delay import DelayCfg
 
@@ -34,6 +34,14 @@ class Blank(ObservationTerm):
 
     def __call__(self, view):
         return None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Level(CurriculumTerm):
+    """Returns a number."""
+
+    def __call__(self, view, reset_E):
+        return 1.0
 
 
 def config(**changes):
@@ -112,3 +120,24 @@ def test_a_delay_as_long_as_an_episode_is_refused(lag, fits):
 def test_numbers_of_steps_are_as_before():
     assert episode_steps(config(episode_length_s=20.0), 0.02) == 1000
     assert torch.tensor(episode_steps(config(), 0.01), dtype=torch.int32) == 1000
+
+
+def test_complex_values_and_other_devices_are_refused_with_their_term():
+    for given, said in (
+        (torch.ones(2, dtype=torch.complex64), "returns torch.complex64"),
+        (torch.ones(2, device="meta"), "on meta"),
+    ):
+        with pytest.raises(ValueError, match=f"reward term 'riddle' .*{said}"):
+            envs.build(config(rewards={"riddle": Riddle(given=given)}))
+
+
+def test_a_level_that_is_no_tensor_is_refused_with_its_term():
+    with pytest.raises(ValueError, match="curriculum term 'steps' returns float: expected a tensor"):
+        envs.build(config(curriculum={"steps": Level()}))
+
+
+def test_an_action_that_selects_nothing_is_refused():
+    actions = config().actions
+    force = dataclasses.replace(actions["force"], joints=[])
+    with pytest.raises(ValueError, match="actions.force: it takes no number of the action"):
+        envs.build(config(actions={"force": force}))

@@ -73,6 +73,12 @@ def test_a_transform_that_does_not_fit_the_env_is_named():
         envs.build(dataclasses.replace(cfg, transforms={"limits": clip}))
 
 
+def test_a_stock_transform_that_reads_what_no_env_emits_is_named():
+    image = "+task.transforms.image={_target_: torchrl.envs.transforms.ToTensorImage}"
+    with pytest.raises(ValueError, match="task.transforms.image: ToTensorImage reads 'pixels': valid: .*actor"):
+        envs.build(envs.make_cfg("cartpole_balance", ["task.scene.num_envs=1", image]))
+
+
 def test_python_gives_descriptions_rather_than_transforms():
     cfg = envs.make_cfg("cartpole_balance")
     lag = TransformCfg(ActionDelay, delay=DelayCfg(max_lag=2))

@@ -28,6 +28,8 @@ class ActionManager:
         for name, term in terms.items():
             with self._driver.scope(f"actions/{name}", part=term):
                 self.sizes[name] = term.size(view)
+                if self.sizes[name] < 1:
+                    raise ValueError("it takes no number of the action: it selects nothing")
                 bounds.append(term.bounds(view))
             stop = start + self.sizes[name]
             self._parts.append((f"actions/{name}", term, slice(start, stop)))

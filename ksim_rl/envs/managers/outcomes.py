@@ -27,7 +27,8 @@ class _OutcomeManager:
 
     def _values(self, dtype: torch.dtype | None = None) -> list[Tensor]:
         """Return what each term says of the current state, [E] each, in any dtype unless one is asked for."""
-        values, shape = [], (self._view.num_envs,)
+        values = []
+        shape, device = (self._view.num_envs,), torch.device(self._view.device)
         for name, term in self._terms.items():
             with self._driver.scope(f"{self.kind}s/{name}", part=term):
                 value_E = term(self._view)
@@ -36,10 +37,15 @@ class _OutcomeManager:
                     f"{self.kind} term {name!r} returns {type(value_E).__name__}: expected a tensor {shape}, one value "
                     "per env"
                 )
-            if value_E.shape != shape or dtype not in (None, value_E.dtype):
+            fits = not value_E.is_complex() if dtype is None else value_E.dtype == dtype
+            if value_E.shape != shape or not fits:
                 raise ValueError(
                     f"{self.kind} term {name!r} returns {value_E.dtype} {tuple(value_E.shape)}: expected "
-                    f"{dtype or 'any dtype'} {shape}, one value per env"
+                    f"{dtype or 'any real dtype'} {shape}, one value per env"
+                )
+            if value_E.device.type != device.type:
+                raise ValueError(
+                    f"{self.kind} term {name!r} returns a tensor on {value_E.device}: expected {device}"
                 )
             values.append(value_E)
         return values
@@ -187,6 +193,11 @@ class CurriculumManager(_OutcomeManager):
             scope, counter = f"curriculum/{name}", self._view.reset_count_E
             with self._driver.scope(scope, counter, part=term, mask_E=mask_E):
                 level = term(self._view, mask_E)
+            if not isinstance(level, Tensor):
+                raise ValueError(
+                    f"curriculum term {name!r} returns {type(level).__name__}: expected a tensor (), one level for all "
+                    "envs"
+                )
             if level.shape != ():
                 raise ValueError(
                     f"curriculum term {name!r} returns shape {tuple(level.shape)}: expected (), one level for all envs"

@@ -91,7 +91,8 @@ def test_the_log_sums_over_rows_that_end_together_and_apart():
 
 def test_a_shape_other_than_one_per_env_is_refused_at_construction():
     with pytest.raises(
-        ValueError, match=r"'column' returns torch\.float32 \(3, 1\): expected any dtype \(3,\), one value"
+        ValueError,
+        match=r"'column' returns torch\.float32 \(3, 1\): expected any real dtype \(3,\), one value",
     ):
         puck_env(metrics={"column": Column()})
 

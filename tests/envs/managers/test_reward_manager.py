@@ -55,7 +55,8 @@ def test_without_rewards_the_reward_is_zero():
 
 def test_a_shape_other_than_one_per_env_is_refused_at_construction():
     with pytest.raises(
-        ValueError, match=r"'column' returns torch\.float32 \(3, 1\): expected any dtype \(3,\), one value"
+        ValueError,
+        match=r"'column' returns torch\.float32 \(3, 1\): expected any real dtype \(3,\), one value",
     ):
         puck_env(rewards={"column": Column()})
 
