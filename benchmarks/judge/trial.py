@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -139,7 +140,7 @@ def reason(message: str) -> str:
     plain = re.sub(
         r"'[^']*'|\bnumber \d+ \(unnamed\)|[-\d.]+(?:e-?\d+)?", "", message.replace("XML string: ", "")
     )
-    return " ".join(plain.split())[:120]
+    return textwrap.shorten(plain, 120, placeholder=" ...")
 
 
 def _nothing() -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import report
-from benchmarks.pages import algorithms, memory, peer_settings, speed, tasks, terms, terrain_course
+from benchmarks.pages import algorithms, judge, memory, peer_settings, speed, tasks, terms, terrain_course
 from benchmarks.pages.committed import results
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -15,6 +15,7 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
     "memory.md": {"per env": memory.per_env, "of many": memory.of_many, "speed": memory.speed},
     "notes/go1.md": {"settings": lambda: peer_settings.text(results("peer_settings"))},
     "notes/rough_ground.md": {"course": lambda: terrain_course.table(results("terrain_course"))},
+    "reliability.md": {"judge": lambda: judge.text(results("agreement"))},
     "speed.md": {
         "iteration": speed.iteration,
         "equal runs": speed.equal_runs,
