@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from ksim_rl.modules.network import ObservationNormalizer
+
 README = Path(__file__).parents[1] / "README.md"
 
 
@@ -24,7 +26,10 @@ def test_the_python_block_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     script = tmp_path / "composed.py"
     script.write_text(block("python"))
     monkeypatch.chdir(tmp_path)
-    runpy.run_path(str(script), run_name="__main__")
+    composed = runpy.run_path(str(script), run_name="__main__")
+    for network in (composed["actor"], composed["critic"]):
+        counts = [int(part.count) for part in network.modules() if isinstance(part, ObservationNormalizer)]
+        assert counts == [3 * 2048], "each env state counts once"
     assert capsys.readouterr().out.count("reward per step") == 3
 
 
