@@ -72,13 +72,14 @@ CHECKS: dict[str, Callable[[EnvBase, int], None]] = {
 def check_env(env: EnvBase, *, num_steps: int = 4, skip: Collection[str] = ()) -> None:
     """Check an env with batch size [E], E > 1, against TorchRL's contract and ours; the env's seed and state change.
 
-    The checks, by name: `names` (the label "E" on specs and data, ("E", "T") on rollouts), `values` (finite, inside
-    their specs), `terms` (of a `ManagerBasedRlEnv`: they write only what is their own), `torchrl` (`check_env_specs`,
-    which looks at neither), `actions` (wrong shapes and dtypes are refused), `determinism` (by seed, bit for bit, on
-    the CPU), `partial_reset` (other rows stay bit-identical), `episode_end` (the true terminal observation), `syncs`
-    (none), `memory` (no growth), `python` (the same in each step, where steps are recorded) and `c_engine` (20
-    substeps of a `ManagerBasedRlEnv` against MuJoCo's). They look at rollouts of `num_steps`; `skip` leaves some out.
-    Raises one AssertionError with all findings, each with what to change.
+    The checks, by name: `names` (the label "E" on specs and data, ("E", "T") on rollouts), `values` (of the shapes and
+    dtypes of their specs, inside them, and finite; rewards and metrics, too), `terms` (of a `ManagerBasedRlEnv`: they
+    write only what is their own), `torchrl` (`check_env_specs`, which looks at neither), `actions` (wrong shapes and
+    dtypes are refused), `determinism` (by seed, bit for bit, on the CPU), `partial_reset` (other rows stay
+    bit-identical), `episode_end` (the true terminal observation), `syncs` (none), `memory` (no growth), `python` (the
+    same in each step, where steps are recorded) and `c_engine` (20 substeps of a `ManagerBasedRlEnv` against MuJoCo's).
+    They look at rollouts of `num_steps`; `skip` leaves some out. Raises one AssertionError with all findings, each with
+    what to change, or what the env raised.
     """
     for name in skip:
         if name not in CHECKS:
@@ -91,5 +92,11 @@ def check_env(env: EnvBase, *, num_steps: int = 4, skip: Collection[str] = ()) -
             check(env, num_steps)
         except AssertionError as finding:
             findings.append(f"[{name}] {finding}")
+        except (
+            Exception
+        ) as error:  # whatever an env raises belongs to the findings, with the term that it names
+            first = (str(error).splitlines() or [""])[0]
+            notes = " ".join(getattr(error, "__notes__", []))
+            findings.append(f"[{name}] {type(error).__name__}: {first} {notes}".rstrip())
     if findings:
         raise AssertionError("\n".join((f"{type(env).__name__} has {len(findings)} findings:", *findings)))

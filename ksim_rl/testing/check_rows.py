@@ -5,7 +5,14 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.testing.replays import Replays, copy_of, differing, end_episodes_at_next_step, reset_rows
+from ksim_rl.testing.replays import (
+    Replays,
+    copy_of,
+    differing,
+    end_episodes_at_next_step,
+    reset_rows,
+    same_bits,
+)
 
 
 def check_determinism(env: EnvBase, num_steps: int) -> None:
@@ -101,8 +108,7 @@ def _others_changed(before: Tensor, after: Tensor, num_envs: int) -> bool:
     """Say if anything but row 0 changed, for each dim that may be that of the envs (a ring may have E frames)."""
     dims = [dim for dim, size in enumerate(before.shape) if size == num_envs]
     return all(
-        not torch.equal(before.narrow(dim, 1, num_envs - 1), after.narrow(dim, 1, num_envs - 1))
-        for dim in dims
+        not same_bits(before.narrow(dim, 1, num_envs - 1), after.narrow(dim, 1, num_envs - 1)) for dim in dims
     )
 
 

@@ -1,12 +1,19 @@
 """Finds wrong specs, dim names and values, and wrong actions that an env takes."""
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs import EnvBase
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from ksim_rl import dims
+from ksim_rl.envs.contract import part
+from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+
+_NOT_FINITE = (
+    "Look for a division by zero, a root of a negative number or an uninitialized buffer in what computes it"
+)
 
 
 def assert_dims(td: TensorDictBase, *names: str) -> None:
@@ -42,11 +49,18 @@ def check_names(env: EnvBase, num_steps: int) -> None:
 
 
 def check_values(env: EnvBase, num_steps: int) -> None:
-    """Observations are finite and inside their specs."""
-    _check_values(env.reset(), env.full_observation_spec, "reset")
+    """Observations have the shapes and dtypes of their specs and are inside them; these, and rewards, are finite."""
+    _check_values(env.reset(), env, "reset")
     rollout_ET = env.rollout(num_steps, break_when_any_done=False)
     for step in range(num_steps):
-        _check_values(rollout_ET[:, step]["next"], env.full_observation_spec, f"step {step}")
+        _check_values(rollout_ET[:, step]["next"], env, f"step {step}")
+    base_env = part(env, ManagerBasedRlEnv)
+    lines = [] if base_env is None else base_env.non_finite_terms()
+    if lines:
+        raise AssertionError(f"{'; '.join(lines)}. {_NOT_FINITE}")
+    reward = rollout_ET["next", "reward"]
+    if not bool(torch.isfinite(reward).all()):
+        raise AssertionError(f"the reward is not finite. {_NOT_FINITE}")
 
 
 def check_torchrl(env: EnvBase, num_steps: int) -> None:
@@ -87,19 +101,49 @@ def _check_spec_names(spec: Composite, where: str, batch_dims: int) -> None:
             _check_spec_names(child, f"{where}[{key!r}]", batch_dims)
 
 
-def _check_values(tensordict: TensorDictBase, spec: Composite, when: str) -> None:
+def _check_values(tensordict: TensorDictBase, env: EnvBase, when: str) -> None:
+    spec = env.full_observation_spec
     for key in spec.keys(True, True):
         value = tensordict.get(key, None)
         if value is None:  # `check_env_specs` lists what is missing and what is too much
             continue
+        _check_kind(key, value, env, when)
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             rows = (~torch.isfinite(value.reshape(value.shape[0], -1)).all(-1)).nonzero().flatten().tolist()
-            raise AssertionError(
-                f"observation {key!r} is not finite at {when}, in the rows {rows}. Look for a division by zero, a root "
-                "of a negative number or an uninitialized buffer in the term that computes it"
-            )
+            where = f"at {when}, in the rows {rows}, {_written_by(env, key)}"
+            raise AssertionError(f"observation {key!r} is not finite {where}. {_NOT_FINITE}")
         if not spec[key].is_in(value):
             raise AssertionError(
                 f"observation {key!r} leaves its spec at {when}: values {value.min()} to {value.max()}, {spec[key]}. "
                 "Widen the spec, or clip the value"
             )
+
+
+def _check_kind(key: NestedKey, value: object, env: EnvBase, when: str) -> None:
+    """Refuse what has another type, dtype or shape than its spec says."""
+    spec = env.full_observation_spec[key]
+    expected = f"{spec.dtype} {tuple(spec.shape)}"
+    if not isinstance(value, Tensor):
+        given = type(value).__name__
+    elif value.dtype != spec.dtype or value.shape != spec.shape:
+        given = f"{value.dtype} {tuple(value.shape)}"
+    else:
+        return
+    raise AssertionError(
+        f"observation {key!r} is {given} at {when}, and its spec says {expected}, {_written_by(env, key)}. Return what "
+        "the spec says, or say in `transform_observation_spec` what a transform makes of it"
+    )
+
+
+def _written_by(env: EnvBase, key: NestedKey) -> str:
+    """Return which transform wrote an observation last, or that the env did."""
+    found = "written by the env"
+    while isinstance(env, TransformedEnv):
+        transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
+        for number, transform in enumerate(transforms):
+            if unravel_key(key) in [unravel_key(own) for own in transform.out_keys or ()]:
+                found = f"written by transform {number}, {type(transform).__name__}"
+        if found != "written by the env":
+            break
+        env = env.base_env
+    return found

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -79,11 +80,15 @@ def differing(one: TensorDictBase, other: TensorDictBase, rows: Sequence[int]) -
     return [
         key
         for key in one.keys(True, True)
-        if not torch.equal(_bits(one.get(key)[list(rows)]), _bits(other.get(key)[list(rows)]))
+        if not same_bits(one.get(key)[list(rows)], other.get(key)[list(rows)])
     ]
 
 
+def same_bits(one: Shaped[Tensor, "*leaf"], other: Shaped[Tensor, "*leaf"]) -> bool:
+    """Whether two tensors hold the same bits: a NaN equals itself, and a zero without a sign is another."""
+    return torch.equal(_bits(one), _bits(other))
+
+
 def _bits(value: Tensor) -> Tensor:
-    if value.dtype == torch.float32:
-        return value.contiguous().view(torch.int32)
-    return value
+    whole = {torch.float32: torch.int32, torch.float64: torch.int64}.get(value.dtype)
+    return value if whole is None else value.contiguous().view(whole)

@@ -27,10 +27,19 @@ class ActionManager:
         start = 0
         for name, term in terms.items():
             with self._driver.scope(f"actions/{name}", part=term):
-                self.sizes[name] = term.size(view)
-                if self.sizes[name] < 1:
+                self.sizes[name] = size = term.size(view)
+                if isinstance(size, bool) or not isinstance(size, int):
+                    raise ValueError(
+                        f"size() returns {size!r}: expected how many columns of the action it takes"
+                    )
+                if size < 1:
                     raise ValueError("it takes no number of the action: it selects nothing")
-                bounds.append(term.bounds(view))
+                part_K2 = term.bounds(view)
+                if part_K2 is not None and part_K2.shape != (size, 2):
+                    raise ValueError(
+                        f"bounds() returns shape {tuple(part_K2.shape)}: expected ({size}, 2), (low, high) by column"
+                    )
+                bounds.append(part_K2)
             stop = start + self.sizes[name]
             self._parts.append((f"actions/{name}", term, slice(start, stop)))
             start = stop

@@ -42,11 +42,6 @@ class CommandManager:
                     # Columns beyond those of `ranges` are the term's own.
                     columns = term.shared_ranges(view).unbind(-1)
                     driver.readings.command_ranges[name] = dict(zip(term.ranges, columns, strict=False))
-            if value_EK.ndim != 2 or value_EK.shape[0] != view.num_envs:
-                raise ValueError(
-                    f"command term {name!r} returns shape {tuple(value_EK.shape)}: expected [{view.num_envs}, K], one "
-                    "row per env"
-                )
             self.values[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1], owner=ENV)
             driver.non_finite.watch("command", self.values[name], (name,), value_EK.shape[1:])
 
@@ -118,7 +113,22 @@ class CommandManager:
         with self._driver.scope(f"commands/{name}", part=term) as written:
             value_EK = term(self._view)
         self._kept[name].update(written)
+        self._check(name, value_EK)
         return value_EK
+
+    def _check(self, name: str, value_EK: object) -> None:
+        """Refuse what is no row per env, by the term's name."""
+        expected = f"expected [{self._view.num_envs}, K], one row per env"
+        if not isinstance(value_EK, Tensor):
+            raise ValueError(f"command term {name!r} returns {type(value_EK).__name__}: {expected}")
+        shape = tuple(value_EK.shape)
+        if len(shape) != 2 or shape[0] != self._view.num_envs:
+            raise ValueError(f"command term {name!r} returns shape {shape}: {expected}")
+        if name in self.values and shape != tuple(self.values[name].shape):
+            first = tuple(self.values[name].shape)
+            raise ValueError(
+                f"command term {name!r} returns shape {shape}, and first had {first}: expected the same in each step"
+            )
 
     def _draw(
         self, name: str, term: CommandTerm, mask_E: Bool[Tensor, " E"], moment: str, counter: Tensor

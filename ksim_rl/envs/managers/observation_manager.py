@@ -22,23 +22,13 @@ class ObservationManager:
 
     def __init__(self, groups: Mapping[str, ObservationGroupCfg], driver: EnvDriver) -> None:
         self._driver = driver
-        self._view = view = driver.view
+        self._view = driver.view
         self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
         # What each term writes whenever it is read; most write nothing.
         self._kept: dict[str, dict[str, Kept]] = {}
+        self._shapes: dict[str, torch.Size] = {}
         readings = self.read()
         self.examples = {name: reading.to("meta") for name, reading in readings.items()}
-        for name, reading in readings.items():
-            if getattr(self.terms[name], "is_image", False):
-                fits = reading.ndim in (3, 4) and reading.dtype in IMAGE_DTYPES
-                expected = f"[{view.num_envs}, H, W] or [{view.num_envs}, H, W, C], float32, int32 or uint8"
-            else:
-                fits = reading.ndim == 2 and reading.dtype == torch.float32
-                expected = f"torch.float32 [{view.num_envs}, L], one row per env"
-            if not fits or reading.shape[0] != view.num_envs:
-                raise ValueError(
-                    f"observation term {name!r} returns {reading.dtype} {tuple(reading.shape)}: expected {expected}"
-                )
 
     def read(self, reset_E: Bool[Tensor, " E"] | None = None) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
         """Return the readings of the current state by term, in memory of their own: nobody else reads or writes it.
@@ -86,4 +76,24 @@ class ObservationManager:
                 if not isinstance(reading, Tensor):
                     raise ValueError(f"returns {type(reading).__name__}: expected a tensor, one row per env")
             kept.update(written)
+        if self._shapes.get(name) != reading.shape:
+            self._check_shape(name, reading)
         return reading
+
+    def _check_shape(self, name: str, reading: Tensor) -> None:
+        """Refuse a reading that is none, or has another shape than the first one of its term."""
+        num_envs, given = self._view.num_envs, f"{reading.dtype} {tuple(reading.shape)}"
+        if name in self._shapes:
+            raise ValueError(
+                f"observation term {name!r} returns {given}, and first had shape {tuple(self._shapes[name])}: expected "
+                "the same in each step"
+            )
+        if getattr(self.terms[name], "is_image", False):
+            fits = reading.ndim in (3, 4) and reading.dtype in IMAGE_DTYPES
+            expected = f"[{num_envs}, H, W] or [{num_envs}, H, W, C], float32, int32 or uint8"
+        else:
+            fits = reading.ndim == 2 and reading.dtype == torch.float32
+            expected = f"torch.float32 [{num_envs}, L], one row per env"
+        if not fits or reading.shape[0] != num_envs:
+            raise ValueError(f"observation term {name!r} returns {given}: expected {expected}")
+        self._shapes[name] = reading.shape

@@ -99,6 +99,16 @@ class Simulation:
         value_EN: Float[Tensor, "E N"],
     ) -> None:
         """Copy the rows of `mask_E` into some columns of the state."""
+        width = _width(columns, state_EL.shape[1])
+        if (
+            value_EN.ndim != 2
+            or value_EN.shape[1] not in (1, width)
+            or len(value_EN) not in (1, len(state_EL))
+        ):
+            raise ValueError(
+                f"writes values of shape {tuple(value_EN.shape)} into the state: expected ({len(state_EL)}, {width}), "
+                "one row per env"
+            )
         self.is_writing = True
         try:
             state_EL[:, columns] = torch.where(mask_E[:, None], value_EN, state_EL[:, columns])
@@ -176,3 +186,10 @@ class Simulation:
         self.is_frozen = self.world.is_frozen = True
         self.buffers.freeze()
         self.shared_values.freeze()
+
+
+def _width(columns: Index, of_all: int) -> int:
+    """Return how many columns an index picks of so many, without picking them."""
+    if isinstance(columns, slice):
+        return len(range(*columns.indices(of_all)))
+    return columns.numel()
