@@ -6,6 +6,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
+import numpy as np
+
 from benchmarks.judge.trial import Kernels
 
 PHYSICS = "ksim_rl.physics"
@@ -22,6 +25,7 @@ class Fault:
         instead: makes what stands there while it is put back, from what mends it.
         needs: the features that a model needs for it, all of them.
         written: a pattern that the model's XML has.
+        suits: whether a compiled model may show it.
         kernels: by which it shows.
     """
 
@@ -31,6 +35,7 @@ class Fault:
     instead: Callable[[Any], Any]
     needs: tuple[str, ...]
     written: str = ""
+    suits: Callable[[mujoco.MjModel], bool] | None = None
     kernels: Kernels = "our solver"
 
 
@@ -103,6 +108,12 @@ def several_short_chains(limbs: Any, *, nv: int) -> bool:
     return len(limbs.chains) > 1 and len(limbs.trunk) <= 10 and len(limbs.chains[-1]) <= 8
 
 
+def is_small_and_branches(mj_model: mujoco.MjModel) -> bool:
+    """Say whether a model has few degrees of freedom, two of which hang from a third."""
+    parents = mj_model.dof_parentid[mj_model.dof_parentid >= 0]
+    return mj_model.nv <= 5 and np.unique(parents).size < parents.size
+
+
 def without_priority(corrections: dict[Any, Any]) -> dict[Any, Any]:
     """Leave out what gives contacts the law of the geom with priority."""
     return {
@@ -137,6 +148,7 @@ FAULTS = {
         place=("newton.limbs", "_suits"),
         instead=gives(several_short_chains),
         needs=("tree.branches",),
+        suits=is_small_and_branches,
     ),
     "free bodies": Fault(
         number="2",

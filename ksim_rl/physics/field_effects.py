@@ -10,6 +10,7 @@ from contextlib import contextmanager
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import warp as wp
 
 # What builders of our kernels look at, and a value that asks for all of it: a solref below 0 is a stiffness, and ranges
@@ -53,11 +54,29 @@ def check_effects(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
         )
     slides = (mj_model.body_simple == 2) & (mj_model.body_dofnum > 1)
     if "jnt_axis" in expanded and slides.any():
-        body = mj_model.body(int(slides.argmax())).name or f"number {int(slides.argmax())} (unnamed)"
-        raise ValueError(
-            f"per_world_fields has 'jnt_axis', but body {body!r} is compiled as simple, with slides at right angles: "
-            'call prepare_spec(spec, per_world_fields) before compiling, or set simple="false" in its XML'
-        )
+        raise _not_simple(mj_model, "jnt_axis", int(slides.argmax()), "with slides at right angles")
+    turns = _turns_about_centre(mj_model)
+    if "jnt_pos" in expanded and turns.any():
+        raise _not_simple(mj_model, "jnt_pos", int(turns.argmax()), "turning about its centre of mass")
+
+
+def _turns_about_centre(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Return the simple bodies with several degrees of freedom and a hinge or ball, bool [nbody].
+
+    Elsewhere, such a joint would couple them, and simple bodies have no room for that.
+    """
+    turning = np.isin(mj_model.jnt_type, (mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_HINGE))
+    turns = np.isin(np.arange(mj_model.nbody), mj_model.jnt_bodyid[turning])
+    return turns & (mj_model.body_simple > 0) & (mj_model.body_dofnum > 1)
+
+
+def _not_simple(mj_model: mujoco.MjModel, field: str, body: int, how: str) -> ValueError:
+    """Return what refuses a field that moves a joint of a body that was compiled as simple."""
+    name = mj_model.body(body).name or f"number {body} (unnamed)"
+    return ValueError(
+        f"per_world_fields has {field!r}, but body {name!r} is compiled as simple, {how}: "
+        'call prepare_spec(spec, per_world_fields) before compiling, or set simple="false" in its XML'
+    )
 
 
 def switch_on(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:

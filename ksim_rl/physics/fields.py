@@ -66,9 +66,9 @@ def prepare_spec(spec: mujoco.MjSpec, per_world_fields: Iterable[str]) -> None:
 
     Call it before the spec is compiled, with the names that `World` gets as `per_world_fields`.
     A body that floats about its centre of mass, or slides along axes at right angles, is compiled as "simple", with a
-    diagonal inertia matrix, which a moved centre of mass or a turned axis makes wrong.
+    diagonal inertia matrix, which a moved centre of mass, or a moved or turned axis, makes wrong.
     """
-    if {"body_ipos", "body_iquat", "jnt_axis"} & set(per_world_fields):
+    if {"body_ipos", "body_iquat", "jnt_axis", "jnt_pos"} & set(per_world_fields):
         for body in spec.bodies:
             body.simple = False
 

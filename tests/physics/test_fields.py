@@ -201,6 +201,18 @@ def test_moved_centres_of_mass_need_bodies_that_are_not_compiled_as_simple():
         World(load_model(source), num_envs=2, per_world_fields=("body_ipos",))
 
 
+def test_balls_elsewhere_need_bodies_that_are_not_compiled_as_simple():
+    source = (
+        '<mujoco><worldbody><body name="ball"{}><joint type="ball"/><geom type="box" size=".1 .05 .03"/></body>'
+        '<body pos="1 0 0"><joint/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    with pytest.raises(
+        ValueError, match="'jnt_pos', but body 'ball' is compiled as simple, turning about its centre"
+    ):
+        World(load_model(source.format("")), num_envs=2, per_world_fields=("jnt_pos",))
+    World(load_model(source.format(' simple="false"')), num_envs=2, per_world_fields=("jnt_pos",))
+
+
 def test_room_for_dry_friction_that_the_model_does_not_have():
     spec = mujoco.MjSpec.from_string(EVERY_JOINT.replace("TENDON", ""))
     plain = World(load_model(spec), num_envs=1)
