@@ -7,11 +7,11 @@ from typing import ClassVar, Literal
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import array_constant, constant, index_constant
+from ksim_rl.mdp.constants import array_constant, index_constant
 from ksim_rl.mdp.fields import OfJoints
 from ksim_rl.mdp.randomization.randomize import (
     Pair,
@@ -21,6 +21,7 @@ from ksim_rl.mdp.randomization.randomize import (
     write_entries,
 )
 from ksim_rl.scene.names import Patterns, actuators_of_joint, scalar_joint_ids
+from ksim_rl.scene.state.joint_control import joint_control
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,8 +170,9 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
 class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
     """Gains of the servos that drive joints: stiffness, N m / rad or N / m; damping, N m s / rad or N s / m.
 
-    MuJoCo's position servo keeps one stiffness in its gain and its bias, its velocity servo one damping; both places
-    are written. Explicit actuators keep theirs in `EnvView.actuator_param`, never below 0. None leaves a gain alone.
+    Gains are meant at the joint, behind the gear. MuJoCo's position servo keeps its stiffness in its gain and its bias,
+    its velocity servo the damping; all places are written, so that targets mean what they did. Explicit actuators keep
+    theirs in `EnvView.actuator_param`, never below 0. None leaves a gain alone.
     """
 
     stiffness: Pair | None = None
@@ -187,24 +189,33 @@ class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
         if not builtin:
             return
         model, names = view.world.mj_model, [view.joints(self.joints).names[i] for i in builtin]
-        places = [_servo(model, model.joint(joint).id, name) for joint in names]
-        servos = [actuator for actuator, _ in places]
+        servos = [_servo(model, model.joint(joint).id, name) for joint in names]
         column = 1 if name == "stiffness" else 2
-        own = -model.actuator_biasprm[servos, column]
+        before_gear = -model.actuator_biasprm[servos, column]
+        gear = model.actuator_gear[servos, 0]
+        own = before_gear * gear * gear
         self._check_not_negative(name, names, own, pair)
         drawn_EN = drawn_EN[:, index_constant(builtin, view.device)]
-        value_EN1 = self.combine(array_constant(own, view.device), drawn_EN)[..., None]
-        write_entries(view.field("actuator_biasprm"), servos, (column,), mask_E, -value_EN1)
-        in_gain = [i for i, (_, also_gain) in enumerate(places) if also_gain]
-        if in_gain:
-            gains_EN1 = value_EN1[:, index_constant(in_gain, view.device)]
-            rows = [servos[i] for i in in_gain]
-            write_entries(view.field("actuator_gainprm"), rows, (0,), mask_E, gains_EN1)
+        value_EN = self.combine(array_constant(own, view.device), drawn_EN)
+        value_EN = _times(value_EN, 1.0 / (gear * gear))
+        write_entries(view.field("actuator_biasprm"), servos, (column,), mask_E, -value_EN[..., None])
+        # The gain and the constant of what holds a position, or a velocity alone, are in proportion to it.
+        leads = [i for i, servo in enumerate(servos) if _leading_column(model, servo) == column]
+        if not leads:
+            return
+        rows = [servos[i] for i in leads]
+        lead_EN = value_EN[:, index_constant(leads, view.device)]
+        gain_EN = _times(lead_EN, model.actuator_gainprm[rows, 0] / before_gear[leads])
+        write_entries(view.field("actuator_gainprm"), rows, (0,), mask_E, gain_EN[..., None])
+        constants = model.actuator_biasprm[rows, 0]
+        if constants.any():
+            constant_EN = _times(lead_EN, constants / before_gear[leads])
+            write_entries(view.field("actuator_biasprm"), rows, (0,), mask_E, constant_EN[..., None])
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
-    """Largest effort of the actuators of joints, N m or N: one draw for both directions.
+    """Largest effort of the actuators of joints, N m or N behind the gear: one draw for both directions.
 
     It changes what holds the effort: the actuator's force range, the joint's, both, or an explicit actuator's
     `effort_limit`, which stays at 0 or above.
@@ -233,38 +244,48 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
             if not place_of:
                 continue
             rows, places = list(place_of), list(place_of.values())
-            # The lower bound as a size, like the upper one.
+            # The lower bound as a size, like the upper one; an actuator's range is before its gear.
             own = getattr(model, field)[rows] * np.array((-1.0, 1.0))
+            gear_N1 = np.ones((len(rows), 1))
+            if field == "actuator_forcerange":
+                gear_N1 = np.abs(model.actuator_gear[rows, :1])
+            own = own * gear_N1
             self._check_not_negative("ranges", [names[i] for i in places], own, self.ranges)
             limit_EN1 = drawn_EN[:, index_constant(places, view.device)][..., None]
             size_EN2 = self.combine(array_constant(own, view.device), limit_EN1).expand(-1, -1, 2)
-            signs_2 = constant((-1.0, 1.0), view.device)
-            write_entries(view.field(field), rows, (0, 1), mask_E, size_EN2 * signs_2)
+            signs_N2 = array_constant(np.array((-1.0, 1.0)) / gear_N1, view.device)
+            write_entries(view.field(field), rows, (0, 1), mask_E, size_EN2 * signs_N2)
 
 
-def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> tuple[int, bool]:
-    """Return the servo that has this gain, and whether the number is also its `gainprm[0]`.
-
-    A position servo's bias is (0, -stiffness, -damping) with the gain stiffness, a velocity servo's (0, 0, -damping)
-    with the gain damping.
-    """
-    position, velocity = None, None
+def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> int:
+    """Return the servo of a joint that has this gain: a velocity servo for the damping, if there is one."""
+    position: int | None = None
+    velocity: int | None = None
     for actuator in actuators_of_joint(mj_model, joint):
-        if (
-            mj_model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED
-            or mj_model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE
-        ):
+        control = joint_control(mj_model, actuator)
+        if control.refusal or control.kind == "effort":
             continue
-        force, bias = mj_model.actuator_gainprm[actuator, 0], mj_model.actuator_biasprm[actuator]
-        if bias[1] == -force:
+        if _leading_column(mj_model, actuator) == 1:
             position = actuator
-        elif bias[1] == 0.0 and bias[2] == -force:
+        else:
             velocity = actuator
     if gain == "damping" and velocity is not None:
-        return velocity, True
+        return velocity
     if position is not None:
-        return position, gain == "stiffness"
+        return position
     raise ValueError(
         f"RandomizeActuatorGains.{gain}: joint {mj_model.joint(joint).name!r} has no servo with this gain; expected a "
         "position or velocity actuator, or an explicit actuator"
     )
+
+
+def _leading_column(mj_model: mujoco.MjModel, actuator: int) -> int:
+    """Return the column of a servo's bias that its gain belongs to: 1 where it holds a position, else 2."""
+    return 1 if mj_model.actuator_biasprm[actuator, 1] != 0.0 else 2
+
+
+def _times(value_EN: Float[Tensor, "E N"], factor_N: np.ndarray) -> Float[Tensor, "E N"]:
+    """Return the products; factors of 1, those of plain servos, cost nothing."""
+    if np.all(factor_N == 1.0):
+        return value_EN
+    return value_EN * array_constant(factor_N, value_EN.device)
