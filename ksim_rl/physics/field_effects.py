@@ -5,6 +5,7 @@ draw such numbers later. What can be switched on is; fields whose effect hangs o
 not have are refused by name.
 """
 
+import warnings
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
@@ -52,12 +53,27 @@ def check_effects(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
             f"per_world_fields has 'geom_size', but geom {geom!r} moves the fluid around it, whose mass follows from "
             'that size and is the same in all worlds: leave out fluidshape="ellipsoid" in its XML, or geom_size'
         )
+    _warn_of_still_air(mj_model, expanded)
     slides = (mj_model.body_simple == 2) & (mj_model.body_dofnum > 1)
     if "jnt_axis" in expanded and slides.any():
         raise _not_simple(mj_model, "jnt_axis", int(slides.argmax()), "with slides at right angles")
     turns = _turns_about_centre(mj_model)
     if "jnt_pos" in expanded and turns.any():
         raise _not_simple(mj_model, "jnt_pos", int(turns.argmax()), "turning about its centre of mass")
+
+
+def _warn_of_still_air(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
+    """Warn of bodies without mass in a fluid: where a world gives one mass, MuJoCo Warp has drag of it wrong."""
+    is_fluid = mj_model.opt.density > 0.0 or mj_model.opt.viscosity > 0.0
+    moves = mj_model.body_dofnum[mj_model.body_weldid] > 0
+    massless = np.flatnonzero(moves & (mj_model.body_mass < mujoco.mjMINVAL))
+    if "body_mass" in expanded and is_fluid and massless.size:
+        body = mj_model.body(int(massless[0])).name or f"number {massless[0]} (unnamed)"
+        warnings.warn(
+            f"per_world_fields has 'body_mass', and body {body!r}, which is in a fluid, has no mass in the model: where "
+            "a world gives it mass, its drag is not the C engine's. Give it a little mass in the XML",
+            stacklevel=4,
+        )
 
 
 def _turns_about_centre(mj_model: mujoco.MjModel) -> np.ndarray:

@@ -1,4 +1,5 @@
 import copy
+import warnings
 
 import mujoco
 import mujoco_warp as mjw
@@ -211,6 +212,24 @@ def test_balls_elsewhere_need_bodies_that_are_not_compiled_as_simple():
     ):
         World(load_model(source.format("")), num_envs=2, per_world_fields=("jnt_pos",))
     World(load_model(source.format(' simple="false"')), num_envs=2, per_world_fields=("jnt_pos",))
+
+
+@pytest.mark.parametrize("mass", (0.0, 0.1))
+def test_bodies_without_mass_in_a_fluid_are_warned_of(mass: float):
+    source = (
+        '<mujoco><option density="100"/><worldbody><body><joint/><geom size=".1"/>'
+        f'<body name="fin" pos="1 0 0"><geom size=".1" mass="{mass}"/></body></body></worldbody></mujoco>'
+    )
+    mj_model = load_model(source)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        World(mj_model, num_envs=1, per_world_fields=("body_mass",))
+    told = [
+        str(warning.message)
+        for warning in caught
+        if "body 'fin', which is in a fluid" in str(warning.message)
+    ]
+    assert len(told) == (mass == 0.0)
 
 
 def test_room_for_dry_friction_that_the_model_does_not_have():
