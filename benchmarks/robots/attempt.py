@@ -79,7 +79,7 @@ def _tried(listed: Listed, path: Path) -> Attempt:
     )
     found.as_listed = stands and set(analysis.foot_bodies) == set(listed.feet)
     if stands:
-        task = VelocityTask.for_robot(str(path), name="of_a_stranger")
+        task = VelocityTask.for_robot(analysis, name="of_a_stranger")
         found.trained = _train(task)
     return found
 

@@ -86,10 +86,15 @@ def copy_model(source: Path, target: Path) -> None:
     spec = load_spec(source)
     assets = [(spec.meshdir, entry) for entry in (*spec.meshes, *spec.hfields, *spec.skins) if entry.file]
     assets += [(spec.texturedir, entry) for entry in spec.textures if entry.file]
+    names: dict[Path, str] = {}
     for folder, entry in assets:
         (target.parent / "assets").mkdir(exist_ok=True)
-        copied = shutil.copy(source.resolve().parent / folder / entry.file, target.parent / "assets")
-        entry.file = Path(copied).name
+        asset = source.resolve().parent / folder / entry.file
+        if asset not in names:
+            # Two folders may have a file of one name each.
+            names[asset] = asset.name if asset.name not in names.values() else f"{len(names)}_{asset.name}"
+        entry.file = names[asset]
+        shutil.copy(asset, target.parent / "assets" / entry.file)
     if not assets and source.suffix == ".xml" and "<include" not in _read(source):
         shutil.copyfile(source, target)  # with its comments
         return

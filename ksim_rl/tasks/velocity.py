@@ -302,21 +302,26 @@ class VelocityTask(Task):
     @classmethod
     def for_robot(
         cls,
-        robot: Source | ModelRobot,
+        robot: Source | ModelRobot | RobotAnalysis,
         *,
         name: str = "",
         num_iterations: int = 3_000,
         pose: str | None = None,
     ) -> "VelocityTask":
-        """Return the task of a model with all that `robots.analyse` proposes for it, or of an edited proposal.
+        """Return the task of a model with all that `robots.analyse` proposes for it, of that, or of an edited proposal.
 
         The robot is analysed when the config is first asked for, from the keyframe `pose` where one is named. `name` is
         "<robot>_velocity_flat" by default.
         """
-        own = robot.name if isinstance(robot, ModelRobot) else robot_name(robot)
+        if isinstance(robot, RobotAnalysis):
+            own = robot.robot.name
+        else:
+            own = robot.name if isinstance(robot, ModelRobot) else robot_name(robot)
 
         @functools.cache
         def analysis() -> RobotAnalysis:
+            if isinstance(robot, RobotAnalysis):
+                return robot
             return analyse(robot.spec() if isinstance(robot, ModelRobot) else robot, pose=pose)
 
         return cls(

@@ -78,6 +78,24 @@ def test_a_model_is_copied_with_what_it_includes_and_its_meshes(tmp_path):
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "new" / "own.xml")).nmesh == 1
 
 
+def test_files_of_one_name_in_two_folders_stay_two(tmp_path):
+    (tmp_path / "new").mkdir()
+    for folder, size in (("small", 0.1), ("large", 0.2)):
+        (tmp_path / folder).mkdir()
+        corners = f"v 0 0 0\nv {size} 0 0\nv 0 {size} 0\nv 0 0 {size}\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+        (tmp_path / folder / "part.obj").write_text(corners)
+    meshes = '<mesh name="a" file="small/part.obj"/><mesh name="b" file="large/part.obj"/>'
+    geoms = '<geom type="mesh" mesh="a"/><geom type="mesh" mesh="b"/>'
+    (tmp_path / "robot.xml").write_text(
+        f"<mujoco><asset>{meshes}</asset><worldbody><body><freejoint/>{geoms}</body></worldbody></mujoco>"
+    )
+    before = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
+    copy_model(tmp_path / "robot.xml", tmp_path / "new" / "own.xml")
+    after = mujoco.MjModel.from_xml_path(str(tmp_path / "new" / "own.xml"))
+    assert after.body_mass[1] == pytest.approx(before.body_mass[1])
+    assert after.mesh_vert.max() == pytest.approx(before.mesh_vert.max())
+
+
 @pytest.mark.full
 @pytest.mark.parametrize(("model", "name"), [("tin_man.xml", "tin_man"), ("unitree_a1/a1", "my_a1")])
 def test_it_trains_at_once_and_its_own_test_passes(work, model, name):

@@ -99,9 +99,7 @@ def mirror_joints(mj_model: "mujoco.MjModel", joints: Sequence[str] | None = Non
     return MirrorMap(source=tuple(source), signs=tuple(signs))
 
 
-def _sign(
-    mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: int, *, hinge: int
-) -> float:
+def _sign(mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: int, *, hinge: int) -> float:
     reflection = np.array([1.0, -1.0, 1.0])
     apart = np.abs(data.xanchor[joint] * reflection - data.xanchor[other]).max()
     # A rotation axis is a pseudovector: its mirror image turns the other way as well.
