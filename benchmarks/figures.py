@@ -32,6 +32,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "diagnosis": ("ksim_rl/diagnosis", *LEARN),
     "g1_ppo": (*STEP, *LEARN, *TASK),
     "humanoids": (*STEP, *LEARN, *TASK),
+    "imports": (*LEARN[1:4], "ksim_rl/transforms", "ksim_rl/device", "ksim_rl/physics"),
     "learning": (*STEP, *LEARN, *TASK),
     "manipulation": (*STEP, *LEARN, "ksim_rl/suites"),
     "nan_names": ("ksim_rl/envs/non_finite.py", "ksim_rl/device/quick_launch.py"),
