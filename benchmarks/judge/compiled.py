@@ -1,4 +1,4 @@
-"""This module compiles a model with the fields of one world, as if its XML had them."""
+"""Compiles a model with the fields of one world, as if its XML had them."""
 
 import mujoco
 import numpy as np

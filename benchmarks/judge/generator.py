@@ -1,4 +1,4 @@
-"""This module draws a model of random features, and which fields its worlds differ in."""
+"""Draws a model of random features, and which fields its worlds differ in."""
 
 import dataclasses
 import xml.etree.ElementTree as ET

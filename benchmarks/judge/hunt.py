@@ -1,4 +1,4 @@
-"""This module judges many generated models, in processes of their own, and sums up what was found."""
+"""Judges many generated models, in child processes, and sums up the findings."""
 
 import dataclasses
 import time

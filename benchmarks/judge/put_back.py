@@ -1,4 +1,4 @@
-"""This command puts faults that are mended back, one by one, and says which generated model shows each.
+"""Puts mended faults back, one by one, and says which generated model shows each.
 
     python -m benchmarks.judge.put_back [FAULT ...]
 

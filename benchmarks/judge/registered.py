@@ -1,4 +1,4 @@
-"""This module judges the models of registered tasks and of robot files, in processes of their own."""
+"""Judges the models of registered tasks and of robot files, in child processes."""
 
 import copy
 import dataclasses

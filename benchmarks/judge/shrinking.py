@@ -1,4 +1,4 @@
-"""This module makes a model that fails small: what it fails without is left out, until all that is left is needed."""
+"""Makes a failing model small: parts are left out until it needs all that remain."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Sequence

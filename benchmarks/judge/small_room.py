@@ -1,4 +1,4 @@
-"""This module looks whether worlds with too little room for their constraint rows say so."""
+"""Checks that worlds with too little room for their constraint rows say so."""
 
 import dataclasses
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""This module judges one model: worlds of it beside MuJoCo's C engine, from the same states."""
+"""Judges one model: worlds of it beside MuJoCo's C engine, from the same states."""
 
 import dataclasses
 import re

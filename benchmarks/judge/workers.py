@@ -1,4 +1,4 @@
-"""This module runs tasks in processes of their own, so that one that crashes or hangs ends alone."""
+"""Runs tasks in child processes, so that a crash or a hang ends one of them only."""
 
 import multiprocessing
 import time

@@ -1,4 +1,4 @@
-"""This module tries one file: the analysis, the task, and some iterations of training on MuJoCo's C engine."""
+"""Tries one file: the analysis, the task, and some iterations of training on MuJoCo's C engine."""
 
 import dataclasses
 import tempfile

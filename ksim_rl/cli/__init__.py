@@ -1,1 +1,1 @@
-"""This room is the command `ksim-rl`."""
+"""The command `ksim-rl`."""

@@ -1,4 +1,4 @@
-"""This module turns an error into one line for the user and an exit code."""
+"""Turns an error into one line for the user and an exit code."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""This module trains for a command, and prints how the run went."""
+"""Trains for a command, and prints how the run went."""
 
 import os
 from collections.abc import Iterator

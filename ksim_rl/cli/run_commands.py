@@ -1,4 +1,4 @@
-"""This module holds the commands that take no Hydra overrides: resume, eval, play, envs, robot."""
+"""The commands that take no Hydra overrides: resume, eval, play, envs, robot."""
 
 import dataclasses
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""This module holds what the command line uses of Hydra beyond its documented interface, checked with Hydra 1.3.7.
+"""Undocumented interfaces of Hydra that the command line uses, checked with Hydra 1.3.7.
 
 `tests/cli/test_upstream.py` names the part that a new version moved.
 """

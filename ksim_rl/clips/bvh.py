@@ -1,4 +1,4 @@
-"""This module reads BVH files (Biovision hierarchy): a skeleton's offsets, and its joints' Euler angles by frame."""
+"""Reads BVH files (Biovision hierarchy): a skeleton's offsets, and its joints' Euler angles by frame."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""This module writes motions as files that `view.motion` reads, with velocities made from the positions."""
+"""Writes motions as files that `view.motion` reads, with velocities made from the positions."""
 
 import io
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""This module makes a robot do what recorded points do: pairs say which part of the robot follows which point."""
+"""Lets a robot follow recorded points: pairs say which part of the robot follows which point."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

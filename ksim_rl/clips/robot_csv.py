@@ -1,4 +1,4 @@
-"""This module reads motions of a robot from CSV files: root position, root quaternion and joint positions in each line.
+"""Reads motions of a robot from CSV files: root position, root quaternion and joint positions in each line.
 
 It is the layout that mjlab's `csv_to_npz` and Unitree's retargeted LAFAN1 files have: x, y, z (m), qx, qy, qz, qw, then
 the joints in the model's order (rad), without a header.

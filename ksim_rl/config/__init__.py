@@ -1,1 +1,1 @@
-"""This room turns dataclasses into plain trees and back, loads plug-ins, and stores the configs that Hydra finds."""
+"""Turns dataclasses into plain trees and back, loads plug-ins, and stores the configs that Hydra finds."""

@@ -1,4 +1,4 @@
-"""This module starts every process that the library starts: Python children, and git.
+"""Starts every process that the library starts: Python children, and git.
 
 Python puts the working directory first on the path of `python -m` and `python -c`. A user who stands in a stranger's
 folder would run the `mujoco.py` that lies there. So a child is started with `-P`, in a folder that no stranger writes,

@@ -1,4 +1,4 @@
-"""This module spells classes in configs by public paths, and finds the class of a path, also of one that 0.1 wrote."""
+"""Spells classes in configs by public paths, and finds the class of a path, also of one that 0.1 wrote."""
 
 import importlib
 import sys

@@ -1,4 +1,4 @@
-"""This module turns dataclasses into plain trees, which YAML and Hydra see, and builds them from checked trees.
+"""Turns dataclasses into plain trees, which YAML and Hydra see, and builds them from checked trees.
 
 A tree is made of dicts, lists and scalars. A dataclass becomes a dict of its fields; where the annotation does not say
 which class it is (any term, any robot), the key `_target_` does. Only classes of allowed packages are ever imported

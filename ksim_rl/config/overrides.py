@@ -1,4 +1,4 @@
-"""This module checks Hydra overrides against a config tree before anything is composed."""
+"""Checks Hydra overrides against a config tree before anything is composed."""
 
 import copy
 import string

@@ -1,4 +1,4 @@
-"""This module reads files that a stranger may have written as plain data: nothing in them executes or leads on."""
+"""Reads files that a stranger may have written as plain data: nothing in them executes or leads on."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""This module finds and imports plug-ins: other packages' tasks, terms, robots, transforms, networks and algorithms.
+"""Finds and imports plug-ins: other packages' tasks, terms, robots, transforms, networks and algorithms.
 
 An installed package declares what it has in its pyproject.toml, and is then known to every command:
 

@@ -1,4 +1,4 @@
-"""This module holds what configs use of Hydra beyond its documents, checked with Hydra 1.3.8 and OmegaConf 2.3.1.
+"""Undocumented interfaces of Hydra that configs use, checked with Hydra 1.3.8 and OmegaConf 2.3.1.
 
 `ConfigStore.store` makes OmegaConf nodes of whatever it is given, which takes most of a second for all of our tasks.
 And Hydra copies all that it holds whenever it lists a group, which `ksim-rl train --help` does a hundred times; what it

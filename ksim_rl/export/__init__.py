@@ -1,4 +1,4 @@
-"""This room takes a trained policy out of the library: into a folder that runs with numpy, onnxruntime and MuJoCo."""
+"""Takes a trained policy out of the library: into a folder that runs with numpy, onnxruntime and MuJoCo."""
 
 from ksim_rl.export import describe_tasks
 from ksim_rl.export.describe import NotDescribedError, describe, op, quantity

@@ -1,4 +1,4 @@
-"""This module finds out why a policy acts differently in another simulator, from single steps that both have taken.
+"""Finds the reason why a policy acts differently in another simulator, from single steps that both have taken.
 
 Each recorded step is taken once more there, from the recorded state, with the recorded observation and action. So each
 link of the chain is compared by itself: observation, policy, target, effort, motion. A link that differs hides those

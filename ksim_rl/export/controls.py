@@ -1,4 +1,4 @@
-"""This module says in plain data what an env does to observations and actions: noise, lags, targets, motors."""
+"""Describes as plain data how an env changes observations and actions: noise, lags, targets, motors."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""This module says in plain data what terms compute, so that a program without this library computes the same.
+"""Describes as plain data what terms compute, so that a program without this library computes the same.
 
 A description is a tree: a number or a list of numbers; `{"quantity": name, ...}`, which is read from the robot; or
 `{"op": name, "of": [...]}`, which is computed from other trees. All values are vectors; `runner.py` has both lists.

@@ -1,4 +1,4 @@
-"""This module describes the terms that tasks of ours keep for themselves."""
+"""Describes the terms that tasks of ours keep for themselves."""
 
 import math
 from typing import Any

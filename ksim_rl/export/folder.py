@@ -1,4 +1,4 @@
-"""This module writes the folder that takes a policy out of the library: the policy, its robot, and what they mean."""
+"""Writes the folder that takes a policy out of the library: the policy, its robot, and their descriptions."""
 
 import dataclasses
 import importlib.util

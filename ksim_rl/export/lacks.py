@@ -1,4 +1,4 @@
-"""This module says before a training what an export of its policy will lack, when there is time to mend it."""
+"""Says before a training what an export of its policy will lack, when there is time to mend it."""
 
 from collections.abc import Callable
 

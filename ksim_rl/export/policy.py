@@ -1,4 +1,4 @@
-"""This module turns a policy into a file: its deterministic action, with normalization and recurrent state inside."""
+"""Turns a policy into a file: its deterministic action, with normalization and recurrent state inside."""
 
 import io
 import logging

@@ -1,4 +1,4 @@
-"""This module records episodes of a policy in our own physics, so that another simulator can run the same ones."""
+"""Records episodes of a policy in our own physics, so that another simulator can run the same ones."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""This module writes the model of a scene as one file, with its actuators in the order of the policy's actions."""
+"""Writes the model of a scene as one file, with its actuators in the order of the policy's actions."""
 
 import hashlib
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""This module is the commands `ksim-rl export` and `ksim-rl sim2sim`, and the report of the second one."""
+"""The commands `ksim-rl export` and `ksim-rl sim2sim`, and the report of the second one."""
 
 import json
 import tempfile

@@ -1,1 +1,1 @@
-"""This room opens every file that a command reads, and writes every file that a command leaves."""
+"""Opens every file that a command reads, and writes every file that a command leaves."""

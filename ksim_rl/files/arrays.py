@@ -1,4 +1,4 @@
-"""This module reads archives of arrays (`.npz`), whose headers may claim more than the file or the memory holds."""
+"""Reads archives of arrays (`.npz`), whose headers may claim more than the file or the memory holds."""
 
 import io
 import math

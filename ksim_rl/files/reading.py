@@ -1,4 +1,4 @@
-"""This module opens every file that may be a stranger's: a regular file of limited size, or a refusal by name."""
+"""Opens every file that may be a stranger's: a regular file of limited size, or a refusal by name."""
 
 import os
 import stat

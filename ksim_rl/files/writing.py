@@ -1,4 +1,4 @@
-"""This module writes every file that a command leaves: whole or not at all, and never through links.
+"""Writes every file that a command leaves: whole or not at all, and never through links.
 
 A folder may come from a stranger, with links in the place of files: `RUN/export/README.md` may be the user's `.bashrc`.
 So a link, a file that has other names (hard links) and what is no file are refused by name. A file appears under its

@@ -1,4 +1,4 @@
-"""This module decodes XML as its first bytes say: byte order mark, or declared encoding, else UTF-8."""
+"""Decodes XML as its first bytes say: byte order mark, or declared encoding, else UTF-8."""
 
 import codecs
 import re

@@ -1,4 +1,4 @@
-"""This module tells callbacks of MuJoCo Warp that a program sets, at any time, from our own."""
+"""Tells the callbacks that a program sets in MuJoCo Warp apart from our own."""
 
 from collections.abc import Callable
 from typing import Any

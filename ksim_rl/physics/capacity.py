@@ -1,4 +1,4 @@
-"""This module finds how many constraint rows and contacts a world needs, by a probe with MuJoCo's C engine."""
+"""Finds how many constraint rows and contacts a world needs, by a probe with MuJoCo's C engine."""
 
 import copy
 import hashlib

@@ -1,4 +1,4 @@
-"""This module mends the contacts that MuJoCo Warp finds otherwise than the C engine; docs/upstream.md shows each."""
+"""Mends the contacts that MuJoCo Warp and the C engine find differently; docs/upstream.md shows each."""
 
 import dataclasses
 from collections.abc import Callable

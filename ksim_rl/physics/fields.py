@@ -1,4 +1,4 @@
-"""This module knows which model fields may differ between worlds, and which constants follow from them."""
+"""Lists the model fields that may differ between worlds, and the constants that follow from them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""This module places the geoms that are fixed to the world, where a field that moves them differs between worlds.
+"""Places the geoms that are fixed to the world, where a field that moves them differs between worlds.
 
 MuJoCo Warp, and our kernel of the kinematics, leave them where `make_data` has put them, which is one place for all.
 """

@@ -1,4 +1,4 @@
-"""This module loads and checks a model from a file, an XML string, a spec or a menagerie name."""
+"""Loads and checks a model from a file, an XML string, a spec or a menagerie name."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""This module makes kernels of our own C++, which take those arrays of a model and its worlds that the C++ names."""
+"""Compiles kernels of our own C++, with the arrays of a model and its worlds that the C++ names."""
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false

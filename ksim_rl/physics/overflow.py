@@ -1,4 +1,4 @@
-"""This module reports contacts and constraints that did not fit, from sticky bits and maxima read once per rollout."""
+"""Reports contacts and constraints that did not fit, from sticky bits and maxima read once per rollout."""
 
 import dataclasses
 import math

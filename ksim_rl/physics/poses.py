@@ -1,4 +1,4 @@
-"""This module draws poses and controls of a model, and puts its bodies on the ground, for MuJoCo's C engine."""
+"""Draws poses and controls of a model, and puts its bodies on the ground, for MuJoCo's C engine."""
 
 import math
 

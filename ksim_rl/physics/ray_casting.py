@@ -1,4 +1,4 @@
-"""This module casts rays in all worlds at once: those of a sensor, or those of a camera's picture."""
+"""Casts rays in all worlds: for a sensor, or for the picture of a camera."""
 
 from collections.abc import Sequence
 from functools import partial

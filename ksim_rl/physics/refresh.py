@@ -1,4 +1,4 @@
-"""This module launches the refresh of a world: what derives from the present state, without a collision pass."""
+"""Launches the refresh of a world: what derives from the present state, without a collision pass."""
 
 from collections.abc import Callable
 

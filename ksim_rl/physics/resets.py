@@ -1,4 +1,4 @@
-"""This module resets worlds by two kernels, where MuJoCo Warp launches six and more, each of which takes as long."""
+"""Resets worlds with two kernels, where MuJoCo Warp launches six or more."""
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
 # pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false

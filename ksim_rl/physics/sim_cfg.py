@@ -1,4 +1,4 @@
-"""This module holds the settings of solver and integrator that are laid over those of a model."""
+"""Settings of solver and integrator that override a model's."""
 
 import dataclasses
 from typing import Literal

@@ -1,4 +1,4 @@
-"""This module runs the stages of one substep, ours or MuJoCo Warp's, in the order of MuJoCo's forward dynamics."""
+"""Runs the stages of one substep, ours or MuJoCo Warp's, in the order of MuJoCo's forward dynamics."""
 
 import dataclasses
 from collections.abc import Callable

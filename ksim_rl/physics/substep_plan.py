@@ -1,4 +1,4 @@
-"""This module says which kernels compute each stage of a substep, ours or MuJoCo Warp's, and why."""
+"""Says which kernels compute each stage of a substep, ours or MuJoCo Warp's, and why."""
 
 import dataclasses
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""This module launches the substeps of a world with the sensors that are wanted."""
+"""Launches the substeps of a world, with the sensors that are asked for."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping

@@ -1,4 +1,4 @@
-"""This module holds what `physics` uses of MuJoCo Warp beyond its documented interface.
+"""Undocumented interfaces of MuJoCo Warp that `physics` uses.
 
 Each part says why it is needed; all were checked with MuJoCo Warp 4.0.0 and Warp 1.19.0, which pyproject.toml bounds.
 `tests/physics/test_upstream.py` names the part that a new version moved.

@@ -1,4 +1,4 @@
-"""This module makes zero-copy torch views of Warp arrays, and names those that the next steps of a world depend on."""
+"""Makes zero-copy torch views of Warp arrays, and names those that the next steps of a world depend on."""
 
 import dataclasses
 from abc import abstractmethod

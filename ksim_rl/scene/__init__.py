@@ -1,1 +1,1 @@
-"""This package is the physical scene: robots, objects, terrains, sensors, actuators, and the state that terms read."""
+"""The physical scene: robots, objects, terrains, sensors, actuators, and the state that terms read."""

@@ -1,4 +1,4 @@
-"""This module joins the models of several entities into one, and checks that each is in there what it is alone."""
+"""Joins the models of several entities into one, and checks that each is in there what it is alone."""
 
 import re
 from collections.abc import Iterator, Mapping

@@ -1,4 +1,4 @@
-"""This module edits the keyframes of specs: what a file leaves out of them, where entities are placed, and joining."""
+"""Edits the keyframes of specs: what a file leaves out of them, where entities are placed, and joining."""
 
 from collections.abc import Collection, Sequence
 

@@ -1,4 +1,4 @@
-"""This module resolves names of a model's elements, once, to index tensors or slices."""
+"""Resolves names of a model's elements, once, to index tensors or slices."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""This module has passive things for `SceneCfg.objects`."""
+"""Passive things for `SceneCfg.objects`."""
 
 from dataclasses import dataclass
 

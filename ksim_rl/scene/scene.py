@@ -1,4 +1,4 @@
-"""This module puts the scene of one world together: robots at their places on a terrain, and sensors."""
+"""Puts the scene of one world together: robots at their places on a terrain, and sensors."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""This module configures the camera of `render()`."""
+"""Configures the camera of `render()`."""
 
 import re
 from dataclasses import dataclass

@@ -1,1 +1,1 @@
-"""This folder has the source of `runner.py`, which runs without this library: `folder.runner_source` joins it."""
+"""The source of `runner.py`, which runs without this library: `folder.runner_source` joins it."""

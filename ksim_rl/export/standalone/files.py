@@ -1,4 +1,4 @@
-"""This module reads the files of an exported folder, which may be a stranger's: as data, of limited size."""
+"""Reads the files of an exported folder, which may be a stranger's: as data, of limited size."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""This module runs the network of an exported policy, with what it carries from step to step."""
+"""Runs the network of an exported policy, with what it carries from step to step."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""This program runs an exported policy on MuJoCo's C engine; it needs numpy, onnxruntime and mujoco, and nothing else.
+"""Runs an exported policy on MuJoCo's C engine; it needs numpy, onnxruntime and mujoco, and nothing else.
 
     python runner.py [DIR] --episodes 100 --output result.json
 

@@ -1,4 +1,4 @@
-"""This module computes what the descriptions of an exported folder say from MuJoCo's state."""
+"""Computes what the descriptions of an exported folder say from MuJoCo's state."""
 
 import math
 from collections.abc import Callable

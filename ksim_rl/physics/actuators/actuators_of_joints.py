@@ -1,4 +1,4 @@
-"""This module lets actuators add armature and damping to joints and tendons where only some worlds give them any.
+"""Lets actuators add armature and damping to joints and tendons where only some worlds give them any.
 
 MuJoCo notes for each joint and tendon which actuator adds to it, by the values that the model was compiled with. Where
 none had any, a world's own `actuator_armature` or `actuator_damping` would add nothing.

@@ -1,4 +1,4 @@
-"""This module computes the transmissions of actuators that adhere to a body, whose moments its contacts decide.
+"""Computes the transmissions of actuators that adhere to a body, whose moments its contacts decide.
 
 Such an actuator pulls along the mean of the normals of a body's contacts. MuJoCo Warp counts the pairs of geoms whose
 distance a sensor reads among the contacts, and upper corners of boxes on planes, so that the pull is weaker than C's:

@@ -1,4 +1,4 @@
-"""This module switches off the actuators whose group the option `actuatorgroupdisable` disables, as the C engine does.
+"""Switches off the actuators whose group the option `actuatorgroupdisable` disables, as the C engine does.
 
 A disabled actuator makes no force, adds nothing to the derivatives of an implicit integrator, and its activation keeps
 still; its length, velocity and `act_dot` are computed as ever. MuJoCo Warp never reads the option.

@@ -1,4 +1,4 @@
-"""This module measures how far boxes are apart, or how deep in each other, for the sensors of distances.
+"""Measures how far boxes are apart, or how deep in each other, for the sensors of distances.
 
 MuJoCo Warp finds that by GJK, but only for models whose boxes collide by GJK as well, and so otherwise than in C
 (`upstream.collide_boxes_exactly`). Where boxes collide as in C, it measures nothing beyond their margin.

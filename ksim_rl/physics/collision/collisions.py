@@ -1,4 +1,4 @@
-"""This module launches the collision pass of a substep: one kernel, which owns a world, and MuJoCo Warp's for the rest.
+"""Launches the collision pass of a substep: one kernel, which owns a world, and MuJoCo Warp's for the rest.
 
 MuJoCo Warp's has a thread for each pair of geoms, and each that passes waits for the one counter of all worlds, as each
 contact does afterwards. Read the parts in their order: broad_phase.cpp, shapes.cpp, narrow_phase.cpp.

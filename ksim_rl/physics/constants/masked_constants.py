@@ -1,4 +1,4 @@
-"""This module recomputes the constants that follow from model fields in some worlds only, as a reset needs it.
+"""Recomputes the constants that follow from model fields in some worlds only, as a reset needs it.
 
 `mujoco_warp.set_const` recomputes all worlds, with one solve per dof and six per body: hundreds of launches. Here it is
 one launch, and worlds outside of the mask cost an early return.

@@ -1,4 +1,4 @@
-"""This module diagonalizes many inertia matrices at once, without a host sync."""
+"""Diagonalizes a batch of inertia matrices without a host sync."""
 
 import warp as wp
 from jaxtyping import Float32

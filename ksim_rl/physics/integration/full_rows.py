@@ -1,4 +1,4 @@
-"""This module launches MuJoCo Warp's implicit integrators with all derivatives of what acts on simple bodies.
+"""Launches MuJoCo Warp's implicit integrators with all derivatives of what acts on simple bodies.
 
 The inertia matrix of such a body has a diagonal alone: rows of `M` leave out the others, and MuJoCo Warp's derivatives
 with them. C has these for "implicit", and with both integrators for a lone body, whose only joint is a free one. For

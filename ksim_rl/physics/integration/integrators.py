@@ -1,4 +1,4 @@
-"""This module launches MuJoCo Warp's integrators such that they reach the C engine's state; docs/upstream.md shows why.
+"""Launches MuJoCo Warp's integrators so that they reach the C engine's state; docs/upstream.md shows why.
 
 What its implicit integrators leave out is given back by a shallow variant of the model:
 

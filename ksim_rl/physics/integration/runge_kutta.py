@@ -1,4 +1,4 @@
-"""This module launches MuJoCo Warp's Runge-Kutta, and mends what its stages leave wrong."""
+"""Launches MuJoCo Warp's Runge-Kutta, and mends what its stages leave wrong."""
 
 import dataclasses
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""This module finds the files of menagerie robots by name, in a folder or in the package that downloads them."""
+"""Finds the files of menagerie robots by name, in a folder or in the package that downloads them."""
 
 import os
 from pathlib import Path

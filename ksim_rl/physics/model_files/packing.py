@@ -1,4 +1,4 @@
-"""This module collects the files of a model, so that they can be kept elsewhere and compared."""
+"""Collects the files of a model, so that they can be kept elsewhere and compared."""
 
 import hashlib
 import os

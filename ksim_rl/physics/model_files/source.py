@@ -1,4 +1,4 @@
-"""This module reads what a model is named by: a path, an XML text or a menagerie name."""
+"""Reads what a model is named by: a path, an XML text or a menagerie name."""
 
 import re
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""This module readies the text of a URDF file for MuJoCo: meshes are found in ROS packages, and fixed links stay.
+"""Readies the text of a URDF file for MuJoCo: meshes are found in ROS packages, and fixed links stay.
 
 MuJoCo's own reading of URDF knows no packages, and melts links without joints into their parents, so that a robot whose
 base is free to move becomes a part of the world. Its extension of URDF, `<mujoco><compiler .../></mujoco>`, says

@@ -1,4 +1,4 @@
-"""This command replays the last substeps of a world that became non-finite on MuJoCo's C engine.
+"""Replays the last substeps of a world that became non-finite on MuJoCo's C engine.
 
     python -m ksim_rl.physics.nan_guard.replay FILE
 

@@ -1,4 +1,4 @@
-"""This module makes the one kernel of MuJoCo's Newton solver, in which a warp solves one world until it has converged.
+"""Makes the one kernel of MuJoCo's Newton solver, in which a warp solves one world until it has converged.
 
 MuJoCo Warp launches about ten kernels per iteration, over all worlds, until the last of them has converged; here no
 world waits for another, and what an iteration computes stays on the chip. The algorithm is the same, with the same

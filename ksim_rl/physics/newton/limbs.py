@@ -1,4 +1,4 @@
-"""This module finds the limbs of a kinematic tree: chains that hang from a trunk, between which M couples nothing."""
+"""Finds the limbs of a kinematic tree: chains that hang from a trunk, between which M couples nothing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""This module chooses the constraint solver of a world, and launches the one that is a single kernel."""
+"""Chooses the constraint solver of a world, and launches the one that is a single kernel."""
 
 from collections.abc import Callable
 from functools import partial

@@ -1,4 +1,4 @@
-"""This module launches the one kernel of all constraint rows: equalities, dry friction, limits and contacts.
+"""Launches the one kernel of all constraint rows: equalities, dry friction, limits and contacts.
 
 MuJoCo Warp launches about ten for them, whose threads take places for rows as they come, so that sums over rows round
 otherwise in each run on a GPU. Here some lanes of a warp own a world, and rows stand in the order of MuJoCo's C engine.

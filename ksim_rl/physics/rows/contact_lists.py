@@ -1,4 +1,4 @@
-"""This module lists each world's contacts in one order, whatever their places in the pool that all worlds share.
+"""Lists each world's contacts in one order, whatever their places in the pool that all worlds share.
 
 MuJoCo Warp's threads take places in the pool as they come, otherwise in each run on a GPU.
 """

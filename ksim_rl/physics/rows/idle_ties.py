@@ -1,4 +1,4 @@
-"""This module takes the force from rows of connect and weld that no joint can do anything about.
+"""Takes the force from rows of connect and weld that no joint can do anything about.
 
 The rotation of a body that only slides is tied by rows without a Jacobian and without a weight, so that each is as hard
 as numbers allow: a rounding error of float32 in the poses is a force of 1e9, which moves nothing, and which views of

@@ -1,4 +1,4 @@
-"""This module adds the second row of a joint or tendon both of whose limits hold, which MuJoCo Warp leaves out.
+"""Adds the second row of a joint or tendon both of whose limits hold, which MuJoCo Warp leaves out.
 
 A limit holds within its margin, so that both do where the range is narrower than twice that. MuJoCo Warp makes a row of
 the nearer one only; C makes one of each, the lower first.

@@ -1,4 +1,4 @@
-"""This module gives the rows of connect and weld the weights of the bodies that they tie, as the C engine does.
+"""Gives the rows of connect and weld the weights of the bodies that they tie, as the C engine does.
 
 MuJoCo Warp's sparse rows take the weight of the body with joints that a body is welded to, such as of a hand instead of
 the tool frame in it, which is lighter or heavier by any factor.

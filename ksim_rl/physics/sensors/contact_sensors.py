@@ -1,4 +1,4 @@
-"""This module reads contact sensors, and the forces that contacts exert on bodies, from each world's list of contacts.
+"""Reads contact sensors, and the forces that contacts exert on bodies, from each world's list of contacts.
 
 MuJoCo Warp sums and chooses in the order in which its threads come, which on a GPU is another one in each run. The
 kernels are rows/wrench.cpp with rows/sensors.cpp, and with rows/bodies.cpp. The first reads accelerometers as well, for

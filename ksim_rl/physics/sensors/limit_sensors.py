@@ -1,4 +1,4 @@
-"""This module reads the sensors of joint and tendon limits: how far, how fast and how strongly a limit is violated.
+"""Reads the sensors of joint and tendon limits: how far, how fast and how strongly a limit is violated.
 
 MuJoCo Warp looks for them among the constraint rows, where it takes a joint for the tendon of the same number, and
 which a refresh does not make. Distances and speeds follow from the state alone, as they do in C, whose row of a limit

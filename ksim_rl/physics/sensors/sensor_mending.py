@@ -1,4 +1,4 @@
-"""This module reads, once forces are known, the sensors that MuJoCo Warp reads otherwise than the C engine.
+"""Reads the sensors that MuJoCo Warp and the C engine read differently, once forces are known.
 
 It takes contacts as its threads come, where C has an order, and puts no bounds to touch sensors.
 """

@@ -1,4 +1,4 @@
-"""This module launches the kernels of a substep before and after its constraints: smooth dynamics and integration.
+"""Launches the kernels of a substep before and after its constraints: smooth dynamics and integration.
 
 MuJoCo Warp launches some 35 kernels for the first and some 10 for the second, each of which waits for its slowest
 world; here some lanes of a warp own a world, with its bodies or its inertia matrix on the chip. They are written in

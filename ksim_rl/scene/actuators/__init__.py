@@ -1,4 +1,4 @@
-"""This package drives joints: by MuJoCo's own actuators, or by motor models that run before each physics substep.
+"""Drives joints: by MuJoCo's own actuators, or by motor models that run before each physics substep.
 
 A robot lists entries in its `actuators`, puts them into its model by `set_actuators(spec, self.actuators)`, and each
 entry says by name or pattern which joints it drives.

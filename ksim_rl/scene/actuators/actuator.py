@@ -1,4 +1,4 @@
-"""This module has the bases of actuators: an edit of the model and, for motor models of our own, a law per substep."""
+"""The bases of actuators: an edit of the model and, for motor models of our own, a law per substep."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""This module has the actuators that MuJoCo computes itself; their numbers are model fields, which worlds may vary.
+"""The actuators that MuJoCo computes itself; their numbers are model fields, which worlds may vary.
 
 MuJoCo's effort is `gain * ctrl + bias`, clamped to `forcerange`, times the gear. A position servo has
 `actuator_gainprm[0] = stiffness` and `actuator_biasprm[1:3] = (-stiffness, -damping)`, a velocity servo

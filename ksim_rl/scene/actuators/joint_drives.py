@@ -1,4 +1,4 @@
-"""This module edits a spec so that joints have their actuators, and runs the laws of these in the worlds."""
+"""Edits a spec so that joints have their actuators, and runs the laws of these in the worlds."""
 
 from collections.abc import Hashable, Mapping, Sequence
 

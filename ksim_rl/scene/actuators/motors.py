@@ -1,4 +1,4 @@
-"""This module has motors with a proportional-derivative controller, and targets of any actuator that arrive late."""
+"""Motors with a proportional-derivative controller, and targets of any actuator that arrive late."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass

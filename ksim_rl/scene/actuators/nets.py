@@ -1,4 +1,4 @@
-"""This module has learned motor models: networks whose weights and settings stand in a safetensors file."""
+"""Learned motor models: networks whose weights and settings stand in a safetensors file."""
 
 import hashlib
 import json

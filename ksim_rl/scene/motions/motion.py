@@ -1,4 +1,4 @@
-"""This module reads reference motions: recorded states of a scene, at any time between their frames."""
+"""Reads reference motions: recorded states of a scene, at any time between their frames."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

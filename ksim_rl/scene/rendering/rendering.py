@@ -1,4 +1,4 @@
-"""This module draws pictures of an env off screen, by MuJoCo's renderer on an OpenGL platform that works here."""
+"""Draws pictures of an env off screen, by MuJoCo's renderer on an OpenGL platform that works here."""
 
 import copy
 import importlib

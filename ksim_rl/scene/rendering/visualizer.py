@@ -1,4 +1,4 @@
-"""This module says what terms may draw for debugging, and draws it into a MuJoCo scene."""
+"""Draws what terms show for debugging into a MuJoCo scene."""
 
 from collections.abc import Sequence
 

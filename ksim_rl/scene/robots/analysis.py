@@ -1,4 +1,4 @@
-"""This module analyses a robot that nobody here has seen: what its model says, and all that a walking task needs."""
+"""Analyses an unknown robot: what its model says, and all that a walking task needs."""
 
 import dataclasses
 import io

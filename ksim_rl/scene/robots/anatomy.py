@@ -1,4 +1,4 @@
-"""This module finds the legs, soles and limbs of a robot that it has never seen, and fits them with lean hulls."""
+"""Finds the legs, soles and limbs of an unknown robot, and fits them with lean hulls."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""This module has the small models of the control tasks, each in an MJCF file beside it; none needs a download.
+"""The small models of the control tasks, each in an MJCF file beside it; none needs a download.
 
 Hopper, cheetah and walker move in the xz plane: "root_x" (m), "root_z" (m, the torso's height) and "root_y" (rad,
 positive nose down); their sensor "com_velocity" reads the velocity of the centre of mass, world frame.

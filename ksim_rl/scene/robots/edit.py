@@ -1,4 +1,4 @@
-"""This module edits a robot's `MjSpec`: one general function per kind, fed with the tables of the robot's own file."""
+"""Edits a robot's `MjSpec`: one general function per kind, fed with the tables of the robot's own file."""
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""This module says what walking tasks read of a robot beyond its model; menagerie robots share how they are built."""
+"""Says what walking tasks need to know of a robot beyond its model; menagerie robots share how they are built."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

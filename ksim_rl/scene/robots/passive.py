@@ -1,4 +1,4 @@
-"""This module tells which joints of a stranger's robot have no motor."""
+"""Tells which joints of a stranger's robot have no motor."""
 
 import mujoco
 import numpy as np

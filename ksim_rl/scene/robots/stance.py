@@ -1,4 +1,4 @@
-"""This module makes robots stand: it finds a pose with the centre of mass over the soles, and holds it in C."""
+"""Makes robots stand: finds a pose with the centre of mass over the soles, and holds it in C."""
 
 import copy
 from collections.abc import Collection, Mapping, Sequence

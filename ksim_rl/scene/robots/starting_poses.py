@@ -1,4 +1,4 @@
-"""This module finds the poses from which a stranger's robot may stand: its keyframes, and the model's own pose."""
+"""Finds the poses from which a stranger's robot may stand: its keyframes, and the model's own pose."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""This module reads the model of a robot that nobody here has seen, and readies it for an analysis."""
+"""Reads the model of a robot that nobody here has seen, and readies it for an analysis."""
 
 import dataclasses
 import re

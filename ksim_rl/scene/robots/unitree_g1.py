@@ -1,4 +1,4 @@
-"""This module has Unitree G1 with 29 joints: the menagerie's model with reflected motor inertia and position servos.
+"""Unitree G1 with 29 joints: the menagerie's model with reflected motor inertia and position servos.
 
 Frames: the root is `pelvis` (x forward, y left, z up). Masses, joints and ranges are those of
 mujoco_menagerie/unitree_g1. Servo gains follow from the motors' gear trains and a chosen 10 Hz, as in BeyondMimic

@@ -1,4 +1,4 @@
-"""This module has Unitree's quadrupeds: the menagerie's models with position servos or PD motors, and lean collisions.
+"""Unitree's quadrupeds: the menagerie's models with position servos or PD motors, and lean collisions.
 
 Frames: the root is `trunk` (Go1) or `base` (Go2): x forward, y left, z up, origin at the body frame, not at the center
 of mass. Legs are FR, FL, RR, RL; each has hip (abduction, about x), thigh and calf (about y). Masses, joints, ranges

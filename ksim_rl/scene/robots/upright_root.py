@@ -1,4 +1,4 @@
-"""This module readies a stranger's spec for walking tasks: names for all, a root that is free, and z up."""
+"""Readies a stranger's spec for walking tasks: names for all, a root that is free, and z up."""
 
 import math
 

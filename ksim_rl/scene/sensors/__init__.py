@@ -1,4 +1,4 @@
-"""This package has the sensors of a scene, one file each; terms read them by name through the view."""
+"""The sensors of a scene, one file each; terms read them by name through the view."""
 
 from ksim_rl.scene.sensors.camera import CameraSensor, CameraTracker
 from ksim_rl.scene.sensors.contact import ContactSensor, ContactState, ContactTracker

@@ -1,4 +1,4 @@
-"""This module draws cameras for all worlds at once, on the device."""
+"""Renders the cameras of all worlds on the device."""
 
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""This module senses contact: what geoms, bodies or whole limbs touch, how hard, and since when."""
+"""Senses contact: what geoms, bodies or whole limbs touch, how hard, and since when."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

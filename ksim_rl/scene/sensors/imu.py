@@ -1,4 +1,4 @@
-"""This module has inertial measurement units: gyroscope, accelerometer and orientation at a place on a body."""
+"""Inertial measurement units: gyroscope, accelerometer and orientation at a place on a body."""
 
 from dataclasses import dataclass
 

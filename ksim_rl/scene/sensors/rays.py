@@ -1,4 +1,4 @@
-"""This module casts rays from a place on a robot, in patterns, and says how far it is to whatever they hit.
+"""Casts rays from a place on a robot, in patterns, and measures the distance to whatever they hit.
 
 Patterns are in the sensor's own axes: x forward, y left, z up.
 """

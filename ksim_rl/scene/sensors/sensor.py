@@ -1,4 +1,4 @@
-"""This module has the bases of sensors: a config that edits the model, perhaps mounted on a body, and a reader."""
+"""The bases of sensors: a config that edits the model, perhaps mounted on a body, and a reader."""
 
 import re
 from abc import ABC, abstractmethod

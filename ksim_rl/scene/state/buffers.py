@@ -1,4 +1,4 @@
-"""This module holds what terms keep from step to step: buffers with a row per env, and values that all envs share."""
+"""The buffers that terms keep from step to step: with a row per env, or shared by all envs."""
 
 import math
 from collections.abc import Collection, Iterator, Sequence

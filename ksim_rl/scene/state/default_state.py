@@ -1,4 +1,4 @@
-"""This module says in what state rows start before events draw: all that a model's first keyframe holds."""
+"""Says in what state rows start before events draw: all that a model's first keyframe holds."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""This module gives terms the joints, bodies and sites that they name: `view.joints("hip.*").pos_EL`."""
+"""Gives terms the joints, bodies and sites that they name: `view.joints("hip.*").pos_EL`."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

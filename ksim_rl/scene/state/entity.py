@@ -1,4 +1,4 @@
-"""This module reads and moves one robot or object of a scene: its root, its joints, and where it starts."""
+"""Reads and moves one robot or object of a scene: its root, its joints, and where it starts."""
 
 import mujoco
 import torch

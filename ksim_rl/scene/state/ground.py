@@ -1,4 +1,4 @@
-"""This module is the ground of E worlds as terms read it: where envs start, and how high it is at any place."""
+"""The ground of E worlds as terms read it: where envs start, and how high it is at any place."""
 
 import math
 

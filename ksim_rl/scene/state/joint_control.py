@@ -1,4 +1,4 @@
-"""This module says what the control of a joint's actuator means: the target at the joint that it stands for.
+"""Says what the control of a joint's actuator means: the target at the joint that it stands for.
 
 MuJoCo's actuator on a hinge or slide with gear r has length r q, and exerts the effort r (g u + b0 + b1 r q + b2 r q')
 on the joint, with its gain g, its bias (b0, b1, b2), and its control u (behind dynamics: its activation). The control

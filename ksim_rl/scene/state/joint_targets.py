@@ -1,4 +1,4 @@
-"""This module holds what joints are asked for, and writes it to the controls of MuJoCo's own actuators."""
+"""Keeps the targets of joints, and writes them to the controls of MuJoCo's own actuators."""
 
 from collections.abc import Collection, Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""This module follows a reference motion through an episode: when in the motion each env is, and what it shows then."""
+"""Follows a reference motion through an episode: when in the motion each env is, and what it shows then."""
 
 from jaxtyping import Float
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""This module makes named quantities of the current state, each computed at most once per step."""
+"""Makes named quantities of the current state, each computed at most once per step."""
 
 from collections.abc import Callable
 from typing import Any

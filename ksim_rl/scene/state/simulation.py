@@ -1,4 +1,4 @@
-"""This module drives the worlds of an env: it knows when the state changes, whose turn it is, and what is kept."""
+"""Drives the worlds of an env: it knows when the state changes, whose turn it is, and what is kept."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext

@@ -1,4 +1,4 @@
-"""This module is what the parts of a scene and the terms of an env read: named quantities of the current state."""
+"""The view that parts of a scene and terms of an env read: named quantities of the current state."""
 
 from collections.abc import Sequence
 from typing import Any, TypeVar

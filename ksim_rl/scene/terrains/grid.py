@@ -1,4 +1,4 @@
-"""This module lays ground out in levels of difficulty and columns of kinds; each world has one patch to itself."""
+"""Lays ground out in levels of difficulty and columns of kinds; each world has one patch to itself."""
 
 import math
 from collections.abc import Iterator, Mapping

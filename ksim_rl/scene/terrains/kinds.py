@@ -1,4 +1,4 @@
-"""This module has the kinds of ground: each is a rule that gives the heights of a square patch at a difficulty."""
+"""The kinds of ground: each is a rule that gives the heights of a square patch at a difficulty."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""This module has the base of all kinds of ground: a rule gives the heights of a square patch at a difficulty."""
+"""The base of all kinds of ground: a rule gives the heights of a square patch at a difficulty."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

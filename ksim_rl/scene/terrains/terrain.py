@@ -1,4 +1,4 @@
-"""This module has the base of all terrains: a config edits the model, and makes the ground that terms read."""
+"""The base of all terrains: a config edits the model, and makes the ground that terms read."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
