@@ -118,7 +118,9 @@ def hunt(
     tasks = [Task(seed=seed, number=number, device=device, shrinks=shrinks) for number in range(count)]
     until = time.monotonic() + 60.0 * most_minutes
     outcomes = []
-    for task, result in in_processes(judged, tasks, jobs=jobs, most_seconds=MOST_SECONDS, until=until):
+    for task, result in in_processes(
+        judged, tasks, jobs=jobs, most_seconds=MOST_SECONDS, until=until, spoils=has_error
+    ):
         outcome = result
         if isinstance(result, RuntimeError):
             outcome = Outcome(generated=generate(task.seed, task.number), error=str(result))
@@ -126,6 +128,11 @@ def hunt(
         if outcome.fails:
             print("\n".join(told(outcome)), flush=True)
     return outcomes
+
+
+def has_error(result: object) -> bool:
+    """Whether something was raised, after which a GPU may compute nothing further in that process."""
+    return bool(getattr(result, "error", True))
 
 
 def told(outcome: Outcome) -> list[str]:

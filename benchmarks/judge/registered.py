@@ -15,7 +15,7 @@ import torch
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from benchmarks.judge.hunt import MOST_SECONDS, compile_quickly, told_of
+from benchmarks.judge.hunt import MOST_SECONDS, compile_quickly, has_error, told_of
 from benchmarks.judge.trial import NUM_WORLDS, SETTINGS, Given, Verdict, judge, judge_worlds, reason
 from benchmarks.judge.workers import in_processes
 from benchmarks.judge.worlds import solved_well, state_of_row
@@ -168,7 +168,9 @@ def judge_all(tasks: Sequence[Registered], *, jobs: int, most_minutes: float) ->
     """Judge tasks and robots, as many of them as begin in time, and print each that fails."""
     until = time.monotonic() + 60.0 * most_minutes
     outcomes = {}
-    for task, result in in_processes(judged, tasks, jobs=jobs, most_seconds=MOST_SECONDS, until=until):
+    for task, result in in_processes(
+        judged, tasks, jobs=jobs, most_seconds=MOST_SECONDS, until=until, spoils=has_error
+    ):
         outcome = result
         if isinstance(result, RuntimeError):
             outcome = RegisteredOutcome(error=str(result))

@@ -20,6 +20,7 @@ class _Worker:
         self.process.start()
         there.close()
         self.done = 0
+        self.is_spoilt = False
         self.task: Any = None
         self.begun = 0.0
 
@@ -45,6 +46,7 @@ def in_processes(
     jobs: int,
     most_seconds: float,
     until: float = float("inf"),
+    spoils: Callable[[Any], bool] = lambda result: False,
 ) -> Iterator[tuple[Any, Any]]:
     """Yield each task with its result; RuntimeError as a result says that its process crashed or took too long.
 
@@ -54,6 +56,7 @@ def in_processes(
         jobs: how many processes there are.
         most_seconds: that a task may take.
         until: when no further task begins, as time.monotonic says it.
+        spoils: whether a result leaves a process that should do nothing further, as an error on a GPU does.
     """
     left = list(tasks)
     workers: list[_Worker] = []
@@ -73,7 +76,9 @@ def in_processes(
                 is_late = time.monotonic() - worker.begun > most_seconds
                 if worker.here not in ready and not is_late:
                     continue
-                yield worker.task, _result(worker, is_late=worker.here not in ready)
+                result = _result(worker, is_late=worker.here not in ready)
+                worker.is_spoilt = spoils(result)
+                yield worker.task, result
                 worker.task = None
     finally:
         for worker in workers:
@@ -81,7 +86,7 @@ def in_processes(
 
 
 def _fresh(worker: _Worker, do: Callable[[Any], Any]) -> _Worker:
-    if worker.process.is_alive() and worker.done < TASKS_OF_A_PROCESS:
+    if worker.process.is_alive() and not worker.is_spoilt and worker.done < TASKS_OF_A_PROCESS:
         return worker
     worker.end()
     return _Worker(do)

@@ -11,6 +11,8 @@ def do(task: str) -> str:
         os._exit(7)
     if task == "hang":
         time.sleep(1000.0)
+    if task.startswith("which"):
+        return str(os.getpid())
     return task.upper()
 
 
@@ -24,3 +26,10 @@ def test_others_go_on():
 
 def test_no_task_begins_too_late():
     assert list(in_processes(do, ["a"], jobs=1, most_seconds=8.0, until=time.monotonic() - 1.0)) == []
+
+
+def test_a_process_that_is_spoilt_does_nothing_further():
+    same = list(in_processes(do, ["which 1", "which 2"], jobs=1, most_seconds=60.0))
+    assert same[0][1] == same[1][1]
+    others = list(in_processes(do, ["which 1", "which 2"], jobs=1, most_seconds=60.0, spoils=str.isdigit))
+    assert others[0][1] != others[1][1]
