@@ -175,3 +175,17 @@ def test_ctrl_c_saves_and_exits_with_130(tmp_path, monkeypatch, capsys):
     (session,) = record.read(tmp_path)
     assert (session.status, session.why) == ("interrupted", "SIGINT")
     assert session.command.endswith(f"hydra.run.dir={tmp_path}") and " train num_envs=16 " in session.command
+
+
+def test_what_an_export_will_leave_out_is_said_before_the_first_iteration(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    own = "+task.rewards.force={_target_:ksim_rl.mdp.ActuatorForceL2,weight:-0.001}"
+    quick = (
+        "trainer.num_iterations=1",
+        "trainer.video=false",
+        "trainer.eval_episodes=0",
+        "task.sim.engine=c",
+    )
+    run("train", *SMALL, *quick, own, f"hydra.run.dir={tmp_path / 'run'}")
+    said = capsys.readouterr().out
+    assert "task.rewards.force is left out of sim2sim: ActuatorForceL2" in " ".join(said.split())

@@ -137,12 +137,12 @@ def test_motors_and_servos_are_told_apart_with_their_limits():
     actuators = """
       <motor joint="left_hip" gear="20" ctrlrange="-2 3" ctrllimited="true"/>
       <position joint="left_knee" kp="50" kv="2" forcerange="-40 40"/>
-      <velocity joint="left_ankle" kv="3"/>"""
+      <velocity joint="left_ankle" kv="3" gear="2"/>"""
     found = analyse(biped(actuators=actuators))
     joints = {joint.name: joint for joint in found.joints}
     assert (joints["left_hip"].actuator, joints["left_hip"].effort_limit) == ("motor", 60.0)
     assert (joints["left_knee"].actuator, joints["left_knee"].effort_limit) == ("position", 40.0)
-    assert joints["left_knee"].gains == (50.0, 2.0) and joints["left_ankle"].gains == (0.0, 3.0)
+    assert joints["left_knee"].gains == (50.0, 2.0) and joints["left_ankle"].gains == (0.0, 12.0)
     assert joints["left_ankle"].actuator == "velocity"
     # What no actuator moves has no motor, and gets none.
     assert set(found.passive_joints) == {
