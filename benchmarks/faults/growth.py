@@ -9,6 +9,7 @@ import os
 import re
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from benchmarks import report
 from benchmarks.faults import children
 from benchmarks.faults.row import AT_LEAST, AT_MOST, EXACTLY, Figures, Row
-from ksim_rl.trainers import Hook, RunProgress, Trainer, run_folder
+from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run_folder
 
 # Torch, Warp and the allocator settle within this share of a run.
 SETTLED = 0.4
@@ -60,9 +61,19 @@ class _Samples(Hook):
             self.samples.write_text(json.dumps(self.rows))  # also if the process is killed
 
 
-def soak(folder: Path, *, iterations: int, picture: Path | None = None) -> Figures:
-    """Train the smallest task with all that a run does by default, and look for growth."""
-    cfg, _ = children.warm()
+def _as_it_is(cfg: RunCfg) -> RunCfg:
+    return cfg
+
+
+def soak(
+    folder: Path,
+    *,
+    iterations: int,
+    picture: Path | None = None,
+    change: Callable[[RunCfg], RunCfg] = _as_it_is,
+) -> Figures:
+    """Train the smallest task, changed, with all that a run does by default, and look for growth."""
+    cfg = change(children.warm()[0])
     sampler = _Samples(folder / "run", iterations=iterations)
 
     def work() -> int:

@@ -14,6 +14,7 @@ from benchmarks.faults import (
     machine,
     numbers,
     saving,
+    seen_soak,
     strangers,
     viewer,
 )
@@ -32,5 +33,6 @@ ROWS: dict[str, Row] = {
     **bad_input.ROWS,
     **machine.ROWS,
     **growth.ROWS,
+    **seen_soak.ROWS,
     **gpu.ROWS,
 }

@@ -30,6 +30,8 @@ WRITTEN_BY_LOGGERS = ("wandb", "mlflow")
 MOST_LETTERS = 120
 # Hydra reads a group in Python, a letter in some 50 us.
 MOST_GROUP_BYTES = 2**16
+# Thirty references, each to two before it, are a text of gigabytes.
+MOST_REFERENCES = 16
 
 
 def job_folder(number: int, task: str, overrides: str) -> str:
@@ -101,7 +103,8 @@ def check_groups(folder: Path) -> None:
     """Refuse a folder of config groups that holds more than values for fields and choices of groups.
 
     That is what the config of a run may not hold either (tags, anchors, resolvers such as `${oc.env:HOME}`), links, and
-    how Hydra launches, logs or calls back. References to other fields, such as `${num_envs}`, are values.
+    how Hydra launches, logs or calls back. References to other fields, such as `${num_envs}`, are values; there may be
+    `MOST_REFERENCES` of them.
     """
     found = config_files(folder)
     if not any(len(path.parts) > 1 and path.name != RUN_CONFIG for path in found):
@@ -116,6 +119,7 @@ def check_groups(folder: Path) -> None:
                 raise ValueError(
                     f"{os.path.join(root, name)}: a link, and what it leads to is no part of the folder"
                 )
+    references = 0
     for path in found:
         text = read_bytes(folder / path, limit=MOST_GROUP_BYTES).decode(errors="replace")
         try:
@@ -124,6 +128,12 @@ def check_groups(folder: Path) -> None:
         except yaml.YAMLError as error:
             raise ValueError(f"{folder / path}: cannot be read: {' '.join(str(error).split())}") from error
         plain_data.check_references(tree, str(folder / path))
+        references += str(tree).count("${")
+        if references > MOST_REFERENCES:
+            raise ValueError(
+                f"{folder / path}: the folder has more than {MOST_REFERENCES} references to other fields, such as "
+                "${num_envs}: give values"
+            )
         if len(path.parts) == 1 or "hydra" in f"{path} {text} {tree}".lower():
             raise ValueError(
                 f"{folder / path}: a folder of config groups holds choices of groups only, which do not name Hydra; "

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from omegaconf import OmegaConf
 
 from ksim_rl.clips.amass import read_amass
 from ksim_rl.clips.bvh import read_bvh
@@ -63,6 +64,20 @@ def yaml_of_keys_that_are_compared(folder):
     path = folder / "config.yaml"
     path.write_text("".join(f"{number}:\n" for number in range(70_000)))
     return lambda: read_yaml(path)
+
+
+@bomb
+def group_of_references(folder):
+    """Each text is the one before it twice, which Hydra writes out."""
+    path = folder / "objective" / "long.yaml"
+    path.parent.mkdir()
+    path.write_text("a0: xxxxxxxxxx\n" + "".join(f"a{n + 1}: '${{a{n}}}${{a{n}}}'\n" for n in range(30)))
+
+    def read():
+        check_groups(folder)
+        return OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+
+    return read
 
 
 @bomb
