@@ -4,14 +4,28 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import report
-from benchmarks.pages import algorithms, judge, memory, peer_settings, speed, tasks, terms, terrain_course
+from benchmarks.pages import (
+    algorithms,
+    judge,
+    learned,
+    memory,
+    peer_settings,
+    speed,
+    tasks,
+    terms,
+    terrain_course,
+)
 from benchmarks.pages.committed import results
 
 DOCS = Path(__file__).parents[2] / "docs"
 WHOLE: dict[str, Callable[[], str]] = {"terms.md": terms.page, "tasks.md": tasks.page}
 # By page and name: a part stands between two comments, `<!-- made: NAME -->` and `<!-- end: NAME -->`.
 PARTS: dict[str, dict[str, Callable[[], str]]] = {
-    "learning.md": {"algorithms": algorithms.algorithms},
+    "learning.md": {
+        "algorithms": algorithms.algorithms,
+        "walking": learned.walking,
+        "suite": learned.suite,
+    },
     "memory.md": {"per env": memory.per_env, "of many": memory.of_many, "speed": memory.speed},
     "notes/go1.md": {"settings": lambda: peer_settings.text(results("peer_settings"))},
     "notes/rough_ground.md": {"course": lambda: terrain_course.table(results("terrain_course"))},
