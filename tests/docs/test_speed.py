@@ -10,6 +10,7 @@ from tests.docs.guide import DOCS, REPOSITORY
 
 README = (REPOSITORY / "README.md").read_text()
 PAGE = (DOCS / "speed.md").read_text()
+NOTE = (DOCS / "notes" / "speed.md").read_text()
 GO1, G1 = "h200/go1_velocity_flat/4096/", "h200/g1_velocity_flat/4096/"
 MEMORY = ("physics", "env_and_rollout", "update")
 ROOMS = ("physics", "terms", "update", "refresh", "resets", "policy")
@@ -79,8 +80,8 @@ def said() -> dict[str, tuple[str, str]]:
         "terrain": (PAGE, f"x {results('terrain')['rough_over_flat']:.2f}"),
         "profile": (PAGE, f"| share | {in_rooms(GO1, 'share')} |"),
         "kernels of the profile": (PAGE, f"| kernels | {in_rooms(GO1, 'kernels')} |"),
-        "profile before": (PAGE, f"| before | {in_rooms(f'{GO1}before/', 'share')} |"),
-        "kernels before": (PAGE, f"| before | {in_rooms(f'{GO1}before/', 'kernels')} |"),
+        "profile before": (NOTE, f"| share | {in_rooms(f'{GO1}before/', 'share')} |"),
+        "kernels before": (NOTE, f"| kernels | {in_rooms(f'{GO1}before/', 'kernels')} |"),
         "collector": (PAGE, f"x {collector['h200/cartpole/4096/captured_over_stock']:.1f} |"),
         "its graphs": (PAGE, f"x {collector['h200/cartpole/4096/captured_over_stock_with_graphs']:.1f} |"),
         "update": (PAGE, f"x {update['h200/98304/stock_eager_over_update']:.1f} |"),
