@@ -10,6 +10,7 @@ not there is left out of the figures. Exit code 1: a traceback, a line that is n
 
 import argparse
 import dataclasses
+import json
 import sys
 from pathlib import Path
 
@@ -44,30 +45,41 @@ def figures_of(tried: dict[str, tuple[Listed, Attempt]]) -> dict[str, float]:
     }
 
 
+def earlier() -> dict[str, tuple[Listed, Attempt]]:
+    """Return what came of the listed files before, each row with the commit that ran then."""
+    path = report.RESULTS / "robots.json"
+    rows = json.loads(path.read_text())["robots"] if path.exists() else {}
+    return {
+        listed.path: (listed, Attempt(**rows[listed.path])) for listed in read_list() if listed.path in rows
+    }
+
+
 def main() -> int:
     """Try the files, print a line for each, and write benchmarks/results/robots.json."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.robots", description=__doc__)
     parser.add_argument("--folder", type=Path, required=True, help="where the packages are")
-    parser.add_argument("--only", default="", help="files whose path has this in it; writes nothing")
+    parser.add_argument("--only", default="", help="try files whose path has this in it; other rows stay")
     options = parser.parse_args()
     tried: dict[str, tuple[Listed, Attempt]] = {}
+    commit = report.commit()
     for listed in read_list():
         if options.only not in listed.path or not (options.folder / listed.path).is_file():
             continue
         found = attempt(listed, options.folder)
+        found.commit = commit
         tried[listed.path] = listed, found
         words = (
             found.said.splitlines()[-1][:160] if found.said else f"{', '.join(found.feet)} from {found.pose}"
         )
         mark = "as listed" if found.as_listed else "NOT as listed"
         print(f"{listed.path}: {found.outcome} ({mark}, {found.seconds:g} s): {words}", flush=True)
+    tried = {**earlier(), **tried}
     figures = figures_of(tried)
     print(figures)
-    if not options.only:
-        robots = {path: dataclasses.asdict(found) for path, (_, found) in tried.items()}
-        report.write(
-            "robots", figures=figures, device=torch.device("cpu"), module="benchmarks.robots", robots=robots
-        )
+    robots = {path: dataclasses.asdict(found) for path, (_, found) in tried.items()}
+    report.write(
+        "robots", figures=figures, device=torch.device("cpu"), module="benchmarks.robots", robots=robots
+    )
     others_are_told = figures["others_with_their_line"] == figures["files"] - figures["walkers"]
     stand = figures["walkers_that_stand"] >= LEAST_SHARE
     return 0 if stand and others_are_told and not figures["tracebacks"] else 1

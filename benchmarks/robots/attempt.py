@@ -49,6 +49,7 @@ class Attempt:
     trained: int = 0
     said: str = ""
     as_listed: bool = False
+    commit: str = ""
 
 
 def attempt(listed: Listed, folder: Path) -> Attempt:

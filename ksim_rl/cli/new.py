@@ -31,6 +31,9 @@ def new(arguments: list[str]) -> int:
     parser.add_argument(
         "model", metavar="PATH", help="an MJCF or URDF file, or a menagerie name: unitree_a1/a1"
     )
+    parser.add_argument(
+        "--pose", metavar="NAME", help='the keyframe to stand in, or "qpos0"; default: the first that stands'
+    )
     parser.add_argument("--name", help="of the package; default: that of the model")
     parser.add_argument("--output", type=Path, help="the new folder; default: the package's name, here")
     options = parser.parse_args(arguments)
@@ -41,7 +44,7 @@ def new(arguments: list[str]) -> int:
     if folder.exists():
         raise ValueError(f"{folder}: exists already; choose another folder with --output")
     with shown_working(f"analysing {options.model}"):
-        found = analyse(options.model)
+        found = analyse(options.model, pose=options.pose)
     robot, stands = replace(found.robot, name=name, model=MODEL), found.stands_s >= TRIAL_S
     model = Path(options.model).expanduser()
     is_file = model.exists()

@@ -125,13 +125,21 @@ def _keep(
             for file in files.names:
                 (unfinished / file).parent.mkdir(parents=True, exist_ok=True)
                 write_whole(unfinished / file, files.contents(file))
-            copied = files_of_model(unfinished / files.main)
-            if copied is None or copied.sha256() != kept.sha256:
+            if not _is_whole(unfinished / files.main, kept):
                 raise AbsolutePathError(f"{source} names files by absolute paths")
     except AbsolutePathError as error:
         note(f"task.scene.{name.replace('/', '.')}: {error}: the run keeps only its hash")
         return kept
     return dataclasses.replace(kept, copy=f"{place}/{files.main}")
+
+
+def _is_whole(copy: Path, kept: KeptModel) -> bool:
+    """Return whether a copy finds all files of the model beside it, and these alone."""
+    try:
+        files = files_of_model(copy)
+    except ValueError:
+        return False
+    return files is not None and files.sha256() == kept.sha256
 
 
 def _difference(source: str, kept: KeptModel) -> str:

@@ -51,6 +51,7 @@ def test_the_package_has_robot_task_test_and_readme(work, capsys):
         (["tin_man.xml", "--name", "quadruped"], "there is a task 'quadruped_velocity_flat' already"),
         (["tin_man.xml", "--output", "."], "exists already"),
         (["nowhere.xml"], "nowhere.xml"),
+        (["tin_man.xml", "--pose", "home"], "the model has no pose 'home': valid: qpos0"),
     ],
 )
 def test_what_cannot_be_written_is_one_line_and_leaves_nothing(work, capsys, arguments, message):

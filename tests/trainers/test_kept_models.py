@@ -150,6 +150,22 @@ def test_above_a_size_only_the_hash_is_kept_and_a_change_is_told(robot, run, mon
     assert "has changed since the run began, and the run kept its hash alone" in said[1]
 
 
+def test_a_urdf_file_of_a_package_is_copied_with_what_it_finds_there(run, tmp_path):
+    package = tmp_path / "share" / "robots"
+    (package / "cart" / "urdf").mkdir(parents=True)
+    (package / "cart" / "meshes").mkdir()
+    (package / "cart" / "meshes" / "cart.obj").write_text(TETRAHEDRON)
+    mesh = '<geometry><mesh filename="package://robots/cart/meshes/cart.obj"/></geometry>'
+    urdf = package / "cart" / "urdf" / "cart.urdf"
+    urdf.write_text(f'<robot name="cart"><link name="cart"><collision>{mesh}</collision></link></robot>')
+    (tmp_path / "linked").symlink_to(tmp_path / "share")
+    for source in (urdf, tmp_path / "linked" / "robots" / "cart" / "urdf" / "cart.urdf"):
+        _, said = kept(source, run)
+        record = read_record(run)["robots/cart"]
+        assert said == [] and record.copy == "robots_cart/robots/cart/urdf/cart.urdf"
+        assert load_model(run / "models" / record.copy).nmesh == 1
+
+
 def test_files_at_absolute_paths_are_not_copied_and_the_run_says_so(robot, run):
     robot.write_text(ROBOT.replace("../meshes", str(Path("meshes").resolve())))
     _, said = kept(robot, run)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 from ksim_rl.physics.model_files.source import model_file, read_source
-from ksim_rl.physics.model_files.urdf import is_urdf, ready_urdf
+from ksim_rl.physics.model_files.urdf import is_urdf, packages_of, ready_urdf
 from ksim_rl.physics.model_size import files_named
 
 
@@ -47,10 +47,14 @@ def files_of_model(source: str | Path) -> ModelFiles | None:
     if path is None:
         return None
     read = read_source(path)
-    text = ready_urdf(read.text, read.folder) if is_urdf(read.text) else read.text
+    text = read.text
+    packages: list[Path] = []
+    if is_urdf(text):
+        packages = packages_of(text, read.folder)
+        text = ready_urdf(text, read.folder)
     main = Path(os.path.abspath(path))
     paths = sorted({main, *files_named(text, read.folder, read.label)})
-    folder = Path(os.path.commonpath([file.parent for file in paths])).parent
+    folder = Path(os.path.commonpath([*(file.parent for file in paths), *packages])).parent
     return ModelFiles(
         folder=folder,
         main=str(main.relative_to(folder)),

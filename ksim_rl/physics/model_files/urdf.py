@@ -6,7 +6,9 @@ otherwise; where a file has one, that stays as its author wrote it.
 """
 
 import html
+import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 _ROBOT = re.compile(r"<robot\b[^>]*>")
@@ -34,7 +36,7 @@ def ready_urdf(text: str, folder: Path) -> str:
         discards = "true" if _COLLISION.search(text) else "false"
         compiler = f'<compiler strippath="false" fusestatic="false" discardvisual="{discards}"/>'
         text = _ROBOT.sub(lambda found: f"{found[0]}<mujoco>{compiler}</mujoco>", text, count=1)
-    folder = folder.resolve()
+    folder = Path(os.path.abspath(folder))  # as it is called, since links may be what holds packages together
 
     def found_mesh(match: re.Match[str]) -> str:
         path = _mesh_path(html.unescape(match["name"].strip()), folder)
@@ -43,19 +45,37 @@ def ready_urdf(text: str, folder: Path) -> str:
     return _MESH.sub(found_mesh, text)
 
 
+def packages_of(text: str, folder: Path) -> list[Path]:
+    """Return the folders of the packages that a URDF text of `folder` takes meshes from."""
+    found: dict[Path, None] = {}
+    for mesh in _MESH.finditer(text):
+        in_package = _PACKAGE.fullmatch(html.unescape(mesh["name"].strip()))
+        if in_package is None:
+            continue
+        for of_package in _folders_of(in_package["package"], Path(os.path.abspath(folder))):
+            if (of_package / in_package["path"]).is_file():
+                found[of_package] = None
+                break
+    return list(found)
+
+
+def _folders_of(package: str, folder: Path) -> Iterator[Path]:
+    """Yield the folders that may be a package's, from a file's own folder upwards."""
+    for above in (folder, *folder.parents):
+        yield above / package
+        if above.name == package:
+            yield above
+
+
 def _mesh_path(name: str, folder: Path) -> str:
     """Return the path under which MuJoCo finds a mesh that a file of `folder` names."""
     in_package = _PACKAGE.fullmatch(name)
     if in_package is None:
         return name.removeprefix("file://")
     package, path = in_package["package"], in_package["path"]
-    for above in (folder, *folder.parents):
-        candidates = [above / package / path]
-        if above.name == package:
-            candidates.append(above / path)
-        for candidate in candidates:
-            if candidate.is_file():
-                return str(candidate)
+    for of_package in _folders_of(package, folder):
+        if (of_package / path).is_file():
+            return str(of_package / path)
     raise ValueError(
         f"mesh {name!r}: no folder above the file has {package}/{path}: put the package {package!r} beside the "
         "file's, or write the mesh's path in place of package://"
