@@ -3,11 +3,12 @@
 import dataclasses
 import importlib
 import pkgutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
 import torch
+from tensordict import NestedKey
 from tensordict.utils import unravel_key
 from torchrl.envs.transforms import Transform
 
@@ -17,6 +18,7 @@ from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
+from ksim_rl.envs.specs import misfit
 from ksim_rl.envs.task import Task
 from ksim_rl.transforms.groups.group_cfg import compile_groups
 from ksim_rl.transforms.row_transform import follow_level, seed_transforms
@@ -101,8 +103,11 @@ def build(
     base_env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
     level = base_env.view.level
     env = MaskedTransformedEnv(base_env, compile_groups(cfg.observations, level=level))
+    foreign: dict[str, Transform] = {}
     for name, described in cfg.transforms.items():
         transform = described.build(name)
+        if not type(transform).__module__.startswith(("ksim_rl.", "torchrl.")):
+            foreign[name] = transform
         follow_level([transform], level)
         try:
             _check_reads(transform, env)
@@ -114,8 +119,30 @@ def build(
             raise ValueError(f"task.transforms.{name}: {reason}") from error
     seed = base_env.cfg.seed
     assert seed is not None  # an env stores the seed that it drew
+    if foreign:
+        _check_writes(env, foreign)
+        base_env.set_seed(seed)  # as if nothing had been reset
     seed_transforms(env, seed)  # alone: the base env has its seed already
     return env
+
+
+def _check_writes(env: MaskedTransformedEnv, foreign: Mapping[str, Transform]) -> None:
+    """Refuse what transforms of others make of a first root, if their specs say something else."""
+    try:
+        root = env.reset()
+    except Exception as error:
+        error.add_note(f"(in the first reset, with task.transforms.{', '.join(foreign)})")
+        raise
+    spec = env.full_observation_spec
+    for key in spec.keys(True, True):
+        reason = misfit(root.get(key, None), spec[key])
+        writers = [name for name, own in foreign.items() if _writes(own, key)]
+        if reason and writers:
+            raise ValueError(f"task.transforms.{writers[-1]}: observation {key!r} {reason}")
+
+
+def _writes(transform: Transform, key: NestedKey) -> bool:
+    return unravel_key(key) in {unravel_key(own) for own in transform.out_keys or ()}
 
 
 def _check_reads(transform: Transform, env: MaskedTransformedEnv) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from ksim_rl import dims
 
@@ -50,3 +50,17 @@ def make_specs(
         spec.names = [dims.E]
     observation, action_spec, reward, done = specs
     return observation, action_spec, reward, done
+
+
+def misfit(value: object, spec: TensorSpec) -> str:
+    """Return how a value differs from what its spec says of type, dtype and shape, or nothing."""
+    if not isinstance(value, Tensor):
+        given = type(value).__name__
+    elif value.dtype != spec.dtype or value.shape != spec.shape:
+        given = f"{value.dtype} {tuple(value.shape)}"
+    else:
+        return ""
+    return (
+        f"is {given}, and its spec says {spec.dtype} {tuple(spec.shape)}: return what the spec says, or say in "
+        "`transform_observation_spec` what the transform makes of it"
+    )

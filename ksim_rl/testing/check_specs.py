@@ -2,7 +2,6 @@
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -10,6 +9,7 @@ from torchrl.envs.utils import check_env_specs
 from ksim_rl import dims
 from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
+from ksim_rl.envs.specs import misfit
 
 _NOT_FINITE = (
     "Look for a division by zero, a root of a negative number or an uninitialized buffer in what computes it"
@@ -107,7 +107,8 @@ def _check_values(tensordict: TensorDictBase, env: EnvBase, when: str) -> None:
         value = tensordict.get(key, None)
         if value is None:  # `check_env_specs` lists what is missing and what is too much
             continue
-        _check_kind(key, value, env, when)
+        if reason := misfit(value, spec[key]):
+            raise AssertionError(f"observation {key!r}, {_written_by(env, key)}, {reason} (at {when})")
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             rows = (~torch.isfinite(value.reshape(value.shape[0], -1)).all(-1)).nonzero().flatten().tolist()
             where = f"at {when}, in the rows {rows}, {_written_by(env, key)}"
@@ -117,22 +118,6 @@ def _check_values(tensordict: TensorDictBase, env: EnvBase, when: str) -> None:
                 f"observation {key!r} leaves its spec at {when}: values {value.min()} to {value.max()}, {spec[key]}. "
                 "Widen the spec, or clip the value"
             )
-
-
-def _check_kind(key: NestedKey, value: object, env: EnvBase, when: str) -> None:
-    """Refuse what has another type, dtype or shape than its spec says."""
-    spec = env.full_observation_spec[key]
-    expected = f"{spec.dtype} {tuple(spec.shape)}"
-    if not isinstance(value, Tensor):
-        given = type(value).__name__
-    elif value.dtype != spec.dtype or value.shape != spec.shape:
-        given = f"{value.dtype} {tuple(value.shape)}"
-    else:
-        return
-    raise AssertionError(
-        f"observation {key!r} is {given} at {when}, and its spec says {expected}, {_written_by(env, key)}. Return what "
-        "the spec says, or say in `transform_observation_spec` what a transform makes of it"
-    )
 
 
 def _written_by(env: EnvBase, key: NestedKey) -> str:

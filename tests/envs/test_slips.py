@@ -20,7 +20,7 @@ from ksim_rl.envs.term import (
     TerminationTerm,
 )
 from ksim_rl.testing import check_env
-from ksim_rl.transforms import ObservationTermCfg
+from ksim_rl.transforms import ObservationTermCfg, TransformCfg
 
 E = 3
 
@@ -267,30 +267,62 @@ class Own(Transform):
         return self._call(tensordict_reset)
 
 
-WRITTEN = "written by transform 1, Own"
 TRANSFORMS = {
-    "wider": (
-        lambda obs: torch.cat((obs, obs), -1),
-        rf"'actor' is torch.float32 \(3, 10\) .*\(3, 5\), {WRITTEN}",
-    ),
-    "float64": (
-        lambda obs: obs.double(),
-        rf"'actor' is torch.float64 \(3, 5\) .*torch.float32 \(3, 5\), {WRITTEN}",
-    ),
-    "no leaf dim": (lambda obs: obs[..., 0], rf"'actor' is torch.float32 \(3,\) .*, {WRITTEN}"),
-    "no return": (lambda obs: None, rf"'actor' is NonTensorData .*, {WRITTEN}"),
-    "not a number": (lambda obs: obs * torch.nan, rf"'actor' is not finite .*, {WRITTEN}"),
+    "wider": (lambda obs: torch.cat((obs, obs), -1), r"is torch.float32 \(3, 10\), and .*\(3, 5\)"),
+    "float64": (lambda obs: obs.double(), r"is torch.float64 \(3, 5\), and .* torch.float32 \(3, 5\)"),
+    "no leaf dim": (lambda obs: obs[..., 0], r"is torch.float32 \(3,\), and"),
+    "no return": (lambda obs: None, "is NonTensorData, and"),
 }
 SLOW = ("c_engine", "memory", "syncs", "determinism")
 
 
 @pytest.mark.parametrize("slip", TRANSFORMS)
-def test_check_env_names_the_transform(slip):
+def test_a_transform_of_a_wrong_shape_is_named(slip):
     make, message = TRANSFORMS[slip]
     env = envs.build(base())
     env.append_transform(Own(make))
-    with pytest.raises(AssertionError, match=rf"\[values\] observation {message}"):
+    with pytest.raises(
+        AssertionError, match=rf"\[values\] observation 'actor', written by transform 1, Own, {message}"
+    ):
         check_env(env, skip=SLOW)
+
+
+def test_check_env_names_the_transform_of_what_is_not_a_number():
+    env = envs.build(base())
+    env.append_transform(Own(lambda obs: obs * torch.nan))
+    with pytest.raises(
+        AssertionError, match=r"\[values\] observation 'actor' is not finite .* by transform 1, Own"
+    ):
+        check_env(env, skip=SLOW)
+
+
+class Doubling(Own):
+    """Gives twice as many numbers as its spec says."""
+
+    def __init__(self):
+        super().__init__(lambda obs: torch.cat((obs, obs), -1))
+
+
+class Halving(Own):
+    """Is as it says."""
+
+    def __init__(self):
+        super().__init__(lambda obs: 0.5 * obs)
+
+
+def test_a_tasks_own_transform_of_a_wrong_shape_is_refused_by_name():
+    with pytest.raises(
+        ValueError, match=r"task.transforms.mine: observation 'actor' is torch.float32 \(3, 10\), and"
+    ):
+        envs.build(base(transforms={"mine": TransformCfg(Doubling)}))
+
+
+def test_a_tasks_own_transform_that_fits_changes_no_draw():
+    plain, halved = (
+        envs.build(base(transforms=own, seed=5)) for own in ({}, {"mine": TransformCfg(Halving)})
+    )
+    expected = plain.reset()["actor"] * 0.5
+    assert halved.reset()["actor"].equal(expected)
 
 
 @pytest.mark.parametrize(("kind", "term"), [("rewards", Reward), ("metrics", Metric)])
