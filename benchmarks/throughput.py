@@ -7,8 +7,9 @@ takes the overrides of `ksim-rl train`, trains some iterations, and prints one t
 this project's own substeps from the same states, the env step, the rollout, the update and the whole iteration, each in
 env states/s and relative to raw physics. Below it: what the guards against overflow and non-finite states take of an
 iteration, and on CUDA the kernels of a control step, the policy's included, the device memory per world, and the waits
-and copies of the host in one iteration. Figures go to benchmarks/results/throughput.json. How long the first iteration
-takes: `benchmarks.first_iteration`.
+and copies of the host in one iteration. On the CPU a second table sets MuJoCo's C engine beside MuJoCo Warp, by turns in
+the same process, as `benchmarks.engines` does alone. Figures go to benchmarks/results/throughput.json. How long the first
+iteration takes: `benchmarks.first_iteration`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import command_line, report
+from benchmarks import command_line, engines, report
 from benchmarks.host_traffic import cuda_events, host_traffic
 from benchmarks.raw_physics import own_physics_ms, physics_ms, record_steps
 from benchmarks.stopwatch import milliseconds
@@ -239,7 +240,7 @@ def _table(cfg: RunCfg, figures: dict[str, float], device: torch.device) -> Tabl
 
 
 def main() -> None:
-    """Measure, print the table, and write the figures."""
+    """Measure, print the tables, and write the figures."""
     cfg = command_line.compose([*sys.argv[1:], "logger=none", "trainer.eval_episodes=0"])
     device = cfg.resolved_device()
     figures = measure(cfg)
@@ -247,6 +248,10 @@ def main() -> None:
     beside = ("per_world", "host", "kernels")
     for name in ("guards_share", *(name for name in figures if any(word in name for word in beside))):
         print(f"{name} {figures[name]:.4g}")
+    if device.type == "cpu":
+        both = engines.measure(cfg)
+        Console().print(engines.table(cfg, both))
+        figures |= both
     prefix = f"{report.device_label(device)}/{cfg.task_name}/{cfg.num_envs}"
     path = report.write(
         "throughput",
