@@ -3,8 +3,8 @@
     python -m benchmarks.engines task=go1_velocity_flat num_envs=64,512,4096 collector.rollout_length=8
 
 takes the overrides of `ksim-rl train`. Whatever else the machine does slows both alike, but not quite: the C engine
-waits for the slowest of its threads. So times are taken on the wall clock and as the processor time of all threads, which
-is the wall clock's on one core that nobody else uses. Figures go to benchmarks/results/throughput.json.
+waits for the slowest of its threads. So times are taken on the wall clock and as the processor time of all threads,
+which is the wall clock's on one core that nobody else uses. Figures go to benchmarks/results/throughput.json.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from benchmarks import command_line, report
 from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.trainers import RunCfg, Trainer, build
+from ksim_rl.trainers.run_cfg import with_engine
 
 ENGINES = ("c", "warp")
 # The first rollouts compile, record and compare.
@@ -46,7 +47,7 @@ def measure(cfg: RunCfg, *, repeats: int = REPEATS) -> dict[str, float]:
     Rollouts are those of training, each engine with its own defaults: those of MuJoCo Warp are compiled. Physics is one
     env step's substeps and the refresh after them.
     """
-    trainers = {engine: build(_with_engine(cfg, engine)) for engine in ENGINES}
+    trainers = {engine: build(with_engine(cfg, engine)) for engine in ENGINES}
     rollouts = {engine: trainers[engine].collector.collect for engine in ENGINES}
     physics = {engine: _physics(trainers[engine]) for engine in ENGINES}
     figures = _figures("rollout", _by_turns(rollouts, repeats))
@@ -91,11 +92,6 @@ def main() -> None:
         print(f"written to {path}")
 
 
-def _with_engine(cfg: RunCfg, engine: Any) -> RunCfg:
-    sim = dataclasses.replace(cfg.task.sim, engine=engine)
-    return dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, sim=sim))
-
-
 def _physics(trainer: Trainer) -> Callable[[], None]:
     env = part(trainer.collector.env, ManagerBasedRlEnv)
     assert env is not None  # the env of a config is ours
@@ -133,9 +129,7 @@ def _by_turns(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, Ti
             wall[name].append(1000.0 * (time.perf_counter() - began))
             processor[name].append(1000.0 * (time.process_time() - used))
     return {
-        name: Times(
-            wall_ms=statistics.median(wall[name]), processor_ms=statistics.median(processor[name])
-        )
+        name: Times(wall_ms=statistics.median(wall[name]), processor_ms=statistics.median(processor[name]))
         for name in calls
     }
 

@@ -7,9 +7,9 @@ takes the overrides of `ksim-rl train`, trains some iterations, and prints one t
 this project's own substeps from the same states, the env step, the rollout, the update and the whole iteration, each in
 env states/s and relative to raw physics. Below it: what the guards against overflow and non-finite states take of an
 iteration, and on CUDA the kernels of a control step, the policy's included, the device memory per world, and the waits
-and copies of the host in one iteration. On the CPU a second table sets MuJoCo's C engine beside MuJoCo Warp, by turns in
-the same process, as `benchmarks.engines` does alone. Figures go to benchmarks/results/throughput.json. How long the first
-iteration takes: `benchmarks.first_iteration`.
+and copies of the host in one iteration. On the CPU a second table sets MuJoCo's C engine beside MuJoCo Warp, by turns
+in the same process, as `benchmarks.engines` does alone. Figures go to benchmarks/results/throughput.json. How long the
+first iteration takes: `benchmarks.first_iteration`.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from ksim_rl.device.capture import Captured
 from ksim_rl.physics.warp_world import WarpWorld
 from ksim_rl.trainers import RunCfg, Trainer, build
 from ksim_rl.trainers.algorithm import make_update
+from ksim_rl.trainers.run_cfg import with_engine
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +55,8 @@ SCHEDULES = {
 
 
 def measure(cfg: RunCfg) -> dict[str, float]:
-    """Train some iterations of `cfg` and return the figures, ms and env states/s."""
-    trainer = build(cfg)
+    """Train some iterations of `cfg` on MuJoCo Warp and return the figures, ms and env states/s."""
+    trainer = build(_on_warp(cfg))
     device = _world(trainer).device
     schedule = SCHEDULES[device.type]
     collector, update = trainer.collector, trainer.update
@@ -99,6 +100,13 @@ def measure(cfg: RunCfg) -> dict[str, float]:
         **memory,
         **traffic,
     }
+
+
+def _on_warp(cfg: RunCfg) -> RunCfg:
+    """Leave no choice of the engine: the other has no arrays of MuJoCo Warp to time."""
+    if cfg.task.sim.engine == "auto":
+        return with_engine(cfg, "warp")
+    return cfg
 
 
 def _bytes_per_world(trainer: Trainer, cfg: RunCfg) -> dict[str, float]:
@@ -161,7 +169,7 @@ def num_env_states(cfg: RunCfg) -> int:
 def train_ms(cfg: RunCfg, *, iterations: int) -> float:
     """Train so many iterations with the logs of `cfg`; return the median time of the second half of them, ms."""
     with tempfile.TemporaryDirectory() as folder:
-        trainer = build(cfg, run_folder=Path(folder))
+        trainer = build(_on_warp(cfg), run_folder=Path(folder))
         for _ in range(iterations - iterations // 2):
             trainer.iterate()
         median_ms = _iteration_ms(trainer, _world(trainer).device, iterations // 2)

@@ -6,6 +6,7 @@ from pathlib import Path
 from benchmarks import report
 from benchmarks.pages import (
     algorithms,
+    engines,
     judge,
     learned,
     memory,
@@ -34,6 +35,7 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "iteration": speed.iteration,
         "equal runs": speed.equal_runs,
         "larger steps": speed.larger_steps,
+        "engines": engines.engines,
     },
 }
 NAMES = sorted({*WHOLE, *PARTS})

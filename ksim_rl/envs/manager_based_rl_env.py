@@ -43,7 +43,7 @@ from ksim_rl.physics import World, load_model, prepare_spec
 from ksim_rl.scene.actuators import JointDrives
 from ksim_rl.scene.rendering.rendering import OffscreenRenderer
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
-from ksim_rl.scene.scene import build_spec
+from ksim_rl.scene.scene import build_spec, warp_alone
 
 RENDER_MODES = (None, "rgb_array")
 
@@ -93,11 +93,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             OffscreenRenderer(model, cfg.viewer, spacing=cfg.scene.spacing) if render_mode else None
         )
         self._is_closed = False
-
-        varied = tuple(dict.fromkeys(fields))
-        self.world = World(
-            model, num_envs=cfg.scene.num_envs, device=device, sim=cfg.sim, per_world_fields=varied
-        )
+        how: dict[str, Any] = {"device": device, "sim": cfg.sim, "warp_alone": warp_alone(cfg.scene)}
+        how["per_world_fields"] = tuple(dict.fromkeys(fields))
+        self.world = World(model, num_envs=cfg.scene.num_envs, **how)
         self.driver = EnvDriver(
             self.world,
             step_dt=self.step_dt,

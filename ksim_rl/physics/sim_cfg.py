@@ -29,7 +29,9 @@ class SimCfg(Checked):
             Both are the room of MuJoCo Warp: the C engine takes what it needs.
         engine: "warp" simulates on MuJoCo Warp, with our kernels, on GPU or CPU. "c" simulates on MuJoCo's C engine, on
             all cores of the CPU, in float64: it judges the first, compiles nothing at the first start, and has no
-            limits of contacts and rows. Cameras that see all worlds need "warp".
+            limits of contacts and rows. Cameras that see all worlds need "warp". "auto" chooses, and `World.explained`
+            says why: "warp" on GPUs, and wherever something is asked for that it alone can do; on the CPU by the sizes
+            of `engine_choice`, from which on "c" was measured to be faster. A run names the engine that was chosen.
         one_kernel_solver: solve the constraints of a substep in one kernel instead of some hundred. It is MuJoCo Warp's
             algorithm, so that results agree up to rounding (four substeps of 4096 worlds on an H200: Go1 2.4 ms instead
             of 8.2, G1 5.0 instead of 9.9). Models out of its range (solvers other than Newton, integrators "rk4" and
@@ -43,7 +45,7 @@ class SimCfg(Checked):
             compensation, muscles, delayed actuators, transmissions other than to hinges and slides; for rows, bodies
             that are tied) take MuJoCo Warp's own; `World.one_kernel_dynamics_unavailable` and
             `one_kernel_rows_unavailable` say why. `None` does so on GPUs; on the CPU it gains a tenth of the physics,
-            and compiles for 12 s.
+            and compiles for 12 s. Either value asks for engine "warp".
         require_graphs: refuse to run where graphs are unavailable, instead of a warning and a slow run.
         nan_guard: where to save what led to a non-finite state; `None` keeps nothing and costs nothing.
 
@@ -61,7 +63,7 @@ class SimCfg(Checked):
     ccd_iterations: Count | None = None
     njmax: Count | None = None
     nconmax: Count | None = None
-    engine: Literal["warp", "c"] = "warp"
+    engine: Literal["auto", "warp", "c"] = "auto"
     one_kernel_solver: bool = True
     one_kernel_dynamics: bool | None = None
     require_graphs: bool = False

@@ -54,6 +54,8 @@ class WarpWorld(World):
             which the same setting asks for. Callbacks that are set later count in `plan`, not in these.
     """
 
+    engine = "warp"
+
     def __init__(
         self,
         mj_model: mujoco.MjModel,
@@ -62,10 +64,10 @@ class WarpWorld(World):
         device: str | torch.device = "cpu",
         sim: SimCfg | None = None,
         per_world_fields: Sequence[str] = (),
+        warp_alone: Sequence[str] = (),
     ) -> None:
-        super().__init__(
-            mj_model, num_envs=num_envs, device=device, sim=sim, per_world_fields=per_world_fields
-        )
+        given = {"num_envs": num_envs, "device": device, "sim": sim, "warp_alone": warp_alone}
+        super().__init__(mj_model, per_world_fields=per_world_fields, **given)
         expanded = self._expanded
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
         self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
@@ -261,7 +263,7 @@ class WarpWorld(World):
 
     def explained(self) -> tuple[str, ...]:
         """Return a line for each stage of a substep, which says what computes it, and why."""
-        return self.plan.lines()
+        return (*self.plan.lines(), self._chosen_line())
 
     def recorded_python(self) -> Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]:
         """Return the callbacks and options of the model, each with what reads its values, by name."""

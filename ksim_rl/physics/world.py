@@ -1,9 +1,10 @@
 """The door to the physics: many copies of one model, stepped by MuJoCo Warp or by MuJoCo's C engine."""
 
 import copy
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from typing import Any, Literal, Self, cast
+from typing import Any, ClassVar, Literal, Self, cast
 
 import mujoco
 import torch
@@ -14,6 +15,7 @@ from ksim_rl.checks import check_count, unknown_name
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.device.streams import checked_device
 from ksim_rl.physics import views
+from ksim_rl.physics.engine_choice import choose_engine
 from ksim_rl.physics.field_effects import check_effects, switch_on
 from ksim_rl.physics.fields import fields_to_expand
 from ksim_rl.physics.model_checks import check_asleep, check_not_simple
@@ -29,8 +31,8 @@ ENGINES: dict[str, type["World"]] = {}
 class World(views.DataViews):
     """Worlds of one MuJoCo model that are stepped together; `World(...)` makes a `WarpWorld` or a `CWorld`.
 
-    The two behave alike: `sim.engine` chooses, "warp" by default. Arrays of MuJoCo's data are torch tensors with a row
-    for each world: the attributes of `DataViews`, such as `qpos_EL` and `ctrl_EL`, and any other by `view(name)`.
+    The two behave alike: `sim.engine` names one, or with "auto" chooses. Arrays of MuJoCo's data are torch tensors with
+    a row for each world: the attributes of `DataViews`, such as `qpos_EL` and `ctrl_EL`, and any other by `view(name)`.
     Write `qpos_EL`, `qvel_EL`, `ctrl_EL` and applied forces in place, and call `step`.
 
     Position- and velocity-stage quantities (poses, velocities, their sensors) are those of the present state after
@@ -47,15 +49,19 @@ class World(views.DataViews):
         device: "cpu", "cuda" or "cuda:<index>".
         sim: settings that are laid over those of the model; None leaves them.
         per_world_fields: names of model fields that may differ between worlds, such as "body_mass".
+        warp_alone: what else will be asked of the worlds that only MuJoCo Warp can do, such as cameras, in words; with
+            engine "auto" it is Warp then.
 
     Attributes:
         mj_model: the copy of the model, with the settings of `sim`.
+        sim: the settings, with the engine that was chosen; `engine_because` says why.
         is_frozen: whether graphs may hold `refresh`, so that it computes nothing further.
         njmax, nconmax: constraint rows and contacts that a world has room for; 0 where there is no limit.
         gravity_EL: gravity of each world, m/s^2, [E, 3].
         can_be_recorded: whether graphs and recordings may hold steps of the engine.
     """
 
+    engine: ClassVar[Literal["warp", "c"]]
     can_be_recorded: bool = True
     njmax: int = 0
     nconmax: int = 0
@@ -63,10 +69,10 @@ class World(views.DataViews):
     gravity_EL: Tensor
 
     def __new__(cls, *args: Any, sim: SimCfg | None = None, **kwargs: Any) -> Self:
-        """Choose the engine that `sim` names."""
+        """Choose the engine."""
         if cls is not World:
             return super().__new__(cls)
-        name = sim.engine if isinstance(sim, SimCfg) else SimCfg().engine
+        name, _ = _choice(*args, sim=sim, **kwargs)
         return cast("Self", object.__new__(ENGINES[name]))
 
     def __init__(
@@ -77,14 +83,17 @@ class World(views.DataViews):
         device: str | torch.device = "cpu",
         sim: SimCfg | None = None,
         per_world_fields: Sequence[str] = (),
+        warp_alone: Sequence[str] = (),
     ) -> None:
         check_count("num_envs", num_envs)
         if not isinstance(mj_model, mujoco.MjModel):
             raise ValueError(f"mj_model={mj_model!r}: expected a mujoco.MjModel, as load_model returns it")
         if sim is not None and not isinstance(sim, SimCfg):
             raise ValueError(f"sim={sim!r}: expected a SimCfg, or None")
-        self.sim = SimCfg() if sim is None else sim
         self.device = checked_device(device)
+        name, why = _choice(mj_model, num_envs=num_envs, device=device, sim=sim, warp_alone=warp_alone)
+        self.engine_because = why if name == self.engine else f"a {type(self).__name__} was asked for"
+        self.sim = dataclasses.replace(sim or SimCfg(), engine=self.engine)
         self.num_envs = num_envs
         self.is_frozen = False
         self.mj_model = copy.copy(mj_model)
@@ -96,6 +105,10 @@ class World(views.DataViews):
         check_effects(self.mj_model, self._expanded)
         switch_on(self.mj_model, self._expanded)
         self._fields: dict[str, Tensor] = {}
+
+    def _chosen_line(self) -> str:
+        """Return the line which says that the engine of this world was chosen, and why."""
+        return f"engine {self.engine}: {self.engine_because}"
 
     @property
     def timestep(self) -> float:
@@ -234,3 +247,20 @@ class World(views.DataViews):
     @abstractmethod
     def _state_tensors(self) -> dict[str, Tensor]:
         """Return the tensors that make up the state, by name."""
+
+
+def _choice(
+    mj_model: Any = None,
+    *,
+    num_envs: Any = None,
+    device: str | torch.device = "cpu",
+    sim: Any = None,
+    warp_alone: Sequence[str] = (),
+    **_: Any,
+) -> tuple[str, str]:
+    """Choose the engine by arguments that nobody has checked yet; what is wrong with them, either engine says."""
+    sim = sim if isinstance(sim, SimCfg) else SimCfg()
+    if not isinstance(mj_model, mujoco.MjModel) or not isinstance(num_envs, int):
+        return "warp", ""
+    where = checked_device(device)
+    return choose_engine(sim, mj_model, num_envs=num_envs, device=where, warp_alone=warp_alone)

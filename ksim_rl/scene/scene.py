@@ -107,6 +107,12 @@ class SceneCfg(Checked):
         return {**self.robots, **self.objects}
 
 
+def warp_alone(cfg: SceneCfg) -> list[str]:
+    """Return what of a scene only MuJoCo Warp can do."""
+    found = {sensor.warp_alone for sensor in cfg.sensors.values()}
+    return sorted(found - {""})
+
+
 def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     """Assemble the scene's spec: robots and objects, then terrain, then sensors."""
     entities = {name: robot.spec() for name, robot in cfg.entities.items()}

@@ -14,13 +14,13 @@ from torchrl.envs import EnvBase
 from ksim_rl import envs, ranks
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.device.eager import eagerly
-from ksim_rl.envs.contract import EpisodeClock, part
+from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
 from ksim_rl.trainers.algorithm import HasWarmUp, make_update
 from ksim_rl.trainers.checkpoint import Checkpoint, fitting
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.loggers import check_installed, make_loggers
-from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.trainers.run_cfg import RunCfg, with_engine
 from ksim_rl.trainers.sources import check_targets
 from ksim_rl.trainers.trainer import Hook, Trainer
 
@@ -52,7 +52,14 @@ def build(
     torch.set_num_threads(cfg.trainer.num_threads or default_threads(cfg.resolved_device()))
 
     said: list[str] = []
+    if cfg.collector.compile and cfg.task.sim.engine == "auto":
+        cfg = with_engine(cfg, "warp")
+        said.append("collector.compile=true: MuJoCo Warp simulates, as no kernel steps MuJoCo's C engine")
     env = envs.with_room(partial(build_env, cfg, num_envs=cfg.num_envs, seed=cfg.seed), note=said.append)
+    # The engine that was chosen for these envs is also the one of evaluations, which are fewer, and of resumed runs.
+    simulated = part(env, SimulatedWorld)
+    if simulated is not None:
+        cfg = with_engine(cfg, simulated.world.engine)
     with eagerly(cfg.collector.eager):
         update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
     if cfg.trainer.stop_at and not hooks:  # which may log figures of their own

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 
@@ -10,14 +10,14 @@ from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.scene.scene import build_spec
 from ksim_rl.trainers.run_cfg import RunCfg
 
-ENGINES = {"warp": "MuJoCo Warp", "c": "MuJoCo's C engine"}
+ENGINES = {"auto": "the engine that suits", "warp": "MuJoCo Warp", "c": "MuJoCo's C engine"}
 PREFIX = "task.sim."
 ENGINE = f"{PREFIX}engine"
 # The integrator by which a run of another one is judged.
 _OTHER_INTEGRATOR = {"euler": "implicitfast", "discrete": "implicitfast"}
 
 
-def trained_with(tree: Mapping[str, Any]) -> str:
+def trained_with(tree: Mapping[str, Any]) -> Literal["auto", "warp", "c"]:
     """Return the engine that made a run, from its tree of config; those that name none were made by Warp."""
     sim: Any = tree.get("task", {}).get("sim", {})
     return sim.get("engine", "warp")

@@ -248,6 +248,12 @@ class RunCfg(TrainingCfg):
         return torch.device(ranks.device(auto if self.device == "auto" else self.device))
 
 
+def with_engine(cfg: RunCfg, engine: Literal["auto", "warp", "c"]) -> RunCfg:
+    """Return the config of a run with another engine."""
+    sim = replace(cfg.task.sim, engine=engine)
+    return replace(cfg, task=replace(cfg.task, sim=sim))
+
+
 def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[str] = ()) -> None:
     """Refuse the config of a run folder if it holds more than a run's fields, or says what to write elsewhere.
 

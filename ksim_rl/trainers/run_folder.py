@@ -25,9 +25,10 @@ from ksim_rl.runs.watch import threads_that_fail, watch
 from ksim_rl.trainers import checkpoint, kept_models, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
+from ksim_rl.trainers.other_physics import trained_with
 from ksim_rl.trainers.outcome import Outcome
 from ksim_rl.trainers.progress import RunProgress
-from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.trainers.run_cfg import RunCfg, with_engine
 from ksim_rl.trainers.trainer import Hook, Trainer
 from ksim_rl.trainers.trial import first_that_fits
 from ksim_rl.transforms import observation_columns
@@ -101,6 +102,7 @@ def _run_locked(
         checkpoint.remove_leftovers(folder)
     with progress.busy("building envs and networks"):
         trainer = make()
+    cfg = with_engine(cfg, trained_with(trainer.config))
     if before is not None:
         before(trainer)
     kept_models.keep_models(cfg, run_folder, note=progress.note)

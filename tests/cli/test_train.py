@@ -60,6 +60,7 @@ def test_an_unsolved_run_exits_with_1_and_leaves_a_whole_run_folder(trained):
         "tensorboard",
     }
     assert record.status(folder) == ("done", "all 2 iterations are done")
+    assert "engine: warp" in (folder / "config.yaml").read_text(), "the engine that auto chose"
     assert [row["iteration"] for row in rows(folder)] == ["1", "2"]
     assert imageio.imread(folder / "curves.png").shape[0] > 300
     figures = json.loads((folder / "evaluation.json").read_text())

@@ -32,7 +32,7 @@ def tables(text):
     """Return the tables by title, each a list of rows without its heads."""
     found: dict[str, list[str]] = {}
     title = ""
-    for line in text.splitlines()[6:]:
+    for line in text.splitlines()[7:]:
         if line and not line.startswith(" "):
             title = line
             found[title] = []
@@ -81,6 +81,9 @@ def test_the_next_lines_say_whose_each_stage_of_a_substep_is_and_why():
         "constraints are solved by one kernel",
         "the state is advanced by MuJoCo Warp's own kernels, because sim.one_kernel_dynamics is None, on the CPU",
     ]
+    chosen = explained().splitlines()[6]
+    assert chosen.startswith("engine warp: on the CPU C is taken from ")
+    assert chosen.endswith("and here are 1 in 3")
     env = puck_env(limit=None, sim=SimCfg(solver="cg", one_kernel_dynamics=True))
     dynamics, _, _, solver, integration = env.explain().splitlines()[1:6]
     assert solver == "constraints are solved by MuJoCo Warp's own solver, because the solver is not Newton's"

@@ -5,7 +5,7 @@ import dataclasses
 from ksim_rl import conf
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.contract import part
-from ksim_rl.physics import capacity
+from ksim_rl.physics import capacity, engine_choice
 from ksim_rl.trainers.build import build
 from tests.envs.test_room import sled_env
 from tests.trainers.test_trainer import Notes
@@ -24,3 +24,20 @@ def test_a_run_whose_envs_need_more_room_gets_it_before_training_and_says_so(mon
         base = part(env, ManagerBasedRlEnv)
         assert base.world.njmax >= 48 and base.world.nconmax >= 12
     assert trainer.metrics["physics/nefc_share"] < 1.0
+
+
+def test_evaluations_and_checkpoints_keep_the_engine_that_was_chosen_for_training(monkeypatch):
+    monkeypatch.setattr(engine_choice, "LEAST_DOFS", 1)
+    monkeypatch.setattr(engine_choice, "LEAST_WORLDS", 8)
+    overrides = ["task=cartpole_balance", "num_envs=8", "device=cpu", "trainer.eval_episodes=4"]
+    overrides += ["data.num_env_states_per_minibatch=32"]
+    trainer = build(conf.compose(overrides))
+    for env in (trainer.collector.env, trainer.evaluator.env):
+        # Alone, the four of the evaluation would be too few for C.
+        assert part(env, ManagerBasedRlEnv).world.engine == "c"
+    assert trainer.config["task"]["sim"]["engine"] == "c"
+    overrides += ["collector.compile=true", "trainer.eval_episodes=0", "trainer.num_iterations=1"]
+    compiled, notes = build(conf.compose(overrides)), Notes()
+    assert part(compiled.collector.env, ManagerBasedRlEnv).world.engine == "warp"
+    compiled.train(notes)
+    assert [note for note in notes.notes if note.startswith("collector.compile=true: MuJoCo Warp simulates")]

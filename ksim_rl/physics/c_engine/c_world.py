@@ -43,6 +43,7 @@ class CWorld(World):
     threads. Contacts and constraint rows have no limit but the model's memory; a RuntimeError says where that is full.
     """
 
+    engine = "c"
     can_be_recorded = False
 
     def __init__(
@@ -53,10 +54,10 @@ class CWorld(World):
         device: str | torch.device = "cpu",
         sim: SimCfg | None = None,
         per_world_fields: Sequence[str] = (),
+        warp_alone: Sequence[str] = (),
     ) -> None:
-        super().__init__(
-            mj_model, num_envs=num_envs, device=device, sim=sim, per_world_fields=per_world_fields
-        )
+        given = {"num_envs": num_envs, "device": device, "sim": sim, "warp_alone": warp_alone}
+        super().__init__(mj_model, per_world_fields=per_world_fields, **given)
         _check_suits(self.sim, self.device)
         stepped = copy.copy(self.mj_model)
         # A state that is not finite stays so, and its env ends by it.
@@ -266,9 +267,11 @@ class CWorld(World):
         return self._data_bytes + shown
 
     def explained(self) -> tuple[str, ...]:
-        """Return one line: the C engine computes every stage."""
+        """Return that the C engine computes every stage, and why it was chosen."""
+        threads = self._batch.nthread
         return (
-            f"every stage is computed by MuJoCo's C engine, in float64, on {self._batch.nthread} threads",
+            f"every stage is computed by MuJoCo's C engine, in float64, on {threads} threads",
+            self._chosen_line(),
         )
 
     def recorded_python(self) -> Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]:

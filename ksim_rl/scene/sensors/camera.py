@@ -1,7 +1,7 @@
 """Renders the cameras of all worlds on the device."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import mujoco
 import torch
@@ -29,6 +29,8 @@ class CameraSensor(Sensor):
         max_depth: m; what is farther, or not there at all, has this depth.
         geom_groups, textures: what is visible; the model's sky counts as a texture.
     """
+
+    warp_alone: ClassVar[str] = "cameras of all worlds"
 
     camera: str | None = None
     body: str = "world"

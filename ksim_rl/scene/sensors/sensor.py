@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import mujoco
 
@@ -40,7 +40,9 @@ class SensorTracker:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor(Checked, ABC):
-    """A sensor of `scene.sensors`, where its key is its name."""
+    """A sensor of `scene.sensors`, where its key is its name; `warp_alone` says what of it only MuJoCo Warp can do."""
+
+    warp_alone: ClassVar[str] = ""
 
     @abstractmethod
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
