@@ -35,6 +35,7 @@ from torch import Tensor, nn
 from benchmarks import command_line, learning_curve, report
 from benchmarks.learning_picture import finish_panel
 from ksim_rl.algorithms import PPOUpdate
+from ksim_rl.algorithms.ppo.fused import NotFused
 from ksim_rl.checks import check_known
 from ksim_rl.runs.csv_table import thinned
 from ksim_rl.tables.levels import HELD_STATES, means_of, reached
@@ -229,7 +230,7 @@ def train(name: str, cfg: RunCfg) -> Run:
         **first.facts,
         "precision": update.cfg.precision,
         "matmul_precision": torch.get_float32_matmul_precision(),
-        "fused": not isinstance(update.fused, str),
+        "fused": not isinstance(update.fused, NotFused),
     }
     run = Run(points=rows.points, facts=facts)
     print(f"{name}, seed {cfg.seed}: {run.found}", flush=True)

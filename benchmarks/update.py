@@ -35,6 +35,7 @@ from torchrl.objectives.value import GAE
 
 from benchmarks import command_line, report
 from benchmarks.stopwatch import milliseconds
+from ksim_rl.algorithms.ppo.fused import NotFused
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.data import DatasetCfg, EpochSampler
 from ksim_rl.device.capture import Captured
@@ -104,7 +105,7 @@ def compare(
         figures["ours_captured_ms"] = _time(lambda: update(rollout_ET), device)
         fast = ours(precision="bfloat16")
         figures["update_ms"] = _time(lambda: fast(rollout_ET), device)
-        notes["update"] = fast.fused if isinstance(fast.fused, str) else "fused kernels"
+        notes["update"] = fast.fused.reason if isinstance(fast.fused, NotFused) else "fused kernels"
         # Last, because a capture that fails leaves its stream behind.
         notes["stock_captured_ms"] = why_not_captured(stock, rollout_ET, device=device)
     else:

@@ -23,7 +23,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
 from ksim_rl import envs
-from ksim_rl.algorithms.ppo.fused import fused_networks
+from ksim_rl.algorithms.ppo.fused import NotFused, fused_networks
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.data import DatasetBuffer, DatasetCfg
 from ksim_rl.device.capture import Captured
@@ -172,7 +172,7 @@ def make_fused(settings: Settings, ppo: PPO) -> Any:
         "num_env_states_per_minibatch": data.num_env_states_per_minibatch,
         "num_minibatches": data.num_minibatches,
     }
-    if isinstance(networks, str) or why_not_fused(settings.objective, networks, **sizes) is not None:
+    if isinstance(networks, NotFused) or why_not_fused(settings.objective, networks, **sizes) is not None:
         return None
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
 

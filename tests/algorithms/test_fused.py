@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ksim_rl.algorithms.ppo.fused import fused_networks, make_fused_ppo
+from ksim_rl.algorithms.ppo.fused import NotFused, fused_networks, make_fused_ppo
 from ksim_rl.data import DatasetCfg
 from ksim_rl.modules import ActorCfg, TanhGaussian, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg, StepGuard
@@ -333,8 +333,9 @@ def test_what_the_kernels_cannot_do_is_said():
     ):
         cfg = PPOCfg(precision="bfloat16", **option)
         assert next(iter(option)) in why_not_fused(cfg, made, **SIZES)
-    assert "['GELU'], and not all one of" in fused_networks(*networks(activation="gelu"))
-    assert "Gaussian" in fused_networks(make_actor(bounded, obs_dim=ACTOR_OBS, action_dim=ACTIONS), critic)
+    assert "['GELU'], and not all one of" in fused_networks(*networks(activation="gelu")).reason
+    policy = make_actor(bounded, obs_dim=ACTOR_OBS, action_dim=ACTIONS)
+    assert "Gaussian" in fused_networks(policy, critic).reason
     squashed = fused_networks(*networks(distribution="tanh_gaussian", action_bound=1.0))
     assert why_not_fused(PPOCfg(precision="bfloat16"), squashed, **SIZES) is None
     assert "squashed" in why_not_fused(PPOCfg(precision="bfloat16", symmetry="loss"), squashed, **SIZES)
@@ -350,7 +351,7 @@ def test_what_the_kernels_cannot_do_is_said():
     rows = {"num_env_states_per_minibatch": 2**31 // (2 * made_columns(made)) + 1, "num_minibatches": 1}
     assert why_not_fused(cfg, made, **rows) is None
     assert "too many" in why_not_fused(PPOCfg(precision="bfloat16", symmetry="augment"), made, **rows)
-    assert isinstance(fused_networks(actor, torch.nn.Identity()), str)
+    assert isinstance(fused_networks(actor, torch.nn.Identity()), NotFused)
     assert update(PPOCfg(), actor, critic).metrics()["update/fused"] == 0.0
 
 
@@ -369,7 +370,7 @@ def test_narrow_networks_are_fused_in_float32():
 def test_on_the_cpu_torch_makes_the_steps():
     actor, critic = networks()
     made = update(PPOCfg(), actor, critic)
-    assert make_fused_ppo(made) == made.fused == "they need CUDA and Triton"
+    assert make_fused_ppo(made) == made.fused == NotFused("they need CUDA and Triton")
     assert made.notes == []
     made.device = torch.device("cuda")
     assert made.notes == ["torch makes the gradient steps, not the fused kernels: they need CUDA and Triton"]

@@ -3,6 +3,7 @@
 import importlib.util
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
@@ -22,22 +23,32 @@ if TYPE_CHECKING:
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
 
 
-def make_fused_ppo(update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None = None) -> "FusedPPO | str":
-    """Build the fused gradient steps of a PPO update, or return why torch has to make them."""
+@dataclass(frozen=True)
+class NotFused:
+    """Says by `reason` why torch makes the gradient steps of a run, and no fused kernels."""
+
+    reason: str
+
+
+def make_fused_ppo(
+    update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None = None
+) -> "FusedPPO | NotFused":
+    """Build the fused gradient steps of a PPO update, or say why torch has to make them."""
     if update.device.type != "cuda" or importlib.util.find_spec("triton") is None:
-        return "they need CUDA and Triton"
+        return NotFused("they need CUDA and Triton")
     if update.dataset.cfg.shards > 1:
-        return "minibatches come from shards"
+        return NotFused("minibatches come from shards")
     if type(update.dataset.sampler) is not EpochSampler:
-        return f"minibatches come from a {type(update.dataset.sampler).__name__}"
+        return NotFused(f"minibatches come from a {type(update.dataset.sampler).__name__}")
     cfg: Any = update.cfg
     actor, critic = [cast(Any, update.networks[name]) for name in ("actor", "critic")]
     networks, data = fused_networks(actor, critic), update.dataset.cfg
     sizes: Any = {name: getattr(data, name) for name in ("num_env_states_per_minibatch", "num_minibatches")}
-    reason = networks if isinstance(networks, str) else why_not_fused(cfg, networks, **sizes)
+    if isinstance(networks, NotFused):
+        return networks
+    reason = why_not_fused(cfg, networks, **sizes)
     if reason is not None:
-        return reason
-    assert isinstance(networks, FusedNetworks)
+        return NotFused(reason)
     # Triton is there only where CUDA is.
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
 
@@ -87,20 +98,20 @@ class FusedBehavior(ProbabilisticTensorDictSequential):
 
 def fused_networks(
     actor: ProbabilisticTensorDictSequential, critic: TensorDictModuleBase
-) -> FusedNetworks | str:
+) -> FusedNetworks | NotFused:
     """Return what the kernels need to know of `make_actor`'s and `make_critic`'s networks, or why they are others."""
     policy, value = getattr(actor[0], "module", None), getattr(critic, "module", None)
     if type(policy) is not PolicyNetwork or type(value) is not ValueNetwork:
-        return "the networks are not those of make_actor and make_critic"
+        return NotFused("the networks are not those of make_actor and make_critic")
     head: Any = policy.head
     if type(head) not in (GaussianHead, TanhGaussianHead):
-        return f"the policy is no {DiagonalGaussian.__name__} or {TanhGaussian.__name__}"
+        return NotFused(f"the policy is no {DiagonalGaussian.__name__} or {TanhGaussian.__name__}")
     layers = [*_layers(policy.trunk), head.loc], _layers(value.layers)
     activations = {type(part) for part in (*policy.trunk, *value.layers)} - {nn.Linear}
     if len(activations) != 1 or not activations <= {*ACTIVATIONS}:
         present = sorted(kind.__name__ for kind in activations)
         known = sorted(kind.__name__ for kind in ACTIVATIONS)
-        return f"the activations are {present}, and not all one of {known}"
+        return NotFused(f"the activations are {present}, and not all one of {known}")
     (activation,) = activations
     std: Any = {"std_A": head.std, "std_layer": head.std_layer, "log_std": head.std_type == "log"}
     return FusedNetworks(

@@ -11,7 +11,7 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
-from ksim_rl.algorithms.ppo.fused import FusedBehavior, make_fused_ppo
+from ksim_rl.algorithms.ppo.fused import FusedBehavior, NotFused, make_fused_ppo
 from ksim_rl.device import state_tree
 from ksim_rl.modules import CarriedState, update_normalizers
 from ksim_rl.objectives import (
@@ -69,14 +69,14 @@ class PPOUpdate(DatasetUpdate):
         self._carried = CarriedState(critic, acting=actor)
         # The kernels that make the gradient steps, or why torch makes them.
         self.fused = make_fused_ppo(self, mirror)
-        self._is_fused = torch.tensor(float(not isinstance(self.fused, str)), device=self.device)
+        self._is_fused = torch.tensor(float(not isinstance(self.fused, NotFused)), device=self.device)
         self._std = torch.zeros((), device=self.device)
         self._scale_keys = [key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"]
 
     @property
     def behavior(self) -> ProbabilisticTensorDictSequential:
         """The policy that collects: the actor, with means as chained kernels compute them where they make the steps."""
-        if isinstance(self.fused, str) or not self.fused.layout.chained:
+        if isinstance(self.fused, NotFused) or not self.fused.layout.chained:
             return self.actor
         return FusedBehavior(self.actor, self.fused)
 
@@ -92,8 +92,9 @@ class PPOUpdate(DatasetUpdate):
     @property
     def notes(self) -> list[str]:
         """Why torch makes the gradient steps where there is a GPU, said at the start of a run."""
-        slower = isinstance(self.fused, str) and self.device.type == "cuda"
-        return [f"torch makes the gradient steps, not the fused kernels: {self.fused}"] if slower else []
+        if not isinstance(self.fused, NotFused) or self.device.type != "cuda":
+            return []
+        return [f"torch makes the gradient steps, not the fused kernels: {self.fused.reason}"]
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
@@ -102,7 +103,7 @@ class PPOUpdate(DatasetUpdate):
 
     def _update(self) -> None:
         rollout_ET = self.rollout_ET
-        if isinstance(self.fused, str):
+        if isinstance(self.fused, NotFused):
             steps = self._torch_steps(rollout_ET)
             self._count()
             self._measure_(steps)
