@@ -1,4 +1,4 @@
-"""This benchmark times MuJoCo's C engine beside MuJoCo Warp on the CPU, by turns in one process.
+"""Times MuJoCo's C engine beside MuJoCo Warp on the CPU, by turns in one process.
 
     python -m benchmarks.engines task=go1_velocity_flat num_envs=64,512,4096 collector.rollout_length=8
 

@@ -1,4 +1,4 @@
-"""This module chooses the engine where the settings leave it open: by device, by what is asked for, and by size."""
+"""Chooses the engine where the settings leave it open: by device, by what is asked for, and by size."""
 
 from collections.abc import Sequence
 
