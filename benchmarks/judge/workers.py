@@ -8,6 +8,8 @@ from typing import Any
 
 # Kernels that were loaded stay in a process; a fresh one frees them.
 TASKS_OF_A_PROCESS = 40
+# What still runs so many seconds after the end is given up, so that what was found by then is written.
+GRACE = 30.0
 
 
 class _Worker:
@@ -46,6 +48,7 @@ def in_processes(
     jobs: int,
     most_seconds: float,
     until: float = float("inf"),
+    grace: float = GRACE,
     spoils: Callable[[Any], bool] = lambda result: False,
 ) -> Iterator[tuple[Any, Any]]:
     """Yield each task with its result; RuntimeError as a result says that its process crashed or took too long.
@@ -56,6 +59,7 @@ def in_processes(
         jobs: how many processes there are.
         most_seconds: that a task may take.
         until: when no further task begins, as time.monotonic says it.
+        grace: seconds after that, when tasks that still run are given up.
         spoils: whether a result leaves a process that should do nothing further, as an error on a GPU does.
     """
     left = list(tasks)
@@ -64,6 +68,8 @@ def in_processes(
         while left or any(worker.task is not None for worker in workers):
             if time.monotonic() > until:
                 left.clear()
+            if time.monotonic() > until + grace:
+                return
             workers = [_fresh(worker, do) if worker.task is None else worker for worker in workers]
             while len(workers) < min(jobs, len(left)):
                 workers.append(_Worker(do))

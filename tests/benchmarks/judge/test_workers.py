@@ -33,3 +33,10 @@ def test_a_process_that_is_spoilt_does_nothing_further():
     assert same[0][1] == same[1][1]
     others = list(in_processes(do, ["which 1", "which 2"], jobs=1, most_seconds=60.0, spoils=str.isdigit))
     assert others[0][1] != others[1][1]
+
+
+def test_what_runs_too_long_after_the_end_is_given_up():
+    begun = time.monotonic()
+    tasks = ["a", "hang"]
+    found = list(in_processes(do, tasks, jobs=2, most_seconds=900.0, until=begun + 10.0, grace=1.0))
+    assert [task for task, _ in found] == ["a"]
