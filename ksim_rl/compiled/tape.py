@@ -28,7 +28,7 @@ MOST_SHARED = 256
 MOST_OPERATIONS = 200
 """Operations of one kernel, whose compilation takes longer the more there are."""
 MOST_BYTES = 40_000
-"""Memory on the chip for the arrays of the rows of a block."""
+"""Shared memory for the arrays of the rows of a block."""
 _COUNTS = frozenset(
     {"count_non_finite"}
 )  # all rows add to the same numbers, in an order that does not matter

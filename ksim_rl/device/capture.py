@@ -96,7 +96,7 @@ def live_launches(*, warming_up: bool = False, capturing: bool = False) -> Itera
 class Captured:
     """A function without arguments that becomes one CUDA graph; on CPU it stays a plain call.
 
-    The first `warmup` calls run eagerly on a stream aside (their work counts), the next one records the graph, and
+    The first `warmup` calls run eagerly on a side stream (their work counts), the next one records the graph, and
     from then on each call replays it. So `body` must be fit for replay: it reads and writes tensors that stay where
     they are, allocates no size that depends on data, and neither syncs with the host nor branches on tensor values.
     What it does in Python happens only while it is eager or recorded; where that changes, `forget` the graph. It may

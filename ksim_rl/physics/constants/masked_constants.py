@@ -27,8 +27,8 @@ _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 class MaskedConstants:
-    """Launches for the worlds of a mask, on memory of its own: 48 nbody bytes per world, and on the CPU, or where the
-    chip has no room for it, 8 nv^2 + 36 nv + 108 nbody more.
+    """Launches for the worlds of a mask, on memory of its own: 48 nbody bytes per world, and on the CPU, or where
+    shared memory has no room for it, 8 nv^2 + 36 nv + 108 nbody more.
 
     Build it once the model's arrays are in their final place, on the device of the model.
     """

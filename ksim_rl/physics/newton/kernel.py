@@ -1,7 +1,7 @@
 """Makes the one kernel of MuJoCo's Newton solver, in which a warp solves one world until it has converged.
 
 MuJoCo Warp launches about ten kernels per iteration, over all worlds, until the last of them has converged; here no
-world waits for another, and what an iteration computes stays on the chip. The algorithm is the same, with the same
+world waits for another, and what an iteration computes stays in shared memory. The algorithm is the same, with the same
 tests of convergence, but for a line search that is no more exact than iterations need; costs agree within the
 tolerance. It is written in C++, since its matrix lies in registers, which needs loops that are unrolled, shuffles and
 shared memory; the CPU compiles the same source, for a warp of one lane. Read its `_PARTS` in their order.
@@ -92,8 +92,8 @@ def launcher(
 ) -> Callable[[], None]:
     """Return what launches the kernel.
 
-    The `sizes` are those of a `layout`. There are 32 lanes on CUDA and 1 on the CPU. Rows beyond those on the chip (in
-    shared memory) are in the scratch. A `checked` (debug) build writes each world's broken `Invariant`s. Of `own` it
+    The `sizes` are those of a `layout`. There are 32 lanes on CUDA and 1 on the CPU. Rows that find no room in
+    shared memory are in the scratch. A `checked` (debug) build writes each world's broken `Invariant`s. Of `own` it
     takes `efc_J_colind` and `efc_J`, the `scratch`, the tables of `limbs`, the `order` in which the worlds are taken
     up, and `broken`.
     """

@@ -56,7 +56,7 @@ def _suits(limbs: Limbs, *, nv: int) -> bool:
 
 
 def row_stride(entries: int) -> int:
-    """Return the floats from one row of so many entries to the next on the chip.
+    """Return the floats from one row of so many entries to the next in shared memory.
 
     Rows are whole groups of four floats, which are loaded at once. The number of groups is odd, so that the rows of
     neighbouring lanes begin in other banks of shared memory.

@@ -1,9 +1,9 @@
 """Launches the kernels of a substep before and after its constraints: smooth dynamics and integration.
 
 MuJoCo Warp launches some 35 kernels for the first and some 10 for the second, each of which waits for its slowest
-world; here some lanes of a warp own a world, with its bodies or its inertia matrix on the chip. They are written in
-C++, as the solver's kernel is; the CPU compiles the same source, for one lane. Read their parts in the order in which
-SMOOTH and INTEGRATION name them.
+world; here some lanes of a warp own a world, with its bodies or its inertia matrix in shared memory. They are written
+in C++, as the solver's kernel is; the CPU compiles the same source, for one lane. Read their parts in the order in
+which SMOOTH and INTEGRATION name them.
 
 Source of the algorithms: https://mujoco.readthedocs.io/en/stable/computation/index.html
 """
