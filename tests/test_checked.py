@@ -1,11 +1,14 @@
 """Fields of config dataclasses are checked against their annotations."""
 
+import ast
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import pytest
 
+import ksim_rl
 from ksim_rl.checked import Checked, Count, Name, Positive, Range, Share, Within
 
 
@@ -131,12 +134,14 @@ def test_what_each_class_says_of_several_fields_is_asked_of_all_bases():
         high: float = 1.0
 
         def _check_fields(self) -> None:
+            super()._check_fields()
             if self.low > self.high:
                 raise ValueError("low exceeds high")
 
     @dataclass(frozen=True, kw_only=True)
     class Even(Span):
         def _check_fields(self) -> None:
+            super()._check_fields()
             if self.high % 2:
                 raise ValueError("high is odd")
 
@@ -145,3 +150,18 @@ def test_what_each_class_says_of_several_fields_is_asked_of_all_bases():
     with pytest.raises(ValueError, match="high is odd"):
         Even()
     assert Even(high=2.0).high == 2.0
+
+
+def test_no_check_of_several_fields_leaves_out_those_of_its_bases():
+    found = 0
+    for path in sorted((Path(ksim_rl.__file__).parent).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.FunctionDef) or node.name != "_check_fields":
+                continue
+            found += 1
+            statements = [ast.unparse(own) for own in node.body]
+            is_first = "super()._check_fields()" in statements[:2]
+            assert is_first or path.name == "checked.py", (
+                f"{path}:{node.lineno}: call super()._check_fields() first"
+            )
+    assert found > 40

@@ -55,6 +55,7 @@ class Retarget(Checked):
     sole_z: float = 0.0
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if not self.pairs:
             raise ValueError("pairs=(): expected at least one pair of a point and a part of the robot")
 

@@ -52,6 +52,7 @@ class CollectorCfg(Checked):
     rollout_length: Count | None = None
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.eager and (self.compile or self.require_graphs):
             raise ValueError(
                 "eager=True with compile or require_graphs, which ask for the opposite: leave one out"

@@ -196,6 +196,7 @@ class ReplayCfg(Checked):
 
     def _check_fields(self) -> None:
         """Refuse a ring that is too small for its rollouts."""
+        super()._check_fields()
         # A rollout whose episodes all end at once takes two places per env state, and must not overwrite itself.
         least = 2 * self.num_steps + self.n_step
         if self.capacity < least:

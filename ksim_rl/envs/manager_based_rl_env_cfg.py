@@ -51,6 +51,7 @@ class ManagerBasedRlEnvCfg(Checked):
     transforms: Mapping[str, TransformCfg] = field(default_factory=dict)
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.viewer.env_index >= self.scene.num_envs:
             raise ValueError(
                 f"viewer.env_index={self.viewer.env_index}: expected less than scene.num_envs={self.scene.num_envs}"

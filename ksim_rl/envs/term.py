@@ -89,6 +89,7 @@ class EventTerm(Term):
     interval_range_s: NonNegativeRange | None = None
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if (self.mode == "interval") != (self.interval_range_s is not None):
             raise ValueError(
                 f"interval_range_s={self.interval_range_s!r} with mode={self.mode!r}: give a pair of seconds with "

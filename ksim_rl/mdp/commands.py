@@ -35,6 +35,7 @@ class OfTarget(InFrame):
     site: str | None = None
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if (self.body is None) == (self.site is None):
             raise ValueError(f"body={self.body!r}, site={self.site!r}: name exactly one of the two")
 
@@ -345,6 +346,7 @@ class JoystickCommand(CommandTerm):
     resampling_time_range_s: NonNegativeRange | None = None
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.resampling_time_range_s is not None:
             raise ValueError(
                 f"resampling_time_range_s={self.resampling_time_range_s!r}: it is set, never drawn; leave it out"

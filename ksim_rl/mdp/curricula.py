@@ -43,6 +43,7 @@ class LinearLevel(LevelCurriculum):
     end_step: int
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         check_in_range("end_step", self.end_step, low=self.begin_step, low_open=True)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
@@ -65,6 +66,7 @@ class SteppedLevel(LevelCurriculum):
     min_episodes: Count | None = None
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.lower_below is not None:
             check_in_range("lower_below", self.lower_below, high=self.raise_above)
 
@@ -244,6 +246,7 @@ class CommandRangesByLevel(OfCommand, CurriculumTerm):
     end: Ranges
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.start.keys() != self.end.keys():
             raise ValueError(
                 f"start has the fields {sorted(self.start)} and end {sorted(self.end)}: give the same"

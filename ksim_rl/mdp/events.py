@@ -51,6 +51,7 @@ class ResetJoints(JointReset):
     distribution: Literal["uniform", "gaussian"] = "uniform"
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         for name in ("position_range", "velocity_range"):
             if self.distribution == "uniform":
                 check_pair(name, getattr(self, name))
@@ -164,6 +165,7 @@ class PushByForce(EventTerm, mode="interval"):
     duration_s: NonNegativeRange
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.mode != "interval":
             raise ValueError(f"mode={self.mode!r}: expected 'interval', which also says when a push ends")
 

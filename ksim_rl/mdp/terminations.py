@@ -82,6 +82,7 @@ class RootVelocityAbove(OfEntity, TerminationTerm):
     angular: Positive | None = None
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.linear is None and self.angular is None:
             raise ValueError("linear=None, angular=None: give at least one limit")
 

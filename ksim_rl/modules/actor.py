@@ -63,6 +63,7 @@ class ActorCfg(OnPolicyNetworkCfg):
 
     def _check_fields(self) -> None:
         """Refuse a bound that does nothing."""
+        super()._check_fields()
         if self.action_bound is not None and self.distribution not in ("tanh_gaussian", "truncated_gaussian"):
             raise ValueError(
                 f"action_bound={self.action_bound!r} does nothing with distribution={self.distribution!r}: "

@@ -42,6 +42,7 @@ class SquashedActorCfg(BoundedActorCfg):
     log_std_max: float = 2.0
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.log_std_min >= self.log_std_max:
             raise ValueError(
                 f"log_std_min={self.log_std_min!r} is not below log_std_max={self.log_std_max!r}"

@@ -62,6 +62,7 @@ class QNetworkCfg(OffPolicyNetworkCfg):
     v_max: float = 10.0
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.v_min >= self.v_max:
             raise ValueError(f"v_min={self.v_min!r} is not below v_max={self.v_max!r}")
 

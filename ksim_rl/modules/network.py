@@ -100,6 +100,7 @@ class NetworkCfg(Checked):
     obs_normalization: bool = True
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
         check_choice("activation", self.activation, ACTIVATIONS)
 
@@ -120,6 +121,7 @@ class OnPolicyNetworkCfg(NetworkCfg):
 
     def _check_fields(self) -> None:
         """Make the keys hashable, and refuse one that comes twice."""
+        super()._check_fields()
         keys = tuple(_hashable(key) for key in self.in_keys)
         if len(set(keys)) < len(keys):
             raise ValueError(f"in_keys={keys!r}: each key can be read once")

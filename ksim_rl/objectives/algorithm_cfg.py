@@ -52,6 +52,7 @@ class GradientCfg(AlgorithmCfg):
     max_skipped_steps: Count = 100
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         object.__setattr__(self, "betas", tuple(self.betas))
         if not all(0.0 <= beta < 1.0 for beta in self.betas):
             raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
@@ -75,6 +76,7 @@ class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
     anneal_learning_rate: bool = False
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         low = self.learning_rate_min
         high = self.learning_rate_max
         if low > high:
@@ -126,6 +128,7 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
     kernels: Literal["auto", "torch"] = "auto"
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.min_advantage_std != PPOCfg.min_advantage_std and self.normalize_advantage != "dataset":
             raise ValueError(
                 f"min_advantage_std={self.min_advantage_std!r} does nothing with normalize_advantage="
@@ -179,6 +182,7 @@ class AMPCfg(PPOCfg):
         return (self.style_group,)
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         for field in ("motions", "discriminator_hidden_dims"):
             object.__setattr__(self, field, tuple(getattr(self, field)))
 
@@ -253,4 +257,5 @@ class TD3Cfg(OffPolicyCfg, policy_delay=2):
     target_noise_clip: NonNegative = 0.5
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         check_in_range("exploration_noise_max", self.exploration_noise_max, low=self.exploration_noise_min)

@@ -25,6 +25,7 @@ class Placement(Checked):
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if not math.isclose(math.hypot(*self.quat), 1.0, abs_tol=1e-3):
             raise ValueError(f"quat={self.quat!r}: expected a unit quaternion (w, x, y, z)")
 
@@ -94,6 +95,7 @@ class SceneCfg(Checked):
     soft_joint_pos_limit_factor: Share = 1.0  # of each joint's range, about its middle: the soft limits
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         for name in self.objects:
             if name in self.robots:
                 raise ValueError(f"objects: {name!r} is the name of a robot: give it another")

@@ -28,6 +28,7 @@ class ViewerCfg(Checked):
     draw: tuple[str, ...] = (".*",)
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         for index, pattern in enumerate(self.draw):
             with naming(f"draw[{index}]={pattern!r}: no regular expression", re.error):
                 re.compile(pattern)

@@ -54,6 +54,7 @@ class Row(Checked):
     against: str = ""
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds={self.seeds!r}: expected at least one, and each once")
         if self.measure == "seconds" and not self.levels:

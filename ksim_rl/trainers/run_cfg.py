@@ -90,6 +90,7 @@ class ModulesCfg(Checked):
 
     def _check_fields(self) -> None:
         """Refuse a trunk that a network does not read, and features that nothing writes."""
+        super()._check_fields()
         for name, cfg in (("actor", self.actor), ("critic", self.critic)):
             if (FEATURES in self._read_by(name)) != (self.trunk is not None):
                 raise ValueError(
@@ -153,6 +154,7 @@ class TrainingCfg(Checked):
 
     def _check_fields(self) -> None:
         """Let the size of the data follow from `collector.rollout_length`, where that is given."""
+        super()._check_fields()
         if self.collector.rollout_length is not None:
             data = self.data.with_rollout_length(self.collector.rollout_length, self.num_envs)
             object.__setattr__(self, "data", data)
@@ -171,6 +173,7 @@ class RunCfg(TrainingCfg):
 
     def _check_fields(self) -> None:
         """Refuse values that no run can have, before any model is compiled."""
+        super()._check_fields()
         if not TASK_NAME.fullmatch(self.task_name):
             raise ValueError(
                 f"task_name={self.task_name!r}: expected letters, digits and _.+-, as it names a folder"

@@ -33,6 +33,7 @@ class DelayCfg(Checked):
     by_level: bool = False
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.min_lag > self.max_lag:
             raise ValueError(f"min_lag={self.min_lag} exceeds max_lag={self.max_lag}")
         if self.hold_probability and not self.resample_every:

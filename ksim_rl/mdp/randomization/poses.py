@@ -35,6 +35,7 @@ class RandomizeTurn(RandomizeField, columns=4):
     operation: Literal["abs", "add"] = "add"
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         for angle, pair in self.ranges.items():
             self.check_range(f"ranges.{angle}", pair)
         missing = [angle for angle in get_args(Angle) if angle not in self.ranges]

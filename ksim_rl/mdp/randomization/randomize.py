@@ -51,6 +51,7 @@ class Randomize(EventTerm, mode="startup"):
     drawn: ClassVar[tuple[str, ...]] = ()  # the fields with one range each, or None
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         for name in self.drawn:
             if getattr(self, name) is not None:
                 self.check_range(name, getattr(self, name))
@@ -152,6 +153,7 @@ class RandomizeModelField(RandomizeField):
     columns_of_one_pair: ClassVar[tuple[int, ...]] = ()
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if not isinstance(self.ranges, Mapping):
             self.check_range("ranges", self.ranges)
             return

@@ -104,6 +104,7 @@ class FeetAirTime(OfSensor, RewardWhileCommanded):
     threshold_max: float
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         check_in_range("threshold_max", self.threshold_max, low=self.threshold_min)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

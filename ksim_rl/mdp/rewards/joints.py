@@ -186,6 +186,7 @@ class Symmetry(RewardTerm):
     signs: Mapping[str, float] = field(default_factory=lambda: {".*": 1.0})
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         for pattern, sign in self.signs.items():
             check_choice(f"signs[{pattern!r}]", sign, (1.0, -1.0))
 

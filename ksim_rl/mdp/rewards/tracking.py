@@ -185,6 +185,7 @@ class Pose(OfCommand, OfJoints, RewardTerm):
     running_threshold: float
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         check_in_range("running_threshold", self.running_threshold, low=self.walking_threshold)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

@@ -95,6 +95,7 @@ class DelayedActuator(Actuator):
     max_lag: WholeNumber
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.min_lag > self.max_lag:
             raise ValueError(f"min_lag={self.min_lag} exceeds max_lag={self.max_lag}")
 

@@ -48,6 +48,7 @@ class CameraSensor(Sensor):
     shadows: bool = False
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if not (self.rgb or self.depth or self.segmentation):
             raise ValueError("rgb=False, depth=False, segmentation=False: draw at least one of them")
 

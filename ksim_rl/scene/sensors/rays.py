@@ -44,6 +44,7 @@ class GridPattern(RayPattern):
     direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if not any(self.direction):
             raise ValueError(f"direction={self.direction!r}: expected a vector that is not zero")
 

@@ -79,6 +79,7 @@ class MountedSensor(Sensor, ABC):
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if (self.site is None) == (self.body is None):
             raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
         if self.site is not None and any(self.pos):

@@ -61,6 +61,7 @@ class TerrainGrid(Terrain):
     friction: Friction = (1.0, 0.005, 0.0001)
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         check_count("num_columns", self.num_columns, low=len(self.patches))
         check_in_range("spawn_width", self.spawn_width, low=0.0, high=self.size)
 

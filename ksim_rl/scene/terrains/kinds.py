@@ -40,6 +40,7 @@ class Waves(TerrainPatch):
     cell: Cell = 0.2
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         check_in_range("wave_length", self.wave_length, low=4 * self.cell)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
@@ -81,6 +82,7 @@ class PyramidStairs(TerrainPatch):
     cell: Cell = 0.05
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         check_in_range("step_width", self.step_width, low=2 * self.cell)
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
@@ -127,6 +129,7 @@ class SteppingStones(TerrainPatch):
     cell: Cell = 0.05
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         Within(low=self.cell).check("stone_width", self.stone_width)
         Within(low=2 * self.cell).check("gap", self.gap)
 
@@ -161,6 +164,7 @@ class Gaps(TerrainPatch):
     cell: Cell = 0.05
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         Within(low=2 * self.cell).check("width", self.width)
         check_in_range("spacing", self.spacing, low=self.cell)
 

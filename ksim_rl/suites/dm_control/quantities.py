@@ -91,6 +91,7 @@ class Offset(ObservationTerm):
     axes: str = AXES
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         for point in (*self.ends, *filter(None, (self.start, self.frame))):
             if point.partition(":")[0] not in POINTS:
                 raise ValueError(
@@ -179,6 +180,7 @@ class ToleranceProduct(RewardTerm):
     factors: Mapping[str, Factor]
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if not self.factors:
             raise ValueError("factors={}: name at least one factor")
 

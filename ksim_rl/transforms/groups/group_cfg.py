@@ -40,6 +40,7 @@ class ObservationTermCfg(Checked):
     history: int | HistoryCfg | None = None
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if not callable(self.term):
             raise ValueError(f"term={self.term!r}: expected a callable that reads the env's view")
         if self.clip is not None:
@@ -73,6 +74,7 @@ class ObservationGroupCfg(Checked):
     history: int | HistoryCfg | None = None
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         history_cfg(self.history)
         images = [name for name, cfg in self.terms.items() if cfg.is_image]
         if images and len(self.terms) > 1:

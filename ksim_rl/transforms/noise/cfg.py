@@ -41,6 +41,7 @@ class NoiseCfg(Checked, ABC):
     by_level: bool = False
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         if self.bias is not None:
             for field in ("bias", "walk_std", "resolution", "dropout", "by_level"):
                 if getattr(self.bias, field) not in (None, 0.0):
@@ -59,6 +60,7 @@ class UniformNoise(NoiseCfg):
     high: PerDim
 
     def _check_fields(self) -> None:
+        super()._check_fields()
         low, high = _numbers(self.low), _numbers(self.high)
         if not low or not high or (len(low) != len(high) and 1 not in (len(low), len(high))):
             raise ValueError(f"low has {len(low)} numbers and high has {len(high)}: give as many, or one")
