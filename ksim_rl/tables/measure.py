@@ -36,7 +36,10 @@ FIXED = "trainer.eval_interval=0 trainer.checkpoint_interval=0 trainer.stop_when
 # Two iterations and a few short episodes say whether all parts of a row work, and nothing about how well it learns.
 SMOKE = "num_envs=8 data.num_env_states_per_minibatch=32 data.num_minibatches=2 task.episode_length_s=0.4"
 # Fields that came after the first tables, with values that change nothing, as the text of a fingerprint has them.
-LATER = re.compile('"min_advantage_std": 0.0001, |"min_std": 0.001, |"engine": "auto", |"eager": false, ')
+LATER = re.compile(
+    '"min_advantage_std": 0.0001, |"min_std": 0.001, |"engine": "auto", |"eager": false, '
+    r'|"free_root": false, |"root_turn": \[1.0, 0.0, 0.0, 0.0\], '
+)
 
 
 def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -> RunCfg:
