@@ -6,6 +6,7 @@ import mujoco
 import pytest
 
 from ksim_rl.physics import SimCfg, World
+from ksim_rl.physics.warp_world import WarpWorld
 from tests.physics.beside_c import KERNELS, step_and_check
 
 XML = """
@@ -69,3 +70,21 @@ def test_trees_fall_asleep_as_in_c(tolerance: str):
     # What an actuator drives never sleeps, and the other tree does by the tolerance.
     assert not any(driven for _, driven in asleep)
     assert any(alone for alone, _ in asleep) == (tolerance != "1e-9")
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_nothing_sleeps_without_islands(kernels: str):
+    """MuJoCo Warp's solver took its way for sleeping trees all the same, through arrays that it had not made."""
+    xml = """
+<mujoco>
+  <option timestep="0.004" sleep_tolerance="0.2"><flag sleep="enable" island="disable"/></option>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body pos="0 0 0.099"><freejoint/><geom size="0.1" mass="1"/></body>
+    <body pos="1 0 0.5"><joint axis="0 1 0" damping="0.03"/><geom type="capsule" size="0.03 0.1" mass="0.2"/></body>
+  </worldbody>
+</mujoco>
+"""
+    step_and_check(xml, KERNELS[kernels], substeps=12, names=("qpos", "qvel", "qacc", "qfrc_constraint"))
+    world = World(mujoco.MjModel.from_xml_string(xml), num_envs=1, sim=KERNELS["ours"])
+    assert isinstance(world, WarpWorld) and world.has_one_kernel_solver

@@ -7,6 +7,7 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from ksim_rl.physics.model_checks import may_sleep
 from ksim_rl.physics.native import FEW_WORLDS
 from ksim_rl.physics.newton.kernel import CUDA_LANES, launcher, layout, put_longest_first
 from ksim_rl.physics.newton.limbs import limbs_of
@@ -46,7 +47,7 @@ def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
         "no iterations are allowed": opt.iterations < 1,
         "there are noslip iterations": opt.noslip_iterations > 0,
         "warm starts are off": bool(opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART),
-        "bodies may sleep": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
+        "bodies may sleep": may_sleep(mj_model),
         "energies are computed": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY),
         "there are flexes": mj_model.nflex > 0,
         f"there are {nv} degrees of freedom, outside of 1 to {MOST_DOFS}": not 0 < nv <= MOST_DOFS,
