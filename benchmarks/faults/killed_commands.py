@@ -29,6 +29,8 @@ groups: {ppo: {objective: ppo, env_states: 1.0e+3, seeds: [1], rows: {One: {task
 """
 # A command that is never alive at the moment of its kill would be tried for ever.
 MOST_TRIES = 4
+# A table says nothing while it waits for the job of a process that was killed, and then does its own.
+MOST_SILENT_S = 900
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +138,7 @@ def _run(words: Sequence[str], *, kill_after: float | None = None) -> children.E
             return int(ended.code or 0)
         raise AssertionError("a command always exits")
 
-    child = children.start(work)
+    child = children.start(work, hangs_s=MOST_SILENT_S)
     if kill_after is None:
         return child.wait()
     children.pause(kill_after)

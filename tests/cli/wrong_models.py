@@ -30,7 +30,7 @@ MODELS: dict[str, tuple[str | bytes, str]] = {
     "an include that is missing": ('<mujoco><include file="other.xml"/></mujoco>', "other.xml"),
     "a negative time step": (
         f'<mujoco><option timestep="-1"/><worldbody>{BODY}</worldbody></mujoco>',
-        "timestep",
+        "feet",
     ),
     "a URDF without links": ('<robot name="r"/>', "free joint"),
     "a URDF whose joint has no child": (
