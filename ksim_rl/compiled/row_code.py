@@ -287,12 +287,8 @@ def _reduce(
         ctype = "bool"
     else:
         ctype = CTYPES[out.dtype]
-    if name in ("any", "all"):
-        element = "bool"
-    else:
-        element = ctype
     count = math.prod(source.shape[k] for k in dims)
-    inner = f"const {element} e = ({element}){cells.at(source, list(names.values()))}; {step};"
+    inner = f"const {ctype} e = ({ctype}){cells.at(source, list(names.values()))}; {step};"
     over = " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in dims)
     end = end.replace("count", literal(count, ctype))
     body = f"{ctype} s = {start}; {over} {{ {inner} }} {cells.at(out, place)} = {end};"

@@ -20,6 +20,8 @@ MARGIN, PAIR_MARGIN = 1.5, 1.2
 FALLS_MARGIN = REHEARSED_MARGIN = 1.25
 EXTRA = 4
 MULTIPLE = 8
+# Rows that MuJoCo Warp takes together.
+TILE = 16
 RANDOM_STATES = 512
 DROPS = 12
 DROP_STEPS = 50
@@ -37,11 +39,20 @@ _cache: dict[bytes, tuple[int, int]] = {}
 def capacities(
     mj_model: mujoco.MjModel, sim: SimCfg, per_world_fields: Sequence[str] = ()
 ) -> tuple[int, int]:
-    """Return (njmax, nconmax) per world: those of `sim`, or the probe's where they are None."""
-    if sim.njmax is not None and sim.nconmax is not None:
-        return sim.njmax, sim.nconmax
-    njmax, nconmax = probe(_rubbing(mj_model, per_world_fields))
-    return sim.njmax or njmax, sim.nconmax or nconmax
+    """Return (njmax, nconmax) per world: as `sim` has them, or the probe's where they are None.
+
+    The integrator "discrete" has room for whole tiles of rows, so that njmax may be up to 15 more.
+    """
+    njmax = sim.njmax
+    nconmax = sim.nconmax
+    if njmax is None or nconmax is None:
+        probed_njmax, probed_nconmax = probe(_rubbing(mj_model, per_world_fields))
+        njmax = njmax or probed_njmax
+        nconmax = nconmax or probed_nconmax
+    if mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE:
+        # MuJoCo Warp regularizes rows up to the end of their last tile, and reads arrays there that end at njmax.
+        njmax = TILE * math.ceil(njmax / TILE)
+    return njmax, nconmax
 
 
 def is_certain(mj_model: mujoco.MjModel, sim: SimCfg, *, njmax: int) -> bool:

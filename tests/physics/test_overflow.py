@@ -8,6 +8,7 @@ import torch
 
 from ksim_rl.physics import OverflowReport, SimCfg, World
 from ksim_rl.physics.overflow import METRIC_BITS
+from ksim_rl.physics.warp_world import WarpWorld
 from tests.physics.models import quadruped, standing_quadrupeds
 from tests.physics.overflowing_models import SCENES, bullet, can_on_fine_field, felt_crowd, pile, sensed_box
 
@@ -38,6 +39,16 @@ def test_too_few_rows_names_the_need():
     assert f"set sim.njmax >= {report.nefc}" in report.messages[0]
     assert "has 10" in report.messages[0]
     assert world.overflow_report().nefc == 0, "a report starts a new period"
+
+
+def test_discrete_steps_have_room_for_whole_tiles_of_rows():
+    """MuJoCo Warp went through rows beyond njmax there, up to the end of a tile: an illegal access on a GPU."""
+    world = fallen(SimCfg(njmax=10, nconmax=40, integrator="discrete"))
+    assert isinstance(world, WarpWorld)
+    assert world.njmax == world.warp_data_E.efc.D.shape[1] == 16
+    world.step(4)
+    report = world.overflow_report()
+    assert report.nefc > 16 and report.worlds["NEFC"] == 4
 
 
 def test_too_few_contacts_names_the_need():
