@@ -46,14 +46,12 @@ class Rewrite:
     Args:
         folder, part: the file.
         new, old: what stands there, and what stood there before.
-        then: another one.
     """
 
     folder: str
     part: str
     new: str
     old: str
-    then: "Rewrite | None" = None
 
     def __call__(self, source_of: Callable[[str, tuple[str, ...]], str]) -> Callable[..., str]:
         """Return what gives the sources with the lines as they were."""
@@ -61,13 +59,7 @@ class Rewrite:
         def changed(folder: str, parts: tuple[str, ...]) -> str:
             return source_of(folder, parts).replace(self.new, self.old)
 
-        return changed if self.then is None else self.then(changed)
-
-    def files(self) -> Iterator[tuple[str, str, str]]:
-        """Yield the folder, the part and what stands there, of each rewrite."""
-        yield self.folder, self.part, self.new
-        if self.then is not None:
-            yield from self.then.files()
+        return changed
 
 
 def gives(value: Any) -> Callable[[Any], Any]:
@@ -297,14 +289,13 @@ FAULTS = {
     ),
     "overflow": Fault(
         number="13",
-        what="rows that find no room are not told of",
+        what="what finds no room is not told of",
         place=("native", "source_of"),
         instead=Rewrite(
             folder="smooth",
             part="record",
-            new="rows > problem.njmax ? OUT_OF_ROWS : 0",
+            new="problem.overflow.data[world] | lacking",
             old="0",
-            then=Rewrite(folder="smooth", part="advance", new="lacks_rows ? OUT_OF_ROWS : 0", old="0"),
         ),
         needs=("tree.free", "geom.box"),
         kernels="ours",

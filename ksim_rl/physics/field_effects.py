@@ -70,8 +70,8 @@ def _warn_of_still_air(mj_model: mujoco.MjModel, expanded: Collection[str]) -> N
     if "body_mass" in expanded and is_fluid and massless.size:
         body = mj_model.body(int(massless[0])).name or f"number {massless[0]} (unnamed)"
         warnings.warn(
-            f"per_world_fields has 'body_mass', and body {body!r}, which is in a fluid, has no mass in the model: where "
-            "a world gives it mass, its drag is not the C engine's. Give it a little mass in the XML",
+            f"per_world_fields has 'body_mass', and body {body!r}, which is in a fluid, has no mass in the model: "
+            "where a world gives it mass, its drag is not the C engine's. Give it a little mass in the XML",
             stacklevel=4,
         )
 

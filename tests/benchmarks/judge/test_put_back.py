@@ -23,8 +23,7 @@ def test_what_mends_a_fault_is_left_out_for_a_while(name: str):
 def test_lines_of_cpp_that_are_written_as_they_were_stand_there(name: str):
     rewrite = FAULTS[name].instead
     assert isinstance(rewrite, Rewrite)
-    for folder, part, text in rewrite.files():
-        assert text in native.source_of(folder, (part,)), part
+    assert rewrite.new in native.source_of(rewrite.folder, (rewrite.part,))
 
 
 def test_all_faults_of_the_issue_are_there():
