@@ -94,7 +94,8 @@ def _hints(cls: type) -> dict[str, Any]:
 
 def check_value(field: str, value: object, annotation: Any) -> None:
     """Refuse a value that is not what an annotation says, as `checks` do; protocols, callables and `Any` take all."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
     if annotation is Any:  # a class since Python 3.11, but none to ask `isinstance` of
         return
     if origin is Annotated:

@@ -58,7 +58,10 @@ def check_in_range(
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f"{field}={value!r}: expected a number in {bounds}")
     # Not as a float, which would take a large int for its neighbour.
-    number = value if isinstance(value, int) else float(value)
+    if isinstance(value, int):
+        number = value
+    else:
+        number = float(value)
     below = low is not None and (number <= low if low_open else number < low)
     if number != number or abs(number) == float("inf") or below or (high is not None and number > high):
         raise ValueError(f"{field}={value!r}: expected a finite number in {bounds}")

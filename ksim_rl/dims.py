@@ -11,7 +11,10 @@ from typing import TypeVar
 
 from tensordict import TensorDictBase
 
-E, T, D, B = "E", "T", "D", "B"
+E = "E"
+T = "T"
+D = "D"
+B = "B"
 
 AnyTensorDict = TypeVar("AnyTensorDict", bound=TensorDictBase)
 

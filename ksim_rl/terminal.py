@@ -43,4 +43,6 @@ def _letter(letter: str) -> str:
     if letter.isprintable():
         return letter
     # Python's way to carry a byte that is no text.
-    return f"\\x{ord(letter) - 0xDC00:02x}" if "\udc80" <= letter <= "\udcff" else " "
+    if "\udc80" <= letter <= "\udcff":
+        return f"\\x{ord(letter) - 0xDC00:02x}"
+    return " "

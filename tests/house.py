@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
-from tests import signatures
+from tests import density, signatures
 
 PACKAGE = "ksim_rl"
 ROOM_SHARE = 0.25
@@ -268,6 +268,23 @@ def tests_in_place(house: House) -> list[str]:
     return found
 
 
+def crammed(house: House) -> list[str]:
+    """Return statements that hold two or more comprehensions, ternaries or lambdas."""
+    return [f"{house.name(path)}:{line}" for path, line in density.crammed(house.texts)]
+
+
+def means(house: House) -> list[str]:
+    """Return the means over the package that rose above what they have been."""
+    found = []
+    tokens = density.tokens_per_line(house.texts)
+    if tokens > density.TOKENS_PER_LINE:
+        found.append(f"{tokens:.2f} tokens in a line of code, and not {density.TOKENS_PER_LINE} or less")
+    anys = density.any_per_function(house.texts)
+    if anys > density.ANY_PER_FUNCTION:
+        found.append(f"`Any` {anys:.3f} times per function, and not {density.ANY_PER_FUNCTION} or less")
+    return found
+
+
 LIMITS: dict[str, Callable[[House], list[str]]] = {
     f"no room has more than {ROOM_SHARE:.0%} of the lines": room_shares,
     f"no file has more than {FILE_LINES} lines": file_lengths,
@@ -279,6 +296,8 @@ LIMITS: dict[str, Callable[[House], list[str]]] = {
     "tensor names carry their dims": suffixes,
     "rooms ask the contract what an env has": probes,
     "tests lie where their modules do": tests_in_place,
+    "no statement holds two comprehensions, ternaries or lambdas": crammed,
+    "code gets no denser, and no less typed": means,
 }
 
 

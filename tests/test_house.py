@@ -1,10 +1,11 @@
 """The package keeps the limits of `python -m tests.house`, and each limit is one that can be broken."""
 
+import subprocess
 from pathlib import Path
 
 import pytest
 
-from tests import house, signatures
+from tests import density, house, signatures
 
 ROOT = Path(__file__).parents[1]
 
@@ -45,6 +46,14 @@ BREAKS = {
     ),
     "probes": ({"ksim_rl/trainers/a.py": "def f(env):\n    return hasattr(env, 'x')\n"}, "hasattr(env, 'x')"),
     "tests_in_place": ({"tests/old_room/test_a.py": "x = 1\n"}, "tests/old_room is of no room"),
+    "crammed": (
+        {"ksim_rl/scene/a.py": "x = [a if a else 0 for a in (1, 2)]\n"},
+        "scene/a.py:1",
+    ),
+    "means": (
+        {"ksim_rl/scene/a.py": "x = ((1, 2, 3), (4, 5, 6), (7, 8, 9), (1, 2, 3), (4, 5, 6))\n" * 200},
+        "tokens in a line",
+    ),
 }
 
 
@@ -99,6 +108,18 @@ def test_each_limit_can_be_broken(sound, name, capsys):
 
 def test_every_limit_is_broken_once():
     assert {check.__name__ for check in house.LIMITS.values()} == set(BREAKS)
+
+
+def test_subjects_of_commits_fit_into_a_line():
+    assert not density.long_subjects(ROOT)
+
+
+def test_a_long_subject_is_found(tmp_path):
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.example"]
+    subprocess.run([*git, "init", "--quiet"], check=True)
+    for letters in (72, 73):
+        subprocess.run([*git, "commit", "--quiet", "--allow-empty", "-m", "x" * letters], check=True)
+    assert density.long_subjects(tmp_path, "HEAD") == ["x" * 73]
 
 
 def test_a_root_without_the_package_is_refused(tmp_path):

@@ -8,7 +8,8 @@ from contextlib import contextmanager
 
 from ksim_rl.terminal import printable, show, show_traceback
 
-REFUSED, FAILED = 2, 3
+REFUSED = 2
+FAILED = 3
 
 
 def report(error: Exception, *, about: str = "") -> int:
@@ -26,7 +27,9 @@ def report(error: Exception, *, about: str = "") -> int:
     notes = getattr(error, "__notes__", ())  # where in the config it was, for instance
     text = " ".join(" ".join((str(error), *notes)).split())
     say(f"error: {about}{text if explained and text else f'{type(error).__name__}: {text}'}")
-    return REFUSED if isinstance(error, ValueError) else FAILED
+    if isinstance(error, ValueError):
+        return REFUSED
+    return FAILED
 
 
 @contextmanager
@@ -48,10 +51,15 @@ def sigterm_interrupts() -> Iterator[None]:
 
 def interruption(stopped: KeyboardInterrupt) -> signal.Signals:
     """Return which signal it was."""
-    return signal.Signals(stopped.args[0]) if stopped.args else signal.SIGINT
+    if stopped.args:
+        return signal.Signals(stopped.args[0])
+    return signal.SIGINT
 
 
 def say(text: str) -> None:
     """Print one line of the program's own on stderr, and which of several ranks says it."""
-    rank = f"rank {os.environ['RANK']}: " if os.environ.get("WORLD_SIZE", "1") != "1" else ""
+    if os.environ.get("WORLD_SIZE", "1") != "1":
+        rank = f"rank {os.environ['RANK']}: "
+    else:
+        rank = ""
     show(f"ksim-rl: {rank}{printable(text)}", to_stderr=True)

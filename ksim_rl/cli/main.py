@@ -120,7 +120,8 @@ def _dispatch(words: list[str]) -> int:
 
 def _without_plugins(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Take `--plugin NAME` and `--plugin=NAME` out of a command's arguments; return those left, and the names."""
-    left, names = [], []
+    left = []
+    names = []
     following = iter(arguments)
     for argument in following:
         flag, equals, name = argument.partition("=")

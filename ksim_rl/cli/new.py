@@ -45,7 +45,8 @@ def new(arguments: list[str]) -> int:
         raise ValueError(f"{folder}: exists already; choose another folder with --output")
     with shown_working(f"analysing {options.model}"):
         found = analyse(options.model, pose=options.pose)
-    robot, stands = replace(found.robot, name=name, model=MODEL), found.stands_s >= TRIAL_S
+    robot = replace(found.robot, name=name, model=MODEL)
+    stands = found.stands_s >= TRIAL_S
     model = Path(options.model).expanduser()
     is_file = model.exists()
     path = f'str(files("{name}").joinpath("{name}.xml"))'

@@ -35,13 +35,18 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
     folder = Path(ranks.run_folder(str(folder)))
     if ranks.restarted() and checkpoint.saved(folder / "checkpoint"):
         resume_from = checkpoint.load_latest(folder)
-    done = 0 if resume_from is None else resume_from.iteration
+    if resume_from is None:
+        done = 0
+    else:
+        done = resume_from.iteration
     progress = RunProgress(cfg.trainer.num_iterations, done=done)
     length = cfg.data.rollout_length(cfg.num_envs)
-    each, size = cfg.num_envs * length, ranks.size()
-    all_ranks = (
-        f" on each of {size} ranks, {cfg.num_envs * size} envs and {each * size} in all" if size > 1 else ""
-    )
+    each = cfg.num_envs * length
+    size = ranks.size()
+    if size > 1:
+        all_ranks = f" on each of {size} ranks, {cfg.num_envs * size} envs and {each * size} in all"
+    else:
+        all_ranks = ""
     progress.note(
         f"{cfg.task_name}: {cfg.num_envs} envs x {length} steps = {each} env states per iteration{all_ranks}, "
         f"on {cfg.device}; run folder {shown(folder)}"
@@ -72,7 +77,10 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
         progress.note(line)
     if outcome.interrupted_by is not None:
         return 128 + int(outcome.interrupted_by)
-    reached = outcome.solved if outcome.target_met is None else outcome.target_met
+    if outcome.target_met is None:
+        reached = outcome.solved
+    else:
+        reached = outcome.target_met
     return 1 if reached is False else 0
 
 
@@ -116,8 +124,14 @@ def shown(path: Path) -> str:
 
 def _far_from(cfg: RunCfg, length: int) -> str:
     """Say which rollout length the task is tuned for, where a run's is very different, by the same algorithm."""
-    task = envs.task(cfg.task_name) if cfg.task_name in envs.names() else None
-    trainings = [] if task is None else [task.training, *task.other_trainings]
+    if cfg.task_name in envs.names():
+        task = envs.task(cfg.task_name)
+    else:
+        task = None
+    if task is None:
+        trainings = []
+    else:
+        trainings = [task.training, *task.other_trainings]
     for training in trainings:
         if isinstance(training, TrainingCfg) and type(training.objective) is type(cfg.objective):
             own = training.data.rollout_length(training.num_envs)
@@ -127,7 +141,10 @@ def _far_from(cfg: RunCfg, length: int) -> str:
 
 
 def _summary(cfg: RunCfg, outcome: Outcome, folder: Path) -> list[str]:
-    speed = outcome.env_states / outcome.seconds if outcome.seconds else 0.0
+    if outcome.seconds:
+        speed = outcome.env_states / outcome.seconds
+    else:
+        speed = 0.0
     lines = [
         f"{outcome.iteration} iterations, {outcome.env_states:,} env states in {outcome.seconds:.0f} s "
         f"({speed:,.0f} per s, evaluations included)"

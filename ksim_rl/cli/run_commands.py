@@ -59,7 +59,10 @@ def resume(arguments: list[str]) -> int:
         check_links(folder, below=FOLDERS)
         check_run_tree(saved.config, saved.path, given=fields)
     tree = {**saved.config, "device": options.device}
-    cfg = conf.changed(tree, saved.path, overrides) if overrides else RunCfg.from_tree(tree)
+    if overrides:
+        cfg = conf.changed(tree, saved.path, overrides)
+    else:
+        cfg = RunCfg.from_tree(tree)
     cfg = dataclasses.replace(_on_these_ranks(cfg, saved), device=str(cfg.resolved_device()))
     if cfg.trainer.num_iterations < saved.iteration:
         raise ValueError(
@@ -73,11 +76,14 @@ def resume(arguments: list[str]) -> int:
 
 def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
     """Share the envs out anew where a run goes on with another number of ranks: the dataset of all stays as large."""
-    before, now = saved.state.get(checkpoint.RANKS, {"size": 1})["size"], ranks.size()
+    before = saved.state.get(checkpoint.RANKS, {"size": 1})["size"]
+    now = ranks.size()
     if before == now:
         return cfg
-    data, objective = cfg.data, cfg.objective
-    size, shards = ranks.share_of(data, "num_env_states_per_minibatch", before), data.shards * before // now
+    data = cfg.data
+    objective = cfg.objective
+    size = ranks.share_of(data, "num_env_states_per_minibatch", before)
+    shards = data.shards * before // now
     data = dataclasses.replace(data, num_env_states_per_minibatch=size, shards=max(1, shards))
     if isinstance(objective, AMPCfg):
         size = ranks.share_of(objective, "num_transitions_per_step", before)
@@ -123,7 +129,9 @@ def evaluate(arguments: list[str]) -> int:
     assert evaluation is not None
     threshold = solved_at(policy.cfg)
     show(f"{judged}: {verdict(evaluation, threshold)}")
-    return 0 if threshold is None or evaluation.return_mean >= threshold else 1
+    if threshold is None or evaluation.return_mean >= threshold:
+        return 0
+    return 1
 
 
 def _in_physics(
@@ -153,7 +161,10 @@ def list_envs(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.task is not None:
         with shown_working(f"building {options.task}"):
-            device = "cuda" if torch.cuda.is_available() else "cpu"
+            if torch.cuda.is_available():
+                device = "cuda"
+            else:
+                device = "cpu"
             env = envs.make(options.task, num_envs=1, device=device)
         ours = part(env, envs.ManagerBasedRlEnv)
         assert ours is not None

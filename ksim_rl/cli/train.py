@@ -41,7 +41,10 @@ def train(arguments: list[str]) -> int:
     if unknown:
         raise conf.spelling.of_flag(unknown[0], arguments)
     name, own_config = _primary_config(flags)
-    began = Path(flags.config_dir) if name == conf.RUN_AGAIN else None
+    if name == conf.RUN_AGAIN:
+        began = Path(flags.config_dir)
+    else:
+        began = None
     if not (flags.help or flags.hydra_help or flags.shell_completion or own_config):
         builds = flags.cfg is None and flags.info is None
         multirun = flags.multirun or not builds
@@ -51,7 +54,8 @@ def train(arguments: list[str]) -> int:
     groups = _folders_of_groups(flags, own_config)
     given = conf.fields_of(flags.overrides)
     codes: list[int] = []
-    process, own_command = os.getpid(), sys.argv
+    process = os.getpid()
+    own_command = sys.argv
 
     @hydra.main(config_path=f"pkg://{conf.MODULE}", config_name=name, version_base="1.3")
     def job(config: DictConfig) -> None:
@@ -70,7 +74,10 @@ def train(arguments: list[str]) -> int:
     # Hydra prints errors in its own way unless this is set; here they go to `ksim_rl.cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     # A run folder is data: Hydra must not look for configs in it. The last of two folders counts.
-    away = ["--config-dir", str(Path(conf.__file__).parent)] if name == conf.RUN_AGAIN else []
+    if name == conf.RUN_AGAIN:
+        away = ["--config-dir", str(Path(conf.__file__).parent)]
+    else:
+        away = []
     overrides = list(flags.overrides)
     if ranks.size() > 1 and flags.multirun:
         raise ValueError(
@@ -128,7 +135,9 @@ def _folders_of_groups(flags: argparse.Namespace, own_config: bool) -> list[Path
 
 def _with_models_of(began: Path | None, cfg: RunCfg, *, note: Callable[[str], None]) -> RunCfg:
     """Return the config of a run that is made once more with the models that the run in folder `began` began with."""
-    return cfg if began is None else with_kept_models(cfg, began, note=note)
+    if began is None:
+        return cfg
+    return with_kept_models(cfg, began, note=note)
 
 
 def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str], began: Path | None) -> int:
@@ -158,7 +167,8 @@ def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str],
 
 def _unused(folder: Path) -> Path:
     """Return `folder`, or one beside it where a run that began in the same second has it already."""
-    candidate, number = folder, 1
+    candidate = folder
+    number = 1
     while (candidate / conf.RUN_CONFIG).exists() or is_locked(candidate):
         number += 1
         candidate = folder.with_name(f"{folder.name}_{number}")

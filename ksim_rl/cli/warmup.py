@@ -26,7 +26,8 @@ def warmup(arguments: list[str]) -> int:
     check_sources(cfg)
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     compiled: list[str] = []
-    progress, began = RunProgress(1), time.perf_counter()
+    progress = RunProgress(1)
+    began = time.perf_counter()
 
     def notice(text: str) -> None:
         compiled.append(text)

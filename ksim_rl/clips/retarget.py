@@ -156,7 +156,10 @@ def _low_height(mj_model: mujoco.MjModel, qpos_FL: Array, soles: Sequence[str]) 
         mujoco.mj_kinematics(mj_model, data)
         heights = []
         for name in soles:
-            sole = data.site(name) if name in sites else data.body(name)
+            if name in sites:
+                sole = data.site(name)
+            else:
+                sole = data.body(name)
             heights.append(sole.xpos[2])
         lowest.append(min(heights))
     return float(np.percentile(lowest, 5.0))

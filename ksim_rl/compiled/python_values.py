@@ -79,7 +79,10 @@ class _Search:
         self._device = device
         self._parts = set()
         for part in parts.values():
-            owner = part.of if isinstance(part, Listed) else part
+            if isinstance(part, Listed):
+                owner = part.of
+            else:
+                owner = part
             self._parts.add(id(owner))
         self._packages = packages_of(parts.values())
         self._seen: set[int] = set()

@@ -97,7 +97,8 @@ def objective_defaults(name: str, objective: str) -> Tree:
     For an algorithm that it has no settings for, that is what fits of those in `training`: data and networks of the
     kinds that the algorithm has as well, and the settings that it inherits.
     """
-    task, algorithm = envs.task(name), algorithms.algorithm(objective)
+    task = envs.task(name)
+    algorithm = algorithms.algorithm(objective)
     if task.training is None:
         return {}
     base = _checked(task, task.training)

@@ -51,7 +51,7 @@ def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, value
         with hydra.initialize_config_module(MODULE, version_base="1.3"):
             loader = GlobalHydra.instance().config_loader()
             overrides = [_parse(text, loader) for text in texts]
-            sweeps = [override.input_line for override in overrides if override.is_sweep_override()]
+            sweeps = [str(override.input_line) for override in overrides if override.is_sweep_override()]
             if sweeps and not multirun:
                 raise ValueError(
                     f"override {sweeps[0]!r} has several values: add --multirun to run one job for each"
@@ -109,7 +109,8 @@ def _parse(text: str, loader: ConfigLoader) -> Override:
 
 def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str) -> None:
     groups = _groups(loader)
-    choices, fields = [], []
+    choices = []
+    fields = []
     for override in overrides:
         if override.key_or_group == "task_name":
             raise ValueError(

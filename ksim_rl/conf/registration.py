@@ -22,8 +22,10 @@ from ksim_rl.files.reading import read_bytes
 from ksim_rl.runs.listing import CONFIG
 from ksim_rl.trainers.run_cfg import check_run_tree, up_to_date, without_env_size
 
-MODULE, NAME = "ksim_rl.conf", "train"
-RUN_AGAIN, RUN_CONFIG = "run_again", CONFIG
+MODULE = "ksim_rl.conf"
+NAME = "train"
+RUN_AGAIN = "run_again"
+RUN_CONFIG = CONFIG
 CHOSEN_BY_TASK = TRAINING, OBJECTIVE_TRAINING = "task/training", "task/objective_training"
 WRITTEN_BY_LOGGERS = ("wandb", "mlflow")
 
@@ -147,7 +149,10 @@ def searched_folders(overrides: Sequence[str]) -> list[Path]:
     for text in overrides:
         if text.lstrip("+").partition("=")[0] == "hydra.searchpath":
             value = OverridesParser.create().parse_override(text).value()
-            places = value if isinstance(value, list) else [value]
+            if isinstance(value, list):
+                places = value
+            else:
+                places = [value]
             found += [
                 Path(str(place).removeprefix("file://")) for place in places if "pkg://" not in str(place)
             ]

@@ -16,8 +16,14 @@ def of_flag(flag: str, arguments: Sequence[str] = ()) -> ValueError:
     """Build the error for a flag that does not exist, such as `--num_envs=4`, or `--task x` in `arguments`."""
     name, equals, value = flag.lstrip("-").partition("=")
     if not equals:
-        after = list(arguments)[list(arguments).index(flag) + 1 :] if flag in arguments else []
-        value = after[0] if after and not after[0].startswith("-") and "=" not in after[0] else "VALUE"
+        if flag in arguments:
+            after = list(arguments)[list(arguments).index(flag) + 1 :]
+        else:
+            after = []
+        if after and not after[0].startswith("-") and "=" not in after[0]:
+            value = after[0]
+        else:
+            value = "VALUE"
     name = name.replace("-", "_")
     known = [*GROUPS, *_fields(DEFAULTS)]
     found = [field for field in known if field == name] or [

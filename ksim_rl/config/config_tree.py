@@ -59,7 +59,8 @@ def to_tree(value: Any, annotation: Any = None) -> Any:
 
 def default_tree(cls: type, annotation: Any = None) -> dict[str, Any]:
     """Return the plain tree of a dataclass's defaults, with Hydra's "???" for fields that have none."""
-    hints, tree = typing.get_type_hints(cls), {}
+    hints = typing.get_type_hints(cls)
+    tree = {}
     if annotation is not None and cls is not _default_class(annotation):
         tree[TARGET] = class_paths.public_path(cls)
     for field in dataclasses.fields(cls):
@@ -107,7 +108,8 @@ _MAPPINGS = (collections.abc.Mapping, dict)
 
 
 def _match(option: Any, value: Any, path: str) -> Any:
-    origin, arguments = typing.get_origin(option), typing.get_args(option)
+    origin = typing.get_origin(option)
+    arguments = typing.get_args(option)
     if origin is Literal:
         return value if value in arguments else _NO_MATCH
     if origin in (tuple, collections.abc.Sequence, list):
@@ -135,8 +137,12 @@ def _match(option: Any, value: Any, path: str) -> Any:
     if option not in (bool, str, int, float) or isinstance(value, bool) and option is not bool:
         return _NO_MATCH
     if option is float:
-        return float(value) if isinstance(value, (int, float)) else _NO_MATCH
-    return value if isinstance(value, option) else _NO_MATCH
+        if isinstance(value, (int, float)):
+            return float(value)
+        return _NO_MATCH
+    if isinstance(value, option):
+        return value
+    return _NO_MATCH
 
 
 def _join(path: str, name: object) -> str:
@@ -203,7 +209,8 @@ def _default_class(annotation: Any) -> Any:
 
 
 def _describe(annotation: Any) -> str:
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
     if origin in (Union, types.UnionType):
         return " or ".join(map(_describe, arguments))
     if origin in (tuple, list, collections.abc.Sequence):

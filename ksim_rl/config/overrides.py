@@ -87,7 +87,13 @@ def check_key(tree: Mapping[str, Any], key: str) -> None:
             above = ".".join(parts[:depth])
             names = level if isinstance(level, Mapping) else ()
             choices = [str(name) for name in names if name != "_target_"]
-            where = f"{above} has no field {part!r}: " if above else ""
+            if above:
+                where = f"{above} has no field {part!r}: "
+            else:
+                where = ""
             inside = [top for top, below in tree.items() if isinstance(below, Mapping) and parts[0] in below]
-            hint = near(part, choices) if above or not inside else f"did you mean {f'{inside[0]}.{key}'!r}?"
+            if above or not inside:
+                hint = near(part, choices)
+            else:
+                hint = f"did you mean {f'{inside[0]}.{key}'!r}?"
             raise ValueError(f"unknown field {key!r}: {where}{hint}")

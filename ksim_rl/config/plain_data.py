@@ -92,7 +92,9 @@ def _without_references(tree: Any) -> Any:
     if isinstance(tree, (list, tuple)):
         return [_without_references(entry) for entry in tree]
     # An escaped one stays, of which Hydra's grammar may make another.
-    return _REFERENCE.sub("", tree) if isinstance(tree, str) and "\\" not in tree else tree
+    if isinstance(tree, str) and "\\" not in tree:
+        return _REFERENCE.sub("", tree)
+    return tree
 
 
 def flat(tree: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Any]]:

@@ -31,7 +31,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
-TASKS, CONF, ALGORITHMS = "ksim_rl.tasks", "ksim_rl.conf", "ksim_rl.algorithms"
+TASKS = "ksim_rl.tasks"
+CONF = "ksim_rl.conf"
+ALGORITHMS = "ksim_rl.algorithms"
 VARIABLE = "KSIM_RL_PLUGINS"
 PATH_VARIABLE = "KSIM_RL_PLUGIN_PATH"
 
@@ -97,7 +99,9 @@ def environment() -> dict[str, str]:
         places = module.__spec__.submodule_search_locations or [module.__spec__.origin]
         folders += [str(Path(place).absolute().parent) for place in places if place]
     found = {PATH_VARIABLE: os.pathsep.join(dict.fromkeys(folders))}
-    return {**found, VARIABLE: ",".join(_named)} if _named else found
+    if _named:
+        return {**found, VARIABLE: ",".join(_named)}
+    return found
 
 
 def _folders() -> list[str]:
@@ -143,7 +147,10 @@ def check_remembered(names: Sequence[str]) -> None:
 def modules(group: str) -> Iterator[tuple[str, ModuleType]]:
     """Import the modules that a group of entry points names, and the plug-ins, with the origin of each for messages."""
     for point in declared(group):
-        owner = "an unknown package" if point.dist is None else point.dist.name
+        if point.dist is None:
+            owner = "an unknown package"
+        else:
+            owner = point.dist.name
         origin = f"entry point {point.name} = {point.value!r} of {owner}"
         for module in _import(origin, point.module, "mend or uninstall that package"):
             yield origin, module

@@ -29,7 +29,10 @@ class _Made(_Kept):
         self, make: Callable[[], dict[str, Any]], *, name: str, group: str, package: str | None
     ) -> None:
         self.make = make
-        self.name, self.group, self.package, self.provider = name, group, package, None
+        self.name = name
+        self.group = group
+        self.package = package
+        self.provider = None
 
     @cached_property
     def node(self) -> DictConfig:
@@ -54,7 +57,8 @@ def store_config(
 
 def quicken(folder: dict[str, Any] | None = None) -> None:
     """Let what others stored so far be listed without copies of it."""
-    folder = ConfigStore.instance().repo if folder is None else folder
+    if folder is None:
+        folder = ConfigStore.instance().repo
     for name, entry in folder.items():
         if isinstance(entry, dict):
             quicken(entry)

@@ -77,4 +77,6 @@ class NativeKernel:
 
 
 def _type_of(kind: type | str) -> Any:
-    return vars(wp)[kind] if isinstance(kind, str) else kind
+    if isinstance(kind, str):
+        return vars(wp)[kind]
+    return kind

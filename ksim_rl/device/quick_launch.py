@@ -118,7 +118,10 @@ def as_operator(
     # torch 2.11 looks for each of these among the arguments that were given, without those that equal their defaults.
     defaults = {name for name, own in signature(launch).parameters.items() if own.default is not own.empty}
     assert not defaults & set(mutates), f"{name}: arguments that are changed have no default"
-    chosen = launch if in_torch is None else _by_kernel_or_torch(launch, in_torch)
+    if in_torch is None:
+        chosen = launch
+    else:
+        chosen = _by_kernel_or_torch(launch, in_torch)
     operator = torch.library.custom_op(f"ksim_rl::{name}", chosen, mutates_args=mutates)
     operator.register_fake(fake)
 

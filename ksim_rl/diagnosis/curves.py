@@ -97,6 +97,9 @@ def _number(text: str | None) -> float | None:
 def _columns(path: Path) -> dict[str, list[float | None]]:
     names, rows = read_table(path)
     try:
-        return {name: [_number(row.get(name)) for row in rows] for name in names}
+        columns = {}
+        for name in names:
+            columns[name] = [_number(row.get(name)) for row in rows]
+        return columns
     except ValueError as error:
         raise ValueError(f"{path}: damaged: {error}") from error

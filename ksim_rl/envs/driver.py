@@ -37,7 +37,10 @@ class EnvDriver(Simulation):
             if tracker.every_substep:
                 self.after_substep.append(partial(self._update_in_substep, name, tracker))
                 only = tracker.contacts_only and self.substep_sensors != "every"
-                self.substep_sensors = "contacts" if only else "every"
+                if only:
+                    self.substep_sensors = "contacts"
+                else:
+                    self.substep_sensors = "every"
 
     def update_sensors(self) -> None:
         """Let each sensor read the env step that has just been made."""

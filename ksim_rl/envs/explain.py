@@ -43,7 +43,8 @@ def explain(
     show = partial(_show, console)
     console.print(_summary(cfg, driver))
     for group, group_cfg in cfg.observations.items():
-        rows, widths = [], []
+        rows = []
+        widths = []
         for name, term_cfg in group_cfg.terms.items():
             shape = tuple(shapes[name][1:])
             if len(shape) == 1:
@@ -72,10 +73,16 @@ def explain(
         name: f"{float(weights[name]):g}" if name in weights else "0: not computed" for name in cfg.rewards
     }
     rows = [(name, shown[name], _described(term, ("weight",))) for name, term in cfg.rewards.items()]
-    scaled = f"times {driver.step_dt:g} s" if cfg.scale_rewards_by_dt else "per step"
+    if cfg.scale_rewards_by_dt:
+        scaled = f"times {driver.step_dt:g} s"
+    else:
+        scaled = "per step"
     show(f"rewards ({scaled})", ("term", "weight", "parameters"), rows)
 
-    ends = "terminated" if cfg.is_finite_horizon else "truncated"
+    if cfg.is_finite_horizon:
+        ends = "terminated"
+    else:
+        ends = "truncated"
     rows = [
         (name, ends if term.time_out else "terminated", _described(term, ("time_out",)))
         for name, term in cfg.terminations.items()
@@ -115,7 +122,8 @@ def _summary(cfg: ManagerBasedRlEnvCfg, driver: EnvDriver) -> str:
 
 def _hooks(driver: EnvDriver) -> list[str]:
     """Return a line where parts of the env, such as motor models, run between substeps."""
-    before, after = len(driver.before_substep), len(driver.after_substep)
+    before = len(driver.before_substep)
+    after = len(driver.after_substep)
     if not before and not after:
         return []
     return [f"substeps are launched one by one, for {before} hooks before and {after} after each"]
@@ -125,7 +133,9 @@ def _keys(transform: Transform) -> str:
     """Return what a transform reads and, where that is elsewhere, writes."""
     keys = [[*transform.in_keys, *transform.in_keys_inv], [*transform.out_keys, *transform.out_keys_inv]]
     reads, writes = (", ".join(map(spell, part)) for part in keys)
-    return reads if reads == writes else f"{reads} -> {writes}"
+    if reads == writes:
+        return reads
+    return f"{reads} -> {writes}"
 
 
 def _call(described: TransformCfg) -> str:
@@ -172,11 +182,15 @@ def _shown(value: Any) -> str:
         return "{" + ", ".join(f"{key}: {_shown(entry)}" for key, entry in value.items()) + "}"
     if isinstance(value, (tuple, list)):
         return "(" + ", ".join(_shown(entry) for entry in value) + ")"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return str(value)
 
 
 def _seconds(pair: tuple[float, float] | None, otherwise: str) -> str:
     if pair is None:
         return otherwise
     low, high = pair
-    return f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
+    if low == high:
+        return f"{low:g} s"
+    return f"{low:g} to {high:g} s"

@@ -32,7 +32,8 @@ class _Seed:
 
 
 def _seed(env: EnvBase | None, seed: int = -1) -> int:
-    seed = secrets.randbelow(2**31) if seed == -1 else seed
+    if seed == -1:
+        seed = secrets.randbelow(2**31)
     if env is not None:
         env.set_seed(seed)
     else:
@@ -72,7 +73,9 @@ class MaskedReset(EnvBase):
     @property
     def dim_names(self) -> list[str | None]:
         """Labels of the batch dims: "E" for the first."""
-        return [dims.E, *[None] * (len(self.batch_size) - 1)] if self.batch_size else []
+        if self.batch_size:
+            return [dims.E, *[None] * (len(self.batch_size) - 1)]
+        return []
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         next_td = self._labelled(super()._step_proc_data(next_tensordict_out))
@@ -115,7 +118,10 @@ class MaskedReset(EnvBase):
             self.seed(seed)
         if env_ids is not None:
             tensordict = self._with_mask_of(tensordict, env_ids)
-        mask_E1 = None if tensordict is None else self._checked_mask(tensordict)
+        if tensordict is None:
+            mask_E1 = None
+        else:
+            mask_E1 = self._checked_mask(tensordict)
         if tensordict is not None and mask_E1 is not None:
             self._complete_with_last_root(tensordict)
         if not self._masks_resets:
@@ -128,7 +134,10 @@ class MaskedReset(EnvBase):
     def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
         """TorchRL's rollout, with its dims labelled ("E", "T")."""
         rollout_ET = super().rollout(*args, **kwargs)
-        names = self.dim_names if rollout_ET.batch_dims == len(self.batch_size) + 1 else [None]
+        if rollout_ET.batch_dims == len(self.batch_size) + 1:
+            names = self.dim_names
+        else:
+            names = [None]
         rollout_ET.names = [*names, dims.T]
         return rollout_ET
 
@@ -146,10 +155,16 @@ class MaskedReset(EnvBase):
         select_reset_only: bool = False,
     ) -> TensorDictBase:
         set_state = upstream.resolved_set_state(self, tensordict, set_state, select_reset_only)
-        forwarded = {} if set_state is None else {"set_state": set_state}
+        if set_state is None:
+            forwarded = {}
+        else:
+            forwarded = {"set_state": set_state}
         reset_td = tensordict
         if tensordict is not None:
-            keys = [_RESET] if select_reset_only else [_RESET, *self.state_spec.keys(True, True)]
+            if select_reset_only:
+                keys = [_RESET]
+            else:
+                keys = [_RESET, *self.state_spec.keys(True, True)]
             reset_td = tensordict.select(*keys, strict=False)
             if mask_E1 is not None:
                 reset_td.set(_RESET, mask_E1)
@@ -176,7 +191,8 @@ class MaskedReset(EnvBase):
         for key in fresh.keys(True, True):
             if key == _RESET:
                 continue
-            new, old = fresh.get(key), root.get(key, None)
+            new = fresh.get(key)
+            old = root.get(key, None)
             if old is not None and isinstance(old, Tensor):
                 pair = _shared_rows(new, old)
                 if pair is None:
@@ -246,7 +262,10 @@ def mask_from_env_ids(
         raise ValueError(
             f"env_ids has dtype {env_ids.dtype}: expected integers; a mask goes to tensordict['_reset']"
         )
-    ids = env_ids.reshape(-1).tolist() if isinstance(env_ids, Tensor) else list(env_ids)
+    if isinstance(env_ids, Tensor):
+        ids = env_ids.reshape(-1).tolist()
+    else:
+        ids = list(env_ids)
     if any(isinstance(row, bool) or not hasattr(row, "__index__") for row in ids):
         raise ValueError(f"env_ids={ids!r}: expected integers")
     ids = [row.__index__() for row in ids]
@@ -272,10 +291,13 @@ def _shared_rows(new: Tensor, old: Tensor) -> tuple[Tensor, Tensor] | None:
     """Return the tensors that two leaves are the same columns of, if there are such: one `where` serves all columns."""
     if torch.compiler.is_compiling():
         return None
-    new_base, old_base = base_of(new), base_of(old)
+    new_base = base_of(new)
+    old_base = base_of(old)
     if new_base is None or old_base is None or new_base.ndim != 2 or new_base.shape != old_base.shape:
         return None
     same_place = new.stride() == old.stride() and new.storage_offset() == old.storage_offset()
     whole = all(base.is_contiguous() and base.storage_offset() == 0 for base in (new_base, old_base))
     columns = new.ndim == 2 and new.shape == old.shape and new.shape[0] == new_base.shape[0]
-    return (new_base, old_base) if same_place and whole and columns and new.dtype == old.dtype else None
+    if same_place and whole and columns and new.dtype == old.dtype:
+        return (new_base, old_base)
+    return None

@@ -15,7 +15,9 @@ from torchrl.envs.transforms import Compose, Transform
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.transforms.row_transform import seed_transforms
 
-_BASE, _TRANSFORM, _ROOT = "base_env.", "transform.", "last_root."
+_BASE = "base_env."
+_TRANSFORM = "transform."
+_ROOT = "last_root."
 
 
 class MaskedTransformedEnv(MaskedReset, TransformedEnv):

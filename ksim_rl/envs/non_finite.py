@@ -44,7 +44,9 @@ class NonFiniteTerms:
     """Counts, on the device and without a sync, the numbers that are not finite by the term that gave them."""
 
     def __init__(self, num_envs: int, step_count: Int64[Tensor, ""]) -> None:
-        self._num_envs, self._step, self._names = num_envs, step_count, []
+        self._num_envs = num_envs
+        self._step = step_count
+        self._names = []
         self._device = step_count.device
         self._columns: dict[tuple[str, ...], Tensor] = {}
         self._is_learning = True

@@ -15,7 +15,8 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm, MetricTerm, RewardTerm, TerminationTerm
 
-CFG, OPTIONS = "cfg", "world.warp_model.opt"
+CFG = "cfg"
+OPTIONS = "world.warp_model.opt"
 _MANAGERS = (
     "event_manager",
     "command_manager",

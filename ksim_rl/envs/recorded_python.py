@@ -51,7 +51,9 @@ class RecordedPython:
     def __init__(
         self, env: EnvBase, others: Mapping[str, Any] | None = None, *, is_compared: bool = False
     ) -> None:
-        self._env, self._others, self._is_compared = env, dict(others or {}), is_compared
+        self._env = env
+        self._others = dict(others or {})
+        self._is_compared = is_compared
         self._watch = PythonWatch(env.device or torch.device("cpu"))
         self._calls = 0
         # Places in which each step puts another tensor.

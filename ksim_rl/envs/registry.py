@@ -115,7 +115,10 @@ def build(
             # Specs that are made show what does not fit.
             assert env.output_spec is not None and env.input_spec is not None
         except (KeyError, ValueError, RuntimeError, TypeError) as error:
-            reason = error.args[0] if isinstance(error, KeyError) and error.args else error
+            if isinstance(error, KeyError) and error.args:
+                reason = error.args[0]
+            else:
+                reason = error
             raise ValueError(f"task.transforms.{name}: {reason}") from error
     seed = base_env.cfg.seed
     assert seed is not None  # an env stores the seed that it drew

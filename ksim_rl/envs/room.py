@@ -18,7 +18,8 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.physics import OverflowReport
 
 # Long enough for a robot to fall and lie, and so many env steps at most.
-SECONDS, MOST_STEPS = 1.0, 50
+SECONDS = 1.0
+MOST_STEPS = 50
 # Contacts that found no place had no rows: only then are those seen.
 MOST_BUILDS = 5
 
@@ -83,7 +84,10 @@ def rehearse_room(env: ManagerBasedRlEnv) -> OverflowReport:
     saved = env.state_dict()
     env.world.overflow_report()
     generator = torch.Generator().manual_seed(0)
-    devices = [env.device] if env.device.type == "cuda" else []
+    if env.device.type == "cuda":
+        devices = [env.device]
+    else:
+        devices = []
     # A term of the user's may draw from torch's own generators.
     with torch.no_grad(), torch.random.fork_rng(devices=devices):
         state = env.reset()

@@ -35,7 +35,8 @@ def make_specs(
         for group, values in readings.items()
         if values
     }
-    shape_E1, shape_EL = torch.Size((*batch_size, 1)), torch.Size((*batch_size, size))
+    shape_E1 = torch.Size((*batch_size, 1))
+    shape_EL = torch.Size((*batch_size, size))
     action: Unbounded | Bounded = Unbounded(shape=shape_EL, device=device)
     if bounds_L2 is not None:
         low_EL, high_EL = (edge_L.expand(shape_EL).clone() for edge_L in bounds_L2.unbind(-1))

@@ -27,7 +27,8 @@ class Readings:
     """What an `EnvView` shows beyond the worlds; managers fill it while the env is constructed, then write in place."""
 
     def __init__(self, simulation: Simulation) -> None:
-        num_envs, device = simulation.num_envs, simulation.device
+        num_envs = simulation.num_envs
+        device = simulation.device
         self.sensors: dict[str, SensorTracker] = {}
         self.commands: dict[str, Float[Tensor, "E ?K"]] = {}
         self.command_ranges: dict[str, dict[str, Float[Tensor, " 2"]]] = {}
@@ -71,8 +72,10 @@ class EnvView(WorldView):
         self.reward_weights: Mapping[str, Float[Tensor, ""]] = MappingProxyType(readings.reward_weights)
         self.episode_rewards: Mapping[str, Float[Tensor, " E"]] = MappingProxyType(readings.episode_rewards)
         self.terminations: Mapping[str, Bool[Tensor, " E"]] = MappingProxyType(readings.terminations)
-        self.terminated_E, self.truncated_E = readings.terminated_E, readings.truncated_E
-        self.level, self.command_cache = readings.level, readings.command_cache
+        self.terminated_E = readings.terminated_E
+        self.truncated_E = readings.truncated_E
+        self.level = readings.level
+        self.command_cache = readings.command_cache
 
     @property
     def action_EL(self) -> Float[Tensor, "E L"]:

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 Arrays = Mapping[str, np.ndarray]
-SAME, LIKE = 2e-3, 2e-2
+SAME = 2e-3
+LIKE = 2e-2
 """Relative errors: of what should be equal, and of what explains a difference."""
 MOST_SHIFT = 4
 
@@ -37,14 +38,16 @@ def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[
     """
     found: list[Cause] = []
     recorded_s = float(trace["trace/dt"]) * int(trace["trace/decimation"])
-    step_s, substep_s = float(replay["dt"]) * int(replay["decimation"]), float(replay["dt"])
+    step_s = float(replay["dt"]) * int(replay["decimation"])
+    substep_s = float(replay["dt"])
     if abs(step_s / recorded_s - 1.0) > 1e-6 or abs(substep_s / float(trace["trace/dt"]) - 1.0) > 1e-6:
         evidence = f"{step_s:g} s in steps of {substep_s:g} s, trained with {recorded_s:g} s in steps of "
         found.append(Cause("rate", "env step", evidence + f"{float(trace['trace/dt']):g} s"))
 
     signal = partial(_pairs, trace=trace, replay=replay)
     frames = _newest(meta, trace["trace/obs"])
-    start, obs_differs = 0, False
+    start = 0
+    obs_differs = False
     ours, theirs, episode = _pairs("obs", {**trace, "trace/obs": frames}, replay)
     for term in meta["observations"]:
         columns = slice(start, start + term["size"])
@@ -156,7 +159,9 @@ def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.nda
 
     Of the lags that an episode may have had, the one that fits is taken, whatever the scale.
     """
-    ours, theirs, episode = [], [], []
+    ours = []
+    theirs = []
+    episode = []
     lags = sorted({key.split("/")[0] for key in replay if "/" in key})
     for number, recorded in enumerate(trace[f"trace/{name}"]):
         fits = [replay[f"{lag}/{number}/{name}"] for lag in lags if f"{lag}/{number}/{name}" in replay]
@@ -171,7 +176,8 @@ def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.nda
 
 def _newest(meta: Mapping[str, Any], obs: np.ndarray) -> np.ndarray:
     """Return the newest frame [..., L] of vectors that hold histories."""
-    columns, stop = [], 0
+    columns = []
+    stop = 0
     for term in meta["observations"]:
         stop += term["size"] * term["history_length"]
         columns += range(stop - term["size"], stop)
@@ -182,14 +188,16 @@ def _error(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Return the mean difference of the column that differs most, by the size of what is recorded."""
     if not len(ours):
         return 0.0
-    ours, theirs = ours.reshape(len(ours), -1), theirs.reshape(len(theirs), -1)
+    ours = ours.reshape(len(ours), -1)
+    theirs = theirs.reshape(len(theirs), -1)
     size = np.abs(ours).mean() + 1e-6
     return float(np.abs(ours - theirs).mean(0).max() / size)
 
 
 def _unlike(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Return the error that is left when each of our columns may be scaled and shifted."""
-    ours, theirs = ours - ours.mean(0), theirs - theirs.mean(0)
+    ours = ours - ours.mean(0)
+    theirs = theirs - theirs.mean(0)
     return _error(ours * _ratios(ours, theirs), theirs)
 
 
@@ -211,20 +219,25 @@ def _order(ours: np.ndarray, theirs: np.ndarray) -> list[int] | None:
     order = np.where(apart[own, own] <= apart[own, order] + 1e-9, own, order)
     is_other = sorted(order) == list(own) and (order != own).any()
     matches = _error(ours[:, order], theirs) <= LIKE
-    return order.tolist() if is_other and matches else None
+    if is_other and matches:
+        return order.tolist()
+    return None
 
 
 def _shift(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, tolerance: float = LIKE) -> int | None:
     """Return by how many steps theirs is late, negative where it is early; None where no shift explains it."""
-    best, found = _error(ours, theirs), None
+    best = _error(ours, theirs)
+    found = None
     for shift in (s for k in range(1, MOST_SHIFT + 1) for s in (k, -k)):
-        late, early = (
-            (slice(shift, None), slice(None, -shift))
-            if shift > 0
-            else (slice(None, shift), slice(-shift, None))
-        )
+        if shift > 0:
+            late = slice(shift, None)
+            early = slice(None, -shift)
+        else:
+            late = slice(None, shift)
+            early = slice(-shift, None)
         whole = episode[late] == episode[early]
         error = _error(ours[early][whole], theirs[late][whole])
         if whole.any() and error <= min(tolerance, 0.3 * best):
-            best, found = error, shift
+            best = error
+            found = shift
     return found

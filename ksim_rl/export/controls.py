@@ -35,7 +35,12 @@ def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
     if cfg is None:
         return None
     offset, spread = cfg.affine(size)
-    draw = "gaussian" if cfg.is_gaussian else "uniform" if any(spread) else "none"
+    if cfg.is_gaussian:
+        draw = "gaussian"
+    elif any(spread):
+        draw = "uniform"
+    else:
+        draw = "none"
     found = {"draw": draw, "offset": offset, "spread": spread, "operation": cfg.operation}
     walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
     errors = {"walk_std": walk, "resolution": grain, "dropout": cfg.dropout, "lost": cfg.lost}
@@ -92,7 +97,8 @@ def action_chain(cfg: ManagerBasedRlEnvCfg) -> list[Plain]:
     """Return what happens to an action on its way to the action terms, in this order."""
     found: list[Plain] = []
     for name, transform in reversed(list(cfg.transforms.items())):
-        kind, given = transform.transform, transform.arguments
+        kind = transform.transform
+        given = transform.arguments
         if kind is ActionDelay:
             found.append({"kind": "delay", **(lag(given["delay"]) or {}), "initial": given["initial"]})
         elif kind is ActionLowPass:
@@ -113,7 +119,8 @@ def actions(env: ManagerBasedRlEnv) -> list[Plain]:
 
     Raises NotDescribedError, naming the term, for one of a kind that this room does not know.
     """
-    found, start = [], 0
+    found = []
+    start = 0
     for name, term in env.cfg.actions.items():
         stop = start + env.action_manager.sizes[name]
         found.append({"name": name, "columns": [start, stop], **_action(term, name, env.view)})
@@ -136,14 +143,21 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
         return {"kind": "ctrl", "names": names, "limits": limits, **plain}
     if type(term) not in kinds:
         raise NotDescribedError(f"task.actions.{name}: {type(term).__name__} has no description")
-    names, kind = joint_names(view, term.joints), kinds[type(term)]
-    alpha = smoothing(term.cutoff_hz, view.step_dt) if term.cutoff_hz else None
+    names = joint_names(view, term.joints)
+    kind = kinds[type(term)]
+    if term.cutoff_hz:
+        alpha = smoothing(term.cutoff_hz, view.step_dt)
+    else:
+        alpha = None
     shared = {"clip": term.clip, "tanh": term.tanh, "alpha": alpha}
     offset = _numbers(view, term, "offset")
     if getattr(term, "use_default_offset", False):
         default = view.joints(term.joints).default_pos_EL[0].tolist()
         offset = [a + b for a, b in zip(offset, default, strict=True)]
-    limits_K2 = view.targets.limits("effort", term.joints) if kind == "effort" else None
+    if kind == "effort":
+        limits_K2 = view.targets.limits("effort", term.joints)
+    else:
+        limits_K2 = None
     found = {
         "kind": kind,
         "names": names,
@@ -160,12 +174,15 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
 
 def _numbers(view: EnvView, term: Any, field: str) -> list[float]:
     value: Any = per_joint(view, field, getattr(term, field), term.joints)
-    return [value] * len(view.joints(term.joints)) if isinstance(value, float) else value.tolist()
+    if isinstance(value, float):
+        return [value] * len(view.joints(term.joints))
+    return value.tolist()
 
 
 def actuators(env: ManagerBasedRlEnv) -> list[Plain]:
     """Return what drives the joints that have targets: laws that run before each substep, or MuJoCo's own."""
-    found, view = [], env.view
+    found = []
+    view = env.view
     explicit: set[str] = set()
     for name, robot in env.cfg.scene.entities.items():
         prefix = view.entity(name).prefix
@@ -196,7 +213,10 @@ def _law(actuator: Actuator, joints: list[str], view: EnvView) -> Plain:
         delay = lag(DelayCfg(min_lag=actuator.min_lag, max_lag=actuator.max_lag))
         actuator = actuator.actuator
     kinds = {IdealPDActuator: "ideal_pd", DCMotorActuator: "dc_motor"}
-    kind = "builtin" if isinstance(actuator, BuiltinActuator) else kinds.get(type(actuator))
+    if isinstance(actuator, BuiltinActuator):
+        kind = "builtin"
+    else:
+        kind = kinds.get(type(actuator))
     if kind is None:
         raise NotDescribedError(
             f"actuator {type(actuator).__name__} of {joints[0]!r} has no description: an export takes MuJoCo's "
@@ -213,15 +233,19 @@ def _of_actuators(view: EnvView, joints: Sequence[str], kind: TargetKind | None)
 
     Without a kind they are the motors of laws, one of each joint, whose controls are the laws' own.
     """
-    every, names = joint_names(view, None), view.resolver.names("actuator")
+    every = joint_names(view, None)
+    names = view.resolver.names("actuator")
     found: Plain = {"actuators": [], "scale": [], "offset": []}
     for joint in joints:
         number = every.index(joint)
         if kind is None:
-            actuator, scale, offset = view.targets.motor(number), 1.0, 0.0
+            actuator = view.targets.motor(number)
+            scale = 1.0
+            offset = 0.0
         else:
             actuator, control = view.targets.driven(kind, number)
-            scale, offset = control.scale, control.offset
+            scale = control.scale
+            offset = control.offset
         found["actuators"].append(names[actuator])
         found["scale"].append(scale)
         found["offset"].append(offset)

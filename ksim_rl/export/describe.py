@@ -68,7 +68,9 @@ def _add(kind: type[Term], make: Callable[[Any, EnvView], Node]) -> None:
 
 def into_root(term: Any, view: EnvView, vectors: Node) -> Node:
     """Return vectors in the axes of the frame of a term."""
-    return op("into", vectors, body=root(term, view)) if term.frame == "root" else vectors
+    if term.frame == "root":
+        return op("into", vectors, body=root(term, view))
+    return vectors
 
 
 def points(term: Any, view: EnvView, positions: Node) -> Node:
@@ -80,7 +82,12 @@ def points(term: Any, view: EnvView, positions: Node) -> Node:
 
 def joints(name: str, *fields: str) -> Callable[[Any, EnvView], Node]:
     """Return the description of a quantity of joints, with some fields of the term."""
-    return lambda t, v: quantity(name, joints=joint_names(v, t.joints), **{f: getattr(t, f) for f in fields})
+
+    def described(term: Any, view: EnvView) -> Node:
+        own = {field: getattr(term, field) for field in fields}
+        return quantity(name, joints=joint_names(view, term.joints), **own)
+
+    return described
 
 
 def contact(term: Any, field: str) -> Node:
@@ -279,7 +286,9 @@ def _pose(t: mdp.Pose, v: EnvView) -> Node:
     return op("exp", op("negative", op("mean", op("square", op("divide", _pos_rel(t, v), std)))))
 
 
-_pos_rel, _vel, _effort = joints("joint_pos_rel"), joints("joint_vel"), joints("joint_effort")
+_pos_rel = joints("joint_pos_rel")
+_vel = joints("joint_vel")
+_effort = joints("joint_effort")
 
 
 def _swing_height(t: mdp.FootSwingHeight, v: EnvView) -> Node:

@@ -36,7 +36,9 @@ def linear(value: Node, low: float, margin: float, value_at_margin: float = 0.0)
 
 def product(*of: Node) -> Node:
     """Return the product of some numbers."""
-    return of[0] if len(of) == 1 else op("multiply", of[0], product(*of[1:]))
+    if len(of) == 1:
+        return of[0]
+    return op("multiply", of[0], product(*of[1:]))
 
 
 def mean(one: Node, other: Node, weight: float = 1.0) -> Node:
@@ -55,7 +57,8 @@ def _reward(*_: Any) -> Node:
     small_control = mean(1.0, difference(1.0, op("square", force)), weight=4.0)
     speed = quantity("joint_vel", joints=["hinge"])
     small_velocity = mean(1.0, tolerance(speed, 0.0, 0.0, 5.0))
-    upright, centered = mean(1.0, op("cos", HINGE)), mean(1.0, tolerance(CART, 0.0, 0.0, 2.0))
+    upright = mean(1.0, op("cos", HINGE))
+    centered = mean(1.0, tolerance(CART, 0.0, 0.0, 2.0))
     return product(upright, centered, small_control, small_velocity)
 
 

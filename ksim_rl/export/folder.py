@@ -33,7 +33,8 @@ from ksim_rl.trainers.run_folder import Policy, policy_of
 STANDALONE = Path(__file__).parent / "standalone"
 PARTS = ("files", "signals", "network", "runner")
 """The modules of `runner.py`, in this order."""
-TRACED, TRACED_STEPS = 4, 60
+TRACED = 4
+TRACED_STEPS = 60
 FILES = (
     "policy.onnx",
     "policy.pt2",
@@ -70,7 +71,8 @@ def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **opti
         commit = sessions[-1].code.get("ksim_rl", {}).get("commit")
         options["trained_with"] = {"commit": commit, "versions": dict(sessions[-1].versions)}
     below = run_folder if folder is None else folder
-    folder = run_folder / "export" if folder is None else folder
+    if folder is None:
+        folder = run_folder / "export"
     check_folder(folder, below=below)
     for name in FILES:  # before minutes of work
         check_own(folder / name)
@@ -134,7 +136,8 @@ def _fill(
 ) -> None:
     """Write the files of an export into a folder that is empty."""
     cfg = dataclasses.replace(trained.cfg, task=dataclasses.replace(trained.cfg.task, curriculum={}))
-    seed = cfg.seed + EVALUATION_SEED_OFFSET if seed is None else seed
+    if seed is None:
+        seed = cfg.seed + EVALUATION_SEED_OFFSET
     env = build_env(cfg, num_envs=max(episodes, TRACED), seed=seed)
     ours = part(env, ManagerBasedRlEnv)
     assert ours is not None  # the env of a config is ours
@@ -185,10 +188,13 @@ def _fill(
         shared: dict[str, Any] = {"groups": groups, "order": order, "seed": seed}
         shared["joints"] = meta["joints"]["names"]
         shared["params"] = sorted({name for law in meta["actuators"] for name in law["numbers"]})
-        actor, steps = trained.actor, ours.max_episode_length or UNLIMITED_EPISODE_STEPS
+        actor = trained.actor
+        steps = ours.max_episode_length or UNLIMITED_EPISODE_STEPS
         recorded = Recording(env, ours, actor, steps=steps, **shared)
         figures = recorded.figures[:episodes]
-        meta["ours"] = {name: [one[name] for one in figures] for name in figures[0]}
+        meta["ours"] = {}
+        for name in figures[0]:
+            meta["ours"][name] = [one[name] for one in figures]
         np.savez_compressed(folder / "episodes.npz", **recorded.arrays)  # pyright: ignore
         env.eval()
         traced = Recording(env, ours, actor, steps=min(steps, TRACED_STEPS), traces=TRACED, **shared)
@@ -222,8 +228,10 @@ def metadata(
 
     `terms` are those that the policy observes. Raises NotDescribedError, naming the term, for an action or actuator.
     """
-    cfg, view = ours.cfg, ours.view
-    actions, laws = controls.actions(ours), controls.actuators(ours)
+    cfg = ours.cfg
+    view = ours.view
+    actions = controls.actions(ours)
+    laws = controls.actuators(ours)
     asked = list(dict.fromkeys(n for action in actions if action["kind"] != "ctrl" for n in action["names"]))
     names = [*asked, *(n for n in joint_names(view, None) if n not in asked)]
     left_out: list[str] = []
@@ -242,7 +250,10 @@ def metadata(
     ends = {name: term for name, term in cfg.terminations.items() if type(term).__name__ != "TimeOut"}
     means = {name: term for name, term in cfg.metrics.items() if term.reduce == "mean"}
     gains = _gains(ours, laws, names)
-    by_term = [view.joints(n).default_pos_EL[0].tolist() for n in (asked, names)] if names else [[], []]
+    if names:
+        by_term = [view.joints(n).default_pos_EL[0].tolist() for n in (asked, names)]
+    else:
+        by_term = [[], []]
     scales = [s for a in actions for s in np.broadcast_to(a["scale"], len(a["names"])).tolist()]
     sensors = {n: s for n, s in cfg.scene.sensors.items() if isinstance(s, ContactSensor)}
     return {
@@ -294,23 +305,29 @@ def _gains(
     ours: ManagerBasedRlEnv, laws: Sequence[Any], names: Sequence[str]
 ) -> tuple[list[float], list[float]]:
     """Return stiffness and damping by joint: of laws their numbers, of MuJoCo's servos the model's."""
-    model, found = ours.world.mj_model, dict.fromkeys(names, (0.0, 0.0))
+    model = ours.world.mj_model
+    found = dict.fromkeys(names, (0.0, 0.0))
     for law in laws:
         for k, (joint, actuator) in enumerate(zip(law["joints"], law["actuators"], strict=True)):
             control = joint_control(model, model.actuator(actuator).id)
-            stiffness, damping = control.stiffness, control.damping
+            stiffness = control.stiffness
+            damping = control.damping
             if "stiffness" in law["numbers"] and law["kind"] != "builtin":
-                stiffness, damping = (law["numbers"][name][k] for name in ("stiffness", "damping"))
+                stiffness = law["numbers"]["stiffness"][k]
+                damping = law["numbers"]["damping"][k]
             found[joint] = (stiffness, damping)
-    return [found[n][0] for n in names], [found[n][1] for n in names]
+    stiffness_of = [found[name][0] for name in names]
+    damping_of = [found[name][1] for name in names]
+    return stiffness_of, damping_of
 
 
 def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> dict[str, Any]:
     """Return soft limits of position, and of effort at the joint, behind the gear; null where there is none."""
-    model, limits = (
-        ours.world.mj_model,
-        ours.view.joints(list(names)).soft_limits_L2.tolist() if names else [],
-    )
+    model = ours.world.mj_model
+    if names:
+        limits = ours.view.joints(list(names)).soft_limits_L2.tolist()
+    else:
+        limits = []
     effort: dict[str, float] = {}
     for i in range(model.nu):
         if not drives_scalar_joint(model, i) or not model.actuator_forcelimited[i]:
@@ -319,7 +336,13 @@ def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> dict[str, Any]:
         effort[model.joint(joint).name] = float(
             abs(model.actuator_gear[i, 0]) * model.actuator_forcerange[i, 1]
         )
-    finite = [[None if not np.isfinite(edge) else edge for edge in pair] for pair in limits]
+    finite = []
+    for low, high in limits:
+        # JSON has no infinity.
+        edges = []
+        for edge in (low, high):
+            edges.append(edge if np.isfinite(edge) else None)
+        finite.append(edges)
     return {"position": finite, "effort": [effort.get(name) for name in names]}
 
 
@@ -344,5 +367,8 @@ def _attach(path: Path, meta: dict[str, Any]) -> None:
         entry = model.metadata_props.add()
         entry.key = key
         value = meta[key]
-        entry.value = ",".join(map(str, value)) if isinstance(value, list) else str(value)
+        if isinstance(value, list):
+            entry.value = ",".join(map(str, value))
+        else:
+            entry.value = str(value)
     onnx.save(model, path)

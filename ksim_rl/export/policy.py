@@ -22,7 +22,9 @@ from ksim_rl.modules.actor import PARAMETERS, MixedHead
 from ksim_rl.modules.network import ObservationNormalizer, side_by_side
 from ksim_rl.modules.recurrent import RESET_KEY, RecurrentModule
 
-TOLERANCE, CHECKED, ROWS = 1e-5, 10_000, 100
+TOLERANCE = 1e-5
+CHECKED = 10_000
+ROWS = 100
 OPSET = 18
 
 
@@ -70,8 +72,12 @@ class ExportedPolicy(nn.Module):
         self.parts = list(_parts(actor))
         self.groups = groups
         mixed = _mixed_head(self.parts[-1])
-        self.action_keys: list[Any] = mixed.action_keys if mixed else ["action"]
-        self.states, start = [], 0
+        if mixed:
+            self.action_keys: list[Any] = mixed.action_keys
+        else:
+            self.action_keys = ["action"]
+        self.states = []
+        start = 0
         for column in self.columns:
             if column.length > 1:
                 shape = ((column.length - 1) * column.stride, column.size)
@@ -103,7 +109,8 @@ class ExportedPolicy(nn.Module):
         self, obs_BL: Float[Tensor, "B L"], *states: Float[Tensor, "B *?S"]
     ) -> tuple[Float[Tensor, "B *?M"], ...]:
         """Return the actions and the next states."""
-        given, after = list(states), []
+        given = list(states)
+        after = []
         values: dict[Any, Tensor] = {}
         start = 0
         for group, columns in self.groups.items():
@@ -127,9 +134,13 @@ class ExportedPolicy(nn.Module):
                 actions = _best(part, values)
             else:
                 found = part.module(*(values[key] for key in part.in_keys))
-                found = found if isinstance(found, tuple) else (found,)
+                if not isinstance(found, tuple):
+                    found = (found,)
                 values |= dict(zip(part.out_keys, found, strict=True))
-                actions = [values["action"]] if "action" in part.out_keys else []
+                if "action" in part.out_keys:
+                    actions = [values["action"]]
+                else:
+                    actions = []
         return torch.cat([_row(action) for action in actions], -1), *after
 
 
@@ -153,9 +164,13 @@ def _parts(module: Any) -> Iterator[Any]:
 def _best(part: Any, values: dict[Any, Tensor]) -> list[Tensor]:
     """Return the deterministic action of each distribution, as `ExplorationType.DETERMINISTIC` does."""
     if mixed := _mixed_head(part):
-        found, heads = [], cast(Any, mixed.heads)
+        found = []
+        heads = cast(Any, mixed.heads)
         for key, head in zip(mixed.action_keys, heads, strict=True):
-            path = (PARAMETERS, key) if isinstance(key, str) else (PARAMETERS, *key)
+            if isinstance(key, str):
+                path = (PARAMETERS, key)
+            else:
+                path = (PARAMETERS, *key)
             parameters = {name: values[(*path, name)] for name in head.parameter_names}
             found.append(head.distribution(**parameters).deterministic_sample)
         return found
@@ -165,7 +180,9 @@ def _best(part: Any, values: dict[Any, Tensor]) -> list[Tensor]:
 
 def _mixed_head(part: Any) -> MixedHead | None:
     owner = getattr(getattr(part, "distribution_class", None), "__self__", None)
-    return owner if isinstance(owner, MixedHead) else None
+    if isinstance(owner, MixedHead):
+        return owner
+    return None
 
 
 def _row(action: Tensor) -> Tensor:
@@ -176,9 +193,11 @@ def _recurrent(
     part: RecurrentModule, values: dict[Any, Tensor], state: list[Tensor]
 ) -> tuple[Tensor, list[Tensor]]:
     """Return the features and the state [B, N, H] after one step, by the formulas of `torch.nn.LSTM` and `GRU`."""
-    network, cfg = part.module, part.cfg
+    network = part.module
+    cfg = part.cfg
     features = side_by_side([values[key] for key in part.obs_keys])
-    features = features if network.normalizer is None else network.normalizer(features)
+    if network.normalizer is not None:
+        features = network.normalizer(features)
     after: list[tuple[Tensor, ...]] = []
     for layer in range(cfg.num_layers):
         weights = [
@@ -193,8 +212,10 @@ def _recurrent(
             features = o.sigmoid() * cell.tanh()
             after.append((features, cell))
         else:
-            (rx, zx, nx), (rh, zh, nh) = x.chunk(3, -1), h.chunk(3, -1)
-            r, z = (rx + rh).sigmoid(), (zx + zh).sigmoid()
+            (rx, zx, nx) = x.chunk(3, -1)
+            (rh, zh, nh) = h.chunk(3, -1)
+            r = (rx + rh).sigmoid()
+            z = (zx + zh).sigmoid()
             n = (nx + r * nh).tanh()
             features = n + z * (state[0][:, layer] - n)
             after.append((features,))
@@ -254,7 +275,8 @@ def greatest_difference(policy: ExportedPolicy, path: Path) -> float:
     import onnxruntime  # an extra
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    draws, worst = np.random.default_rng(0), 0.0
+    draws = np.random.default_rng(0)
+    worst = 0.0
     mean, std = _statistics(policy)
     carried: dict[Any, Tensor] = {}
     states: list[np.ndarray] = []
@@ -293,11 +315,13 @@ def greatest_difference(policy: ExportedPolicy, path: Path) -> float:
 
 def _statistics(policy: ExportedPolicy) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and std of one frame, [L] each; 0 and 1 without a normalizer that covers it."""
-    mean, std = np.zeros(policy.obs_dim), np.ones(policy.obs_dim)
+    mean = np.zeros(policy.obs_dim)
+    std = np.ones(policy.obs_dim)
     for module in policy.actor.modules():
         whole = sum(column.size * column.length for column in policy.columns)
         if isinstance(module, ObservationNormalizer) and module.dim == whole:
-            newest, stop = [], 0
+            newest = []
+            stop = 0
             for column in policy.columns:
                 stop += column.size * column.length
                 newest += range(stop - column.size, stop)

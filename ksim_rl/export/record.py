@@ -41,8 +41,11 @@ class Recording:
         seed: int,
         traces: int = 0,
     ) -> None:
-        self._ours, self._pushes, self._now = ours, [], 0
-        self._joints, every = list(joints), list(ours.view.joints().names)
+        self._ours = ours
+        self._pushes = []
+        self._now = 0
+        self._joints = list(joints)
+        every = list(ours.view.joints().names)
         self._columns = [every.index(name) for name in joints]
         sensors = ours.cfg.scene.sensors.items()
         self._sensors = [name for name, sensor in sensors if isinstance(sensor, ContactSensor)]
@@ -106,7 +109,8 @@ class Recording:
         return found
 
     def _start(self, order: Sequence[int], params: Sequence[str]) -> Arrays:
-        view, world = self._ours.view, self._ours.world
+        view = self._ours.view
+        world = self._ours.world
         found = self._state(order) | {"ctrl": world.ctrl_EL[:, list(order)]}
         if world.mj_model.nmocap:
             found |= {name: world.view(name) for name in ("mocap_pos", "mocap_quat")}
@@ -116,7 +120,8 @@ class Recording:
         for name, value in world.per_world_fields().items():
             if name not in (*FIELDS, CHOICE, "gravity"):
                 continue  # that which only pictures show
-            value = value[:, list(order)] if name.startswith("actuator_") else value
+            if name.startswith("actuator_"):
+                value = value[:, list(order)]
             found["gravity" if name == "gravity" else f"model/{name}"] = value
         return {f"start/{name}": value.detach().cpu().numpy().copy() for name, value in found.items()}
 
@@ -134,7 +139,8 @@ class Recording:
         }
 
     def _add(self, done_E: Tensor) -> None:
-        view, metrics = self._ours.view, self._ours.metric_manager
+        view = self._ours.view
+        metrics = self._ours.metric_manager
         step_E = view.episode_step_E.float()
         now = {f"reward/{name}": value_E for name, value_E in view.episode_rewards.items()}
         now["return"] = sum(now.values(), torch.zeros_like(step_E))

@@ -63,7 +63,10 @@ def activation_order(mj_model: mujoco.MjModel, order: Sequence[int]) -> list[int
 
 def _bring_files(root: ElementTree.Element, source: Path, folder: Path) -> None:
     compiler = root.find("compiler")
-    folders = {} if compiler is None else dict(compiler.attrib)
+    if compiler is None:
+        folders = {}
+    else:
+        folders = dict(compiler.attrib)
     for tag, directory in (("mesh", "meshdir"), ("hfield", "meshdir"), ("texture", "texturedir")):
         for element in root.iter(tag):
             for field, name in [(k, v) for k, v in element.items() if k.startswith("file")]:

@@ -41,7 +41,9 @@ class Report:
     @property
     def return_ratio(self) -> float:
         """Their mean return by ours, both of the reward terms that the export describes."""
-        return self.theirs["return"] / self.ours["return"] if self.ours["return"] else float("nan")
+        if self.ours["return"]:
+            return self.theirs["return"] / self.ours["return"]
+        return float("nan")
 
     def table(self) -> str:
         """Return the report as text."""
@@ -52,14 +54,22 @@ class Report:
         for name, value in self.theirs.items():
             if name in self.ours:
                 own = self.ours[name]
-                share = f"{value / own - 1.0:+.1%}" if abs(own) > 1e-6 else f"{value - own:+.3g}"
+                if abs(own) > 1e-6:
+                    share = f"{value / own - 1.0:+.1%}"
+                else:
+                    share = f"{value - own:+.3g}"
                 lines.append(f"{name:<44}{own:>12.4g}{value:>12.4g}{share:>12}")
         lines += [f"left out, since it has no description: {name}" for name in self.left_out]
         lines.append(f"return ratio {self.return_ratio:.4f} +- {self.standard_error:.4f} (standard error)")
-        lines += ["likely causes:", *(f"  {cause}" for cause in self.causes)] if self.causes else []
-        if not self.causes:
+        if self.causes:
+            lines.append("likely causes:")
+            lines += [f"  {cause}" for cause in self.causes]
+        else:
             beyond = abs(self.return_ratio - 1.0) > 3.0 * self.standard_error + 1e-3
-            what = "but the returns differ by more than chance" if beyond else "what differs above is chance"
+            if beyond:
+                what = "but the returns differ by more than chance"
+            else:
+                what = "what differs above is chance"
             lines.append(
                 f"single steps agree: {what}; export with --no-noise compares without the sensors' noise"
             )
@@ -100,7 +110,10 @@ def sim2sim(
     # The same episodes on both sides, in pairs, and returns of the same terms.
     pairs = np.arange(episodes) % len(ours["return"])
     own = {name: values[pairs] for name, values in ours.items() if name.startswith(TABLE)}
-    theirs = {name: np.array([one[name] for one in found]) for name in found[0] if name.startswith(TABLE)}
+    theirs = {}
+    for name in found[0]:
+        if name.startswith(TABLE):
+            theirs[name] = np.array([one[name] for one in found])
     described = [own[name] for name in own if name.startswith("reward/") and name in theirs]
     own["return"] = np.sum(described, axis=0) if described else np.zeros(episodes)
     return Report(
@@ -137,7 +150,10 @@ def _recorded(meta: Mapping[str, Any], folder: Path) -> dict[str, np.ndarray]:
             f"{folder}: exported without episodes: export the run once more, with --episodes 100"
         )
     returns = ours["return"]
-    count = len(returns) if isinstance(returns, list) else 0
+    if isinstance(returns, list):
+        count = len(returns)
+    else:
+        count = 0
     found = {}
     for name, values in ours.items():
         numbers = isinstance(values, list) and all(isinstance(value, int | float) for value in values)

@@ -39,9 +39,10 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
         version = np.lib.format.read_magic(file)
         if version not in ((1, 0), (2, 0)):
             raise ValueError(f"{entry.filename}: a format of arrays that is not known, {version}")
-        reads = (
-            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        )
+        if version == (1, 0):
+            reads = np.lib.format.read_array_header_1_0
+        else:
+            reads = np.lib.format.read_array_header_2_0
         shape, in_columns, dtype = reads(file)
         if dtype.hasobject:
             raise ValueError(f"{entry.filename}: an array of objects, which are pickles")

@@ -12,7 +12,8 @@ MOST_TEXT_BYTES = 128 * 2**20  # recordings, tables of metrics
 MOST_MODEL_BYTES = 64 * 2**20  # the text of a model
 MOST_CONFIG_BYTES = 2**19  # YAML, of which a config of ours has some 20 kB
 # A file that takes next to nothing on the disk, and claims more than this, was made to fill memory.
-MOST_SPARSE_BYTES, LEAST_SHARE = 64 * 2**20, 0.01
+MOST_SPARSE_BYTES = 64 * 2**20
+LEAST_SHARE = 0.01
 
 
 def open_regular(path: Path, *, limit: int, follows_links: bool = False) -> BinaryIO:

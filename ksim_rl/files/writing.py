@@ -72,7 +72,10 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a text or bytes into a file that appears once it is whole."""
-    data = content.encode() if isinstance(content, str) else content
+    if isinstance(content, str):
+        data = content.encode()
+    else:
+        data = content
     with whole_file(path) as temporary:
         temporary.write_bytes(data)
 

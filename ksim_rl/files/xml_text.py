@@ -36,4 +36,6 @@ def _encoding(data: bytes) -> str:
         if data.startswith(mark):
             return encoding
     declared = _DECLARED.match(data)
-    return declared[1].decode() if declared else "utf-8"
+    if declared:
+        return declared[1].decode()
+    return "utf-8"

@@ -16,7 +16,8 @@ from ksim_rl.physics.sim_cfg import SimCfg
 
 # On what poses of the probe needed: half as much again for rows and contacts, less for candidate pairs, which all
 # worlds share. On what its falls needed, and an env's rehearsal: less, since these go on as an episode does.
-MARGIN, PAIR_MARGIN = 1.5, 1.2
+MARGIN = 1.5
+PAIR_MARGIN = 1.2
 FALLS_MARGIN = REHEARSED_MARGIN = 1.25
 EXTRA = 4
 MULTIPLE = 8
@@ -29,7 +30,11 @@ DROP_STEPS = 50
 DEPTH = 0.02
 # Falls, their steps, the steps between new controls, the speed at first (of each degree of freedom, rad/s or m/s), and
 # how much heavier everything is in the second half.
-FALLS, FALL_STEPS, HOLD, FALL_SPEED, PRESSURE = 24, 200, 10, 1.0, 3.0
+FALLS = 24
+FALL_STEPS = 200
+HOLD = 10
+FALL_SPEED = 1.0
+PRESSURE = 3.0
 # Degrees of freedom, geoms and vertices of flexes, times steps of all falls: about a second.
 MOST_WORK = 1_200_000
 
@@ -76,7 +81,8 @@ def remember(
     probed = _rubbing(mj_model, per_world_fields)
     key = _key(probed)
     njmax, nconmax = probe(probed)
-    wanted_njmax, wanted_nconmax = njmax, nconmax
+    wanted_njmax = njmax
+    wanted_nconmax = nconmax
     if sim.njmax is None and any(report.worlds[name] for name in OF_ROWS):
         needed = max(report.nefc, report.njmax)
         wanted_njmax = max(njmax, _round_up(REHEARSED_MARGIN * needed))
@@ -104,7 +110,8 @@ def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
     key = _key(mj_model)
     if key not in _cache:
         with caught_warnings():
-            posed, fallen = Need(mj_model), Need(mj_model)
+            posed = Need(mj_model)
+            fallen = Need(mj_model)
             _look_at_poses(mj_model, posed)
             _look_at_falls(mj_model, fallen)
         rows = max(
@@ -133,7 +140,8 @@ def _round_up(needed: float) -> int:
 
 def _most_limits(mj_model: mujoco.MjModel) -> int:
     """Return how many limits may have a row at once: both of one joint where its range is within its margins."""
-    joints, margin = mj_model.jnt_limited.astype(bool), mj_model.jnt_margin
+    joints = mj_model.jnt_limited.astype(bool)
+    margin = mj_model.jnt_margin
     is_narrow = joints & (np.ptp(mj_model.jnt_range, axis=1) < 2.0 * margin)
     return int(joints.sum() + is_narrow.sum() + mj_model.tendon_limited.sum())
 
@@ -197,7 +205,10 @@ def _look_at_falls(mj_model: mujoco.MjModel, need: Need) -> None:
     heavy.opt.gravity *= PRESSURE
     is_moving = mj_model.body_weldid[mj_model.geom_bodyid] != 0
     mujoco.mj_kinematics(mj_model, mj_data)
-    size = float(np.ptp(mj_data.geom_xpos[is_moving], axis=0).max(initial=0.0)) if is_moving.any() else 0.0
+    if is_moving.any():
+        size = float(np.ptp(mj_data.geom_xpos[is_moving], axis=0).max(initial=0.0))
+    else:
+        size = 0.0
     work = mj_model.nv + mj_model.ngeom + mj_model.nflexvert + 1
     steps = min(FALL_STEPS, max(1, MOST_WORK // (FALLS * work)))
     for index, qpos in enumerate(random_qpos(mj_model, FALLS, rng)):
@@ -236,8 +247,10 @@ class CandidatePairs:
     def __init__(self, mj_model: mujoco.MjModel) -> None:
         self.mj_model = mj_model
         first, second = np.triu_indices(mj_model.ngeom, k=1)
-        body_1, body_2 = mj_model.geom_bodyid[first], mj_model.geom_bodyid[second]
-        weld_1, weld_2 = mj_model.body_weldid[body_1], mj_model.body_weldid[body_2]
+        body_1 = mj_model.geom_bodyid[first]
+        body_2 = mj_model.geom_bodyid[second]
+        weld_1 = mj_model.body_weldid[body_1]
+        weld_2 = mj_model.body_weldid[body_2]
         parent_1 = mj_model.body_weldid[mj_model.body_parentid[weld_1]]
         parent_2 = mj_model.body_weldid[mj_model.body_parentid[weld_2]]
         affine = (mj_model.geom_contype[first] & mj_model.geom_conaffinity[second]) | (

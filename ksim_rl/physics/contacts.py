@@ -48,7 +48,7 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
     upstream.measure_without_contacts(warp_model)
     # The next one takes pairs away.
     ways = (take_over_height_fields, take_over_measured_boxes, rows_left_out)
-    always = tuple(hook for hook in (way(warp_model) for way in ways) if hook)
+    always = tuple(filter(None, [way(warp_model) for way in ways]))
     of_theirs = corrections(warp_model, warp_model.nxn_geom_pair_filtered, warp_model.nxn_pairid_filtered)
     loosen = loose_contacts(warp_model)
     at_last = () if loosen is None else (loosen,)
@@ -93,7 +93,8 @@ def _have_boxes_on_planes(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np
 
 def take_the_law_of_priority(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     """Launch what gives contacts the `solref` of the geom with priority, which our own narrow phase does itself."""
-    m, contact = warp_model, warp_data_E.contact
+    m = warp_model
+    contact = warp_data_E.contact
     inputs = [m.geom_priority, m.geom_solref, m.pair_geom1, m.pair_geom2]
     inputs += [contact.geom, contact.worldid, warp_data_E.nacon]
     dim = warp_data_E.naconmax
@@ -125,8 +126,10 @@ def rows_left_out(warp_model: mjw.Model) -> Hook | None:
     of_geoms = wp.array(rigid_body, dtype=int)
 
     def leave_out(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-        contact, nacon = warp_data_E.contact, warp_data_E.nacon
-        inputs, outputs = [of_geoms, contact.geom, nacon], [contact.includemargin, contact.adhesion]
+        contact = warp_data_E.contact
+        nacon = warp_data_E.nacon
+        inputs = [of_geoms, contact.geom, nacon]
+        outputs = [contact.includemargin, contact.adhesion]
         wp.launch(kernels.leave_out_rows, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
 
     return leave_out
@@ -149,7 +152,8 @@ def loose_contacts(warp_model: mjw.Model) -> Hook | None:
 
     def loosen(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
         contact = warp_data_E.contact
-        inputs, outputs = [contact.type, warp_data_E.nacon], [contact.adhesion]
+        inputs = [contact.type, warp_data_E.nacon]
+        outputs = [contact.adhesion]
         wp.launch(kernels.loosen_rowless, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
 
     return loosen

@@ -87,7 +87,10 @@ def write_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> 
 
 def _copy_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> None:
     for name, value in fields.items():
-        target = mj_model.opt.gravity if name == GRAVITY else getattr(mj_model, name, None)
+        if name == GRAVITY:
+            target = mj_model.opt.gravity
+        else:
+            target = getattr(mj_model, name, None)
         # A few of MuJoCo Warp's fields are its own, or laid out otherwise.
         if target is not None and target.size == value.size:
             target[:] = value.reshape(target.shape)

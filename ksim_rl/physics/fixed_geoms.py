@@ -31,7 +31,8 @@ def placing_of_fixed_geoms(
     warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
     """Return what launches it, with arrays in their final place; None where no field of `expanded` moves any."""
-    m, d = warp_model, warp_data_E
+    m = warp_model
+    d = warp_data_E
     ids = np.flatnonzero(fixed_geoms(m))
     if not FIELDS.intersection(expanded) or not ids.size:
         return None

@@ -75,7 +75,8 @@ def _parsed(source: Source) -> tuple[mujoco.MjSpec, str, str, list[str]]:
             )
         return source.copy(), "", _labels.get(source, f"model {source.modelname!r}"), []
     read = read_source(source)
-    text, label = read.text, read.label
+    text = read.text
+    label = read.label
     if is_urdf(text):
         with naming(label):
             text = ready_urdf(text, read.folder)
@@ -110,7 +111,10 @@ def _readable(message: str, label: str, text: str) -> str:
     if found := _ELEMENT.search(message):
         return f"{label}: {what} (element <{found['tag']}>{_at_line(text, int(found['line']))})"
     if found := _NAMED_ELEMENT.search(message):
-        called = f"{found['name']!r}" if found["name"] else f"number {found['id']} (unnamed)"
+        if found["name"]:
+            called = f"{found['name']!r}"
+        else:
+            called = f"number {found['id']} (unnamed)"
         return f"{label}: {what} (element {called}{_at_line(text, int(found['line'] or 0))})"
     if found := _FILE_IN_MESSAGE.search(message):
         lines = [number for number, line in enumerate(text.splitlines(), 1) if found["file"] in line]

@@ -34,7 +34,8 @@ _FIELDS = (
     "dof_damping dof_frictionloss dof_armature tendon_damping tendon_frictionloss geom_friction pair_friction "
     "actuator_damping"
 )
-NOT_NEGATIVE_OPTIONS, NOT_NEGATIVE_FIELDS = tuple(_OPTIONS.split()), tuple(_FIELDS.split())
+NOT_NEGATIVE_OPTIONS = tuple(_OPTIONS.split())
+NOT_NEGATIVE_FIELDS = tuple(_FIELDS.split())
 CALLBACKS = {field: getattr(mujoco, f"get_mjcb_act_{field}") for field in ("dyn", "gain", "bias")}
 FREE = mujoco.mjtJoint.mjJNT_FREE
 
@@ -158,7 +159,8 @@ def _constraint_of_still_tendon(mj_model: mujoco.MjModel, tendon: int, still: Co
     m = mj_model
     if m.tendon_frictionloss[tendon] > 0.0:
         return "it has a frictionloss"
-    length, margin = m.tendon_length0[tendon], m.tendon_margin[tendon]
+    length = m.tendon_length0[tendon]
+    margin = m.tendon_margin[tendon]
     low, high = m.tendon_range[tendon]
     if m.tendon_limited[tendon] and (length - low < margin or high - length < margin):
         return f"its length, {length:.3g}, violates its range"
@@ -174,7 +176,8 @@ def _is_still(mj_model: mujoco.MjModel, tendon: int) -> bool:
     first = mj_model.tendon_adr[tendon]
     bodies = set()
     for wrap in range(first, first + mj_model.tendon_num[tendon]):
-        kind, owner = mj_model.wrap_type[wrap], mj_model.wrap_objid[wrap]
+        kind = mj_model.wrap_type[wrap]
+        owner = mj_model.wrap_objid[wrap]
         if kind == mujoco.mjtWrap.mjWRAP_JOINT:
             return False
         if kind == mujoco.mjtWrap.mjWRAP_SITE:
@@ -235,9 +238,11 @@ def _element_of(mj_model: mujoco.MjModel, field: str, flat_index: int, shape: tu
     row = flat_index // max(1, int(np.prod(shape[1:])))
     prefix = field.split("_")[0]
     if prefix == "dof":
-        prefix, row = "jnt", int(mj_model.dof_jntid[row])
+        prefix = "jnt"
+        row = int(mj_model.dof_jntid[row])
     elif field in ("qpos0", "qpos_spring"):
-        prefix, row = "jnt", int(np.searchsorted(mj_model.jnt_qposadr, row, side="right")) - 1
+        prefix = "jnt"
+        row = int(np.searchsorted(mj_model.jnt_qposadr, row, side="right")) - 1
     return _element(mj_model, prefix, row)
 
 
@@ -247,7 +252,9 @@ def _element(mj_model: mujoco.MjModel, prefix: str, row: int) -> str:
     if not kind:
         return f"row {row}"
     name = mujoco.mj_id2name(mj_model, kind, row)
-    return f"{word} {name!r}" if name else f"{word} number {row} (unnamed)"
+    if name:
+        return f"{word} {name!r}"
+    return f"{word} number {row} (unnamed)"
 
 
 def _with_elements(mj_model: mujoco.MjModel, message: str) -> str:
@@ -262,7 +269,10 @@ def _with_elements(mj_model: mujoco.MjModel, message: str) -> str:
         users += [_element(mj_model, "actuator", int(i)) for i in plugins]
     for name in ("Integrator", "Cone", "Solver", "DisableBit", "EnableBit"):
         users += ["<option>" for member in getattr(mujoco, f"mjt{name}").__members__ if member in message]
-    used_by = f" Used by {', '.join(users[:5])}." if users else ""
+    if users:
+        used_by = f" Used by {', '.join(users[:5])}."
+    else:
+        used_by = ""
     remedy = "Remove it from the model, or replace it by a supported feature."
     if "mjSOL_" in message:
         remedy = (

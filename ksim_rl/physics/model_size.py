@@ -119,7 +119,8 @@ def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> t
     times = [1]
     read.folders.add(folder)
     for found in _TAG.finditer(text):
-        tag, attributes = found["tag"], _attributes(found["rest"] or "")
+        tag = found["tag"]
+        attributes = _attributes(found["rest"] or "")
         if tag is None:
             continue
         read.below |= {attributes[name] for name in _FOLDERS if name in attributes}
@@ -157,7 +158,8 @@ def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> t
             if tag == "model":
                 largest_model = max(largest_model, inner)
             else:
-                elements, numbers = elements + inner[0] * times[-1], numbers + inner[1]
+                elements = elements + inner[0] * times[-1]
+                numbers = numbers + inner[1]
     elements += attachments * largest_model[0]
     return elements, numbers + attachments * largest_model[1] + user * elements
 

@@ -52,7 +52,9 @@ def launcher(
     values = {name.upper(): int(value) for name, value in constants.items()}
     values |= {"LANES": lanes, "THREADS": threads}
     kernel, struct = _kernel(source, tuple(values.items()), types, threads, fast_math, max_registers)
-    problem, dim, device = filled(struct, *owners), (warp_data_E.nworld, lanes), warp_data_E.qpos.device
+    problem = filled(struct, *owners)
+    dim = (warp_data_E.nworld, lanes)
+    device = warp_data_E.qpos.device
 
     def launch(**changes: Any) -> None:
         for name, value in changes.items():
@@ -63,7 +65,9 @@ def launcher(
 
 
 def _type_of(value: Any) -> Any:
-    return _ARRAYS[value.ndim][value.dtype] if isinstance(value, wp.array) else type(value)
+    if isinstance(value, wp.array):
+        return _ARRAYS[value.ndim][value.dtype]
+    return type(value)
 
 
 @functools.cache

@@ -21,7 +21,8 @@ OUT_OF = {
     "OUT_OF_CONTACTS": int(mjw.OverflowType.NARROWPHASE),
 }
 # What njmax makes room for, and nconmax.
-OF_ROWS, OF_POOL = ("NEFC", "NJMAX_NNZ"), ("BROADPHASE", "NARROWPHASE", "CCD")
+OF_ROWS = ("NEFC", "NJMAX_NNZ")
+OF_POOL = ("BROADPHASE", "NARROWPHASE", "CCD")
 # In the order of the bits, lowest first.
 BIT_NAMES = tuple(name for name, bit in mjw.OverflowType.__members__.items() if bit and bit & (bit - 1) == 0)
 
@@ -98,7 +99,11 @@ class OverflowRecord:
     """
 
     def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-        self._warp_data_E, threads = warp_data_E, 128 if warp_data_E.qpos.device.is_cuda else 1
+        self._warp_data_E = warp_data_E
+        if warp_data_E.qpos.device.is_cuda:
+            threads = 128
+        else:
+            threads = 1
         sizes = {"sticky": warp_data_E.nworld, "most_nefc": warp_data_E.nworld, "most_pool": 2}
         self.arrays = {name: wp.zeros(size, dtype=int) for name, size in sizes.items()}
         self.sticky_E, self.most_nefc_E, self.most_pool = map(wp.to_torch, self.arrays.values())
@@ -127,7 +132,8 @@ class OverflowRecord:
         """Say what `counts`, read on the host, mean."""
         d = self._warp_data_E
         worlds = dict(zip(BIT_NAMES, numbers, strict=False))
-        nefc, ncon = numbers[len(BIT_NAMES)], max(numbers[len(BIT_NAMES) + 1 :])
+        nefc = numbers[len(BIT_NAMES)]
+        ncon = max(numbers[len(BIT_NAMES) + 1 :])
         return OverflowReport(
             worlds=worlds, nefc=nefc, njmax=d.njmax, ncon=ncon, naconmax=d.naconmax, num_envs=d.nworld
         )

@@ -13,15 +13,22 @@ def random_qpos(mj_model: mujoco.MjModel, num_states: int, rng: np.random.Genera
     """Draw poses [num_states, nq]: joints within their limits (else within a turn or a metre), any orientation."""
     qpos = np.tile(mj_model.qpos0, (num_states, 1))
     for joint in range(mj_model.njnt):
-        adr, kind = int(mj_model.jnt_qposadr[joint]), mj_model.jnt_type[joint]
+        adr = int(mj_model.jnt_qposadr[joint])
+        kind = mj_model.jnt_type[joint]
         if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            start = adr + 3 if kind == mujoco.mjtJoint.mjJNT_FREE else adr
+            if kind == mujoco.mjtJoint.mjJNT_FREE:
+                start = adr + 3
+            else:
+                start = adr
             quat = rng.normal(size=(num_states, 4))
             qpos[:, start : start + 4] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
         elif mj_model.jnt_limited[joint]:
             qpos[:, adr] = rng.uniform(*mj_model.jnt_range[joint], size=num_states)
         else:
-            reach = math.pi if kind == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+            if kind == mujoco.mjtJoint.mjJNT_HINGE:
+                reach = math.pi
+            else:
+                reach = 1.0
             qpos[:, adr] += rng.uniform(-reach, reach, size=num_states)
     return qpos
 
@@ -94,7 +101,8 @@ def _highest_solid(
     if not others.any():
         return -np.inf
     highest = (mj_data.geom_xpos[others, 2] + mj_model.geom_rbound[others]).max() + 1.0
-    start, down = np.array([point[0], point[1], highest]), np.array([0.0, 0.0, -1.0])
+    start = np.array([point[0], point[1], highest])
+    down = np.array([0.0, 0.0, -1.0])
     hit = np.zeros(1, dtype=np.int32)
     # Rays hit what moves and what does not collide, too: then they go on below it.
     for _ in range(mj_model.ngeom):
@@ -130,7 +138,8 @@ def _ground_heights(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndar
 def _lowest_points(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarray:
     """Return the height of each geom's lowest point, in m; for other than round geoms, that of its bounding box."""
     up = mj_data.geom_xmat.reshape(-1, 3, 3)[:, 2]
-    center, half = mj_model.geom_aabb[:, :3], mj_model.geom_aabb[:, 3:]
+    center = mj_model.geom_aabb[:, :3]
+    half = mj_model.geom_aabb[:, 3:]
     box = mj_data.geom_xpos[:, 2] + (up * center).sum(1) - (np.abs(up) * half).sum(1)
     radius = mj_model.geom_size[:, 0]
     length = np.where(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE, mj_model.geom_size[:, 1], 0.0)

@@ -42,7 +42,8 @@ class RayBatch:
         shape = (world.num_envs, num_rays)
         with warp_scope(world.device):
             self._start, self._direction, self._normal = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
-            self._distance, self._geom = wp.zeros(shape, dtype=float), wp.zeros(shape, dtype=int)
+            self._distance = wp.zeros(shape, dtype=float)
+            self._geom = wp.zeros(shape, dtype=int)
             self._exclude = wp.array(np.full(num_rays, exclude_body, dtype=np.int32), dtype=int)
         self.start_EN3, self.direction_EN3 = wp.to_torch(self._start), wp.to_torch(self._direction)
         self.distance_EN, self.normal_EN3 = wp.to_torch(self._distance), wp.to_torch(self._normal)
@@ -62,7 +63,8 @@ class RayBatch:
 
     def _launch(self, world: WarpWorld) -> None:
         found = self._distance, self._geom, self._normal
-        m, d = world.warp_model, world.warp_data_E
+        m = world.warp_model
+        d = world.warp_data_E
         mjw.rays(m, d, self._start, self._direction, self._groups, True, self._exclude, *found)
 
 
@@ -90,8 +92,10 @@ class BatchCamera:
             raise ValueError(
                 f"camera {camera!r} draws pictures of all worlds by MuJoCo Warp: choose sim.engine='warp'"
             )
-        self._world, self._camera = world, camera
-        model, fields = world.mj_model, world.per_world_fields()
+        self._world = world
+        self._camera = camera
+        model = world.mj_model
+        fields = world.per_world_fields()
         world.view("cam_xpos")  # so that refreshes place cameras and lights
         with warp_scope(world.device):
             self._context = mjw.create_render_context(
@@ -134,6 +138,7 @@ class BatchCamera:
         return wp.to_torch(self._context.seg_data).view(*self._shape, 2)
 
     def _launch(self) -> None:
-        m, d = self._world.warp_model, self._world.warp_data_E
+        m = self._world.warp_model
+        d = self._world.warp_data_E
         mjw.refit_bvh(m, d, self._context)
         mjw.render(m, d, self._context)

@@ -68,7 +68,9 @@ def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Call
 
     `mjw.reset_data` must have run once: what sleeps or is awake stays as it is, unless the model has more.
     """
-    m, d, contact = warp_model, warp_data_E, warp_data_E.contact
+    m = warp_model
+    d = warp_data_E
+    contact = warp_data_E.contact
     names = {field.name for field in dataclasses.fields(contact)} - {"worldid", "efc_address"}
     device = d.qpos.device
 
@@ -79,7 +81,10 @@ def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Call
         return places, wp.array(widths, dtype=int, device=device)
 
     # A body that something adheres to has no contacts after a reset.
-    of_adhesion = ("actuator_moment",) if m.nacttrnbody else ()
+    if m.nacttrnbody:
+        of_adhesion = ("actuator_moment",)
+    else:
+        of_adhesion = ()
     of_worlds = table([getattr(d, name) for name in (*ZEROED, *of_adhesion)], d.nworld)
     of_pool = table([getattr(contact, name) for name in sorted(names)], d.naconmax)
     has_more = any(getattr(m, name) for name in HAS_MORE) or bool(m.opt.enableflags & mjw.EnableBit.SLEEP)

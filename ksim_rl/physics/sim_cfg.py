@@ -71,7 +71,10 @@ class SimCfg(Checked):
 
     def apply_to(self, target: mujoco.MjSpec | mujoco.MjModel) -> None:
         """Write the settings that are not `None` into the options of a spec or a model, in place."""
-        option = target.option if isinstance(target, mujoco.MjSpec) else target.opt
+        if isinstance(target, mujoco.MjSpec):
+            option = target.option
+        else:
+            option = target.opt
         for field in ("timestep", "impratio", "tolerance", "iterations", "ls_iterations", "ccd_iterations"):
             value = getattr(self, field)
             if value is not None:

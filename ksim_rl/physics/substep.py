@@ -93,7 +93,10 @@ def _launch_our_dynamics(
 ) -> None:
     # Where dynamics alone fill a GPU, placing bodies twice, for collisions first, takes longer than it saves.
     at_once = aside is not None and warp_data_E.nworld <= FEW_WORLDS
-    rest = [partial(dynamics, places_geoms=False)] if at_once else []
+    if at_once:
+        rest = [partial(dynamics, places_geoms=False)]
+    else:
+        rest = []
     with beside(aside, partial(stages.solve, solves=False), *rest):
         dynamics(goes_on=not at_once)
         if warp_model.opt.run_collision_detection:

@@ -66,7 +66,10 @@ class Substeps:
         self._place_fixed_geoms = placing_of_fixed_geoms(warp_model, warp_data_E, expanded)
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())
         limits = LimitSensors(mj_model, warp_model, warp_data_E)
-        dynamics = smooth_dynamics(warp_model, warp_data_E, mask=mask) if one_kernel_dynamics else None
+        if one_kernel_dynamics:
+            dynamics = smooth_dynamics(warp_model, warp_data_E, mask=mask)
+        else:
+            dynamics = None
         self._refresh = Refresh(
             mj_model, warp_model, warp_data_E, dynamics, limits, place_fixed_geoms=self._place_fixed_geoms
         )

@@ -69,7 +69,9 @@ GEOM_TYPES = {kind.name: int(kind) for kind in mjw.GeomType}
 FIXED = int(mjw.SetConstGroup.FIXED)
 # The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures; and the
 # first for a pair that may touch without a <pair> of its own.
-NO_CONTACT, NO_SENSOR, NO_PAIR = -2, -1, -1
+NO_CONTACT = -2
+NO_SENSOR = -1
+NO_PAIR = -1
 # Of what is in `sensor_acc_adr`, those that read no accelerations and forces of bodies.
 FORCELESS = mujoco.mjtSensor.mjSENS_ACTUATORFRC, mujoco.mjtSensor.mjSENS_JOINTACTFRC
 
@@ -91,8 +93,13 @@ def drop_unread(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
 
     Whatever MuJoCo Warp launches for this model takes them along unread, if at all.
     """
-    m, d, kinds = warp_model, warp_data_E, mjw.IntegratorType
-    names = "" if m.opt.integrator == kinds.DISCRETE else "qH qHLD qHDiagInv efm_fluid "
+    m = warp_model
+    d = warp_data_E
+    kinds = mjw.IntegratorType
+    if m.opt.integrator == kinds.DISCRETE:
+        names = ""
+    else:
+        names = "qH qHLD qHDiagInv efm_fluid "
     names += "" if m.opt.integrator == kinds.IMPLICIT else "qLU "
     if not m.opt.enableflags & mjw.EnableBit.SLEEP:
         names += "map_iefc2efc map_efc2iefc efc_islandid map_idof2dof map_dof2idof dof_islandid"
@@ -203,7 +210,8 @@ def with_contact_sensors_only(warp_model: mjw.Model) -> mjw.Model:
 
 def without(sensors: Sequence[int], warp_model: mjw.Model) -> mjw.Model:
     """Return a model on the same arrays without these sensors, nor forces of all bodies if no other reads them."""
-    m, left = warp_model, dict[str, np.ndarray]()
+    m = warp_model
+    left = dict[str, np.ndarray]()
     for stage in ("contact_pos", "contact_vel", "contact_acc", "acc"):
         ids = vars(m)[f"sensor_{stage}_adr"].numpy()
         left[f"sensor_{stage}_adr"] = ids[~np.isin(ids, sensors)]
@@ -229,7 +237,8 @@ def geom_pairs(warp_model: mjw.Model) -> tuple[np.ndarray, np.ndarray]:
 def repeated_pairs(warp_model: mjw.Model) -> np.ndarray:
     """Return the <pair>s whose geoms a later <pair> has, too, int [N]."""
     geoms = np.stack([warp_model.pair_geom1.numpy(), warp_model.pair_geom2.numpy()], axis=-1)
-    low, high = geoms.min(-1), geoms.max(-1)
+    low = geoms.min(-1)
+    high = geoms.max(-1)
     names = low.astype(np.int64) * warp_model.ngeom + high
     _, last = np.unique(names[::-1], return_index=True)
     return np.setdiff1d(np.arange(names.size), names.size - 1 - last)
@@ -241,7 +250,8 @@ def take_pairs_as_written(warp_model: mjw.Model) -> None:
     `put_model` keeps one number for two geoms, the last one's. The others stand at the end of the lists, beyond those
     that are found by their geoms. What sensors of distances measure keeps the order of the geoms, on which they count.
     """
-    m, repeated = warp_model, repeated_pairs(warp_model)
+    m = warp_model
+    repeated = repeated_pairs(warp_model)
     if m.pair_dim.size == 0:
         return
     geoms = np.stack([m.pair_geom1.numpy(), m.pair_geom2.numpy()], axis=-1)
@@ -251,7 +261,8 @@ def take_pairs_as_written(warp_model: mjw.Model) -> None:
     own_ids = np.stack([repeated, np.full_like(repeated, NO_SENSOR)], axis=-1)
     pairs = np.concatenate([pairs, geoms[repeated]]).astype(np.int32)
     pair_ids = np.concatenate([pair_ids, own_ids]).astype(np.int32)
-    m.nxn_geom_pair, m.nxn_pairid = wp.array(pairs, dtype=wp.vec2i), wp.array(pair_ids, dtype=wp.vec2i)
+    m.nxn_geom_pair = wp.array(pairs, dtype=wp.vec2i)
+    m.nxn_pairid = wp.array(pair_ids, dtype=wp.vec2i)
     if repeated.size:
         # To sweep and prune finds pairs by their geoms.
         m.opt.broadphase = mjw.BroadphaseType.NXN
@@ -260,8 +271,10 @@ def take_pairs_as_written(warp_model: mjw.Model) -> None:
 
 def pair_type_counts(warp_model: mjw.Model, pairs: np.ndarray) -> tuple[int, ...]:
     """Return the number of pairs of geoms [N, 2] by their types, in the order of a matrix's upper triangle."""
-    types, kinds = warp_model.geom_type.numpy()[pairs], len(mjw.GeomType)
-    low, high = types.min(-1), types.max(-1)
+    types = warp_model.geom_type.numpy()[pairs]
+    kinds = len(mjw.GeomType)
+    low = types.min(-1)
+    high = types.max(-1)
     places = (low * (2 * kinds - low - 1)) // 2 + high
     return tuple(np.bincount(places, minlength=kinds * (kinds + 1) // 2).tolist())
 
@@ -286,7 +299,8 @@ def measure_without_contacts(warp_model: mjw.Model) -> None:
 
     They come from the collision pass, which MuJoCo Warp then leaves out: it gets one in which no pair makes contacts.
     """
-    m, contact = warp_model, int(mjw.DisableBit.CONTACT)
+    m = warp_model
+    contact = int(mjw.DisableBit.CONTACT)
     if m.nsensorcollision and m.opt.disableflags & contact:
         m.opt.disableflags &= ~contact
         drop_contacts(m, np.ones(m.nxn_pairid.shape[0], dtype=bool))
@@ -297,7 +311,8 @@ def add_height_fields(context: mjw.RenderContext, mj_model: mujoco.MjModel) -> N
 
     Worlds may differ in that field, and so show patches of ground that the model itself does not.
     """
-    ids, bounds = context.hfield_bvh_id.numpy(), context.hfield_bounds_size.numpy()
+    ids = context.hfield_bvh_id.numpy()
+    bounds = context.hfield_bounds_size.numpy()
     for field in range(mj_model.nhfield):
         if not ids[field]:
             mesh, bounds[field] = build_hfield_bvh(mj_model, field, constructor="cubql")

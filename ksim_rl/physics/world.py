@@ -92,7 +92,10 @@ class World(views.DataViews):
             raise ValueError(f"sim={sim!r}: expected a SimCfg, or None")
         self.device = checked_device(device)
         name, why = _choice(mj_model, num_envs=num_envs, device=device, sim=sim, warp_alone=warp_alone)
-        self.engine_because = why if name == self.engine else f"a {type(self).__name__} was asked for"
+        if name == self.engine:
+            self.engine_because = why
+        else:
+            self.engine_because = f"a {type(self).__name__} was asked for"
         self.sim = dataclasses.replace(sim or SimCfg(), engine=self.engine)
         self.num_envs = num_envs
         self.is_frozen = False

@@ -112,7 +112,10 @@ def _compare(part: _Part, field: str, own: list[int], joined_values: np.ndarray)
     if same.all():
         return
     place = int(np.argwhere(~same)[0][0])
-    kind = "joint" if field.startswith(("jnt_", "dof_")) else field.split("_")[0]
+    if field.startswith(("jnt_", "dof_")):
+        kind = "joint"
+    else:
+        kind = field.split("_")[0]
     raise ValueError(
         f"scene: {field} of {kind} number {own[place]} of {part.name!r} is {alone[place]} alone and "
         f"{joined_values[place]} beside the others: a setting of its file does not reach a joined model; write what it "

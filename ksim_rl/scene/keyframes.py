@@ -69,13 +69,15 @@ def move_keyframe(
 
     What it leaves out follows from the bodies, which have moved.
     """
-    shift, turn = np.array(pos_3), np.array(quat_4)
+    shift = np.array(pos_3)
+    turn = np.array(quat_4)
     free = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     if len(key.qpos):
         qpos = np.array(key.qpos)
         for address in mj_model.jnt_qposadr[free]:
             pose = qpos[address : address + 7]
-            pos, quat = pose[:3].copy(), pose[3:].copy()
+            pos = pose[:3].copy()
+            quat = pose[3:].copy()
             mujoco.mju_mulPose(pose[:3], pose[3:], shift, turn, pos, quat)
         key.qpos = qpos
     if len(key.qvel):

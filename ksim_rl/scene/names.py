@@ -35,7 +35,10 @@ class NameResolver:
         counts["material"] = m.nmat
         ids: dict[str, Sequence[int]] = {kind: range(count) for kind, count in counts.items()}
         ids["joint"] = scalar_joint_ids(m)
-        self._tables = {kind: [getattr(m, kind)(i).name for i in own] for kind, own in ids.items()}
+        self._tables = {}
+        for kind, own in ids.items():
+            element = getattr(m, kind)
+            self._tables[kind] = [element(i).name for i in own]
         self._ids: dict[tuple[str, tuple[str, ...]], tuple[int, ...]] = {}
         self._indices: dict[tuple[str, tuple[str, ...]], Index] = {}
 
@@ -68,7 +71,9 @@ class NameResolver:
 
 def as_patterns(patterns: Patterns) -> tuple[str, ...]:
     """Return one pattern or several as a tuple."""
-    return (patterns,) if isinstance(patterns, str) else tuple(patterns)
+    if isinstance(patterns, str):
+        return (patterns,)
+    return tuple(patterns)
 
 
 def scalar_joint_ids(mj_model: mujoco.MjModel) -> list[int]:

@@ -10,7 +10,10 @@ from torch import Tensor
 
 def multiply(a: Float[Tensor, "*a 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor, "*batch 4"]:
     """Return the Hamilton product of quaternions [..., 4]."""
-    aw, au, bw, bu = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    aw = a[..., :1]
+    au = a[..., 1:]
+    bw = b[..., :1]
+    bu = b[..., 1:]
     vector = torch.addcmul(torch.addcmul(torch.linalg.cross(au, bu), aw, bu), bw, au)
     return torch.cat((aw * bw - (au * bu).sum(-1, keepdim=True), vector), dim=-1)
 
@@ -22,14 +25,16 @@ def conjugate(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
 
 def rotate(q: Float[Tensor, "*q 4"], v: Float[Tensor, "*v 3"]) -> Float[Tensor, "*batch 3"]:
     """Rotate vectors [..., 3] by quaternions [..., 4] (body to world, if `q` is the body's orientation)."""
-    w, u = q[..., :1], q[..., 1:]
+    w = q[..., :1]
+    u = q[..., 1:]
     across = torch.linalg.cross(u, v)
     return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across), alpha=2.0)
 
 
 def rotate_inverse(q: Float[Tensor, "*q 4"], v: Float[Tensor, "*v 3"]) -> Float[Tensor, "*batch 3"]:
     """Rotate vectors [..., 3] by the inverse of quaternions [..., 4] (world to body)."""
-    w, u = q[..., :1], q[..., 1:]
+    w = q[..., :1]
+    u = q[..., 1:]
     across = torch.linalg.cross(u, v)
     return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across, value=-1.0), alpha=2.0)
 
@@ -57,7 +62,8 @@ def from_euler_xyz(
     products = (cos_sin[..., 1, :, None] * cos_sin[..., 2, None, :]).flatten(-2)
     cc, cs, sc, ss = products.unbind(-1)
     _, _, minus_sc, minus_ss = (-products).unbind(-1)
-    by_cos, by_sin = torch.stack((cc, minus_ss, sc, cs), dim=-1), torch.stack((ss, cc, cs, minus_sc), dim=-1)
+    by_cos = torch.stack((cc, minus_ss, sc, cs), dim=-1)
+    by_sin = torch.stack((ss, cc, cs, minus_sc), dim=-1)
     return torch.addcmul(cos_sin[..., 0, :1] * by_cos, cos_sin[..., 0, 1:], by_sin)
 
 

@@ -123,7 +123,10 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     for entity in entities.values():
         _name_actuators(entity)
         complete_keyframes(entity)
-    spec = joined(entities) if len(entities) > 1 else next(iter(entities.values()))
+    if len(entities) > 1:
+        spec = joined(entities)
+    else:
+        spec = next(iter(entities.values()))
     if cfg.terrain is not None:
         cfg.terrain.add_to(spec)
     for name, sensor in cfg.sensors.items():

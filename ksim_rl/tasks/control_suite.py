@@ -59,7 +59,8 @@ class CartpolePosition(ObservationTerm):
     """Position of the cart, m, and cosine and sine of the pole's angle from upright, [E, 3]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
-        cart_E1, angle_E1 = view.joints("slider").pos_EL, view.joints("hinge").pos_EL
+        cart_E1 = view.joints("slider").pos_EL
+        angle_E1 = view.joints("hinge").pos_EL
         return torch.cat((cart_E1, torch.cos(angle_E1), torch.sin(angle_E1)), dim=-1)
 
 
@@ -194,7 +195,8 @@ class PendulumReward(RewardTerm):
     """
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        cosine_E, speed_E = torch.cos(view.joint_pos_EL[:, 0]), view.joint_vel_EL[:, 0]
+        cosine_E = torch.cos(view.joint_pos_EL[:, 0])
+        speed_E = view.joint_vel_EL[:, 0]
         up_E = tolerance(cosine_E, low=UPRIGHT, margin=1.0 + UPRIGHT, value_at_margin=0.0, shape="linear")
         return up_E * (1.0 + 4.0 * tolerance(speed_E, low=0.0, high=0.0, margin=5.0)) / 5.0
 

@@ -238,7 +238,8 @@ WALKER_RUN = _task("walker_run", partial(walker, 5.0), "a planar biped runs at 5
 # where in it it should be.
 
 MOTION = "walker_walk"
-SPEED, CYCLE_S = 0.8, 1.0
+SPEED = 0.8
+CYCLE_S = 1.0
 """m/s, and s of one stride, of that motion."""
 FEET = ("right_foot", "left_foot")
 
@@ -250,7 +251,8 @@ class WalkAt(RewardTerm):
     speed: float
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        low, high = self.speed - 0.1, self.speed + 0.1
+        low = self.speed - 0.1
+        high = self.speed + 0.1
         return tolerance(forward_speed(view), low=low, high=high, margin=self.speed)
 
 
@@ -263,7 +265,8 @@ class PoseDistance(MetricTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         joints = view.joints(self.joints)
-        poses_FL, own_EL = view.motion(self.file).joint_pos_FL[:, joints.index], joints.pos_EL
+        poses_FL = view.motion(self.file).joint_pos_FL[:, joints.index]
+        own_EL = joints.pos_EL
         return torch.cdist(own_EL, poses_FL).amin(-1) / own_EL.shape[-1] ** 0.5
 
 
@@ -271,7 +274,8 @@ def _motion_cfg(
     terms: Mapping[str, ObservationTermCfg], groups: Sequence[str] = ("actor", "critic"), **parts: Any
 ) -> ManagerBasedRlEnvCfg:
     """Put together what both tasks share: the robot, what it observes of itself and `terms`, and its servos."""
-    robot, seen = Walker(actuators=WALKER_SERVOS), {**_own_state(Walker.joints), **terms}
+    robot = Walker(actuators=WALKER_SERVOS)
+    seen = {**_own_state(Walker.joints), **terms}
     return ManagerBasedRlEnvCfg(
         decimation=4,
         scene=SceneCfg(robots={"walker": robot}, terrain=PlaneTerrain(), num_envs=2048),

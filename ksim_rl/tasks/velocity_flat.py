@@ -22,8 +22,12 @@ from ksim_rl.trainers import TrainingCfg
 from ksim_rl.transforms import ActionDelay, DelayCfg
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
-GO1_ROBOT, GO2_ROBOT, QUADRUPED_ROBOT = UnitreeGo1(), UnitreeGo2(), Quadruped()
-G1_ROBOT, T1_ROBOT, HUMANOID_ROBOT = UnitreeG1(), BoosterT1(), Humanoid()
+GO1_ROBOT = UnitreeGo1()
+GO2_ROBOT = UnitreeGo2()
+QUADRUPED_ROBOT = Quadruped()
+G1_ROBOT = UnitreeG1()
+T1_ROBOT = BoosterT1()
+HUMANOID_ROBOT = Humanoid()
 
 
 def _task(
@@ -212,13 +216,15 @@ HUMANOID = _task(humanoid_velocity_flat, "our humanoid", num_iterations=3_000, a
 
 def go1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree Go1."""
-    flat, height = go1_velocity_flat(), GO1_ROBOT.init_pos[2]
+    flat = go1_velocity_flat()
+    height = GO1_ROBOT.init_pos[2]
     return velocity.on_rough_ground(flat, root_height=height, njmax=208, nconmax=40)
 
 
 def g1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree G1."""
-    flat, height = g1_velocity_flat(), G1_ROBOT.init_pos[2]
+    flat = g1_velocity_flat()
+    height = G1_ROBOT.init_pos[2]
     return velocity.on_rough_ground(flat, root_height=height, njmax=840, nconmax=100)
 
 

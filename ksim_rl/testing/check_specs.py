@@ -55,7 +55,10 @@ def check_values(env: EnvBase, num_steps: int) -> None:
     for step in range(num_steps):
         _check_values(rollout_ET[:, step]["next"], env, f"step {step}")
     base_env = part(env, ManagerBasedRlEnv)
-    lines = [] if base_env is None else base_env.non_finite_terms()
+    if base_env is None:
+        lines = []
+    else:
+        lines = base_env.non_finite_terms()
     if lines:
         raise AssertionError(f"{'; '.join(lines)}. {_NOT_FINITE}")
     reward = rollout_ET["next", "reward"]
@@ -124,7 +127,10 @@ def _written_by(env: EnvBase, key: NestedKey) -> str:
     """Return which transform wrote an observation last, or that the env did."""
     found = "written by the env"
     while isinstance(env, TransformedEnv):
-        transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
+        if isinstance(env.transform, Compose):
+            transforms = env.transform
+        else:
+            transforms = [env.transform]
         for number, transform in enumerate(transforms):
             if unravel_key(key) in [unravel_key(own) for own in transform.out_keys or ()]:
                 found = f"written by transform {number}, {type(transform).__name__}"

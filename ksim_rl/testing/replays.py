@@ -91,4 +91,6 @@ def same_bits(one: Shaped[Tensor, "*leaf"], other: Shaped[Tensor, "*leaf"]) -> b
 
 def _bits(value: Tensor) -> Tensor:
     whole = {torch.float32: torch.int32, torch.float64: torch.int64}.get(value.dtype)
-    return value if whole is None else value.contiguous().view(whole)
+    if whole is None:
+        return value
+    return value.contiguous().view(whole)

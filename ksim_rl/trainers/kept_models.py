@@ -22,7 +22,8 @@ from ksim_rl.scene.scene import MjcfRobot
 from ksim_rl.terminal import printable
 from ksim_rl.trainers.run_cfg import RunCfg
 
-FOLDER, RECORD = "models", "models.json"
+FOLDER = "models"
+RECORD = "models.json"
 MOST_KEPT_BYTES = 64 * 2**20
 """Of a model with its meshes and pictures, of which a run keeps a copy."""
 KINDS = ("robots", "objects")

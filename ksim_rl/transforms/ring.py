@@ -121,7 +121,10 @@ def _turn_in_torch(
     if mask_E is None:
         writes_E = torch.ones(num_rows, dtype=torch.bool, device=value_E.device)
         now_E = age_E.reshape(-1) + 1
-        newest_E = torch.zeros_like(now_E) if lag_E is None else lag_E.reshape(-1)
+        if lag_E is None:
+            newest_E = torch.zeros_like(now_E)
+        else:
+            newest_E = lag_E.reshape(-1)
     else:
         writes_E = mask_E.reshape(-1)
         now_E = torch.zeros_like(age_E).reshape(-1)

@@ -92,7 +92,10 @@ class CheckedKeys(Transform):
         # Of the TensorDict around each key: a nested one may have more than the env.
         batch_dims = []
         for key in in_keys:
-            around = specs if isinstance(key, str) else specs[key[:-1]]
+            if isinstance(key, str):
+                around = specs
+            else:
+                around = specs[key[:-1]]
             batch_dims.append(around.ndim)
         if is_inverse:
             self.batch_dims_inv = batch_dims

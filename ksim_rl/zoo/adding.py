@@ -17,7 +17,8 @@ from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.zoo.cards import CARD, CHECKPOINT, FOLDER, MOST_BYTES, ONNX, Card, hashes, read_card
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_]*", re.ASCII)
-CURVE_POINTS, RETURN = 24, "episode/return"
+CURVE_POINTS = 24
+RETURN = "episode/return"
 
 
 def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> Card:
@@ -35,7 +36,8 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
     card = _of_run(saved, name=name)
     folder.mkdir(parents=True, exist_ok=True)
     with unfinished_folder(folder) as temporary:
-        entry, exported = temporary / name, temporary / "export"
+        entry = temporary / name
+        exported = temporary / "export"
         with checkpoint.fitting(saved.path):
             actor = dict(saved.state["update"]["actor"])
             actor |= {key: x.half() for key, x in actor.items() if x.is_floating_point() and x.ndim > 1}
@@ -59,7 +61,8 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
 
 def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
     """Return the card of a run as its folder tells."""
-    run, summary = saved.run_folder, listing.summarize(saved.run_folder)
+    run = saved.run_folder
+    summary = listing.summarize(saved.run_folder)
     codes = [session.code.get("ksim_rl", {}) for session in record.read(run)] or [{}]
     made = {code.get("commit", "no commit") + " with changes" * ("changed" in code) for code in codes}
     commit = " and ".join(sorted(made))

@@ -17,7 +17,9 @@ from ksim_rl.files.reading import read_bytes
 from ksim_rl.terminal import printable
 
 FOLDER = Path(__file__).parent / "policies"
-CARD, ONNX, CHECKPOINT = "card.json", "policy.onnx", "checkpoint"
+CARD = "card.json"
+ONNX = "policy.onnx"
+CHECKPOINT = "checkpoint"
 MOST_BYTES = 200_000
 
 

@@ -29,7 +29,10 @@ def zoo(arguments: Sequence[str]) -> int:
         case []:
             show(ROW.format("name", "task", "env states", "return", "C engine", "commit"))
             for card in cards(options.folder):
-                earned = "-" if card.return_mean is None else f"{card.return_mean:.4g}"
+                if card.return_mean is None:
+                    earned = "-"
+                else:
+                    earned = f"{card.return_mean:.4g}"
                 ratio = f"x {card.sim2sim.get('return_ratio', float('nan')):.3f}"
                 row = (card.name, card.task, f"{card.env_states:,}", earned, ratio, card.commit[:7])
                 show(ROW.format(*row))

@@ -75,7 +75,9 @@ def test_a_transform_that_does_not_fit_the_env_is_named():
 
 def test_a_stock_transform_that_reads_what_no_env_emits_is_named():
     image = "+task.transforms.image={_target_: torchrl.envs.transforms.ToTensorImage}"
-    with pytest.raises(ValueError, match="task.transforms.image: ToTensorImage reads 'pixels': valid: .*actor"):
+    with pytest.raises(
+        ValueError, match="task.transforms.image: ToTensorImage reads 'pixels': valid: .*actor"
+    ):
         envs.build(envs.make_cfg("cartpole_balance", ["task.scene.num_envs=1", image]))
 
 

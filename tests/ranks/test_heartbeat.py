@@ -4,7 +4,8 @@ import threading
 
 import pytest
 
-from ksim_rl.ranks import group, heartbeat
+from ksim_rl.device import group
+from ksim_rl.ranks import heartbeat
 
 
 class Values(dict):

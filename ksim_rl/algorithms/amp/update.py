@@ -58,8 +58,11 @@ class AMPUpdate(RolloutUpdate):
             raise ValueError(
                 f"motions={cfg.motions!r}: group {cfg.style_group!r} is not finite in their states"
             )
-        self.cfg, self.ppo, self.notes = cfg, ppo, ppo.notes
-        self.actor, self.behavior = ppo.actor, ppo.behavior
+        self.cfg = cfg
+        self.ppo = ppo
+        self.notes = ppo.notes
+        self.actor = ppo.actor
+        self.behavior = ppo.behavior
         self.set_progress = ppo.set_progress  # the discriminator's learning rate stays
         self.num_env_states = ppo.num_env_states
         self.reference_N2L = reference_N2L.to(ppo.device)
@@ -74,7 +77,8 @@ class AMPUpdate(RolloutUpdate):
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **options)
         # So that the first scores are of features in a fitting range. Ranks add up what they have counted.
         self.discriminator.normalizer.update(self.reference_N2L[ranks.rank() :: ranks.size()])
-        rate, decay = cfg.discriminator_learning_rate, cfg.discriminator_weight_decay
+        rate = cfg.discriminator_learning_rate
+        decay = cfg.discriminator_weight_decay
         own = dataclasses.replace(cfg, learning_rate=rate, weight_decay=decay, schedule="fixed")
         self.optimizer = make_optimizer(own, self.discriminator)
         num_steps = ppo.num_env_states // num_envs
@@ -129,7 +133,9 @@ class AMPUpdate(RolloutUpdate):
 
     def _learn_style(self, rollout_ET: TensorDictBase) -> None:
         self.replay.extend(rollout_ET.select(*self._features, *STANDARD.following))
-        net, made, shown = self.discriminator, [], []
+        net = self.discriminator
+        made = []
+        shown = []
         for minibatch_B in self.replay.minibatches(self.cfg.num_discriminator_steps):
             drawn_B = ranks.randint(len(self.reference_N2L), minibatch_B.batch_size, device=self.device)
             reference_B2L = self.reference_N2L[drawn_B]

@@ -63,7 +63,8 @@ class DistillationUpdate(DatasetUpdate):
         teacher: Teacher,
         **shared: Any,
     ) -> None:
-        self.actor, self.teacher = actor, teacher
+        self.actor = actor
+        self.teacher = teacher
         loss = DistillationLoss(actor, teacher.policy, loss=cfg.loss)
         super().__init__(cfg, loss=loss, networks={"actor": actor}, logged=LOGGED, **shared)
         self.teacher_share = torch.tensor(cfg.teacher_share, device=self.device)

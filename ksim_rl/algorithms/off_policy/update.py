@@ -75,27 +75,33 @@ class OffPolicyUpdate(RolloutUpdate):
         }
         logged = LOGGED | (OF_TEMPERATURE if isinstance(loss, SACLoss) else {})
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, logged=logged, **shared)
-        self.cfg, self.loss, self.data = cfg, loss, data
+        self.cfg = cfg
+        self.loss = loss
+        self.data = data
         self.actor: TensorDictModuleBase = loss.actor_network
         self.critic = loss.critic_network
-        self.behavior, self.num_env_states = behavior, num_envs * data.num_steps
+        self.behavior = behavior
+        self.num_env_states = num_envs * data.num_steps
         self._observations: list[Any] = loss.observation_keys
         fast: Any = partial(compiled, device=self.device, wanted=cfg.compile)
         self._images = None
         if cfg.symmetry == "augment":
             self._images = SymmetricAugmentation(mirror, read=self._observations, device=self.device)
         self._read, self._count_ = fast(self._stored), fast(self._counted_)
-        self._critic_loss, self._actor_losses = fast(loss.critic_loss), fast(loss.actor_losses)
+        self._critic_loss = fast(loss.critic_loss)
+        self._actor_losses = fast(loss.actor_losses)
         self.replay = ReplayRing(
             data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
         )
-        target, rate = loss.target_critic_network.parameters(), cfg.critic_learning_rate
+        target = loss.target_critic_network.parameters()
+        rate = cfg.critic_learning_rate
         self.optimizers = {
             "critic": FlatAdamW(cfg, self.critic.parameters(), learning_rate=rate, target=target),
             "actor": FlatAdamW(cfg, self.actor.parameters(), learning_rate=cfg.actor_learning_rate),
         }
         if isinstance(cfg, SACCfg) and isinstance(loss, SACLoss) and loss.log_alpha.requires_grad:
-            free, rate = replace(cfg, weight_decay=0.0), cfg.alpha_learning_rate
+            free = replace(cfg, weight_decay=0.0)
+            rate = cfg.alpha_learning_rate
             self.optimizers["alpha"] = FlatAdamW(free, [loss.log_alpha], learning_rate=rate)
         self.steps_made = 0
         # Zero until learning starts.
@@ -135,7 +141,8 @@ class OffPolicyUpdate(RolloutUpdate):
     def _update(self) -> None:
         self._store()
         minibatches = self.replay.minibatches(self.data.num_minibatches, read=self._read)
-        of_critic, of_actor = [], []
+        of_critic = []
+        of_actor = []
         for step, minibatch_B in enumerate(minibatches, start=1):
             of_critic.append(self._improve_critic(minibatch_B))
             if step % self.cfg.policy_delay == 0:
@@ -147,7 +154,8 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def _counted_(self, of_critic_S: Tensor, of_actor: Tensor) -> Tensor:
         """Count S gradient steps, skipped if one of their parts was; return how many in a row were at most."""
-        longest, delay = torch.zeros_like(self.guard.skipped), self.cfg.policy_delay
+        longest = torch.zeros_like(self.guard.skipped)
+        delay = self.cfg.policy_delay
         for step, skipped in enumerate(of_critic_S.unbind(), start=1):
             if step % delay == 0:
                 skipped = torch.maximum(skipped, of_actor[step // delay - 1])
@@ -215,7 +223,10 @@ class OffPolicyUpdate(RolloutUpdate):
             load_optimizer_state(optimizer, state["optimizers"][name], what=f"{name} optimizer")
         state_tree.copy_into(self.behavior.exploration_state(), state["exploration"], what="exploration")
         self.replay.load_state_dict(state["replay"])
-        self.steps_made = state["steps_made"] if state["replay"] else 0
+        if state["replay"]:
+            self.steps_made = state["steps_made"]
+        else:
+            self.steps_made = 0
         self.behavior.random.fill_(self.steps_made < self.data.learning_starts)
 
     def load_weights(self, state: Mapping[str, Any]) -> None:

@@ -76,7 +76,10 @@ def make_off_policy_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
     """Build the policy of a run: with SAC's settings one that draws its actions, with TD3's one that does not."""
     spec: Any = env.observation_spec
     draws = isinstance(cfg.objective, SACCfg)
-    make: Any = make_squashed_actor if draws else make_deterministic_actor
+    if draws:
+        make: Any = make_squashed_actor
+    else:
+        make = make_deterministic_actor
     return make(
         part_of(cfg, "modules.actor", SquashedActorCfg if draws else DeterministicActorCfg),
         obs_dim=spec["actor"].shape[-1],

@@ -42,7 +42,8 @@ def make_fused_ppo(
         return NotFused(f"minibatches come from a {type(update.dataset.sampler).__name__}")
     cfg: Any = update.cfg
     actor, critic = [cast(Any, update.networks[name]) for name in ("actor", "critic")]
-    networks, data = fused_networks(actor, critic), update.dataset.cfg
+    networks = fused_networks(actor, critic)
+    data = update.dataset.cfg
     sizes: Any = {name: getattr(data, name) for name in ("num_env_states_per_minibatch", "num_minibatches")}
     if isinstance(networks, NotFused):
         return networks
@@ -73,7 +74,8 @@ class FusedBehavior(ProbabilisticTensorDictSequential):
 
     def __init__(self, actor: ProbabilisticTensorDictSequential, fused: "FusedPPO") -> None:
         parts: list[Any] = [*cast(Any, actor).module]
-        network, keys = parts[0].module, {"in_keys": parts[0].in_keys, "out_keys": parts[0].out_keys}
+        network = parts[0].module
+        keys = {"in_keys": parts[0].in_keys, "out_keys": parts[0].out_keys}
 
         def parameters_of(*observations: Tensor) -> tuple[Tensor, Tensor]:
             if not self._is_steady:
@@ -83,7 +85,8 @@ class FusedBehavior(ProbabilisticTensorDictSequential):
 
         parts[0] = TensorModule(parameters_of, **keys)
         super().__init__(*parts)
-        self._fused, self._is_steady = fused, False
+        self._fused = fused
+        self._is_steady = False
 
     @contextmanager
     def steady(self) -> Iterator[None]:
@@ -100,7 +103,8 @@ def fused_networks(
     actor: ProbabilisticTensorDictSequential, critic: TensorDictModuleBase
 ) -> FusedNetworks | NotFused:
     """Return what the kernels need to know of `make_actor`'s and `make_critic`'s networks, or why they are others."""
-    policy, value = getattr(actor[0], "module", None), getattr(critic, "module", None)
+    policy = getattr(actor[0], "module", None)
+    value = getattr(critic, "module", None)
     if type(policy) is not PolicyNetwork or type(value) is not ValueNetwork:
         return NotFused("the networks are not those of make_actor and make_critic")
     head: Any = policy.head
@@ -131,7 +135,8 @@ def _layers(network: nn.Sequential) -> list[nn.Linear]:
 
 def _observer(module: Any) -> Observer:
     network: PolicyNetwork | ValueNetwork = module.module
-    keys, moments = list(module.in_keys), network.normalizer
+    keys = list(module.in_keys)
+    moments = network.normalizer
     return Observer(
         read=lambda env_states: network.joined(*(env_states.get(key) for key in keys)),
         moments=moments,

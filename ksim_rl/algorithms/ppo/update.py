@@ -58,7 +58,8 @@ class PPOUpdate(DatasetUpdate):
         **shared: Any,
     ) -> None:
         cfg = with_precision_of(cfg, device)
-        self.actor, self.critic = actor, critic
+        self.actor = actor
+        self.critic = critic
         self.advantage = make_advantage(cfg, actor, critic)
         loss = make_loss(cfg, actor, critic)
         networks = {"actor": actor, "critic": critic}
@@ -98,7 +99,10 @@ class PPOUpdate(DatasetUpdate):
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
-        std = {"policy/std": self._std} if self._scale_keys else {}
+        if self._scale_keys:
+            std = {"policy/std": self._std}
+        else:
+            std = {}
         return super().metrics() | std | {"update/fused": self._is_fused}
 
     def _update(self) -> None:

@@ -52,12 +52,14 @@ def make_ppo_policy(cfg: RunCfg, env: EnvBase) -> ProbabilisticTensorDictSequent
 
 def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
     """Build actor and critic for what an env observes and does; a ValueError refuses those of an off-policy method."""
-    device, modules = cfg.resolved_device(), cfg.modules
+    device = cfg.resolved_device()
+    modules = cfg.modules
     actor_cfg = part_of(cfg, "modules.actor", ActorCfg)
     critic_cfg = part_of(cfg, "modules.critic", CriticCfg)
     spec: Any = env.observation_spec
 
-    trunk, shared = None, 0
+    trunk = None
+    shared = 0
     if modules.trunk is not None:
         shared = modules.trunk.hidden_dims[-1]
         trunk = make_shared_trunk(
@@ -68,9 +70,16 @@ def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSe
         return observation_dim(spec, [key for key in keys if key != FEATURES]) + shared
 
     # Behind a recurrent module, where there is one.
-    new_actor = partial(make_recurrent_actor, m) if (m := modules.recurrent_actor) else make_actor
-    new_critic = partial(make_recurrent_critic, m) if (m := modules.recurrent_critic) else make_critic
-    action_spec, obs_dim = env.full_action_spec, width(actor_cfg.in_keys)
+    if m := modules.recurrent_actor:
+        new_actor = partial(make_recurrent_actor, m)
+    else:
+        new_actor = make_actor
+    if m := modules.recurrent_critic:
+        new_critic = partial(make_recurrent_critic, m)
+    else:
+        new_critic = make_critic
+    action_spec = env.full_action_spec
+    obs_dim = width(actor_cfg.in_keys)
     actor = new_actor(actor_cfg, obs_dim=obs_dim, action_spec=action_spec, device=device)
     critic = new_critic(critic_cfg, obs_dim=width(critic_cfg.in_keys), device=device)
     if trunk is None:

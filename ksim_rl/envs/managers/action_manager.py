@@ -45,13 +45,17 @@ class ActionManager:
             start = stop
         self.size = start
         given = [part_K2 for part_K2 in bounds if part_K2 is not None and torch.isfinite(part_K2).all()]
-        self.bounds_L2 = torch.cat(given) if len(given) == len(terms) > 0 else None
+        if len(given) == len(terms) > 0:
+            self.bounds_L2 = torch.cat(given)
+        else:
+            self.bounds_L2 = None
         # Pinned, and read as an array: looking at what has arrived there never waits for the device.
         pinned = torch.device(view.device).type == "cuda"
         self._accepts_any = torch.ones(1, dtype=torch.bool, pin_memory=pinned)
         self._arrived = self._accepts_any.numpy()
         self._has_warned = False
-        buffers, readings = driver.buffers, driver.readings
+        buffers = driver.buffers
+        readings = driver.readings
         self._action_EL = readings.action_EL = buffers.get("actions.action_EL", start, owner=ENV)
         self._last_action_EL = readings.last_action_EL = buffers.get(
             "actions.last_action_EL", start, owner=ENV

@@ -65,7 +65,10 @@ class CommandManager:
         """
         check_known("command", name, self._terms)
         view = self._view
-        rows = range(view.num_envs) if env_ids is None else env_ids
+        if env_ids is None:
+            rows = range(view.num_envs)
+        else:
+            rows = env_ids
         mask_E = mask_from_env_ids(rows, torch.Size([view.num_envs]), view.device)
         value_EK = torch.as_tensor(values, dtype=torch.float32, device=view.device)
         with self._driver.scope(f"commands/{name}"):

@@ -20,7 +20,8 @@ class EventManager:
     """
 
     def __init__(self, terms: Mapping[str, EventTerm], driver: EnvDriver) -> None:
-        self._driver, self.terms = driver, dict(terms)
+        self._driver = driver
+        self.terms = dict(terms)
         self._view = view = driver.view
         self._by_mode: dict[str, list[tuple[str, EventTerm]]] = {}
         for name, term in terms.items():

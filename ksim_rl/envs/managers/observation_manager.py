@@ -82,7 +82,8 @@ class ObservationManager:
 
     def _check_shape(self, name: str, reading: Tensor) -> None:
         """Refuse a reading that is none, or has another shape than the first one of its term."""
-        num_envs, given = self._view.num_envs, f"{reading.dtype} {tuple(reading.shape)}"
+        num_envs = self._view.num_envs
+        given = f"{reading.dtype} {tuple(reading.shape)}"
         if name in self._shapes:
             raise ValueError(
                 f"observation term {name!r} returns {given}, and first had shape {tuple(self._shapes[name])}: expected "

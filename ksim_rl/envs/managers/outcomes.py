@@ -19,8 +19,10 @@ class _OutcomeManager:
     kind: ClassVar[str]
 
     def __init__(self, terms: Mapping[str, Any], driver: EnvDriver) -> None:
-        self._driver, self._view = driver, driver.view
-        self._terms, self.names = dict(terms), tuple(terms)
+        self._driver = driver
+        self._view = driver.view
+        self._terms = dict(terms)
+        self.names = tuple(terms)
 
     def _everybody_E(self) -> Tensor:
         return torch.ones(self._view.num_envs, dtype=torch.bool, device=self._view.device)
@@ -28,7 +30,8 @@ class _OutcomeManager:
     def _values(self, dtype: torch.dtype | None = None) -> list[Tensor]:
         """Return what each term says of the current state, [E] each, in any dtype unless one is asked for."""
         values = []
-        shape, device = (self._view.num_envs,), torch.device(self._view.device)
+        shape = (self._view.num_envs,)
+        device = torch.device(self._view.device)
         for name, term in self._terms.items():
             with self._driver.scope(f"{self.kind}s/{name}", part=term):
                 value_E = term(self._view)
@@ -37,7 +40,10 @@ class _OutcomeManager:
                     f"{self.kind} term {name!r} returns {type(value_E).__name__}: expected a tensor {shape}, one value "
                     "per env"
                 )
-            fits = not value_E.is_complex() if dtype is None else value_E.dtype == dtype
+            if dtype is None:
+                fits = not value_E.is_complex()
+            else:
+                fits = value_E.dtype == dtype
             if value_E.shape != shape or not fits:
                 raise ValueError(
                     f"{self.kind} term {name!r} returns {value_E.dtype} {tuple(value_E.shape)}: expected "
@@ -103,7 +109,8 @@ class TerminationManager(_OutcomeManager):
         self, terms: Mapping[str, TerminationTerm], driver: EnvDriver, *, is_finite_horizon: bool
     ) -> None:
         super().__init__(terms, driver)
-        num_envs, device = driver.view.num_envs, driver.view.device
+        num_envs = driver.view.num_envs
+        device = driver.view.device
         self._is_finite_horizon = is_finite_horizon
         self.names = (*terms, "non_finite")
         self.flags_EK = torch.zeros(num_envs, len(self.names), dtype=torch.bool, device=device)
@@ -190,7 +197,8 @@ class CurriculumManager(_OutcomeManager):
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Adapt to the episodes that just ended in the rows of `mask_E`."""
         for index, (name, term) in enumerate(self._terms.items()):
-            scope, counter = f"curriculum/{name}", self._view.reset_count_E
+            scope = f"curriculum/{name}"
+            counter = self._view.reset_count_E
             with self._driver.scope(scope, counter, part=term, mask_E=mask_E):
                 level = term(self._view, mask_E)
             if not isinstance(level, Tensor):
@@ -226,7 +234,10 @@ class EpisodeLog:
         metrics: MetricManager,
     ) -> None:
         view = driver.view
-        self._view, self._rewards, self._terminations, self._metrics = view, rewards, terminations, metrics
+        self._view = view
+        self._rewards = rewards
+        self._terminations = terminations
+        self._metrics = metrics
         self._num_non_finite = driver.non_finite.num_terms
         parts = {"reward": rewards.names, "termination": terminations.names, "metric": metrics.names}
         of_terms = [f"{kind}/{name}" for kind, names in parts.items() for name in names]

@@ -60,7 +60,8 @@ class TermGuard:
     """
 
     def __init__(self, simulation: Simulation, readings: Readings, view: EnvView) -> None:
-        self._simulation, self._view = simulation, view
+        self._simulation = simulation
+        self._view = view
         self._memory = TermMemory(simulation, readings, view)
         self._on_cuda = torch.device(simulation.device).type == "cuda"
         self._seen: set[tuple[str, int]] = set()
@@ -72,7 +73,8 @@ class TermGuard:
     def watching(self, *, past_torch: bool = True) -> Iterator[None]:
         """Watch each call in this block, `past_torch` too, which makes the host wait for the device."""
         before = self._is_on, self._compares
-        self._is_on, self._compares = True, past_torch
+        self._is_on = True
+        self._compares = past_torch
         try:
             yield
         finally:

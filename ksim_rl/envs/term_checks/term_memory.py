@@ -19,13 +19,19 @@ from ksim_rl.scene.state.buffers import ENV
 from ksim_rl.scene.state.quantity import QuantityOf
 from ksim_rl.scene.state.simulation import Simulation
 
-STATE, MOCAP, INPUT, COMPUTED = "state", "mocap", "input", "computed"
+STATE = "state"
+MOCAP = "mocap"
+INPUT = "input"
+COMPUTED = "computed"
 """Of the worlds: positions and velocities, poses of mocap bodies, what else the physics reads, and what it computes."""
-FIELD, MODEL = "field", "model"
+FIELD = "field"
+MODEL = "model"
 """Model fields that differ between worlds, and what all worlds share of the model."""
-PARAMETER, DIFFICULTY = "parameter", "difficulty"
+PARAMETER = "parameter"
+DIFFICULTY = "difficulty"
 """Tables and targets that events and actions write for all to read, and what curricula write."""
-TABLE, QUANTITY = "table", "quantity"
+TABLE = "table"
+QUANTITY = "quantity"
 """What nobody writes once it is made, and quantities that were computed once for all who read them."""
 
 _KIND_OF_ARRAY = {"qpos": STATE, "qvel": STATE, "mocap_pos": MOCAP, "mocap_quat": MOCAP}
@@ -50,7 +56,9 @@ class Piece:
     @cached_property
     def bits(self) -> Shaped[Tensor, "*shape"] | None:
         """The bits of the tensor, as NaN equals no NaN, and 0 equals -0."""
-        return None if self.tensor is None else bits_of(self.tensor)
+        if self.tensor is None:
+            return None
+        return bits_of(self.tensor)
 
 
 def bits_of(tensor: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
@@ -73,7 +81,9 @@ class TermMemory:
     """
 
     def __init__(self, simulation: Simulation, readings: Readings, view: EnvView) -> None:
-        self._simulation, self._readings, self._view = simulation, readings, view
+        self._simulation = simulation
+        self._readings = readings
+        self._view = view
         self._pieces: list[Piece] = []
         self._starts: list[int] = []
         self._listed_at: tuple[int, ...] = ()
@@ -134,7 +144,8 @@ class TermMemory:
 
     def _counts(self) -> tuple[int, ...]:
         """Return how much there is of each kind that still grows while an env is constructed."""
-        simulation, readings = self._simulation, self._readings
+        simulation = self._simulation
+        readings = self._readings
         growing = (
             simulation.buffers.by_name(),
             simulation.shared_values.by_name(),
@@ -172,7 +183,8 @@ class TermMemory:
         spelled |= {id(tensor): f"view.{name}" for name, tensor in _tensors_of(self._readings)}
         for name, value_EK in self._readings.commands.items():
             spelled[id(value_EK)] = f"view.command({name!r})"
-        buffers, shared = self._simulation.buffers, self._simulation.shared_values
+        buffers = self._simulation.buffers
+        shared = self._simulation.shared_values
         for name, buffer in buffers.by_name().items():
             if buffer.numel():
                 called = spelled.get(id(buffer), f"the buffer {name!r}")
@@ -191,8 +203,14 @@ class TermMemory:
             shown[attribute.rpartition("_")[0]] = f"view.world.{attribute}"
         for called, tensor, start, end in world.memory():
             room, _, name = called.rpartition(".")
-            owner = MODEL if room.endswith("model") else _KIND_OF_ARRAY.get(name, COMPUTED)
-            spelled = called if owner == MODEL else shown.get(name, called)
+            if room.endswith("model"):
+                owner = MODEL
+            else:
+                owner = _KIND_OF_ARRAY.get(name, COMPUTED)
+            if owner == MODEL:
+                spelled = called
+            else:
+                spelled = shown.get(name, called)
             if tensor is None:
                 yield Piece(name=spelled, owner=owner, start=start, end=end)
             else:
@@ -219,7 +237,10 @@ class TermMemory:
                 called = self._aliases.get((id(cache), key))
                 if called is None:
                     is_named = spelled != "view" or hasattr(type(self._view), key)
-                    called = f"{spelled}.{key}" if is_named else f"view.cache[{key!r}]"
+                    if is_named:
+                        called = f"{spelled}.{key}"
+                    else:
+                        called = f"view.cache[{key!r}]"
                 for name, tensor in _leaves(called, value):
                     yield _piece(name, QUANTITY, tensor)
         for name, sum_E in self._readings.episode_rewards.items():

@@ -72,7 +72,10 @@ def may_write(scope: str, piece: Piece) -> bool:
 def refusal(scope: str, part: object, how: str, name: str, piece: Piece) -> str:
     """Return what a term does to what it calls `name`, why that is wrong, and what to write instead."""
     rule = rule_of(scope)
-    effect = ", which moves the robot" if piece.owner == STATE else ""
+    if piece.owner == STATE:
+        effect = ", which moves the robot"
+    else:
+        effect = ""
     read = name if name.startswith("view.") else "x"
     fix = (
         f"Write `error = {read} - 0.5` instead of `error = {read}; error -= 0.5`, or change `{read}.clone()`"

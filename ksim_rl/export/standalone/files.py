@@ -108,7 +108,8 @@ def read_model(folder: Path) -> mujoco.MjModel:
 
 def check_closed(path: Path) -> None:
     """Refuse a model that takes in others, or names what is no regular file of its own folder."""
-    folder, text = path.parent, read(path, 2**28)
+    folder = path.parent
+    text = read(path, 2**28)
     if found := LEAVES_THE_FOLDER.search(text):
         raise ValueError(f"{path}: {found.group().decode()!r}: an exported model stands for itself")
     for name in PATHS.findall(text.decode(errors="replace")):
@@ -144,7 +145,10 @@ def check_record(
     for name, value in record.items():
         kind, _, rest = name.partition("/")
         if kind == "start":
-            shape = (joints,) if rest.startswith("actuator/") else shapes.get(rest)
+            if rest.startswith("actuator/"):
+                shape = (joints,)
+            else:
+                shape = shapes.get(rest)
             if rest.startswith("model/"):
                 shape = _check_field(path, rest.removeprefix("model/"), value, mj_model)
             if shape is None:
@@ -181,7 +185,8 @@ def _check_field(path: Path, field: str, value: Array, mj_model: mujoco.MjModel)
 def _check_choice(path: Path, value: Array, mj_model: mujoco.MjModel) -> None:
     counts = {mujoco.mjtGeom.mjGEOM_HFIELD: mj_model.nhfield, mujoco.mjtGeom.mjGEOM_MESH: mj_model.nmesh}
     for geom, kind in enumerate(mj_model.geom_type.tolist()):
-        chosen, own = value[..., geom], mj_model.geom_dataid[geom]
+        chosen = value[..., geom]
+        own = mj_model.geom_dataid[geom]
         count = counts.get(mujoco.mjtGeom(kind), 0)
         fits = (chosen == own) | ((chosen >= 0) & (chosen < count) & (own >= 0))
         if value.dtype.kind != "i" or not bool(np.all(fits)):

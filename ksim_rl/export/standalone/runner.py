@@ -52,8 +52,13 @@ class Runner(Signals):
     # -- observations --------------------------------------------------------------------------------------------
 
     def _term(self, spec: dict[str, Any]) -> Callable[[bool], Array]:
-        read_it, low, high = self.value(spec["value"]), *spec["clip"]
-        scale, lag = np.asarray(spec["scale"]), None
+        read_it = self.value(spec["value"])
+        low, high = spec["clip"]
+        # JSON has no infinity: None is a side without a bound.
+        low = -np.inf if low is None else low
+        high = np.inf if high is None else high
+        scale = np.asarray(spec["scale"])
+        lag = None
         noise = Noise(spec["noise"], self) if spec["noise"] else None
         self.noises += [noise] if noise else []
         if spec["delay"]:
@@ -64,8 +69,7 @@ class Runner(Signals):
             value = read_it()
             if noise and self.noisy:
                 value = noise(value)
-            low_, high_ = -np.inf if low is None else low, np.inf if high is None else high
-            value = np.clip(value, low_, high_) * scale
+            value = np.clip(value, low, high) * scale
             return value if lag is None else lag(value, advances)
 
         return term
@@ -136,7 +140,8 @@ class Runner(Signals):
     def _law(self, spec: dict[str, Any]) -> Callable[[], None]:
         """Return what sets the controls of some joints' actuators from their targets before each substep."""
         names, takes, kind = spec["joints"], spec["takes"], spec["kind"]
-        pos, vel = (np.array([self.joints[n][k] for n in names], int) for k in (0, 1))
+        pos = np.array([self.joints[name][0] for name in names], int)
+        vel = np.array([self.joints[name][1] for name in names], int)
         ctrl = [self.model.actuator(name).id for name in spec["actuators"]]
         numbers = {key: np.asarray(value, np.float64) for key, value in spec["numbers"].items()}
         self.numbers = getattr(self, "numbers", []) + [(names, numbers)]
@@ -146,7 +151,9 @@ class Runner(Signals):
         scale, offset = np.asarray(spec.get("scale", 1.0)), np.asarray(spec.get("offset", 0.0))
 
         def law() -> None:
-            target = {key: np.array([self.targets[key][n] for n in names]) for key in KINDS}
+            target = {}
+            for key in KINDS:
+                target[key] = np.array([self.targets[key][name] for name in names])
             if lag:
                 late = lag(np.concatenate([target[key] for key in takes]))
                 target |= dict(zip(takes, np.split(late, len(takes)), strict=True))

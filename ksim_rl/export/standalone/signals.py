@@ -35,6 +35,19 @@ FUNCTIONS |= {
 }
 
 
+def _in_blocks(values: Array, width: int | None) -> Array:
+    """Return values in rows of a width; without one they are a single row."""
+    return values.reshape(-1, width) if width else values[None]
+
+
+def _sum(blocks: Array) -> Array:
+    return blocks.sum(-1)
+
+
+def _norm(blocks: Array) -> Array:
+    return np.sqrt((blocks * blocks).sum(-1))
+
+
 def rotated(quat: Array, vector: Array) -> Array:
     """Return a vector turned by a quaternion (w, x, y, z)."""
     result = np.zeros(3)
@@ -215,11 +228,11 @@ class Signals:
     def _op(self, name: str, node: dict[str, Any], parts: list[Value]) -> Value:
         width = node.get("width")
         if name in ("sum", "norm"):
-            power = (lambda v: np.sqrt((v * v).sum(-1))) if name == "norm" else (lambda v: v.sum(-1))
-            return lambda: power(parts[0]().reshape(-1, width) if width else parts[0]()[None])
+            power = _norm if name == "norm" else _sum
+            return lambda: power(_in_blocks(parts[0](), width))
         if name == "take":
             wanted = np.asarray(node["indices"], int)
-            return lambda: parts[0]().reshape(-1, width)[:, wanted].ravel() if width else parts[0]()[wanted]
+            return lambda: _in_blocks(parts[0](), width)[:, wanted].ravel()
         if name == "clip":
             return lambda: np.clip(parts[0](), node["low"], node["high"])
         if name == "into":
@@ -228,7 +241,11 @@ class Signals:
         if name in ("previous", "peak", "low_pass"):
             return self._remembering(name, node, parts)
         function = FUNCTIONS[name]
-        return lambda: function(*[part() for part in parts])
+
+        def applied() -> Array:
+            return function(*[part() for part in parts])
+
+        return applied
 
     def _remembering(self, name: str, node: dict[str, Any], parts: list[Value]) -> Value:
         kept: list[Any] = [None]
@@ -257,8 +274,8 @@ class Signals:
         data, model = self.data, self.model
         if "joints" in node:
             names = node["joints"]
-            pos, vel = (np.array([self.joints[n][k] for n in names], int) for k in (0, 1))
-            shift = np.array([self.default[n] if name == "joint_pos_rel" else 0.0 for n in names])
+            pos = np.array([self.joints[joint][0] for joint in names], int)
+            vel = np.array([self.joints[joint][1] for joint in names], int)
             biased = bool(node.get("biased"))
             of_joints = {
                 "joint_pos": lambda: data.qpos[pos] + ([self.bias[n] for n in names] if biased else 0.0),
@@ -266,11 +283,19 @@ class Signals:
                 "joint_acc": lambda: data.qacc[vel],
                 "joint_effort": lambda: data.qfrc_actuator[vel],
             }
-            return (lambda: of_joints["joint_pos"]() - shift) if name == "joint_pos_rel" else of_joints[name]
+            if name == "joint_pos_rel":
+                default = np.array([self.default[joint] for joint in names])
+                return lambda: of_joints["joint_pos"]() - default
+            return of_joints[name]
         if "bodies" in node or "sites" in node:
-            kind = "body" if "bodies" in node else "site"
-            ids = [getattr(model, kind)(n).id for n in node["bodies" if kind == "body" else "sites"]]
-            where = data.xpos if kind == "body" else data.site_xpos
+            if "bodies" in node:
+                kind = "body"
+                where = data.xpos
+                ids = [model.body(name).id for name in node["bodies"]]
+            else:
+                kind = "site"
+                where = data.site_xpos
+                ids = [model.site(name).id for name in node["sites"]]
             return {
                 f"{kind}_pos": lambda: where[ids].ravel(),
                 f"{kind}_height": lambda: where[ids][:, 2] - [self.ground_at(p) for p in where[ids]],

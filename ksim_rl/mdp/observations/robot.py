@@ -30,7 +30,9 @@ class EncodedJoints(OfJoints, ObservationTerm):
 
     def read(self, view: EnvView, pos_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
         """Return what encoders read at these positions of the joints."""
-        return pos_EL + view.joints(self.joints).encoder_bias_EL if self.biased else pos_EL
+        if self.biased:
+            return pos_EL + view.joints(self.joints).encoder_bias_EL
+        return pos_EL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +115,9 @@ class RootLinVel(InFrame, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         entity = view.entity(self.entity)
-        return entity.root_lin_vel_b_EL if self.frame == "root" else entity.root_lin_vel_w_EL
+        if self.frame == "root":
+            return entity.root_lin_vel_b_EL
+        return entity.root_lin_vel_w_EL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +126,9 @@ class RootAngVel(InFrame, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         entity = view.entity(self.entity)
-        return entity.root_ang_vel_b_EL if self.frame == "root" else entity.root_ang_vel_w_EL
+        if self.frame == "root":
+            return entity.root_ang_vel_b_EL
+        return entity.root_ang_vel_w_EL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,7 +239,9 @@ class CameraImage(OfSensor, ObservationTerm, is_image=True):
 
     def __call__(self, view: EnvView) -> Shaped[Tensor, " E *image"]:
         camera = view.camera(self.sensor)
-        return camera.rgb_EHW3 if self.output == "rgb" else getattr(camera, f"{self.output}_EHW")
+        if self.output == "rgb":
+            return camera.rgb_EHW3
+        return getattr(camera, f"{self.output}_EHW")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,7 +286,8 @@ class HeightScan(OfEntity, ObservationTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         body = view.entity(self.entity)
         x_N, y_N = _grid(tuple(self.size), self.resolution, view.device)
-        sin_E1, cos_E1 = torch.sin(body.heading_E)[:, None], torch.cos(body.heading_E)[:, None]
+        sin_E1 = torch.sin(body.heading_E)[:, None]
+        cos_E1 = torch.cos(body.heading_E)[:, None]
         root_E3 = body.root_pos_EL
         points_EN2 = root_E3[:, None, :2] + torch.stack(
             (cos_E1 * x_N - sin_E1 * y_N, sin_E1 * x_N + cos_E1 * y_N), dim=-1

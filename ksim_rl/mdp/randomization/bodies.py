@@ -58,13 +58,15 @@ class RandomizeBodyInertia(RandomizeBodyField, field="body_inertia", columns=3, 
     operation: Literal["scale"] = "scale"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        ids, pairs = self.ids(view), self.ranges_by_column()
+        ids = self.ids(view)
+        pairs = self.ranges_by_column()
         self._check_reach(view, np.ones((len(ids), 3)), pairs)
         factor_EN3 = torch.ones(view.num_envs, 1 if self.shared else len(ids), 3, device=view.device)
         drawn_ENC = self.draw(view, len(ids), list(pairs.values()))
         factor_EN3[..., index_constant(tuple(pairs), view.device)] = drawn_ENC
         own_N3 = array_constant(second_moments(view, ids), view.device)
-        own_mass_N, mass_EN = array_constant(_masses(view, ids), view.device), view.field("body_mass")
+        own_mass_N = array_constant(_masses(view, ids), view.device)
+        mass_EN = view.field("body_mass")
         ratio_EN = mass_EN[:, index_constant(ids, view.device)] / own_mass_N
         spread_EN3 = own_N3 * factor_EN3 * ratio_EN[..., None]
         inertia_EN3 = spread_EN3.sum(-1, keepdim=True) - spread_EN3
@@ -111,7 +113,8 @@ class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shi
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        ids, model = view.resolver.ids("body", self.bodies), view.world.mj_model
+        ids = view.resolver.ids("body", self.bodies)
+        model = view.world.mj_model
         rows = list(ids)
         mass_N1 = array_constant(model.body_mass[rows][:, None], view.device)
         com_N3 = array_constant(model.body_ipos[rows], view.device)
@@ -120,9 +123,11 @@ class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shi
         drawn = self.draw(
             view, len(ids), [self.alpha, *[self.stretch] * 3, *[self.shear] * 3, *[self.shift] * 3]
         )
-        density_EN1, shift_EN3 = torch.exp(2.0 * drawn[..., 0:1]), drawn[..., 7:10]
+        density_EN1 = torch.exp(2.0 * drawn[..., 0:1])
+        shift_EN3 = drawn[..., 7:10]
         map_EN33 = torch.diag_embed(torch.exp(drawn[..., 1:4]))
-        map_EN33[..., 0, 1:], map_EN33[..., 1, 2] = drawn[..., 4:6], drawn[..., 6]
+        map_EN33[..., 0, 1:] = drawn[..., 4:6]
+        map_EN33[..., 1, 2] = drawn[..., 6]
 
         # Second moments about the moved centre of mass; the inertia is trace * 1 minus these.
         spread_EN33 = density_EN1[..., None] * product(map_EN33 * spread_N3[:, None, :], map_EN33.mT)

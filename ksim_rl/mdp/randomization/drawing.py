@@ -62,8 +62,14 @@ def _launch(
     the model's own values, and how much the follower [E, N, F] has of each. The numbers are the first `_ARGUMENTS`.
     """
     lanes = 32 if field_ENC.is_cuda else 1
-    mask_E = None if mask_E is None else mask_E.contiguous()
-    followers = 0 if follower_ENF is None else follower_ENF.shape[-1]
+    if mask_E is None:
+        mask_E = None
+    else:
+        mask_E = mask_E.contiguous()
+    if follower_ENF is None:
+        followers = 0
+    else:
+        followers = follower_ENF.shape[-1]
     where = lanes, *field_ENC.stride()[:2], followers, counter.ndim, first_row, stream
     tensors = seed, counter.contiguous(), mask_E, table_L, field_ENC, follower_ENF
     _quick(field_ENC.device, (field_ENC.shape[0], lanes), *numbers, cut, *where, *map(address, tensors))

@@ -79,7 +79,8 @@ def _unfelt(mj_model: mujoco.MjModel, geom: int, column: int, reach: tuple[float
     felt_from = ""
     for ground in grounds:
         name = mj_model.geom(ground).name or f"number {ground}"
-        own, other = int(mj_model.geom_priority[geom]), int(mj_model.geom_priority[ground])
+        own = int(mj_model.geom_priority[geom])
+        other = int(mj_model.geom_priority[ground])
         if own > other:
             condim = int(mj_model.geom_condim[geom])
         elif own < other:
@@ -96,11 +97,15 @@ def _unfelt(mj_model: mujoco.MjModel, geom: int, column: int, reach: tuple[float
             felt_from = name
     if not grounds or reach[0] >= floor:
         return ""
-    where = "has no effect" if reach[1] <= floor else f"has no effect below {floor:g}"
+    if reach[1] <= floor:
+        where = "has no effect"
+    else:
+        where = f"has no effect below {floor:g}"
     return f"{where}, the friction of {felt_from!r} at the same priority: give these geoms a higher one"
 
 
 def _collide(mj_model: mujoco.MjModel, geom: int, other: int) -> bool:
     """Whether two geoms may touch by their bits; explicit pairs have friction of their own."""
-    types, affinities = mj_model.geom_contype, mj_model.geom_conaffinity
+    types = mj_model.geom_contype
+    affinities = mj_model.geom_conaffinity
     return bool(types[geom] & affinities[other]) or bool(types[other] & affinities[geom])

@@ -62,8 +62,14 @@ class RandomizeJointRange(RandomizeJointField, field="jnt_range", columns=2, ope
     """Limits of joints that have any, rad or m; columns: 0 lower, 1 upper. Soft limits stay those of the model."""
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
-        lower = self.reach(nominal[:, 0], pairs[0])[1] if 0 in pairs else nominal[:, 0]
-        upper = self.reach(nominal[:, 1], pairs[1])[0] if 1 in pairs else nominal[:, 1]
+        if 0 in pairs:
+            lower = self.reach(nominal[:, 0], pairs[0])[1]
+        else:
+            lower = nominal[:, 0]
+        if 1 in pairs:
+            upper = self.reach(nominal[:, 1], pairs[1])[0]
+        else:
+            upper = nominal[:, 1]
         for row, joint in enumerate(self.ids(view)):
             name = view.world.mj_model.joint(joint).name
             if not view.world.mj_model.jnt_limited[joint]:
@@ -152,7 +158,8 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
             columns = index_constant([joints[i] for i in explicit], view.device)
             own_N = view.actuator_params.nominal(name)[columns]
             explicit_EN = drawn_EN[:, index_constant(explicit, view.device)]
-            value_EN, held_EL = self.combine(own_N, explicit_EN).clamp(min=0.0), view.actuator_param(name)
+            value_EN = self.combine(own_N, explicit_EN).clamp(min=0.0)
+            held_EL = view.actuator_param(name)
             held_EL[:, columns] = torch.where(mask_E[:, None], value_EN, held_EL[:, columns])
         return drawn_EN, [i for i, joint in enumerate(joints) if joint not in owners]
 
@@ -188,7 +195,8 @@ class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
         drawn_EN, builtin = self._draw_explicit(view, mask_E, name, pair)
         if not builtin:
             return
-        model, names = view.world.mj_model, [view.joints(self.joints).names[i] for i in builtin]
+        model = view.world.mj_model
+        names = [view.joints(self.joints).names[i] for i in builtin]
         servos = [_servo(model, model.joint(joint).id, name) for joint in names]
         column = 1 if name == "stiffness" else 2
         before_gear = -model.actuator_biasprm[servos, column]
@@ -227,7 +235,8 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
         # A factor or an offset cannot limit what has no limit: there, the limit of the joint itself may be meant.
         finite = self.operation != "abs"
         drawn_EN, builtin = self._draw_explicit(view, mask_E, "effort_limit", self.ranges, finite)
-        model, names = view.world.mj_model, view.joints(self.joints).names
+        model = view.world.mj_model
+        names = view.joints(self.joints).names
         ranges: dict[str, dict[int, int]] = {"actuator_forcerange": {}, "jnt_actfrcrange": {}}
         for i in builtin:
             joint = model.joint(names[i]).id
@@ -243,7 +252,8 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
         for field, place_of in ranges.items():
             if not place_of:
                 continue
-            rows, places = list(place_of), list(place_of.values())
+            rows = list(place_of)
+            places = list(place_of.values())
             # The lower bound as a size, like the upper one; an actuator's range is before its gear.
             own = getattr(model, field)[rows] * np.array((-1.0, 1.0))
             gear_N1 = np.ones((len(rows), 1))
@@ -281,7 +291,9 @@ def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> int:
 
 def _leading_column(mj_model: mujoco.MjModel, actuator: int) -> int:
     """Return the column of a servo's bias that its gain belongs to: 1 where it holds a position, else 2."""
-    return 1 if mj_model.actuator_biasprm[actuator, 1] != 0.0 else 2
+    if mj_model.actuator_biasprm[actuator, 1] != 0.0:
+        return 1
+    return 2
 
 
 def _times(value_EN: Float[Tensor, "E N"], factor_N: np.ndarray) -> Float[Tensor, "E N"]:

@@ -45,14 +45,17 @@ class RandomizeTurn(RandomizeField, columns=4):
             )
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        ids, own_NC = self.ids(view), array_constant(self.nominal(view), view.device)
+        ids = self.ids(view)
+        own_NC = array_constant(self.nominal(view), view.device)
         pairs = [self.ranges.get(angle, (0.0, 0.0)) for angle in get_args(Angle)]
         turn_EN4 = quaternion.from_euler_xyz(*self.draw(view, len(ids), pairs).unbind(-1))
         value_ENC = self._turned(own_NC[None], turn_EN4)
         write_entries(view.field(self.field), ids, range(self.columns), mask_E, value_ENC)
 
     def _turned(self, own_1NC: Tensor, turn_EN4: Tensor) -> Tensor:
-        return turn_EN4 if self.operation == "abs" else quaternion.multiply(own_1NC, turn_EN4)
+        if self.operation == "abs":
+            return turn_EN4
+        return quaternion.multiply(own_1NC, turn_EN4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +65,8 @@ class OfBodies(RandomizeField):
     bodies: Patterns
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
-        model, ids = view.world.mj_model, super().ids(view)
+        model = view.world.mj_model
+        ids = super().ids(view)
         for body in ids:
             free = model.jnt_type[model.body_jntadr[body]] == mujoco.mjtJoint.mjJNT_FREE
             if model.body_mocapid[body] >= 0 or (model.body_jntnum[body] and free):

@@ -75,7 +75,8 @@ class Randomize(EventTerm, mode="startup"):
         low, high = zip(*pairs.values(), strict=True)
         table_L = constant((*low, *high, *pairs, *ids, *own_NC.flat, *follower[1]), view.device)
         kinds = get_args(Distribution).index(self.distribution), get_args(Operation).index(operation)
-        numbers, keys = [*own_NC.shape, int(self.shared), *kinds], view.next_keys()
+        numbers = [*own_NC.shape, int(self.shared), *kinds]
+        keys = view.next_keys()
         given = keys.seed, keys.counter, table_L, follower[0], numbers, CUT, keys.stream, keys.first_row
         draw_entries(field_ENC, mask_E, *given)
 
@@ -85,14 +86,17 @@ class Randomize(EventTerm, mode="startup"):
         """Return the values that the draws make of the model's own; these broadcast to the draws."""
         if self.operation == "abs":
             return drawn
-        return nominal + drawn if self.operation == "add" else nominal * drawn
+        if self.operation == "add":
+            return nominal + drawn
+        return nominal * drawn
 
     def reach(self, nominal: np.ndarray, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest values that the draws can make of the model's own, shaped like these."""
         low, high = pair
         if self.distribution == "gaussian":
             mean, deviation = pair
-            low, high = mean - CUT * deviation, mean + CUT * deviation
+            low = mean - CUT * deviation
+            high = mean + CUT * deviation
         if self.operation == "add":
             return nominal + low, nominal + high
         if self.operation == "scale":
@@ -168,12 +172,15 @@ class RandomizeModelField(RandomizeField):
         return dict.fromkeys(self.columns_of_one_pair or range(self.columns), self.ranges)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        ids, pairs, nominal = self.ids(view), self.ranges_by_column(), self.nominal(view)
+        ids = self.ids(view)
+        pairs = self.ranges_by_column()
+        nominal = self.nominal(view)
         if not pairs:
             return
         self._check_reach(view, nominal, pairs)
         field_ENC = view.field(self.field).view(view.num_envs, -1, self.columns)
-        own_NC, follower = nominal[:, list(pairs)], self._follower(view)
+        own_NC = nominal[:, list(pairs)]
+        follower = self._follower(view)
         self._draw_into(field_ENC, view, own_NC, ids, pairs, self.operation, mask_E, follower)
 
     def _follower(self, view: EnvView) -> tuple[Tensor | None, Sequence[float]]:
@@ -204,8 +211,12 @@ def write_entries(
     value_ENC: Float[Tensor, "E N C"],
 ) -> None:
     """Write entries of a per-world field, [E, rows] or [E, rows, columns], in the worlds of `mask_E`."""
-    entries_ERC = field_E.unsqueeze(-1) if field_E.ndim == 2 else field_E
-    rows, across = index_constant(ids, field_E.device), index_constant(columns, field_E.device)
+    if field_E.ndim == 2:
+        entries_ERC = field_E.unsqueeze(-1)
+    else:
+        entries_ERC = field_E
+    rows = index_constant(ids, field_E.device)
+    across = index_constant(columns, field_E.device)
     held_ENC = entries_ERC[:, rows][..., across]
     if isinstance(rows, slice) and isinstance(across, slice):
         torch.where(mask_E[:, None, None], value_ENC, held_ENC, out=held_ENC)

@@ -120,7 +120,8 @@ class GaitPhase(OfSensor, RewardWhileCommanded):
     gait: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        touches_EF, phase_EL = view.contact(self.sensor).found_EN > 0, view.command(self.gait)
+        touches_EF = view.contact(self.sensor).found_EN > 0
+        phase_EL = view.command(self.gait)
         feet = touches_EF.shape[-1]
         if phase_EL.shape[-1] != 2 * feet:
             raise ValueError(

@@ -37,7 +37,8 @@ class JointPosLimits(OfJoints, RewardTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         joints = view.joints(self.joints)
-        pos_EL, limits_L2 = joints.pos_EL, joints.soft_limits_L2
+        pos_EL = joints.pos_EL
+        limits_L2 = joints.soft_limits_L2
         inside_EL = torch.clamp(pos_EL, limits_L2[:, 0], limits_L2[:, 1])
         return (pos_EL - inside_EL).abs().sum(-1)
 
@@ -192,7 +193,8 @@ class Symmetry(RewardTerm):
 
     def _pairs(self, view: EnvView) -> tuple[list[str], list[str]]:
         """Return the names of left and right joints, pair by pair."""
-        left, right = view.joints(self.left).names, view.joints(self.right).names
+        left = view.joints(self.left).names
+        right = view.joints(self.right).names
         if len(left) != len(right):
             raise ValueError(
                 f"left matches {left}, right matches {right}: give each left joint one right joint"

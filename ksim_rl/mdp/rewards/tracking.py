@@ -53,7 +53,10 @@ def tolerance(
     if shape == "long_tail":
         return 1.0 / (1.0 + (1.0 / value_at_margin - 1.0) * distance.square())
     if shape != "gaussian":
-        fall = distance if shape == "linear" else distance.square()
+        if shape == "linear":
+            fall = distance
+        else:
+            fall = distance.square()
         return torch.clamp(1.0 - (1.0 - value_at_margin) * fall, min=0.0)
     return torch.exp(distance.square() * math.log(value_at_margin))
 

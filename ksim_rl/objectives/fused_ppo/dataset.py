@@ -41,7 +41,10 @@ class FusedDataset:
         device: torch.device,
         mirror: SymmetricAugmentation | None = None,
     ) -> None:
-        self.layout, self.size, self._mirror, self._networks = layout, size, mirror, networks
+        self.layout = layout
+        self.size = size
+        self._mirror = mirror
+        self._networks = networks
         rows = size if mirror is None else 2 * size
         self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
         self.records = torch.zeros(rows, 3 * layout.out + 8, device=device)
@@ -106,7 +109,8 @@ class FusedDataset:
 
     def _take_records(self, part_ET: TensorDictBase, first: int, moments: Tensor) -> Tensor:
         """Write records, and return of each program how many env states it left out."""
-        rows, block = part_ET.numel(), _block(self._arguments["RECORD_LANES"])
+        rows = part_ET.numel()
+        block = _block(self._arguments["RECORD_LANES"])
         left_out = torch.empty(parts(rows, block), dtype=torch.int32, device=self.records.device)
         own = {"obs": self.obs[0, first:], "records": self.records[first:], "first": first, "num_rows": rows}
         own |= {"moments": moments, "num_moments": len(moments), "left_out": left_out, "BLOCK": block}
@@ -122,7 +126,8 @@ class FusedDataset:
 
     def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor, **changes: Any) -> None:
         observer = self._networks.observers[network]
-        source, block = _time_major(observer.read(part_ET)), _block(self._arguments["LANES"])
+        source = _time_major(observer.read(part_ET))
+        block = _block(self._arguments["LANES"])
         own = {"source": source, "obs": obs, "num_rows": len(source), "WIDTH": source.shape[1], "num_envs": 0}
         given = self._arguments | observer.moments_given | own | {"LISTED": False, "faults": None} | changes
         launch(read_observations, (parts(len(source), block),), given, BLOCK=block)

@@ -42,7 +42,12 @@ class Observer:
     @property
     def moments_given(self) -> dict[str, Any]:
         """What kernels get to normalize with, by the names of their parameters."""
-        mean, var = (None, None) if self.moments is None else (self.moments.mean, self.moments.var)
+        if self.moments is None:
+            mean = None
+            var = None
+        else:
+            mean = self.moments.mean
+            var = self.moments.var
         return {"mean": mean, "var": var, "eps": self.eps, "NORMALIZED": self.moments is not None}
 
 
@@ -117,7 +122,10 @@ class FusedLayout:
     """
 
     def __init__(self, networks: FusedNetworks, *, chained: bool | None = None) -> None:
-        self.chained = networks.chained if chained is None else chained
+        if chained is None:
+            self.chained = networks.chained
+        else:
+            self.chained = chained
         pairs = zip(networks.actor[:-1], networks.critic[:-1], strict=True)
         # Layers of actor and critic that lie side by side take the room of the wider one.
         self.hidden = tuple(
@@ -126,20 +134,35 @@ class FusedLayout:
         self.actions = networks.actor[-1].out_features
         self.obs_dims = networks.actor[0].in_features, networks.critic[0].in_features
         self.stored = _multiple(max(*self.obs_dims, MIN_WIDTH))
-        self.obs = power_of_two(self.stored) if self.chained else self.stored
+        if self.chained:
+            self.obs = power_of_two(self.stored)
+        else:
+            self.obs = self.stored
         # What is stored as two powers of two, where these are less than `obs`.
         head = 1 << (self.stored.bit_length() - 1)
-        rest = power_of_two(self.stored - head) if self.stored > head else 0
-        self.head, self.rest = (head, rest) if head + rest < self.obs else (self.obs, 0)
+        if self.stored > head:
+            rest = power_of_two(self.stored - head)
+        else:
+            rest = 0
+        if head + rest < self.obs:
+            self.head = head
+            self.rest = rest
+        else:
+            self.head = self.obs
+            self.rest = 0
         self.out = power_of_two(max(self.actions, MIN_WIDTH))
-        outputs = self.out if networks.std_layer is None else 2 * self.out
+        if networks.std_layer is None:
+            outputs = self.out
+        else:
+            outputs = 2 * self.out
         widths = (self.obs, *self.hidden, outputs)
         self.places: list[LayerPlace] = []
         weight = bias = column = gradient = 0
         for number, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
             at = {"weight": weight, "bias": bias, "input": column, "gradient": gradient}
             self.places.append(LayerPlace(fan_in=fan_in, fan_out=fan_out, **at))
-            weight, bias = weight + fan_in * fan_out, bias + fan_out
+            weight = weight + fan_in * fan_out
+            bias = bias + fan_out
             column += 0 if self.chained and number == 1 else fan_in
             gradient += 0 if self.chained and number == 0 else fan_out
         self.num_weights = weight
@@ -148,13 +171,15 @@ class FusedLayout:
         self.num_flat = sum(parameter.numel() for parameter in networks.parameters)
         # Columns of a row of layer inputs (observation first), and of gradients of layer outputs. Where the kernels are
         # chained neither are of the first hidden layer.
-        self.inputs, self.gradients = column, gradient
+        self.inputs = column
+        self.gradients = gradient
 
     def padded_index(self, networks: FusedNetworks) -> Int32[Tensor, " N"]:
         """Return for each element of the flat form its place in the padded one, on the CPU."""
         places = torch.arange(2 * self.num_padded, dtype=torch.int32).view(2, self.num_padded)
         index: list[Tensor] = []
-        std_at, actions = self.num_padded - self.out, self.actions
+        std_at = self.num_padded - self.out
+        actions = self.actions
         for row, layers in zip(places, (networks.actor, networks.critic), strict=True):
             for layer, at in zip(layers, self.places, strict=True):
                 block = row[at.weight :][: at.fan_in * at.fan_out].view(at.fan_out, at.fan_in)
@@ -178,11 +203,17 @@ class FusedLayout:
         for network in range(2):
             for number, at in enumerate(self.places):
                 for row in range(0, 0 if self.chained and number == 0 else at.fan_out, tile):
-                    fan_in = 0 if self.chained and number == 1 else at.fan_in
+                    if self.chained and number == 1:
+                        fan_in = 0
+                    else:
+                        fan_in = at.fan_in
                     for column in range(0, max(fan_in, 1), tile):
                         first = network, at.input + column, at.gradient + row
                         used = min(tile, fan_in - column), min(tile, at.fan_out - row)
-                        bias = -1 if column else self.num_weights + at.bias + row
+                        if column:
+                            bias = -1
+                        else:
+                            bias = self.num_weights + at.bias + row
                         tiles.append([*first, at.weight + row * at.fan_in + column, at.fan_in, *used, bias])
         return torch.tensor(tiles, dtype=torch.int32)
 
@@ -220,7 +251,10 @@ class Tuning:
     def of(cls, layout: FusedLayout, dtype: torch.dtype) -> "Tuning":
         """Return what suits a layout: chained, the first and the third width must be whole numbers of chunks."""
         # An element of float32 takes twice the registers and shared memory: so two programs share a multiprocessor.
-        wide: Any = {"stages": 2, "tile": 64, "tile_warps": 4} if dtype is torch.float32 else {}
+        if dtype is torch.float32:
+            wide: Any = {"stages": 2, "tile": 64, "tile_warps": 4}
+        else:
+            wide = {}
         if not layout.chained:
             return cls(block=64 if wide else 128, **wide)
         chunk = math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2])
@@ -270,7 +304,9 @@ def why_not_fused(
     rows = num_env_states_per_minibatch * (1 if cfg.symmetry == "none" else 2)
     columns = max(layout.inputs, layout.gradients, num_minibatches * layout.obs)
     too_many = f"{num_env_states_per_minibatch} env states in a minibatch are too many"
-    return too_many if rows * columns >= MAX_PLACES else None
+    if rows * columns >= MAX_PLACES:
+        return too_many
+    return None
 
 
 def launch(
@@ -281,7 +317,10 @@ def launch(
     It gets those of `arguments` and `changes` that are its parameters; where `only_compiles` is set it only compiles.
     """
     given = {**arguments, **changes}
-    run = partial(kernel.warmup, grid=grid) if only_compiles.get() else kernel[grid]
+    if only_compiles.get():
+        run = partial(kernel.warmup, grid=grid)
+    else:
+        run = kernel[grid]
     run(**{name: given[name] for name in kernel.arg_names}, num_warps=num_warps)
 
 

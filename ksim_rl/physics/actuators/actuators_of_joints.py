@@ -13,7 +13,8 @@ import warp as wp
 
 ADDED_FIELDS = frozenset(("actuator_armature", "actuator_damping", "actuator_dampingpoly"))
 # What MuJoCo notes where no actuator adds, and where several do.
-NONE, SEVERAL = -1, -2
+NONE = -1
+SEVERAL = -2
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _OF_TENDONS = (mujoco.mjtTrn.mjTRN_TENDON,)
 

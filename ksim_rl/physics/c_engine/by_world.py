@@ -51,7 +51,10 @@ class ByWorld:
 
     def array(self, name: str) -> np.ndarray:
         """Return the array of that name, zeros at first, which `fill` fills from then on."""
-        together = FORCES_OF_BODIES if name in FORCES_OF_BODIES else SUBTREE_VELOCITIES
+        if name in FORCES_OF_BODIES:
+            together = FORCES_OF_BODIES
+        else:
+            together = SUBTREE_VELOCITIES
         if together not in self._arrays:
             self._arrays[together] = {one: self._zeros(one) for one in together}
         return self._arrays[together][name]

@@ -141,7 +141,10 @@ class CWorld(World):
 
     def refresh(self, mask_E: Bool[Tensor, " E"] | None = None) -> None:
         """Recompute position- and velocity-stage quantities and sensors from the present state; see `World.refresh`."""
-        rows = None if mask_E is None else self._rows(mask_E)
+        if mask_E is None:
+            rows = None
+        else:
+            rows = self._rows(mask_E)
         if rows is not None and rows.numel() == 0:
             return
         self._push_all()
@@ -253,7 +256,9 @@ class CWorld(World):
 
     def nan_report(self) -> NanReport:
         """Write the worlds that became non-finite since the last report to files; see `World.nan_report`."""
-        return NanReport() if self._nan_guard is None else self._nan_guard.report()
+        if self._nan_guard is None:
+            return NanReport()
+        return self._nan_guard.report()
 
     def forget_failures(self) -> None:
         """Let the next `nan_report` leave out worlds that became non-finite until now."""
@@ -307,7 +312,9 @@ class CWorld(World):
         return self._of_data[name].tensor
 
     def _array(self, name: str) -> np.ndarray:
-        return self._by_world.array(name) if name in self._left_out else self._batch.bind(name)
+        if name in self._left_out:
+            return self._by_world.array(name)
+        return self._batch.bind(name)
 
     def close(self) -> None:
         """Free the simulations, after a last `nan_report`. Views that are still held keep their memory."""

@@ -78,4 +78,6 @@ def _shape(name: str, array: np.ndarray) -> tuple[int, ...]:
 def _dtype(name: str, array: np.ndarray) -> torch.dtype:
     if name in FLAGS:
         return torch.bool
-    return torch.float32 if np.issubdtype(array.dtype, np.floating) else torch.int32
+    if np.issubdtype(array.dtype, np.floating):
+        return torch.float32
+    return torch.int32

@@ -17,7 +17,9 @@ from ksim_rl.physics.rows.contact_lists import HAS_ROWS, ContactLists
 
 # Lanes of a world on CUDA, threads of a block, which shares nothing, and registers: as many as let 4096 worlds be on an
 # H200 at once. Most of the 103 that the compiler likes are for capsules with boxes, which are few.
-LANES, CUDA_THREADS, REGISTERS = 32, 128, 64
+LANES = 32
+CUDA_THREADS = 128
+REGISTERS = 64
 FILTERS = mjw.BroadphaseFilter.PLANE | mjw.BroadphaseFilter.SPHERE | mjw.BroadphaseFilter.OBB
 # How many contacts a pair of these types has at most.
 MOST_CONTACTS = {
@@ -31,7 +33,9 @@ def broad_phase_unavailable(
     warp_model: mjw.Model, warp_data_E: mjw.Data, *, rows_unavailable: str | None = None
 ) -> str | None:
     """Return why MuJoCo Warp's own broad phase finds a model's pairs, or None where ours does."""
-    m, opt, bits = warp_model, warp_model.opt, mjw.DisableBit
+    m = warp_model
+    opt = warp_model.opt
+    bits = mjw.DisableBit
     reasons = {
         "the rows of contacts are not made by one kernel": rows_unavailable is not None,
         "no contacts are wanted": bool(opt.disableflags & (bits.CONSTRAINT | bits.CONTACT)),
@@ -46,12 +50,15 @@ def broad_phase_unavailable(
 def pairs_left(warp_model: mjw.Model) -> str | None:
     """Return whose contacts MuJoCo Warp's narrow phase finds after our broad one, or None."""
     left = {" and ".join(kinds) for *_, kinds, most in _pairs(warp_model) if not most}
-    return f"{', '.join(sorted(left))} meet, whose contacts they alone find" if left else None
+    if left:
+        return f"{', '.join(sorted(left))} meet, whose contacts they alone find"
+    return None
 
 
 def _pairs(warp_model: mjw.Model) -> Iterator[tuple[int, int, list[str], int]]:
     """Yield each pair, the geom of the lower type first, its types, and how many contacts the kernel finds at most."""
-    pairs, types = warp_model.nxn_geom_pair_filtered.numpy(), warp_model.geom_type.numpy()
+    pairs = warp_model.nxn_geom_pair_filtered.numpy()
+    types = warp_model.geom_type.numpy()
     for pair, (_, sensor) in zip(pairs.tolist(), warp_model.nxn_pairid_filtered.numpy(), strict=True):
         a, b = sorted(pair, key=types.__getitem__)
         kinds = [mjw.GeomType(types[geom]).name.lower() for geom in (a, b)]
@@ -68,8 +75,10 @@ def collisions(
     The pool has to be empty (`nacon`). Places in it are others, as in each run on a GPU; contacts are appended to the
     lists, unless others come to the pool. `lanes` is how many threads share a world on CUDA; None takes the usual.
     """
-    m, d = warp_model, warp_data_E
-    device, aabb = d.qpos.device, m.geom_aabb
+    m = warp_model
+    d = warp_data_E
+    device = d.qpos.device
+    aabb = m.geom_aabb
     pairs = np.array([(a, b, most) for a, b, _, most in _pairs(m)], dtype=np.int32).reshape(-1, 3)
     are_theirs = pairs[:, 2] == 0
     others = pairs[are_theirs, :2]
@@ -83,7 +92,14 @@ def collisions(
     }
     source = native.source_of("rows", ("layout",))
     source += native.source_of("collision", ("broad_phase", "shapes", "narrow_phase"))
-    lanes, threads, most = (lanes or LANES, CUDA_THREADS, REGISTERS) if device.is_cuda else (1, 1, None)
+    if device.is_cuda:
+        lanes = lanes or LANES
+        threads = CUDA_THREADS
+        most = REGISTERS
+    else:
+        lanes = 1
+        threads = 1
+        most = None
     margins = m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap
     constants = {
         **upstream.GEOM_TYPES,

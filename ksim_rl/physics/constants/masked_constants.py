@@ -36,13 +36,16 @@ class MaskedConstants:
     def __init__(
         self, mj_model: mujoco.MjModel, warp_model: mjw.Model, mask: wp.array, expanded: Iterable[str]
     ) -> None:
-        self._mj_model, self._warp_model = mj_model, warp_model
-        self._moves, self._resizes = KINEMATIC & set(expanded), "geom_size" in expanded
+        self._mj_model = mj_model
+        self._warp_model = warp_model
+        self._moves = KINEMATIC & set(expanded)
+        self._resizes = "geom_size" in expanded
         self._inert = not mj_model.ntendon and not mj_model.nflex and _drives_scalar_joints(mj_model)
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any()) or mj_model.ntendon > 0
         has_armature = "actuator_armature" in expanded or np.any(mj_model.actuator_armature)
         self._num_envs = num_envs = mask.shape[0]
-        nbody, nv = mj_model.nbody, mj_model.nv
+        nbody = mj_model.nbody
+        nv = mj_model.nv
         starts, sizes = _joint_groups(mj_model)
         self._lanes = LANES if mask.device.is_cuda else 1
         floats = kernels.floats_per_world(nv, nbody)
@@ -50,7 +53,8 @@ class MaskedConstants:
         self._kernel = kernels.constants_kernel(nv, nbody, self._lanes, on_chip)
         # Frames at qpos0 are shared unless a field that moves them differs between worlds.
         num_frames = num_envs if self._moves else 1
-        self._mask, self._everywhere = mask, wp.full(num_frames, True, dtype=bool)
+        self._mask = mask
+        self._everywhere = wp.full(num_frames, True, dtype=bool)
         own = {
             "mask": mask,
             "sums_masses": "body_subtreemass" in expanded,
@@ -98,7 +102,8 @@ class MaskedConstants:
             return
         if self._moves:
             wp.launch(kernels.frames, dim=self._num_envs, inputs=[self._constants])
-        dim, inputs = (self._num_envs, self._lanes), [self._constants, groups]
+        dim = (self._num_envs, self._lanes)
+        inputs = [self._constants, groups]
         wp.launch(self._kernel, dim=dim, inputs=inputs, block_dim=self._lanes)
 
 

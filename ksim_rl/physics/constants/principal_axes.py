@@ -22,7 +22,8 @@ def principal_axes(
     """Return principal moments, and the axes' orientation (w, x, y, z); a diagonal matrix keeps its order and axes."""
     # In float64: with float32, Warp stops far from the accuracy of float32.
     matrices = inertia_33.reshape(-1, 3, 3).double().contiguous()
-    moments, quats = matrices.new_empty(matrices.shape[0], 3), matrices.new_empty(matrices.shape[0], 4)
+    moments = matrices.new_empty(matrices.shape[0], 3)
+    quats = matrices.new_empty(matrices.shape[0], 4)
     arrays = ((matrices, wp.mat33d), (moments, wp.vec3d), (quats, wp.vec4d))
     with warp_scope(matrices.device):
         inputs = [wp.from_torch(tensor, dtype=dtype, return_ctype=True) for tensor, dtype in arrays]

@@ -249,7 +249,8 @@ def convex_height_field_contacts(c: Searches):
 
 def append(own: Mapping[str, wp.array], warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     """Launch the kernel for pairs of height fields and geoms, with the memory for it, as `Searches` has them."""
-    slots, opt = own["vert"].shape[0], warp_model.opt
+    slots = own["vert"].shape[0]
+    opt = warp_model.opt
     numbers = {"iterations": int(opt.ccd_iterations), "worlds": warp_data_E.nworld, "slots": slots}
     owners = {**own, **numbers, "ccd_tolerance": opt.ccd_tolerance}, warp_model, warp_data_E
     wp.launch(convex_height_field_contacts, dim=slots, inputs=[filled(Searches, *owners)])
@@ -257,9 +258,13 @@ def append(own: Mapping[str, wp.array], warp_model: mjw.Model, warp_data_E: mjw.
 
 def memory_for(warp_model: mjw.Model, warp_data_E: mjw.Data, *, num_pairs: int) -> dict[str, wp.array]:
     """Return the memory of searches: vertices, faces and edges of their polytopes. On a CPU there is one at a time."""
-    slots = min(SEARCHES, warp_data_E.nworld * num_pairs) if warp_data_E.qpos.device.is_cuda else 1
+    if warp_data_E.qpos.device.is_cuda:
+        slots = min(SEARCHES, warp_data_E.nworld * num_pairs)
+    else:
+        slots = 1
     iterations = int(warp_model.opt.ccd_iterations)
-    faces, vertices = 6 + MJ_MAX_EPAFACES * iterations, 10 + 2 * iterations
+    faces = 6 + MJ_MAX_EPAFACES * iterations
+    vertices = 10 + 2 * iterations
     return {
         "corners": wp.empty((slots, 6), dtype=wp.vec3),
         "vert": wp.empty((slots, vertices), dtype=wp.vec3),

@@ -28,10 +28,13 @@ PARALLEL = wp.constant(1.0e-6)
 # How much farther apart, m, two shapes have to be along what is normal to two edges than along the normal of a face:
 # where edges lie in a face, both are the same but for rounding.
 NEARLY = wp.constant(1.0e-6)
-FACES, EDGES, CORNERS = wp.constant(5), wp.constant(9), wp.constant(6)
+FACES = wp.constant(5)
+EDGES = wp.constant(9)
+CORNERS = wp.constant(6)
 # The directions that may separate a prism and a box: normals of faces of each, then of each two edges that differ in
 # direction, of which a prism has seven.
-FACE_AXES, AXES = wp.constant(8), wp.constant(29)
+FACE_AXES = wp.constant(8)
+AXES = wp.constant(29)
 
 
 @wp.struct

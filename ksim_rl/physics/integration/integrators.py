@@ -157,7 +157,10 @@ def _inputs_of_gains(
     flags = int(m.opt.disableflags)
     if flags & mjw.DisableBit.ACTUATION or not _gain_depends_on_velocity(m):
         return None
-    ranges = mj_model.actuator_ctrllimited if not flags & mjw.DisableBit.CLAMPCTRL else np.zeros(0)
+    if not flags & mjw.DisableBit.CLAMPCTRL:
+        ranges = mj_model.actuator_ctrllimited
+    else:
+        ranges = np.zeros(0)
     if not np.any(ranges) and _has_own_controls(mj_model):
         return None
     if np.any(mj_model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR) and not _has_own_controls(
@@ -186,7 +189,10 @@ def _gain_depends_on_velocity(warp_model: mjw.Model) -> bool:
     gains = warp_model.actuator_gainprm
     may_differ = gains.shape[0] > 1
     # Fields that differ between worlds may be written at any time.
-    depends = np.ones(affine.size, dtype=bool) if may_differ else gains.numpy()[0, :, 2] != 0.0
+    if may_differ:
+        depends = np.ones(affine.size, dtype=bool)
+    else:
+        depends = gains.numpy()[0, :, 2] != 0.0
     return bool(np.any(affine & stateless & depends))
 
 

@@ -19,8 +19,11 @@ def hook_after_rows(warp_model: mjw.Model) -> str:
 
     It calls the second unless actuation is disabled: then a model takes its place whose actuators do nothing.
     """
-    flags, bits = int(warp_model.opt.disableflags), mjw.DisableBit
-    return "control" if flags & bits.SPRING and flags & bits.DAMPER else "passive"
+    flags = int(warp_model.opt.disableflags)
+    bits = mjw.DisableBit
+    if flags & bits.SPRING and flags & bits.DAMPER:
+        return "control"
+    return "passive"
 
 
 def mended_runge_kutta(
@@ -52,7 +55,10 @@ def mended_runge_kutta(
         hooks.setdefault("control", []).append(clock.advance)
         hooks.setdefault("act_dyn", []).append(clock.put_back)
 
-    changes = _idle_actuators(warp_model) if hook == "control" and not acts else {}
+    if hook == "control" and not acts:
+        changes = _idle_actuators(warp_model)
+    else:
+        changes = {}
 
     def launch(substep_warp_model: mjw.Model) -> None:
         clock.start()

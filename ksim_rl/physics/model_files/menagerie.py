@@ -14,12 +14,17 @@ def model_path(name: str) -> Path:
     """
     robot, _, entry = name.partition("/")
     root = os.environ.get("MENAGERIE_ROOT")
-    return _in_folder(Path(root), robot, entry) if root else _from_package(robot, entry)
+    if root:
+        return _in_folder(Path(root), robot, entry)
+    return _from_package(robot, entry)
 
 
 def _in_folder(root: Path, robot: str, entry: str) -> Path:
     if not (root / robot).is_dir():
-        found = [path.name for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
+        if root.is_dir():
+            found = [path.name for path in root.iterdir() if path.is_dir()]
+        else:
+            found = []
         raise ValueError(
             f"menagerie model {robot!r} is not under MENAGERIE_ROOT={root}: {near(robot, found)}; copy its "
             "folder there, or unset MENAGERIE_ROOT to download it with the package mujoco-menagerie"

@@ -33,7 +33,10 @@ def ready_urdf(text: str, folder: Path) -> str:
     """
     if not _EXTENSION.search(text):
         # Without shapes that collide, those that are drawn are all that is known of the links.
-        discards = "true" if _COLLISION.search(text) else "false"
+        if _COLLISION.search(text):
+            discards = "true"
+        else:
+            discards = "false"
         compiler = f'<compiler strippath="false" fusestatic="false" discardvisual="{discards}"/>'
         text = _ROBOT.sub(lambda found: f"{found[0]}<mujoco>{compiler}</mujoco>", text, count=1)
     folder = Path(os.path.abspath(folder))  # as it is called, since links may be what holds packages together
@@ -72,7 +75,8 @@ def _mesh_path(name: str, folder: Path) -> str:
     in_package = _PACKAGE.fullmatch(name)
     if in_package is None:
         return name.removeprefix("file://")
-    package, path = in_package["package"], in_package["path"]
+    package = in_package["package"]
+    path = in_package["path"]
     for of_package in _folders_of(package, folder):
         if (of_package / path).is_file():
             return str(of_package / path)

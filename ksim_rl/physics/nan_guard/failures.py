@@ -20,7 +20,10 @@ from ksim_rl.physics.upstream import per_world_fields
 from ksim_rl.physics.views import SUBSTEP_INPUTS
 
 FORMAT = "ksim_rl.nan_guard/2"
-_MODEL, _STATE, _FIELD, _REACHED = "model", "state/", "field/", "reached/"
+_MODEL = "model"
+_STATE = "state/"
+_FIELD = "field/"
+_REACHED = "reached/"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +112,8 @@ def _check(failure: Failure) -> None:
         value = getattr(failure, name)
         if type(value) is not int or not least <= value < 2**31:
             raise ValueError(f"{name}={value!r}: expected a number from {least} on")
-    data, kept = mujoco.MjData(failure.mj_model), len(failure.states["qpos"])
+    data = mujoco.MjData(failure.mj_model)
+    kept = len(failure.states["qpos"])
     width = {name: np.size(getattr(data, name)) for name in SUBSTEP_INPUTS}
     expected = {f"{_STATE}{name}": (kept, size) for name, size in width.items() if size}
     expected |= {f"{_REACHED}{name}": (width[name],) for name in ("qpos", "qvel")}

@@ -20,7 +20,9 @@ from torch import Tensor
 from ksim_rl.checked import Checked, Count, Filled
 from ksim_rl.physics.views import SUBSTEP_INPUTS
 
-_WATCHED, _FAILED, _KEPT = 0, 1, 2
+_WATCHED = 0
+_FAILED = 1
+_KEPT = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +99,8 @@ class NanGuard:
         num_envs: int,
         by_warp: bool,
     ) -> None:
-        self.cfg, self._mj_model = cfg, mj_model
+        self.cfg = cfg
+        self._mj_model = mj_model
         self._failures = _failures(cfg)
         self._launches = by_warp
         self._folder = Path(cfg.folder)
@@ -107,7 +110,8 @@ class NanGuard:
         self._rows = [_as_rows(state[name], num_envs) for name in self._names]
         self._reached_from = {name: _as_rows(state[name], num_envs) for name in ("qpos", "qvel")}
         self._rings = [wp.zeros((num_envs, cfg.history, rows.shape[1]), dtype=float) for rows in self._rows]
-        self._failed, self._count = wp.zeros(num_envs, dtype=int), wp.zeros(num_envs, dtype=int)
+        self._failed = wp.zeros(num_envs, dtype=int)
+        self._count = wp.zeros(num_envs, dtype=int)
         self._reached = {name: wp.zeros_like(rows) for name, rows in self._reached_from.items()}
         self._failed_E, self._count_E = wp.to_torch(self._failed), wp.to_torch(self._count)
         self._fields = dict(fields)
@@ -168,7 +172,8 @@ class NanGuard:
         worlds = tuple(int(world) for world in (self._failed_E != _WATCHED).nonzero().flatten().cpu())
         if not worlds:
             return NanReport()
-        files, messages = [], []
+        files = []
+        messages = []
         try:
             for world in worlds[: max(self.cfg.max_files - self._written, 0)]:
                 files.append(self._write(world))
@@ -188,7 +193,8 @@ class NanGuard:
         self._failed_E.zero_()
 
     def _write(self, world: int) -> Path:
-        count, history = int(self._count_E[world]), self.cfg.history
+        count = int(self._count_E[world])
+        history = self.cfg.history
         # The newest row stands at count - 1; fewer substeps than places leave the rest unused.
         places = [place % history for place in range(max(0, count - history), count)]
         failure = self._failures.Failure(

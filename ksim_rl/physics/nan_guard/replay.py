@@ -99,7 +99,9 @@ def dof_name(mj_model: mujoco.MjModel, dof: int) -> str:
     joint = int(mj_model.dof_jntid[dof])
     name = mj_model.joint(joint).name or f"joint {joint}"
     several = mj_model.jnt_type[joint] in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
-    return f"{name}[{dof - int(mj_model.jnt_dofadr[joint])}]" if several else name
+    if several:
+        return f"{name}[{dof - int(mj_model.jnt_dofadr[joint])}]"
+    return name
 
 
 def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
@@ -111,13 +113,19 @@ def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
     rows: list[tuple[str, ...]] = [tuple(heads.split(","))]
     last = len(result.substeps) - 1
     for k, substep in enumerate(result.substeps):
-        (speed, fast), (acceleration, pushed) = substep.speed, substep.acceleration
+        (speed, fast) = substep.speed
+        (acceleration, pushed) = substep.acceleration
         numbers = (f"{substep.time:.4f}", _short(substep.energy), _short(speed), dof_name(mj_model, fast))
         numbers += (_short(acceleration), dof_name(mj_model, pushed), _short(substep.control[0]))
         said = ", ".join(substep.warnings) or "ok"
         rows.append((str(k - last), *numbers, str(substep.contacts), _short(substep.deviation), said))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    widths = []
+    for column in zip(*rows, strict=True):
+        widths.append(max(len(cell) for cell in column))
+    lines = []
+    for row in rows:
+        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+        lines.append("  ".join(cells))
     names = [dof_name(mj_model, dof) for dof in result.dofs]
     shown = ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
     kept = len(result.substeps)
@@ -160,12 +168,15 @@ def _substep(data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.nda
         else:
             target = getattr(data, name)
             target[:] = values[k].reshape(target.shape)
-    speed, control = _largest(data.qvel), _largest(data.ctrl)
+    speed = _largest(data.qvel)
+    control = _largest(data.ctrl)
     given = data.ctrl.copy()
     data.ctrl[:] = np.clip(np.nan_to_num(given), -MOST_CONTROL, MOST_CONTROL)
     mujoco.mj_forward(mj_model, data)
     data.ctrl[:] = given
-    energy, contacts, acceleration = float(data.energy.sum()), int(data.ncon), _largest(data.qacc)
+    energy = float(data.energy.sum())
+    contacts = int(data.ncon)
+    acceleration = _largest(data.qacc)
     time = float(data.time)
     mujoco.mj_step(mj_model, data)
     return Substep(
@@ -193,7 +204,10 @@ def _broken_dofs(mj_model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -
     broken = ~np.isfinite(qvel)
     for joint in range(mj_model.njnt):
         start = int(mj_model.jnt_qposadr[joint])
-        end = int(mj_model.jnt_qposadr[joint + 1]) if joint + 1 < mj_model.njnt else mj_model.nq
+        if joint + 1 < mj_model.njnt:
+            end = int(mj_model.jnt_qposadr[joint + 1])
+        else:
+            end = mj_model.nq
         if not np.isfinite(qpos[start:end]).all() and not broken[mj_model.dof_jntid == joint].any():
             broken[mj_model.dof_jntid == joint] = True
     return tuple(int(dof) for dof in np.flatnonzero(broken))

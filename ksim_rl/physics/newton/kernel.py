@@ -22,7 +22,8 @@ import warp as wp
 from ksim_rl.physics import native
 from ksim_rl.physics.newton.limbs import Limbs, padded, row_stride
 
-CUDA_LANES, SORTING_THREADS = 32, 1024
+CUDA_LANES = 32
+SORTING_THREADS = 1024
 _PARTS = ("layout", "constraints", "cost", "limbs", "tiles", "hessian", "line_search", "newton")
 _SOURCE = native.source_of("newton", _PARTS)
 
@@ -48,17 +49,31 @@ def layout(
     nv: int, njmax: int, limbs: Limbs, *, ntendon: int, elliptic: bool, rows_on_chip: int
 ) -> dict[str, int]:
     """Return the sizes of what the lanes of a world share, by the names of the C++, and all of it in `FLOATS`."""
-    arms, chains, trunk = len(limbs.trunk) + 1, len(limbs.chains), padded(len(limbs.trunk))
-    limb, stride = len(limbs.chains[-1]) if chains else 1, row_stride(nv)
-    narrow = row_stride(trunk + limb) if chains else stride
+    arms = len(limbs.trunk) + 1
+    chains = len(limbs.chains)
+    trunk = padded(len(limbs.trunk))
+    limb = len(limbs.chains[-1]) if chains else 1
+    stride = row_stride(nv)
+    if chains:
+        narrow = row_stride(trunk + limb)
+    else:
+        narrow = stride
     # A column of a whole block has the entries of the block twice; one more is that of the gradient.
     column = padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
     # Part 4 of the C++ has blocks and arms of limbs, then the trunk; part 6 has two columns, or in the end two rows.
     of_limbs = chains * (limb + arms) * padded(limb) + max(padded(arms * (arms + 1) // 2), 2 * narrow)
-    workspace, spread = max(2 * column, 2 * stride, of_limbs), trunk + chains * padded(limb)
+    workspace = max(2 * column, 2 * stride, of_limbs)
+    spread = trunk + chains * padded(limb)
     # So many lanes sum the tile of a limb: a power of two. A lane has three rows of it in its registers.
-    lanes = 1 << (CUDA_LANES // chains).bit_length() - 1 if chains else 0
-    rows, tile = padded(njmax), lanes if len(limbs.trunk) + limb <= min(lanes + 1, 12) else 0
+    if chains:
+        lanes = 1 << (CUDA_LANES // chains).bit_length() - 1
+    else:
+        lanes = 0
+    rows = padded(njmax)
+    if len(limbs.trunk) + limb <= min(lanes + 1, 12):
+        tile = lanes
+    else:
+        tile = 0
     bounds = rows if elliptic else padded(min(nv + ntendon, njmax))  # of cones, or else of dry friction
     floats = (nv + 1) * stride + rows_on_chip * narrow + workspace + spread + bounds + 4 * rows + rows // 2
     return {
@@ -97,7 +112,8 @@ def launcher(
     takes `efc_J_colind` and `efc_J`, the `scratch`, the tables of `limbs`, the `order` in which the worlds are taken
     up, and `broken`.
     """
-    states, rows = mujoco.mjtConstraintState, mujoco.mjtConstraint
+    states = mujoco.mjtConstraintState
+    rows = mujoco.mjtConstraint
     constants = {
         **sizes,
         "MOST_TRIALS": warp_model.opt.ls_iterations,

@@ -18,17 +18,21 @@ class Limbs:
 
     def tables(self, nv: int) -> dict[str, list[int]]:
         """Return, by degree of freedom, its slot, its limb (-1 in the trunk) and its place in a narrow row."""
-        where = {dof: (-1, place) for place, dof in enumerate(self.trunk if self.chains else range(nv))}
+        # Where nothing branches, all are of the trunk.
+        trunk = self.trunk if self.chains else range(nv)
+        where = {dof: (-1, place) for place, dof in enumerate(trunk)}
         for limb, chain in enumerate(self.chains):
             where |= {dof: (limb, padded(len(self.trunk)) + place) for place, dof in enumerate(chain)}
-        dofs, (limbs, places) = list(where), zip(*(where[dof] for dof in range(nv)), strict=True)
+        dofs = list(where)
+        (limbs, places) = zip(*(where[dof] for dof in range(nv)), strict=True)
         slots = sorted(range(nv), key=dofs.__getitem__)
         return {"dofs": dofs, "slots": slots, "limbs": list(limbs), "places": list(places)}
 
 
 def limbs_of(parents: Sequence[int]) -> Limbs:
     """Return the limbs of a tree, or nothing where there is one limb, a part is too large, or no row gets narrower."""
-    leaves, chains = [0] * len(parents), dict[int, list[int]]()
+    leaves = [0] * len(parents)
+    chains = dict[int, list[int]]()
     for dof in reversed(range(len(parents))):
         leaves[dof] = max(leaves[dof], 1)
         if parents[dof] >= 0:
@@ -40,7 +44,9 @@ def limbs_of(parents: Sequence[int]) -> Limbs:
     # The longest is the last, so that what a limb lacks of it are slots of others, of which it has no entries.
     limbs = tuple(sorted(map(tuple, chains.values()), key=len))
     found = Limbs(trunk=trunk, chains=limbs)
-    return found if _suits(found, nv=len(parents)) else Limbs(trunk=(), chains=())
+    if _suits(found, nv=len(parents)):
+        return found
+    return Limbs(trunk=(), chains=())
 
 
 def _suits(limbs: Limbs, *, nv: int) -> bool:

@@ -17,12 +17,15 @@ from ksim_rl.physics.sim_cfg import SimCfg
 SHARED_FLOATS = 48 * 1024 // 4
 # What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. Of many eleven do, if
 # an eighth of the rows fit (H200, 32768 worlds of G1, own substeps: 11.88 ms; with ten 11.93, with twelve 12.14).
-FLOATS_PER_WORLD, FLOATS_OF_MANY = 5536, 5048
+FLOATS_PER_WORLD = 5536
+FLOATS_OF_MANY = 5048
 # A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where
 # warps stay, 512 registers for a lane. With 72 of them as many worlds of Go1 run at once as the memory lets, 28. With
 # 96 only 20 do, and fewer values lie in memory meanwhile, which is faster where most worlds run at once anyway (H200,
 # 4096 worlds: 119 us, 125 with 72; 32768: 776 and 722). Where more than 128 are left, there is no need of a bound.
-SHARED_BYTES, LEAST_REGISTERS, MOST_REGISTERS = 228 * 1024, (96, 72), 128
+SHARED_BYTES = 228 * 1024
+LEAST_REGISTERS = (96, 72)
+MOST_REGISTERS = 128
 MOST_DOFS = 64
 # MuJoCo Warp's solver ends its loop by a conditional node, which costs more than the few iterations that it saves
 # (H200, 4096 worlds, at most 10 iterations: Go1 8.22 ms without and 8.46 with it, G1 9.88 and 10.17).
@@ -36,7 +39,8 @@ INTEGRATORS = (
 
 def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
     """Return why the kernel cannot solve this model, or None where it can."""
-    opt, nv = mj_model.opt, mj_model.nv
+    opt = mj_model.opt
+    nv = mj_model.nv
     elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
     limbs = limbs_of(mj_model.dof_parentid.tolist())
     floats = layout(nv, njmax, limbs, ntendon=mj_model.ntendon, elliptic=elliptic, rows_on_chip=0)["FLOATS"]
@@ -92,17 +96,24 @@ def solver(
         rows_on_chip: None is what was measured to be best: half of the rows, which few worlds exceed, where they fit.
         broken: int32 [E], makes a debug build, which adds to each world's number the `Invariant`s that do not hold.
     """
-    m, d, efc = warp_model, warp_data_E, warp_data_E.efc
+    m = warp_model
+    d = warp_data_E
+    efc = warp_data_E.efc
     elliptic = bool(m.opt.cone == mjw.ConeType.ELLIPTIC)
-    device, on_cuda = d.qpos.device, d.qpos.device.is_cuda
+    device = d.qpos.device
+    on_cuda = d.qpos.device.is_cuda
     limbs = limbs_of(m.dof_parentid.numpy().tolist())
     sizes_with = partial(layout, m.nv, d.njmax, limbs, ntendon=m.ntendon, elliptic=elliptic)
     sizes = sizes_with(rows_on_chip=0)
-    stride, narrow = sizes["STRIDE"], sizes["NARROW"]
+    stride = sizes["STRIDE"]
+    narrow = sizes["NARROW"]
     if rows_on_chip is None:
         is_tight = d.nworld > FEW_WORLDS and sizes["FLOATS"] + d.njmax // 8 * narrow <= FLOATS_OF_MANY
         room = (FLOATS_OF_MANY if is_tight else FLOATS_PER_WORLD) - sizes["FLOATS"]
-        rows_on_chip = min(-(-d.njmax // 2), max(0, room // narrow)) if on_cuda else d.njmax
+        if on_cuda:
+            rows_on_chip = min(-(-d.njmax // 2), max(0, room // narrow))
+        else:
+            rows_on_chip = d.njmax
     sizes = sizes_with(rows_on_chip=rows_on_chip)
     far_floats = (d.njmax - rows_on_chip * narrow // stride) * stride
     own = {
@@ -113,7 +124,12 @@ def solver(
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
     }
-    lanes, registers = (CUDA_LANES, most_registers(sizes["FLOATS"], d.nworld)) if on_cuda else (1, None)
+    if on_cuda:
+        lanes = CUDA_LANES
+        registers = most_registers(sizes["FLOATS"], d.nworld)
+    else:
+        lanes = 1
+        registers = None
     solve = launcher(m, d, own, sizes, lanes=lanes, max_registers=registers, checked=broken is not None)
 
     def launch(*, orders: bool = True, solves: bool = True) -> None:

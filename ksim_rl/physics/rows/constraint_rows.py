@@ -19,10 +19,12 @@ from ksim_rl.physics.rows.second_limits import joints_between_limits
 
 PARTS = ("layout", "order", "row", "joints", "contacts")
 # The degrees of freedom that move a geom are bits of a number, and a geom of a pair is 15 bits of another.
-MOST_DOFS, MOST_GEOMS = 64, 1 << 15
+MOST_DOFS = 64
+MOST_GEOMS = 1 << 15
 # The compiler likes 104 registers, with which this many threads are on a multiprocessor at once. Where there are more,
 # 80 take less time: 6.435 ms instead of 6.566 for a control step of 32768 worlds of Go1 on an H200.
-THREADS_AT_ONCE, REGISTERS = 512, 80
+THREADS_AT_ONCE = 512
+REGISTERS = 80
 _ENUMS = {
     **native.names_of(mujoco.mjtConstraint),
     "BALL": mujoco.mjtJoint.mjJNT_BALL,
@@ -51,7 +53,10 @@ def constraint_rows(
     It also makes the contact lists. What only MuJoCo Warp's own solver reads (`jtdaj_*`, `Jqvel`, `dof_frictionadr`) is
     not written. `lanes` is how many threads share a world on CUDA; None takes the usual.
     """
-    m, d, bits, flags = warp_model, warp_data_E, mjw.DisableBit, int(warp_model.opt.disableflags)
+    m = warp_model
+    d = warp_data_E
+    bits = mjw.DisableBit
+    flags = int(warp_model.opt.disableflags)
     limited = np.concatenate([m.jnt_limited_ball_adr.numpy(), m.jnt_limited_slide_hinge_adr.numpy()])
     moves = m.body_isdofancestor.numpy()[m.body_weldid.numpy()[m.geom_bodyid.numpy()], : m.nv] != 0
     masks = (moves * (np.uint64(1) << np.arange(m.nv, dtype=np.uint64))).sum(-1, dtype=np.uint64)
@@ -76,8 +81,10 @@ def constraint_rows(
         "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
         "refsafe": not flags & bits.REFSAFE,
     }
-    lanes = lanes if lanes and device.is_cuda else lists.lanes
-    threads, waits = lists.threads, device.is_cuda and d.nworld * lanes > THREADS_AT_ONCE * device.sm_count
+    if not (lanes and device.is_cuda):
+        lanes = lists.lanes
+    threads = lists.threads
+    waits = device.is_cuda and d.nworld * lanes > THREADS_AT_ONCE * device.sm_count
     most = REGISTERS if waits else None
     source = native.source_of("rows", PARTS)
     launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)

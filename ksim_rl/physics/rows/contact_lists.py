@@ -9,7 +9,8 @@ import warp as wp
 from ksim_rl.physics import native, upstream
 
 # Lanes of a world on CUDA, and threads of a block, which shares nothing.
-LANES, CUDA_THREADS = 16, 64
+LANES = 16
+CUDA_THREADS = 64
 HAS_ROWS = int(upstream.ContactType.CONSTRAINT)
 
 
@@ -26,7 +27,9 @@ class ContactLists:
     """
 
     def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data, *, room: int | None = None) -> None:
-        m, d, device = warp_model, warp_data_E, warp_data_E.qpos.device
+        m = warp_model
+        d = warp_data_E
+        device = warp_data_E.qpos.device
         # Each contact but those in a gap takes a row at least.
         gaps = any(gap.numpy().any() for gap in (m.geom_gap, m.pair_gap))
         self.room = room or max(1, d.njmax + (d.naconmax // d.nworld if gaps else 0))
@@ -41,7 +44,12 @@ class ContactLists:
             "pairs": m.pair_dim.size,
             "repeated_pairs": bool(upstream.repeated_pairs(m).size),
         }
-        self.lanes, self.threads = (LANES, CUDA_THREADS) if device.is_cuda else (1, 1)
+        if device.is_cuda:
+            self.lanes = LANES
+            self.threads = CUDA_THREADS
+        else:
+            self.lanes = 1
+            self.threads = 1
         sources = [native.source_of("rows", parts) for parts in (("append",), ("layout", "order"))]
         self._append, self.order = (
             native.launcher(source, self.constants, vars(self), m, d, lanes=self.lanes, threads=self.threads)

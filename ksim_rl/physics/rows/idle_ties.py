@@ -21,7 +21,9 @@ from ksim_rl.physics.rows.tie_weights import EQUALITY, tied_bodies
 # What rounding makes of a tie that holds, in m and rad. C has forces of what is further apart.
 ROUNDING = wp.constant(1.0e-5)
 LEAST_WEIGHT = 1e-10
-NOT_A_TIE, TIE, FIXED_TIE = 0, 1, 2
+NOT_A_TIE = 0
+TIE = 1
+FIXED_TIE = 2
 
 
 def kinds_of_ties(mj_model: mujoco.MjModel) -> np.ndarray:
@@ -31,7 +33,10 @@ def kinds_of_ties(mj_model: mujoco.MjModel) -> np.ndarray:
         if bodies[0] < 0:
             continue
         weights = mj_model.body_invweight0[bodies].sum(0)
-        parts = 2 if mj_model.eq_type[equality] == mujoco.mjtEq.mjEQ_WELD else 1
+        if mj_model.eq_type[equality] == mujoco.mjtEq.mjEQ_WELD:
+            parts = 2
+        else:
+            parts = 1
         if not _moves(mj_model, bodies).any():
             kinds[equality] = FIXED_TIE
         elif (weights[:parts] < LEAST_WEIGHT).any():

@@ -88,8 +88,11 @@ def adding_of_second_limits(
     warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
     """Return what launches it after MuJoCo Warp's rows, with arrays in their final place; None if no row lacks."""
-    m, d, bits = warp_model, warp_data_E, mjw.DisableBit
-    joints, tendons = joints_between_limits(m, expanded), tendons_between_limits(m, expanded)
+    m = warp_model
+    d = warp_data_E
+    bits = mjw.DisableBit
+    joints = joints_between_limits(m, expanded)
+    tendons = tendons_between_limits(m, expanded)
     if not joints.size + tendons.size or m.opt.disableflags & (bits.CONSTRAINT | bits.LIMIT):
         return None
     own = {

@@ -33,7 +33,8 @@ def weighing_of_ties(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
 ) -> Callable[[], None] | None:
     """Return what launches it after MuJoCo Warp's rows, with arrays in their final place; None where they are right."""
-    m, d = warp_model, warp_data_E
+    m = warp_model
+    d = warp_data_E
     bodies = tied_bodies(mj_model)
     carriers = np.where(bodies < 0, -1, mj_model.body_weldid[bodies])
     bodies[(bodies == carriers).all(-1)] = -1

@@ -16,7 +16,11 @@ from ksim_rl.physics import native
 from ksim_rl.physics.rows.contact_lists import ContactLists
 
 # The `intprm` of the two kinds: bits of mjtConDataField, the reduction of several contacts, and the number of slots.
-_FOUND, _FORCE, _POSITION, _NORMAL, _TANGENT = 1 << 0, 1 << 1, 1 << 4, 1 << 5, 1 << 6
+_FOUND = 1 << 0
+_FORCE = 1 << 1
+_POSITION = 1 << 4
+_NORMAL = 1 << 5
+_TANGENT = 1 << 6
 NET = (_FOUND | _FORCE | _POSITION, 3, 1)
 # A single contact's force is in the axes of that contact, which are needed to turn it.
 STRONGEST = (NET[0] | _NORMAL | _TANGENT, 2, 1)
@@ -27,7 +31,9 @@ MATCHED = {name: int(getattr(mujoco.mjtObj, f"mjOBJ_{theirs}")) for name, theirs
 
 def read_by_us(mj_model: mujoco.MjModel) -> tuple[list[int], list[int]]:
     """Return the sensors that the kernel reads, without delay and cutoff: kinds of `ContactSensor`, accelerometers."""
-    m, kinds, objects = mj_model, mujoco.mjtSensor, list(MATCHED.values())
+    m = mj_model
+    kinds = mujoco.mjtSensor
+    objects = list(MATCHED.values())
     if m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return [], []
     plain = ~m.sensor_history.any(-1) & (m.sensor_cutoff == 0.0)
@@ -48,7 +54,8 @@ class ContactReadings:
     def __init__(
         self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists
     ) -> None:
-        m, d = warp_model, warp_data_E
+        m = warp_model
+        d = warp_data_E
         of_contacts, accelerometers = read_by_us(mj_model)
         self.sensors = of_contacts + accelerometers
         own = {
@@ -72,7 +79,10 @@ class ContactReadings:
             "sum": NET[1],
         }
         # Of 32768 worlds of Go1 on an H200 sensors are read in 52 us instead of 80, of G1 in 93 instead of 148.
-        lanes = 4 if d.qpos.device.is_cuda and d.nworld > native.FEW_WORLDS else lists.lanes
+        if d.qpos.device.is_cuda and d.nworld > native.FEW_WORLDS:
+            lanes = 4
+        else:
+            lanes = lists.lanes
         parts = ("matching", "sensors", "accelerometers"), ("bodies",)
         sources = [native.source_of("rows", ("layout", "wrench", *own_parts)) for own_parts in parts]
         self._read_sensors, self._sum_forces = (

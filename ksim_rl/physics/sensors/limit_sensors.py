@@ -61,7 +61,10 @@ class LimitSensors:
         """Launch the reading of distances and speeds, of which a refresh leaves delayed ones alone."""
         m = self._warp_model
         d = self._warp_data_E
-        sensors = self._of_refresh if in_refresh else self._of_state
+        if in_refresh:
+            sensors = self._of_refresh
+        else:
+            sensors = self._of_state
         if sensors.size == 0:
             return
         inputs = [

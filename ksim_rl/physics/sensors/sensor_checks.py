@@ -8,10 +8,13 @@ DISTANCES = (
     mujoco.mjtSensor.mjSENS_GEOMNORMAL,
     mujoco.mjtSensor.mjSENS_GEOMFROMTO,
 )
-SDF, MESH = mujoco.mjtGeom.mjGEOM_SDF, mujoco.mjtGeom.mjGEOM_MESH
+SDF = mujoco.mjtGeom.mjGEOM_SDF
+MESH = mujoco.mjtGeom.mjGEOM_MESH
 SITE = mujoco.mjtObj.mjOBJ_SITE
 _OTHER_SHAPES = "make the site a sphere, capsule, ellipsoid, cylinder or box"
-GEOM, BODY, TREE = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
+GEOM = mujoco.mjtObj.mjOBJ_GEOM
+BODY = mujoco.mjtObj.mjOBJ_BODY
+TREE = mujoco.mjtObj.mjOBJ_XBODY
 
 
 def check_sensors(mj_model: mujoco.MjModel) -> None:
@@ -19,7 +22,8 @@ def check_sensors(mj_model: mujoco.MjModel) -> None:
     check_signed_distance_fields(mj_model)
     check_delayed(mj_model)
     check_sites_of_meshes(mj_model)
-    flags, bits = mj_model.opt.disableflags, mujoco.mjtDisableBit
+    flags = mj_model.opt.disableflags
+    bits = mujoco.mjtDisableBit
     for sensor in np.flatnonzero(np.isin(mj_model.sensor_type, DISTANCES)):
         if flags & bits.mjDSBL_CONSTRAINT:
             raise ValueError(
@@ -36,7 +40,8 @@ def check_sensors(mj_model: mujoco.MjModel) -> None:
 def check_delayed(mj_model: mujoco.MjModel) -> None:
     """Refuse the first contacts of several where they have no order, and bounds of touch that delay comes before."""
     for sensor in range(mj_model.nsensor):
-        kind, (samples, interpolation) = mj_model.sensor_type[sensor], mj_model.sensor_history[sensor]
+        kind = mj_model.sensor_type[sensor]
+        (samples, interpolation) = mj_model.sensor_history[sensor]
         takes_first = kind == mujoco.mjtSensor.mjSENS_CONTACT and mj_model.sensor_intprm[sensor, 1] == 0
         if takes_first and (samples or mj_model.nflex):
             raise ValueError(
@@ -59,7 +64,10 @@ def check_sites_of_meshes(mj_model: mujoco.MjModel) -> None:
     for sensor in np.flatnonzero(np.isin(m.sensor_type, (kinds.mjSENS_CONTACT, kinds.mjSENS_INSIDESITE))):
         # A sensor of what is inside names the site second.
         is_second = m.sensor_type[sensor] == kinds.mjSENS_INSIDESITE
-        kind = m.sensor_reftype[sensor] if is_second else m.sensor_objtype[sensor]
+        if is_second:
+            kind = m.sensor_reftype[sensor]
+        else:
+            kind = m.sensor_objtype[sensor]
         site = int(m.sensor_refid[sensor] if is_second else m.sensor_objid[sensor])
         if kind == SITE and m.site_type[site] == MESH:
             raise ValueError(
@@ -131,4 +139,6 @@ def _is_below(mj_model: mujoco.MjModel, body: int, ancestor: int) -> bool:
 
 def _name(mj_model: mujoco.MjModel, sensor: int) -> str:
     name = mj_model.sensor(sensor).name
-    return f"sensor {name!r}" if name else f"sensor number {sensor} (unnamed)"
+    if name:
+        return f"sensor {name!r}"
+    return f"sensor number {sensor} (unnamed)"

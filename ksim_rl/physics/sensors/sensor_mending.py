@@ -39,7 +39,9 @@ def contact_sensors_left(mj_model: mujoco.MjModel, read: list[int]) -> list[int]
     m = mj_model
     left = (m.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT) & ~m.sensor_history.any(-1)
     left[read] = False
-    return [] if m.nflex else np.flatnonzero(left).tolist()
+    if m.nflex:
+        return []
+    return np.flatnonzero(left).tolist()
 
 
 def bounded_touch_sensors(mj_model: mujoco.MjModel) -> list[int]:
@@ -78,7 +80,8 @@ def mend_sensors(
 
 
 def _bounding_of(sensors: list[int], warp_model: mjw.Model, warp_data_E: mjw.Data) -> Callable[[], None]:
-    m, d = warp_model, warp_data_E
+    m = warp_model
+    d = warp_data_E
     inputs = [wp.array(sensors, dtype=int), m.sensor_adr, m.sensor_cutoff]
     dim = (d.nworld, len(sensors))
     return lambda: wp.launch(bound_touch, dim=dim, inputs=inputs, outputs=[d.sensordata])
@@ -87,8 +90,12 @@ def _bounding_of(sensors: list[int], warp_model: mjw.Model, warp_data_E: mjw.Dat
 def _reading_of(
     sensors: list[int], warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists | None
 ) -> Callable[[], None]:
-    m, d = warp_model, warp_data_E
-    of_contacts = ContactLists(m, d) if lists is None else lists
+    m = warp_model
+    d = warp_data_E
+    if lists is None:
+        of_contacts = ContactLists(m, d)
+    else:
+        of_contacts = lists
     own = {**vars(of_contacts), "sensors": wp.array(sensors, dtype=int, device=d.qpos.device)}
     site_types = {f"site_{name}": upstream.GEOM_TYPES[name] for name in _SITE_TYPES}
     constants = {
@@ -99,7 +106,8 @@ def _reading_of(
         "sensors": len(sensors),
     }
     source = native.source_of("rows", ("layout", "wrench", "matching", "slots"))
-    lanes, threads = of_contacts.lanes, of_contacts.threads
+    lanes = of_contacts.lanes
+    threads = of_contacts.threads
     launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads)
 
     def read_sensors() -> None:

@@ -30,7 +30,10 @@ SHARED_FLOATS = 48 * 1024 // 4
 # Few worlds do not fill a GPU with 8 lanes each. Many have 8 where a block of two warps is small, so that shared memory
 # does not limit how many run (32768 of Go1 on an H200 are integrated in 65 us, in 87 with 16; of G1 in 267 and 234). In
 # small blocks dynamics take 56 registers, not the 72 that the compiler likes (Go1, 16 lanes: 154 us instead of 164).
-LANES, LANES_OF_FEW, SMALL_BLOCK_FLOATS, REGISTERS = (8, 16, 32), {SMOOTH: 16, INTEGRATION: 32}, 3072, 56
+LANES = (8, 16, 32)
+LANES_OF_FEW = {SMOOTH: 16, INTEGRATION: 32}
+SMALL_BLOCK_FLOATS = 3072
+REGISTERS = 56
 # Whether it writes where geoms are, goes on after that, and after the velocities to the inertia matrix and the forces,
 # and whether others than a substep read what it writes. Or else it sums momenta of subtrees there, takes the worlds of
 # a mask alone, or empties the pool of contacts where it places geoms.
@@ -110,7 +113,8 @@ def smooth_dynamics(
     two. With `masked=True` it does so for the worlds of `mask`, bool [E]; with `is_read=False` it writes only what the
     other kernels of a substep read. `lanes` is how many threads share a world on CUDA; None takes the usual.
     """
-    mask = wp.empty(0, dtype=bool, device=warp_data_E.qpos.device) if mask is None else mask
+    if mask is None:
+        mask = wp.empty(0, dtype=bool, device=warp_data_E.qpos.device)
     launch = _launcher(SMOOTH, warp_model, warp_data_E, lanes, {"mask": mask})
     return partial(launch, **WHOLE)
 
@@ -139,9 +143,17 @@ def _launcher(
     lanes: int | None,
     given: Mapping[str, wp.array],
 ) -> Callable[..., None]:
-    m, d = warp_model, warp_data_E
-    sizes, device = _sizes(m), d.qpos.device
-    block = ((lanes, 64) if lanes else _block(parts, sizes, d.nworld)) if device.is_cuda else (1, 1)
+    m = warp_model
+    d = warp_data_E
+    sizes = _sizes(m)
+    device = d.qpos.device
+    if device.is_cuda:
+        if lanes:
+            block = (lanes, 64)
+        else:
+            block = _block(parts, sizes, d.nworld)
+    else:
+        block = (1, 1)
     assert block is not None, "the model is unsuited"
     lanes, threads = block
     driven = m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]
@@ -165,7 +177,8 @@ def _launcher(
 def _sizes(warp_model: mjw.Model) -> dict[str, int]:
     """Return what of a model is compiled into its kernels: its sizes, and what it has of MuJoCo's features."""
     m = warp_model
-    flags, bits = int(m.opt.disableflags), mjw.DisableBit
+    flags = int(m.opt.disableflags)
+    bits = mjw.DisableBit
     fast = m.opt.integrator == mjw.IntegratorType.IMPLICITFAST
     actuators_act = m.nactuator > 0 and not flags & bits.ACTUATION
     return {
@@ -210,15 +223,21 @@ def _floats(parts: tuple[str, ...], sizes: Mapping[str, int], lanes: int) -> int
 
 def _num_free_bodies(warp_model: mjw.Model) -> int:
     """Return how many bodies have nothing but a free joint, and are solved for each on its own."""
-    return 0 if warp_model.opt.integrator == mjw.IntegratorType.EULER else warp_model.body_freeadr.size
+    if warp_model.opt.integrator == mjw.IntegratorType.EULER:
+        return 0
+    return warp_model.body_freeadr.size
 
 
 def _elimination(warp_model: mjw.Model) -> dict[str, Sequence[int] | np.ndarray]:
     """Return the degrees of freedom to eliminate, the last first, those in no other's row, and what each changes."""
-    m, changes, first = warp_model, [], [0]
+    m = warp_model
+    changes = []
+    first = [0]
     alone = m.body_freeadr.numpy()[: _num_free_bodies(m)]
     order = np.flatnonzero(~np.isin(m.dof_bodyid.numpy(), alone))[::-1]
-    row, column, starts = m.M_hinit_i.numpy(), m.M_colind.numpy(), m.M_rowadr.numpy()
+    row = m.M_hinit_i.numpy()
+    column = m.M_colind.numpy()
+    starts = m.M_rowadr.numpy()
     for dof in order:
         *ancestors, _ = column[row == dof]
         for other, ancestor in enumerate(ancestors):
@@ -243,7 +262,10 @@ def _block(parts: tuple[str, ...], sizes: Mapping[str, int], worlds: int) -> tup
     is_few = worlds <= native.FEW_WORLDS
     least = LANES_OF_FEW[parts] if is_few else 0
     for threads, lanes in itertools.product((32,) if is_few else (64, 32), LANES):
-        most = SMALL_BLOCK_FLOATS if lanes == 8 else SHARED_FLOATS
+        if lanes == 8:
+            most = SMALL_BLOCK_FLOATS
+        else:
+            most = SHARED_FLOATS
         if lanes >= least and _floats(parts, sizes, lanes) * (threads // lanes) <= most:
             return lanes, threads
     return None

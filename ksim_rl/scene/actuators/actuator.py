@@ -25,8 +25,12 @@ class Drive:
     """The N joints of one law, in the model's order."""
 
     def __init__(self, name: str, simulation: Simulation, view: WorldView, joint_ids: Sequence[int]) -> None:
-        self.num_envs, self.num_joints, self.device = view.num_envs, len(joint_ids), view.device
-        self.name, self._simulation, self._view = name, simulation, view
+        self.num_envs = view.num_envs
+        self.num_joints = len(joint_ids)
+        self.device = view.device
+        self.name = name
+        self._simulation = simulation
+        self._view = view
         self._joints = view.joints().some(joint_ids)
         self._motors = as_index([view.targets.motor(i) for i in joint_ids], view.device)
         self._at_reset: list[Callable[[Bool[Tensor, " E"]], None]] = []
@@ -59,12 +63,14 @@ class Drive:
 
     def state(self) -> JointState:
         """Return where the joints are now, in the middle of an env step too."""
-        world, joints = self._view.world, self._joints
+        world = self._view.world
+        joints = self._joints
         return JointState(world.qpos_EL[:, joints.qpos], world.qvel_EL[:, joints.qvel])
 
     def target(self) -> JointTarget:
         """Return what the joints are asked for."""
-        targets, joints = self._view.targets, self._joints.index
+        targets = self._view.targets
+        joints = self._joints.index
         return JointTarget(targets.pos_EL[:, joints], targets.vel_EL[:, joints], targets.effort_EL[:, joints])
 
     def write(self, control_EN: Float[Tensor, "E N"]) -> None:

@@ -69,7 +69,8 @@ class DCMotorActuator(IdealPDActuator):
 
     def law(self, drive: Drive) -> Law:
         def effort_EN(state: JointState, target: JointTarget) -> Tensor:
-            stall_EN, limit_EN = drive.param("saturation_effort"), drive.param("effort_limit")
+            stall_EN = drive.param("saturation_effort")
+            limit_EN = drive.param("effort_limit")
             lost_EN = stall_EN * state.vel_EN / drive.param("velocity_limit")
             highest_EN = (stall_EN - lost_EN).clamp(-limit_EN, limit_EN)
             lowest_EN = (-stall_EN - lost_EN).clamp(-limit_EN, limit_EN)

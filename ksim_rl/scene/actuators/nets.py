@@ -64,7 +64,7 @@ class NetFile:
             wanted in (-1, found) for wanted, found in zip(shape, tensor.shape, strict=True)
         )
         if not fits:
-            wanted = ", ".join("any" if size == -1 else str(size) for size in shape)
+            wanted = ", ".join(str(size) for size in shape).replace("-1", "any")
             raise ValueError(f"{self.where}: {name} has shape {tuple(tensor.shape)}: expected ({wanted})")
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{self.where}: {name} holds numbers that are not finite")
@@ -195,7 +195,8 @@ def _layers(net: NetFile, num_inputs: int, activation: type[nn.Module]) -> nn.Se
         weight = net.tensor(f"{number}.weight", 1 if number == numbers[-1] else -1, width)
         bias = net.tensor(f"{number}.bias", weight.shape[0])
         linear = nn.Linear(width, weight.shape[0])
-        linear.weight.data, linear.bias.data = weight.clone(), bias.clone()
+        linear.weight.data = weight.clone()
+        linear.bias.data = bias.clone()
         layers += [linear, activation()]
         width = weight.shape[0]
     return nn.Sequential(*layers[:-1]).requires_grad_(False)
@@ -221,9 +222,14 @@ class LSTMActuator(NetActuator):
             layers.append([net.tensor(name, *shape) for name, shape in named])
         names = {f"lstm.{part}_l{layer}" for part in _LSTM_PARTS for layer in range(num_layers)}
         net.check_all_known(names | {"head.weight", "head.bias"})
-        head, head_bias = net.tensor("head.weight", 1, size), net.tensor("head.bias", 1)
-        layers = [[weight.to(drive.device) for weight in layer] for layer in layers]
-        head, head_bias = head.to(drive.device), head_bias.to(drive.device)
+        head = net.tensor("head.weight", 1, size)
+        head_bias = net.tensor("head.bias", 1)
+        on_device = []
+        for layer in layers:
+            on_device.append([weight.to(drive.device) for weight in layer])
+        layers = on_device
+        head = head.to(drive.device)
+        head_bias = head_bias.to(drive.device)
         num_rows = drive.num_envs * drive.num_joints
         buffers = [
             tuple(drive.buffer(f"{kind}{layer}_ENH", drive.num_joints, size) for kind in ("hidden", "cell"))
@@ -233,7 +239,8 @@ class LSTMActuator(NetActuator):
         def predict(error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]) -> Float[Tensor, "E N"]:
             value = torch.stack((error_EN, vel_EN), dim=-1).view(num_rows, 2)
             for (hidden_ENH, cell_ENH), layer in zip(buffers, layers, strict=True):
-                hidden, cell = hidden_ENH.view(num_rows, size), cell_ENH.view(num_rows, size)
+                hidden = hidden_ENH.view(num_rows, size)
+                cell = cell_ENH.view(num_rows, size)
                 value, next_cell = torch.lstm_cell(value, (hidden, cell), *layer)
                 hidden.copy_(value)
                 cell.copy_(next_cell)

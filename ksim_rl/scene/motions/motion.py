@@ -49,7 +49,8 @@ class ReferenceMotion:
         Between frames both are interpolated linearly, quaternions along the shorter arc and normalized.
         """
         low_E, share_E1 = self._between(time_E)
-        before_EL, after_EL = self.qpos_FL[low_E], self.qpos_FL[low_E + 1]
+        before_EL = self.qpos_FL[low_E]
+        after_EL = self.qpos_FL[low_E + 1]
         qpos_EL = torch.lerp(before_EL, after_EL, share_E1)
         for start in self.quats:
             columns = slice(start, start + 4)
@@ -90,7 +91,9 @@ class ReferenceMotion:
 def motion_path(file: str) -> Path:
     """Return where a motion of this name lies in the package or, if there is none of this name, `file` as a path."""
     shipped = Path(__file__).parent / f"{file}.npz"
-    return shipped if shipped.is_file() and shipped.parent == Path(__file__).parent else Path(file)
+    if shipped.is_file() and shipped.parent == Path(__file__).parent:
+        return shipped
+    return Path(file)
 
 
 def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device) -> ReferenceMotion:
@@ -116,7 +119,8 @@ def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device
         raise ValueError(
             f"motion {file}: qpos has {arrays['qpos'].shape[0]} frames and qvel {arrays['qvel'].shape[0]}"
         )
-    names, own = arrays.get("joint_names"), [mj_model.joint(i).name for i in range(mj_model.njnt)]
+    names = arrays.get("joint_names")
+    own = [mj_model.joint(i).name for i in range(mj_model.njnt)]
     for name in () if names is None else names:
         if name not in own:
             raise ValueError(f"motion {file}: the model has no joint {str(name)!r}: {near(str(name), own)}")
@@ -175,7 +179,9 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
 
 def _entries(table: Tensor, frame_E: Int64[Tensor, " E"], columns: Index) -> Tensor:
     """Return some columns of a table [F, N, ...] in each env's frame, [E, N, ...]."""
-    return table[:, columns][frame_E] if isinstance(columns, slice) else table[frame_E[:, None], columns]
+    if isinstance(columns, slice):
+        return table[:, columns][frame_E]
+    return table[frame_E[:, None], columns]
 
 
 def _blend(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
@@ -188,7 +194,8 @@ def _blend(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
 def _body_poses(mj_model: mujoco.MjModel, qpos_FL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where the bodies are in each frame, [F, N, 3] and [F, N, 4]."""
     data = mujoco.MjData(mj_model)
-    pos_FN3, quat_FN4 = [], []
+    pos_FN3 = []
+    quat_FN4 = []
     for qpos in qpos_FL:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(mj_model, data)

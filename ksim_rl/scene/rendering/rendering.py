@@ -59,11 +59,14 @@ class OffscreenRenderer:
 
     def __init__(self, mj_model: mujoco.MjModel, cfg: ViewerCfg, *, spacing: float) -> None:
         # A copy, since each env that is drawn writes its own fields into it.
-        self._mj_model, self._cfg, self._spacing = copy.copy(mj_model), cfg, spacing
+        self._mj_model = copy.copy(mj_model)
+        self._cfg = cfg
+        self._spacing = spacing
         self._data = mujoco.MjData(self._mj_model)
         self._renderer: mujoco.Renderer | None = None
         self._camera = mujoco.MjvCamera()
-        self._camera.distance, self._camera.elevation = cfg.distance, cfg.elevation
+        self._camera.distance = cfg.distance
+        self._camera.elevation = cfg.elevation
         self._camera.azimuth = cfg.azimuth
         self._body: int | None = None
         if cfg.body is not None:
@@ -75,9 +78,13 @@ class OffscreenRenderer:
     def render(self, world: World, *, draw: Callable[[DebugVisualizer, int], None]) -> np.ndarray:
         """Return a picture of the current state, uint8 [H, W, 3]; `draw` adds the debug drawing of one env."""
         renderer = self._open()
-        first, last = self._cfg.env_index, min(self._cfg.env_index + self._cfg.num_envs, world.num_envs)
+        first = self._cfg.env_index
+        last = min(self._cfg.env_index + self._cfg.num_envs, world.num_envs)
         pose_env(self._mj_model, self._data, world, first)
-        target = self._cfg.lookat if self._body is None else self._data.xpos[self._body]
+        if self._body is None:
+            target = self._cfg.lookat
+        else:
+            target = self._data.xpos[self._body]
         self._camera.lookat[:] = target
         renderer.update_scene(self._data, self._camera, visible_groups(self._mj_model))
         for light in renderer.scene.lights[: renderer.scene.nlight]:
@@ -107,7 +114,8 @@ class OffscreenRenderer:
         if self._renderer is None:
             platform = choose_gl_platform()
             try:
-                vis, cfg = self._mj_model.vis.global_, self._cfg
+                vis = self._mj_model.vis.global_
+                cfg = self._cfg
                 vis.offwidth, vis.offheight = max(vis.offwidth, cfg.width), max(vis.offheight, cfg.height)
                 self._renderer = mujoco.Renderer(self._mj_model, cfg.height, cfg.width, max_geom=20_000)
             except Exception as error:  # MuJoCo's platforms raise whatever their loader raises

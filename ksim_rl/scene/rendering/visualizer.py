@@ -20,7 +20,8 @@ class DebugVisualizer:
     def __init__(
         self, mj_model: mujoco.MjModel, scene: mujoco.MjvScene, offset: Vector = (0.0, 0.0, 0.0)
     ) -> None:
-        self._mj_model, self._scene = mj_model, scene
+        self._mj_model = mj_model
+        self._scene = scene
         self._offset = np.asarray(offset, dtype=np.float64)
 
     def arrow(self, start: Vector, end: Vector, *, rgba: Rgba, width: float = 0.02) -> None:

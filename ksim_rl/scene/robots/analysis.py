@@ -30,17 +30,22 @@ from ksim_rl.scene.robots.starting_poses import StartingPose, starting_poses
 from ksim_rl.scene.robots.strangers_model import StrangersModel, read_model
 from ksim_rl.scene.state.joint_control import joint_control
 
-FREQUENCY, DAMPING_RATIO = 10.0, 2.0
+FREQUENCY = 10.0
+DAMPING_RATIO = 2.0
 """Of a joint's motor alone under its servo, Hz; as in BeyondMimic (Liao et al., 2025)."""
 ARMATURE_PER_EFFORT = 2e-4
 """kg m^2 per N m for a model without armature: that of Go1's and G1's geared motors is 1.1e-4 to 2.5e-4."""
-SOFTEST, MOST_SAG = 0.25, 0.1
+SOFTEST = 0.25
+MOST_SAG = 0.1
 """rad: from which error on a servo may saturate whatever its armature, and what the load in the stance may bend it."""
-LEAST_SCALE, MOST_SCALE = 0.15, 0.5
+LEAST_SCALE = 0.15
+MOST_SCALE = 0.5
 """rad per unit action: stiff servos saturate within less than a step, soft ones only beyond what legs can do."""
 MOST_EFFORT = 1000.0
 """Times weight and height of the centre of mass: where a file says more, its author meant that nothing limits it."""
-TRIAL_S, TRIALS, STIFFER = 5.0, 6, 1.5
+TRIAL_S = 5.0
+TRIALS = 6
+STIFFER = 1.5
 """The legs' stiffness is multiplied until the robot stands that long and straight, so often at most."""
 GRAVITY = 9.81
 
@@ -106,12 +111,19 @@ class RobotAnalysis:
     def by_joint(self, pitch: float, legs: float, others: float) -> dict[str, float]:
         """Return a value by joint pattern: for the legs' joints that turn about y, their others, and all others."""
         values = dict.fromkeys(self.robot.default_joint_pos, others) | dict.fromkeys(self.leg_joints, legs)
-        return {re.escape(j): pitch if j in self.pitch_joints else value for j, value in values.items()}
+        by_pattern = {}
+        for joint, value in values.items():
+            by_pattern[re.escape(joint)] = pitch if joint in self.pitch_joints else value
+        return by_pattern
 
     def table(self) -> str:
         """Return the report as text."""
-        robot, ratio = self.robot, self.ankle_stiffness_ratio
-        ankles = "" if ratio is None else f", ankle stiffness {ratio:.1f} m g h"
+        robot = self.robot
+        ratio = self.ankle_stiffness_ratio
+        if ratio is None:
+            ankles = ""
+        else:
+            ankles = f", ankle stiffness {ratio:.1f} m g h"
         lines = [
             f"{robot.name}: {self.mass:.2f} kg, {self.height:.2f} m, root {robot.root_body}",
             f"feet: {', '.join(self.foot_bodies)}",
@@ -127,7 +139,10 @@ class RobotAnalysis:
             table.add_column(head, justify="left" if head in ("joint", "actuator") else "right", no_wrap=True)
         for joint in self.joints:
             name, actuator, limits, gains, *numbers = dataclasses.astuple(joint)
-            span = "-" if limits is None else f"{limits[0]:.2f} {limits[1]:.2f}"
+            if limits is None:
+                span = "-"
+            else:
+                span = f"{limits[0]:.2f} {limits[1]:.2f}"
             table.add_row(name, actuator, span, *(f"{number:.3g}" for number in (*gains, *numbers)))
         text = io.StringIO()
         Console(file=text, force_jupyter=False, width=240, highlight=False).print(table)
@@ -150,9 +165,12 @@ TASK = velocity.VelocityTask.for_robot({name})
     def draw(self, file: Path) -> None:
         """Write a picture of the stance, 640 x 480."""
         choose_gl_platform()
-        mj_model, camera = on_plane(self.robot.spec()), mujoco.MjvCamera()
-        camera.lookat[2], camera.distance = self.com_height, 2.5 * max(self.height, 0.5)
-        camera.azimuth, camera.elevation = 130.0, -15.0
+        mj_model = on_plane(self.robot.spec())
+        camera = mujoco.MjvCamera()
+        camera.lookat[2] = self.com_height
+        camera.distance = 2.5 * max(self.height, 0.5)
+        camera.azimuth = 130.0
+        camera.elevation = -15.0
         with mujoco.Renderer(mj_model, 480, 640) as renderer:
             renderer.update_scene(posed(mj_model, mj_model.key_qpos[0]), camera, visible_groups(mj_model))
             picture = Image.fromarray(renderer.render())
@@ -191,32 +209,48 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
     model, given = model.turned_upright(start.qpos)
     mj_model = model.mj_model
     anatomy = dissect(mj_model, given)
-    legs, biped = anatomy.legs, len(anatomy.legs) == 2
+    legs = anatomy.legs
+    biped = len(anatomy.legs) == 2
     passive = passive_joints(mj_model)
     data = posed(mj_model, find_stance(mj_model, legs, given, passive=passive))
     names = {j: mj_model.joint(j).name for j in scalar_joint_ids(mj_model) if j not in passive}
-    of_legs = [j for j in dict.fromkeys(j for leg in legs for j in leg.joints) if j in names]
-    dof, com_height = mj_model.jnt_dofadr, float(data.subtree_com[0, 2])
+    of_legs = []
+    for leg in legs:
+        of_legs += [j for j in leg.joints if j in names and j not in of_legs]
+    dof = mj_model.jnt_dofadr
+    com_height = float(data.subtree_com[0, 2])
     if com_height <= 0.0:
         raise ValueError(
             f"in pose {start.name!r} the soles lie over the centre of mass: the robot does not stand in it"
         )
     weight = float(mj_model.body_subtreemass[0]) * GRAVITY
     # What holds the pose while all feet carry the same weight.
-    load, jacobian = data.qfrc_bias.copy(), np.zeros((3, mj_model.nv))
+    load = data.qfrc_bias.copy()
+    jacobian = np.zeros((3, mj_model.nv))
     for leg in legs:
         mujoco.mj_jac(mj_model, data, jacobian, None, leg.points(data).mean(0), data.body(leg.foot).id)
         load -= jacobian[2] * weight / len(legs)
     most = MOST_EFFORT * weight * com_height
     given_drives = {j: _drive(mj_model, j, most=most) for j in names}
     usual = 0.5 * weight * com_height
-    usual = round(usual, 1) if usual > 1.0 else _short(usual)
+    if usual > 1.0:
+        usual = round(usual, 1)
+    else:
+        usual = _short(usual)
     efforts = {j: limit or usual for j, (_, _, limit) in given_drives.items()}
     inertias = {j: _short(mj_model.dof_armature[dof[j]] or ARMATURE_PER_EFFORT * efforts[j]) for j in names}
     gains = {}
     for j in names:
-        over = mj_model.jnt_bodyid[j] if j not in of_legs else 0
-        share = 1.0 if j not in of_legs else 0.5 if biped else 0.0
+        if j not in of_legs:
+            over = mj_model.jnt_bodyid[j]
+        else:
+            over = 0
+        if j not in of_legs:
+            share = 1.0
+        elif biped:
+            share = 0.5
+        else:
+            share = 0.0
         lever = np.hypot(*data.xaxis[j, :2]) * max(0.0, data.subtree_com[over, 2] - data.xanchor[j, 2])
         topples = share * mj_model.body_subtreemass[over] * GRAVITY * lever
         own = min(inertias[j] * (2.0 * math.pi * FREQUENCY) ** 2, efforts[j] / SOFTEST)
@@ -225,9 +259,13 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
         alike = [j for j in joints if j in gains]
         gains |= dict.fromkeys(alike, max((gains[j] for j in alike), default=0.0))
 
-    pitch, trials = [[j for j in leg.pitch_joints(data) if j in names] for leg in legs], []
+    pitch = []
+    for leg in legs:
+        pitch.append([j for j in leg.pitch_joints(data) if j in names])
+    trials = []
     while not trials or (trials[-1][:2] < (TRIAL_S, -1.5 * MOST_SAG) and len(trials) < TRIALS):
-        stiffer = {j: STIFFER ** len(trials) if j in of_legs else 1.0 for j in names}
+        # Each trial holds the legs by stiffer servos than the last one.
+        stiffer = dict.fromkeys(names, 1.0) | dict.fromkeys(of_legs, STIFFER ** len(trials))
         servos = {}
         for j, kp in gains.items():
             kp = _short(kp * stiffer[j])
@@ -346,7 +384,10 @@ def _robot(
     )
     trial = robot.spec().compile()
     contacts = posed(trial, trial.key_qpos[0]).contact.geom
-    touching = {tuple(trial.body(trial.geom_bodyid[geom]).name for geom in pair) for pair in contacts}
+    touching = set()
+    for first, second in contacts:
+        bodies = trial.geom_bodyid[first], trial.geom_bodyid[second]
+        touching.add((trial.body(bodies[0]).name, trial.body(bodies[1]).name))
     return dataclasses.replace(robot, overlaps=tuple(sorted(touching)))
 
 
@@ -357,7 +398,9 @@ def _drive(
 
     A limit above `most` is no limit.
     """
-    kind, gains, limits = "none", (0.0, 0.0), []
+    kind = "none"
+    gains = (0.0, 0.0)
+    limits = []
     if mj_model.jnt_actfrclimited[joint]:
         limits.append(np.abs(mj_model.jnt_actfrcrange[joint]).max())
     for a in actuators_of_joint(mj_model, joint):

@@ -12,7 +12,8 @@ SLAB = 0.01
 """m: what is so near to a foot's lowest point belongs to its sole."""
 RIDGE = 2 * SLAB
 """m: a sole that is narrower has no room for two capsules."""
-MOST_LEVELLING, LEVELLING_STEP = 30, 2
+MOST_LEVELLING = 30
+LEVELLING_STEP = 2
 """Degrees by which a foot may be tilted, and the step in which its sole is looked for."""
 LIMB = 0.15
 """Share of the robot's height from which on a limb is worth a hull."""
@@ -53,7 +54,8 @@ class Leg:
     @property
     def geoms(self) -> list[CollisionGeom]:
         """What treads on the ground."""
-        name, foot = f"{self.foot}_sole", self.foot
+        name = f"{self.foot}_sole"
+        foot = self.foot
         if len(self.centres_N3) == 1:
             return [sphere(name, foot, self.radius, rounded(self.centres_N3), priority=1)]
         edges = [self.centres_N3[first : first + 2] for first in range(0, len(self.centres_N3), 2)]
@@ -89,7 +91,8 @@ def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
     if not points:
         raise ValueError("the model has no geoms: its feet cannot be found")
     heights = np.concatenate(list(points.values()))[:, 2]
-    height, inner = float(np.ptp(heights)), {int(weld[mj_model.body_parentid[b]]) for b in moving}
+    height = float(np.ptp(heights))
+    inner = {int(weld[mj_model.body_parentid[b]]) for b in moving}
     ends = [b for b in points if b not in {root, *inner}]
     lowest = [b for b in ends if points[b][:, 2].min() < heights.min() + REACHES_GROUND * height]
     if not lowest:
@@ -97,7 +100,11 @@ def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
             "no chain of joints ends at the lowest point of the model: it has no feet to stand on"
         )
     builds = {b: _build_of(mj_model, b, root) for b in ends}
-    feet = [b for b in ends if b in lowest or any(_alike(builds[b], builds[foot]) for foot in lowest)]
+    feet = []
+    for end in ends:
+        is_like_a_foot = any(_alike(builds[end], builds[foot]) for foot in lowest)
+        if end in lowest or is_like_a_foot:
+            feet.append(end)
     feet = list(dict.fromkeys(_foot_of(mj_model, points, toes, root) for toes in feet))
     if len(feet) < 2:
         raise ValueError(
@@ -157,7 +164,9 @@ def _foot_of(mj_model: mujoco.MjModel, points: dict[int, np.ndarray], toes: int,
 def _build_of(mj_model: mujoco.MjModel, end: int, root: int) -> np.ndarray:
     """Return what tells kinds of chains apart, from the root to a body: joints, slides among them, m and kg."""
     joints = _joints_above(mj_model, end, root)
-    body, length, mass = end, 0.0, 0.0
+    body = end
+    length = 0.0
+    mass = 0.0
     while body != root:
         above = int(mj_model.body_parentid[body])
         mass += float(mj_model.body_mass[body])
@@ -184,11 +193,14 @@ def _axle(mj_model: mujoco.MjModel, body: int) -> str | None:
     # Two axes across that of the joint.
     across = np.linalg.svd(data.xaxis[last][None])[2][1:]
     flat = points @ across.T
-    low, high = flat.min(0), flat.max(0)
+    low = flat.min(0)
+    high = flat.max(0)
     radius = float((high - low).max() / 2)
     is_centred = bool((np.abs(high + low) / 2 < ROUND * radius).all())
     is_round = float((high - low).min() / 2) > (1.0 - ROUND) * radius
-    return mj_model.joint(last).name if is_centred and is_round else None
+    if is_centred and is_round:
+        return mj_model.joint(last).name
+    return None
 
 
 def _joints_above(mj_model: mujoco.MjModel, body: int, root: int) -> list[int]:
@@ -228,7 +240,8 @@ def _leg(mj_model: mujoco.MjModel, data: mujoco.MjData, foot: int, root: int) ->
     ground = float(points[:, 2].min())
     treading = [g for g, of_geom in of_geoms.items() if of_geom[:, 2].min() < ground + SLAB]
     lowest = min(of_geoms, key=lambda g: of_geoms[g][:, 2].min())
-    kind, radius = mj_model.geom_type[lowest], float(mj_model.geom_size[lowest, 0])
+    kind = mj_model.geom_type[lowest]
+    radius = float(mj_model.geom_size[lowest, 0])
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE and radius >= SLAB:
         centres = data.geom_xpos[lowest][None]
     elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE and radius >= SLAB and len(treading) == 1:
@@ -259,7 +272,8 @@ def _levelling(points_N3: np.ndarray) -> np.ndarray:
     A foot whose ankle is not level in this pose shows its sole as an edge. The size of a face is that of the box about
     what lies within a slab of it.
     """
-    best, most = np.eye(3), 0.0
+    best = np.eye(3)
+    most = 0.0
     tilts = sorted(range(-MOST_LEVELLING, MOST_LEVELLING + 1, LEVELLING_STEP), key=abs)
     if _has_face(points_N3):
         return best
@@ -271,7 +285,8 @@ def _levelling(points_N3: np.ndarray) -> np.ndarray:
             area = float(np.prod(np.ptp(sole[:, :2], axis=0)))
             # By a tenth, since of two tilts that differ by less the smaller one is meant.
             if area > 1.1 * most:
-                best, most = turn, area
+                best = turn
+                most = area
     return best
 
 
@@ -282,7 +297,8 @@ def _has_face(points_N3: np.ndarray) -> bool:
 
 def _about(axis: int, angle: float) -> np.ndarray:
     """Return the rotation matrix about a world axis."""
-    quat, matrix = np.zeros(4), np.zeros(9)
+    quat = np.zeros(4)
+    matrix = np.zeros(9)
     mujoco.mju_axisAngle2Quat(quat, np.eye(3)[axis], angle)
     mujoco.mju_quat2Mat(matrix, quat)
     return matrix.reshape(3, 3)
@@ -292,8 +308,10 @@ def _sole(points_N3: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the centres and the radius, m, of what treads in place of a sole with these lowest points, world frame."""
     x0, y0, z = points_N3.min(0)
     x1, y1, _ = points_N3.max(0)
-    length, width = x1 - x0, y1 - y0
-    middle_x, middle_y = (x0 + x1) / 2, (y0 + y1) / 2
+    length = x1 - x0
+    width = y1 - y0
+    middle_x = (x0 + x1) / 2
+    middle_y = (y0 + y1) / 2
     if max(length, width) < 4 * SLAB:
         radius = max(SLAB, float(length + width) / 4)
         return np.array([[middle_x, middle_y, z + radius]]), radius
@@ -305,14 +323,20 @@ def _sole(points_N3: np.ndarray) -> tuple[np.ndarray, float]:
             return np.array([[x0 + radius, middle_y, z], [x1 - radius, middle_y, z]]), radius
         return np.array([[middle_x, y0 + radius, z], [middle_x, y1 - radius, z]]), radius
     radius = round(min(1.5 * SLAB, float(min(length, width)) / 4), 4)
-    x0, x1, y0, y1, z = x0 + radius, x1 - radius, y0 + radius, y1 - radius, z + radius
+    x0 = x0 + radius
+    x1 = x1 - radius
+    y0 = y0 + radius
+    y1 = y1 - radius
+    z = z + radius
     return np.array([[x0, y0, z], [x1, y0, z], [x0, y1, z], [x1, y1, z]]), radius
 
 
 def _hull(body: str, points_N3: np.ndarray) -> CollisionGeom:
     """Return the capsule along the longest edge of the box about the points; it slides without friction."""
-    low, high = points_N3.min(0), points_N3.max(0)
-    middle, edges = (low + high) / 2, high - low
+    low = points_N3.min(0)
+    high = points_N3.max(0)
+    middle = (low + high) / 2
+    edges = high - low
     axis = int(edges.argmax())
     radius = round(float(0.4 * (edges.sum() - edges[axis]) / 2), 3)
     if edges[axis] / 2 < 1.2 * radius:

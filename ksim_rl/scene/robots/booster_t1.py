@@ -54,8 +54,10 @@ _SMOOTH: dict[str, Any] = {"condim": 1, "priority": 1}
 
 
 def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
-    y, low = (1.0 if side == "Left" else -1.0), side.lower()
-    upper_arm, shank = f"A{side[0]}3", f"Shank_{side}"
+    y = 1.0 if side == "Left" else -1.0
+    low = side.lower()
+    upper_arm = f"A{side[0]}3"
+    shank = f"Shank_{side}"
     soles = tuple(
         capsule(
             f"{low}_foot{number}_collision",

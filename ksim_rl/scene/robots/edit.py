@@ -109,7 +109,10 @@ def spread(
     for index, name in enumerate(names):
         found = [table[pattern] for pattern, matches in owners.items() if index in matches]
         if len(found) > 1 or (not found and default is None):
-            hint = "" if found else ", or a default=, as in spread(table, names, default=0.0)"
+            if found:
+                hint = ""
+            else:
+                hint = ", or a default=, as in spread(table, names, default=0.0)"
             raise ValueError(
                 f"{name!r} matches {len(found)} of the patterns {list(table)}: expected one{hint}"
             )
@@ -119,7 +122,8 @@ def spread(
 
 def root_sensors(*, imu: str, root: str) -> tuple[Sensor, ...]:
     """Return what walking tasks read: an IMU at a site, and the angular momentum of all that hangs on the root."""
-    site, body = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
+    site = mujoco.mjtObj.mjOBJ_SITE
+    body = mujoco.mjtObj.mjOBJ_BODY
     kinds = mujoco.mjtSensor
     at_imu = {
         "imu_ang_vel": kinds.mjSENS_GYRO,
@@ -222,7 +226,8 @@ def _keep_inertia(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody]) -> None
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     for number, (body, is_inferred) in enumerate(zip(present, inferred, strict=True), 1):
         if is_inferred and mj_model.body_mass[number] > 0.0:
-            ipos, iquat = mj_model.body_ipos[number], mj_model.body_iquat[number]
+            ipos = mj_model.body_ipos[number]
+            iquat = mj_model.body_iquat[number]
             write_inertia(body, mj_model, number, ipos=ipos, iquat=iquat)
 
 
@@ -269,7 +274,9 @@ def set_sites(spec: mujoco.MjSpec, sites: Iterable[Site]) -> None:
             spec.delete(placed)
             placed = None
         placed = placed or bodies[site.body].add_site(name=site.name)
-        placed.pos, placed.size, placed.group = site.pos, [site.radius] * 3, 5
+        placed.pos = site.pos
+        placed.size = [site.radius] * 3
+        placed.group = 5
 
 
 def exclude_contacts(spec: mujoco.MjSpec, pairs: Iterable[tuple[str, str]]) -> None:

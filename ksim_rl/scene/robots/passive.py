@@ -34,7 +34,8 @@ def _moved_by(mj_model: mujoco.MjModel, actuator: int) -> list[int] | None:
         return [target]
     if kind != mujoco.mjtTrn.mjTRN_TENDON:
         return None
-    first, count = int(mj_model.tendon_adr[target]), int(mj_model.tendon_num[target])
+    first = int(mj_model.tendon_adr[target])
+    count = int(mj_model.tendon_num[target])
     if (mj_model.wrap_type[first : first + count] != mujoco.mjtWrap.mjWRAP_JOINT).any():
         return None
     return mj_model.wrap_objid[first : first + count].tolist()

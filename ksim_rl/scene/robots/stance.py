@@ -33,7 +33,8 @@ def find_stance(
     ranges. Straight legs are bent, with the knees forward on two legs; others keep their crouch. Springs, which are
     `passive` joints, keep their length; rods of closed chains move with the rest, and hold together.
     """
-    data, root = posed(mj_model, qpos), int(mj_model.jnt_type.argmin())
+    data = posed(mj_model, qpos)
+    root = int(mj_model.jnt_type.argmin())
     first = int(mj_model.jnt_qposadr[root])
     closed = _closed_chains(mj_model)
     of_legs = dict.fromkeys(joint for leg in legs for joint in leg.joints)
@@ -52,7 +53,8 @@ def find_stance(
             for (joint, sign), turn in zip(list(pitch.items())[-3:], bend, strict=False):
                 data.qpos[mj_model.jnt_qposadr[joint]] += sign * turn
     limits = np.where(mj_model.jnt_limited[joints][:, None], mj_model.jnt_range[joints], [-np.pi, np.pi])
-    low, high = limits @ [0.95, 0.05], limits @ [0.05, 0.95]
+    low = limits @ [0.95, 0.05]
+    high = limits @ [0.05, 0.95]
     data.qpos[columns[1:]] = np.clip(data.qpos[columns[1:]], low, high)
     mujoco.mj_kinematics(mj_model, data)
     data.qpos[columns[0]] -= min(leg.points(data)[:, 2].min() for leg in legs)
@@ -81,7 +83,8 @@ def find_stance(
         bounds=[np.array([[wanted[0] + reach, *ends]]).T for reach, ends in ((-1.0, low), (1.0, high))],
         verbose=0,
     )
-    data.qpos[columns], data.qpos[first : first + 2] = x.ravel(), 0.0
+    data.qpos[columns] = x.ravel()
+    data.qpos[first : first + 2] = 0.0
     return data.qpos.copy()
 
 

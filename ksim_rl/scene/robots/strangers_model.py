@@ -64,7 +64,10 @@ def read_model(source: Source) -> StrangersModel:
     """Read a robot's model from what `load_spec` takes; a URDF file's base is freed, since URDF cannot say so."""
     spec = load_spec(source)
     name = robot_name(source, spec)
-    given = _as_text(spec) if isinstance(source, mujoco.MjSpec) else str(source)
+    if isinstance(source, mujoco.MjSpec):
+        given = _as_text(spec)
+    else:
+        given = str(source)
     notes = []
     # The task has options of its own, so that those of the file need not be any that can be simulated here.
     reset_options(spec)
@@ -102,7 +105,10 @@ def robot_name(source: Source, spec: mujoco.MjSpec | None = None) -> str:
         try:
             called = (spec or load_spec(source)).modelname
         except ValueError:
-            called = Path(source).absolute().parent.name if is_file else "robot"
+            if is_file:
+                called = Path(source).absolute().parent.name
+            else:
+                called = "robot"
     return re.sub(r"\W+", "_", called.lower()) or "robot"
 
 

@@ -31,7 +31,8 @@ _ARM_JOINTS = (".*_shoulder_.*", ".*_elbow_joint", ".*_wrist_roll_joint")
 _TURN_JOINTS = (".*_hip_pitch_joint", ".*_hip_yaw_joint", "waist_yaw_joint")
 _LIFT_JOINTS = (".*_hip_roll_joint", ".*_knee_joint")
 _HAND_JOINTS = (".*_wrist_pitch_joint", ".*_wrist_yaw_joint")
-_WAIST_JOINTS, _ANKLE_JOINTS = ("waist_roll_joint", "waist_pitch_joint"), (".*_ankle_.*",)
+_WAIST_JOINTS = ("waist_roll_joint", "waist_pitch_joint")
+_ANKLE_JOINTS = (".*_ankle_.*",)
 
 SERVOS = (
     PositionActuator.tuned(joints=_ARM_JOINTS, effort_limit=25.0, armature=_M5020),

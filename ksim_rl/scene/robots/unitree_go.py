@@ -18,7 +18,8 @@ from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 LEGS = ("FR", "FL", "RR", "RL")
 JOINTS = tuple(f"{leg}_{kind}_joint" for leg in LEGS for kind in ("hip", "thigh", "calf"))
 STANCE = {"[FR]R_hip_joint": 0.1, "[FR]L_hip_joint": -0.1, ".*_thigh_joint": 0.9, ".*_calf_joint": -1.8}
-_LIGHT_JOINTS, _CALF_JOINTS = (".*_hip_joint", ".*_thigh_joint"), (".*_calf_joint",)
+_LIGHT_JOINTS = (".*_hip_joint", ".*_thigh_joint")
+_CALF_JOINTS = (".*_calf_joint",)
 # Contacts with other parts of the robot are frictionless: fewer dimensions cost less. Go2's priority makes those with
 # the ground frictionless too, which cost a quarter then.
 _GO1_SMOOTH: dict[str, Any] = {"condim": 1, "solref": (0.01, 1.0)}
@@ -52,7 +53,8 @@ _GO1_FOOT: Any = {"condim": 6, "solref": (0.01, 1.0), "priority": 1, "friction":
 
 def _go1_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
     y = 1.0 if leg.endswith("L") else -1.0
-    thigh, calf = f"{leg}_thigh", f"{leg}_calf"
+    thigh = f"{leg}_thigh"
+    calf = f"{leg}_calf"
     return (
         capsule(f"{leg}_hip_collision", f"{leg}_hip", 0.05, (0, 0.02 * y, 0, 0, 0.04 * y, 0), **_GO1_SMOOTH),
         capsule(f"{thigh}_collision1", thigh, 0.015, (-0.02, 0, 0, -0.02, 0, -0.16), **_GO1_SMOOTH),
@@ -101,7 +103,8 @@ _GO2_FOOT = (-0.002, 0.0, -0.213)
 
 def _go2_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
     y = 1.0 if leg.endswith("L") else -1.0
-    thigh, calf = f"{leg}_thigh", f"{leg}_calf"
+    thigh = f"{leg}_thigh"
+    calf = f"{leg}_calf"
     return (
         capsule(f"{leg}_hip_collision", f"{leg}_hip", 0.046, (0, 0.06 * y, 0, 0, 0.1 * y, 0), **_GO2_SMOOTH),
         capsule(f"{thigh}_collision", thigh, 0.017, (0, 0, -0.01, 0, 0, -0.2), **_GO2_SMOOTH),

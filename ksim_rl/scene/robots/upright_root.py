@@ -81,7 +81,8 @@ def _turn_inertia(spec: mujoco.MjSpec, body: mujoco.MjsBody, quat: Quaternion) -
     mujoco.mju_negQuat(back, np.array(quat))
     mj_model = compiled_bodies(spec)
     number = mj_model.body(body.name).id
-    ipos, iquat = np.zeros(3), np.zeros(4)
+    ipos = np.zeros(3)
+    iquat = np.zeros(4)
     mujoco.mju_rotVecQuat(ipos, mj_model.body_ipos[number], back)
     mujoco.mju_mulQuat(iquat, back, mj_model.body_iquat[number])
     write_inertia(body, mj_model, number, ipos=ipos, iquat=iquat)

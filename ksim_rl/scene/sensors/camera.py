@@ -70,7 +70,9 @@ class CameraTracker(SensorTracker):
     """Draws the pictures of one camera, at most once per state, and only if something reads them."""
 
     def __init__(self, name: str, sensor: CameraSensor, view: WorldView) -> None:
-        self._name, self._sensor, self._view = name, sensor, view
+        self._name = name
+        self._sensor = sensor
+        self._view = view
         drawn = ("width", "height", "rgb", "depth", "segmentation", "geom_groups", "textures", "shadows")
         settings = {field: getattr(sensor, field) for field in drawn}
         self._camera = BatchCamera(view.world, sensor.camera or name, **settings)
@@ -97,7 +99,8 @@ class CameraTracker(SensorTracker):
         visualizer.frame(origin, view.world.view("cam_xmat")[env_index, camera].cpu().numpy().reshape(3, 3))
 
     def _read(self, output: str) -> Tensor:
-        cache, key = self._view.cache, f"camera/{self._name}."
+        cache = self._view.cache
+        key = f"camera/{self._name}."
         if key + output not in cache:
             if not getattr(self._sensor, output):
                 raise ValueError(f"scene.sensors.{self._name}.{output}=False: set it to True to read it")
@@ -108,11 +111,14 @@ class CameraTracker(SensorTracker):
 
     def _pictures(self) -> dict[str, Tensor]:
         """Copy what was drawn last: the next drawing overwrites it."""
-        camera, sensor, pictures = self._camera, self._sensor, {}
+        camera = self._camera
+        sensor = self._sensor
+        pictures = {}
         if sensor.rgb:
             pictures["rgb"] = camera.rgb_EHW3
         if sensor.depth:
-            depth_EHW, most = camera.depth_EHW, sensor.max_depth
+            depth_EHW = camera.depth_EHW
+            most = sensor.max_depth
             pictures["depth"] = torch.where(depth_EHW > 0.0, depth_EHW.clamp(max=most), most)
         if sensor.segmentation:
             pictures["segmentation"] = camera.segmentation_EHW2[..., 0].clone()

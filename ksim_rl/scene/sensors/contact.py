@@ -68,7 +68,11 @@ class ContactSensor(Sensor):
     @property
     def kind(self) -> Literal["geom", "body", "subtree"]:
         """What the elements are."""
-        return "geom" if self.geoms else "body" if self.bodies else "subtree"
+        if self.geoms:
+            return "geom"
+        if self.bodies:
+            return "body"
+        return "subtree"
 
     def elements(self, present: Sequence[str]) -> list[str]:
         """Return the elements among the `present` ones of their kind, in the order of the N dim."""
@@ -135,7 +139,9 @@ class ContactTracker(SensorTracker):
 
     def __init__(self, name: str, sensor: ContactSensor, view: WorldView) -> None:
         self._key = f"contact/{name}"
-        self._world, self._view, self._strongest = view.world, view, sensor.reduce == "strongest"
+        self._world = view.world
+        self._view = view
+        self._strongest = sensor.reduce == "strongest"
         elements = sensor.elements(view.resolver.names(_TABLES[sensor.kind]))
         self._count = len(elements)
         found = [self._world.mj_model.sensor(f"{name}_{element}") for element in elements]
@@ -171,7 +177,8 @@ class ContactTracker(SensorTracker):
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw an arrow for each contact: the force on the element, from the point of contact."""
-        state, model = self.state, self._world.mj_model
+        state = self.state
+        model = self._world.mj_model
         # m per newton, as in MuJoCo's own viewer.
         scale = model.vis.map.force / model.stat.meanmass
         forces_N3 = state.force_EN3[env_index].cpu().numpy()
@@ -195,7 +202,8 @@ class ContactTracker(SensorTracker):
         clock = self._clocks
         touches = readings[..., 0] > 0
         touched = clock["found"] > 0
-        lands, leaves = touches & ~touched, touched & ~touches
+        lands = touches & ~touched
+        leaves = touched & ~touches
         flight_EN = clock["air_time"] + dt
         # What stands on the ground at the start of an episode has not flown.
         ends_flight = lands & (clock["air_time"] > 0)
@@ -215,6 +223,7 @@ class ContactTracker(SensorTracker):
     def _force(self, readings: Tensor) -> Tensor:
         if not self._strongest:
             return readings[..., 1:4]
-        normal, tangent = readings[..., 7:10], readings[..., 10:13]
+        normal = readings[..., 7:10]
+        tangent = readings[..., 10:13]
         axes = torch.stack((normal, tangent, torch.linalg.cross(normal, tangent)), dim=-1)
         return product(axes, readings[..., 1:4, None])[..., 0]

@@ -42,7 +42,9 @@ class ImuTracker(SensorTracker):
     """What one inertial measurement unit reads, float32, in its own axes."""
 
     def __init__(self, name: str, view: WorldView, site: str) -> None:
-        self._name, self._view, self._site = name, view, site
+        self._name = name
+        self._view = view
+        self._site = site
         self._down = torch.tensor([0.0, 0.0, -1.0], device=view.device)
 
     @property
@@ -63,7 +65,8 @@ class ImuTracker(SensorTracker):
     @property
     def projected_gravity_EL(self) -> Float[Tensor, "E 3"]:
         """Unit vector of world -z; position stage."""
-        cache, key = self._view.cache, f"imu/{self._name}.projected_gravity"
+        cache = self._view.cache
+        key = f"imu/{self._name}.projected_gravity"
         if key not in cache:
             cache[key] = quaternion.rotate_inverse(self.quat_EL, self._down.expand(self._view.num_envs, 3))
         return cache[key]

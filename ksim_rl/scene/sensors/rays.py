@@ -148,13 +148,16 @@ class RayTracker(SensorTracker):
     """Casts the rays of one sensor, at most once per state, and only if something reads them."""
 
     def __init__(self, name: str, sensor: RayCaster, view: WorldView) -> None:
-        self._sensor, self._view, self._key = sensor, view, f"rays/{name}"
+        self._sensor = sensor
+        self._view = view
+        self._key = f"rays/{name}"
         site = view.world.mj_model.site(sensor.mounting_site(name))
         self._site = int(site.id)
         start_N3, direction_N3 = (
             torch.tensor(table, dtype=torch.float32, device=view.device) for table in sensor.pattern.rays()
         )
-        self._start_N3, self._direction_N3 = start_N3, direction_N3
+        self._start_N3 = start_N3
+        self._direction_N3 = direction_N3
         self._batch = RayBatch(
             view.world,
             len(start_N3),
@@ -185,7 +188,8 @@ class RayTracker(SensorTracker):
 
     def _cast(self) -> RayState:
         """Cast, and copy what was found: the next cast overwrites it."""
-        batch, most = self._batch, self._sensor.max_distance
+        batch = self._batch
+        most = self._sensor.max_distance
         batch.start_EN3.copy_(self.origin_E3[:, None] + self._turned(self._start_N3))
         batch.direction_EN3.copy_(self._turned(self._direction_N3))
         batch.cast()
@@ -205,7 +209,8 @@ class RayTracker(SensorTracker):
         matrix_E33 = self._view.derived().site_xmat_EL[:, self._site].view(-1, 3, 3)
         if self._sensor.alignment == "yaw":
             yaw_E1 = torch.atan2(matrix_E33[:, 1, 0], matrix_E33[:, 0, 0])[:, None]
-            cos_E1, sin_E1 = torch.cos(yaw_E1), torch.sin(yaw_E1)
+            cos_E1 = torch.cos(yaw_E1)
+            sin_E1 = torch.sin(yaw_E1)
             x_N, y_N, z_N = vectors_N3.unbind(-1)
             turned = (cos_E1 * x_N - sin_E1 * y_N, sin_E1 * x_N + cos_E1 * y_N, z_N.expand(len(cos_E1), -1))
             return torch.stack(turned, dim=-1)

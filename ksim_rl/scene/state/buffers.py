@@ -58,7 +58,8 @@ class Arena:
     def take(self, shape: tuple[int, ...]) -> Shaped[Tensor, " E *shape"]:
         """Return a buffer [E, *shape], contiguous, that nobody else has."""
         width = math.prod(shape)
-        start, self._used = self._used, self._used + self._num_envs * width
+        start = self._used
+        self._used = self._used + self._num_envs * width
         rows = torch.arange(self._num_envs, dtype=torch.int32, device=self.values.device)
         # Which env each number belongs to.
         self._row_N = torch.cat((self._row_N, rows.repeat_interleave(width)))
@@ -220,7 +221,9 @@ class ActuatorParams:
     """
 
     def __init__(self, buffers: Buffers, joint_names: Sequence[str], device: torch.device) -> None:
-        self._all_buffers, self._joint_names, self._device = buffers, list(joint_names), device
+        self._all_buffers = buffers
+        self._joint_names = list(joint_names)
+        self._device = device
         self._buffers: dict[str, Tensor] = {}
         self._nominal: dict[str, Tensor] = {}
         self._owners: dict[str, dict[int, float]] = {}

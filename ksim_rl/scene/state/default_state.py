@@ -68,7 +68,9 @@ def activation_range(mj_model: mujoco.MjModel, actuator: int) -> tuple[float, fl
     is_filter = int(mj_model.actuator_dyntype[actuator]) in SMOOTHED
     if is_filter and mj_model.actuator_ctrllimited[actuator]:
         ranges.append(tuple(mj_model.actuator_ctrlrange[actuator].tolist()))
-    return max(low for low, _ in ranges), min(high for _, high in ranges)
+    highest_low = max(low for low, _ in ranges)
+    lowest_high = min(high for _, high in ranges)
+    return highest_low, lowest_high
 
 
 class DefaultState:
@@ -109,7 +111,10 @@ class DefaultState:
         for name, start in self._restored.items():
             rows = mask_E.view(-1, *[1] * start.ndim)
             if name in ("qpos", "qvel"):
-                state_EL = world.qpos_EL if name == "qpos" else world.qvel_EL
+                if name == "qpos":
+                    state_EL = world.qpos_EL
+                else:
+                    state_EL = world.qvel_EL
                 self._simulation.write(state_EL, slice(None), mask_E, start.expand_as(state_EL))
                 continue
             held_E = world.view(name)
@@ -121,7 +126,8 @@ class DefaultState:
         """Let the servos' activations follow joints of the rows of `mask_E` to where events have put them."""
         if self._following is None:
             return
-        world, following = self._simulation.world, self._following
+        world = self._simulation.world
+        following = self._following
         moved_EK = world.qpos_EL[:, following.qpos] - following.start_K
         resting_EK = following.act_K + following.scale_K * moved_EK
         resting_EK = torch.clamp(resting_EK, following.low_K, following.high_K)
@@ -140,7 +146,8 @@ class DefaultState:
                 continue
             columns.append(activation_of(model, actuator))
             qpos.append(int(model.jnt_qposadr[model.actuator_trnid[actuator, 0]]))
-            start, act = float(self.qpos_L[qpos[-1]]), float(self.act_L[columns[-1]])
+            start = float(self.qpos_L[qpos[-1]])
+            act = float(self.act_L[columns[-1]])
             low, high = activation_range(model, actuator)
             # At the default pose itself the keyframe's activation holds, even beyond its range.
             numbers.append((control.activation_scale, start, act, min(low, act), max(high, act)))

@@ -20,7 +20,8 @@ class _Elements:
     """
 
     def __init__(self, state: Simulation, ids: Sequence[int], names: Sequence[str]) -> None:
-        self.ids, self.names = tuple(ids), list(names)
+        self.ids = tuple(ids)
+        self.names = list(names)
         self.index = as_index(ids, state.world.device)
         self.cache = state.new_cache()
         self._state = state
@@ -52,9 +53,11 @@ class Joints(_Elements):
         every_joint: "Joints | None" = None,
     ) -> None:
         super().__init__(state, ids, names)
-        model, device = state.world.mj_model, state.world.device
+        model = state.world.mj_model
+        device = state.world.device
         scalar = scalar_joint_ids(model)
-        self._tables, self._every_joint = tables, every_joint or self
+        self._tables = tables
+        self._every_joint = every_joint or self
         self.qpos = as_index([model.jnt_qposadr[scalar[i]] for i in ids], device)
         self.qvel = as_index([model.jnt_dofadr[scalar[i]] for i in ids], device)
 
@@ -157,7 +160,8 @@ class Body:
     """The body `name` with index `id` in the model: `view.body("torso").lin_vel_EL`; units as in `Bodies`."""
 
     def __init__(self, bodies: Bodies) -> None:
-        (self.name,), (self.id,) = bodies.names, bodies.ids
+        (self.name,) = bodies.names
+        (self.id,) = bodies.ids
         self._bodies = bodies
 
     pos_EL = first_of("_bodies", Bodies.pos_EN3)
@@ -195,7 +199,8 @@ class Site:
     """The site `name` with index `id` in the model: `view.site("finger").pos_EL`; units as in `Sites`."""
 
     def __init__(self, sites: Sites) -> None:
-        (self.name,), (self.id,) = sites.names, sites.ids
+        (self.name,) = sites.names
+        (self.id,) = sites.ids
         self._sites = sites
 
     pos_EL = first_of("_sites", Sites.pos_EN3)

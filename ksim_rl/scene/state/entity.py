@@ -32,21 +32,29 @@ class Entity:
     ) -> None:
         self.cache = state.new_cache()
         self._state = state
-        model, device = state.world.mj_model, state.world.device
-        self.name, self.prefix = name, prefix
+        model = state.world.mj_model
+        device = state.world.device
+        self.name = name
+        self.prefix = prefix
         roots = {r for r in model.body_rootid[1:].tolist() if model.body(r).name.startswith(prefix)}
         bodies = [b for b in range(1, model.nbody) if model.body_rootid[b] in roots]
         if prefix and not bodies:
             raise ValueError(f"scene: {name!r} has no body: give it one, or put its geoms into the terrain")
         joints = [j for j in range(model.njnt) if model.body_rootid[model.jnt_bodyid[j]] in roots]
         self.free_root = bool(joints) and model.jnt_type[joints[0]] == mujoco.mjtJoint.mjJNT_FREE
-        root = int(model.jnt_bodyid[joints[0]]) if self.free_root else (bodies or [0])[0]
+        if self.free_root:
+            root = int(model.jnt_bodyid[joints[0]])
+        else:
+            root = (bodies or [0])[0]
         self.root = Body(Bodies(state, [root], [model.body(root).name]))
-        self.root_qpos, self.root_qvel = slice(0, 0), slice(0, 0)
+        self.root_qpos = slice(0, 0)
+        self.root_qvel = slice(0, 0)
         pose = torch.tensor([*model.body_pos[root], *model.body_quat[root]], device=device)
         if self.free_root:
-            qpos, qvel = int(model.jnt_qposadr[joints[0]]), int(model.jnt_dofadr[joints[0]])
-            self.root_qpos, self.root_qvel = slice(qpos, qpos + 7), slice(qvel, qvel + 6)
+            qpos = int(model.jnt_qposadr[joints[0]])
+            qvel = int(model.jnt_dofadr[joints[0]])
+            self.root_qpos = slice(qpos, qpos + 7)
+            self.root_qvel = slice(qvel, qvel + 6)
             pose = default_qpos_L[self.root_qpos]
         self.default_root_pos_L, self.default_root_quat_L = pose.to(torch.float32).split((3, 4))
         self._down = torch.tensor([0.0, 0.0, -1.0], device=device)
@@ -55,12 +63,16 @@ class Entity:
     @quantity
     def root_pos_EL(self) -> Float[Tensor, "E 3"]:
         """Position of the root body's frame in the world, m."""
-        return self._free_qpos_EL[:, :3] if self.free_root else self.root.pos_EL
+        if self.free_root:
+            return self._free_qpos_EL[:, :3]
+        return self.root.pos_EL
 
     @quantity
     def root_quat_EL(self) -> Float[Tensor, "E 4"]:
         """Orientation of the root body, body to world, (w, x, y, z)."""
-        return self._free_qpos_EL[:, 3:] if self.free_root else self.root.quat_EL
+        if self.free_root:
+            return self._free_qpos_EL[:, 3:]
+        return self.root.quat_EL
 
     @quantity
     def projected_gravity_EL(self) -> Float[Tensor, "E 3"]:
@@ -75,7 +87,9 @@ class Entity:
     @quantity
     def root_lin_vel_w_EL(self) -> Float[Tensor, "E 3"]:
         """Linear velocity of the root body's frame origin, world frame, m/s."""
-        return self._free_qvel_EL[:, :3] if self.free_root else self.root.lin_vel_EL
+        if self.free_root:
+            return self._free_qvel_EL[:, :3]
+        return self.root.lin_vel_EL
 
     @quantity
     def root_lin_vel_b_EL(self) -> Float[Tensor, "E 3"]:

@@ -38,7 +38,9 @@ class Ground:
     def clearance(self, points_EN3: Float[Tensor, "E N 3"]) -> Float[Tensor, "E N"]:
         """Return how high points (world frame, m) are above the ground right below them, m."""
         height_EN = points_EN3[..., 2]
-        return height_EN if self.is_flat else height_EN - self.heights(points_EN3[..., :2])
+        if self.is_flat:
+            return height_EN
+        return height_EN - self.heights(points_EN3[..., :2])
 
     def set_levels(self, mask_E: Bool[Tensor, " E"], levels_E: Int64[Tensor, " E"]) -> None:
         """Move the rows of `mask_E` to other levels, before their reset; a ValueError where the terrain has none."""

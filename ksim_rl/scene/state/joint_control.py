@@ -77,7 +77,10 @@ def _control(
     constant, per_length, per_speed = (float(number) for number in biasprm[:3])
     force = float(gainprm[0])
     integrates = dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
-    kind: TargetKind = "pos" if per_length != 0.0 and not integrates else "vel"
+    if per_length != 0.0 and not integrates:
+        kind: TargetKind = "pos"
+    else:
+        kind = "vel"
     refusal = _no_servo(gaintype, force, gear, per_length, per_speed, dyntype)
     if refusal:
         return JointControl(kind, refusal=refusal)

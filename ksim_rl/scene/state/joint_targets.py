@@ -61,7 +61,9 @@ class _Line(NamedTuple):
         """Return the controls; of plain servos the targets themselves, bit for bit."""
         if self.scale_K is not None:
             target_EK = target_EK * self.scale_K
-        return target_EK if self.offset_K is None else target_EK + self.offset_K
+        if self.offset_K is None:
+            return target_EK
+        return target_EK + self.offset_K
 
 
 class _Route(NamedTuple):
@@ -91,8 +93,10 @@ class JointTargets:
         default_joint_pos_EL: Float[Tensor, "E L"],
         default_state: DefaultState,
     ) -> None:
-        model, num_joints = world.mj_model, default_joint_pos_EL.shape[1]
-        self._world, self._resolver = world, resolver
+        model = world.mj_model
+        num_joints = default_joint_pos_EL.shape[1]
+        self._world = world
+        self._resolver = resolver
         self.pos_EL = buffers.get("joint_pos_target_EL", num_joints, initial=default_joint_pos_EL)
         self.vel_EL = buffers.get("joint_vel_target_EL", num_joints)
         self.effort_EL = buffers.get("joint_effort_target_EL", num_joints)
@@ -175,7 +179,10 @@ class JointTargets:
         rows_E1 = mask_E[:, None]
         for kind, beyond_L in self._asked_beyond.items():
             target_EL = self._buffers[kind]
-            asked_EL = beyond_L + self._default_joint_pos_EL if kind == "pos" else beyond_L
+            if kind == "pos":
+                asked_EL = beyond_L + self._default_joint_pos_EL
+            else:
+                asked_EL = beyond_L
             target_EL.copy_(torch.where(rows_E1, asked_EL, target_EL))
         ctrl_EL = self._world.ctrl_EL
         if self._start_ctrl_L is not None:
@@ -186,7 +193,8 @@ class JointTargets:
 
     def _find_servos(self) -> None:
         """Find the position servos, which follow the default pose, and what the default state asks for beyond it."""
-        device, start = self._world.device, self._default_state
+        device = self._world.device
+        start = self._default_state
         num_joints = self.pos_EL.shape[1]
         addresses = self._world.mj_model.jnt_qposadr[scalar_joint_ids(self._world.mj_model)]
         beyond = {kind: np.zeros(num_joints) for kind in self._buffers}
@@ -214,7 +222,10 @@ class JointTargets:
         self._start_ctrl_L = None
         if other_ctrl_L.any():
             self._start_ctrl_L = torch.tensor(other_ctrl_L, device=device, dtype=torch.float32)
-        self._servo_ctrl = as_index([driven.actuator for _, driven in servos], device) if servos else None
+        if servos:
+            self._servo_ctrl = as_index([driven.actuator for _, driven in servos], device)
+        else:
+            self._servo_ctrl = None
         self._servo_joints = as_index([joint for joint, _ in servos], device)
         self._servo_line = self._line([driven.control for _, driven in servos])
 
@@ -223,7 +234,8 @@ class JointTargets:
         scale = [control.scale for control in controls]
         offset = [control.offset for control in controls]
         device = self._world.device
-        is_scaled, is_shifted = any(number != 1.0 for number in scale), any(offset)
+        is_scaled = any(number != 1.0 for number in scale)
+        is_shifted = any(offset)
         return _Line(
             torch.tensor(scale, device=device, dtype=torch.float32) if is_scaled else None,
             torch.tensor(offset, device=device, dtype=torch.float32) if is_shifted else None,
@@ -249,7 +261,8 @@ class JointTargets:
             ctrl.append(driven.actuator)
             controls.append(driven.control)
             columns.append(column)
-        model, device = self._world.mj_model, self._world.device
+        model = self._world.mj_model
+        device = self._world.device
         limits_K2 = None
         if kind == "effort" and any(model.actuator_ctrllimited[actuator] for actuator in ctrl):
             limits_K2 = torch.tensor([-torch.inf, torch.inf], device=device).repeat(len(joints), 1)

@@ -34,7 +34,8 @@ def motion_bodies(
     """Return the poses that bodies have in the motion now, world frame, moved by `motion_shift`; once per state."""
     key = f"motion/{file}.bodies {bodies}"
     if key not in view.cache:
-        index, shift_E3 = view.bodies(bodies).index, motion_shift(view)
+        index = view.bodies(bodies).index
+        shift_E3 = motion_shift(view)
         pos_EN3, quat_EN4 = view.motion(file).sample_bodies(motion_time(view, file), index)
         view.cache[key] = (pos_EN3 if shift_E3 is None else pos_EN3 + shift_E3[:, None]), quat_EN4
     return view.cache[key]
@@ -42,4 +43,6 @@ def motion_bodies(
 
 def motion_shift(view: WorldView) -> Float[Tensor, "E 3"] | None:
     """Return how far motions are moved in each env, m: to its origin, if the robot's root can go there."""
-    return None if view.terrain.is_flat or not view.robot.free_root else view.terrain.origins_E3
+    if view.terrain.is_flat or not view.robot.free_root:
+        return None
+    return view.terrain.origins_E3

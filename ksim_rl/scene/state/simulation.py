@@ -40,8 +40,11 @@ class Simulation:
     """
 
     def __init__(self, world: World, *, step_dt: float, max_episode_length: int = 0) -> None:
-        self.world, self.num_envs, self.device = world, world.num_envs, world.device
-        self.physics_dt, self.step_dt = float(world.mj_model.opt.timestep), step_dt
+        self.world = world
+        self.num_envs = world.num_envs
+        self.device = world.device
+        self.physics_dt = float(world.mj_model.opt.timestep)
+        self.step_dt = step_dt
         self.max_episode_length = max_episode_length
         self.ground = Ground(self.num_envs, self.device)
         self.buffers = Buffers(self.num_envs, self.device)
@@ -55,11 +58,15 @@ class Simulation:
         self.after_substep: list[Callable[[], None]] = []
         self.substep_sensors: Literal["last", "contacts", "every"] = "last"
         self.startup_counter = torch.zeros_like(self.seed)
-        self.reader, self.is_frozen, self._is_stale = "", False, False
+        self.reader = ""
+        self.is_frozen = False
+        self._is_stale = False
         self._caches: list[dict[str, Tensor]] = []
         self._body_root = torch.tensor(world.mj_model.body_rootid, device=self.device, dtype=torch.int64)
         self._counter = self.startup_counter
-        self._scope, self._draw_scope, self._draws = "", "", 0
+        self._scope = ""
+        self._draw_scope = ""
+        self._draws = 0
         self.is_writing = False
 
     def new_cache(self) -> dict[str, Any]:
@@ -140,9 +147,14 @@ class Simulation:
         counters may coincide. `part` is what runs, if what it writes is to be watched, and `mask_E` the rows that it
         may write. Gives what the part has written of its own, by name, where it was watched (see `watch`).
         """
-        self._scope, self._draw_scope, self._draws = name, f"{name}@{draws}", 0
+        self._scope = name
+        self._draw_scope = f"{name}@{draws}"
+        self._draws = 0
         self.reader = name
-        self._counter = self.step_count if counter is None else counter
+        if counter is None:
+            self._counter = self.step_count
+        else:
+            self._counter = counter
         try:
             with self.watch(part, mask_E) as written:
                 yield written

@@ -47,19 +47,25 @@ class WorldView:
         entities: Sequence[str] = (),
     ) -> None:
         self._simulation = simulation
-        self.world, self.num_envs, self.device = simulation.world, simulation.num_envs, simulation.device
-        self.physics_dt, self.step_dt = simulation.physics_dt, simulation.step_dt
+        self.world = simulation.world
+        self.num_envs = simulation.num_envs
+        self.device = simulation.device
+        self.physics_dt = simulation.physics_dt
+        self.step_dt = simulation.step_dt
         self.max_episode_length = simulation.max_episode_length
         self.buffers = simulation.buffers
-        self.seed, self.step_count = simulation.seed, simulation.step_count
-        self.reset_count_E, self.episode_step_E = simulation.reset_count_E, simulation.episode_step_E
+        self.seed = simulation.seed
+        self.step_count = simulation.step_count
+        self.reset_count_E = simulation.reset_count_E
+        self.episode_step_E = simulation.episode_step_E
         self.time_out_offset_E = simulation.time_out_offset_E
         self.resolver = NameResolver(self.world.mj_model, self.device)
         self.cache = simulation.new_cache()
         self._named: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._motions: dict[str, ReferenceMotion] = {}
 
-        model, joints = self.world.mj_model, scalar_joint_ids(self.world.mj_model)
+        model = self.world.mj_model
+        joints = scalar_joint_ids(self.world.mj_model)
         self.num_joints = len(joints)
         places = zip(model.sensor_adr.tolist(), model.sensor_dim.tolist(), strict=True)
         slices = (slice(first, first + size) for first, size in places)
@@ -79,7 +85,8 @@ class WorldView:
             default_joint_pos_EL=self.default_joint_pos_EL,
             default_state=self.default_state,
         )
-        self.joint_pos_target_EL, self.joint_vel_target_EL = self.targets.pos_EL, self.targets.vel_EL
+        self.joint_pos_target_EL = self.targets.pos_EL
+        self.joint_vel_target_EL = self.targets.vel_EL
         self.joint_effort_target_EL = self.targets.effort_EL
         self.actuator_params = ActuatorParams(self.buffers, self.resolver.names("joint"), self.device)
         ctrl_range = torch.tensor(model.actuator_ctrlrange, device=self.device, dtype=torch.float32)
@@ -135,7 +142,8 @@ class WorldView:
     def _points(self, kind: type[Points], element: str, patterns: Patterns) -> Points:
         key = (element, as_patterns(patterns))
         if key not in self._named:
-            ids, names = self.resolver.ids(element, patterns), self.resolver.names(element)
+            ids = self.resolver.ids(element, patterns)
+            names = self.resolver.names(element)
             self._named[key] = kind(self._simulation, ids, [names[i] for i in ids])
         return self._named[key]
 
@@ -239,14 +247,16 @@ class WorldView:
 
         What a term writes into it in each call advances once per env step.
         """
-        full_name, owner = self._simulation.scoped(name), self._simulation.reader
+        full_name = self._simulation.scoped(name)
+        owner = self._simulation.reader
         return self.buffers.get(full_name, *shape, dtype=dtype, keep=keep, owner=owner)
 
     def shared(
         self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]
     ) -> Float[Tensor, "*shape"]:
         """Return a float32 tensor of the calling term that all envs share; it starts at `initial` and is saved."""
-        full_name, owner = self._simulation.scoped(name), self._simulation.reader
+        full_name = self._simulation.scoped(name)
+        owner = self._simulation.reader
         return self._simulation.shared_values.get(full_name, initial, owner=owner)
 
     def uniform(
@@ -303,7 +313,8 @@ class WorldView:
         """Shrink the joint ranges about their middles; unlimited joints get infinite limits. [L, 2]."""
         model = self.world.mj_model
         limits = torch.tensor(model.jnt_range[joints], device=self.device, dtype=torch.float32).view(-1, 2)
-        middle, half = limits.mean(-1), (limits[:, 1] - limits[:, 0]) / 2 * factor
+        middle = limits.mean(-1)
+        half = (limits[:, 1] - limits[:, 0]) / 2 * factor
         return self._limited(torch.stack((middle - half, middle + half), dim=-1), model.jnt_limited[joints])
 
     def _limited(self, limits_L2: Float[Tensor, "L 2"], is_limited: np.ndarray) -> Tensor:

@@ -82,7 +82,9 @@ class TerrainGrid(Terrain):
 
     def difficulty(self, level: int) -> float:
         """Return the difficulty of a level, in [0, 1]; that of a single level is 1."""
-        return level / (self.num_levels - 1) if self.num_levels > 1 else 1.0
+        if self.num_levels > 1:
+            return level / (self.num_levels - 1)
+        return 1.0
 
     def heights(self, level: int, column: int) -> np.ndarray:
         """Return the heights of one patch, m, float64 [R, C]: rows along y, columns along x, lowest point 0."""
@@ -99,7 +101,8 @@ class TerrainGrid(Terrain):
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add all patches as height fields, and the geom, with the steepest patch in place."""
         add_look(spec, repeat=1)
-        steepest, most = "", -math.inf
+        steepest = ""
+        most = -math.inf
         for name, heights_RC in self.named_heights():
             top = max(float(heights_RC.max()), THINNEST)
             rows, columns = heights_RC.shape
@@ -113,7 +116,8 @@ class TerrainGrid(Terrain):
             )
             gradient = (columns - 1) * float(np.abs(np.diff(heights_RC)).mean())
             if gradient > most:
-                steepest, most = name, gradient
+                steepest = name
+                most = gradient
         add_ground(
             spec,
             friction=self.friction,
@@ -142,8 +146,10 @@ class PatchedGround(Ground):
 
     def __init__(self, view: WorldView, grid: TerrainGrid) -> None:
         super().__init__(view.num_envs, view.device)
-        mj_model, device = view.world.mj_model, view.device
-        self.num_levels, self._num_columns = grid.num_levels, grid.num_columns
+        mj_model = view.world.mj_model
+        device = view.device
+        self.num_levels = grid.num_levels
+        self._num_columns = grid.num_columns
         max_initial_level = min(grid.max_initial_level, grid.num_levels - 1)
         spawn_heights = [grid.spawn_height(heights_RC) for _, heights_RC in grid.named_heights()]
         # A robot's own model may have height fields too.
@@ -196,14 +202,16 @@ class PatchedGround(Ground):
         place_EN2 = torch.minimum(place_EN2.clamp(min=0.0), cells_E11)
         corner_EN2 = torch.minimum(place_EN2.long(), cells_E11 - 1)
         within_EN2 = place_EN2 - corner_EN2
-        x_EN, y_EN = within_EN2[..., 0], within_EN2[..., 1]
+        x_EN = within_EN2[..., 0]
+        y_EN = within_EN2[..., 1]
         first_EN = self._address_P[patch_E][:, None] + corner_EN2[..., 1] * columns_E1 + corner_EN2[..., 0]
         # MuJoCo splits each cell along the diagonal from its first corner to the opposite one.
         second_EN = first_EN + torch.where(x_EN >= y_EN, 1, columns_E1)
         low_EN, mid_EN, high_EN = (
             self._heights[index] for index in (first_EN, second_EN, first_EN + columns_E1 + 1)
         )
-        steep_EN, flat_EN = torch.maximum(x_EN, y_EN), torch.minimum(x_EN, y_EN)
+        steep_EN = torch.maximum(x_EN, y_EN)
+        flat_EN = torch.minimum(x_EN, y_EN)
         return low_EN + steep_EN * (mid_EN - low_EN) + flat_EN * (high_EN - mid_EN)
 
     def set_levels(self, mask_E: Bool[Tensor, " E"], levels_E: Int64[Tensor, " E"]) -> None:

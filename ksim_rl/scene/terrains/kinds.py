@@ -102,7 +102,8 @@ class DiscreteObstacles(TerrainPatch):
     platform_width: NonNegative = 1.5
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-        height, reach = between(self.height, difficulty), lattice.size / 2
+        height = between(self.height, difficulty)
+        reach = lattice.size / 2
         ground_RC = np.zeros_like(lattice.x_RC)
         for _ in range(self.num_obstacles):
             half_x, half_y = rng.uniform(*self.width, size=2) / 2
@@ -138,7 +139,8 @@ class SteppingStones(TerrainPatch):
         width = max(1, round(between(self.stone_width, difficulty) / cell))
         gap = max(2, round(between(self.gap, difficulty) / cell))
         place_C = np.arange(lattice.num_cells + 1)
-        stone_C, within_C = place_C // (width + gap), place_C % (width + gap)
+        stone_C = place_C // (width + gap)
+        within_C = place_C % (width + gap)
         on_stone_C = within_C <= width
         unevenness = between(self.unevenness, difficulty)
         tops = rng.uniform(-unevenness, unevenness, size=(stone_C[-1] + 1,) * 2)

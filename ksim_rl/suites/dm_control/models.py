@@ -67,7 +67,10 @@ def _add_links(spec: mujoco.MjSpec, count: int) -> None:
         site = parent.add_site(defaults["swimmer"], name=f"site_{index}")
         limit = 2.0 * math.pi / count
         # Degrees, as in the file, which the compiler turns into radians.
-        limits = [-math.degrees(limit), math.degrees(limit)] if spec.compiler.degree else [-limit, limit]
+        if spec.compiler.degree:
+            limits = [-math.degrees(limit), math.degrees(limit)]
+        else:
+            limits = [-limit, limit]
         joint = parent.add_joint(defaults["swimmer"], name=f"joint_{index}", range=limits)
         motor = spec.add_actuator(spec.default, name=f"motor_{index}", target=joint.name)
         motor.trntype = mujoco.mjtTrn.mjTRN_JOINT

@@ -56,7 +56,9 @@ class Readings(ObservationTerm):
             reading_EL = view.sensor(name)
             parts.append(reading_EL[:, _columns(view, axes)] if axes else reading_EL)
         readings_EL = torch.cat(parts, dim=-1)
-        return torch.log1p(readings_EL) if self.log else readings_EL
+        if self.log:
+            return torch.log1p(readings_EL)
+        return readings_EL
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,17 +48,20 @@ class StartRule(EventTerm):
 
     def bounds(self, mj_model: mujoco.MjModel, default_L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest qpos, [nq] each, without the orientation of a free root."""
-        low_L, high_L = default_L.copy(), default_L.copy()
+        low_L = default_L.copy()
+        high_L = default_L.copy()
         names = [mj_model.joint(joint).name for joint in range(mj_model.njnt)]
         if self.own_ranges:
             for joint, address in enumerate(mj_model.jnt_qposadr):
                 if mj_model.jnt_limited[joint]:
                     low_L[address], high_L[address] = mj_model.jnt_range[joint]
                 elif mj_model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
-                    low_L[address], high_L[address] = -np.pi, np.pi
+                    low_L[address] = -np.pi
+                    high_L[address] = np.pi
         for pattern, (low, high) in self.ranges.items():
             for joint in match_names("joint", (pattern,), names):
-                low_L[mj_model.jnt_qposadr[joint]], high_L[mj_model.jnt_qposadr[joint]] = low, high
+                low_L[mj_model.jnt_qposadr[joint]] = low
+                high_L[mj_model.jnt_qposadr[joint]] = high
         return low_L, high_L
 
 
@@ -74,7 +77,10 @@ class DrawStart(StartRule):
         # A number between equal bounds may be rounded.
         qpos_EL = torch.where(low_L == high_L, low_L, qpos_EL)
         if self.root != "default":
-            quat_E4 = view.normal(4) if self.root == "uniform" else view.uniform(4)
+            if self.root == "uniform":
+                quat_E4 = view.normal(4)
+            else:
+                quat_E4 = view.uniform(4)
             qpos_EL[:, 3:7] = quat_E4 / torch.linalg.vector_norm(quat_E4, dim=-1, keepdim=True)
         view.write_qpos(mask_E, qpos_EL)
         qvel_EL = torch.zeros_like(view.world.qvel_EL)
@@ -131,7 +137,8 @@ class StartFromBank(StartRule):
 
     def draw(self, mj_model: mujoco.MjModel, default_L: np.ndarray) -> np.ndarray:
         """Return the bank, qpos and qvel of each start, [N, nq + nv]; a ValueError if starts touch again and again."""
-        random, data = np.random.default_rng(self.bank_seed), mujoco.MjData(mj_model)
+        random = np.random.default_rng(self.bank_seed)
+        data = mujoco.MjData(mj_model)
         low_L, high_L = self.bounds(mj_model, default_L)
         bank_NL = np.zeros((self.size, mj_model.nq + mj_model.nv))
         for row_L in bank_NL:
@@ -139,7 +146,10 @@ class StartFromBank(StartRule):
                 mujoco.mj_resetData(mj_model, data)
                 data.qpos = random.uniform(low_L, high_L)
                 if self.root != "default":
-                    quat = random.normal(size=4) if self.root == "uniform" else random.random(4)
+                    if self.root == "uniform":
+                        quat = random.normal(size=4)
+                    else:
+                        quat = random.random(4)
                     data.qpos[3:7] = quat / np.linalg.norm(quat)
                 if not self.without_contacts:
                     break
@@ -149,7 +159,9 @@ class StartFromBank(StartRule):
             else:
                 raise ValueError(f"without_contacts=True: no start without contacts in {MOST_DRAWS} draws")
             row_L[: mj_model.nq] = data.qpos
-        return _settled(mj_model, bank_NL, steps=self.settle_steps) if self.settle_steps else bank_NL
+        if self.settle_steps:
+            return _settled(mj_model, bank_NL, steps=self.settle_steps)
+        return bank_NL
 
 
 def _settled(mj_model: mujoco.MjModel, bank_NL: np.ndarray, *, steps: int) -> np.ndarray:

@@ -59,8 +59,13 @@ class RingTarget(Target):
     def draw(self, view: EnvView) -> Float[Tensor, "E 3"]:
         share_E, angle_E = view.uniform(2).unbind(-1)
         inner, outer = self.radius
-        radius_E, angle_E = inner + share_E * (outer - inner), 2.0 * torch.pi * angle_E
-        first_E, second_E = radius_E * torch.sin(angle_E), radius_E * torch.cos(angle_E)
+        radius_E = inner + share_E * (outer - inner)
+        angle_E = 2.0 * torch.pi * angle_E
+        first_E = radius_E * torch.sin(angle_E)
+        second_E = radius_E * torch.cos(angle_E)
         zero_E = torch.zeros_like(first_E)
-        offset = (first_E, second_E, zero_E) if self.plane == "xy" else (first_E, zero_E, second_E)
+        if self.plane == "xy":
+            offset = (first_E, second_E, zero_E)
+        else:
+            offset = (first_E, zero_E, second_E)
         return constant(self.center, view.device) + torch.stack(offset, dim=-1)

@@ -33,7 +33,8 @@ from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, Observation
 
 EPISODE_STEPS = 1000
 # Env states of the tasks that take long: of PPO, and of FastSAC.
-LONG, FAST_SAC_LONG = 100e6, 10e6
+LONG = 100e6
+FAST_SAC_LONG = 10e6
 # s of a control step.
 CONTROL_S = {
     "acrobot": 0.01, "ball_in_cup": 0.02, "cartpole": 0.01, "cheetah": 0.01, "finger": 0.02, "fish": 0.04,
@@ -298,7 +299,8 @@ def domain_of(name: str) -> str:
 
 def make_cfg(name: str, variant: Variant) -> ManagerBasedRlEnvCfg:
     """Return the config of a task of `SUITE_TASKS`."""
-    task, domain = SUITE_TASKS[name], DOMAINS[domain_of(name)]
+    task = SUITE_TASKS[name]
+    domain = DOMAINS[domain_of(name)]
     if variant == "playground":
         domain = dataclasses.replace(domain, **domain.playground)
     terms = {

@@ -72,7 +72,8 @@ class PlaceFreeBody(EventTerm):
         if self.orientation == "uniform":
             # Independent normals favour no direction.
             quat_E4 = torch.nn.functional.normalize(view.normal(4), dim=-1)
-        before_EL, after_EL = view.world.qpos_EL[:, :start], view.world.qpos_EL[:, start + 7 :]
+        before_EL = view.world.qpos_EL[:, :start]
+        after_EL = view.world.qpos_EL[:, start + 7 :]
         view.write_qpos(mask_E, torch.cat((before_EL, pos_E3, quat_E4, after_EL), dim=-1))
 
 

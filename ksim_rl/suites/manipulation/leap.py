@@ -30,7 +30,9 @@ from ksim_rl.suites.manipulation.targets import JointTarget, MoveTargets, Target
 from ksim_rl.transforms import GaussianNoise, UniformNoise
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
-GOAL, CUBE, CUBE_ORIENTATION = "goal", "cube", "cube_orientation"
+GOAL = "goal"
+CUBE = "cube"
+CUBE_ORIENTATION = "cube_orientation"
 HAND = "(if|mf|rf|th)_.*"
 TIPS = tuple(f"{finger}_tip_position" for finger in ("th", "if", "mf", "rf"))
 CONTROL_S = 0.05
@@ -59,14 +61,16 @@ class GoalOrientation(CommandTerm):
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw an orientation; its turn and its count of steps are zero in rows that reset."""
-        goal_E4, drawn_E4 = view.buffer("goal_E4", 4), normalize(view.normal(4), dim=-1)
+        goal_E4 = view.buffer("goal_E4", 4)
+        drawn_E4 = normalize(view.normal(4), dim=-1)
         goal_E4.copy_(torch.where(mask_E[:, None], drawn_E4, goal_E4))
         shown_E4 = self._shown(view)
         shown_E4.copy_(torch.where(mask_E[:, None], goal_E4, shown_E4))
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 4"]:
         """Move the goal if an env step has passed, and return it."""
-        goal_E4, turn_E3 = view.buffer("goal_E4", 4), view.buffer("turn_E3", 3)
+        goal_E4 = view.buffer("goal_E4", 4)
+        turn_E3 = view.buffer("turn_E3", 3)
         steps_E = view.buffer("steps_E", dtype=torch.int64)
         # No env step has passed when a row has just been reset, so that its goal stays where it was drawn.
         moves_E1 = (steps_E != view.episode_step_E)[:, None]
@@ -145,11 +149,9 @@ class ActuatorPower(RewardTerm):
 
 def leap_cube_reorient() -> ManagerBasedRlEnvCfg:
     """Return the config: 20 Hz control, episodes of 1000 steps, rewards per second but for that of reaching a goal."""
-    pos, offset, turn = (
-        mdp.JointPos(joints=HAND),
-        Offset(ends=("site:grasp_site",), start=f"com:{CUBE}"),
-        GoalTurn(),
-    )
+    pos = mdp.JointPos(joints=HAND)
+    offset = Offset(ends=("site:grasp_site",), start=f"com:{CUBE}")
+    turn = GoalTurn()
     actor = {
         "joint_pos": ObservationTermCfg(term=pos, noise=UniformNoise(low=-0.05, high=0.05)),
         "joint_target": ObservationTermCfg(term=JointTarget(joints=HAND)),

@@ -31,7 +31,9 @@ from ksim_rl.suites.manipulation.bodies import LeavesBox, PlaceFreeBody, Playgro
 from ksim_rl.suites.manipulation.targets import JointTarget, MoveTargets
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
-COMMAND, BOX, GRIPPER = "target", "box", "gripper"
+COMMAND = "target"
+BOX = "box"
+GRIPPER = "gripper"
 ARM = "joint[1-7]"
 DRIVEN = (ARM, "finger_joint1")  # an equality moves the other finger
 # Of an orientation's matrix: entry "yx" is the y component of the x axis.

@@ -56,4 +56,6 @@ class JointTarget(OfJoints, ObservationTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
         joints = view.joints(self.joints)
         target_EK = view.joint_pos_target_EL[:, joints.index]
-        return target_EK - joints.pos_EL if self.relative else target_EK
+        if self.relative:
+            return target_EK - joints.pos_EL
+        return target_EK

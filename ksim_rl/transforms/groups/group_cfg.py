@@ -89,7 +89,9 @@ class ObservationGroupCfg(Checked):
         for history in (self.terms[term].history, self.history):
             if history is not None:
                 frames = history_cfg(history)
-                return frames.length if frames is not None and frames.flat else 1
+                if frames is not None and frames.flat:
+                    return frames.length
+                return 1
         return 1
 
 
@@ -98,10 +100,15 @@ def history_cfg(history: int | HistoryCfg | None) -> HistoryCfg | None:
     if history is None:
         return None
     try:
-        cfg = history if isinstance(history, HistoryCfg) else HistoryCfg(length=history)
+        if isinstance(history, HistoryCfg):
+            cfg = history
+        else:
+            cfg = HistoryCfg(length=history)
     except ValueError as error:
         raise ValueError(f"history.{error}") from None
-    return cfg if cfg.length > 1 or not cfg.flat else None
+    if cfg.length > 1 or not cfg.flat:
+        return cfg
+    return None
 
 
 def compile_groups(

@@ -48,7 +48,9 @@ class GroupSpec:
 
 def last_name(key: NestedKey) -> str:
     """Return the last part of a key."""
-    return key if isinstance(key, str) else str(key[-1])
+    if isinstance(key, str):
+        return key
+    return str(key[-1])
 
 
 class ObservationGroups(CheckedKeys):

@@ -61,14 +61,20 @@ def image(
     vector: Shaped[Tensor, "*batch L"], source_L: Int64[Tensor, " L"] | None, signs_L: Float32[Tensor, " L"]
 ) -> Shaped[Tensor, "*batch L"]:
     """Return the mirror image of vectors [..., L]; a `source_L` of None leaves the columns in place."""
-    columns = vector if source_L is None else vector.index_select(-1, source_L)
+    if source_L is None:
+        columns = vector
+    else:
+        columns = vector.index_select(-1, source_L)
     return columns * signs_L.to(vector.dtype)
 
 
 @functools.lru_cache(maxsize=256)
 def _tensors(mirror: MirrorMap, device: Device) -> tuple[Tensor | None, Tensor]:
     moves = mirror.source != tuple(range(mirror.size))
-    source_L = torch.tensor(mirror.source, device=device) if moves else None
+    if moves:
+        source_L = torch.tensor(mirror.source, device=device)
+    else:
+        source_L = None
     return source_L, torch.tensor(mirror.signs, device=device)
 
 
@@ -122,12 +128,14 @@ class Mirror(KeyedTransform):
         stream: str | None = None,
     ) -> None:
         super().__init__(in_keys, out_keys, in_keys_inv, out_keys_inv, seed=seed, stream=stream)
-        keys, keys_inv = self.in_keys, self.in_keys_inv
+        keys = self.in_keys
+        keys_inv = self.in_keys_inv
         if set(maps) != {*keys, *keys_inv}:
             raise ValueError(f"maps has the keys {list(maps)}: expected those of {keys} and {keys_inv}")
         checks.check_in_range("probability", probability, low=0.0, high=1.0)
         self._register_rows("mirrored_E")
-        self.maps, self.probability = dict(maps), probability
+        self.maps = dict(maps)
+        self.probability = probability
         # Buffers rather than the maps' own tensors: compiled code would make those anew in each step.
         for index, key in enumerate([*keys, *keys_inv]):
             for name, tensor in zip(("source", "signs"), self.maps[key].tensors(None), strict=True):
@@ -141,8 +149,10 @@ class Mirror(KeyedTransform):
         return observation_spec
 
     def _widened(self, index: int, spec: TensorSpec) -> TensorSpec:
-        plain, other = bounds(spec), self._image(self.in_keys[index], bounds(spec), self.batch_dims[index])
-        low, high = torch.minimum(plain[0], other[0]), torch.maximum(plain[1], other[1])
+        plain = bounds(spec)
+        other = self._image(self.in_keys[index], bounds(spec), self.batch_dims[index])
+        low = torch.minimum(plain[0], other[0])
+        high = torch.maximum(plain[1], other[1])
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
@@ -151,8 +161,10 @@ class Mirror(KeyedTransform):
 
     def _narrowed(self, index: int, spec: TensorSpec) -> TensorSpec:
         key = self.in_keys_inv[index]
-        plain, other = bounds(spec), self._image(key, bounds(spec), self.batch_dims_inv[index])
-        low, high = torch.maximum(plain[0], other[0]), torch.minimum(plain[1], other[1])
+        plain = bounds(spec)
+        other = self._image(key, bounds(spec), self.batch_dims_inv[index])
+        low = torch.maximum(plain[0], other[0])
+        high = torch.minimum(plain[1], other[1])
         if bool((low > high).any()):
             raise ValueError(
                 f"Mirror: the bounds of the action {key!r} and of its mirror image have nothing in common"
@@ -187,7 +199,8 @@ class Mirror(KeyedTransform):
 
     def _seen(self, index: int, value: Tensor, batch_size: torch.Size) -> Tensor:
         mirrored_E = self.mirrored_E.reshape(*batch_size, *[1] * (value.ndim - len(batch_size)))
-        source_L, signs_L = getattr(self, f"source_{index}"), getattr(self, f"signs_{index}")
+        source_L = getattr(self, f"source_{index}")
+        signs_L = getattr(self, f"signs_{index}")
         return torch.where(mirrored_E, image(value, source_L, signs_L), value)
 
 

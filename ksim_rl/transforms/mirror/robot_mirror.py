@@ -42,7 +42,10 @@ def mirror_name(name: str, names: Sequence[str]) -> str:
         return arms if arms in names else name
     found = [image for image in images if image in names]
     if len(found) != 1:
-        hint = f"both {found}" if found else f"none of {images}: {checks.near(images[0], names)}"
+        if found:
+            hint = f"both {found}"
+        else:
+            hint = f"none of {images}: {checks.near(images[0], names)}"
         raise ValueError(f"mirror image of {name!r}: {hint}")
     return found[0]
 
@@ -63,7 +66,8 @@ def mirror_by_name(names: Sequence[str], each: MirrorMap | None = None) -> Mirro
     Example:
         >>> mirror_by_name(["FL", "FR"], POLAR)  # two forces, one after another
     """
-    each = MirrorMap(source=(0,)) if each is None else each
+    if each is None:
+        each = MirrorMap(source=(0,))
     blocks = [list(names).index(mirror_name(name, names)) for name in names]
     return MirrorMap(
         source=tuple(block * each.size + column for block in blocks for column in each.source),
@@ -88,10 +92,14 @@ def mirror_joints(mj_model: "mujoco.MjModel", joints: Sequence[str] | None = Non
     hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
     scalar = (hinge, int(mujoco.mjtJoint.mjJNT_SLIDE))
     valid = {mj_model.joint(i).name: i for i in range(mj_model.njnt) if mj_model.jnt_type[i] in scalar}
-    names = list(valid) if joints is None else list(joints)
+    if joints is None:
+        names = list(valid)
+    else:
+        names = list(joints)
     for name in names:
         checks.check_known("hinge or slide", name, valid)
-    source, signs = [], []
+    source = []
+    signs = []
     for name in names:
         other = mirror_name(name, names)
         source.append(names.index(other))
@@ -103,7 +111,10 @@ def _sign(mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: 
     reflection = np.array([1.0, -1.0, 1.0])
     apart = np.abs(data.xanchor[joint] * reflection - data.xanchor[other]).max()
     # A rotation axis is a pseudovector: its mirror image turns the other way as well.
-    handed = -1.0 if mj_model.jnt_type[joint] == hinge else 1.0
+    if mj_model.jnt_type[joint] == hinge:
+        handed = -1.0
+    else:
+        handed = 1.0
     agreement = float(handed * reflection * data.xaxis[joint] @ data.xaxis[other])
     extent = max(float(mj_model.stat.extent), _TOLERANCE)
     differs = mj_model.jnt_type[joint] != mj_model.jnt_type[other] or abs(abs(agreement) - 1) > _TOLERANCE

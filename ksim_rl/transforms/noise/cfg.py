@@ -61,7 +61,8 @@ class UniformNoise(NoiseCfg):
 
     def _check_fields(self) -> None:
         super()._check_fields()
-        low, high = _numbers(self.low), _numbers(self.high)
+        low = _numbers(self.low)
+        high = _numbers(self.high)
         if not low or not high or (len(low) != len(high) and 1 not in (len(low), len(high))):
             raise ValueError(f"low has {len(low)} numbers and high has {len(high)}: give as many, or one")
         width = max(len(low), len(high))
@@ -69,7 +70,8 @@ class UniformNoise(NoiseCfg):
             raise ValueError(f"low={self.low!r} exceeds high={self.high!r}")
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
-        low, high = per_dim("low", self.low, size), per_dim("high", self.high, size)
+        low = per_dim("low", self.low, size)
+        high = per_dim("high", self.high, size)
         return low, [b - a for a, b in zip(low, high, strict=True)]
 
 
@@ -101,8 +103,12 @@ def per_dim(field: str, value: PerDim, size: int) -> list[float]:
         raise ValueError(
             f"{field} has {len(numbers)} numbers, but the observation has {size} per env: give 1 or {size}"
         )
-    return numbers * size if len(numbers) == 1 else numbers
+    if len(numbers) == 1:
+        return numbers * size
+    return numbers
 
 
 def _numbers(value: PerDim) -> tuple[float, ...]:
-    return tuple(value) if isinstance(value, Sequence) else (value,)
+    if isinstance(value, Sequence):
+        return tuple(value)
+    return (value,)

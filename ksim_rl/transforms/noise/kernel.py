@@ -119,7 +119,10 @@ def _noise_in_torch(
         begins_E = torch.ones(num_rows, dtype=torch.bool, device=clean_EL.device)
     else:
         begins_E = mask_E.reshape(-1)
-    count = (counter + 1) if moment == "forward" else (counter.reshape(-1) + 1)
+    if moment == "forward":
+        count = counter + 1
+    else:
+        count = counter.reshape(-1) + 1
     keys = draws.keys_of(seed, stream, count, num_rows=num_rows, first_row=ranks.first_row(num_rows))
     if moment != "forward":
         counter += begins_E.view_as(counter)

@@ -146,7 +146,10 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         state = *read, buffers["seed_value"], *changed
         drawn = mask_E, self._stream_ids[moment], counter
         noisy_EL = add_noise(clean_EL, *state, columns.features, moment, *drawn)
-        found = [noisy_EL] if len(values) == 1 else split(noisy_EL, values)
+        if len(values) == 1:
+            found = [noisy_EL]
+        else:
+            found = split(noisy_EL, values)
         for out_key, noisy, value in zip(self.out_keys, found, values):  # noqa: B905 (takes time in every step)
             tensordict.set(out_key, noisy if noisy.dtype == value.dtype else noisy.to(value.dtype))
         return tensordict
@@ -203,7 +206,10 @@ class NoiseColumns(nn.Module):
 def _parameters(cfg: NoiseCfg, key: NestedKey, size: int) -> list[list[float]]:
     """Return the parameters of one observation, in the order of the rows of `noise_kernel`'s table."""
     with naming(f"{type(cfg).__name__} of {key!r}"):
-        bias = cfg.bias.affine(size) if cfg.bias is not None else ([0.0] * size, [0.0] * size)
+        if cfg.bias is not None:
+            bias = cfg.bias.affine(size)
+        else:
+            bias = ([0.0] * size, [0.0] * size)
         walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
         return [*cfg.affine(size), *bias, walk, grain, [cfg.dropout] * size]
 
@@ -239,9 +245,11 @@ def widen(
     ends = ends[0] - drift, ends[1] + drift
     ends = _noisy(cfg, rows[noise_kernel.OFFSET], rows[noise_kernel.SPREAD], ends)
     half = rows[noise_kernel.RESOLUTION] / 2
-    lowest, highest = torch.minimum(low, ends[0] - half), torch.maximum(high, ends[1] + half)
+    lowest = torch.minimum(low, ends[0] - half)
+    highest = torch.maximum(high, ends[1] + half)
     if cfg.dropout and cfg.lost == "zero":
-        lowest, highest = lowest.clamp(max=0.0), highest.clamp(min=0.0)
+        lowest = lowest.clamp(max=0.0)
+        highest = highest.clamp(min=0.0)
     return lowest, highest
 
 
@@ -255,7 +263,8 @@ def _noisy(
         noise = (offset - reach).expand(low.shape), (offset + reach).expand(low.shape)
     else:
         noise = offset.expand(low.shape), (offset + spread).expand(low.shape)
-    noisy_low, noisy_high = low + noise[0], high + noise[1]
+    noisy_low = low + noise[0]
+    noisy_high = high + noise[1]
     if cfg.operation == "multiply":
         noisy_low, noisy_high = multiply_bounds(ends, noise)
     return torch.minimum(low, noisy_low), torch.maximum(high, noisy_high)

@@ -51,8 +51,8 @@ def start_of(env):
     return root_E["obs", "position"].unique().tolist(), root_E["obs", "velocity"].unique().tolist()
 
 
-def test_no_events_configured_means_the_first_keyframe_at_rest():
-    assert start_of(env_of(None, source=PUCK_XML.replace("</mujoco>", KEYFRAME))) == ([0.75], [0.0])
+def test_no_events_configured_means_the_first_keyframe():
+    assert start_of(env_of(None, source=PUCK_XML.replace("</mujoco>", KEYFRAME))) == ([0.75], [9.0])
 
 
 def test_no_events_configured_and_no_keyframe_means_the_default_pose():
@@ -60,8 +60,8 @@ def test_no_events_configured_and_no_keyframe_means_the_default_pose():
     assert start_of(env_of(None, source=source)) == ([0.5], [0.0])
 
 
-def test_empty_events_mean_none_not_even_the_keyframe():
-    assert start_of(env_of({}, source=PUCK_XML.replace("</mujoco>", KEYFRAME))) == ([0.0], [0.0])
+def test_without_events_a_reset_is_to_the_first_keyframe_too():
+    assert start_of(env_of({}, source=PUCK_XML.replace("</mujoco>", KEYFRAME))) == ([0.75], [9.0])
 
 
 def test_events_run_in_their_order():
