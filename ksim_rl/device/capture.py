@@ -57,9 +57,11 @@ def _refuse_or_warn(device: torch.device, *, require_graphs: bool) -> bool:
     reason = (
         f"Warp's memory pool is off on {device}, and graphs cannot allocate without it; unset "
         "WARP_ENABLE_MEMPOOLS_AT_INIT, or use a driver that supports memory pools"
+        # Warp's CPU graphs need no memory pool.
     )
     if require_graphs:
         raise RuntimeError(f"require_graphs=True, but {reason}")
+    # The warning points at the caller of the constructor that asked.
     warnings.warn(f"RUNNING WITHOUT GRAPHS, about 13 times slower: {reason}", RuntimeWarning, stacklevel=3)
     return False
 
@@ -68,6 +70,7 @@ def _refuse_or_warn(device: torch.device, *, require_graphs: bool) -> bool:
 def no_collection() -> Iterator[None]:
     """Keep the garbage collector out of a capture: a free in the middle of it would invalidate the graph."""
     was_enabled = gc.isenabled()
+    # Collection may have been off before, and must then stay off.
     gc.disable()
     try:
         yield
@@ -82,6 +85,7 @@ def live_launches(*, warming_up: bool = False, capturing: bool = False) -> Itera
 
     With `warming_up` they replay the graphs that they have.
     """
+    # Counters, not flags, since these blocks nest.
     _phase.live += 1
     _phase.warming_up += warming_up
     _phase.capturing += capturing
@@ -101,9 +105,9 @@ class Captured:
     they are, allocates no size that depends on data, and neither syncs with the host nor branches on tensor values.
     What it does in Python happens only while it is eager or recorded; where that changes, `forget` the graph. It may
     draw from the device's default random generator. The graphs of a device have their temporaries in the same memory:
-    no two may run at once, and what one makes lasts as long as something refers to it. With `require_graphs`, a CUDA
-    device without graphs is refused instead of a warning and eager calls. Calls are eager while `is_eager`, which
-    those that are made within `eagerly` are for ever.
+    no two may run at the same time, and a tensor that one makes lasts as long as something refers to it. With
+    `require_graphs`, a CUDA device without graphs is refused instead of a warning and eager calls. Calls are eager
+    while `is_eager`, which stays true for those that are made within `eagerly`.
     """
 
     def __init__(
@@ -122,6 +126,7 @@ class Captured:
         self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._warp_graph: wp.Graph | None = None
+        # Decided once, so that the warning is given once.
         self._eager_for_ever = self.device.type == "cpu" or not _refuse_or_warn(
             self.device, require_graphs=require_graphs
         )
@@ -140,7 +145,9 @@ class Captured:
         """Drop the graph: the next call is eager, as the body may need other kernels now, and the one after records."""
         if self._graph is not None and self.device.type == "cuda":
             torch.cuda.synchronize(self.device)  # it may still run
+        # Both graphs go together: Warp's only keeps kernels loaded for torch's.
         self._graph = self._warp_graph = None
+        # One eager call remains, which loads kernels that the body needs now.
         self._calls = min(self._calls, self.warmup - 1)
 
     def __call__(self) -> None:
@@ -156,13 +163,17 @@ class Captured:
             self._run_eagerly(self._stream)
         else:
             self._graph, self._warp_graph = self._record(self._stream)
+            # Recording runs nothing, so this call's work is the first replay.
             self._graph.replay()
 
     def _run_eagerly(self, stream: torch.cuda.Stream) -> None:
+        # The side stream waits for the caller's work, and the caller for the body's.
         caller = torch.cuda.current_stream(self.device)
+        # Events order both streams without waiting on the host.
         stream.wait_stream(caller)
         with (
             torch.cuda.stream(stream),
+            # Warp adds no waits of its own: those above and below order the two streams.
             wp.ScopedStream(warp_stream(stream), sync_enter=False, sync_exit=False),
             live_launches(warming_up=True),
         ):
@@ -171,11 +182,13 @@ class Captured:
 
     def _record(self, stream: torch.cuda.Stream) -> tuple[torch.cuda.CUDAGraph, wp.Graph]:
         warp_side = warp_stream(stream)
+        # Work in flight may use memory that is freed next.
         torch.cuda.synchronize(self.device)
         # What the eager calls took: graphs have a pool of their own, and would take it again.
         upstream.free_cublas_workspaces()
         torch.cuda.empty_cache()
         graph = torch.cuda.CUDAGraph()
+        # Sharing one pool lets graphs that never run at the same time have the same temporaries.
         others = _graphs.setdefault(self.device, WeakSet())
         pool = next((other.pool() for other in others), None)
         with (
@@ -184,8 +197,10 @@ class Captured:
             wp.ScopedStream(warp_side, sync_enter=False, sync_exit=False),
             live_launches(capturing=True),
         ):
+            # In "thread_local" mode, other threads (a viewer, a logger) may call CUDA meanwhile.
             graph.capture_begin(pool=pool, capture_error_mode="thread_local")
             try:
+                # Warp joins torch's capture, so that its launches and allocations go into the same graph.
                 wp.capture_begin(stream=warp_side, external=True)
                 self.body()
                 # It holds no graph of its own, but keeps the kernels loaded that torch's graph launches.
@@ -200,6 +215,7 @@ class Captured:
                     f"the body cannot be captured in a CUDA graph: {error}. It must not sync with the host (.item(), "
                     "branching on a tensor, boolean indexing), nor allocate a size that depends on data"
                 ) from error
+        # Held weakly: a pool lives as long as one of its graphs.
         others.add(graph)
         return graph, warp_graph
 
@@ -216,6 +232,7 @@ class WarpGraphs:
         self.device = device
         self._available = _refuse_or_warn(device, require_graphs=require_graphs)
         self._graphs: dict[Hashable, wp.Graph] = {}
+        # Keys whose kernels an eager run has loaded: loading inside a capture fails.
         self._warm: set[Hashable] = set()
         self._joined: list[wp.Graph | None] = []
         # The default stream cannot record, so graphs are recorded on a stream of our own and launched on any.
@@ -229,19 +246,23 @@ class WarpGraphs:
 
         Where they are `live`, they are issued one by one each time, since their Python has to run.
         """
+        # While operations are written down, the launch becomes an entry of the recording.
         if recording.launched(lambda: self.run(key, launches, live=live)):
             return
         with warp_scope(self.device):
+            # A warm-up may replay, but a capture in progress cannot hold another graph.
             replays = _phase.warming_up and key in self._graphs
             if live or not self._available or (_wants_live_launches(self.device) and not replays):
                 self._launch_live(launches)
                 return
             if key not in self._graphs:
+                # The first run on CUDA is eager, and its work counts.
                 if self._stream is not None and key not in self._warm:
                     self._warm.add(key)
                     launches()
                     return
                 self._graphs[key] = self._record(launches)
+            # CPU graphs have no stream; CUDA graphs run in order with torch's work.
             if self._stream is None:
                 stream = None
             else:
@@ -255,6 +276,7 @@ class WarpGraphs:
         self._joined.clear()
 
     def _launch_live(self, launches: Callable[[], None]) -> None:
+        # Inside a `Captured`, Warp has joined the capture already.
         if self._stream is None or is_capturing() or not torch.cuda.is_current_stream_capturing():
             launches()
             return
@@ -270,6 +292,7 @@ class WarpGraphs:
             with wp.ScopedCapture(device="cpu") as recorded:
                 launches()
         else:
+            # A free or a sync in this block would invalidate the graph.
             with (
                 no_collection(),
                 wp.ScopedStream(self._stream, sync_enter=False, sync_exit=False),

@@ -64,9 +64,10 @@ class CWorld(World):
         stepped.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         if _MOVES_GEOMS & set(self._expanded):
             stepped.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
-        # One MjData for each world: what a call does not compute is then of that world's last call.
+        # One MjData for each world: quantities that a call leaves out keep that world's last values.
         self._batch = mujoco.batch.Batch(stepped, num_envs, persistent=True)
         self._data_bytes = mujoco.MjData(stepped).nbuffer
+        # Views of the fields are float32 mirrors of the engine's float64 arrays.
         self._of_fields = {name: Mirror(name, self._batch.expand(name)) for name in self._expanded}
         self._of_fields[GRAVITY] = Mirror(GRAVITY, self._batch.expand("opt.gravity"))
         self._fields = {name: mirror.tensor for name, mirror in self._of_fields.items()}
@@ -74,6 +75,7 @@ class CWorld(World):
         with _told():
             self._batch.reset(stage=_STAGE_NONE)
         self._of_state = bound(self._batch, _STATE)
+        # `make_view` adds the arrays that are read, so that others are never copied.
         self._of_data = dict(self._of_state)
         self._left_out = left_out(stepped)
         self._by_world = ByWorld(self._batch)
@@ -83,6 +85,7 @@ class CWorld(World):
             self._nan_guard = NanGuard(
                 self.sim.nan_guard, self.mj_model, tensors, self._fields, num_envs=num_envs, by_warp=False
             )
+        # Views exist before the first refresh, which fills them.
         self.show_views()
         self.refresh()
 
@@ -98,9 +101,11 @@ class CWorld(World):
 
         Each substep computes all sensors, whichever are asked for.
         """
+        # Arguments are checked before anything is written into the engine.
         check_count("n", n)
         check_choice("sensors", sensors, ("last", "contacts", "every"))
         self._push_all()
+        # Hooks and the guard must see each substep's state; without them, one call advances by all `n`.
         if before or after or self._nan_guard is not None:
             for substep in range(n):
                 is_read = sensors == "every" or substep == n - 1
@@ -114,10 +119,12 @@ class CWorld(World):
         self, before: Sequence[Callable[[], None]], after: Sequence[Callable[[], None]], *, is_read: bool
     ) -> None:
         """Advance by one substep between hooks, whose changes alone are float32."""
+        # Hooks may write ctrl or applied forces.
         for hook in before:
             hook()
         if self._nan_guard is not None:
             self._nan_guard.before_substep()
+        # An unchanged state stays float64 in the engine.
         self._push_changes()
         self._advance(1, is_read=is_read)
         if self._nan_guard is not None:
@@ -141,6 +148,7 @@ class CWorld(World):
 
     def refresh(self, mask_E: Bool[Tensor, " E"] | None = None) -> None:
         """Recompute position- and velocity-stage quantities and sensors from the present state; see `World.refresh`."""
+        # None stands for all worlds, as in the engine's own calls.
         if mask_E is None:
             rows = None
         else:
@@ -148,6 +156,7 @@ class CWorld(World):
         if rows is not None and rows.numel() == 0:
             return
         self._push_all()
+        # C recomputes accelerations and forces on its way, but they belong to the last substep.
         kept = {name: self._of_data[name].tensor.clone() for name in self._kept_by_refresh()}
         self._compute_velocities(rows)
         for mirror in self._of_data.values():
@@ -159,10 +168,11 @@ class CWorld(World):
         """Compute the stages of positions and velocities, in all worlds or in some."""
         ids = None if rows is None else rows.numpy()
         self._run(lambda: self._batch.forward(ids=ids, stage=_STAGE_VEL))
+        # Velocities of subtrees are computed in C for sensors only.
         self._by_world.fill(views.SUBTREE_VELOCITIES, range(self.num_envs) if ids is None else ids)
 
     def _kept_by_refresh(self) -> list[str]:
-        """Return the names of what belongs to the last substep, though C computes it on its way to the velocities."""
+        """Return the names of arrays of the last substep, which C computes on its way to the velocities, too."""
         return [name for name in views.ACCELERATION_STAGE if name in self._of_data]
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
@@ -170,8 +180,10 @@ class CWorld(World):
         rows = self._rows(mask_E)
         if rows.numel() == 0:
             return
+        # A qpos0 that was written for some worlds must reach the engine before it resets them to it.
         self._push_changes()
         self._run(lambda: self._batch.reset(ids=rows.numpy(), stage=_STAGE_NONE))
+        # State comes from the engine; accelerations and sensors read zero until the next step.
         for name, mirror in self._of_data.items():
             if name in self._of_state:
                 mirror.pull(rows)
@@ -185,22 +197,27 @@ class CWorld(World):
         groups = const_groups(fields, self.mj_model)
         if not groups:
             return
+        # Masks become row numbers, which the engine takes.
         rows = self._rows(torch.ones(self.num_envs, dtype=torch.bool) if mask_E is None else mask_E)
         if rows.numel() == 0:
             return
         self._push_all()
         self._run(lambda: self._batch.set_const(ids=rows.numpy()))
+        # The engine writes derived constants into its own arrays; the mirrors have to follow.
         for name in derived_fields(groups):
             self._of_fields[name].pull(rows)
         if groups & FIXED and "geom_size" in self._fields:
             self._bound_geoms(rows)
 
     def _bound_geoms(self, rows: Tensor) -> None:
+        # New sizes of the chosen worlds, float64 [rows, N, 3].
         size_EN3 = self._batch.expand("geom_size")[rows.numpy()]
         half_EN3, has_size = geom_bounds.half_sizes(self.mj_model, size_EN3)
+        # Geoms whose bounds do not follow from their size (meshes, say) keep the compiled ones.
         chosen = np.ix_(rows.numpy(), has_size)
         self._batch.expand("geom_rbound")[chosen] = geom_bounds.radii(self.mj_model, size_EN3)[:, has_size]
         boxes = self._batch.expand("geom_aabb")
+        # The second half of a box is its half sizes; the first, its centre, does not depend on the size.
         boxes[rows.numpy()[:, None], np.flatnonzero(has_size), 3:] = half_EN3[:, has_size]
         for name in ("geom_rbound", "geom_aabb"):
             self._of_fields[name].pull(rows)
@@ -213,6 +230,7 @@ class CWorld(World):
         exclude_body: int,
     ) -> tuple[Float[Tensor, "E N"], Float[Tensor, "E N 3"]]:
         """Return distances [E, N] m, -1 for none, and normals [E, N, 3], of the first geoms that rays hit."""
+        # Rays are cast in poses of the present fields and state.
         self._push_all()
         distance, _, normal = self._batch.ray(
             start_EN3.double().numpy(),
@@ -232,6 +250,7 @@ class CWorld(World):
 
     def overflow_counts(self, *, clear: bool = True) -> Int[Tensor, " N"]:
         """Return zeros: nothing overflows without an error."""
+        # The layout of the Warp engine: a count for each bit, then three needs.
         return torch.zeros(len(BIT_NAMES) + 3, dtype=torch.int64)
 
     def explain_overflow(self, numbers: Sequence[int]) -> OverflowReport:
@@ -266,7 +285,7 @@ class CWorld(World):
             self._nan_guard.forget()
 
     def bytes_per_world(self) -> int:
-        """Return the bytes of one MjData and of the views of a world, without what contacts and rows take."""
+        """Return the bytes of one MjData and of the views of a world, without the memory of contacts and rows."""
         tensors = [mirror.tensor for mirror in (*self._of_data.values(), *self._of_fields.values())]
         shown = sum(tensor.numel() * tensor.element_size() for tensor in tensors) // self.num_envs
         return self._data_bytes + shown
@@ -299,8 +318,9 @@ class CWorld(World):
         return views.READABLE - _NOT_OF_C
 
     def make_view(self, name: str) -> Shaped[Tensor, "*shape"]:
-        """Make the view of an array; what C computes only for sensors, and the model has none of, costs extra."""
+        """Make the view of an array; quantities that C computes only for sensors cost extra without them."""
         if name not in self._of_data:
+            # A graph or a recorded program that holds `refresh` would not fill a new view.
             if self.is_frozen:
                 raise RuntimeError(
                     f"{name} is not computed: let a term of the config read it during construction"
@@ -312,6 +332,7 @@ class CWorld(World):
         return self._of_data[name].tensor
 
     def _array(self, name: str) -> np.ndarray:
+        # Arrays that no sensor makes C compute are computed by us, one world after the other.
         if name in self._left_out:
             return self._by_world.array(name)
         return self._batch.bind(name)
@@ -320,11 +341,13 @@ class CWorld(World):
         """Free the simulations, after a last `nan_report`. Views that are still held keep their memory."""
         if self._nan_guard is not None:
             self.nan_report()
+        # The guard's arrays are freed with it, so the last report is written first.
         self._nan_guard = None
         self.drop_views()
 
     def _state_tensors(self) -> dict[str, Tensor]:
         found = {name: mirror.tensor for name, mirror in self._of_state.items()}
+        # STATE lists arrays of both engines; only those with a view can be saved.
         for name in views.STATE:
             if name in self._of_data:
                 found[name] = self._of_data[name].tensor
@@ -332,8 +355,10 @@ class CWorld(World):
 
     def _push_all(self) -> None:
         """Write state and fields into the engine: from here on all of them are float32."""
+        # The whole state is rounded, changed or not, so that a step depends on nothing that the views do not show.
         for mirror in self._of_state.values():
             mirror.push()
+        # Fields are float32 already; most of them change only at resets.
         for mirror in self._of_fields.values():
             mirror.push_changes()
 
@@ -347,6 +372,7 @@ class CWorld(World):
 
     def _run(self, call: Callable[[], None]) -> None:
         """Run a call of the engine; a RuntimeError names the worlds in which it failed, or ran out of memory."""
+        # The engine fails in two ways: by this exception, or by a warning that `_told` makes a RuntimeError.
         try:
             with _told():
                 call()

@@ -64,7 +64,7 @@ class Prism:
 
 @wp.struct
 class Core:
-    """What of a geom collides, but for its radius: a box, of which a capsule has one edge and a sphere the centre."""
+    """The part of a geom that collides, without its radius: a box, one edge of it (capsule) or its centre (sphere)."""
 
     center: wp.vec3
     turn: wp.mat33
@@ -86,7 +86,7 @@ class Touch:
 
 @wp.struct
 class Gap:
-    """What lies between a prism and a core that are not in each other: a place on each, and their distance."""
+    """The gap between a prism and a core that are apart: a place on each, and their distance."""
 
     distance: float
     ground: wp.vec3
@@ -104,6 +104,7 @@ def field_of(size: wp.vec4, rows: int, columns: int, address: int) -> Field:
     field.half_y = size[1]
     field.top = size[2]
     field.base = size[3]
+    # Spacing of the lattice, m: n points have n - 1 cells between them.
     field.dx = 2.0 * size[0] / float(columns - 1)
     field.dy = 2.0 * size[1] / float(rows - 1)
     return field
@@ -115,6 +116,7 @@ def field_point(field: Field, data: wp.array[float], row: int, column: int) -> w
     return wp.vec3(
         float(column) * field.dx - field.half_x,
         float(row) * field.dy - field.half_y,
+        # Heights are stored from 0 to 1; `top` scales them to m.
         data[field.address + row * field.columns + column] * field.top,
     )
 
@@ -123,6 +125,7 @@ def field_point(field: Field, data: wp.array[float], row: int, column: int) -> w
 def prism_of(field: Field, data: wp.array[float], row: int, column: int, half: int) -> Prism:
     """Return the first or second prism of a cell."""
     prism = Prism()
+    # The diagonal a-c is common to both triangles of a cell; `half` picks the corner beside it.
     prism.a = field_point(field, data, row, column)
     prism.b = field_point(field, data, row + 1 - half, column + half)
     prism.c = field_point(field, data, row + 1, column + 1)
@@ -133,6 +136,7 @@ def prism_of(field: Field, data: wp.array[float], row: int, column: int, half: i
 @wp.func
 def corner_of_prism(prism: Prism, corner: int) -> wp.vec3:
     """Return one of three corners at the top, or below them at the base."""
+    # Corners 3 to 5 lie straight below 0 to 2.
     which = corner % 3
     point = wp.where(which == 0, prism.a, wp.where(which == 1, prism.b, prism.c))
     if corner >= 3:
@@ -143,9 +147,11 @@ def corner_of_prism(prism: Prism, corner: int) -> wp.vec3:
 @wp.func
 def start_and_end(prism: Prism, edge: int):
     """Return the ends of an edge: three at the top, three at the base, and three between them."""
+    # Edges 0 to 2 are at the top, 3 to 5 at the base.
     if edge < 6:
         level = 3 * (edge // 3)
         return corner_of_prism(prism, level + edge % 3), corner_of_prism(prism, level + (edge + 1) % 3)
+    # Edges 6 to 8 are vertical, from the base up.
     return corner_of_prism(prism, edge - 3), corner_of_prism(prism, edge - 6)
 
 
@@ -155,11 +161,14 @@ def normal_of_face(prism: Prism, face: int) -> wp.vec3:
     if face == 4:
         return wp.vec3(0.0, 0.0, -1.0)
     if face == 3:
+        # The two triangles of a cell turn in opposite senses, so that the sign is chosen by its z.
         up = wp.normalize(wp.cross(prism.b - prism.a, prism.c - prism.a))
         return wp.where(up[2] < 0.0, -up, up)
+    # Sides are vertical: their normals are horizontal, and only the sign depends on the sense.
     start = corner_of_prism(prism, face)
     along = corner_of_prism(prism, (face + 1) % 3) - start
     normal = wp.normalize(wp.vec3(along[1], -along[0], 0.0))
+    # The third corner is inside, so that an outward normal points away from it.
     return wp.where(wp.dot(normal, corner_of_prism(prism, (face + 2) % 3) - start) > 0.0, -normal, normal)
 
 
@@ -174,6 +183,7 @@ def point_of_face(prism: Prism, face: int) -> wp.vec3:
 @wp.func
 def closest_on_face(prism: Prism, face: int, point: wp.vec3) -> wp.vec3:
     """Return the closest place of a face to a point."""
+    # Top and base are triangles.
     if face >= 3:
         level = 3 * (face - 3)
         return closest_on_triangle(
@@ -182,6 +192,7 @@ def closest_on_face(prism: Prism, face: int, point: wp.vec3) -> wp.vec3:
             corner_of_prism(prism, level + 1),
             corner_of_prism(prism, level + 2),
         )
+    # A side is a quadrilateral, tested as two triangles.
     start, end = corner_of_prism(prism, face), corner_of_prism(prism, (face + 1) % 3)
     below = corner_of_prism(prism, 3 + (face + 1) % 3)
     place = closest_on_triangle(point, start, end, below)
@@ -192,6 +203,7 @@ def closest_on_face(prism: Prism, face: int, point: wp.vec3) -> wp.vec3:
 @wp.func
 def touch_of_point(prism: Prism, point: wp.vec3) -> Touch:
     """Return how far a point is from a prism, and the closest place of its surface."""
+    # Inside of all faces, the face least deep is the way out.
     touch = Touch()
     touch.distance = -FAR
     for face in range(FACES):
@@ -200,6 +212,7 @@ def touch_of_point(prism: Prism, point: wp.vec3) -> Touch:
         if height > touch.distance:
             touch.distance = height
             touch.normal = normal
+    # The foot of the perpendicular is on the face itself only for points inside; others continue below.
     touch.place = point - touch.distance * touch.normal
     if touch.distance <= 0.0:
         return touch
@@ -214,6 +227,7 @@ def touch_of_point(prism: Prism, point: wp.vec3) -> Touch:
             if distance < touch.distance:
                 touch.distance = distance
                 touch.place = place
+    # On the surface, the direction to the closest place is noise: the face's normal holds.
     touch.normal = axis
     if touch.distance > TOUCHING:
         touch.normal = (point - touch.place) / touch.distance
@@ -234,18 +248,24 @@ def nearer(gap: Gap, ground: wp.vec3, place: wp.vec3) -> Gap:
 @wp.func
 def gap_between(prism: Prism, core: Core) -> Gap:
     """Return the gap between a prism and a core that are not in each other: at corners of either, or at edges."""
+    # All pairs of features of two convex bodies: corners with faces, corners with the box, edges with edges.
     gap = Gap()
     gap.distance = FAR
+    # Corners of the core against the prism; a step of 8 leaves one for a core that is a point.
     for corner in range(0, 8, core.corner_step):
         point = core.center + core.turn @ corner_of(corner, core.half)
         touch = touch_of_point(prism, point)
+        # A corner in the prism has no gap.
         gap = nearer(gap, wp.where(touch.distance > 0.0, touch.place, point), point)
+    # Corners of the prism against the core, if it is more than an edge.
     if core.num_edges > 1:
         for corner in range(CORNERS):
             ground = corner_of_prism(prism, corner)
+            # In the frame of the box, the closest place is found by clamping.
             inside = wp.transpose(core.turn) @ (ground - core.center)
             place = core.center + core.turn @ wp.max(wp.min(inside, core.half), -core.half)
             gap = nearer(gap, ground, place)
+    # Edges against edges.
     for edge in range(core.first_edge, core.first_edge + core.num_edges):
         start = core.center + core.turn @ start_of_edge(edge, core.half)
         along = core.turn @ along_edge(edge, core.half)
@@ -265,6 +285,7 @@ def column_of(turn: wp.mat33, column: int) -> wp.vec3:
 @wp.func
 def widest_axis(prism: Prism, core: Core) -> Touch:
     """Return the direction along which prism and core are the farthest apart, or the least deep in each other."""
+    # The separating axis theorem: convex bodies are apart where the projections on one of the axes are.
     best = Touch()
     best.distance = -FAR
     for axis in range(AXES):
@@ -274,19 +295,24 @@ def widest_axis(prism: Prism, core: Core) -> Touch:
         elif axis < FACE_AXES:
             normal = column_of(core.turn, axis - FACES)
         else:
+            # Cross products of each edge of the prism with each axis of the core.
             edge = (axis - FACE_AXES) // 3
             start, end = start_and_end(prism, edge)
             normal = wp.cross(wp.normalize(end - start), column_of(core.turn, (axis - FACE_AXES) % 3))
         length = wp.length(normal)
+        # Parallel edges have no common normal, and the faces' normals cover them.
         if length > PARALLEL:
             normal = normal / length
+            # The projections of the prism, then of the core, on the axis.
             low, high = float(FAR), float(-FAR)
             for corner in range(CORNERS):
                 along = wp.dot(normal, corner_of_prism(prism, corner))
                 low, high = wp.min(low, along), wp.max(high, along)
             middle = wp.dot(normal, core.center)
             reach = wp.dot(wp.abs(wp.transpose(core.turn) @ normal), core.half)
+            # The signed distance in both senses of the axis.
             above, below = middle - reach - high, low - middle - reach
+            # Between equal axes, a face's normal wins over the rounding of a cross product.
             needed = best.distance + wp.where(axis < FACE_AXES, 0.0, NEARLY)
             if wp.max(above, below) > needed:
                 best.distance = wp.max(above, below)
@@ -298,6 +324,7 @@ def widest_axis(prism: Prism, core: Core) -> Touch:
 def touch_of_core(prism: Prism, core: Core, reach: float) -> Touch:
     """Return how far a geom is from a prism; the distance is `FAR` where it is beyond `reach`."""
     touch = Touch()
+    # A sphere is a point with a radius.
     if core.num_edges == 0:
         touch = touch_of_point(prism, core.center)
         touch.distance = touch.distance - core.radius
@@ -305,6 +332,7 @@ def touch_of_core(prism: Prism, core: Core, reach: float) -> Touch:
         return touch
     widest = widest_axis(prism, core)
     touch.distance = FAR
+    # Most prisms below a geom are out of reach: their closest places are never computed.
     if widest.distance - core.radius >= reach:
         return touch
     # Shapes that are in each other are drawn apart until they touch, which tells where.
@@ -314,6 +342,7 @@ def touch_of_core(prism: Prism, core: Core, reach: float) -> Touch:
     gap = gap_between(prism, apart)
     touch.normal = widest.normal
     distance = gap.distance
+    # In each other, the depth along that axis counts; apart, the distance between the closest places.
     if widest.distance < 0.0:
         distance = widest.distance
     elif distance > TOUCHING:
