@@ -22,6 +22,26 @@ FILE_LINES = 450
 FOLDER_FILES = 30
 CONTRACT_LINES = 120
 VAGUE_NAMES = {"utils", "util", "helpers", "helper", "misc", "common"}
+# The groups of docs/architecture.md, from what people use down to what computes; "" is the modules beside the rooms.
+OTHERS = "of no group"
+GROUPS = {
+    "applications": ("cli", "conf", "tasks", "tracking", "suites", "algorithms", "trainers", "runs"),
+    "library": (
+        "collectors",
+        "objectives",
+        "modules",
+        "data",
+        "mdp",
+        "envs",
+        "transforms",
+        "scene",
+        "config",
+        "ranks",
+        "files",
+    ),
+    "engine": ("physics", "compiled", "device", ""),
+    "tools": ("tables", "viewer", "zoo", "export", "diagnosis", "clips", "testing", "adapters"),
+}
 # Rooms that use envs through envs/contract.py only.
 ROOMS_WITHOUT_PROBES = (
     "trainers",
@@ -301,16 +321,29 @@ LIMITS: dict[str, Callable[[House], list[str]]] = {
 }
 
 
+def group_of(room: str) -> str:
+    """Return the group that a room belongs to."""
+    for group, rooms in GROUPS.items():
+        if room in rooms:
+            return group
+    return OTHERS
+
+
 def report(house: House, most: int) -> tuple[str, bool]:
     """Return the table of rooms and the broken limits with at most `most` findings each, and whether all hold."""
     rooms = house.rooms()
     total = sum(room.lines for room in rooms)
     row = "{:<13}{:>6}{:>8}{:>7}{:>9}  {:>4}  {}"
     lines = [row.format("room", "files", "lines", "share", "words", "most", "longest file")]
-    for room in rooms:
-        name, longest = room.name or "(beside)", f"{room.longest[0]} {room.longest[1]}"
-        cells = (name, room.files, room.lines, f"{room.lines / total:.1%}", room.words, room.most_files[0])
-        lines.append(row.format(*cells, longest))
+    for group in sorted({group_of(room.name) for room in rooms}, key=[*GROUPS, OTHERS].index):
+        lines.append(f"-- {group}")
+        for room in rooms:
+            if group_of(room.name) != group:
+                continue
+            name = room.name or "(beside)"
+            longest = f"{room.longest[0]} {room.longest[1]}"
+            cells = (name, room.files, room.lines, f"{room.lines / total:.1%}", room.words)
+            lines.append(row.format(*cells, room.most_files[0], longest))
     words = sum(room.words for room in rooms)
     longest = max(room.longest for room in rooms)
     most_files = max(room.most_files for room in rooms)

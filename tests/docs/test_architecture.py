@@ -2,6 +2,7 @@
 
 import re
 
+from tests import house
 from tests.docs.guide import DOCS, REPOSITORY
 
 PACKAGE = REPOSITORY / "ksim_rl"
@@ -18,6 +19,19 @@ def test_the_tables_have_each_room_once() -> None:
     linked = [name for row in rows for name in re.findall(r"\]\(\.\./ksim_rl/(\w+)\)", row)]
     assert len(linked) == len(set(linked))
     assert set(linked) == rooms()
+
+
+def test_the_groups_are_those_of_the_house() -> None:
+    page = (DOCS / "architecture.md").read_text()
+    found: dict[str, set[str]] = {}
+    for line in page.splitlines():
+        if heading := re.match(r"\*\*(\w+)\*\*: ", line):
+            group = heading[1].lower()
+        elif line.startswith("| [`"):
+            names = re.findall(r"\]\(\.\./ksim_rl/(\w+)\)", line.split(" | ")[0])
+            found.setdefault(group, set()).update(names)
+    found = {group: names for group, names in found.items() if names}
+    assert found == {group: {*names} - {""} for group, names in house.GROUPS.items()}
 
 
 def test_the_drawing_has_each_room() -> None:
