@@ -1,4 +1,4 @@
-"""These terms map actions to what joints or actuators are asked for."""
+"""These terms map actions to targets of joints or controls of actuators."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class JointAction(ActionTerm):
     """An action with one column per joint, in the order of `joints`; the actuators may stand in any order.
 
     A raw action is clipped, squashed, scaled, filtered and shifted, in this order; each is left out by default. These
-    belong to this term and may differ by joint (keys are regular expressions); clip, scale and filter are those of the
+    belong to this term and may differ by joint (keys are regular expressions); clip, scale and filter work as in the
     transforms `ActionClip`, `ActionScale` and `ActionLowPass`, which treat a whole action alike, in any env.
     """
 
@@ -44,12 +44,14 @@ class JointAction(ActionTerm):
     def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
         if self.clip is None:
             return None
+        # Bounds are of the raw action, which is clipped first: the scale plays no part.
         return constant(self.clip, view.device).expand(self.size(view), 2)
 
     def shaped(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> Float[Tensor, "E K"]:
         """Return the action after clip, tanh, scale, filter and offset."""
         scaled_EK = self.scaled(view, action_EK, "scale", self.scale)
         offset = per_joint(view, "offset", self.offset, self.joints)
+        # The usual case, which is worth no kernel.
         if isinstance(offset, float) and offset == 0.0:
             return scaled_EK
         return scaled_EK + offset
@@ -58,6 +60,7 @@ class JointAction(ActionTerm):
         self, view: EnvView, action_EK: Float[Tensor, "E K"], field: str, scale: PerJoint
     ) -> Float[Tensor, "E K"]:
         """Return the action after clip, tanh, a scale (the field of that name) and the filter."""
+        # The clip comes first: it bounds what the policy gives, not the target.
         if self.clip is not None:
             action_EK = clipped(action_EK, self.clip)
         if self.tanh:
@@ -65,7 +68,10 @@ class JointAction(ActionTerm):
         action_EK = action_EK * per_joint(view, field, scale, self.joints)
         if self.cutoff_hz is None:
             return action_EK
+        # The field's name in the buffer's keeps two filters of one term apart
+        # (`JointPositionVelocityAction`).
         filtered_EK = view.buffer(f"filtered_{field}_EK", action_EK.shape[1])
+        # In place: the buffer is the state of the filter.
         return filtered_EK.lerp_(action_EK, smoothing(self.cutoff_hz, view.step_dt))
 
 
@@ -73,6 +79,7 @@ def per_joint(view: EnvView, field: str, value: PerJoint, joints: Patterns) -> f
     """Return the number for all joints, or those by joint."""
     if not isinstance(value, Mapping):
         return float(value)
+    # Patterns are resolved to one number per column, in policy order.
     return constant(values_by_name(field, value, view.joints(joints).names), view.device)
 
 
@@ -94,6 +101,7 @@ class RelativeJointPositionAction(JointAction):
     """Positions (rad or m): the shaped action, relative to where the joints are when the env step begins."""
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
+        # Measured positions, not the last targets: errors of tracking do not add up.
         now_EK = view.joints(self.joints).pos_EL
         view.write_joint_pos_target(self.joints, now_EK + self.shaped(view, action_EK))
 
@@ -115,13 +123,17 @@ class JointEffortAction(JointAction):
     def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
         own_K2 = super().bounds(view)
         limits_K2 = view.targets.limits("effort", self.joints)
+        # The inverse below is linear, and does not hold behind a tanh.
         if limits_K2 is None or self.tanh:
             return own_K2
         scale = per_joint(view, "scale", self.scale, self.joints)
         offset = per_joint(view, "offset", self.offset, self.joints)
+        # Solve limit = scale * action + offset for the action; a negative scale swaps both ends, hence the
+        # sort.
         range_K2 = ((limits_K2.T - offset) / scale).T.sort(dim=-1).values
         if own_K2 is None:
             return range_K2
+        # With a clip as well, the narrower of both bounds holds.
         return range_K2.clamp(own_K2[:, :1], own_K2[:, 1:])
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
@@ -139,8 +151,10 @@ class JointPositionVelocityAction(JointPositionAction):
         return 2 * super().size(view)
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
+        # Columns are positions [E, K], then velocities [E, K], in the same order of joints.
         pos_EK, vel_EK = action_EK.chunk(2, dim=1)
         super().__call__(view, pos_EK)
+        # Without the offset, which is a position.
         view.write_joint_vel_target(
             self.joints, self.scaled(view, vel_EK, "velocity_scale", self.velocity_scale)
         )
@@ -155,15 +169,18 @@ class ActuatorAction(ActionTerm):
 
     def size(self, view: EnvView) -> int:
         ids = view.resolver.ids("actuator", self.actuators)
+        # A law that writes these controls before each substep would overwrite the action in silence.
         view.targets.check_no_law(ids)
         return len(ids)
 
     def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
         limits_K2 = view.ctrl_limits_L2[view.resolver.index("actuator", self.actuators)]
+        # A negative scale swaps both ends, hence the sort.
         return (limits_K2 / self.scale).sort(dim=-1).values
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         index = view.resolver.index("actuator", self.actuators)
         limits_K2 = view.ctrl_limits_L2[index]
+        # Clamped here, so that `ctrl` reads as what the actuator takes.
         ctrl_EK = torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1])
         view.world.ctrl_EL[:, index] = ctrl_EK

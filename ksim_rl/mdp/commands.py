@@ -61,6 +61,7 @@ def target_pose_w(
     `target_EK` is a position [E, 3], or position and quaternion (w, x, y, z) [E, 7], in the frame of `InFrame`.
     """
     pos_E3 = target_EK[:, :3]
+    # Seven numbers are position and quaternion; three are a position alone.
     if target_EK.shape[1] == 7:
         quat_E4 = target_EK[:, 3:]
     else:
@@ -68,6 +69,7 @@ def target_pose_w(
     if frame == "world":
         return pos_E3, quat_E4
     root = view.entity(entity)
+    # From the root's frame into the world: rotate first, then move by the root's position.
     pos_E3 = root.root_pos_EL + quaternion.rotate(root.root_quat_EL, pos_E3)
     return pos_E3, None if quat_E4 is None else quaternion.multiply(root.root_quat_EL, quat_E4)
 
@@ -82,18 +84,21 @@ class HeldCommand(CommandTerm):
 
     @abstractmethod
     def held(self, view: EnvView) -> Float[Tensor, "E K"]:
-        """Return the buffer of what was drawn."""
+        """Return the buffer of the drawn values."""
 
     @abstractmethod
     def draw(self, view: EnvView) -> Float[Tensor, "E K"]:
         """Return new values for all rows."""
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        # Drawn for all rows, since shapes must not depend on the mask.
         drawn_EK = self.draw(view)
         held_EK = self.held(view)
+        # In place, since captured steps hold on to the buffer.
         held_EK.copy_(torch.where(mask_E[:, None], drawn_EK, held_EK))
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
+        # A copy, for the buffer changes at the next resampling.
         return self.held(view).clone()
 
 
@@ -107,10 +112,13 @@ class BaseHeightCommand(OfEntity, HeldCommand, drawn=("height",)):
         return view.buffer("height_E1", 1)
 
     def draw(self, view: EnvView) -> Float[Tensor, "E 1"]:
+        # Read at each draw: a curriculum may have moved the ranges.
         return view.uniform(1, *self.shared_ranges(view).unbind(0))
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw a ball at the commanded height, in line with the root."""
+        # The command counts from the ground and the root from the world's origin, so that only their
+        # difference is drawn.
         x, y, z = view.entity(self.entity).root_pos_EL[env_index].tolist()
         rise = float(self.held(view)[env_index, 0] - root_height(view, self.entity)[env_index])
         visualizer.sphere((x, y, z + rise), radius=0.03, rgba=_WANTED)
@@ -131,9 +139,11 @@ class JointPositionCommand(HeldCommand, drawn=("offset",)):
         default_EN = joints.default_pos_EL
         limits_N2 = joints.soft_limits_L2
         offset_EN = view.uniform(default_EN.shape[1], *self.shared_ranges(view).unbind(0))
+        # The offset may lead out of the soft limits where the default pose is near to one.
         return torch.clamp(default_EN + offset_EN, limits_N2[:, 0], limits_N2[:, 1])
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
+        # The ghost is the present pose in all but the commanded joints.
         qpos_L = view.world.qpos_EL[env_index].clone()
         qpos_L[view.joints(self.joints).qpos] = self.held(view)[env_index]
         visualizer.ghost(qpos_L.cpu().numpy(), rgba=_WANTED)
@@ -151,9 +161,10 @@ class CartesianCommand(InFrame, HeldCommand):
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """What a curriculum may change: all axes that the command has, x, y, z, roll, pitch, yaw."""
+        """The ranges that a curriculum may change, of all axes that the command has, x, y, z, roll, pitch, yaw."""
         parts = (self.position, self.orientation or {})
         given: dict[str, Range] = {axis: pair for part in parts for axis, pair in part.items()}
+        # An orientation is drawn as three angles, but held as a quaternion of four numbers.
         axes = _AXES[: 3 if self.orientation is None else 6]
         return {axis: given.get(axis, (0.0, 0.0)) for axis in axes}
 
@@ -164,6 +175,7 @@ class CartesianCommand(InFrame, HeldCommand):
         drawn_EK = view.uniform(len(self.ranges), *self.shared_ranges(view).unbind(0))
         if self.orientation is None:
             return drawn_EK
+        # Columns 3 to 5 are roll, pitch and yaw.
         quat_E4 = quaternion.from_euler_xyz(*drawn_EK[:, 3:].unbind(-1))
         return torch.cat((drawn_EK[:, :3], quat_E4), dim=-1)
 
@@ -187,6 +199,7 @@ class StartPoseCommand(OfEntity, CommandTerm):
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Mark the rows of `mask_E`: their pose is read once it is up to date."""
+        # Not read here: a reset has just written the state, and poses of bodies lag behind it.
         self._is_due(view).logical_or_(mask_E)
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
@@ -194,7 +207,9 @@ class StartPoseCommand(OfEntity, CommandTerm):
         is_due_E = self._is_due(view)
         held_E7 = view.buffer("pose_E7", 7)
         pose_E7 = torch.cat((robot.root_pos_EL, robot.root_quat_EL), dim=-1)
+        # Only the rows that are due take over the present pose.
         held_E7.copy_(torch.where(is_due_E[:, None], pose_E7, held_E7))
+        # Each mark counts once.
         is_due_E.zero_()
         return held_E7.clone()
 
@@ -208,6 +223,7 @@ class StartPoseCommand(OfEntity, CommandTerm):
 
 def _axes(quat_4: Tensor) -> np.ndarray:
     """Return the rotation matrix [3, 3] of a quaternion [4]."""
+    # Rotated unit vectors are the columns of the matrix, hence the transpose.
     return quaternion.rotate(quat_4.expand(3, 4), torch.eye(3, device=quat_4.device)).T.cpu().numpy()
 
 
@@ -242,17 +258,21 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
 
     def shared_ranges(self, view: EnvView) -> Float[Tensor, "2 7"]:
         """Return the present ranges, and after them three of [0, 1) for the kinds, (low, high) [2, 7]."""
+        # Columns: vx, vy, wz, heading, and three for the kinds; one table, so that one draw does for all.
         return view.shared("ranges_2N", tuple(zip(*self.ranges.values(), *[(0.0, 1.0)] * 3, strict=True)))
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         # One draw for all: targets in their ranges, then three numbers in [0, 1) that decide the kinds.
         target_E4, kind_E3 = view.uniform(7, *self.shared_ranges(view).unbind(0)).split((4, 3), dim=-1)
         shares_3 = (self.rel_standing_envs, self.rel_heading_envs, self.rel_forward_envs)
+        # Columns: standing, heading-controlled, forward.
         is_kind_E3 = kind_E3 < constant(shares_3, view.device)
+        # Forward envs keep the drawn speed, but walk at least at the minimum, and never backwards.
         speed_E1 = target_E4[:, :1].abs().clamp(min=self.forward_min_speed)
         forward_E3 = speed_E1 * constant((1.0, 0.0, 0.0), view.device)
         velocity_E3 = torch.where(is_kind_E3[:, 2:], forward_E3, target_E4[:, :3])
 
+        # Forward is folded into the velocity; standing and heading control are decided at each step.
         drawn_E4 = torch.cat((velocity_E3, target_E4[:, 3:]), dim=-1)
         held_E4 = self._target(view)
         held_E2 = self._kind(view)
@@ -262,19 +282,25 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
     def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
         target_E4 = self._target(view)
         kind_E2 = self._kind(view)
+        # By the shorter way round.
         error_E = quaternion.wrap_to_pi(target_E4[:, 3] - view.entity(self.entity).heading_E)
+        # Steering stays inside the present range of wz, column 2.
         steer_E = (self.heading_stiffness * error_E).clamp(*self.shared_ranges(view)[:, 2].unbind())
         wz_E = torch.where(kind_E2[:, 1], steer_E, target_E4[:, 2])
         command_E3 = torch.cat((target_E4[:, :2], wz_E[:, None]), dim=-1)
+        # Standing comes last: it overrides all other kinds.
         return torch.where(kind_E2[:, :1], 0.0, command_E3)
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the commanded (green) and the actual (blue) planar velocity above the root, 0.5 m per m/s."""
         robot = view.entity(self.entity)
+        # 0.3 m above the root, clear of the robot's body.
         above = robot.root_pos_EL[env_index] + constant((0.0, 0.0, 0.3), view.device)
         command_E3 = self(view)
         actual_E3 = robot.root_lin_vel_b_EL
         for velocity_E3, rgba in ((command_E3, _COMMANDED), (actual_E3, _REACHED)):
+            # Velocities are in the root's frame, pictures in the world's; vertical speed is not part of the
+            # command.
             planar_E3 = torch.cat((velocity_E3[:, :2], torch.zeros_like(velocity_E3[:, :1])), dim=-1)
             arrow_E3 = 0.5 * quaternion.rotate(robot.root_quat_EL, planar_E3)
             start = above.cpu().numpy()
@@ -305,6 +331,7 @@ class SinusoidalGaitCommand(CommandTerm, drawn=("frequency",)):
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         held_E3 = self._held(view)
+        # A new frequency goes on from the cycles of the old one, so that the phase does not jump.
         drawn_E1 = view.uniform(1, *self.shared_ranges(view).unbind(0))
         fresh_E3 = torch.cat((drawn_E1, view.episode_time_E[:, None], self._cycles(view)[:, None]), dim=-1)
         held_E3.copy_(torch.where(mask_E[:, None], fresh_E3, held_E3))
@@ -322,6 +349,7 @@ class SinusoidalGaitCommand(CommandTerm, drawn=("frequency",)):
 
     def _cycles(self, view: EnvView) -> Tensor:
         """Cycles since the start of the episode, modulo 1, [E]."""
+        # Only the present frequency counts from its drawing on; earlier ones are in `cycles_E`.
         frequency_E, since_E, cycles_E = self._held(view).unbind(-1)
         return torch.remainder(cycles_E + frequency_E * (view.episode_time_E - since_E), 1.0)
 
@@ -332,14 +360,14 @@ class SinusoidalGaitCommand(CommandTerm, drawn=("frequency",)):
 
 @dataclass(frozen=True, kw_only=True)
 class JoystickCommand(CommandTerm):
-    """What was last set from outside, clamped to each axis' range, [E, K]; 0 at first, and kept over resets.
+    """The values last set from outside, clamped to each axis' range, [E, K]; 0 at first, and kept over resets.
 
     Set it between two steps with `env.command_manager.set(name, values)`; the next observation shows it. So a policy
     that was trained on a drawn command of the same columns can be steered by hand.
 
     Attributes:
         axes: (low, high) by name, in the order of the columns, such as `{"vx": (-1.0, 1.0), "wz": (-0.5, 0.5)}`; units
-            are those of the command that it stands in for.
+            are as in the command that it stands in for.
     """
 
     axes: Annotated[Mapping[str, Range], Filled("name at least one, such as {'vx': (-1.0, 1.0)}")]
@@ -357,7 +385,7 @@ class JoystickCommand(CommandTerm):
         return self.axes
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        """Draw nothing: what was set stays."""
+        """Draw nothing: the values that were set stay."""
 
     def set(self, view: EnvView, value_EK: Float[Tensor, "*rows K"], mask_E: Bool[Tensor, " E"]) -> None:
         """Take finite values [E, K], or [K] for all alike, for the rows of `mask_E`; they are checked on the host."""
@@ -367,11 +395,14 @@ class JoystickCommand(CommandTerm):
                 f"values of shape {tuple(value_EK.shape)}: expected [{len(self.axes)}], the axes {list(self.axes)}, "
                 f"or {list(held_EK.shape)}"
             )
+        # A NaN would reach the policy's observation; reading it here waits for the device, which is fine
+        # between steps.
         if not bool(torch.isfinite(value_EK).all()):
             raise ValueError("values hold a number that is not finite: give finite ones")
         held_EK.copy_(torch.where(mask_E[:, None], value_EK.to(held_EK), held_EK))
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
+        # Clamped when read, since a curriculum may have narrowed the ranges since `set`.
         low_K, high_K = self.shared_ranges(view).unbind(0)
         return torch.clamp(self._held(view), low_K, high_K)
 
@@ -381,4 +412,5 @@ class JoystickCommand(CommandTerm):
         visualizer.text((x, y, z + 0.3), ", ".join(f"{axis} {value:+.2f}" for axis, value in values))
 
     def _held(self, view: EnvView) -> Tensor:
+        # Kept over resets: whoever steers does not know of them.
         return view.buffer("held_EK", len(self.axes), keep=True)

@@ -26,7 +26,7 @@ from ksim_rl.transforms.row_transform import by_level
 
 @dataclass(frozen=True, kw_only=True)
 class LevelCurriculum(CurriculumTerm):
-    """A curriculum that drives the level; `initial_level` is that of an env that has just been built."""
+    """A curriculum that drives the level; `initial_level` is the level of an env that has just been built."""
 
     initial_level: Share = 0.0
 
@@ -47,8 +47,10 @@ class LinearLevel(LevelCurriculum):
         check_in_range("end_step", self.end_step, low=self.begin_step, low_open=True)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        # The step count is a tensor, so that captured steps see it grow.
         share = (view.step_count - self.begin_step) / (self.end_step - self.begin_step)
         level = self.initial_level + (1.0 - self.initial_level) * share.clamp(0.0, 1.0)
+        # Levels change only at resets of some env, on any rank: all ranks must keep the same level.
         view.level.copy_(torch.where(ranks.any_of(mask_E), level.to(torch.float32), view.level))
         return view.level.clone()
 
@@ -75,19 +77,25 @@ class SteppedLevel(LevelCurriculum):
         """Return how well the running episodes have gone so far, float32 [E]."""
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        # A reset before the first step ends no episode.
         ended_E = mask_E & (view.episode_step_E > 0)
         held_2 = view.shared("episodes_and_score_2", (0.0, 0.0))
         ended_E2 = torch.stack((torch.ones_like(ended_E, dtype=torch.float32), self.score(view)), dim=-1)
+        # Number of ended episodes, and sum of their scores.
         added_2 = torch.where(ended_E[:, None], ended_E2, 0.0).sum(0)
+        # All ranks count together, so that they move at the same moment.
         ranks.sum_(added_2)
         total_2 = held_2 + added_2
         is_enough = total_2[0] >= (self.min_episodes or view.num_envs * ranks.size())
+        # The mean is used only where enough episodes have ended; the clamp avoids 0 / 0 elsewhere.
         mean = total_2[1] / total_2[0].clamp(min=1.0)
         step = 1.0 / self.num_levels
         level = torch.where(mean > self.raise_above, view.level + step, view.level)
         if self.lower_below is not None:
             level = torch.where(mean < self.lower_below, level - step, level)
         view.level.copy_(torch.where(is_enough, level.clamp(0.0, 1.0), view.level))
+        # The count starts from zero after each move, so that scores of the old level do not count for the new
+        # one.
         held_2.copy_(torch.where(is_enough, 0.0, total_2))
         return view.level.clone()
 
@@ -116,9 +124,9 @@ class DistanceLevel(OfEntity, SteppedLevel):
 
 @dataclass(frozen=True, kw_only=True)
 class SaturationLevel(SteppedLevel):
-    """Moves one step when a reward saturates: the score is what the log shows as `reward/<term>`.
+    """Moves one step when a reward saturates: the score is the number that the log shows as `reward/<term>`.
 
-    That is the weighted sum over the episode per second of the longest possible one (the plain sum where episodes have
+    It is the weighted sum over the episode per second of the longest possible one (the plain sum where episodes have
     no limit), so that a term of weight 2 that is always 1 scores 2.
     """
 
@@ -128,12 +136,14 @@ class SaturationLevel(SteppedLevel):
         check_known("reward", self.reward, view.episode_rewards)
         sum_E = view.episode_rewards[self.reward]
         if view.max_episode_length == 0:
+            # Without a longest episode there is no rate to compare with.
             return sum_E
         return sum_E / (_longest_E(view) * view.step_dt)
 
 
 def _longest_E(view: EnvView) -> Tensor:
     """Return how many env steps each running episode can have; first episodes may have been cut short, [E]."""
+    # Staggered first episodes start with some of their steps used up.
     return (view.max_episode_length - view.time_out_offset_E).to(torch.float32)
 
 
@@ -144,7 +154,7 @@ class TerrainLevels(OfCommand, OfEntity, CurriculumTerm):
     An env moves up one level when its robot got at least `up_distance` away from its origin (horizontally, at the end
     of the episode), and down one when it got less than `down_share` of the way that its last command asks for in a
     whole episode, be it that it was slow or that it fell. An env that has mastered the last level goes on at a random
-    one, so that none is forgotten. The rule is that of Rudin et al., "Learning to walk in minutes", 2022.
+    one, so that none is forgotten. The rule is from Rudin et al., "Learning to walk in minutes", 2022.
 
     The command is a velocity (vx, vy, ...), m/s; `up_distance` a share of the way from a patch's centre to its edge.
     """
@@ -158,12 +168,16 @@ class TerrainLevels(OfCommand, OfEntity, CurriculumTerm):
         top = terrain.num_levels - 1
         distance_E = distance_from_origin(view, self.entity)
         speed_E = torch.linalg.vector_norm(view.command(self.command)[:, :2], dim=-1)
+        # Metres that a robot covers in a whole episode if it follows its last command.
         asked_E = speed_E * (view.max_episode_length * view.step_dt)
         up_E = distance_E >= self.up_distance * terrain.half_width
+        # Never both: who got far enough moves up, even if the command asked for more.
         down_E = ~up_E & (distance_E < self.down_share * asked_E)
         moved_E = level_E + up_E.long() - down_E.long()
+        # The product may round up to `num_levels`, hence the clamp.
         drawn_E = (view.uniform(1)[:, 0] * terrain.num_levels).long().clamp(max=top)
         next_E = torch.where(moved_E > top, drawn_E, moved_E.clamp(min=0))
+        # An env that is reset before its first step has shown nothing, and stays where it is.
         terrain.set_levels(mask_E & (view.episode_step_E > 0), next_E)
         return terrain.levels_E.to(torch.float32).mean()
 
@@ -188,6 +202,7 @@ class RewardWeight(CurriculumTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         held = view.reward_weights[self.reward]
+        # Weights are shared by all envs, and change in place and at resets only.
         held.copy_(torch.where(ranks.any_of(mask_E), self.weight(view, held), held))
         return held.clone()
 
@@ -199,6 +214,7 @@ class RewardWeightByStage(RewardWeight):
     stages: Annotated[Mapping[WholeNumber, float], SOME_STAGE]
 
     def weight(self, view: EnvView, held: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        # In the order of the steps, so that the last stage that has begun wins.
         for step, value in sorted(self.stages.items()):
             held = torch.where(view.step_count >= step, float(value), held)
         return held
@@ -231,7 +247,9 @@ class CommandRangesByStage(OfCommand, CurriculumTerm):
         for step, ranges in sorted(self.stages.items()):
             begins = changes & (view.step_count >= step)
             for field, pair in ranges.items():
+                # In place: the command reads these tensors.
                 held[field].copy_(torch.where(begins, constant(pair, view.device), held[field]))
+        # Stages begin in order, so their number is how many starts have passed.
         stage = (view.step_count >= constant(sorted(self.stages), view.device)).sum().to(torch.float32)
         held_stage = view.shared("stage", 0.0)
         held_stage.copy_(torch.where(changes, stage, held_stage))
@@ -254,6 +272,7 @@ class CommandRangesByLevel(OfCommand, CurriculumTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         changes = ranks.any_of(mask_E)
+        # `by_level` mixes both ends; the level is a tensor that captured steps read.
         for field, held_2 in _ranges_of(view, self.command, self.start).items():
             start_2 = constant(self.start[field], view.device)
             end_2 = constant(self.end[field], view.device)
@@ -264,6 +283,7 @@ class CommandRangesByLevel(OfCommand, CurriculumTerm):
 def _ranges_of(view: EnvView, command: str, fields: Iterable[str]) -> dict[str, Tensor]:
     """Return the present ranges of some fields of a command, (low, high) [2] each."""
     check_known("command with ranges", command, view.command_ranges)
+    # The present ranges are live tensors, shared with the command.
     present = view.command_ranges[command]
     for field in fields:
         check_known(f"range of the command {command!r}", field, present)

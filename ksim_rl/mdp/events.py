@@ -25,6 +25,7 @@ def draw_by_axis(view: EnvView, ranges: Ranges) -> Float[Tensor, "E 6"]:
     """Draw x, y, z, roll, pitch, yaw (m and rad, or m/s and rad/s) uniformly; axes that are left out are 0."""
     pairs = [ranges.get(axis, (0.0, 0.0)) for axis in get_args(Axis)]
     low_6 = constant([float(low) for low, _ in pairs], view.device)
+    # Nothing to draw, as for a term without ranges: no kernel.
     if all(low == high for low, high in pairs):
         return low_6.expand(view.num_envs, 6)
     high_6 = constant([float(high) for _, high in pairs], view.device)
@@ -38,6 +39,7 @@ class JointReset(OfJoints, EventTerm):
     def _write(self, view: EnvView, mask_E: Tensor, pos_EL: Tensor, vel_EL: Tensor) -> None:
         joints = view.joints(self.joints)
         low_L, high_L = joints.soft_limits_L2.unbind(-1)
+        # A drawn position beyond a limit would begin the episode with a violent push back.
         joints.write_pos(mask_E, torch.clamp(pos_EL, low_L, high_L))
         joints.write_vel(mask_E, vel_EL)
 
@@ -53,6 +55,7 @@ class ResetJoints(JointReset):
     def _check_fields(self) -> None:
         super()._check_fields()
         for name in ("position_range", "velocity_range"):
+            # A pair means (low, high) or (mean, standard deviation).
             if self.distribution == "uniform":
                 check_pair(name, getattr(self, name))
             else:
@@ -67,6 +70,7 @@ class ResetJoints(JointReset):
     def _draw(self, view: EnvView, count: int, pair: tuple[float, float]) -> Float[Tensor, "E L"]:
         first = float(pair[0])
         second = float(pair[1])
+        # A range without width needs no draw.
         if second == (0.0 if self.distribution == "gaussian" else first):
             return constant([first] * count, view.device).expand(view.num_envs, count)
         if self.distribution == "gaussian":
@@ -104,8 +108,10 @@ class ResetRootUniform(OfEntity, EventTerm):
         offset_E6 = draw_by_axis(view, self.pose_range)
         velocity_E6 = draw_by_axis(view, self.velocity_range)
         turn_E4 = quaternion.from_euler_xyz(*offset_E6[:, 3:].unbind(-1))
+        # The turn is on the right: its axes are the default pose's, not the world's.
         quat_E4 = quaternion.multiply(body.default_root_quat_L.expand(view.num_envs, 4), turn_E4)
         pos_E3 = body.default_root_pos_L + offset_E6[:, :3]
+        # On flat ground all envs start at the world's origin.
         if not view.terrain.is_flat:
             pos_E3 = pos_E3 + view.terrain.origins_E3
         body.write_root_pose(mask_E, pos_E3, quat_E4)
@@ -120,9 +126,12 @@ class ResetHeading(OfEntity, EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = view.entity(self.entity)
+        # The default heading does not matter: only what is missing from the present one to the drawn one is
+        # turned.
         turn_E = view.uniform(1, *self.heading_range)[:, 0] - body.heading_E
         nothing_E = torch.zeros_like(turn_E)
         turn_E4 = quaternion.from_euler_xyz(nothing_E, nothing_E, turn_E)
+        # On the left, since it turns about the world's z axis.
         body.write_root_pose(mask_E, body.root_pos_EL, quaternion.multiply(turn_E4, body.root_quat_EL))
 
 
@@ -134,6 +143,7 @@ class ResetHeight(OfEntity, EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = view.entity(self.entity)
+        # The root moves by the difference of heights, so that slopes and steps need no special case.
         rise_E1 = view.uniform(1, *self.height_range) - root_height(view, self.entity)[:, None]
         pos_E3 = torch.cat((body.root_pos_EL[:, :2], body.root_pos_EL[:, 2:] + rise_E1), dim=-1)
         body.write_root_pose(mask_E, pos_E3, body.root_quat_EL)
@@ -148,6 +158,7 @@ class PushByVelocity(OfEntity, EventTerm, mode="interval"):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = view.entity(self.entity)
         kick_E6 = draw_by_axis(view, self.velocity_range)
+        # Added to the present velocity, not in place of it.
         lin_vel_E3 = body.root_lin_vel_w_EL + kick_E6[:, :3]
         body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL + kick_E6[:, 3:])
 
@@ -166,20 +177,23 @@ class PushByForce(EventTerm, mode="interval"):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # In other modes it would not be called at each step, and a push would never end.
         if self.mode != "interval":
             raise ValueError(f"mode={self.mode!r}: expected 'interval', which also says when a push ends")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        """Begin a push in the rows of `mask_E`, and go on with or end those of the others; once per env step."""
+        """Begin a push in the rows of `mask_E`, and go on with or end the other rows' pushes; once per env step."""
         held_E6 = view.buffer("wrench_E6", 6)
         applied_E6 = view.buffer("applied_E6", 6)
         left_E = view.buffer("left_s_E")
         drawn_E6 = draw_by_axis(view, self.wrench_range)
+        # At least one env step: a shorter push would be over before physics sees it.
         duration_E = view.uniform(1, *self.duration_s)[:, 0].clamp(min=view.step_dt)
         left_E.copy_(torch.where(mask_E, duration_E, left_E - view.step_dt))
         held_E6.copy_(torch.where(mask_E[:, None], drawn_E6, held_E6))
         # The clock has run out at the env step that is nearest, whatever the subtractions round to.
         wrench_E6 = torch.where((left_E > 0.5 * view.step_dt)[:, None], held_E6, 0.0)
+        # Only the change is added: other events may press on the same body.
         view.world.xfrc_applied_EL[:, view.resolver.one("body", self.body)].add_(wrench_E6 - applied_E6)
         applied_E6.copy_(wrench_E6)
 
@@ -193,7 +207,9 @@ class Jump(OfEntity, EventTerm, mode="interval"):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = view.entity(self.entity)
         height_E = view.uniform(1, *self.height_range)[:, 0]
+        # Each world may have gravity of its own.
         up_E = torch.sqrt(2.0 * torch.linalg.vector_norm(view.world.gravity_EL, dim=-1) * height_E)
         lin_vel_E3 = body.root_lin_vel_w_EL.clone()
+        # World z is up, whatever the direction of gravity.
         lin_vel_E3[:, 2] += up_E
         body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL)

@@ -84,6 +84,7 @@ class OfFeet(OfSites, OfSensor):
         """Return the state of the contact sensor; one element alone would count for all feet, and is refused."""
         contact = view.contact(self.sensor)
         num_feet = len(view.sites(self.sites))
+        # One element for all feet would broadcast without an error.
         if contact.found_EN.shape[-1] != num_feet:
             raise ValueError(
                 f"sensor={self.sensor!r} has {contact.found_EN.shape[-1]} elements, and sites={self.sites!r} are "
@@ -113,12 +114,14 @@ class FramedObservation(InFrame, ObservationTerm):
     def points(self, view: EnvView, pos_EN3: Float[Tensor, "E N 3"]) -> Float[Tensor, "E L"]:
         """Return points of the world in the term's frame, m, flat, [E, 3N]."""
         if self.frame == "root":
+            # Positions are relative to the origin of the frame; directions are not.
             pos_EN3 = pos_EN3 - view.entity(self.entity).root_pos_EL[:, None]
         return self.vectors(view, pos_EN3)
 
     def vectors(self, view: EnvView, vector_EN3: Float[Tensor, "E N 3"]) -> Float[Tensor, "E L"]:
         """Return vectors of the world in the term's axes, flat, [E, 3N]."""
         if self.frame == "root":
+            # Rotations from world to root; [E, 1, 4] broadcasts over N.
             vector_EN3 = quaternion.rotate_inverse(view.entity(self.entity).root_quat_EL[:, None], vector_EN3)
         return vector_EN3.flatten(start_dim=1)
 
@@ -136,17 +139,20 @@ class RewardWhileCommanded(OfCommand, RewardTerm):
 
 def root_height(view: EnvView, entity: str = "") -> Float[Tensor, " E"]:
     """Return the height of an entity's root frame above the ground right below it, m; position stage."""
+    # `clearance` takes [E, N, 3]; the root is a single point per env.
     return view.terrain.clearance(view.entity(entity).root_pos_EL[:, None])[:, 0]
 
 
 def distance_from_origin(view: EnvView, entity: str) -> Float[Tensor, " E"]:
     """Return the horizontal distance of an entity's root from where its env starts, m; position stage."""
+    # Height does not count: a robot that falls has not walked.
     away_E3 = view.entity(entity).root_pos_EL - view.terrain.origins_E3
     return torch.linalg.vector_norm(away_E3[:, :2], dim=-1)
 
 
 def mechanical_power(view: EnvView, joints: Patterns) -> Float[Tensor, " E"]:
     """Return the sum over joints of |effort (acceleration stage) * velocity|, W: braking costs as much as driving."""
+    # Without the absolute value, braking would pay back what driving has cost.
     driven = view.joints(joints)
     return (driven.effort_EL * driven.vel_EL).abs().sum(-1)
 
@@ -158,6 +164,7 @@ def contact_force(view: EnvView, sensor: str) -> Float[Tensor, "E N"]:
 
 def commanded_speed(view: EnvView, command: str) -> Float[Tensor, " E"]:
     """Return |c_xy| + |c_z| of the command (vx, vy, wz), m/s and rad/s added as numbers."""
+    # Several terms ask for the same speed in each step; the cache is emptied when commands change.
     cache = view.command_cache
     key = f"speed of {command}"
     if key not in cache:

@@ -34,6 +34,7 @@ class LinearVelocityError(OfCommand, OfEntity, MetricTerm):
     """|c_xy - v_xy| of a command (vx, vy, wz) and the root velocity, both in the root's frame, m/s; velocity stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # Columns x and y of both, in the root's frame.
         error_E2 = view.command(self.command)[:, :2] - view.entity(self.entity).root_lin_vel_b_EL[:, :2]
         return torch.linalg.vector_norm(error_E2, dim=-1)
 
@@ -51,6 +52,7 @@ class ActionAcceleration(MetricTerm):
     """Mean over columns of |a_t - 2 a_{t-1} + a_{t-2}|; actions before an episode are 0."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # The change of the change of the action: two buffers back, one of them the env's own.
         return change(view, "last_rate_EL", view.action_EL - view.last_action_EL).abs().mean(-1)
 
 
@@ -61,6 +63,7 @@ class FootSlipSpeed(OfFeet, MetricTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         found_EF = self.contact(view).found_EN
         speed_EF = torch.linalg.vector_norm(view.sites(self.sites).lin_vel_EN3[..., :2], dim=-1)
+        # The clamp makes a flight without any contact read 0, not NaN.
         return (speed_EF * found_EF).sum(-1) / found_EF.sum(-1).clamp(min=1.0)
 
 
@@ -92,7 +95,7 @@ class Power(OfJoints, MetricTerm):
 class CostOfTransport(OfJoints, OfEntity, MetricTerm, reduce="last"):
     """Energy / (weight * distance) since the start of the episode, no unit; it needs gravity.
 
-    Energy is the integral of `Power`; distance is the length of the root's path over the ground; the weight is that of
+    Energy is the integral of `Power`; distance is the length of the root's path over the ground; the weight is of
     the nominal model (m g of the root body with all that hangs on it). A path counts as `min_distance` (m) at least, so
     that standing still gives a finite value.
     """
@@ -102,12 +105,15 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm, reduce="last"):
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         robot = view.entity(self.entity)
         model = view.world.mj_model
+        # From the model on the host: randomized masses do not count, so that envs can be compared.
         weight = float(model.body_subtreemass[robot.root.id] * np.linalg.norm(model.opt.gravity))
         if weight == 0.0:
             raise ValueError("CostOfTransport without gravity: a weight of 0 N has no cost of transport")
+        # Buffers start at zero in each episode, so that these are sums over it.
         energy_E = view.buffer("energy_E")
         distance_E = view.buffer("distance_E")
         energy_E.add_(mechanical_power(view, self.joints) * view.step_dt)
+        # Horizontal path, summed up: a robot that walks in a circle has moved too.
         distance_E.add_(torch.linalg.vector_norm(robot.root_lin_vel_w_EL[:, :2], dim=-1) * view.step_dt)
         return energy_E / (weight * distance_E.clamp(min=self.min_distance))
 
@@ -124,6 +130,8 @@ class Success(MetricTerm, reduce="last"):
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         for name in self.terminations:
             check_known("termination", name, view.terminations)
+        # `wanted` by name, `others` by exclusion: an episode may end by several terminations in the same
+        # step.
         wanted = [flag_E for name, flag_E in view.terminations.items() if name in self.terminations]
         others = [flag_E for name, flag_E in view.terminations.items() if name not in self.terminations]
         succeeds_E = torch.stack(wanted).any(0)

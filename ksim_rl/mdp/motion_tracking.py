@@ -1,6 +1,6 @@
 """These terms begin, read, rate and end episodes that follow a reference motion.
 
-`file` is what `view.motion` reads. Kernels are those of Peng et al., "DeepMimic" (2018), with their scales k written as
+`file` is a motion, as `view.motion` reads it. Kernels are from Peng et al., "DeepMimic" (2018), with scales k written as
 std = 1 / sqrt(k): joint positions 2, joint velocities 0.1, ends of limbs 40, root or centre of mass 10.
 """
 
@@ -43,6 +43,7 @@ class OfMotionBodies(OfMotion):
     def offset(self, view: EnvView) -> Float[Tensor, "E N 3"]:
         """Return the motion's positions of the bodies minus their own, world frame, m; position stage."""
         pos_EN3, _ = motion_bodies(view, self.file, self.bodies)
+        # The motion's bodies are shifted to the env's origin by `motion_bodies`.
         return pos_EN3 - view.bodies(self.bodies).pos_EN3
 
 
@@ -53,6 +54,7 @@ class MotionPhase(OfMotion, ObservationTerm):
     cycle_s: Positive | None = None
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        # A whole motion as the cycle: its phase tells where in it the env is.
         cycle_s = self.cycle_s or view.motion(self.file).duration_s
         angle_E = motion_time(view, self.file) * (2.0 * math.pi / cycle_s)
         return torch.stack((torch.sin(angle_E), torch.cos(angle_E)), dim=-1)
@@ -66,8 +68,10 @@ class MotionJoints(OfMotion, OfJoints, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         if self.ahead_s == 0.0:
+            # The present frame is sampled once per step for all terms.
             return torch.cat(motion_joints(view, self.file, self.joints), dim=-1)
         time_E = motion_time(view, self.file) + self.ahead_s
+        # Positions, then velocities, both of the later moment.
         return torch.cat(view.motion(self.file).sample_joints(time_E, view.joints(self.joints).index), dim=-1)
 
 
@@ -112,6 +116,7 @@ class TrackMotionBodyQuat(OfMotionBodies, GaussianReward):
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, quat_EN4 = motion_bodies(view, self.file, self.bodies)
         own_EN4 = view.bodies(self.bodies).quat_EN4
+        # The angle is free of the sign of the quaternions.
         return self.rate(quaternion.angle_between(own_EN4, quat_EN4).square().sum(-1))
 
 
@@ -146,8 +151,10 @@ class ResetToMotion(OfMotion, EventTerm):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         motion = view.motion(self.file)
         start_E = motion_start_time(view, self.file)
+        # Rows that are not reset keep their start: their clock goes on from it.
         start_E.copy_(torch.where(mask_E, self.draw_share(view) * motion.duration_s, start_E))
         qpos_EL, qvel_EL = motion.sample(start_E)
+        # Motions are recorded around the world's origin; on a terrain each env has its own origin.
         view.write_qpos(mask_E, qpos_EL if motion_shift(view) is None else view.at_origins(qpos_EL))
         view.write_qvel(mask_E, qvel_EL)
 

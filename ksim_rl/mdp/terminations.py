@@ -26,6 +26,7 @@ class TimeOut(TerminationTerm, time_out=True):
     """The episode has lasted `episode_length_s`: a truncation, not a failure."""
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        # `time_out_offset_E` staggers the first episodes, so that not all envs reset in the same step.
         return view.episode_step_E + view.time_out_offset_E >= view.max_episode_length
 
 
@@ -70,6 +71,7 @@ class OutsideTerrain(OfEntity, TerminationTerm, time_out=True):
     margin: NonNegative = 0.5
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        # The ground is a square about the world's origin; the coordinate further out decides.
         reach_E = view.entity(self.entity).root_pos_EL[:, :2].abs().amax(-1)
         return reach_E > view.terrain.half_width - self.margin
 
@@ -89,6 +91,7 @@ class RootVelocityAbove(OfEntity, TerminationTerm):
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         root = view.entity(self.entity)
         ends_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
+        # Both limits are optional; either one ends the episode.
         if self.linear is not None:
             ends_E = ends_E | (torch.linalg.vector_norm(root.root_lin_vel_w_EL, dim=-1) > self.linear)
         if self.angular is not None:
@@ -116,6 +119,7 @@ class JointLimitViolated(OfJoints, TerminationTerm):
         joints = view.joints(self.joints)
         pos_EN = joints.pos_EL
         limits_N2 = joints.soft_limits_L2
+        # Positive outside; unlimited joints have infinite limits, and are never beyond them.
         beyond_EN = torch.maximum(limits_N2[:, 0] - pos_EN, pos_EN - limits_N2[:, 1])
         return (beyond_EN > self.margin).any(-1)
 
@@ -140,5 +144,6 @@ class NonFiniteState(TerminationTerm):
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         world = view.world
+        # One test for all three, so that it takes few kernels.
         parts = (world.qacc_EL, world.actuator_force_EL, world.sensordata_EL)
         return ~torch.isfinite(torch.cat(parts, dim=-1)).all(-1)

@@ -1,6 +1,6 @@
 """Each of these observations has one block for each body, site or contact that its names match.
 
-Contacts and their forces are those of the last physics substep (acceleration stage), in the order of the sensor's
+Contacts and their forces are of the last physics substep (acceleration stage), in the order of the sensor's
 elements; poses and velocities are of the current state.
 """
 
@@ -40,6 +40,7 @@ class BodyQuat(BodyObservation):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         quat_EN4 = view.bodies(self.bodies).quat_EN4
+        # Conjugate of the root on the left: orientation relative to the root.
         if self.frame == "root":
             root_E14 = view.entity(self.entity).root_quat_EL[:, None]
             quat_EN4 = quaternion.multiply(quaternion.conjugate(root_E14), quat_EN4)
@@ -51,7 +52,9 @@ class BodyRotation6d(BodyObservation):
     """The x axis, then the y axis, of each body, without jumps (Zhou et al. 2019), [E, 6N]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        # Axes are rows here, so that the first two rows are the x and y axes.
         axes_EN23 = view.bodies(self.bodies).axes_EN33[:, :, :2]
+        # [E, N, 2, 3] as [E, 2N, 3]: each axis is a vector to rotate.
         return self.vectors(view, axes_EN23.flatten(start_dim=1, end_dim=2))
 
 

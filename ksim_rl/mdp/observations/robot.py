@@ -1,4 +1,4 @@
-"""These observations read what a robot knows: joints, actuators, its root, sensors, the last action, commands and time.
+"""These observations read a robot's joints, actuators, root and sensors, the last action, commands and time.
 
 Joints and actuators have one column each in the order of the term's patterns.
 """
@@ -30,6 +30,7 @@ class EncodedJoints(OfJoints, ObservationTerm):
 
     def read(self, view: EnvView, pos_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
         """Return what encoders read at these positions of the joints."""
+        # Biased readings are what the real robot's encoders would give.
         if self.biased:
             return pos_EL + view.joints(self.joints).encoder_bias_EL
         return pos_EL
@@ -135,7 +136,7 @@ class RootAngVel(InFrame, ObservationTerm):
 class ProjectedGravity(OfEntity, ObservationTerm):
     """Direction of gravity (world -z) in the root's frame, a unit vector, [E, 3]; (0, 0, -1) when upright.
 
-    Position stage. `time_constant` (s) is that of a first-order lag, as the attitude filter of an IMU has; a reset
+    Position stage. `time_constant` (s) belongs to a first-order lag, as the attitude filter of an IMU has; a reset
     fills it with the new orientation. Dead time, as of a bus, is the business of the group's delay.
     """
 
@@ -143,15 +144,18 @@ class ProjectedGravity(OfEntity, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         gravity_E3 = view.entity(self.entity).projected_gravity_EL
+        # No lag, no buffers.
         if self.time_constant == 0.0:
             return gravity_E3
         steps_E = view.buffer("steps_E", dtype=torch.int64)
         filtered_E3 = view.buffer("filtered_E3", 3)
+        # Exact for a gravity that is constant over the step, at any ratio of step and time constant.
         gain = 1.0 - math.exp(-view.step_dt / self.time_constant)
         # The first reading of an episode fills the filter.
         gain_E = torch.where(steps_E == 0, 1.0, gain)
         filtered_E3.lerp_(gravity_E3, gain_E[:, None])
         steps_E.add_(1)
+        # A mean of unit vectors is shorter than 1.
         return torch.nn.functional.normalize(filtered_E3, dim=-1)
 
 
@@ -196,6 +200,7 @@ class RemainingTime(ObservationTerm):
             raise ValueError(
                 "RemainingTime with episode_length_s=0: episodes never time out; set episode_length_s"
             )
+        # The offset makes staggered first episodes shorter.
         passed_E = view.episode_step_E + view.time_out_offset_E
         return time_left(view.max_episode_length, passed_E)[:, None] * view.step_dt
 
@@ -208,6 +213,7 @@ class Clock(ObservationTerm):
     phases: Annotated[tuple[float, ...], Filled("give at least one, such as (0.0,)")] = (0.0,)
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        # Phases are in cycles; 2 pi makes them angles on the host.
         offsets_P = constant([2.0 * math.pi * phase for phase in self.phases], view.device)
         angle_EP = view.episode_time_E[:, None] * (2.0 * math.pi * self.frequency) + offsets_P
         return torch.cat((angle_EP.sin(), angle_EP.cos()), dim=-1)
@@ -239,6 +245,7 @@ class CameraImage(OfSensor, ObservationTerm, is_image=True):
 
     def __call__(self, view: EnvView) -> Shaped[Tensor, " E *image"]:
         camera = view.camera(self.sensor)
+        # The camera calls it by its channels.
         if self.output == "rgb":
             return camera.rgb_EHW3
         return getattr(camera, f"{self.output}_EHW")
@@ -246,7 +253,7 @@ class CameraImage(OfSensor, ObservationTerm, is_image=True):
 
 @dataclass(frozen=True, kw_only=True)
 class RayDistance(OfSensor, ObservationTerm):
-    """Distances to what the rays hit, m, the sensor's `max_distance` where they hit nothing, [E, N]; position stage."""
+    """Distances to the first hits of rays, m, `max_distance` of the sensor where there is none, [E, N]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.rays(self.sensor).state.distance_EN
@@ -264,6 +271,7 @@ class RayHeight(OfSensor, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         tracker = view.rays(self.sensor)
+        # World z of the sensor minus world z of the hits.
         below_EN = tracker.origin_E3[:, 2:] - tracker.state.point_EN3[..., 2] - self.offset
         return below_EN.clamp(*self.clip)
 
@@ -273,7 +281,7 @@ class HeightScan(OfEntity, ObservationTerm):
     """How far the ground is below the root at the points of a grid, minus `offset`, clipped, m, [E, L]; position stage.
 
     The grid is centred on the root and turns with its yaw only. Points run along x (forward) first, from back to front,
-    and these rows along y, from right to left. Heights are those of the terrain itself, exactly and without casting
+    and these rows along y, from right to left. Heights are of the terrain itself, exactly and without casting
     rays: of what else stands there nothing is seen (`scene.sensors` with a `RayCaster` does). Ground that is higher
     reads lower; on flat ground all points read root height - offset. `size` has the grid's edges along x and y, m.
     """
@@ -285,13 +293,16 @@ class HeightScan(OfEntity, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         body = view.entity(self.entity)
+        # Points of the grid in the frame of root and yaw, [N] each.
         x_N, y_N = _grid(tuple(self.size), self.resolution, view.device)
+        # Turned with the yaw alone: a robot that pitches still scans straight down.
         sin_E1 = torch.sin(body.heading_E)[:, None]
         cos_E1 = torch.cos(body.heading_E)[:, None]
         root_E3 = body.root_pos_EL
         points_EN2 = root_E3[:, None, :2] + torch.stack(
             (cos_E1 * x_N - sin_E1 * y_N, sin_E1 * x_N + cos_E1 * y_N), dim=-1
         )
+        # Height of the root above each point's ground, less the offset.
         below_EN = root_E3[:, 2:] - view.terrain.heights(points_EN2) - self.offset
         return below_EN.clamp(*self.clip)
 
@@ -299,5 +310,6 @@ class HeightScan(OfEntity, ObservationTerm):
 @cache
 def _grid(size: tuple[float, float], resolution: float, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return x and y of the points about the root, m, [N] each, on the device; made once."""
+    # Python numbers, since `constant` keys its tensors by value.
     x_N, y_N, _ = grid_points(size, resolution).T.tolist()
     return constant(x_N, device), constant(y_N, device)

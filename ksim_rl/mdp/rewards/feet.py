@@ -21,6 +21,7 @@ class ContactForceAbove(OfContacts, RewardTerm):
     """Sum over the sensor's elements of how far the net contact force exceeds a threshold, N."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # Only the excess counts: standing itself is free.
         return (contact_force(view, self.sensor) - self.threshold).clamp(min=0.0).sum(-1)
 
 
@@ -45,7 +46,9 @@ class SelfCollision(OfContacts, RewardTerm):
     threshold: NonNegative = 10.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # [E, S, N]: S substeps of the env step, N elements.
         force_ESN = torch.linalg.vector_norm(view.contact(self.sensor).force_history_ESN3, dim=-1)
+        # The strongest element in each substep, then how many substeps were over it.
         return (force_ESN.amax(-1) > self.threshold).to(torch.float32).sum(-1)
 
 
@@ -57,6 +60,7 @@ class FootClearance(OfSites, RewardWhileCommanded):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         feet = view.sites(self.sites)
+        # Weighted by the speed: only feet that move must be high, so that standing costs nothing.
         miss_EF = (feet.height_EN - self.target_height).abs()
         speed_EF = torch.linalg.vector_norm(feet.lin_vel_EN3[..., :2], dim=-1)
         return self.while_commanded(view, (miss_EF * speed_EF).sum(-1))
@@ -72,8 +76,11 @@ class FootSwingHeight(OfFeet, RewardWhileCommanded):
         contact = self.contact(view)
         height_EF = view.sites(self.sites).height_EN
         held_EF = view.buffer("peak_EF", height_EF.shape[-1])
+        # Grows in the air only: at touch-down it still holds the peak of the swing.
         peak_EF = torch.where(contact.found_EN > 0, held_EF, torch.maximum(held_EF, height_EF))
+        # Starts again with the next swing, after the cost below has been computed from `peak_EF`.
         held_EF.copy_(torch.where(contact.first_contact_EN > 0, 0.0, peak_EF))
+        # Paid once per swing, in the step of touch-down.
         cost_E = ((peak_EF / self.target_height - 1.0).square() * contact.first_contact_EN).sum(-1)
         return self.while_commanded(view, cost_E)
 
@@ -109,6 +116,7 @@ class FeetAirTime(OfSensor, RewardWhileCommanded):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         air_time_EF = view.contact(self.sensor).air_time_EN
+        # Neither short hops nor long flights are rewarded.
         inside_EF = (air_time_EF > self.threshold_min) & (air_time_EF < self.threshold_max)
         return self.while_commanded(view, inside_EF.to(torch.float32).sum(-1))
 
@@ -123,10 +131,12 @@ class GaitPhase(OfSensor, RewardWhileCommanded):
         touches_EF = view.contact(self.sensor).found_EN > 0
         phase_EL = view.command(self.gait)
         feet = touches_EF.shape[-1]
+        # Sines come first, cosines second, one of each per foot.
         if phase_EL.shape[-1] != 2 * feet:
             raise ValueError(
                 f"gait={self.gait!r} has {phase_EL.shape[-1] // 2} feet, sensor={self.sensor!r} has {feet}: give each "
                 "foot one offset"
             )
+        # A foot matches where it touches exactly when its sine says stance.
         matches_EF = touches_EF != (phase_EL[:, :feet] > 0)
         return self.while_commanded(view, matches_EF.to(torch.float32).mean(-1))

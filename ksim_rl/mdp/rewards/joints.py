@@ -26,8 +26,10 @@ class JointLimitReward(OfJoints, RewardTerm):
 
     def overshoot(self, view: EnvView, value_EL: Float[Tensor, "E L"]) -> Float[Tensor, " E"]:
         """Return the sum for the values of the joints."""
+        # Patterns become one limit per joint, on the host and once.
         limit_L = values_by_name("limits", self.limits, view.joints(self.joints).names)
         free_L = constant([self.soft_factor * limit for limit in limit_L], view.device)
+        # Symmetric about zero: speeds and efforts have one limit for both directions.
         return (value_EL.abs() - free_L).clamp(min=0.0).sum(-1)
 
 
@@ -39,6 +41,7 @@ class JointPosLimits(OfJoints, RewardTerm):
         joints = view.joints(self.joints)
         pos_EL = joints.pos_EL
         limits_L2 = joints.soft_limits_L2
+        # What the clamp cuts off is the distance to the nearer limit; infinite limits cut nothing.
         inside_EL = torch.clamp(pos_EL, limits_L2[:, 0], limits_L2[:, 1])
         return (pos_EL - inside_EL).abs().sum(-1)
 
@@ -153,6 +156,7 @@ class ActionAccelerationL2(RewardTerm):
     """|a_t - 2 a_{t-1} + a_{t-2}|^2 of the policy's raw actions, [E]; actions before an episode are 0."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # The env keeps the last action; the last rate is the term's own buffer.
         rate_EL = view.action_EL - view.last_action_EL
         return change(view, "last_rate_EL", rate_EL).square().sum(-1)
 
@@ -162,14 +166,17 @@ class ActionJerkL2(RewardTerm):
     """|a_t - 3 a_{t-1} + 3 a_{t-2} - a_{t-3}|^2 of the policy's raw actions, [E]; actions before an episode are 0."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # Third difference: change of rate, then change of acceleration, each with its own buffer.
         acceleration_EL = change(view, "last_rate_EL", view.action_EL - view.last_action_EL)
         return change(view, "last_acceleration_EL", acceleration_EL).square().sum(-1)
 
 
 def change(view: EnvView, name: str, value_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
     """Return the change of a value since the last step, and remember the value."""
+    # Zeroed at resets, so that an episode starts from a rate of 0.
     last_EL = view.buffer(name, value_EL.shape[-1])
     change_EL = value_EL - last_EL
+    # In place and after the difference was taken.
     last_EL.copy_(value_EL)
     return change_EL
 
@@ -195,6 +202,7 @@ class Symmetry(RewardTerm):
         """Return the names of left and right joints, pair by pair."""
         left = view.joints(self.left).names
         right = view.joints(self.right).names
+        # Pairs are by position in both lists, so that these must be as long.
         if len(left) != len(right):
             raise ValueError(
                 f"left matches {left}, right matches {right}: give each left joint one right joint"
@@ -203,7 +211,9 @@ class Symmetry(RewardTerm):
 
     def _mismatch(self, view: EnvView, left_EP: Tensor, right_EP: Tensor) -> Tensor:
         """Return the sum over pairs of (left - sign * right)^2, [E]."""
+        # Signs are given for left joints only.
         signs_P = constant(values_by_name("signs", self.signs, self._pairs(view)[0]), view.device)
+        # One fused kernel for left - sign * right.
         return torch.addcmul(left_EP, signs_P, right_EP, value=-1.0).square().sum(-1)
 
 
@@ -218,13 +228,14 @@ class JointSymmetryL2(Symmetry):
 
 @dataclass(frozen=True, kw_only=True)
 class ActionSymmetryL2(Symmetry):
-    """Sum over pairs of (a_left - sign a_right)^2 of raw actions, [E]; `joints` are those of the first columns."""
+    """Sum over pairs of (a_left - sign a_right)^2 of raw actions, [E]; `joints` are the joints of the first columns."""
 
     joints: Patterns
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         names = view.joints(self.joints).names
         columns = []
+        # Columns of the action, found by name in the order of the action's joints.
         for side in self._pairs(view):
             missing = [name for name in side if name not in names]
             if missing:

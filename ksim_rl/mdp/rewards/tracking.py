@@ -46,10 +46,13 @@ def tolerance(
     and v the value there, "gaussian" is `v ** (d ** 2)`, "long_tail" `1 / (1 + (1 / v - 1) d ** 2)`, and "linear" and
     "quadratic" are 1 - (1 - v) times d and d ** 2, but not below 0; v may be 0 there. Without a margin it is 0 outside.
     """
+    # Distance to the interval, 0 inside; one of the two differences is negative.
     outside = torch.clamp(torch.maximum(low - value, value - high), min=0.0)
+    # A margin of 0 would divide by zero.
     if margin == 0.0:
         return (outside == 0.0).to(value.dtype)
     distance = outside / margin
+    # A long tail still rises towards the interval far away, where the others are flat or 0.
     if shape == "long_tail":
         return 1.0 / (1.0 + (1.0 / value_at_margin - 1.0) * distance.square())
     if shape != "gaussian":
@@ -57,7 +60,9 @@ def tolerance(
             fall = distance
         else:
             fall = distance.square()
+        # Falls through `value_at_margin` at one margin, and ends at 0.
         return torch.clamp(1.0 - (1.0 - value_at_margin) * fall, min=0.0)
+    # The power v ** (d ** 2) as an exponential, since log(v) is known on the host.
     return torch.exp(distance.square() * math.log(value_at_margin))
 
 
@@ -67,7 +72,9 @@ class TrackLinearVelocity(OfCommand, OfEntity, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         vel_E3 = view.entity(self.entity).root_lin_vel_b_EL
+        # Both in the root's frame, x and y.
         error_E2 = view.command(self.command)[:, :2] - vel_E3[:, :2]
+        # Hopping is no part of any command, so that all vertical speed is an error.
         return self.rate(error_E2.square().sum(-1) + vel_E3[:, 2].square())
 
 
@@ -78,6 +85,7 @@ class TrackAngularVelocity(OfCommand, OfEntity, GaussianReward):
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         vel_E3 = view.entity(self.entity).root_ang_vel_b_EL
         error_E = view.command(self.command)[:, 2] - vel_E3[:, 2]
+        # Roll and pitch rates count as errors, too.
         return self.rate(error_E.square() + vel_E3[:, :2].square().sum(-1))
 
 
@@ -108,12 +116,13 @@ class TrackPosition(OfTarget, GaussianReward):
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOrientation(OfCommand, InFrame, GaussianReward):
-    """exp(-a^2 / std^2), `a` the angle, rad, of a body to that of `command` (`CartesianCommand`), in `frame`."""
+    """exp(-a^2 / std^2), `a` the angle, rad, between a body and `command` (`CartesianCommand`), in `frame`."""
 
     body: str
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         command_EK = view.command(self.command)
+        # The position of the target plays no part here.
         _, target_E4 = target_pose_w(view, command_EK, frame=self.frame, entity=self.entity)
         if target_E4 is None:
             raise ValueError(
@@ -143,6 +152,7 @@ class OfTilt(OfEntity):
         if self.body is None:
             return view.entity(self.entity).projected_gravity_EL[:, :2].square().sum(-1)
         # The world's z axis in the body's frame: the z components of the body's x and y axes.
+        # Axes are rows of `axes_E33`: rows x and y, component z.
         return view.body(self.body).axes_E33[:, :2, 2].square().sum(-1)
 
 
@@ -192,10 +202,12 @@ class Pose(OfCommand, OfJoints, RewardTerm):
         check_in_range("running_threshold", self.running_threshold, low=self.walking_threshold)
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # [E, 1], to broadcast over joints.
         speed_E1 = commanded_speed(view, self.command).unsqueeze(-1)
         standing_L = per_joint(view, "std_standing", self.std_standing, self.joints)
         walking_L = per_joint(view, "std_walking", self.std_walking, self.joints)
         running_L = per_joint(view, "std_running", self.std_running, self.joints)
+        # From the outside in: running or walking first, then standing, which wins below its threshold.
         moving_EL = torch.where(speed_E1 < self.running_threshold, walking_L, running_L)
         std_EL = torch.where(speed_E1 < self.walking_threshold, standing_L, moving_EL)
         return torch.exp(-(view.joints(self.joints).pos_rel_EL / std_EL).square().mean(-1))
@@ -248,8 +260,10 @@ class LinkAccelerationL2(RewardTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         vel_EN3 = view.bodies(self.bodies).lin_vel_EN3
         last_EN3 = view.buffer("last_vel_EN3", *vel_EN3.shape[1:])
+        # Over an env step, not a substep: an impact between the two moments is seen in full.
         acceleration_EN3 = (vel_EN3 - last_EN3) / view.step_dt
         last_EN3.copy_(vel_EN3)
+        # The first step has no velocity before it: the buffer's zero is not one.
         return torch.where(view.episode_step_E <= 1, 0.0, acceleration_EN3.square().sum((-2, -1)))
 
 
