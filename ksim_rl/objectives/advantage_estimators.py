@@ -28,7 +28,7 @@ from ksim_rl.objectives.masked import standardized
 
 @dataclass(frozen=True, kw_only=True)
 class Signals:
-    """What an advantage is made of, all of one shape; ET stands for any batch dims, and dim `time_dim` >= 0 is time."""
+    """The inputs of an advantage, all of one shape; ET stands for any batch dims, and dim `time_dim` >= 0 is time."""
 
     value_ET_t: Float[Tensor, "*batch 1"]
     value_ET_t_plus_1: Float[Tensor, "*batch 1"]
@@ -47,17 +47,17 @@ class Signals:
 
 
 class RolloutEstimator(ValueEstimatorBase):
-    """Base of `GAE`, `TDLambda` and `VTrace`, each beside TorchRL's estimator of that name: its keys and its results.
+    """Base of `GAE`, `TDLambda` and `VTrace`, each with the keys and the results of TorchRL's estimator of that name.
 
     The forward reads no tensor value on the host: it can be captured in a CUDA graph and compiled. The value after a
     step is V of the true next observation, which at a truncation is the last one of the episode, before the reset;
     after a termination it is zero. Gradients are not tracked. The `critic` (`value_network` for TorchRL) computes
-    `state_value` and `("next", "state_value")` always anew; without one the data has them. It takes all env
+    `state_value` and `("next", "state_value")` at each call; without one the data has them. It takes all env
     states in one batch dim. A recurrent critic needs batch dims [E, T]: it runs through the rollout from the state
-    of the first step, and the value after a step is that of the true next observation and the state after the step.
+    of the first step, and the value after a step is for the true next observation and the state after the step.
 
     A step whose reward or values are not finite gets a NaN advantage, so that `DatasetBuffer` removes it, and the
-    recursion starts anew before it: the steps that led there keep finite advantages, which bootstrap from the value at
+    recursion starts again before it: the steps that led there keep finite advantages, which bootstrap from the value at
     that step. A non-finite value after a termination does not matter. `normalize_advantage` shifts and scales the
     finite ones to mean 0 and standard deviation 1 over all env states, or divides by `min_advantage_std` where that is
     more (the default is TorchRL's). Time is the batch dim `time_dim`, whatever the names say.
@@ -79,6 +79,7 @@ class RolloutEstimator(ValueEstimatorBase):
     ) -> None:
         if critic is None:
             critic = value_network
+        # The constants, such as gamma, are buffers that should lie where the critic does.
         if device is None and critic is not None:
             device = next((parameter.device for parameter in critic.parameters()), None)
         super().__init__(
@@ -107,7 +108,7 @@ class RolloutEstimator(ValueEstimatorBase):
     ) -> TensorDictBase:
         """Write `advantage`, `value_target` [..., 1] and the state values into `tensordict`, and return it.
 
-        It has what the critic reads at the root and under "next", and "reward", "done" and "terminated" under "next".
+        It has the critic's inputs at the root and under "next", and "reward", "done" and "terminated" under "next".
         `params` and `target_params` are of a functional critic, at the root and under "next". Raises ValueError where a
         value, the reward or a flag is missing, or their shapes differ.
         """
@@ -115,6 +116,7 @@ class RolloutEstimator(ValueEstimatorBase):
         adv_ET, target_ET, finite_ET = self._estimate(signals, tensordict)
         if self.normalize_advantage:
             adv_ET = standardized(adv_ET, finite_ET, lowest_std=self.min_advantage_std)
+        # NaN marks the steps that the dataset has to remove.
         nan_ET = torch.full_like(adv_ET, torch.nan)
         tensordict.set(self.tensor_keys.advantage, torch.where(finite_ET, adv_ET, nan_ET))
         tensordict.set(self.tensor_keys.value_target, target_ET)
@@ -128,6 +130,7 @@ class RolloutEstimator(ValueEstimatorBase):
             raise ValueError(
                 f"time_dim={time_dim}: the data has {tensordict.batch_dims} batch dims {tuple(tensordict.batch_size)}"
             )
+        # Never negative, so that it holds for leaves with more dims than the batch.
         return time_dim % tensordict.batch_dims
 
     def _signals(
@@ -145,6 +148,7 @@ class RolloutEstimator(ValueEstimatorBase):
                 next_params = params
             else:
                 next_params = target_params
+            # A recurrent critic runs through the rollout first: the values after each step need its states there.
             if carries_state(critic):
                 tensordict.set(keys.value, self._unrolled_values(tensordict, params))
             else:
@@ -153,7 +157,9 @@ class RolloutEstimator(ValueEstimatorBase):
         signals = (keys.value, keys.reward, keys.done, keys.terminated)
         places = [keys.value, *(("next", key) for key in signals)]
         read: list[Any] = [tensordict.get(place, None) for place in places]
+        # An env without "terminated" ends all its episodes by "done".
         read[-1] = read[-2] if read[-1] is None else read[-1]
+        # All signals must agree: a [E, T] reward with a [E, T, 1] value would broadcast to [E, T, T].
         shapes: list[tuple[int, ...] | None] = []
         for signal in read:
             shapes.append(None if signal is None else tuple(signal.shape))
@@ -190,7 +196,7 @@ class RolloutEstimator(ValueEstimatorBase):
     def _in_rows(
         self, network: Callable[[TensorDictBase], Tensor], inputs: TensorDictBase, time_dim: int
     ) -> Tensor:
-        """Return what `network` gives for `inputs` in one batch dim, with the batch dims of `inputs` again."""
+        """Return the outputs of `network` for `inputs` in one batch dim, with the batch dims of `inputs` again."""
         if inputs.batch_dims < 2:
             return network(inputs)
         # Rows are taken in the order of the memory, which saves a copy of all observations.
@@ -203,6 +209,7 @@ class RolloutEstimator(ValueEstimatorBase):
         rows = inputs.apply(
             lambda leaf: leaf.movedim(first, 0).flatten(0, last_dim), batch_size=[inputs.numel()]
         )
+        # Rows go back to the batch dims in the order in which they were taken.
         shape = list(inputs.batch_size)
         shape.insert(0, shape.pop(first))
         return network(rows).unflatten(0, shape).movedim(0, first)
@@ -222,7 +229,7 @@ class RolloutEstimator(ValueEstimatorBase):
 
 
 def carries_state(network: TensorDictModuleBase) -> bool:
-    """Whether a network is recurrent: it writes under "next" what it reads at the root one step later."""
+    """Whether a network is recurrent: it writes under "next" the state that it reads at the root one step later."""
     return any(isinstance(key, tuple) and key[0] == "next" for key in network.out_keys)
 
 
@@ -241,6 +248,7 @@ def discounted_sum(
     terms, discounts = (leaf.movedim(time_dim, 0).unbind(0) for leaf in (term_ET, discount_ET))
     total = torch.zeros_like(terms[0])
     totals = []
+    # Backward in time: each sum contains the one of the step after it.
     for term_t, discount_t in zip(reversed(terms), reversed(discounts), strict=True):
         total = torch.addcmul(term_t, discount_t, total)
         totals.append(total)
@@ -250,10 +258,11 @@ def discounted_sum(
 def _discounted_errors(
     signals: Signals, gamma: Tensor, lmbda: Tensor, weight: Tensor | float = 1.0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what `_estimate` does, of the sums of weighted TD errors, discounted by gamma lambda in each episode."""
+    """Return the results of `_estimate` from sums of weighted TD errors, discounted by gamma lambda in each episode."""
     bootstrap_ET = signals.bootstrap(signals.value_ET_t_plus_1, gamma)
     delta_ET = weight * (signals.reward_ET + bootstrap_ET - signals.value_ET_t)
     finite_ET = delta_ET.isfinite()
+    # The recursion is cut at the end of an episode, and at steps that are not finite.
     adv_ET = discounted_sum(
         torch.where(finite_ET, delta_ET, torch.zeros_like(delta_ET)),
         torch.where(finite_ET & ~signals.done_ET, gamma * lmbda, 0.0),
@@ -279,11 +288,11 @@ class GAE(RolloutEstimator, value.GAE):
 
 
 class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
-    """Computes the lambda return as `value_target`, and what it exceeds the state value by as `advantage`.
+    """Computes the lambda return as `value_target`, and its excess over the state value as `advantage`.
 
     It is TorchRL's `TDLambdaEstimator` (Sutton and Barto, Reinforcement Learning, 2nd ed., section 12.1): the return
-    G_t = r_t + gamma ((1 - lambda) V(s_{t+1}) + lambda G_{t+1}), cut at the end of an episode. It gives what `GAE`
-    gives, but where the value after a step is not that of the next step, such as a target critic's under "next".
+    G_t = r_t + gamma ((1 - lambda) V(s_{t+1}) + lambda G_{t+1}), cut at the end of an episode. It equals
+    `GAE`, except where the value after a step differs from the value of the next step, as with a target critic.
     """
 
     def __init__(self, *, lmbda: float, **options: Any) -> None:
@@ -292,6 +301,7 @@ class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         # G_{t+1} is V_{t+1} + A_{t+1}: TD errors with this mean of both values after a step sum up to G_t - V_t.
         after_ET = signals.value_ET_t_plus_1
+        # A value that is not finite must not spoil the step before it, whose mean would be NaN.
         following_ET = _shifted(signals.value_ET_t.nan_to_num(0.0, 0.0, 0.0), after_ET, signals.time_dim)
         mean_ET = torch.where(signals.done_ET, after_ET, after_ET + self.lmbda * (following_ET - after_ET))
         return _discounted_errors(replace(signals, value_ET_t_plus_1=mean_ET), self.gamma, self.lmbda)
@@ -304,7 +314,7 @@ class VTrace(RolloutEstimator, value.VTrace):
     V(s_{t+1}) - V(s_t)), rho_t = min(rho_thresh, ratio_t) and c_t = lmbda min(c_thresh, ratio_t); `advantage` is rho_t
     (r_t + gamma value_target_{t+1} - V(s_t)), where the present policy (`actor`) took the action `ratio_t` times as
     often as the one that collected. TorchRL's `VTrace` has lmbda 1, and takes the log-probability of an action that it
-    draws anew, whose ratio has nothing to do with the data.
+    draws itself, whose ratio has nothing to do with the data.
     """
 
     lmbda: Tensor
@@ -335,7 +345,7 @@ class VTrace(RolloutEstimator, value.VTrace):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What the data must have, or the arguments of a call without a TensorDict."""
+        """The leaves that the data must have, or the arguments of a call without a TensorDict."""
         # Written out: the compiler cannot follow TorchRL's, which asks its base class for a property.
         keys = self.tensor_keys
         actor = self.actor_network
@@ -351,6 +361,7 @@ class VTrace(RolloutEstimator, value.VTrace):
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         time_dim = signals.time_dim
         value_ET_t_plus_1 = signals.value_ET_t_plus_1
+        # Truncated importance weights: rho scales the error of a step, c how far later errors reach back.
         ratio_ET = self._ratio(tensordict, signals)
         rho_ET = ratio_ET.clamp_max(self.rho_thresh)
         c_ET = self.lmbda * ratio_ET.clamp_max(self.c_thresh)
@@ -365,6 +376,7 @@ class VTrace(RolloutEstimator, value.VTrace):
     def _ratio(self, tensordict: TensorDictBase, signals: Signals) -> Tensor:
         actor = self.actor_network
         keys = [*self.actor_network.in_keys, *self.actor_network.dist_sample_keys]
+        # The states of a recurrent policy are in the data, so that each step can be judged by itself.
         with steps_of(actor):
             log_prob = self._in_rows(self._log_prob, tensordict.select(*keys), signals.time_dim)
         old_log_prob = tensordict.get(self.tensor_keys.sample_log_prob, None)
@@ -379,6 +391,7 @@ class VTrace(RolloutEstimator, value.VTrace):
     def _log_prob(self, rows: TensorDictBase) -> Tensor:
         dist = self.actor_network.get_dist(rows)
         if isinstance(dist, CompositeDistribution):
+            # The log-probabilities of several actions are added up: the ratio is of all of them together.
             with set_composite_lp_aggregate(True):
                 return dist.log_prob(rows)
         (action_key,) = self.actor_network.dist_sample_keys

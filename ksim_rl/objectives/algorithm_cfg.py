@@ -25,7 +25,7 @@ class AlgorithmCfg(Checked):
 
     @property
     def observation_groups(self) -> tuple[str, ...]:
-        """The observation groups that it reads beside those of the networks."""
+        """The observation groups that it reads in addition to the inputs of the networks."""
         return ()
 
     def check_recurrent(self) -> None:
@@ -40,7 +40,7 @@ class AlgorithmCfg(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class GradientCfg(AlgorithmCfg):
-    """What all algorithms of this package say about their gradient steps, by Adam, or AdamW off policy.
+    """The settings of gradient steps that all algorithms share, by Adam, or AdamW off policy.
 
     `max_grad_norm=None` does not clip; so many as `max_skipped_steps` in a row that are not finite end the run.
     """
@@ -53,6 +53,7 @@ class GradientCfg(AlgorithmCfg):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # A config file gives lists; a frozen dataclass is hashable only with tuples.
         object.__setattr__(self, "betas", tuple(self.betas))
         if not all(0.0 <= beta < 1.0 for beta in self.betas):
             raise ValueError(f"betas={self.betas!r}: expected two numbers in [0, 1)")
@@ -60,7 +61,7 @@ class GradientCfg(AlgorithmCfg):
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
-    """What the algorithms share that pass over each rollout `num_epochs` times, with one Adam.
+    """The settings of algorithms that pass over each rollout `num_epochs` times, with one Adam.
 
     The "adaptive" schedule changes the learning rate before each gradient step, within its bounds, so that the
     divergence of the policy from the one that collected the rollout stays near `desired_kl` nats.
@@ -77,6 +78,7 @@ class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # The bounds must be in order before the first rate is compared with them.
         low = self.learning_rate_min
         high = self.learning_rate_max
         if low > high:
@@ -96,14 +98,14 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
     Attributes:
         advantage: "gae", "td_lambda" (lambda returns; the same numbers in the rollout of a collector), or "vtrace",
             whose weights follow the policy from epoch to epoch, within `rho_thresh` and `c_thresh`; see `VTrace`.
-        estimate_each_epoch: estimate advantages and value targets anew before each epoch, with the present networks,
+        estimate_each_epoch: estimate advantages and value targets again before each epoch, with the present networks,
             instead of once (Andrychowicz et al., arXiv 2006.05990, section 3.5). "vtrace" always does.
         min_advantage_std: with `normalize_advantage="dataset"` advantages are divided by their standard deviation, at
             least this. Where no reward is seen they are errors of the critic, and soon shrink below any bound that
             fits the rewards: the policy stays as it is, where otherwise it would follow them and cease to explore.
         symmetry: "augment" adds the mirror image of each env state to its minibatch, "loss" adds `symmetry_coeff` times
             the mirror loss, which is zero for a policy that acts in the mirror as its mirror image.
-        precision: of what layers multiply in the gradient steps: "float32" (on CUDA as `trainer.matmul_precision`
+        precision: of the products of layers in the gradient steps: "float32" (on CUDA as `trainer.matmul_precision`
             says), or "bfloat16", which has 8 significant bits and moves the gradient by about half a percent of its
             norm; "auto" is "bfloat16" on CUDA and "float32" elsewhere. All else is always float32.
         kernels: "auto" takes a few fused kernels for the gradient steps where they fit device, precision and networks,
@@ -129,6 +131,7 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # A setting without effect is refused, so that nobody believes in a floor that is not there.
         if self.min_advantage_std != PPOCfg.min_advantage_std and self.normalize_advantage != "dataset":
             raise ValueError(
                 f"min_advantage_std={self.min_advantage_std!r} does nothing with normalize_advantage="
@@ -137,7 +140,7 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
 
     @property
     def estimates_each_epoch(self) -> bool:
-        """Whether advantages are estimated anew before each epoch."""
+        """Whether advantages are estimated again before each epoch."""
         return self.estimate_each_epoch or self.advantage == "vtrace"
 
     def check_recurrent(self) -> None:
@@ -154,8 +157,8 @@ class AMPCfg(PPOCfg):
     """PPO on the task's reward and on a style reward, learned from reference motions (Peng et al., arXiv 2104.02180).
 
     A discriminator tells transitions of the motions from those of the policy; the style reward, in [0, 1] per step, is
-    how much a transition looks like the motions. The sum `task_coeff * reward + style_coeff * style` is what PPO
-    maximizes; where the env multiplies its rewards by the step's seconds, a fitting `style_coeff` is as small. The
+    how much a transition looks like the motions. PPO maximizes the sum `task_coeff * reward + style_coeff * style`;
+    where the env multiplies its rewards by the step's seconds, a fitting `style_coeff` is as small. The
     group `style_group` is compared: its terms read positions and velocities, no commands, actions, contacts or forces,
     which a motion does not have. A gradient step of the discriminator is on `num_transitions_per_step` of the motions
     and as many of the policy, from the last `replay_rollouts` rollouts.
@@ -173,7 +176,7 @@ class AMPCfg(PPOCfg):
     logit_decay: NonNegative = 0.05  # of the squares of its last layer's weights
     num_discriminator_steps: Count = 10  # per rollout
     num_transitions_per_step: Count = 4096
-    # A rollout whose episodes all end at once takes two places per env state, and must not overwrite itself.
+    # A rollout whose episodes all end at the same time takes two places per env state, and must not overwrite itself.
     replay_rollouts: Annotated[int, Within(low=3)] = 10
 
     @property
@@ -183,6 +186,7 @@ class AMPCfg(PPOCfg):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # As above: lists of a config file become tuples.
         for field in ("motions", "discriminator_hidden_dims"):
             object.__setattr__(self, field, tuple(getattr(self, field)))
 
@@ -193,7 +197,7 @@ class DistillationCfg(OnPolicyCfg, num_epochs=2, checkpoint_fields=("teacher",))
 
     That is DAgger (Ross et al., arXiv 1011.0686) without its aggregate of all data: the newest rollout of thousands of
     envs stands for it. The loss "kl" is the divergence of the student's distribution from the teacher's, which also
-    learns how actions scatter; "mse" is that of the actions that both take deterministically, without noise while the
+    learns how actions scatter; "mse" compares the actions that both take deterministically, without noise while the
     student collects, for teachers without a distribution or with another kind of it. `teacher_share` is the chance that
     the teacher acts instead of the student, in each env state of the first rollout; it decays from rollout to rollout
     by a factor. With 0 a student that sees its own last action may drive it up without end before it has learned
@@ -208,7 +212,7 @@ class DistillationCfg(OnPolicyCfg, num_epochs=2, checkpoint_fields=("teacher",))
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyCfg(GradientCfg):
-    """What all off-policy objectives share, as learned by AdamW.
+    """The settings that all off-policy objectives share, as learned by AdamW.
 
     `value_reduction="min"` learns from, and climbs, the lowest of the predicted values (clipped double Q-learning,
     Fujimoto et al., arXiv 1802.09477); with "mean" each network learns from its own target, and the mean is climbed.
@@ -247,8 +251,8 @@ class TD3Cfg(OffPolicyCfg, policy_delay=2):
     """Twin delayed deterministic policy gradients (Fujimoto et al., arXiv 1802.09477).
 
     Targets take the present policy, not a slow copy of it, as FastTD3 does (Seo et al., arXiv 2505.22642). Each env has
-    a standard deviation of the noise on its actions from [exploration_noise_min, exploration_noise_max]; that of the
-    actions of targets is `target_noise`, clipped. All are in units of half the range of an action.
+    a standard deviation of the noise on its actions from [exploration_noise_min, exploration_noise_max]; the
+    noise on the actions of targets has `target_noise`, clipped. All are in units of half the range of an action.
     """
 
     exploration_noise_min: NonNegative = 0.1

@@ -84,13 +84,14 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
 
     @dispatch  # type: ignore[arg-type]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and what is logged beside them, all detached but those named `loss_*`.
+        """Return the losses and the logged quantities, all detached but those named `loss_*`.
 
         A minibatch is `["B"]`, or `["B","T"]` for recurrent networks, with the `dataset_keys`. Without an advantage it
         must be a rollout, from which the value estimator computes one. Returned, without batch dims, are
         `loss_objective`, `loss_critic`, `loss_entropy`, `entropy`, `kl`, `kl_approx`, `clip_fraction`,
         `value_clip_fraction` and `explained_variance`.
         """
+        # A shallow copy: the networks write their outputs into it, and the caller's minibatch stays as it was.
         tensordict = tensordict.clone(False)
         # Read before the actor runs, which writes its own distribution under the same keys.
         dist_old = stored_distribution(self.actor_network, tensordict)
@@ -111,10 +112,12 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             log_behavior_weight_B = log_weight_B
         else:
             log_behavior_weight_B = log_weight_B + log_is_weight_B
+        # Clipping the logarithm clips the ratio, and does not overflow as its exponential may.
         log_clipped_B = log_weight_B.clamp(*self._clip_bounds)
         clipped_B = log_clipped_B != log_weight_B
         if log_is_weight_B is not None:
             log_clipped_B = log_clipped_B + log_is_weight_B
+        # The smaller gain: a step that moves the ratio beyond its bounds earns nothing more.
         gain_B = torch.minimum(log_behavior_weight_B.exp() * adv_B, log_clipped_B.exp() * adv_B)
 
         losses = {"loss_objective": -gain_B}
@@ -124,11 +127,13 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
                 exact_B = None
             else:
                 exact_B = policy_kl(dist_old, dist)
+            # The adaptive learning rate reads this: the exact divergence has less noise than the estimate.
             logged["kl"] = estimated_kl(log_behavior_weight_B) if exact_B is None else exact_B.unsqueeze(-1)
         out = TensorDict({})
         if self.entropy_bonus:
             entropy_B = self._get_entropy(dist, adv_shape=adv_B.shape[:-1])
             losses["loss_entropy"] = self._weighted_loss_entropy(entropy_B)
+            # Several actions have an entropy each; the loss and the log take their sum.
             if is_tensor_collection(entropy_B):
                 out.set("composite_entropy", entropy_B.detach())
                 entropy_B = entropy_B.sum(dim="feature", reduce=True)  # type: ignore[call-overload]
@@ -139,13 +144,16 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             if value_clip_fraction is not None:
                 out.set("value_clip_fraction", value_clip_fraction)
             if explained_variance is not None:
+                # TorchRL keeps the last dim of size one here; all other logged values are scalars.
                 out.set("explained_variance", explained_variance.squeeze(-1))
         if self.log_ratio_statistics:
             out.update(_ratio_statistics(log_behavior_weight_B.detach()))
+        # Other reductions return losses per env state, which the shared mean below must not touch.
         if self.reduction != "mean":
             for name, loss in losses.items():
                 out.set(name, self._reduce_loss(loss, tensordict).squeeze(-1))
             losses = {}
+        # Losses and logged columns are averaged in one reduction, which saves a kernel for each of them.
         for name, mean in self._means(losses | logged, tensordict).items():
             out.set(name, mean if name in losses else mean.detach())
         self._clear_weakrefs(
@@ -171,6 +179,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     def _advantage(self, tensordict: TensorDictBase) -> Tensor:
         adv_B = tensordict.get(self.tensor_keys.advantage, None)
         estimate = adv_B is None
+        # Without an advantage in the data the value estimator runs on it, which must then be a rollout.
         if estimate:
             self.value_estimator(
                 tensordict,
@@ -182,6 +191,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
 
     def _means(self, columns: dict[str, Tensor], tensordict: TensorDictBase) -> dict[str, Tensor]:
         """Return the means over all env states that take part; one reduction for all columns."""
+        # One row per quantity, [K, B, 1].
         table = torch.stack(list(columns.values()))
         mask = self._mask(tensordict, table[0])
         if mask is None:
@@ -195,6 +205,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     def _mask(self, tensordict: TensorDictBase, column_B: Tensor) -> Tensor | None:
         masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
         masks = [self._expand_loss_mask(mask, column_B) for mask in masks if mask is not None]
+        # One mask is used as it is, without the copy of a stack.
         if len(masks) < 2:
             return masks[0] if masks else None
         return torch.stack(masks).all(0)
@@ -218,6 +229,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     def _entropy(self, dist: Distribution) -> Tensor:
         if has_analytic_entropy(dist):
             return dist.entropy()
+        # The mean of -log p over samples: an unbiased estimate where there is no closed form.
         _, log_prob = sample_and_log_prob(
             dist, (self.samples_mc_entropy,), reparameterize=bool(dist.has_rsample)
         )
@@ -240,6 +252,7 @@ def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
 def _ratio_statistics(log_weight: Tensor) -> dict[str, Tensor]:
     """Return TorchRL's statistics of the probability ratio: effective sample size (a share), maximum and mean."""
     log_weight_B = log_weight.squeeze(-1)
+    # The logarithm of (sum w)^2 / sum w^2, which does not overflow for large ratios.
     log_size = 2.0 * log_weight_B.logsumexp(0) - (2.0 * log_weight_B).logsumexp(0)
     ratio = log_weight.exp()
     return {"ESS": log_size.exp() / log_weight.shape[0], "max_ratio": ratio.max(), "mean_ratio": ratio.mean()}

@@ -20,7 +20,7 @@ def discriminator_loss(
     gradient_penalty: float,
     mask_B: Bool[Tensor, " B"] | None = None,
 ) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
-    """Return the least-squares loss of a discriminator D with a gradient penalty, and what is logged beside it.
+    """Return the least-squares loss of a discriminator D with a gradient penalty, and the quantities to log.
 
     It is mean((D(r) - 1)^2) + mean((D(p) + 1)^2) + w / 2 mean(|dD(r)/dr|^2), r of the reference and p of the policy:
     equation 8 of Peng et al., arXiv 2104.02180, w the `gradient_penalty`, whose gradient needs D to be differentiable
@@ -28,6 +28,7 @@ def discriminator_loss(
     `accuracy`, the share of transitions on their side of zero. With `mask_B` there are as many r as p (C is B), and the
     pairs where it is True count.
     """
+    # The penalty is on the slope at the features, which therefore need a gradient of their own.
     reference_CL = reference_CL.detach().requires_grad_()
     reference_C = judge(reference_CL)
     policy_B = judge(policy_BL)
@@ -37,6 +38,7 @@ def discriminator_loss(
         mean: Judge = torch.mean
     else:
         mean = partial(masked_mean, mask=mask_B)
+    # The squared norm of the slope at each reference transition, averaged over them.
     penalty = mean(slope_CL.square().sum(-1))
     loss = mean((reference_C - 1.0).square()) + mean((policy_B + 1.0).square())
     loss = loss + 0.5 * gradient_penalty * penalty

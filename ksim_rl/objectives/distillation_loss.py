@@ -19,7 +19,7 @@ from ksim_rl.objectives.policy_kl import distribution_keys, observation_keys, po
 from ksim_rl.transforms.specs import path_of
 
 TEACHER = "teacher"
-"""Under this key a dataset holds what the teacher would do: its action and, for "kl", its distribution."""
+"""Under this key a dataset holds the teacher's answer: its action and, for "kl", its distribution."""
 
 
 class DistillationLoss(nn.Module):
@@ -48,6 +48,7 @@ class DistillationLoss(nn.Module):
         if loss == "kl":
             if not isinstance(teacher, ProbabilisticTensorDictSequential):
                 raise ValueError("loss='kl': the teacher's policy has no distribution; use loss='mse'")
+            # The divergence needs the teacher's parameters; an action alone has no spread.
             self.label_keys += distribution_keys(teacher)
         self._has_choices = any(path_of(key)[-1] == "logits" for key in distribution_keys(actor_network))
         if loss == "mse" and self._has_choices:
@@ -62,11 +63,13 @@ class DistillationLoss(nn.Module):
 
     @torch.no_grad()
     def label(self, rollout_ET: TensorDictBase) -> TensorDictBase:
-        """Return a rollout `["E","T"]` with what the teacher would do in each env state, under "teacher"."""
+        """Return a rollout `["E","T"]` with the teacher's answer in each env state, under "teacher"."""
         (teacher,) = self._teacher
         seen_ET = rollout_ET.select(*observation_keys(teacher))
+        # Labels are the teacher's intent, without the noise of its exploration.
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             judged_ET = teacher(seen_ET)
+        # A shallow copy: the collector's buffers keep their keys.
         return rollout_ET.copy().set(TEACHER, judged_ET.select(*self.label_keys))
 
     @torch.no_grad()
@@ -74,6 +77,7 @@ class DistillationLoss(nn.Module):
         """Return the root mean square of a - a* by the policy that collected the data, in units of the action."""
         behaved = stored_distribution(self.actor_network, labelled)
         if behaved is None or self._has_choices:
+            # Choices have no distance, and some policies store no distribution.
             return torch.zeros((), device=labelled.device)
         return _action_error(behaved, labelled.get(TEACHER)).square().nanmean().sqrt()
 
@@ -82,7 +86,9 @@ class DistillationLoss(nn.Module):
 
         The minibatch, `["B"]` or `["B","T"]`, has the `dataset_keys`.
         """
+        # The student writes its outputs into the copy, not into the minibatch.
         minibatch_B = minibatch_B.clone(False)
+        # Read before the student runs, which overwrites the same keys.
         before = stored_distribution(self.actor_network, minibatch_B)
         with set_recurrent_mode(True):
             student = self.actor_network.get_dist(minibatch_B)
@@ -98,6 +104,7 @@ class DistillationLoss(nn.Module):
                 )
             loss_B = divergence_B
         with torch.no_grad():
+            # How far the student has moved since it collected; the adaptive learning rate follows it.
             if before is None:
                 moved_B = None
             else:

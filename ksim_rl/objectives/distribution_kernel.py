@@ -9,15 +9,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import Function
 
-# Lanes that a warp takes, of two rows or more at once: what one waits for, another computes.
+# Lanes that a warp takes, of two rows or more at a time: one row computes while another waits.
 LANES = 256
-# Powers of 2 are one instruction, those of e several.
+# A power of 2 is one instruction, a power of e several.
 LOG2_E = tl.constexpr(1.4426950408889634)
 
 
 @triton.jit
 def _exponentials(at, keep):
-    # Returned are logits, of which the largest is 0, their exponentials, the sum of these, and what the largest was.
+    # Returned are logits shifted so that the largest is 0, their exponentials, the sum of these, and the shift.
     logit = tl.load(at, mask=keep, other=-1e30).to(tl.float32)
     peak = tl.max(logit, 1)[:, None]
     units = tl.exp2((logit - peak) * LOG2_E)
@@ -38,12 +38,14 @@ def compare_rows(
 
     Program (i, n) is of network n. `logits`, `following` and `slope` are [N, num_rows, COUNT].
     """
+    # A tile [ROWS, LANES]: one lane per atom, and lanes beyond COUNT without one.
     row, atom = tl.program_id(0) * ROWS + tl.arange(0, ROWS)[:, None], tl.arange(0, LANES)[None, :]
     there, last = row < num_rows, COUNT - 1.0
     keep = there & (atom < COUNT)
     low = tl.load(support)
     spacing = (tl.load(support + COUNT - 1) - low) / last
     own = tl.program_id(1).to(tl.int64) * num_rows + row
+    # The predicted distribution and its mean, in float32 whatever the logits are.
     parts = _exponentials(logits + own * COUNT + atom, keep)
     logit, mass, total, _ = parts  # pyright: ignore[reportGeneralTypeIssues]
     mass *= 1.0 / total
@@ -53,6 +55,7 @@ def compare_rows(
         # Atom i moves to `start + scale * i`, in units of the spacing.
         start = (tl.load(reward + row, mask=there, other=0.0) + scale * low - low) / spacing
         moved, source = start + scale * atom, own
+        # All critics share the target of the lowest mean, so each program reads the logits of all of them.
         if LOWEST:
             lowest = tl.full((ROWS, 1), float("inf"), tl.float32)
             for network in range(NETWORKS):
@@ -62,10 +65,10 @@ def compare_rows(
                 source, lowest = tl.where(found < lowest, at, source), tl.minimum(found, lowest)
         following += source * COUNT
         _, of_next, sum_next, peak = _exponentials(following + atom, keep)
-        # The parts of what moves beyond the ends that are no neighbours' below.
+        # Mass that moves beyond the ends goes to the end atoms; the loop below sees neighbours only.
         target = tl.where(atom == 0, tl.sum(of_next * _within(-moved, 1.0), 1)[:, None], 0.0)
         target += tl.where(atom == last, tl.sum(of_next * _within(moved - last, 1.0), 1)[:, None], 0.0)
-        # Those that come to lie within one spacing of an atom are neighbours, and read again.
+        # Atoms that come to lie within one spacing of this one are its neighbours, and are read again.
         apart = tl.where(scale > 0.0, scale, 2.0)
         first = tl.floor((atom - 1.0 - start) * (1.0 / apart)) + 1.0
         near = tl.minimum(tl.maximum(first, 0.0), COUNT).to(tl.uint32)
@@ -81,6 +84,7 @@ def compare_rows(
         result = tl.sum(tl.where(keep, target * (tl.log(total) - logit), 0.0), 1)[:, None]
         change = mass - target
     else:
+        # Without targets the mean itself is the result, and the slope is its gradient.
         result, change = value, mass * (low + spacing * atom - value)
     tl.store(loss + own, result, mask=there)
     tl.store(mean + own, value, mask=there)
@@ -99,6 +103,7 @@ class Compared(Function):
         ctx: Any, logits_BNA: Float[Tensor, "B N A"], support_A: Float[Tensor, " A"], *targets: Any
     ) -> tuple[Float[Tensor, "B N"], Float[Tensor, "B N"]]:
         """Return both, and keep the gradient."""
+        # Network by network: the kernel reads the logits of one network as rows that follow each other.
         logits = logits_BNA.transpose(0, 1).contiguous()
         networks, rows, count = logits.shape
         slope = torch.empty_like(logits)
@@ -109,6 +114,7 @@ class Compared(Function):
             following_BNA, *moves, lowest = targets
             given = following_BNA.transpose(0, 1), *(move.expand(rows, 1) for move in moves)
         given = logits, *(own.contiguous() for own in given), support_A, loss_NB, mean_NB, slope
+        # A power of two of lanes holds all atoms; narrow rows share a warp.
         lanes = triton.next_power_of_2(count)
         tall = max(LANES // lanes, 2)
         warps = max(lanes // LANES, 1)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ksim_rl.device.compiling import compiled
 from ksim_rl.objectives.algorithm_cfg import OffPolicyCfg
 
-# Parameters begin at multiples of so many elements, as kernels that load 16 bytes at once ask.
+# Parameters begin at multiples of so many elements, as kernels that load 16 bytes at a time ask.
 ALIGNMENT = 32
 
 
@@ -36,10 +36,12 @@ class FlatAdamW(torch.optim.Optimizer):
         super().__init__(learning, rates)
         self._cfg = cfg
         self._learning = learning
+        # Zeros between the parameters: their gradient, moments and change stay zero.
         self._gaps = [own.new_zeros(-own.numel() % ALIGNMENT) for own in learning]
         self._flat, self._target = self._end_to_end(learning), self._end_to_end(list(target))
         self._moments = torch.zeros_like(self._flat), torch.zeros_like(self._flat)
         self._steps = torch.zeros((), device=device)
+        # Views of the flat moments, so that checkpoints see an optimizer like torch's.
         for own, mean, variance in zip(learning, *map(self._parts, self._moments), strict=True):
             self.state[own] = {"step": self._steps, "exp_avg": mean, "exp_avg_sq": variance}
         self._change_ = compiled(_change_, device=device, wanted=cfg.compile)
@@ -58,6 +60,7 @@ class FlatAdamW(torch.optim.Optimizer):
             flat = torch.cat(self._pieces([own.detach() for own in parameters]))
         else:
             flat = torch.empty(0)
+        # Modules keep their parameter objects, whose memory is now a part of the flat tensor.
         for parameter, part in zip(parameters, self._parts(flat) if parameters else (), strict=True):
             parameter.data = part
         return flat
@@ -70,7 +73,9 @@ class FlatAdamW(torch.optim.Optimizer):
         """
         gradients = []
         for own in self._learning:
+            # A parameter that the loss did not reach has no gradient, but a place in the flat one.
             gradients.append(torch.zeros_like(own) if own.grad is None else own.grad)
+        # The compiled function gets all tensors that change as arguments.
         changed = self._flat, *self._moments, self._steps, self._target
         given = self._pieces(gradients), loss.detach(), self.param_groups[0]["lr"]
         return self._change_(changed, *given, self._cfg)
@@ -94,7 +99,9 @@ def _change_(
     new_mean = mean.lerp(gradient, 1.0 - cfg.betas[0])
     new_variance = variance.lerp(gradient.square(), 1.0 - cfg.betas[1])
     change = new_mean / unbias[0] / ((new_variance / unbias[1]).sqrt() + cfg.adam_eps)
+    # Decoupled weight decay: it scales with the learning rate, and is not in the moments.
     change = rate * (change + cfg.weight_decay * flat)
+    # A step that is not finite changes nothing; a where keeps the decision on the device.
     flat.copy_(torch.where(made, flat - change, flat))
     mean.copy_(torch.where(made, new_mean, mean))
     variance.copy_(torch.where(made, new_variance, variance))

@@ -41,6 +41,7 @@ class StepGuard(nn.Module):
         """Count one gradient step; `found_inf` is 1 if it was skipped, else 0. Makes no host sync."""
         skipped = found_inf.to(torch.int64)
         self.skipped.add_(skipped)
+        # A step that was made multiplies by zero, which begins the count again without a branch.
         self.skipped_in_a_row.add_(skipped).mul_(skipped)
 
 
@@ -56,11 +57,13 @@ def clip_and_guard(
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm = nn.utils.get_total_norm(gradients)
+    # One flag for the whole step: the fused optimizer reads it on the device.
     if loss is None:
         finite = norm.isfinite()
     else:
         finite = norm.isfinite() & loss.isfinite()
     if max_grad_norm is not None:
+        # As in torch, 1e-6 keeps the factor finite where the norm is zero.
         torch._foreach_mul_(gradients, (max_grad_norm / (norm + 1e-6)).clamp_max(1.0))
     return norm, 1.0 - finite.to(torch.float32)
 
@@ -80,6 +83,7 @@ def adapt_learning_rate_(
     The rule of rsl_rl, without host syncs. A divergence of exactly zero (the policy has not moved yet), or one that is
     NaN, changes nothing.
     """
+    # Both candidates are computed, and one is chosen on the device: a branch would wait for the host.
     slower = (lr / factor).clamp_min(lr_min)
     faster = (lr * factor).clamp_max(lr_max)
     # Comparisons with NaN are False.
@@ -91,6 +95,7 @@ def adapt_learning_rate_(
 def rate_bounds(cfg: OnPolicyCfg, optimizer: torch.optim.Optimizer) -> Float32[Tensor, "2"]:
     """Return the least and the greatest learning rate, on the device, where `anneal_learning_rate_` changes them."""
     group = optimizer.param_groups[0]
+    # Kept in the group, as a captured graph needs the same address in each run.
     if "lr_bounds" not in group:
         bounds = cfg.learning_rate_min, cfg.learning_rate_max
         group["lr_bounds"] = torch.tensor(bounds, dtype=torch.float32, device=group["lr"].device)
@@ -104,6 +109,7 @@ def anneal_learning_rate_(cfg: OnPolicyCfg, optimizer: torch.optim.Optimizer, *,
         raise ValueError(f"done={done!r}: expected the share of the run that is done, in [0, 1]")
     if cfg.anneal_learning_rate:
         adapts = cfg.schedule == "adaptive"
+        # The adaptive rate keeps its freedom below a falling ceiling; a fixed one follows the line itself.
         ceiling = (cfg.learning_rate_max if adapts else cfg.learning_rate) * (1.0 - done)
         low, high = rate_bounds(cfg, optimizer)
         low.fill_(min(cfg.learning_rate_min, ceiling) if adapts else ceiling)
@@ -115,10 +121,12 @@ def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
 
     `optimizer.param_groups[0]["lr"]` is a float32 tensor [] on the device that changes in place.
     """
+    # A trunk that actor and critic share must be stepped once.
     parameters = list(dict.fromkeys(parameter for module in modules for parameter in module.parameters()))
     device = parameters[0].device
     return torch.optim.Adam(
         [{"params": parameters, "initial_lr": cfg.learning_rate}],
+        # A tensor, since a number would be baked into a captured graph.
         lr=torch.tensor(cfg.learning_rate, dtype=torch.float32, device=device),
         betas=cfg.betas,
         eps=cfg.adam_eps,
@@ -140,14 +148,17 @@ def go_back(
     A loss is a mean over the rows that `mask` marks, or over all: each rank weighs as much as it has of these. No loss
     may reach a parameter of another's optimizer.
     """
+    # None instead of zeros: parameters that no loss reaches then have no gradient to average or to clip.
     for name in losses:
         optimizers[name].zero_grad(set_to_none=True)
     ends = list(losses.values())
+    # One pass for all losses: none reaches the parameters of another, so their gradients do not mix.
     torch.autograd.backward(ends, [_ones((), dtype=end.dtype, device=end.device) for end in ends])
     if ranks.size() > 1:
         learnt = [parameter.grad for name in losses for parameter in _parameters(optimizers[name])]
         gradients = [gradient for gradient in learnt if gradient is not None]
         values = [value.detach() for value in (*losses.values(), *beside)]
+        # The share of rows that take part on this rank: ranks with more of them weigh more.
         if mask is None:
             weight = torch.ones_like(values[0])
         else:

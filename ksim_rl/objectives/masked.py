@@ -30,9 +30,11 @@ def standardized(
     values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"], *, lowest_std: float
 ) -> Float[Tensor, "*batch"]:
     """Shift and scale to mean 0 and standard deviation 1, or divide by `lowest_std`, over all that masks mark."""
+    # Sums of this rank; the merge below makes them sums of all ranks.
     count = mask.sum()
     own_mean = masked_mean(values, mask)
     own_squares = torch.where(mask, values - own_mean, 0.0).square().sum()
     count, mean, squares = ranks.merged(count, own_mean, own_squares)
+    # The unbiased estimate, as torch's `std`; with one value it is zero, and the bound takes over.
     std = (squares / (count - 1).clamp_min(1)).sqrt().clamp_min(lowest_std)
     return (values - mean.to(values.dtype)) / std.to(values.dtype)

@@ -42,7 +42,7 @@ Scalar = Float[Tensor, ""]
 
 
 class OffPolicyLoss(LossModule):
-    """The part of `SACLoss` and `TD3Loss` that is the same: how N critics learn, and what their values say.
+    """The part of `SACLoss` and `TD3Loss` that is the same: how N critics learn, and how their values are read.
 
     The critics are one TensorDict module that reads observations and "action", and writes "state_action_value" [B, N],
     or "state_action_logits" [B, N, A] if there is a `support_A`: logits of the return's distribution on its A atoms.
@@ -106,13 +106,13 @@ class OffPolicyLoss(LossModule):
 
     @property
     def observation_keys(self) -> list[NestedKey]:
-        """What actor and critics observe, each key once."""
+        """The observations that actor and critics read, each key once."""
         read = dict.fromkeys([*self.actor_network.in_keys, *self.critic_network.in_keys])
         return [key for key in read if key != self.tensor_keys.action]
 
     @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
-        """What a minibatch must have."""
+        """The leaves that a minibatch must have."""
         keys = self.tensor_keys
         observed = self.observation_keys
         following = [*observed, keys.reward, keys.terminated]
@@ -120,7 +120,7 @@ class OffPolicyLoss(LossModule):
 
     @property
     def out_keys(self) -> list[NestedKey]:  # type: ignore[override]
-        """What the forward returns, in the order of a call without a TensorDict; `select_out_keys` changes it."""
+        """The leaves that the forward returns, in the order of a call without a TensorDict; see `select_out_keys`."""
         return self._selected
 
     @out_keys.setter
@@ -128,22 +128,22 @@ class OffPolicyLoss(LossModule):
         self._selected = keys
 
     def reset_parameters_recursive(self) -> None:
-        """Draw the weights of the networks anew; targets begin as the critics do."""
+        """Draw the weights of the networks again; the targets begin as copies of the critics."""
         for network in (self.actor_network, self.critic_network):
             network.reset_parameters_recursive()
         self.update_target_(1.0)
 
     @abstractmethod
     def _next_action(self, following: TensorDictBase) -> tuple[Tensor, Tensor | None]:
-        """Return the actions of targets for what the actor observes, and what is added to their values, [B] or None."""
+        """Return the actions of targets for the next observations, and the bonus on their values, [B] or None."""
 
     @abstractmethod
     def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
-        """Return the losses of all else, each with gradients for its own network alone, and what is logged."""
+        """Return the other losses, each with gradients for its own network alone, and the quantities to log."""
 
     @dispatch  # type: ignore[arg-type]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return all losses, `loss_*`, and what is logged beside them, which is detached.
+        """Return all losses, `loss_*`, and the logged quantities, which are detached.
 
         The minibatch `["B"]`, with the `in_keys`, gets the absolute error of each env state as "td_error".
         """
@@ -163,11 +163,13 @@ class OffPolicyLoss(LossModule):
         """There is no value estimator."""
 
     def _predict(self, critic: TensorDictModule, observed: TensorDictBase, action: Tensor) -> Tensor:
-        """Return what the N critics say of an action: values [B, N], or logits [B, N, A] in the precision of layers."""
+        """Return what N critics predict for an action: values [B, N], or logits [B, N, A] in the layers' dtype."""
         keys = [key for key in critic.in_keys if key != self.tensor_keys.action]
+        # A selection is a new TensorDict, so the minibatch keeps the action of the data.
         inputs = observed.select(*keys).set(self.tensor_keys.action, action)
         out = critic(inputs).get(critic.out_keys[0])
         if self.support_A is None:
+            # Errors of values are differences of large numbers: bfloat16 would lose most of their digits.
             return out.to(torch.promote_types(out.dtype, torch.float32))
         return out
 
@@ -184,25 +186,31 @@ class OffPolicyLoss(LossModule):
         return values_BN.mean(-1)
 
     def critic_loss(self, tensordict: TensorDictBase) -> tuple[Scalar, dict[str, Scalar]]:
-        """Return the loss of the critics, which has gradients for them alone, and what is logged beside it."""
+        """Return the loss of the critics, which has gradients for them alone, and the quantities to log."""
         keys = self.tensor_keys
         following = tensordict.get("next")
         with torch.no_grad():
+            # Targets: the policy's action at the next observation, judged by the slow copy of the critics.
             next_action, next_bonus_B = self._next_action(following.select(*self.actor_network.in_keys))
             reward_B1 = following.get(keys.reward)
+            # Only terminations end the future; after a truncation the value of the last observation still counts.
             going_B1 = 1.0 - following.get(keys.terminated).to(reward_B1.dtype)
             steps_B1 = tensordict.get(keys.steps_to_next_obs, None)
+            # With n-step rewards the next observation lies `steps_B1` env steps ahead, at most n.
             if steps_B1 is None:
                 discount_B1 = self.gamma * going_B1
             else:
                 discount_B1 = self.gamma**steps_B1 * going_B1
             if next_bonus_B is not None:
+                # The entropy bonus belongs to the next state, so it is discounted and cut like the value there.
                 reward_B1 = reward_B1 + discount_B1 * next_bonus_B[:, None]
             next_predicted = self._predict(self._target_critic, following, next_action)
+        # Gradients of the critics begin here: the target above is a constant.
         predicted = self._predict(self.critic_network, tensordict, tensordict.get(keys.action))
         if self.support_A is None:
             with torch.no_grad():
                 target_BN = reward_B1 + discount_B1 * next_predicted
+                # The smallest of the critics' values counters the overestimation by a policy that seeks their maximum.
                 if self.value_reduction == "min":
                     target_BN = target_BN.amin(-1, keepdim=True)
             error_BN = predicted - target_BN
@@ -215,6 +223,7 @@ class OffPolicyLoss(LossModule):
             loss_B = loss_BN.sum(-1)
             # As in Rainbow (Hessel et al., arXiv 1710.02298), what is minimized is the priority.
             td_error_B = loss_BN.detach().amax(-1)
+        # Prioritized replay reads the error of each env state from here.
         tensordict.set(keys.priority, td_error_B)
         return self._mean(loss_B, tensordict), {
             "value": self._mean(values_BN.detach().mean(-1), tensordict),
@@ -227,6 +236,7 @@ class OffPolicyLoss(LossModule):
         if weight_B is None:
             weight_B = torch.ones_like(column_B)
         else:
+            # Priority weights are stored as [B, 1].
             weight_B = weight_B.reshape(column_B.shape)
         for key in self._loss_mask_keys():
             mask = tensordict.get(key, None)
@@ -237,6 +247,7 @@ class OffPolicyLoss(LossModule):
         # In two steps: the compiler makes one block of a sum to 8192 numbers, which takes three times as long.
         parts = math.gcd(len(column_B), 64)
         column_sum, weight_sum = (own.reshape(parts, -1).sum(-1).sum() for own in (column_B, weight_B))
+        # If no env state takes part both sums are zero, and so is the mean.
         return column_sum / weight_sum.clamp_min(torch.finfo(torch.float32).tiny)
 
 
@@ -268,6 +279,7 @@ class SACLoss(OffPolicyLoss):
         check_in_range("target_entropy", target_entropy)
         self.target_entropy = target_entropy
         device = next(critic_network.parameters()).device
+        # The logarithm is learned, so that the temperature stays positive under any step.
         log_alpha = torch.tensor(math.log(alpha_init), device=device)
         self.log_alpha = nn.Parameter(log_alpha, requires_grad=learn_alpha)
 
@@ -281,7 +293,7 @@ class SACLoss(OffPolicyLoss):
         return next_action, -self.alpha * log_prob_B
 
     def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
-        """Return the losses of actor and temperature, each with gradients for it alone, and what is logged."""
+        """Return the losses of actor and temperature, each with gradients for it alone, and the quantities to log."""
         observed = tensordict.select(*self.actor_network.in_keys)
         action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(observed))
         value_B = self._value(tensordict, action)
@@ -322,10 +334,13 @@ class TD3Loss(OffPolicyLoss):
 
     def _next_action(self, following: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         action = self.actor_network(following).get(self.tensor_keys.action)
+        # The target policy is smoothed: a critic must not be trusted at one sharp peak of its value.
         noise = (ranks.randn(action.shape, device=action.device) * self.target_noise).clamp(
             -self.target_noise_clip, self.target_noise_clip
         )
+        # Noise is in units of half the range, so that one setting fits actions of any units.
         action = action + noise * (self.high_L - self.low_L) / 2
+        # Noise may leave the box of the env's actions, beyond which the critics have learned nothing.
         return torch.maximum(torch.minimum(action, self.high_L), self.low_L), None
 
     def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:

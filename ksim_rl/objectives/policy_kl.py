@@ -23,6 +23,7 @@ def kl_divergence(
     scale: Float[Tensor, "*batch L"],
 ) -> Float[Tensor, "*batch"]:
     """Return KL(old || new) of two diagonal gaussians in nats, from means and standard deviations."""
+    # Written with the logarithm of the ratio, which is needed twice and exact where the two are equal.
     log_ratio = (scale_old / scale).log()
     error = ((loc_old - loc) / scale).square()
     return (0.5 * ((2.0 * log_ratio).exp() + error - 1.0) - log_ratio).sum(-1)
@@ -33,8 +34,9 @@ def gaussian_parameters(
 ) -> tuple[Float[Tensor, "*batch L"], Float[Tensor, "*batch L"]] | None:
     """Return `loc` and `scale` of a distribution built on a gaussian, else None.
 
-    The divergence between two that squash their samples in the same way is that of the gaussians beneath them.
+    Two that squash their samples in the same way have the same divergence as the gaussians beneath them.
     """
+    # Transformed distributions keep the gaussian inside, as `base_dist`.
     if hasattr(dist, "loc"):
         base = dist
     else:
@@ -50,6 +52,7 @@ def distribution_keys(actor: Any) -> list[NestedKey]:
     """Return the leaves from which a `ProbabilisticTensorDictSequential` builds its distribution, e.g. `loc`."""
     roots = {path_of(key) for key in actor.dist_params_keys}
     written = {path_of(key): key for key in actor.out_keys}
+    # Mixed actions write a nested entry, whose leaves are wanted and not the node above them.
     parents = {path[:depth] for path in written for depth in range(1, len(path))}
     return [
         key
@@ -59,7 +62,7 @@ def distribution_keys(actor: Any) -> list[NestedKey]:
 
 
 def observation_keys(actor: Any) -> list[NestedKey]:
-    """Return what any policy reads of an EnvState: its `in_keys` without the parameters that it writes itself."""
+    """Return the leaves of an EnvState that a policy reads: its `in_keys` without the parameters that it writes."""
     written = getattr(actor, "dist_params_keys", ())
     return [key for key in actor.in_keys if key not in written]
 
@@ -75,15 +78,17 @@ def policy_kl(old: Distribution, new: Distribution) -> Float[Tensor, "*batch"] |
     """Return KL(old || new) in nats with the batch shape of the two, or None where no closed form is known."""
     if isinstance(old, CompositeDistribution) and isinstance(new, CompositeDistribution):
         parts = [policy_kl(part, new.dists[key]) for key, part in old.dists.items()]
+        # Parts may keep dims of their action, over which independent components add up.
         dims = len(old.batch_shape)
         known = [
             part.flatten(dims).sum(-1) if part.ndim > dims else part for part in parts if part is not None
         ]
+        # One part without a closed form makes the sum unknown.
         if len(known) == len(parts):
             return reduce(add, known)
         return None
     if isinstance(old, TransformedDistribution):
-        # torch compares the two maps on the host. They are those of one policy.
+        # torch compares the two maps on the host. Both are of one policy, and so the same.
         parameters = gaussian_parameters(old), gaussian_parameters(new)
         if parameters[0] is None or parameters[1] is None:
             return None

@@ -54,6 +54,7 @@ def make_advantage(
     cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule
 ) -> RolloutEstimator:
     """Build the advantage estimator of `cfg`. It uses the modules as they are."""
+    # The estimator standardizes over the whole dataset; per minibatch the loss does it itself.
     options: dict[str, Any] = {
         "gamma": cfg.gamma,
         "lmbda": cfg.lmbda,
@@ -102,6 +103,7 @@ def make_symmetric(
         return lambda minibatch_B: loss(mirror(minibatch_B))
 
     def with_mirror_loss(minibatch_B: TensorDictBase) -> TensorDictBase:
+        # The mirror loss gets its coefficient here; PPO's own losses come with theirs.
         losses = loss(minibatch_B)
         return losses.set("loss_mirror", cfg.symmetry_coeff * mirror_loss(actor, minibatch_B, mirror))
 
@@ -124,11 +126,14 @@ def ppo_step(
     returns, detached, and `loss`, `grad_norm` (before clipping), `learning_rate` (of this step), `skipped` (0 or 1).
     """
     losses = loss(minibatch_B)
+    # All terms named `loss_*` are to be minimized; the others are logged only.
     total = reduce(add, [value for name, value in losses.items() if name.startswith("loss_")])
     learning_rate = optimizer.param_groups[0]["lr"]
     measured = {name: value.detach() for name, value in losses.items() if isinstance(value, Tensor)}
     mask = minibatch_B.get(MASK_KEY, None)
+    # From here on losses and measured values are means over all ranks, so that all ranks decide alike.
     go_back({"loss": total}, {"loss": optimizer}, mask=mask, beside=measured.values())
+    # Before the step, as in rsl_rl: the divergence is of the policy as it is now.
     if cfg.schedule == "adaptive":
         low = cfg.learning_rate_min
         high = cfg.learning_rate_max
@@ -145,6 +150,7 @@ def ppo_step(
         **measured,
         "loss": total.detach(),
         "grad_norm": grad_norm,
+        # A copy: the tensor itself changes in place with the next step.
         "learning_rate": learning_rate.clone(),
         "skipped": found_inf,
     }

@@ -18,12 +18,12 @@ Loss = Callable[[TensorDictBase], TensorDictBase]
 
 
 class SymmetricAugmentation:
-    """Adds to a minibatch what it looks like in the mirror (Mittal et al., arXiv 2403.04359, section III-B).
+    """Adds to a minibatch its mirror image (Mittal et al., arXiv 2403.04359, section III-B).
 
     The image of an env state has the mirrored observations, action and distribution of the policy that collected it;
-    advantage, value target, state value and log-probability are those of the env state, as they are the same in the
-    mirror: there another policy collected, which is the image of the one that did. `maps` has, by key, all observations
-    that the networks `read`, and "action"; a ValueError names those that it lacks. Makes no host sync.
+    advantage, value target, state value and log-probability are copied from the env state, as they are the same in
+    the mirror: there another policy collected, which is the image of the one that did. `maps` has, by key, all
+    observations that the networks `read`, and "action"; a ValueError names those that it lacks. Makes no host sync.
     """
 
     def __init__(
@@ -41,6 +41,7 @@ class SymmetricAugmentation:
         device = torch.device("cpu" if device is None else device)
         self._images = {key: mirror.tensors(device) for key, mirror in maps.items()}
         source_L, signs_L = self._images["action"]
+        # The mean mirrors as the action does; a standard deviation moves with its joint, but has no sign.
         self._images["loc"] = (source_L, signs_L)
         self._images["scale"] = (source_L, torch.ones_like(signs_L))
 
@@ -50,6 +51,7 @@ class SymmetricAugmentation:
 
     def image(self, minibatch_B: TensorDictBase) -> TensorDictBase:
         """Return the mirror image of a minibatch; leaves without a map are the same tensors."""
+        # A shallow clone: leaves without a map are shared, not copied.
         reflected_B = minibatch_B.clone(recurse=False)
         for key in self._images:
             leaf_BL = minibatch_B.get(key, None)
@@ -58,7 +60,8 @@ class SymmetricAugmentation:
         return reflected_B
 
     def reflect_every_second_(self, minibatch_B: TensorDictBase) -> None:
-        """Replace every second env state, and what follows it under "next", by its mirror image."""
+        """Replace every second env state, and the one that follows it under "next", by its mirror image."""
+        # By place in the minibatch: env states are drawn at random, so half of them suffice, without a draw.
         order_B = torch.arange(minibatch_B.batch_size[0], device=minibatch_B.device)
         reflected_B1 = (order_B % 2 == 1)[:, None]
         for part_B in (minibatch_B, minibatch_B.get("next")):
@@ -92,6 +95,7 @@ def mirror_loss(
     parameters = gaussian_parameters(dist)
     if parameters is None:
         raise ValueError(f"the mirror loss needs a gaussian policy, got {type(dist).__name__}")
+    # The first half are the policy's means in the env states, the second in their images, [B, A] each.
     loc_BL, loc_of_image_BL = parameters[0].chunk(2)
     image_of_loc_BL = mirror.image_of("action", loc_BL)
     error_B = (loc_of_image_BL - image_of_loc_BL).square().mean(-1)
