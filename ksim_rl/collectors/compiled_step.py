@@ -15,22 +15,22 @@ from ksim_rl.device.copying import copy_rows
 from ksim_rl.device.recording import recorded
 
 CHECKED_STEPS = 2
-"""Steps that are compared before a compiled one is used; what a step keeps elsewhere than in tensors shows in the
-second."""
+"""Steps that are compared before a compiled one is used: state that a step keeps outside of tensors shows in the
+second one."""
 EVERY = 7
-"""Of the rows, one in so many gets an action that is no number where that ends its episode."""
+"""One row in so many gets a NaN action, where a NaN action ends the episode."""
 
 
 class CompiledStep:
     """`env.step_and_maybe_reset` in few kernels: what torch computes between the launches of physics is compiled.
 
-    `tensordict` is what a policy makes of `root_E`, the EnvState before the step, in whose memory the step writes the
-    one after it; the policy's leaves may lie elsewhere each time. Making it takes steps of the env and leaves it as it
-    was. A RuntimeError where the step cannot be recorded, or where a compiled one gives something else: a number may
-    differ by 1e-4 of itself, and by more only in rows that the env's own step changes as much when its inputs move by
-    one unit in the last place.
+    `tensordict` is the policy's output for `root_E`, the EnvState before the step; the step writes the next root into
+    the memory of `root_E`. The policy's leaves may lie elsewhere at each call. The constructor steps the env and then
+    restores it. It raises a RuntimeError where the step cannot be recorded, or where the compiled step gives other
+    numbers: the tolerance is 1e-4 relative, and more only in rows where the env's own step changes as much when its
+    inputs move by one unit in the last place.
 
-    With `nan_ends_rows` a row whose action is not a number ends its episode, so that resets are compared as well. For
+    With `nan_ends_rows` a row whose action is NaN ends its episode, so that resets are compared as well. For
     `by_term` see `StepCheck`.
     """
 
@@ -43,18 +43,23 @@ class CompiledStep:
         nan_ends_rows: bool = False,
         by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
     ) -> None:
+        # The check owns the static memory that the policy's leaves are copied to before each step.
         self._check = StepCheck(env, root_E, tensordict, by_term)
         self._given = self._check.given
         with self._check.left_alone():
+            # One step in Python gives the list of torch operations and Warp launches.
             with recorded() as recorder:
                 self.env_state_E = self._check.own_step()
             self._next_E = self.env_state_E.select("next")
+            # The next root is copied to `root_E`, so only these leaves must outlive the kernels.
             returned = list(self._next_E.values(True, True))
             self._tape = Tape(recorder, num_rows=env.batch_size[0], returned=returned)
         with self._check.left_alone():
+            # Compare, then step for real, so that the second comparison starts from another state.
             for _ in range(CHECKED_STEPS):
                 self._refuse(self.differences())
                 self._run()
+            # The steps above may end no episode, and would leave the reset path unchecked.
             if nan_ends_rows:
                 with self._rows_ending(env.action_key):
                     self._refuse(self.differences())
@@ -64,11 +69,12 @@ class CompiledStep:
 
         The leaves lie in the same memory each time.
         """
+        # The kernels hold fixed addresses: the policy's output is moved to them.
         copy_rows(list(self._given.values()), [tensordict.get(key) for key in self._given])
         return self._run()
 
     def differences(self) -> list[str]:
-        """Return what the env's own step from the present state gives otherwise, with the last action; see `StepCheck`.
+        """Return the differences from the env's own step in the present state, with the last action; see `StepCheck`.
 
         Env, root and draws are left as they were.
         """
@@ -85,6 +91,7 @@ class CompiledStep:
         if action is None or not action.is_floating_point():
             yield
             return
+        # The policy may write into the same memory later, so the action is put back.
         held = action.clone()
         action[1::EVERY] = torch.nan
         yield

@@ -1,4 +1,4 @@
-"""Records one step of an env as a CUDA graph, so that it can be compared with what Python makes later."""
+"""Records one step of an env as a CUDA graph, so that it can be compared with a later step in Python."""
 
 from collections.abc import Callable, Mapping
 
@@ -28,16 +28,19 @@ class GraphStep:
     ) -> None:
         self._check = StepCheck(env, root_E, tensordict, by_term)
         self._run = Captured(self._step, device=env.device or torch.device("cpu"))
+        # A placeholder until the first call of `_step`.
         self._env_state_E = tensordict
         with self._check.left_alone():
+            # The eager calls, and one more that captures.
             for _ in range(self._run.warmup + 1):
                 self._run()
 
     def differences(self) -> list[str]:
-        """Return what the env's own step from the present state gives otherwise; see `StepCheck`."""
+        """Return the differences from the env's own step in the present state; see `StepCheck`."""
         return self._check.differences(self._replayed)
 
     def _replayed(self) -> TensorDictBase:
+        # A replay runs no Python: `_env_state_E` still names the graph's static output, which it fills.
         self._run()
         return self._env_state_E
 

@@ -1,4 +1,4 @@
-"""Keeps what a collector has recorded of an env true to the env, for as long as rollouts go on."""
+"""Keeps the recorded step of an env equal to the env's own Python, for as long as rollouts go on."""
 
 import warnings
 from collections.abc import Callable
@@ -19,15 +19,15 @@ from ksim_rl.envs.recorded_python import EAGER, KEEP, FrozenPythonError, Recorde
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Act = Callable[[], TensorDictBase]
-"""Gives what the policy makes of the present root; its draws do not count."""
+"""Returns the policy's output for the present root; random numbers drawn meanwhile are put back."""
 
 
 class Recording:
     """The recorded step of an env: kernels, if it `compiles`, and on CUDA the `graph` of whole rollouts.
 
-    It is made anew where Python has changed which it was made from. A change that comes again and again makes it wait
-    longer each time: the env's own Python runs meanwhile. What nothing shows but the numbers is found by comparing the
-    recorded step with the env's own, after 1, 2, 4, 8 ... rollouts: so a change is noticed after at most as many
+    It is made again when the Python that it was made from has changed. If changes come again and again, it waits longer
+    each time, and the env's own Python runs meanwhile. Changes that show only in the numbers are found by comparing the
+    recorded step with the env's own after 1, 2, 4, 8 ... rollouts: such a change is noticed after at most as many
     rollouts as there were before it.
 
     Attributes:
@@ -39,6 +39,7 @@ class Recording:
         self._compiles = compiles
         self._graph = graph
         self._has_graph = graph.device.type == "cuda" and not graph.is_eager
+        # With values by term, a difference can be reported by the name of a term.
         inner = part(env, ManagerBasedRlEnv)
         if inner is None:
             self._by_term = dict
@@ -54,6 +55,7 @@ class Recording:
         self._python = RecordedPython(env, others, is_compared=compiles or self._can_return)
         self.compiled_step: CompiledStep | None = None
         self._graph_step: GraphStep | None = None
+        # How many recordings were dropped, and for how many rollouts the next one waits.
         self._times = 0
         self._waiting = 0
         # Since the last recording.
@@ -75,6 +77,7 @@ class Recording:
 
         A FrozenPythonError where Python changes from step to step; see `RecordedPython`.
         """
+        # Python that cannot be recorded is refused here, with a message that names it.
         self._try_python(root_E, act)
         try:
             self.compiled_step = CompiledStep(
@@ -87,21 +90,23 @@ class Recording:
             )
 
     def calling(self) -> AbstractContextManager[None]:
-        """Be around a step of policy and env in Python: the first ones show whether it can be recorded."""
+        """Return a context for a step of policy and env in Python: the first steps show whether it can be recorded."""
         if self._python.is_known or not self._records:
             return nullcontext()
         return self._python.calling()
 
     def before_rollout(self, root_E: TensorDictBase, act: Act) -> list[Change]:
-        """Return what has changed in Python since the recording, which is then forgotten.
+        """Return the changes in Python since the recording, which is dropped if there are any.
 
         A FrozenPythonError where a change is without effect, or where a comparison shows one that was not seen.
         """
         if not (self._records and self._python.is_known):
             return []
+        # Cheap, some tens of microseconds, so it runs before each rollout.
         changes = self._python.changes()
         if changes:
             self._forget(changes)
+        # Nothing changed in this rollout: count down, and let the graph be captured when the wait is over.
         elif self._waiting:
             self._waiting -= 1
             self._graph.is_eager = self._waiting > 0
@@ -121,7 +126,7 @@ class Recording:
         return self.compiled_step is not None or self._graph.ready
 
     def _try_python(self, root_E: TensorDictBase, act: Act) -> None:
-        """Make the first steps of env and policy in Python, which leave no trace: it takes less than to record them."""
+        """Make the first steps of env and policy in Python and undo them, which is cheaper than a failed recording."""
         check = StepCheck(self._env, root_E, act())
         with check.left_alone():
             while not self._python.is_known:
@@ -132,6 +137,7 @@ class Recording:
 
     def _forget(self, changes: list[Change]) -> None:
         """Drop what was recorded, and wait with the next recording if this is not the first time."""
+        # 0, 1, 3, 7 ... rollouts: twice as long after each recording that was dropped.
         self._times += self._is_recorded
         self._waiting = (1 << max(self._times - 1, 0)) - 1
         what = f"{listed(changes)} since the env's step was recorded: it is recorded anew"
@@ -141,6 +147,7 @@ class Recording:
                 f"each step runs, which is SLOWER, until nothing has changed for {self._waiting} rollouts. {KEEP}"
             )
         warnings.warn(what, RuntimeWarning, stacklevel=4)
+        # Both recordings hold the old Python, and so do the remembered values.
         self._drop()
         self._python.forget()
         self._rollouts = self._agreed_after = 0
@@ -154,16 +161,20 @@ class Recording:
         """Compare the recorded step with the env's own, if it is time to."""
         if not self._can_return:
             return
+        # Taken right after the graph of the rollout, while Python is still what the graph was captured from.
         if self.compiled_step is None and self._graph_step is None:
             self._graph_step = GraphStep(self._env, root_E, act(), self._by_term)
+        # Only at powers of two, so that comparisons cost less and less of a long run.
         if self._rollouts.bit_count() != 1:
             return
         step = self.compiled_step or self._graph_step
         assert step is not None
+        # Both steps start from the same state and draws, and the env is restored afterwards.
         found = step.differences()
         if not found:
             self._agreed_after = self._rollouts
             return
+        # It is not known in which of these rollouts the change happened.
         suspects = self.unchecked_rollouts
         if self.compiled_step is not None:
             # Kernels that are made now agree, unless it is they that are wrong in this state: `compile` says that.

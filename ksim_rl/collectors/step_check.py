@@ -1,4 +1,4 @@
-"""Compares a recorded step of an env with the one that the env's own Python makes from the same state."""
+"""Compares a recorded step of an env with the step that the env's own Python makes from the same state."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -15,8 +15,8 @@ from torchrl.envs import EnvBase
 from ksim_rl.compiled.differences import NamedLeaves, differences
 from ksim_rl.compiled.rounding import Nudging, nudged
 
-# What the env last returned is no state of its own, and a recorded step returns it otherwise; how many contacts of all
-# worlds there were at most changes with the smallest difference in one.
+# `last_root` is not state, and a recorded step returns it in other memory. The peak contact counts under `overflow`
+# change with the smallest difference in one world.
 _LEFT_OUT = ("last_root.", "overflow/")
 
 
@@ -26,7 +26,7 @@ def _unchanged(value: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What a step begins from: the state of the env, the root, and what the policy gave."""
+    """The start of a step: the state of the env, the root, and the policy's leaves."""
 
     env: dict[str, Any]
     root_E: TensorDictBase
@@ -36,9 +36,9 @@ class _State:
 class StepCheck:
     """Makes the env's own step in the memory that a recorded one uses, and compares the two.
 
-    `root_E` is the EnvState before a step, in whose memory the one after it is written; `tensordict` is what a policy
-    made of it, whose own leaves are copied to `given`, where each step reads them. `by_term` gives tensors that each
-    step writes in place, by the term that they are of: it is named where they differ.
+    `root_E` is the EnvState before a step; the next root is written into its memory. `tensordict` is the policy's
+    output for it; the leaves that the policy added are copied to `given`, where each step reads them. `by_term` returns
+    tensors that each step writes in place, by the name of their term, which is reported where they differ.
     """
 
     def __init__(
@@ -52,6 +52,7 @@ class StepCheck:
         self._root_E = root_E
         self._by_term = by_term
         self._root_keys = list(root_E.keys(True, True))
+        # A shallow copy: leaves of the root stay shared with `root_E`, the policy's are replaced below.
         self._tensordict = tensordict.copy()
         self.given: dict[NestedKey, Tensor] = {}
         for key in tensordict.keys(True, True):
@@ -62,24 +63,30 @@ class StepCheck:
 
     def own_step(self) -> TensorDictBase:
         """Make the env's own step, write the next root, and return the EnvState."""
+        # A copy, since the env adds keys to the tensordict that it steps.
         env_state_E, next_root_E = self._env.step_and_maybe_reset(self._tensordict.copy())
         for key in self._root_keys:
             self._root_E.get(key).copy_(next_root_E.get(key))
         return env_state_E
 
     def differences(self, recorded_step: Callable[[], TensorDictBase]) -> list[str]:
-        """Return what the two steps from the present state give differently, each with the number of rows.
+        """Return the names of values that differ between the two steps, each with the number of rows.
 
         Both make the same draws. Afterwards env, root, the policy's leaves and torch's random numbers are as they were.
         """
+        # Everything below is undone from this state.
         start = self._state()
         try:
             with self._draws_forgotten():
+                # The env's own step is the reference.
                 true = self._results(self.own_step())
+            # The recorded step starts from the same bits and the same generator state.
             self._return_to(start)
             with self._draws_forgotten():
                 found = self._results(recorded_step())
 
+            # The reference again, from inputs that are off by one unit in the last place: a row that reacts
+            # strongly to that is chaotic, and may differ.
             def moved(number: int) -> NamedLeaves:
                 generator = torch.Generator().manual_seed(number)
                 self._return_to(start, partial(_nudged, generator=generator))
@@ -88,6 +95,7 @@ class StepCheck:
                 return self._results(env_state_E)
 
             rows = differences(found, true, num_rows=self._env.batch_size[0], moved=moved)
+        # Also after an error, so that training can go on.
         finally:
             self._return_to(start)
         return [f"{name} in {number} rows" for name, number in rows.items()]
@@ -104,6 +112,7 @@ class StepCheck:
 
     def _draws_forgotten(self) -> AbstractContextManager[None]:
         device = self._env.device
+        # Restores the CPU generator and the one of the env's own device.
         return torch.random.fork_rng([device] if device is not None and device.type == "cuda" else [])
 
     def _state(self) -> _State:
@@ -111,7 +120,7 @@ class StepCheck:
         return _State(self._env.state_dict(), self._root_E.clone(), given)
 
     def _return_to(self, start: _State, change: Callable[[Any], Any] = _unchanged) -> None:
-        """Restore a state, or what `change` makes of each tensor of it."""
+        """Restore a state, with `change` applied to each of its tensors."""
         self._env.load_state_dict({name: change(value) for name, value in start.env.items()})
         for key in self._root_keys:
             self._root_E.get(key).copy_(change(start.root_E.get(key)))
@@ -119,7 +128,8 @@ class StepCheck:
             self.given[key].copy_(change(value))
 
     def _results(self, env_state_E: TensorDictBase) -> NamedLeaves:
-        """Copy all that a step leads to: what terms gave, the EnvState, the next root, and the state of the env."""
+        """Copy all results of a step: values of terms, the EnvState's `next`, the next root, the state of the env."""
+        # First the values of terms, as the first differences are the ones that get reported.
         results = {name: value.clone() for name, value in self._by_term().items()}
         next_E = env_state_E.get("next")
         results |= {_spelled("next", key): leaf.clone() for key, leaf in next_E.items(True, True)}

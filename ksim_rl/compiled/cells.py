@@ -17,7 +17,7 @@ CTYPES = {
     torch.uint8: "unsigned char",
     torch.bool: "bool",
 }
-"""What an element is in C++."""
+"""The C++ type of an element by its torch dtype."""
 
 
 class NotARowError(Exception):
@@ -25,7 +25,7 @@ class NotARowError(Exception):
 
 
 class Element(NamedTuple):
-    """An element that is used: its tensor, the distance of rows (0 where all use the same), its array, and the C++."""
+    """An element in use: its tensor, the distance between rows (0 where all use the same), its array, and its C++."""
 
     tensor: Tensor
     distance: int
@@ -34,7 +34,7 @@ class Element(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """Statements for each place of a shape, rows aside, whose order does not matter, and the elements they use."""
+    """Statements for each place of a shape (without rows), in any order, and the elements that they use."""
 
     shape: tuple[int, ...]
     body: str
@@ -45,8 +45,8 @@ class Loop(NamedTuple):
 class Cells:
     """Where tensors lie, for the operation at hand: `rows` are E, and 0 where it has no rows.
 
-    `address` returns the name of an array, the place in it, and whether it has all rows. `loops` are those of the
-    operation, and `seen` what is used since the last one.
+    `address` returns the name of an array, the place in it, and whether it has all rows. `loops` are the loops of the
+    operation so far, and `seen` the elements in use since the last of them.
     """
 
     rows: int
@@ -61,13 +61,15 @@ class Cells:
         return replace(self, rows=0)
 
     def at(self, tensor: Shaped[Tensor, "*shape"], place: Sequence[str]) -> str:
-        """Return the element of a tensor at a place, which has the trailing dims of an operation, rows aside."""
+        """Return the element of a tensor at a place, whose indices are the operation's dims without the rows."""
         if tensor.dtype not in CTYPES:
             raise NotARowError(f"numbers of type {tensor.dtype}")
         if not tensor.numel():
             return "0"  # stands in sums over no elements, whose loops never run
+        # A number of the host is a constant of the kernel, as it is of a CUDA graph.
         if tensor.device != self.device:
             return literal(tensor.item(), CTYPES[tensor.dtype])
+        # The empty index stands for the row. Dims are aligned from the right, as torch broadcasts.
         indices = ([""] if self.rows else []) + list(place)
         if tensor.ndim:
             indices = indices[len(indices) - tensor.ndim :]
@@ -77,12 +79,14 @@ class Cells:
         terms = [str(offset)] if offset else []
         distance = 0
         for index, size, stride in zip(indices, tensor.shape, tensor.stride(), strict=True):
+            # A broadcast dim: all places share one number.
             if size == 1 or stride == 0:
                 continue
             if index:
                 terms.append(f"{index} * {stride}" if stride != 1 else index)
             else:
                 distance = stride
+                # An array of a row's own holds one row, so the row does not count there.
                 terms += [f"row * {stride}LL"] if has_all_rows else []
         text = f"{name}[{' + '.join(terms) or '0'}]"
         self.seen.append(Element(tensor, distance, name, text))
@@ -91,6 +95,7 @@ class Cells:
     def loop(self, shape: Sequence[int], body: Sequence[str]) -> None:
         """Write statements for each place of a shape, of indices `names_of(len(shape))`."""
         if 0 not in shape:
+            # A shape with a zero has no places, so its loop is left out.
             self.loops.append(Loop(tuple(shape), " ".join(body), self.seen[:]))
         self.seen.clear()
 
@@ -104,6 +109,7 @@ def literal(value: float, ctype: str) -> str:
     """Return a number of Python in C++."""
     if ctype in ("float", "double"):
         value = float(value)
+        # Python spells these numbers in ways that C++ does not know.
         if math.isnan(value):
             return "NAN"
         if math.isinf(value):

@@ -1,8 +1,8 @@
 """Deals the loops of a row out to a few lanes of a warp.
 
-One thread per row leaves most of a GPU idle, and neighbours read far apart. Here lanes share the places of a loop, and
-wait only where one needs what another has made: loops of one level need nothing of each other, but for the same place
-of the same shape, which is with the same lane. Lone numbers are worked out by all lanes. Sums keep their order.
+One thread per row leaves most of a GPU idle, and neighboring threads read far apart. Here lanes share the places of a
+loop, and wait only where one needs a result of another. Loops of one level need nothing of each other, except for the
+same place of the same shape, which the same lane has. Single numbers are computed by all lanes. Sums keep their order.
 """
 
 import re
@@ -14,7 +14,8 @@ from typing import NamedTuple
 from ksim_rl.compiled.cells import Loop
 
 LANES = {"cpu": 0, "cuda": 8}
-"""Lanes of a row by type of device; 0 where one thread does all of it."""
+"""Lanes of a row by type of device; 0 where one thread does the whole row."""
+# One warp, so that `__syncwarp` is all the waiting that lanes of a row need.
 BLOCK = 32
 DEAL = """
     auto deal = [&](int count, auto body) {
@@ -30,7 +31,7 @@ DEAL = """
         #define WAIT
     #endif
 """
-# Every lane has its own, or those of a row share it, or it is one number at each place that a lane is at.
+# Three kinds of array: each lane has a copy; the lanes of a row share it; or one register at each place of a lane.
 _LONE = "{ctype} {name}[1];"
 SHARED = "ARRAY({ctype}, {name}, {size})"
 _PRIVATE = "struct {{ {ctype} x; auto& operator[](int) {{ return x; }} }} {name};"
@@ -47,7 +48,7 @@ class Own(NamedTuple):
 
 @dataclass(eq=False)
 class Work:
-    """A loop of the operation of this number, and which arrays it writes.
+    """A loop of the operation with this number, and the names of the arrays that it writes.
 
     `level` counts the waits before it, and `is_whole` says that each lane does all of it.
     """
@@ -67,35 +68,42 @@ class Work:
 
     def shares(self, name: str, other: "Work") -> bool:
         """Whether both use an array at the same place in the same lane."""
+        # One spelling, and no index that is itself read from an array: then equal places are equal elements.
         first, *others = self.texts[name] | other.texts[name]
         is_same = prod(self.shape) == 1 or not others and first.count("[") == 1
         return is_same and self.shape == other.shape and not self.is_whole and not other.is_whole
 
     def follow(self, before: "Work", kinds: Mapping[str, str]) -> None:
-        """Take a level at which this may come after another work."""
+        """Raise the level so that this may come after another work."""
+        # Read after write, write after write, and write after read.
         names = before.written & self.texts.keys() | self.written & before.texts.keys()
+        # Loops of one operation have no order among themselves.
         if names and before.operation != self.operation:
             is_at_once = all(
                 before.is_whole if kinds.get(name) == _LONE else before.shares(name, self) for name in names
             )
+            # A level further where lanes must wait, and the same level where each lane reads its own numbers.
             self.level = max(self.level, before.level + (not is_at_once))
 
 
 def schedule(works: Sequence[Work], own: Sequence[Own]) -> dict[str, str]:
-    """Give all works their levels, and return what kind of array each of `own` is."""
+    """Give all works their levels, and return the kind of array of each of `own`."""
     users = {}
     kinds = {}
     for one in own:
         users[one.name] = [work for work in works if one.name in work.texts]
         kinds[one.name] = _LONE if one.size == 1 else SHARED
+    # A single number that is written in a loop of many places would be written by several lanes.
     for work in works:
         if prod(work.shape) > 1:
             kinds |= dict.fromkeys(work.written & kinds.keys(), SHARED)
     for number, work in enumerate(works):
+        # A loop that only writes copies of each lane is done by each lane.
         work.is_whole = bool(work.written) and all(kinds.get(name) == _LONE for name in work.written)
         for before in works[:number]:
             work.follow(before, kinds)
     for name, used in users.items():
+        # An array that lives in one level, at one place per lane, needs no memory: a register will do.
         if all(
             len(one.texts[name]) == 1 and one.level == used[0].level and one.shares(name, used[0])
             for one in used
@@ -107,14 +115,16 @@ def schedule(works: Sequence[Work], own: Sequence[Own]) -> dict[str, str]:
 def source(
     works: Sequence[Work], own: Sequence[Own], kinds: Mapping[str, str], read: Mapping[str, str] | None
 ) -> Iterator[str]:
-    """Write what the lanes of a row do, with loads ahead of what is only `read`; one lane does all of it for None."""
+    """Write the C++ of a row, with loads of `read`-only numbers first; with None, one lane does everything."""
     declared = {one.name: kinds[one.name].format(**one._asdict()) for one in own}
     yield from (line for name, line in declared.items() if kinds[name] != _PRIVATE)
     yield from () if read is None else _loads(works, read)
     for level in range(max(work.level for work in works) + 1):
+        # Within a level: first the loops that every lane does, then the dealt ones, joined by shape.
         here = [work for work in works if work.level == level]
         yield "WAIT"
         yield from (f"{_nest(work.shape)} {{ {work.body} }}" for work in here if work.is_whole)
+        # Joined loops let a lane keep intermediate numbers in registers.
         for shape in dict.fromkeys(work.shape for work in here if not work.is_whole):
             dealt = [work for work in here if work.shape == shape and not work.is_whole]
             used = dict.fromkeys(name for work in dealt for name in work.texts if kinds.get(name) == _PRIVATE)
@@ -129,6 +139,7 @@ def _nest(shape: Sequence[int]) -> str:
 
 
 def _deal(shape: Sequence[int]) -> str:
+    # The lane gets one running number, and C++ recovers the indices i0, i1, ... from it.
     head = f"deal({prod(shape)}, [&](int i, int turn) {{"
     rest = "i"
     for k, size in reversed(list(enumerate(shape))):
@@ -138,10 +149,12 @@ def _deal(shape: Sequence[int]) -> str:
 
 
 def _loads(works: Sequence[Work], read: Mapping[str, str]) -> Iterator[str]:
-    """Load what is only read ahead of all, as each level would wait for memory anew."""
+    """Load read-only numbers before everything else, as each level would wait for memory again."""
     known: dict[tuple[str, tuple[int, ...]], str] = {}
     for work in works:
+        # Longest first, as one element's text may hold another's.
         for _, _, array, text in sorted(work.loop.elements, key=lambda element: -len(element.text)):
+            # Only elements whose indices, too, are read-only.
             if text not in work.body or not set(re.findall(r"\b(?!row|i\d)[a-z]\w*", text)) <= read.keys():
                 continue
             if re.search(r"\bi\d", text):

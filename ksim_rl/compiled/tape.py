@@ -1,9 +1,9 @@
 """Fuses recorded torch operations that act per env into a few kernels.
 
-Operations that keep to their row, one after the other, become one kernel, in C++ of `row_code`, with a thread per row
-or a few `lanes`; what lives in one kernel only lives in a row's own memory. Other operations are run by torch as they
-were, and launches of Warp are issued anew. A replay uses the memory of the recording and runs no Python of the
-function, as a CUDA graph does, and what is fit for that is fit for this.
+Consecutive operations that keep to their row become one kernel, in C++ of `row_code`, with a thread per row or a few
+`lanes`; tensors that only one kernel uses become arrays of a row's own. Torch runs the other operations as they were,
+and Warp's launches are issued again. Like a CUDA graph, a replay uses the memory of the recording and runs no Python
+of the function, so a function that can be captured can be recorded here.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,11 +24,11 @@ from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, arguments_of
 from ksim_rl.device.recording import Operation, Recorder
 
 MOST_SHARED = 256
-"""Numbers without rows that each thread works out for itself."""
+"""At most so many numbers without rows are computed by each thread for itself."""
 MOST_OPERATIONS = 200
-"""Operations of one kernel, whose compilation takes longer the more there are."""
+"""At most so many operations in one kernel; its compilation takes longer the more there are."""
 MOST_BYTES = 40_000
-"""Shared memory for the arrays of the rows of a block."""
+"""Shared memory of a block for the arrays of its rows; a kernel that needs more gets one thread per row."""
 _COUNTS = frozenset(
     {"count_non_finite"}
 )  # all rows add to the same numbers, in an order that does not matter
@@ -40,7 +40,7 @@ def _storage(tensor: Tensor) -> int:
 
 @dataclass(eq=False)
 class _Memory:
-    """Pieces of memory, each known by where it begins: the storages of a recording, and what overlaps outside of it."""
+    """Pieces of memory by first address: storages made in a recording, and joined extents of tensors from outside."""
 
     made: dict[int, Tensor]
     starts: dict[tuple[int, int], int]
@@ -49,14 +49,17 @@ class _Memory:
     def of(cls, operations: Sequence[Operation]) -> "_Memory":
         made: dict[int, Tensor] = {}
         for operation in operations:
+            # A view of a tensor that is read makes no memory.
             before = {_storage(tensor) for tensor in operation.read()}
             for tensor in operation.made:
                 if tensor.numel() and _storage(tensor) not in before:
                     made.setdefault(_storage(tensor), tensor)
+        # Memory from outside may be reached by tensors that overlap; these must count as one place.
         used = [tensor for one in operations for tensor in (*one.read(), *one.made) if tensor.numel()]
         starts: dict[tuple[int, int], int] = {}
         start = 0
         end = 0
+        # Sorted by address, so one pass merges all extents that overlap.
         for first, last in sorted({extent(tensor) for tensor in used if _storage(tensor) not in made}):
             start = first if first >= end else start
             end = max(end, last)
@@ -94,9 +97,12 @@ class _Use:
     def allows(self, other: "_Use") -> bool:
         """Whether `other` may follow in the same kernel: no row sees what another one writes."""
         for place, distances in other.distances.items():
+            # One distance means that each row stays with its own numbers. Two distances in one place mean
+            # that a thread would read numbers of another row, and threads of a kernel have no order.
             is_written = place in self.written or place in other.written
             if is_written and len(distances | self.distances.get(place, set())) > 1:
                 return False
+        # Counters are complete only when all rows have run, so no other operation here may touch them.
         mine = self.distances.keys() - self.counted
         theirs = other.distances.keys() - other.counted
         return self.counted.isdisjoint(theirs) and other.counted.isdisjoint(mine)
@@ -104,7 +110,7 @@ class _Use:
 
 @dataclass(eq=False)
 class Kernel:
-    """Operations that run as one, each with E, or with 0 where it has no rows."""
+    """Operations that run as one kernel, each with its number of rows: E, or 0 where it has none."""
 
     operations: list[tuple[Operation, int]] = field(default_factory=list)
     use: _Use = field(default_factory=_Use)
@@ -118,8 +124,8 @@ class Kernel:
 class Tape:
     """A recorded function of the rows of a batch as kernels and launches.
 
-    Call it to run them: it reads and writes the memory of the recording, what was returned included. `num_rows` is E,
-    and `returned` what is used afterwards.
+    Call it to run them: it reads and writes the memory of the recording, returned tensors included. `num_rows` is E,
+    and `returned` are the tensors that are used afterwards.
     """
 
     def __init__(
@@ -134,10 +140,14 @@ class Tape:
                 self.parts.append(entry)
             elif self._does_something(entry):
                 self._add(entry)
+            # Its result on the host would be a constant of the kernels.
             elif torch.Tag.nondeterministic_seeded in entry.function.tags:
                 raise RuntimeError(f"{entry.function} draws numbers on the host, and would draw them once")
+        # Only now, as the memory of a kernel depends on all parts that come after it.
         self._own = self._find_own(returned)
+        # Kernels hold addresses only, so these tensors must stay alive.
         self._kept = [tensor for place, tensor in self._memory.made.items() if place not in self._own]
+        # All sources first, so that they are compiled together.
         modules = [self._compiled(part) for part in self.parts if isinstance(part, Kernel)]
         kernel_loading.load([module for module in modules if module], self._device)
 
@@ -153,11 +163,13 @@ class Tape:
 
     def _add(self, operation: Operation) -> None:
         """Put an operation into the kernel that comes last, or into a new one, or leave it to torch."""
+        # The count of NaN writes numbers without rows, but runs over the rows of its table.
         first = (*operation.made, *operation.written)[0]
         has_rows = first.ndim > 0 and first.shape[0] == self._num_rows or operation.name in _COUNTS
         rows = self._num_rows if has_rows else 0
         last = self.parts[-1] if self.parts else None
         try:
+            # Writing the C++ is the test: it fails for an operation that mixes rows or is unknown.
             use = self._use(operation, rows)
         except NotARowError:
             self.parts.append(operation)
@@ -167,6 +179,7 @@ class Tape:
             kernel = last
         else:
             kernel = Kernel()
+        # Numbers that all rows share, written in place: fine in memory that the kernel itself made.
         alone = {place for place in use.written if 0 in use.distances[place]}
         if not alone <= kernel.use.made | use.made:
             self.parts.append(operation)  # each row would write numbers that are there for all
@@ -178,12 +191,14 @@ class Tape:
 
     def _use(self, operation: Operation, rows: int) -> _Use:
         """Return how an operation uses memory; a NotARowError where it does not keep to its row."""
+        # A dry run with made-up addresses, which collects the elements that the loops use.
         cells = Cells(rows=rows, address=lambda _: ("", 0, True), device=self._device)
         row_code.write(operation, cells)
         use = _Use()
         counts = operation.name in _COUNTS
         for tensor, distance, _, _ in (element for loop in cells.loops for element in loop.elements):
             root = self._memory.made.get(_storage(tensor))
+            # An array of a row's own has one C type, so reinterpreted memory is left to torch.
             if root is not None and root.dtype != tensor.dtype:
                 raise NotARowError("memory of two types")
             if not rows and tensor.numel() > MOST_SHARED:
@@ -202,7 +217,8 @@ class Tape:
         return use
 
     def _find_own(self, returned: Sequence[Tensor]) -> dict[int, Kernel]:
-        """Return the memory that one kernel alone uses, which need not exist outside of it."""
+        """Return the memory that only one kernel uses, by place: it need not exist outside of that kernel."""
+        # The parts that use each storage.
         users: dict[int, list[object]] = {}
         for part in self.parts:
             if isinstance(part, Kernel):
@@ -215,6 +231,7 @@ class Tape:
                         users.setdefault(_storage(tensor), []).append(part)
         outside = {_storage(tensor) for tensor in returned}
         own: dict[int, Kernel] = {}
+        # A storage that is returned must exist outside.
         for place in self._memory.made.keys() & users.keys() - outside:
             kernel, *others = users[place]
             is_alone = isinstance(kernel, Kernel) and all(other is kernel for other in others)
@@ -226,15 +243,19 @@ class Tape:
         """Return how many numbers of a storage a row of a kernel uses; 0 where that cannot be a piece of its own."""
         width = self._memory.width(place)
         distances = kernel.use.distances.get(place, {0})
+        # Without rows each thread keeps a copy of the whole storage.
         if distances == {0}:
             return width if width <= MOST_SHARED else 0
+        # With rows, only where rows lie one behind the other and fill the storage.
         width, rest = divmod(width, self._num_rows)
         if distances == {width} and not rest:
             return width
         return 0
 
     def _compiled(self, kernel: Kernel) -> tuple[wp.Module, int] | None:
-        """Give a kernel its launch, and return what is to be compiled; None where nobody sees what it computes."""
+        """Give a kernel its launch, and return the module to compile; None where nothing reads the kernel's results."""
+        # By place its name in C++; places that are kernel arguments; pointers among them by C type;
+        # arrays of a row's own; and loops that store shared results at the end.
         names: dict[int, str] = {}
         given: list[int] = []
         pointed: dict[str, str] = {}
@@ -257,9 +278,11 @@ class Tape:
                 if is_shared and not is_own:  # each row works it out, and one hands it on
                     end = f"if (row == 0) (({ctype}*)a.{name})[i0] = {name}[i0];"
                     ends.append(Loop((own[-1].size,), end, [Element(tensor, 0, name, f"{name}[i0]")]))
+            # A place is a byte address, and C++ counts elements.
             offset = (tensor.data_ptr() - place) // tensor.element_size()
             return names[place], offset, not (is_own or is_shared)
 
+        # Write each operation again, now with true addresses.
         works: list[Work] = []
         changed: set[str] = set()
         for number, (operation, rows) in enumerate(kernel.operations):
@@ -273,11 +296,13 @@ class Tape:
         works += [Work(loop, -1, set()) for loop in ends]
         if not given:
             return None
+        # Decide what each lane does, and whether the arrays of the block's rows fit in shared memory.
         kinds = schedule(works, own)
         on_chip = sum(one.size * one.bytes for one in own if kinds[one.name] == SHARED)
         lanes = LANES[self._device.type]
         if not (lanes and BLOCK // lanes * on_chip <= MOST_BYTES):
             lanes = 0
+        # Only pointers that no operation writes may be `const`, and be loaded ahead.
         read = {name: ctype for name, ctype in pointed.items() if name not in changed}
         # No two of them overlap, so that numbers may be read ahead of what is written, unless by another lane.
         kept = "" if lanes else "__restrict__"
@@ -286,6 +311,7 @@ class Tape:
             for name, ctype in pointed.items()
         )
         calls = ", ".join(f"({ctype}*)a.{name}" for name, ctype in pointed.items())
+        # Assemble the text of the kernel and its launch.
         body = source(works, own, kinds, read if lanes else None)
         body = [f"auto run = [&]({pointers}) {{", *body, "};", f"run({calls});"]
         sizes = f"#define LANES {max(lanes, 1)}\n#define BLOCK {BLOCK}"
@@ -297,5 +323,6 @@ class Tape:
         self._kept += [
             tensor for one, _ in kernel.operations for tensor in one.read() if _storage(tensor) in given
         ]
+        # The launch has all that it needs, so the recorded operations and their tensors are dropped.
         kernel.operations.clear()
         return launch.loadable
