@@ -1,4 +1,4 @@
-"""Resets by masks: `step_and_maybe_reset` never syncs, and partial resets leave the other rows alone."""
+"""Resets by masks: `step_and_maybe_reset` never syncs, and partial resets keep the other rows."""
 
 import functools
 import random
@@ -25,7 +25,7 @@ _RESET_KEYWORDS = ("tensordict", "seed", "env_ids", "options", "set_state", "sel
 
 
 class _Seed:
-    """Is a method of an env, and of its class."""
+    """A descriptor that makes `seed` a method of an env and of its class, too."""
 
     def __get__(self, env: EnvBase | None, _owner: type) -> Callable[..., int]:
         return functools.partial(_seed, env)
@@ -33,11 +33,13 @@ class _Seed:
 
 def _seed(env: EnvBase | None, seed: int = -1) -> int:
     if seed == -1:
+        # -1 stands for a seed that is drawn here; the caller gets it back.
         seed = secrets.randbelow(2**31)
     if env is not None:
         env.set_seed(seed)
     else:
         random.seed(seed)
+        # NumPy takes 32 bits only.
         np.random.seed(seed % 2**32)
         torch.manual_seed(seed)
     return seed
@@ -78,12 +80,14 @@ class MaskedReset(EnvBase):
         return []
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        # The root that the next action answers to, unless `maybe_reset` replaces it.
         next_td = self._labelled(super()._step_proc_data(next_tensordict_out))
         self._remember(next_td)
         return next_td
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Reset the rows that are done, without asking the host whether there are any."""
+        # A foreign simulator: TorchRL's own way, which reads the mask on the host.
         if not self._masks_resets:
             return super().maybe_reset(tensordict)
         # A copy: an env may clear its own done buffer in place while transforms still read the mask.
@@ -108,6 +112,7 @@ class MaskedReset(EnvBase):
         is updated in place. `seed` is set first, as `env.seed(seed)` does. `env_ids` are checked on the host: inside a
         hot loop pass a mask. No `options` exist; `kwargs` are TorchRL's own `set_state` and `select_reset_only`.
         """
+        # TorchRL would pass unknown keywords on in silence.
         for keyword in kwargs:
             if keyword not in _RESET_KEYWORDS:
                 hint = checks.near(keyword, _RESET_KEYWORDS)
@@ -116,12 +121,14 @@ class MaskedReset(EnvBase):
             raise ValueError(f"options={options!r}: this env has no reset options; use seed= or env_ids=")
         if seed is not None:
             self.seed(seed)
+        # From here on there are masks only.
         if env_ids is not None:
             tensordict = self._with_mask_of(tensordict, env_ids)
         if tensordict is None:
             mask_E1 = None
         else:
             mask_E1 = self._checked_mask(tensordict)
+        # Before any reset runs, as the last root is replaced at the end.
         if tensordict is not None and mask_E1 is not None:
             self._complete_with_last_root(tensordict)
         if not self._masks_resets:
@@ -133,6 +140,7 @@ class MaskedReset(EnvBase):
 
     def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
         """TorchRL's rollout, with its dims labelled ("E", "T")."""
+        # TorchRL labels the time dim only, if any; "T" is last.
         rollout_ET = super().rollout(*args, **kwargs)
         if rollout_ET.batch_dims == len(self.batch_size) + 1:
             names = self.dim_names
@@ -154,6 +162,7 @@ class MaskedReset(EnvBase):
         set_state: bool | None = None,
         select_reset_only: bool = False,
     ) -> TensorDictBase:
+        # The part of TorchRL's `reset` that settles the keywords.
         set_state = upstream.resolved_set_state(self, tensordict, set_state, select_reset_only)
         if set_state is None:
             forwarded = {}
@@ -161,6 +170,7 @@ class MaskedReset(EnvBase):
             forwarded = {"set_state": set_state}
         reset_td = tensordict
         if tensordict is not None:
+            # `_reset` of an env gets its mask and its state, and nothing of the policy's output.
             if select_reset_only:
                 keys = [_RESET]
             else:
@@ -168,10 +178,12 @@ class MaskedReset(EnvBase):
             reset_td = tensordict.select(*keys, strict=False)
             if mask_E1 is not None:
                 reset_td.set(_RESET, mask_E1)
+            # The mask is not part of the root that comes back.
             tensordict.pop(_RESET, None)
         fresh = self._fresh(reset_td, **forwarded)
         if tensordict is None:
             return self._labelled(fresh)
+        # A reset of all rows: nothing old is kept.
         if mask_E1 is None:
             return self._labelled(tensordict.update(fresh.exclude(_RESET)))
         return self._merge(tensordict, fresh, mask_E1)
@@ -186,6 +198,7 @@ class MaskedReset(EnvBase):
     ) -> TensorDictBase:
         """Write the rows of `fresh` that the mask names into `root`, leaf by leaf, and return `root`."""
         batch_size = root.batch_size
+        # Each shape of mask, and each `where` over a table, is made once for all leaves that need it.
         masks: dict[int, Tensor] = {}
         shared: dict[tuple[int, int], Tensor] = {}
         for key in fresh.keys(True, True):
@@ -193,6 +206,7 @@ class MaskedReset(EnvBase):
                 continue
             new = fresh.get(key)
             old = root.get(key, None)
+            # A leaf that the root lacks is taken as it is.
             if old is not None and isinstance(old, Tensor):
                 pair = _shared_rows(new, old)
                 if pair is None:
@@ -202,6 +216,7 @@ class MaskedReset(EnvBase):
                     if at not in shared:
                         mask = _mask_like(pair[1], mask_E1, batch_size, masks)
                         shared[at] = torch.where(mask, *pair)
+                    # The merged table, seen through the same window as the leaf.
                     new = shared[at].as_strided(new.shape, new.stride(), new.storage_offset())
             root.set(key, new)
         return self._labelled(root)
@@ -213,6 +228,7 @@ class MaskedReset(EnvBase):
 
     def _complete_with_last_root(self, tensordict: TensorDictBase) -> None:
         """Give a partial reset the root values that it was not given."""
+        # What a root consists of: observations and flags of done.
         root_keys = [*self.full_observation_spec.keys(True, True), *self.full_done_spec.keys(True, True)]
         missing = [key for key in root_keys if tensordict.get(key, None) is None]
         if missing and self.last_root is None:
@@ -263,9 +279,11 @@ def mask_from_env_ids(
             f"env_ids has dtype {env_ids.dtype}: expected integers; a mask goes to tensordict['_reset']"
         )
     if isinstance(env_ids, Tensor):
+        # Waits for the device, which the docstring of `reset` warns of.
         ids = env_ids.reshape(-1).tolist()
     else:
         ids = list(env_ids)
+    # A list of booleans is a mask by mistake: as integers it would mean rows 0 and 1.
     if any(isinstance(row, bool) or not hasattr(row, "__index__") for row in ids):
         raise ValueError(f"env_ids={ids!r}: expected integers")
     ids = [row.__index__() for row in ids]
@@ -289,12 +307,14 @@ def _mask_like(
 
 def _shared_rows(new: Tensor, old: Tensor) -> tuple[Tensor, Tensor] | None:
     """Return the tensors that two leaves are the same columns of, if there are such: one `where` serves all columns."""
+    # Strides and storages of traced tensors are not to be relied on.
     if torch.compiler.is_compiling():
         return None
     new_base = base_of(new)
     old_base = base_of(old)
     if new_base is None or old_base is None or new_base.ndim != 2 or new_base.shape != old_base.shape:
         return None
+    # Both leaves must be the same columns of tables that are whole and of one shape.
     same_place = new.stride() == old.stride() and new.storage_offset() == old.storage_offset()
     whole = all(base.is_contiguous() and base.storage_offset() == 0 for base in (new_base, old_base))
     columns = new.ndim == 2 and new.shape == old.shape and new.shape[0] == new_base.shape[0]

@@ -25,9 +25,11 @@ class ActionManager:
         bounds: list[Tensor | None] = []
         self._parts: list[tuple[str, ActionTerm, slice]] = []
         start = 0
+        # Columns are dealt out in the order of the config: this order is the layout of the policy's output.
         for name, term in terms.items():
             with self._driver.scope(f"actions/{name}", part=term):
                 self.sizes[name] = size = term.size(view)
+                # A bool is an int in Python, and would count as one column.
                 if isinstance(size, bool) or not isinstance(size, int):
                     raise ValueError(
                         f"size() returns {size!r}: expected how many columns of the action it takes"
@@ -44,6 +46,7 @@ class ActionManager:
             self._parts.append((f"actions/{name}", term, slice(start, stop)))
             start = stop
         self.size = start
+        # One unbounded column leaves the whole action spec unbounded.
         given = [part_K2 for part_K2 in bounds if part_K2 is not None and torch.isfinite(part_K2).all()]
         if len(given) == len(terms) > 0:
             self.bounds_L2 = torch.cat(given)
@@ -56,16 +59,19 @@ class ActionManager:
         self._has_warned = False
         buffers = driver.buffers
         readings = driver.readings
+        # Buffers of the env, which resets clear: a new episode starts with action and last action of 0.
         self._action_EL = readings.action_EL = buffers.get("actions.action_EL", start, owner=ENV)
         self._last_action_EL = readings.last_action_EL = buffers.get(
             "actions.last_action_EL", start, owner=ENV
         )
+        # Once with zeros, so that a wrong name or shape is an error now.
         self._run_terms(self._action_EL)
 
     def apply(self, action_EL: Float[Tensor, "E L"]) -> Bool[Tensor, " E"]:
         """Write the controls of the action, and return which rows were finite; the others repeat their last action."""
         # Also false for NaN, and in fewer kernels than `torch.isfinite`.
         finite_E = action_EL.sum(-1).abs() < torch.inf
+        # In place: observations, rewards and captured graphs read these addresses.
         self._last_action_EL.copy_(self._action_EL)
         self._action_EL.copy_(torch.where(finite_E[:, None], action_EL, self._last_action_EL))
         self._run_terms(self._action_EL)
@@ -80,6 +86,7 @@ class ActionManager:
         """Say once that no row's action was finite; on a GPU a few steps late, and not from within a graph."""
         if self._has_warned or (finite_E.is_cuda and torch.cuda.is_current_stream_capturing()):
             return
+        # Does not wait: the flag that is read below may be one of an earlier step.
         self._accepts_any.copy_(finite_E.any()[None], non_blocking=True)
         if not self._arrived[0]:
             self._has_warned = True

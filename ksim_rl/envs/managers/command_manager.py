@@ -25,6 +25,7 @@ class CommandManager:
         self._view = view = driver.view
         self._terms = dict(terms)
         self.values = driver.readings.commands
+        # Seconds left [E], only for terms that resample within an episode.
         self._clocks = {
             name: view.buffers.get(f"commands/{name}.time_left_E", owner=ENV)
             for name, term in terms.items()
@@ -35,6 +36,7 @@ class CommandManager:
         nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         for name, term in terms.items():
             with self._driver.scope(f"commands/{name}", part=term, mask_E=nobody_E):
+                # Draws for no row, so that the buffers that `__call__` reads exist.
                 term.resample(view, nobody_E)
             value_EK = self._computed(name)
             with self._driver.scope(f"commands/{name}"):
@@ -42,6 +44,7 @@ class CommandManager:
                     # Columns beyond those of `ranges` are the term's own.
                     columns = term.shared_ranges(view).unbind(-1)
                     driver.readings.command_ranges[name] = dict(zip(term.ranges, columns, strict=False))
+            # The number of columns K is known from the first vector.
             self.values[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1], owner=ENV)
             driver.non_finite.watch("command", self.values[name], (name,), value_EK.shape[1:])
 
@@ -49,6 +52,7 @@ class CommandManager:
         """Return the seconds until each env resamples, [E]; infinite for a command that resets alone resample."""
         if name in self._clocks:
             return self._clocks[name]
+        # No clock: this command lasts for the episode.
         return torch.full((self._view.num_envs,), torch.inf, device=self._view.device)
 
     def set(
@@ -65,6 +69,7 @@ class CommandManager:
         """
         check_known("command", name, self._terms)
         view = self._view
+        # Checked on the host: this is called between steps, not within them.
         if env_ids is None:
             rows = range(view.num_envs)
         else:
@@ -85,12 +90,15 @@ class CommandManager:
         What terms keep advances in these rows only; what all envs share of it, only if this `is_step` of the env.
         """
         for name in self._terms:
+            # A term that writes while it is read must not advance the rows that are not refreshed.
             kept = list(self._kept[name].values())
             with only_in_rows(mask_E, kept, is_step=is_step) if kept else nullcontext():
                 value_EK = self._computed(name)
             held_EK = self.values[name]
+            # In place, as policies and captured graphs hold this address.
             held_EK.copy_(torch.where(mask_E[:, None], value_EK, held_EK))
             self._driver.non_finite.watch("command", held_EK, (name,), (held_EK.shape[1],))
+        # Quantities that follow from commands are stale now.
         self._view.command_cache.clear()
 
     def step(self, going_on_E: Bool[Tensor, " E"]) -> None:
@@ -98,7 +106,9 @@ class CommandManager:
         for name, term in self._terms.items():
             if name in self._clocks:
                 clock_E = self._clocks[name]
+                # Rows that are done are left out: the reset redraws them anyway, by the counter of resets.
                 clock_E.sub_(self._view.step_dt)
+                # Half a step, so that rounding of the subtractions cannot shift the moment by a step.
                 due_E = (clock_E < 0.5 * self._view.step_dt) & going_on_E
                 self._draw(name, term, due_E, "step", self._view.step_count)
         self.refresh(going_on_E, is_step=True)
@@ -139,6 +149,7 @@ class CommandManager:
         if term.resampling_time_range_s is not None:
             clock_E = self._clocks[name]
             with self._driver.scope(f"commands/{name}/clock/{moment}", counter):
+                # Drawn for all rows and used in a few: sizes must not depend on data in a captured step.
                 drawn_E = self._view.uniform(1, *term.resampling_time_range_s)[:, 0]
             clock_E.copy_(torch.where(mask_E, drawn_E, clock_E))
         with self._driver.scope(f"commands/{name}", counter, draws=moment, part=term, mask_E=mask_E):

@@ -15,8 +15,8 @@ from ksim_rl.scene.state.buffers import ENV
 class EventManager:
     """Runs each event in its mode, then recomputes the model constants that follow from the fields that it wrote.
 
-    Interval clocks count down in seconds, one per env and event, and start anew when a row resets. They run out at the
-    env step that is nearest, so that an interval of n steps ends at the n-th, whatever the subtractions round to.
+    Interval clocks count down in seconds, one per env and event, and start again when a row resets. They run out at the
+    nearest env step, so that an interval of n steps ends at the n-th, whatever the subtractions round to.
     """
 
     def __init__(self, terms: Mapping[str, EventTerm], driver: EnvDriver) -> None:
@@ -26,12 +26,14 @@ class EventManager:
         self._by_mode: dict[str, list[tuple[str, EventTerm]]] = {}
         for name, term in terms.items():
             self._by_mode.setdefault(term.mode, []).append((f"events/{name}", term))
+        # By mode the model fields that its events write, each once: derived constants follow from them.
         self._fields = {
             mode: tuple(dict.fromkeys(field for _, term in parts for field in term.per_world_fields))
             for mode, parts in self._by_mode.items()
         }
         clocked = self._by_mode.get("interval", [])
         self._clocks = {scope: view.buffers.get(f"{scope}.time_left_E", owner=ENV) for scope, _ in clocked}
+        # Names that match nothing are errors now, and all buffers exist before the first step.
         self.rehearse()
         for name, term in terms.items():
             for line in term.without_effect(view):
@@ -48,6 +50,7 @@ class EventManager:
         everybody_E = torch.ones(self._view.num_envs, dtype=torch.bool, device=self._view.device)
         for scope, term in self._by_mode.get("startup", []):
             self._run(scope, term, everybody_E, self._driver.startup_counter)
+        # Once after all events, since several may write the same field.
         self._view.world.set_const(self._fields.get("startup", ()))
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
@@ -55,6 +58,7 @@ class EventManager:
         view = self._view
         for scope, term in self._by_mode.get("reset", []):
             self._run(scope, term, mask_E, view.reset_count_E)
+        # Only in the rows that reset, as other worlds keep their constants.
         view.world.set_const(self._fields.get("reset", ()), mask_E)
         for scope, term in self._by_mode.get("interval", []):
             with self._driver.scope(f"{scope}/clock", view.reset_count_E):
@@ -65,14 +69,18 @@ class EventManager:
         view = self._view
         written: list[Tensor] = []
         for scope, term in self._by_mode.get("interval", []):
+            # Seconds left [E], counted down in place.
             clock_E = self._clocks[scope]
             clock_E.sub_(view.step_dt)
+            # Half a step is the tolerance for rounding of the subtractions.
             due_E = clock_E < 0.5 * view.step_dt
+            # The clock is set before the event runs, from a random stream of its own.
             with self._driver.scope(f"{scope}/interval"):
                 self._restart(scope, term, due_E)
             self._run(scope, term, due_E)
             if term.per_world_fields:
                 written.append(due_E)
+        # The rows in which any event was due.
         if written:
             view.world.set_const(self._fields["interval"], torch.stack(written).any(0))
         if "step" in self._by_mode:

@@ -15,7 +15,7 @@ IMAGE_DTYPES = (torch.float32, torch.int32, torch.uint8)
 
 
 class ObservationManager:
-    """Computes the union of the groups' terms; what groups add to them is done by transforms.
+    """Computes the union of the groups' terms; transforms add noise, delay and the like for each group.
 
     `examples` are readings of no state in particular, without memory, which have the shapes and types of all others.
     """
@@ -27,21 +27,23 @@ class ObservationManager:
         # What each term writes whenever it is read; most write nothing.
         self._kept: dict[str, dict[str, Kept]] = {}
         self._shapes: dict[str, torch.Size] = {}
+        # Reads each term once: wrong names and shapes are errors now.
         readings = self.read()
         self.examples = {name: reading.to("meta") for name, reading in readings.items()}
 
     def read(self, reset_E: Bool[Tensor, " E"] | None = None) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
-        """Return the readings of the current state by term, in memory of their own: nobody else reads or writes it.
+        """Return the readings of the current state by term, in memory that nobody else reads or writes.
 
-        They are float32 [E, L], side by side in one tensor, and images [E, H, W] or [E, H, W, C]. What terms keep in
-        their buffers advances in all rows, once per env step, or after a reset in the rows of `reset_E` only; the
-        readings of its other rows then mean nothing.
+        They are float32 [E, L], side by side in one tensor, and images [E, H, W] or [E, H, W, C]. Buffers of terms
+        advance in all rows, once per env step, or after a reset in the rows of `reset_E` only; readings of other rows
+        then mean nothing.
         """
         readings: dict[str, Tensor] = {}
         vectors: list[str] = []
         for name in self.terms:
             reading = self._read_one(name, reset_E)
             readings[name] = reading
+            # Vectors can be joined; images and other dtypes stay on their own.
             if reading.ndim == 2 and reading.dtype == torch.float32:
                 vectors.append(name)
         for name, reading in readings.items():
@@ -49,6 +51,7 @@ class ObservationManager:
             if name not in vectors or len(vectors) == 1:
                 readings[name] = reading.clone()
         watch = self._driver.non_finite.watch
+        # Nothing to join: each reading was cloned above.
         if len(vectors) < 2:
             for name, value in readings.items():
                 if value.is_floating_point() and value.ndim > 1:
@@ -59,6 +62,7 @@ class ObservationManager:
         together_EL = torch.cat([readings[name] for name in vectors], dim=1)
         widths = [readings[name].shape[1] for name in vectors]
         watch("observation", together_EL, vectors, widths)
+        # Each vector is a window [E, L] onto the joined tensor.
         return readings | dict(zip(vectors, together_EL.split(widths, dim=1), strict=True))
 
     def rehearse(self) -> None:
@@ -68,6 +72,7 @@ class ObservationManager:
     def _read_one(self, name: str, reset_E: Tensor | None) -> Tensor:
         kept = self._kept.setdefault(name, {})
         rows = nullcontext()
+        # After a reset, a term with memory advances in the rows that begin; the others have had their step.
         if reset_E is not None and kept:
             rows = only_in_rows(reset_E, list(kept.values()), is_step=False)
         with rows:
@@ -76,6 +81,7 @@ class ObservationManager:
                 if not isinstance(reading, Tensor):
                     raise ValueError(f"returns {type(reading).__name__}: expected a tensor, one row per env")
             kept.update(written)
+        # The cheap comparison first, as this runs for each term in each eager step.
         if self._shapes.get(name) != reading.shape:
             self._check_shape(name, reading)
         return reading

@@ -1,4 +1,4 @@
-"""These managers work out what a step comes to: rewards, ends, metrics and levels, and their sums over episodes."""
+"""The managers of a step's outcomes: rewards, terminations, metrics and levels, and their sums over episodes."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ from ksim_rl.scene.state.buffers import ENV
 
 
 class _OutcomeManager:
-    """Calls terms that return one value per env; each runs in its scope, and what it returns is checked."""
+    """Calls terms that return one value per env; each runs in its scope, and its value is checked."""
 
     kind: ClassVar[str]
 
@@ -28,7 +28,7 @@ class _OutcomeManager:
         return torch.ones(self._view.num_envs, dtype=torch.bool, device=self._view.device)
 
     def _values(self, dtype: torch.dtype | None = None) -> list[Tensor]:
-        """Return what each term says of the current state, [E] each, in any dtype unless one is asked for."""
+        """Return each term's value of the current state, [E] each, in any real dtype unless one is asked for."""
         values = []
         shape = (self._view.num_envs,)
         device = torch.device(self._view.device)
@@ -49,6 +49,7 @@ class _OutcomeManager:
                     f"{self.kind} term {name!r} returns {value_E.dtype} {tuple(value_E.shape)}: expected "
                     f"{dtype or 'any real dtype'} {shape}, one value per env"
                 )
+            # A tensor of the host would be copied over in each step, which waits for the device.
             if value_E.device.type != device.type:
                 raise ValueError(
                     f"{self.kind} term {name!r} returns a tensor on {value_E.device}: expected {device}"
@@ -78,13 +79,16 @@ class RewardManager(_OutcomeManager):
             raise ValueError(
                 f"a curriculum adapts the unknown reward {unknown[0]!r}: {near(unknown[0], terms)}"
             )
+        # Left out here, so that a term of weight 0 costs nothing and may even be invalid.
         computed = {name: term for name, term in terms.items() if term.weight != 0.0 or name in adapted}
         super().__init__(computed, driver)
         self._scale = scale
+        # One tensor, of whose elements curricula get windows below.
         self.weights_R = torch.tensor([term.weight for term in computed.values()], device=driver.view.device)
         self.episode_sums_ER = driver.view.buffers.get("rewards.episode_sums_ER", len(self.names), owner=ENV)
         driver.readings.reward_weights.update(zip(self.names, self.weights_R.unbind(), strict=True))
         driver.readings.episode_rewards.update(zip(self.names, self.episode_sums_ER.unbind(-1), strict=True))
+        # Run once, so that wrong names and shapes are errors now.
         self.step(self._everybody_E())
 
     def step(self, finite_E: Bool[Tensor, " E"]) -> Float[Tensor, " E"]:
@@ -92,9 +96,11 @@ class RewardManager(_OutcomeManager):
         values = self._values()
         if not values:
             return torch.zeros(self._view.num_envs, device=self._view.device)
+        # One table, so that weights, sums and the watch for NaN are one kernel each.
         value_ER = torch.stack(values, dim=-1)
         self._driver.non_finite.watch(self.kind, value_ER, self.names)
         weighted_ER = value_ER * (self.weights_R * self._scale)
+        # Before the sums, as one NaN would spoil all later values of the log.
         weighted_ER = torch.where(finite_E[:, None], weighted_ER, 0.0)
         self.episode_sums_ER.add_(weighted_ER)
         return weighted_ER.sum(-1)
@@ -112,6 +118,7 @@ class TerminationManager(_OutcomeManager):
         num_envs = driver.view.num_envs
         device = driver.view.device
         self._is_finite_horizon = is_finite_horizon
+        # The guard is the last column, a failure and never a time-out.
         self.names = (*terms, "non_finite")
         self.flags_EK = torch.zeros(num_envs, len(self.names), dtype=torch.bool, device=device)
         driver.readings.terminations.update(zip(self.names, self.flags_EK.unbind(-1), strict=True))
@@ -124,11 +131,13 @@ class TerminationManager(_OutcomeManager):
 
         Rows whose physics failed are terminated.
         """
+        # In place: `view.terminations` are windows onto the columns.
         self.flags_EK.copy_(torch.stack((*self._values(torch.bool), ~finite_E), dim=-1))
         timed_out_E = (self.flags_EK & self._time_out_K).any(-1)
         failed_E = (self.flags_EK & self._failure_K).any(-1)
         self._driver.readings.terminated_E.copy_(failed_E)
         self._driver.readings.truncated_E.copy_(timed_out_E)
+        # Time is part of the task, so running out of it ends the return, too.
         if self._is_finite_horizon:
             return failed_E | timed_out_E, torch.zeros_like(timed_out_E)
         return failed_E, timed_out_E
@@ -147,6 +156,7 @@ class MetricManager(_OutcomeManager):
         self.held_EM = driver.view.buffers.get("metrics.held_EM", len(self.names), owner=ENV)
         reductions = [term.reduce for term in terms.values()]
         self._occurring = frozenset(reductions)
+        # Masks of columns [M], made once: a step picks by `where`, without branches.
         self._is_mean_M, self._is_last_M, self._is_max_M = (
             torch.tensor([given == kind for given in reductions], dtype=torch.bool, device=driver.view.device)
             for kind in ("mean", "last", "max")
@@ -161,10 +171,12 @@ class MetricManager(_OutcomeManager):
         value_EM = torch.where(finite_E[:, None], torch.stack(values, dim=-1), 0.0)
         self._driver.non_finite.watch(self.kind, value_EM, self.names)
         held_EM = self.held_EM
+        # A running sum serves both "sum" and "mean".
         next_EM = held_EM + value_EM
         if "last" in self._occurring:
             next_EM = torch.where(self._is_last_M, value_EM, next_EM)
         if "max" in self._occurring:
+            # Buffers start at 0, which would hide a peak below 0.
             is_first_E1 = self._view.episode_step_E[:, None] <= 1
             peak_EM = torch.maximum(torch.where(is_first_E1, value_EM, held_EM), value_EM)
             next_EM = torch.where(self._is_max_M, peak_EM, next_EM)
@@ -175,6 +187,7 @@ class MetricManager(_OutcomeManager):
         """The reduced values of the episodes so far, float32 [E, M]."""
         if "mean" not in self._occurring:
             return self.held_EM
+        # A row at step 0 has no values yet, and must not divide by 0.
         mean_EM = self.held_EM / self._view.episode_step_E[:, None].clamp(min=1)
         return torch.where(self._is_mean_M, mean_EM, self.held_EM)
 
@@ -192,6 +205,7 @@ class CurriculumManager(_OutcomeManager):
         for level in drivers.values():
             driver.readings.level.fill_(level)
         self.levels_C = torch.zeros(len(self.names), device=driver.view.device)
+        # For no row, so that wrong names and shapes are errors now.
         self.reset(~self._everybody_E())
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
@@ -210,10 +224,12 @@ class CurriculumManager(_OutcomeManager):
                 raise ValueError(
                     f"curriculum term {name!r} returns shape {tuple(level.shape)}: expected (), one level for all envs"
                 )
+            # Level is a device tensor: nothing is read by the host.
             self.levels_C[index].copy_(level)
 
     def rehearse(self) -> None:
         """Adapt to no episode, which changes nothing."""
+        # The level is written even where no row resets, so it is put back.
         levels_C = self.levels_C.clone()
         self.reset(~self._everybody_E())
         self.levels_C.copy_(levels_C)
@@ -246,6 +262,7 @@ class EpisodeLog:
 
     def step(self, done_E: Bool[Tensor, " E"]) -> None:
         """Add the episodes that end now, bool [E]."""
+        # One table [E, N] of all entries, masked and summed once: far fewer kernels than one sum per entry.
         done_E1 = done_E[:, None]
         sums_ER = self._rewards.episode_sums_ER
         rows_EN = torch.cat(
@@ -267,5 +284,5 @@ class EpisodeLog:
         return sums | {"non_finite_terms": self._num_non_finite()}
 
     def clear(self) -> None:
-        """Start anew."""
+        """Start the sums again at 0."""
         self.totals_N.zero_()

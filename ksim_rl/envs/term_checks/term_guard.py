@@ -1,4 +1,4 @@
-"""Refuses terms that write what is not theirs, by name: a reward that moves the robot, say, or changes a command."""
+"""Refuses terms that write memory that is not theirs, by name: such as a reward that moves the robot."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -20,7 +20,7 @@ from ksim_rl.scene.state.simulation import UNWATCHED, Simulation
 class _Writes(TorchDispatchMode):
     """Shows each tensor to `look` before an operator writes it, with the operator's name.
 
-    Whatever way led to the tensor (a slice, `.data`, `detach`, `out=`, TorchScript), it comes by here.
+    Every way to the tensor (a slice, `.data`, `detach`, `out=`, TorchScript) ends in torch's dispatcher, and so here.
     """
 
     def __init__(self, look: Callable[[str, Tensor], None]) -> None:
@@ -35,7 +35,7 @@ class _Writes(TorchDispatchMode):
 
 
 class _Call(NamedTuple):
-    """One call of a term that is watched, and what it has written so far of its own."""
+    """One watched call of a term, and the tensors of its own that it has written so far."""
 
     scope: str
     part: object
@@ -44,7 +44,7 @@ class _Call(NamedTuple):
 
 
 class _Copy(NamedTuple):
-    """The bits of something that terms can reach, and a copy; the piece is None for a quantity."""
+    """The bits of a tensor that terms can reach, and a copy of them; the piece is None for a quantity."""
 
     piece: Piece | None
     bits: Tensor
@@ -52,11 +52,11 @@ class _Copy(NamedTuple):
 
 
 class TermGuard:
-    """Watches what terms write, where that costs nothing that counts, and refuses what is not theirs by a ValueError.
+    """Watches the writes of terms where that costs little, and refuses those outside of their memory by a ValueError.
 
     Torch's writes are refused before they happen: at a term's first call, while a step is recorded or captured, and in
-    the blocks of `watching` and `rehearsal`. Writes past torch (NumPy, Warp) show in the bits of what lasts, which are
-    compared while a step is recorded and in these blocks. Any other call costs one look-up.
+    the blocks of `watching` and `rehearsal`. Writes past torch (NumPy, Warp) show in the bits of lasting memory, which
+    are compared while a step is recorded and in these blocks. Any other call costs one look-up.
     """
 
     def __init__(self, simulation: Simulation, readings: Readings, view: EnvView) -> None:
@@ -87,6 +87,7 @@ class TermGuard:
         A write that changes nothing in the state of an env that was just built, as `numpy.clip` of zeros, shows there.
         """
         simulation = self._simulation
+        # Copies of everything first, then a state in which a write by a factor or a clip shows.
         kept: list[tuple[Tensor, Tensor]] = []
         for piece in self._memory.lasting():
             if piece.tensor is None:
@@ -97,6 +98,7 @@ class TermGuard:
         # Servos hold their targets, as they do after each reset.
         everybody_E = torch.ones(simulation.num_envs, dtype=torch.bool, device=simulation.device)
         self._view.targets.reset(everybody_E)
+        # Derived quantities must follow from the odd numbers before a term reads them.
         simulation.world.refresh()
         simulation.refreshed()
         self._rehearses = True
@@ -119,6 +121,7 @@ class TermGuard:
         """
         if part is None:
             return UNWATCHED
+        # The first call of each term is always watched; later ones only where that is asked for.
         key = scope, id(part)
         is_recorded = recording.is_recording()
         is_captured = self._on_cuda and torch.cuda.is_current_stream_capturing()
@@ -131,6 +134,7 @@ class TermGuard:
 
     @contextmanager
     def _watched(self, call: _Call, *, compares: bool) -> Iterator[Mapping[str, Kept]]:
+        # The state of all memory before the call, for writes that torch does not see.
         before = self._copied() if compares else []
         refusals: list[ValueError] = []
 
@@ -166,6 +170,7 @@ class TermGuard:
         if is_allowed and (piece.owner != STATE or self._simulation.is_writing):
             self._keep(call, piece)
             return None
+        # The error names the tensor as the term's author would write it.
         name = self._memory.spelled(tensor, piece)
         how = f"writes into {name} in place (`{operator}`)"
         return ValueError(refusal(call.scope, call.part, how, name, piece))
@@ -195,6 +200,7 @@ class TermGuard:
         """Refuse what has changed and is not the term's, or not in its rows."""
         with recording.paused():
             for piece, bits, old_bits in before:
+                # Most pieces are untouched: the cheap test comes first.
                 if torch.equal(bits, old_bits):
                     continue
                 piece = piece or self._memory.holder(bits)
@@ -221,6 +227,7 @@ class TermGuard:
         is_kept = piece.owner == call.scope and not call.scope.startswith("commands/")
         if is_pressing or is_kept:
             return False
+        # A piece that all envs share may change only if the event has rows to act on.
         if not piece.has_rows:
             return not bool(call.mask_E.any())
         others_E = ~call.mask_E
@@ -229,6 +236,7 @@ class TermGuard:
 
 def _odd_numbers(like: Shaped[Tensor, "*shape"]) -> Tensor:
     """Return numbers in [0.01, 0.02], no two neighbors of which are equal, in the shape of a tensor."""
+    # Multiples of the golden ratio, modulo 1, are spread evenly, so neighbors differ.
     places = torch.arange(like.numel(), dtype=torch.float64, device=like.device)
     golden_ratio = 0.6180339887498949
     return (0.01 + 0.01 * (golden_ratio * places).frac()).to(like.dtype).view(like.shape)

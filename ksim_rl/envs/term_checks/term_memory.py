@@ -1,4 +1,4 @@
-"""The memory that terms reach through their view, piece by piece: what it is called, and who may write it."""
+"""The memory that terms reach through their view, piece by piece: its name, and who may write it."""
 
 from bisect import bisect_left
 from collections.abc import Iterator
@@ -23,16 +23,16 @@ STATE = "state"
 MOCAP = "mocap"
 INPUT = "input"
 COMPUTED = "computed"
-"""Of the worlds: positions and velocities, poses of mocap bodies, what else the physics reads, and what it computes."""
+"""Of the worlds: positions and velocities, poses of mocap bodies, other inputs of the physics, and its results."""
 FIELD = "field"
 MODEL = "model"
-"""Model fields that differ between worlds, and what all worlds share of the model."""
+"""Model fields that differ between worlds, and fields of the model that all worlds share."""
 PARAMETER = "parameter"
 DIFFICULTY = "difficulty"
-"""Tables and targets that events and actions write for all to read, and what curricula write."""
+"""Tables and targets that events and actions write for all to read, and values that curricula write."""
 TABLE = "table"
 QUANTITY = "quantity"
-"""What nobody writes once it is made, and quantities that were computed once for all who read them."""
+"""Tensors that nobody writes once they are made, and quantities that were computed once for all readers."""
 
 _KIND_OF_ARRAY = {"qpos": STATE, "qvel": STATE, "mocap_pos": MOCAP, "mocap_quat": MOCAP}
 _KIND_OF_ARRAY |= dict.fromkeys((*views.SUBSTEP_INPUTS, "eq_active", "userdata"), INPUT) | _KIND_OF_ARRAY
@@ -74,10 +74,10 @@ def _piece(name: str, owner: str, tensor: Shaped[Tensor, "*shape"], *, has_rows:
 
 
 class TermMemory:
-    """Finds whose memory a tensor lies in.
+    """Finds the piece of memory that a tensor lies in, and so its owner.
 
-    What lasts is listed anew only when there is more of it, as while an env is constructed; quantities, which come and
-    go with each state, are looked up when they are asked for.
+    Lasting pieces are listed again only when there are more of them, as while an env is constructed; quantities, which
+    come and go with each state, are looked up when they are asked for.
     """
 
     def __init__(self, simulation: Simulation, readings: Readings, view: EnvView) -> None:
@@ -90,7 +90,8 @@ class TermMemory:
         self._aliases = _aliases(view)
 
     def lasting(self) -> list[Piece]:
-        """Return all that lasts, by address; no two pieces overlap, but for columns of one table."""
+        """Return all lasting pieces, by address; no two overlap, except for columns of one table."""
+        # Listing takes long, counting does not: nothing is removed, so equal counts mean the same pieces.
         counts = self._counts()
         if counts != self._listed_at:
             self._pieces = self._listed()
@@ -99,7 +100,7 @@ class TermMemory:
         return self._pieces
 
     def quantities(self) -> list[Shaped[Tensor, "*?shape"]]:
-        """Return the quantities that are computed now and are no windows onto something that lasts."""
+        """Return the quantities that are computed now and are no windows onto lasting memory."""
         pieces = self.lasting()
         found: list[Tensor] = []
         for cache in self._simulation.caches():
@@ -114,6 +115,7 @@ class TermMemory:
         if not tensor.numel() or tensor.layout is not torch.strided:
             return None
         start, end = extent(tensor)
+        # A window onto lasting memory counts as that memory, though a quantity may name it, too.
         lasting = self._at(self.lasting(), start, end)
         if lasting is not None:
             return lasting
@@ -123,7 +125,7 @@ class TermMemory:
         return None
 
     def spelled(self, tensor: Shaped[Tensor, "*shape"], piece: Piece) -> str:
-        """Return how a term spells what it has written: a quantity, even where that is a window onto the piece."""
+        """Return a term's name of a tensor that it has written: a quantity, even if it is a window onto the piece."""
         start, end = extent(tensor)
         around: list[Piece] = []
         for quantity in self._named_quantities():
@@ -136,14 +138,15 @@ class TermMemory:
         return narrowest.name
 
     def _at(self, pieces: list[Piece], start: int, end: int) -> Piece | None:
-        """Return which of the pieces that last lies between two addresses."""
+        """Return the lasting piece that overlaps the bytes between two addresses."""
+        # The last piece that begins before `end`; it overlaps if it ends behind `start`.
         place = bisect_left(self._starts, end) - 1
         if place >= 0 and pieces[place].end > start:
             return pieces[place]
         return None
 
     def _counts(self) -> tuple[int, ...]:
-        """Return how much there is of each kind that still grows while an env is constructed."""
+        """Return the number of entries of each kind that still grows while an env is constructed."""
         simulation = self._simulation
         readings = self._readings
         growing = (
@@ -171,7 +174,7 @@ class TermMemory:
         return [by_start[start] for start in sorted(by_start)]
 
     def _of_env(self) -> Iterator[Piece]:
-        """List what managers write, and what curricula write."""
+        """List the tensors that managers and curricula write."""
         readings = self._readings
         for name, weight in readings.reward_weights.items():
             yield _piece(f"view.reward_weights[{name!r}]", DIFFICULTY, weight)
@@ -179,6 +182,7 @@ class TermMemory:
             yield _piece(f"view.terminations[{name!r}]", ENV, flag_E)
 
     def _of_buffers(self) -> Iterator[Piece]:
+        # Buffers that terms know by an attribute of the view have that name, others the buffer's own.
         spelled = {id(tensor): f"view.{name}" for name, tensor in _tensors_of(self._view)}
         spelled |= {id(tensor): f"view.{name}" for name, tensor in _tensors_of(self._readings)}
         for name, value_EK in self._readings.commands.items():
@@ -198,10 +202,12 @@ class TermMemory:
         for name, field in world.per_world_fields().items():
             if field.numel():
                 yield _piece(f"view.field({name!r})", FIELD, field, has_rows=True)
+        # Arrays of Warp by the ways in which a term can reach them.
         shown = {name: f"view.world.view({name!r})" for name in views.READABLE}
         for attribute in views.DataViews.__annotations__:
             shown[attribute.rpartition("_")[0]] = f"view.world.{attribute}"
         for called, tensor, start, end in world.memory():
+            # The part before the last dot says whether the array is of the model or of the worlds.
             room, _, name = called.rpartition(".")
             if room.endswith("model"):
                 owner = MODEL

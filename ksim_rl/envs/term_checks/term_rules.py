@@ -1,4 +1,4 @@
-"""What each kind of term may write, beside buffers of its own: a reward nothing, an event the state in its rows."""
+"""Says what each kind of term may write, besides its buffers: a reward nothing, an event the state in its rows."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ _DRIVES = frozenset((STATE, MOCAP, INPUT, PARAMETER))
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """What a kind of term is called, what it does, and the owners of pieces (see `Piece`) that it `writes`."""
+    """The name of a kind of term, its purpose, and the owners of pieces (see `Piece`) that it `writes`."""
 
     noun: str
     does: str
@@ -70,16 +70,18 @@ def may_write(scope: str, piece: Piece) -> bool:
 
 
 def refusal(scope: str, part: object, how: str, name: str, piece: Piece) -> str:
-    """Return what a term does to what it calls `name`, why that is wrong, and what to write instead."""
+    """Return the error text for a write to `name`: what the term did, why that is wrong, and what to write instead."""
     rule = rule_of(scope)
     if piece.owner == STATE:
         effect = ", which moves the robot"
     else:
         effect = ""
+    # The advice repeats the term's own expression where it has one.
     read = name if name.startswith("view.") else "x"
     fix = (
         f"Write `error = {read} - 0.5` instead of `error = {read}; error -= 0.5`, or change `{read}.clone()`"
     )
+    # It may write this, but not in place: the view's methods keep caches and rows right.
     if may_write(scope, piece):
         fix = (
             "Write positions and velocities by `view.write_qpos`, `view.joints(...).write_pos` and their like"
