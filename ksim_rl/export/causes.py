@@ -15,13 +15,14 @@ import numpy as np
 Arrays = Mapping[str, np.ndarray]
 SAME = 2e-3
 LIKE = 2e-2
-"""Relative errors: of what should be equal, and of what explains a difference."""
+"""Relative errors: up to SAME two signals count as equal, up to LIKE a reason explains their difference."""
+# Env steps by which a signal may be late or early and still be recognized.
 MOST_SHIFT = 4
 
 
 @dataclass(frozen=True)
 class Cause:
-    """A likely cause, what it is about, and what shows it."""
+    """A likely cause, the part that it concerns, and the evidence."""
 
     name: str
     about: str
@@ -37,6 +38,7 @@ def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[
     `trace` holds recorded steps, `trace/<signal>` [N, T, ...]; `replay` the same from elsewhere, `<lag>/<n>/<signal>`.
     """
     found: list[Cause] = []
+    # Rates first: with another step nothing later in the chain can agree.
     recorded_s = float(trace["trace/dt"]) * int(trace["trace/decimation"])
     step_s = float(replay["dt"]) * int(replay["decimation"])
     substep_s = float(replay["dt"])
@@ -45,6 +47,7 @@ def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[
         found.append(Cause("rate", "env step", evidence + f"{float(trace['trace/dt']):g} s"))
 
     signal = partial(_pairs, trace=trace, replay=replay)
+    # Observations, term by term. Histories are cut to their newest frame, which the replay gives too.
     frames = _newest(meta, trace["trace/obs"])
     start = 0
     obs_differs = False
@@ -56,9 +59,12 @@ def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[
         obs_differs = obs_differs or bool(causes)
         # The last action follows from what happens to actions, which the targets show.
         found += [] if term["value"] == {"quantity": "action"} else causes
+    # The network itself: it was given the recorded observation, so only its file can explain a difference.
     ours, theirs, _ = signal("action")
+    # With a history or a recurrent state the runner feeds its own frames, and inherits their errors.
     remembers = trace["trace/obs"].shape[-1] != start
     if _error(ours, theirs) > SAME and not (remembers and obs_differs):
+        # Columns in another order are the most common mistake, and would also look like a wrong normalizer.
         if order := _order(ours, theirs):
             found.append(Cause("joint order", "policy.onnx", f"its actions match ours in the order {order}"))
         else:
@@ -67,6 +73,7 @@ def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[
                     "normalizer", "policy.onnx", f"same observation, actions {_error(ours, theirs):.0%} off"
                 )
             )
+    # An actuator that drives another joint explains all motion, so nothing else is looked for then.
     driven = [joint for law in meta["actuators"] for joint in law["joints"]]
     crossed = [joint for joint, wrong in zip(driven, replay["crossed"], strict=True) if wrong]
     if crossed:
@@ -80,15 +87,20 @@ def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[
 def _of_motion(meta: Mapping[str, Any], signal: Any, *, rates: bool) -> Cause | None:
     """Return the first difference on the way from the action to the next state."""
     joints = meta["joints"]["names"]
+    # Targets come straight from the action: no physics is in them yet.
     ours, theirs, episode = signal("target")
     if _error(ours, theirs) > SAME:
         return _of_targets(ours, theirs, episode, joints)
+    # At another rate efforts and velocities differ in any case.
     if not rates:
         return None
+    # Efforts follow from target and state, and so show gains and lags of actuators.
     ours, theirs, episode = signal("effort")
     if _error(ours, theirs) > LIKE:
+        # Looser than elsewhere: efforts also change with the state.
         if shift := _shift(ours, theirs, episode, tolerance=0.2):
             return Cause("delay", "actuators", f"efforts are those of {shift} steps ago")
+        # The joint whose gain is furthest from ours, up or down; the small number keeps the logarithm finite.
         ratios = _ratios(ours, theirs)
         worst = int(np.abs(np.log(np.abs(ratios) + 1e-9)).argmax())
         off = np.abs(ratios - 1.0) > LIKE
@@ -96,6 +108,7 @@ def _of_motion(meta: Mapping[str, Any], signal: Any, *, rates: bool) -> Cause | 
         if off.any() and _error(ours * ratios, theirs) <= 0.3 * _error(ours, theirs):
             evidence = f"same state and target, effort x {ratios[worst]:.2f}; {int(off.sum())} joints differ"
             return Cause("gain", joints[worst], evidence)
+    # What is left is physics. Contact in either engine counts as contact.
     ours, theirs, _ = signal("next_qvel")
     before, _, _ = signal("qvel")
     error = np.abs(ours - theirs).max(1)
@@ -107,9 +120,11 @@ def _of_motion(meta: Mapping[str, Any], signal: Any, *, rates: bool) -> Cause | 
     on_ground, in_air = (
         float(np.mean(error[rows])) / size if rows.any() else 0.0 for rows in (touches, ~touches)
     )
+    # Rounding and the tolerance of the solvers stay below this.
     if max(on_ground, in_air) <= 3 * SAME:
         return None
     evidence = f"velocities {on_ground:.1%} off with contact, {in_air:.1%} without"
+    # In the air only masses count: an error on the ground alone is one of contacts.
     if on_ground > 5 * in_air:
         return Cause("contact parameters", "robot.xml", evidence)
     return Cause("mass or inertia", "robot.xml", evidence)
@@ -119,6 +134,7 @@ def _of_observation(name: str, ours: np.ndarray, theirs: np.ndarray, episode: np
     if _error(ours, theirs) <= SAME:
         return []
     about = f"observation {name!r}"
+    # From the most particular reason to the most general: a factor would fit many others badly, too.
     if shift := _shift(ours, theirs, episode):
         return [Cause("stale sensor", about, f"it is that of {shift} steps ago")]
     if order := _order(ours, theirs):
@@ -126,22 +142,26 @@ def _of_observation(name: str, ours: np.ndarray, theirs: np.ndarray, episode: np
     ratios = _ratios(ours, theirs)
     if _error(ours * ratios, theirs) <= LIKE:
         return [Cause("scale", about, f"x {np.median(ratios):.3g}")]
+    # Only vectors of three can be turned.
     if ours.shape[1] % 3 == 0:
         lengths = [np.linalg.norm(x.reshape(-1, 3), axis=1) for x in (ours, theirs)]
         # A sensor that does not sit in the body's origin feels its turning too.
         if _error(*lengths) <= max(LIKE, 0.3 * _error(ours, theirs)):
             return [Cause("frame", about, "lengths agree, directions do not: it is given in other axes")]
+    # After removing the means, only a constant difference is explained.
     if _error(ours - ours.mean(0), theirs - theirs.mean(0)) <= LIKE:
         return [Cause("offset", about, f"shifted by {np.round((theirs - ours).mean(0), 3).tolist()}")]
     return [Cause("observation", about, f"{_error(ours, theirs):.0%} off, for no reason that is known here")]
 
 
 def _of_targets(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, joints: list[str]) -> Cause:
+    # Columns are position, velocity and effort of all joints, hence the remainder.
     if order := _order(ours, theirs):
         moved = [joints[a % len(joints)] for a, b in enumerate(order) if a != b]
         return Cause("joint order", "targets", f"{', '.join(moved)} get those of other joints")
     if shift := _shift(ours, theirs, episode):
         return Cause("delay", "targets", f"they are those of {shift} steps ago")
+    # A factor or shift by column explains it; about the mean, the two are told apart.
     if _unlike(ours, theirs) <= LIKE:
         ratios = _ratios(ours - ours.mean(0), theirs - theirs.mean(0))
         if np.abs(ratios - 1.0).max() <= LIKE:
@@ -162,9 +182,11 @@ def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.nda
     ours = []
     theirs = []
     episode = []
+    # Each possible lag was replayed, under "<lag>/<episode>/<signal>".
     lags = sorted({key.split("/")[0] for key in replay if "/" in key})
     for number, recorded in enumerate(trace[f"trace/{name}"]):
         fits = [replay[f"{lag}/{number}/{name}"] for lag in lags if f"{lag}/{number}/{name}" in replay]
+        # Up to the first end; the appended True ends an episode that has none.
         length = int(np.argmax(np.append(trace["trace/done"][number].ravel() > 0, True))) + 1
         flat = recorded[:length].reshape(min(length, len(recorded)), -1)
         found = [fit[: len(flat)].reshape(len(flat), -1) for fit in fits] or [flat]
@@ -178,6 +200,7 @@ def _newest(meta: Mapping[str, Any], obs: np.ndarray) -> np.ndarray:
     """Return the newest frame [..., L] of vectors that hold histories."""
     columns = []
     stop = 0
+    # A term's frames stand side by side, the oldest first.
     for term in meta["observations"]:
         stop += term["size"] * term["history_length"]
         columns += range(stop - term["size"], stop)
@@ -185,11 +208,12 @@ def _newest(meta: Mapping[str, Any], obs: np.ndarray) -> np.ndarray:
 
 
 def _error(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Return the mean difference of the column that differs most, by the size of what is recorded."""
+    """Return the mean difference of the column that differs most, relative to the size of the recorded signal."""
     if not len(ours):
         return 0.0
     ours = ours.reshape(len(ours), -1)
     theirs = theirs.reshape(len(theirs), -1)
+    # By the mean size of all columns: one that is zero would blow up its own relative error.
     size = np.abs(ours).mean() + 1e-6
     return float(np.abs(ours - theirs).mean(0).max() / size)
 
@@ -204,6 +228,7 @@ def _unlike(ours: np.ndarray, theirs: np.ndarray) -> float:
 def _ratios(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     """Return the factor of each column, [L], by least squares; 1 where nothing moves."""
     power = (ours * ours).sum(0)
+    # Columns that hardly move have no factor: it would be the quotient of two roundings.
     still = power < 1e-9 * max(float(power.max()), 1e-12)
     return np.where(still, 1.0, (ours * theirs).sum(0) / np.where(still, 1.0, power))
 
@@ -212,11 +237,13 @@ def _order(ours: np.ndarray, theirs: np.ndarray) -> list[int] | None:
     """Return the order of our columns in which they match theirs, or None if there is no other one that does."""
     if ours.shape[1] < 2:
         return None
+    # [theirs, ours]: mean distance of each pair of columns.
     apart = np.abs(theirs[:, :, None] - ours[:, None, :]).mean(0)
     order = apart.argmin(1)
     # Columns that are equal, such as targets nobody writes, keep their places.
     own = np.arange(len(order))
     order = np.where(apart[own, own] <= apart[own, order] + 1e-9, own, order)
+    # A permutation, and not the identity: two of theirs that look like one of ours are no order.
     is_other = sorted(order) == list(own) and (order != own).any()
     matches = _error(ours[:, order], theirs) <= LIKE
     if is_other and matches:
@@ -228,6 +255,7 @@ def _shift(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, tolerance:
     """Return by how many steps theirs is late, negative where it is early; None where no shift explains it."""
     best = _error(ours, theirs)
     found = None
+    # Small shifts first, so that a periodic signal does not match one period later.
     for shift in (s for k in range(1, MOST_SHIFT + 1) for s in (k, -k)):
         if shift > 0:
             late = slice(shift, None)
@@ -235,8 +263,10 @@ def _shift(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, tolerance:
         else:
             late = slice(None, shift)
             early = slice(-shift, None)
+        # Rows of two episodes are not neighbours in time.
         whole = episode[late] == episode[early]
         error = _error(ours[early][whole], theirs[late][whole])
+        # It has to fit well, and clearly better than what was found so far.
         if whole.any() and error <= min(tolerance, 0.3 * best):
             best = error
             found = shift

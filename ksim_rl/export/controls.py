@@ -23,6 +23,7 @@ from ksim_rl.transforms.low_pass import smoothing
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
 
 Plain = dict[str, Any]
+# For readers of export.json, by quantity; a term that is computed from several says "see value".
 UNITS = {
     "joint_pos": "rad or m", "joint_pos_rel": "rad or m", "joint_vel": "rad/s or m/s", "root_lin_vel": "m/s",
     "root_ang_vel": "rad/s", "projected_gravity": "1", "action": "1", "body_pos": "m", "site_height": "m",
@@ -31,9 +32,10 @@ UNITS = {
 
 
 def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
-    """Return what a noise adds to `size` numbers; `by_level` counts as full."""
+    """Return the description of a noise on `size` numbers; `by_level` counts as full."""
     if cfg is None:
         return None
+    # As offset + spread * draw, with one number per column: ranges and stds have the same form then.
     offset, spread = cfg.affine(size)
     if cfg.is_gaussian:
         draw = "gaussian"
@@ -42,6 +44,7 @@ def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
     else:
         draw = "none"
     found = {"draw": draw, "offset": offset, "spread": spread, "operation": cfg.operation}
+    # Zeros stand for no walk and no rounding, so the runner needs no special case.
     walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
     errors = {"walk_std": walk, "resolution": grain, "dropout": cfg.dropout, "lost": cfg.lost}
     return {**found, "bias": noise(cfg.bias, size), **errors}
@@ -51,6 +54,7 @@ def lag(cfg: DelayCfg | None, shared: str | None = None) -> Plain | None:
     """Return a lag in env steps."""
     if cfg is None:
         return None
+    # `initial` None: the first value of an episode fills the lag.
     draws = {"resample_every": cfg.resample_every, "hold_probability": cfg.hold_probability}
     return {"min": cfg.min_lag, "max": cfg.max_lag, **draws, "shared": shared, "initial": None}
 
@@ -65,14 +69,19 @@ def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[Plain]:
         cfg: ObservationGroupCfg = env.cfg.observations[group]
         for name, term in cfg.terms.items():
             try:
+                # Described first: without a description there is nothing to run the rest on.
                 value = describe(term.term, env.view)
             except NotDescribedError as error:
                 raise NotDescribedError(
                     f"task.observations.{group}.terms.{name}: {error}; or leave the term out"
                 ) from None
+            # Size of one frame, before history.
             size = env.observation_spec["obs", name].shape[-1]
             low, high = term.clip or (None, None)
+            # A term's own history or lag takes the place of its group's; a group's lag is shared by its
+            # terms.
             frames = history_cfg(term.history if term.history is not None else cfg.history)
+            # Only a bare quantity has units and a frame of its own; a computed value is a tree.
             leaf = value if isinstance(value, dict) else {}
             delay = lag(term.delay) or lag(cfg.delay, shared=group)
             found.append(
@@ -94,8 +103,9 @@ def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[Plain]:
 
 
 def action_chain(cfg: ManagerBasedRlEnvCfg) -> list[Plain]:
-    """Return what happens to an action on its way to the action terms, in this order."""
+    """Return the stages that an action passes on its way to the action terms, in this order."""
     found: list[Plain] = []
+    # The transform that was appended last meets an action first.
     for name, transform in reversed(list(cfg.transforms.items())):
         kind = transform.transform
         given = transform.arguments
@@ -106,6 +116,7 @@ def action_chain(cfg: ManagerBasedRlEnvCfg) -> list[Plain]:
         elif kind is ActionClip:
             low, high = given["clip"]
             found.append({"kind": "clip", "low": low, "high": high})
+        # Transforms of rewards change nothing on the robot.
         elif not kind.__name__.startswith("Reward"):
             raise NotDescribedError(
                 f"task.transforms.{name}: {kind.__name__} has no description: an export takes ActionDelay, "
@@ -115,12 +126,13 @@ def action_chain(cfg: ManagerBasedRlEnvCfg) -> list[Plain]:
 
 
 def actions(env: ManagerBasedRlEnv) -> list[Plain]:
-    """Return what the columns of an action ask for, by name of the joint or actuator.
+    """Return the meaning of an action's columns, by name of the joint or actuator.
 
     Raises NotDescribedError, naming the term, for one of a kind that this room does not know.
     """
     found = []
     start = 0
+    # Terms take their columns of an action in the order of the config.
     for name, term in env.cfg.actions.items():
         stop = start + env.action_manager.sizes[name]
         found.append({"name": name, "columns": [start, stop], **_action(term, name, env.view)})
@@ -136,24 +148,29 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
         mdp.JointVelocityAction: "vel",
         mdp.JointEffortAction: "effort",
     }
+    # Controls are written as they are, without a joint's target in between.
     if type(term) is mdp.ActuatorAction:
         names = names_of(view, "actuator", term.actuators)
         limits = view.ctrl_limits_L2[view.resolver.index("actuator", term.actuators)].T.tolist()
         plain = {"clip": None, "tanh": False, "scale": term.scale, "offset": 0.0, "alpha": None}
         return {"kind": "ctrl", "names": names, "limits": limits, **plain}
+    # Exact types: a subclass may compute something else.
     if type(term) not in kinds:
         raise NotDescribedError(f"task.actions.{name}: {type(term).__name__} has no description")
     names = joint_names(view, term.joints)
     kind = kinds[type(term)]
     if term.cutoff_hz:
+        # First-order filter: the share of the difference that one env step takes.
         alpha = smoothing(term.cutoff_hz, view.step_dt)
     else:
         alpha = None
     shared = {"clip": term.clip, "tanh": term.tanh, "alpha": alpha}
     offset = _numbers(view, term, "offset")
+    # World 0 stands for all worlds here.
     if getattr(term, "use_default_offset", False):
         default = view.joints(term.joints).default_pos_EL[0].tolist()
         offset = [a + b for a, b in zip(offset, default, strict=True)]
+    # Positions and velocities are not limited here: servos and joints have limits of their own.
     if kind == "effort":
         limits_K2 = view.targets.limits("effort", term.joints)
     else:
@@ -162,12 +179,14 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
         "kind": kind,
         "names": names,
         "relative": isinstance(term, mdp.RelativeJointPositionAction),
+        # JSON has no infinity.
         "limits": [-1e30, 1e30] if limits_K2 is None else limits_K2.T.tolist(),
         **shared,
         "scale": _numbers(view, term, "scale"),
         "offset": offset,
     }
     if isinstance(term, mdp.JointPositionVelocityAction):
+        # The velocity half has no offset: its rest is 0 rad/s.
         found["velocity"] = {**shared, "scale": _numbers(view, term, "velocity_scale"), "offset": 0.0}
     return found
 
@@ -180,12 +199,14 @@ def _numbers(view: EnvView, term: Any, field: str) -> list[float]:
 
 
 def actuators(env: ManagerBasedRlEnv) -> list[Plain]:
-    """Return what drives the joints that have targets: laws that run before each substep, or MuJoCo's own."""
+    """Return the drives of joints that have targets: laws that run before each substep, or MuJoCo's servos."""
     found = []
     view = env.view
+    # Joints that a law of ours drives; the others are left to MuJoCo's servos.
     explicit: set[str] = set()
     for name, robot in env.cfg.scene.entities.items():
         prefix = view.entity(name).prefix
+        # Actuators are given by names in the robot's own file, joints of the scene have its prefix.
         own = [n.removeprefix(prefix) for n in joint_names(view, None) if n.startswith(prefix)]
         for actuator, driven in driven_joints(getattr(robot, "actuators", ()), own):
             joints = [prefix + joint for joint in driven]
@@ -194,6 +215,7 @@ def actuators(env: ManagerBasedRlEnv) -> list[Plain]:
                 explicit |= set(joints)
     kinds: tuple[TargetKind, ...] = ("pos", "vel", "effort")
     for kind in kinds:
+        # Position and velocity of one joint may be driven by two servos of the model.
         joints = [
             n
             for spec in actions(env)
@@ -209,6 +231,7 @@ def actuators(env: ManagerBasedRlEnv) -> list[Plain]:
 
 def _law(actuator: Actuator, joints: list[str], view: EnvView) -> Plain:
     delay = None
+    # The lag is in substeps, as the law runs before each of them.
     if isinstance(actuator, DelayedActuator):
         delay = lag(DelayCfg(min_lag=actuator.min_lag, max_lag=actuator.max_lag))
         actuator = actuator.actuator
@@ -224,6 +247,7 @@ def _law(actuator: Actuator, joints: list[str], view: EnvView) -> Plain:
         )
     # JSON has no infinity.
     numbers = {n: [min(value, 1e30)] * len(joints) for n, value in actuator.params.items()}
+    # Sorted, since a set has no order: the runner joins delayed targets in this one.
     found = {"kind": kind, "joints": joints, "takes": sorted(actuator.takes), "numbers": numbers}
     return {**found, **_of_actuators(view, joints, None), "delay": delay}
 
@@ -237,6 +261,7 @@ def _of_actuators(view: EnvView, joints: Sequence[str], kind: TargetKind | None)
     names = view.resolver.names("actuator")
     found: Plain = {"actuators": [], "scale": [], "offset": []}
     for joint in joints:
+        # `driven` and `motor` take the number of a joint among all of the scene.
         number = every.index(joint)
         if kind is None:
             actuator = view.targets.motor(number)

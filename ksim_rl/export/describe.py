@@ -1,4 +1,4 @@
-"""Describes as plain data what terms compute, so that a program without this library computes the same.
+"""Describes the computation of terms as plain data, so that a program without this library computes the same.
 
 A description is a tree: a number or a list of numbers; `{"quantity": name, ...}`, which is read from the robot; or
 `{"op": name, "of": [...]}`, which is computed from other trees. All values are vectors; `runner.py` has both lists.
@@ -68,6 +68,7 @@ def _add(kind: type[Term], make: Callable[[Any, EnvView], Node]) -> None:
 
 def into_root(term: Any, view: EnvView, vectors: Node) -> Node:
     """Return vectors in the axes of the frame of a term."""
+    # Velocities and forces only turn; positions are shifted too, see `points`.
     if term.frame == "root":
         return op("into", vectors, body=root(term, view))
     return vectors
@@ -84,6 +85,7 @@ def joints(name: str, *fields: str) -> Callable[[Any, EnvView], Node]:
     """Return the description of a quantity of joints, with some fields of the term."""
 
     def described(term: Any, view: EnvView) -> Node:
+        # Copied by name, so that the reader sees them beside the joints: {"biased": true}.
         own = {field: getattr(term, field) for field in fields}
         return quantity(name, joints=joint_names(view, term.joints), **own)
 
@@ -91,7 +93,7 @@ def joints(name: str, *fields: str) -> Callable[[Any, EnvView], Node]:
 
 
 def contact(term: Any, field: str) -> Node:
-    """Return what a contact sensor keeps: found, force, air_time, first_contact, ..."""
+    """Return a field that a contact sensor keeps: found, force, air_time, first_contact, ..."""
     return quantity("contact", sensor=term.sensor, field=field)
 
 
@@ -102,6 +104,7 @@ def force(term: Any) -> Node:
 
 def bodies(name: str) -> Callable[[Any, EnvView], Node]:
     """Return the description of a quantity of bodies."""
+    # Later, when a term is described: patterns match names of the model at hand.
     return lambda t, v: quantity(name, bodies=names_of(v, "body", t.bodies))
 
 
@@ -117,26 +120,31 @@ def _framed(name: str) -> Callable[[Any, EnvView], Node]:
 
 def _gravity(term: mdp.ProjectedGravity, view: EnvView) -> Node:
     reading = quantity("projected_gravity", body=root(term, view))
+    # Without a filter, and so without memory, a reading has the shortest description.
     if term.time_constant == 0.0:
         return reading
     return op("normalize", op("low_pass", reading, time_constant=term.time_constant))
 
 
 def _clock(term: mdp.Clock, _: EnvView) -> Node:
+    # Cycles since the episode began; each phase shifts them by a share of a cycle.
     cycles = op("multiply", term.frequency, quantity("time"))
     angle = op("multiply", 2.0 * math.pi, op("add", cycles, list(term.phases)))
     return op("concat", op("sin", angle), op("cos", angle))
 
 
 def _imu(term: mdp.ImuReading, _: EnvView) -> Node:
+    # An IMU is several MuJoCo sensors, told apart by the ends of their names.
     suffix = {"ang_vel": "gyro", "lin_acc": "accelerometer"}.get(term.quantity, "orientation")
     reading = quantity("sensor", sensor=f"{term.sensor}_{suffix}")
     if term.quantity == "projected_gravity":
+        # Gravity's direction in the axes of the sensor's site, not of its body.
         return op("rotate_inverse", reading, [0.0, 0.0, -1.0])
     return reading
 
 
 def _height_scan(term: mdp.HeightScan, view: EnvView) -> Node:
+    # The grid's points in the root's axes, m; z is left out, since only x and y choose the point.
     grid = grid_points(term.size, term.resolution)[:, :2].tolist()
     below = quantity("height_scan", body=root(term, view), points=grid)
     return op("clip", op("subtract", below, term.offset), low=term.clip[0], high=term.clip[1])
@@ -144,6 +152,7 @@ def _height_scan(term: mdp.HeightScan, view: EnvView) -> Node:
 
 def _signed_log(term: Any, _: EnvView) -> Node:
     newtons = contact(term, "force")
+    # sign(f) log(1 + |f|): impacts of hundreds of newtons stay in the range of a network's inputs.
     return op("multiply", op("sign", newtons), op("log1p", op("absolute", newtons)))
 
 
@@ -210,6 +219,7 @@ def some(node: Node, *indices: int) -> Node:
 
 def rated(term: Any, squared_error: Node) -> Node:
     """Return exp(-error^2 / std^2)."""
+    # A negative divisor saves an operation: exp(x / -std^2).
     return op("exp", op("divide", squared_error, -(term.std**2)))
 
 
@@ -241,11 +251,13 @@ def root_height(term: Any, view: EnvView) -> Node:
 
 def tilt(term: Any, view: EnvView) -> Node:
     """Return the squared sine of the tilt of a body."""
+    # Gravity's direction is a unit vector: its x and y are the sine of the angle to the vertical.
     return squared(some(quantity("projected_gravity", body=term.body or root(term, view)), 0, 1))
 
 
 def beyond(value: Node, low: Sequence[float] | float, high: Sequence[float] | float | None) -> Node:
     """Return how far values are outside of ranges; None is a range without an end."""
+    # `clip` gives the nearest value inside of the range, so inside the distance is 0.
     return op("absolute", difference(value, op("clip", value, low=low, high=high)))
 
 
@@ -262,6 +274,7 @@ def foot_velocity(term: Any, view: EnvView) -> Node:
 
 def _place(t: Any, v: EnvView) -> Node:
     """Return where the body or site of a term is, in the world."""
+    # Terms have a body or a site; the site is asked for first.
     if getattr(t, "site", None) is not None:
         return quantity("site_pos", sites=[t.site])
     return quantity("body_pos", bodies=[t.body])
@@ -269,6 +282,7 @@ def _place(t: Any, v: EnvView) -> Node:
 
 def _to_target(t: Any, v: EnvView) -> Node:
     asked = some(command(t), 0, 1, 2)
+    # A target in the root's frame: turn it into the world's axes and add where the root is.
     if t.frame == "root":
         turned = op("rotate", quantity("body_quat", bodies=[root(t, v)]), asked)
         asked = op("add", quantity("body_pos", bodies=[root(t, v)]), turned)
@@ -280,12 +294,14 @@ def _to_body(t: Any, v: EnvView) -> Node:
 
 
 def _pose(t: mdp.Pose, v: EnvView) -> Node:
+    # The gait follows from the speed that is asked for, and each gait has its own stds by joint.
     standing, walking, running = (table(t, v, f"std_{gait}") for gait in ("standing", "walking", "running"))
     moving = op("where", op("less", speed(t), t.running_threshold), walking, running)
     std = op("where", op("less", speed(t), t.walking_threshold), standing, moving)
     return op("exp", op("negative", op("mean", op("square", op("divide", _pos_rel(t, v), std)))))
 
 
+# Rewards ask for true angles: these have no field `biased`.
 _pos_rel = joints("joint_pos_rel")
 _vel = joints("joint_vel")
 _effort = joints("joint_effort")
@@ -293,6 +309,7 @@ _effort = joints("joint_effort")
 
 def _swing_height(t: mdp.FootSwingHeight, v: EnvView) -> Node:
     landed = contact(t, "first_contact")
+    # The peak since the foot left the ground; it counts at the landing only.
     peak = op("peak", sites("site_height", t, v), contact(t, "found"), landed)
     missed = op("square", difference(op("divide", peak, t.target_height), 1.0))
     return while_commanded(t, total(op("multiply", missed, landed)))
@@ -304,12 +321,14 @@ def _clearance(t: mdp.FootClearance, v: EnvView) -> Node:
 
 
 def _slip(t: mdp.FootSlip, v: EnvView) -> Node:
+    # Squared speed along the ground of each foot: blocks of two, x and y.
     speed2 = op("sum", op("square", foot_velocity(t, v)), width=2)
     return while_commanded(t, total(op("multiply", speed2, contact(t, "found"))))
 
 
 def _air_time(t: mdp.FeetAirTime, _: EnvView) -> Node:
     time = contact(t, "air_time")
+    # 1 for each foot whose flight is longer than the one and shorter than the other threshold.
     inside = op("multiply", op("greater", time, t.threshold_min), op("less", time, t.threshold_max))
     return while_commanded(t, total(inside))
 
@@ -321,16 +340,19 @@ def _tracked(t: Any, v: EnvView) -> tuple[Node, Node, Node]:
 
 def _track_linear(t: mdp.TrackLinearVelocity, v: EnvView) -> Node:
     asked, moves, _ = _tracked(t, v)
+    # The command has no z: a robot that tracks it does not move up or down.
     error = difference(op("concat", some(asked, 0, 1), [0.0]), moves)
     return rated(t, squared(error))
 
 
 def _track_angular(t: mdp.TrackAngularVelocity, v: EnvView) -> Node:
     asked, _, turns = _tracked(t, v)
+    # Roll and pitch rates should be 0, so they are part of the error.
     return rated(t, squared(difference(op("concat", [0.0, 0.0], some(asked, 2)), turns)))
 
 
 def _beyond_limits(t: mdp.JointPosLimits, v: EnvView) -> Node:
+    # The numbers of the built env: the runner knows no soft limits.
     low, high = v.joints(t.joints).soft_limits_L2.T.tolist()
     return total(beyond(joints("joint_pos")(t, v), low, high))
 
@@ -345,10 +367,12 @@ def changed(node: Node) -> Node:
 
 
 def _bad_orientation(t: mdp.BadOrientation, v: EnvView) -> Node:
+    # z of gravity's direction, negated, is the cosine of the tilt; falling over makes it small.
     upright = op("negative", some(quantity("projected_gravity", body=root(t, v)), 2))
     return op("less", upright, math.cos(t.limit_angle))
 
 
+# Rewards that forces on bodies and the motion of feet give.
 _add(mdp.ContactForceAbove, lambda t, v: total(op("maximum", difference(force(t), t.threshold), 0.0)))
 _add(mdp.UndesiredContacts, lambda t, v: total(op("greater", force(t), t.threshold)))
 _add(mdp.SelfCollision, lambda t, v: total(op("greater", contact(t, "peak_history"), t.threshold)))
@@ -361,6 +385,7 @@ _add(
 )
 _add(mdp.FeetAirTime, _air_time)
 _add(mdp.JointPosLimits, _beyond_limits)
+# Costs of joints: distance from the default pose, speed, acceleration, effort, power.
 _add(mdp.JointDeviationL1, lambda t, v: total(op("absolute", _pos_rel(t, v))))
 _add(mdp.JointDeviationL2, lambda t, v: squared(_pos_rel(t, v)))
 _add(mdp.JointVelL2, lambda t, v: squared(_vel(t, v)))
@@ -369,9 +394,11 @@ _add(mdp.JointEffortL2, lambda t, v: squared(_effort(t, v)))
 _add(mdp.Energy, lambda t, v: total(op("absolute", op("multiply", _effort(t, v), _vel(t, v)))))
 _add(mdp.Alive, lambda t, v: 1.0)
 _add(mdp.Terminated, lambda t, v: quantity("terminated"))
+# First, second and third difference of the actions: each `previous` reaches one step further back.
 _add(mdp.ActionRateL2, lambda t, v: squared(_action_rate()))
 _add(mdp.ActionAccelerationL2, lambda t, v: squared(changed(_action_rate())))
 _add(mdp.ActionJerkL2, lambda t, v: squared(changed(changed(_action_rate()))))
+# Commands that are tracked, and the posture of the root.
 _add(mdp.TrackLinearVelocity, _track_linear)
 _add(mdp.TrackAngularVelocity, _track_angular)
 _add(mdp.TrackPosition, lambda t, v: rated(t, squared(_to_target(t, v))))
@@ -386,6 +413,7 @@ _add(mdp.LinVelZL2, lambda t, v: squared(some(root_velocity("root_lin_vel", t, v
 _add(mdp.AngVelXYL2, lambda t, v: squared(some(root_velocity("root_ang_vel", t, v), 0, 1)))
 _add(mdp.BodyAngularVelocity, lambda t, v: squared(some(quantity("body_ang_vel", bodies=[t.body]), 0, 1)))
 _add(mdp.AngularMomentum, lambda t, v: squared(quantity("sensor", sensor=t.sensor)))
+# Terminations and metrics.
 _add(mdp.BadOrientation, _bad_orientation)
 _add(mdp.RootHeightBelow, lambda t, v: op("less", root_height(t, v), t.minimum_height))
 _add(mdp.IllegalContact, lambda t, v: op("any", op("greater", force(t), t.threshold)))

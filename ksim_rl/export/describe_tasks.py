@@ -19,18 +19,21 @@ from ksim_rl.export.describe import (
 from ksim_rl.tasks import control_suite as control
 from ksim_rl.tasks import get_up, planar
 
+# The cart on its rail, m, and the pole's angle, 0 upright, rad.
 CART, HINGE = (quantity("joint_pos", joints=[name]) for name in ("slider", "hinge"))
 
 
 def tolerance(value: Node, low: float, high: float | None, margin: float) -> Node:
     """Return `mdp.rewards.tracking.tolerance` of the shape "gaussian"."""
     outside = op("divide", beyond(value, low, high), margin)
+    # log(0.1): at one margin outside the value is 0.1, as in dm_control.
     return op("exp", op("multiply", math.log(0.1), op("square", outside)))
 
 
 def linear(value: Node, low: float, margin: float, value_at_margin: float = 0.0) -> Node:
     """Return `mdp.rewards.tracking.tolerance` of the shape "linear", from `low` on."""
     outside = op("divide", beyond(value, low, None), margin)
+    # Clamped: far away the line would go below zero.
     return op("maximum", difference(1.0, op("multiply", 1.0 - value_at_margin, outside)), 0.0)
 
 
@@ -38,6 +41,7 @@ def product(*of: Node) -> Node:
     """Return the product of some numbers."""
     if len(of) == 1:
         return of[0]
+    # `multiply` takes two, so a product of more is nested.
     return op("multiply", of[0], product(*of[1:]))
 
 
@@ -48,11 +52,13 @@ def mean(one: Node, other: Node, weight: float = 1.0) -> Node:
 
 @describe.register(control.CartpolePosition)
 def _position(*_: Any) -> Node:
+    # Cosine and sine, since an angle jumps after a turn.
     return op("concat", CART, op("cos", HINGE), op("sin", HINGE))
 
 
 @describe.register(control.CartpoleReward)
 def _reward(*_: Any) -> Node:
+    # The clip is the actuator's: commands beyond it cost no more.
     force = op("clip", op("take", quantity("action"), indices=[0]), low=-1.0, high=1.0)
     small_control = mean(1.0, difference(1.0, op("square", force)), weight=4.0)
     speed = quantity("joint_vel", joints=["hinge"])
@@ -64,17 +70,20 @@ def _reward(*_: Any) -> Node:
 
 @describe.register(control.PoleFallen)
 def _fallen(term: control.PoleFallen, view: EnvView) -> Node:
+    # The pole is upright where cos = 1; further from it than the limit is fallen.
     return op("less", op("cos", HINGE), math.cos(term.limit))
 
 
 @describe.register(control.ReacherPose)
 def _pose(*_: Any) -> Node:
     shoulder, wrist = (quantity("joint_pos", joints=[name]) for name in ("shoulder", "wrist"))
+    # The wrist is limited, so it needs no cosine and sine.
     return op("concat", op("cos", shoulder), op("sin", shoulder), wrist)
 
 
 @describe.register(control.FingerToTarget)
 def _to_target(term: Any, view: EnvView) -> Node:
+    # A planar arm: z is the same for all targets.
     finger = some(quantity("site_pos", sites=["finger"]), 0, 1)
     return difference(quantity("command", command=term.command), finger)
 
@@ -100,12 +109,14 @@ def _swung_up(term: Any, view: EnvView) -> Node:
 
 # -- planar robots -----------------------------------------------------------------------------------------------
 
+# Planar robots have slides and a hinge in place of a free joint; x of the centre of mass is forward, m/s.
 HEIGHT = quantity("joint_pos", joints=["root_z"])
 FORWARD = some(quantity("sensor", sensor="com_velocity"), 0)
 
 
 def upright(body: str) -> Node:
     """Return 1 where a body is upright, 0 where it is upside down."""
+    # z of gravity's direction is -1 upright and 1 upside down: mapped to 1 and 0.
     return mean(1.0, op("negative", some(quantity("projected_gravity", body=body), 2)))
 
 
@@ -121,8 +132,10 @@ def _runs(*_: Any) -> Node:
 
 @describe.register(planar.HopperReward)
 def _hops(term: planar.HopperReward, view: EnvView) -> Node:
+    # Height over the foot, so that a jump alone does not count as standing.
     above_foot = difference(HEIGHT, some(quantity("body_pos", bodies=["foot"]), 2))
     tall = tolerance(above_foot, planar.HOPPER_HEIGHT, None, planar.HOPPER_HEIGHT / 2)
+    # Without a speed the task is to stand, and small actions are paid instead.
     if term.speed:
         return product(tall, upright(root(term, view)), linear(FORWARD, term.speed, term.speed))
     action = op("clip", quantity("action"), low=-1.0, high=1.0)
@@ -133,9 +146,11 @@ def _hops(term: planar.HopperReward, view: EnvView) -> Node:
 @describe.register(planar.WalkerReward)
 def _walks(term: planar.WalkerReward, view: EnvView) -> Node:
     tall = tolerance(HEIGHT, planar.WALKER_HEIGHT, None, planar.WALKER_HEIGHT / 2)
+    # Standing is three parts height, one part upright.
     stands = mean(tall, upright(root(term, view)), weight=3.0)
     if not term.speed:
         return stands
+    # One sixth of the reward is left without any speed, so that standing pays first.
     return product(stands, mean(linear(FORWARD, term.speed, term.speed / 2, 0.5), 1.0, weight=5.0))
 
 
@@ -160,6 +175,7 @@ def _risen(term: Any, view: EnvView) -> Node:
 @describe.register(get_up.Standing)
 def _standing(term: get_up.Standing, view: EnvView) -> Node:
     names = joint_names(view, ".*")
+    # Squared: half risen earns a quarter.
     up = op("square", product(upright(root(term, view)), _risen(term, view)))
     stray = op("mean", op("square", op("divide", quantity("joint_pos_rel", joints=names), term.pose_std)))
     motion = op("mean", op("square", op("divide", quantity("joint_vel", joints=names), term.speed_std)))
@@ -170,4 +186,5 @@ def _standing(term: get_up.Standing, view: EnvView) -> Node:
 def _stands(term: get_up.Stands, view: EnvView) -> Node:
     is_high = op("greater", root_height(term, view), 0.85 * term.standing_height)
     down = some(quantity("projected_gravity", body=root(term, view)), 2)
+    # Up is a tilt below 0.35 rad (20 degrees).
     return product(is_high, op("less", down, -math.cos(0.35)))

@@ -31,8 +31,10 @@ from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, UNLIMITED_EPISODE_STE
 from ksim_rl.trainers.run_folder import Policy, policy_of
 
 STANDALONE = Path(__file__).parent / "standalone"
+# Each needs only those before it, since they become one file.
 PARTS = ("files", "signals", "network", "runner")
 """The modules of `runner.py`, in this order."""
+# Episodes of trace.npz and env steps of each: enough for the causes, and small beside the recorded episodes.
 TRACED = 4
 TRACED_STEPS = 60
 FILES = (
@@ -66,6 +68,7 @@ def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **opti
     """Write the policy of a run into `folder`, `<run>/export` by default, and return it; see `export_policy`."""
     saved = checkpoint.load_latest(run)
     run_folder = saved.run_folder
+    # Commit and versions that trained the policy, not those that export it.
     sessions = record.read(run_folder)
     if sessions:
         commit = sessions[-1].code.get("ksim_rl", {}).get("commit")
@@ -80,6 +83,7 @@ def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **opti
         policy_of(saved, device=device),
         folder,
         below=below,
+        # Relative to the folder of runs, so that the export names no folder of this machine.
         run_path=str(saved.path.absolute().relative_to(saved.run_folder.parent)),
         **options,
     )
@@ -102,12 +106,13 @@ def export_policy(
     `episodes` are recorded from `seed` for `sim2sim` to compare with, with or without `noise` of the sensors; 0 leaves
     them out. The files appear at the end, all or none; links are refused in their places, and in folders from `below`
     on, by default `folder`. Raises ValueError where the policy or an observation term cannot be written down, naming
-    it and what to do, or the files differ from the policy.
+    it and the way out, or the files differ from the policy.
     """
     if episodes < 0:
         raise ValueError(f"--episodes {episodes}: expected 0 or more")
     missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
     if missing:
+        # Asked before the env is built: the packages of the extra are used last.
         raise ValueError(f"no package {missing[0]!r}: pip install 'ksim_rl[export]'")
     with whole_folder(folder, below=folder if below is None else below) as unfinished:
         _fill(
@@ -135,14 +140,17 @@ def _fill(
     note: Callable[[str], None],
 ) -> None:
     """Write the files of an export into a folder that is empty."""
+    # A curriculum would change weights and ranges while episodes are recorded.
     cfg = dataclasses.replace(trained.cfg, task=dataclasses.replace(trained.cfg.task, curriculum={}))
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET
+    # At least as many envs as episodes are traced.
     env = build_env(cfg, num_envs=max(episodes, TRACED), seed=seed)
     ours = part(env, ManagerBasedRlEnv)
     assert ours is not None  # the env of a config is ours
     groups: list[Any] = cfg.modules.observation_keys("actor")
     terms = {str(group): controls.observations(ours, [str(group)]) for group in groups}
+    # Descriptions before files: a term without one is refused before minutes of work.
     meta = metadata(ours, [term for of_group in terms.values() for term in of_group], note)
     columns = {
         group: [
@@ -156,18 +164,22 @@ def _fill(
         ]
         for group in groups
     }
+    # In evaluation mode normalizers stop learning; on the CPU as the files are for it.
     exported = policy.ExportedPolicy(trained.actor.cpu().eval(), columns)
     note("writing policy.onnx and policy.pt2")
     policy.write(exported, folder)
     difference = policy.greatest_difference(exported, folder / "policy.onnx")
+    # Written so that NaN is refused, too.
     if not difference <= policy.TOLERANCE:
         raise ValueError(
             f"policy.onnx differs from the policy by {difference:.2g}: expected at most {policy.TOLERANCE:g}; weights "
             "or observations that large lose digits in float32"
         )
+    # Actuators of the model in the order of the policy's actions; those that no action names follow.
     first = [name for law in meta["actuators"] for name in law["actuators"]]
     asked = [name for action in meta["actions"] for name in action["names"]]
     by_joint = dict(zip((j for law in meta["actuators"] for j in law["joints"]), first, strict=True))
+    # The scene's spec once more: the env's own was compiled, and XML is written of a spec.
     spec = build_spec(cfg.task.scene)
     cfg.task.sim.apply_to(spec)
     prepare_spec(spec, [])
@@ -182,6 +194,7 @@ def _fill(
     meta |= {"policy": own, "task": cfg.task_name, "iteration": trained.iteration, "run_path": run_path}
     meta |= {"commit": None, "versions": {}, **trained_with}
     meta |= {"seed": seed, "ours": None, "noisy": noise}
+    # In training mode the sensors have noise, in evaluation mode they have none.
     env.train(noise)
     if episodes:
         note(f"recording {episodes} episodes for sim2sim")
@@ -192,16 +205,19 @@ def _fill(
         steps = ours.max_episode_length or UNLIMITED_EPISODE_STEPS
         recorded = Recording(env, ours, actor, steps=steps, **shared)
         figures = recorded.figures[:episodes]
+        # The runner's figures are compared with these, episode by episode.
         meta["ours"] = {}
         for name in figures[0]:
             meta["ours"][name] = [one[name] for one in figures]
         np.savez_compressed(folder / "episodes.npz", **recorded.arrays)  # pyright: ignore
+        # Traces have no noise: single steps have to agree to the digit.
         env.eval()
         traced = Recording(env, ours, actor, steps=min(steps, TRACED_STEPS), traces=TRACED, **shared)
         rates = {"trace/dt": np.array(ours.physics_dt), "trace/decimation": np.array(ours.cfg.decimation)}
         np.savez_compressed(folder / "trace.npz", **traced.arrays, **rates)  # pyright: ignore
     env.close(raise_if_closed=False)
     _attach(folder / "policy.onnx", meta)
+    # NaN is no JSON, and stands for a mistake of ours.
     (folder / "export.json").write_text(json.dumps(meta, indent=1, allow_nan=False) + "\n")
     (folder / "runner.py").write_text(runner_source())
     (folder / "README.md").write_text(
@@ -216,15 +232,17 @@ def _fill(
 def runner_source() -> str:
     """Return the text of `runner.py`: the modules of the folder `standalone` as one."""
     *parts, runner = ((STANDALONE / f"{name}.py").read_text() for name in PARTS)
+    # The docstring of the runner becomes that of the file; the other modules lose theirs.
     doc, body = re.split(r'(?<=\n""")\n', runner, maxsplit=1)
     inner = [re.sub(r'\A""".*?"""\n', "", text, flags=re.DOTALL) for text in parts]
+    # Imports of the package go: all names are in the one file then.
     return doc + "\n" + re.sub(r"from ksim_rl[^\n]*\n", "", "\n\n".join([*inner, body]))
 
 
 def metadata(
     ours: ManagerBasedRlEnv, terms: list[dict[str, Any]], note: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Return what the env is made of; rewards, metrics and terminations without a description are left out.
+    """Return the description of the env; rewards, metrics and terminations without a description are left out.
 
     `terms` are those that the policy observes. Raises NotDescribedError, naming the term, for an action or actuator.
     """
@@ -232,6 +250,7 @@ def metadata(
     view = ours.view
     actions = controls.actions(ours)
     laws = controls.actuators(ours)
+    # Joints of the actions first, in their order; then the others, which observations may name.
     asked = list(dict.fromkeys(n for action in actions if action["kind"] != "ctrl" for n in action["names"]))
     names = [*asked, *(n for n in joint_names(view, None) if n not in asked)]
     left_out: list[str] = []
@@ -246,9 +265,12 @@ def metadata(
                 note(f"task.{kind}.{name} is left out of sim2sim: {error}")
         return found
 
+    # A reward of weight 0 needs no description.
     weights = {name: term for name, term in cfg.rewards.items() if term.weight != 0.0}
+    # The runner knows the time limit from `episode_steps`.
     ends = {name: term for name, term in cfg.terminations.items() if type(term).__name__ != "TimeOut"}
     means = {name: term for name, term in cfg.metrics.items() if term.reduce == "mean"}
+    # Controllers for mjlab's policies read the first entries, by these names.
     gains = _gains(ours, laws, names)
     if names:
         by_term = [view.joints(n).default_pos_EL[0].tolist() for n in (asked, names)]
@@ -304,7 +326,8 @@ def metadata(
 def _gains(
     ours: ManagerBasedRlEnv, laws: Sequence[Any], names: Sequence[str]
 ) -> tuple[list[float], list[float]]:
-    """Return stiffness and damping by joint: of laws their numbers, of MuJoCo's servos the model's."""
+    """Return stiffness and damping by joint: the numbers of laws, and the model's gains for MuJoCo's servos."""
+    # Softnesses of servos are in the model, those of laws in the numbers that the laws were given.
     model = ours.world.mj_model
     found = dict.fromkeys(names, (0.0, 0.0))
     for law in laws:
@@ -328,11 +351,13 @@ def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> dict[str, Any]:
         limits = ours.view.joints(list(names)).soft_limits_L2.tolist()
     else:
         limits = []
+    # Of effort only at joints: a tendon's force is no joint's torque.
     effort: dict[str, float] = {}
     for i in range(model.nu):
         if not drives_scalar_joint(model, i) or not model.actuator_forcelimited[i]:
             continue
         joint = int(model.actuator_trnid[i, 0])
+        # The motor's limit times its gear.
         effort[model.joint(joint).name] = float(
             abs(model.actuator_gear[i, 0]) * model.actuator_forcerange[i, 1]
         )
@@ -347,9 +372,10 @@ def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _attach(path: Path, meta: dict[str, Any]) -> None:
-    """Put what controllers look for into the ONNX file: lists as text with commas, and all of ours as JSON."""
+    """Put the entries that controllers look for into the ONNX file: numbers as text, lists with commas."""
     import onnx  # an extra
 
+    # The weights are in the file: nothing is loaded from beside it.
     model = onnx.load(path, load_external_data=False)
     for written in (*model.graph.node, *model.graph.value_info):
         written.ClearField("metadata_props")  # what the exporter notes for itself, 20 kB

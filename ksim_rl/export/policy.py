@@ -22,15 +22,17 @@ from ksim_rl.modules.actor import PARAMETERS, MixedHead
 from ksim_rl.modules.network import ObservationNormalizer, side_by_side
 from ksim_rl.modules.recurrent import RESET_KEY, RecurrentModule
 
+# Greatest error of the ONNX file, and over how many observations it is looked for.
 TOLERANCE = 1e-5
 CHECKED = 10_000
+# Observations in one call, as parallel episodes.
 ROWS = 100
 OPSET = 18
 
 
 @dataclass(frozen=True, kw_only=True)
 class StateSpec:
-    """What the policy carries from step to step: an input [batch, *shape] and the output that feeds it next.
+    """A state that the policy carries from step to step: an input [batch, *shape] and the output that feeds it next.
 
     An episode starts with zeros, or with its first frame, columns [start, stop) of the observation, in all places.
     """
@@ -43,6 +45,7 @@ class StateSpec:
 
 
 def _state(name: str, shape: tuple[int, ...], columns: tuple[int, int] | None = None) -> StateSpec:
+    # A history begins with the first frame in all places, a recurrent state with zeros.
     starts_with = "frame" if columns else "zeros"
     return StateSpec(
         input=f"{name}_in", output=f"{name}_out", shape=shape, starts_with=starts_with, columns=columns
@@ -51,7 +54,7 @@ def _state(name: str, shape: tuple[int, ...], columns: tuple[int, int] | None = 
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One term of what the policy reads: `size` numbers in a frame, of which `length` stand `stride` steps apart."""
+    """One term that the policy reads: `size` numbers in a frame, of which `length` stand `stride` steps apart."""
 
     name: str
     size: int
@@ -69,8 +72,10 @@ class ExportedPolicy(nn.Module):
     def __init__(self, actor: TensorDictModuleBase, groups: Mapping[Any, Sequence[Column]]) -> None:
         super().__init__()
         self.actor = actor
+        # The sequence of modules is run by hand in `forward`: exporters know no TensorDict.
         self.parts = list(_parts(actor))
         self.groups = groups
+        # A mixed head has one action per distribution, under keys of its own.
         mixed = _mixed_head(self.parts[-1])
         if mixed:
             self.action_keys: list[Any] = mixed.action_keys
@@ -79,10 +84,12 @@ class ExportedPolicy(nn.Module):
         self.states = []
         start = 0
         for column in self.columns:
+            # Frames that a history keeps beside the newest one, also those that its stride leaves out.
             if column.length > 1:
                 shape = ((column.length - 1) * column.stride, column.size)
                 columns = (start, start + column.size)
                 self.states.append(_state(f"history_{column.name}", shape, columns))
+            # Start of the next term in the frame.
             start += column.size
         self.obs_dim = start
         for part in self.parts:
@@ -109,6 +116,7 @@ class ExportedPolicy(nn.Module):
         self, obs_BL: Float[Tensor, "B L"], *states: Float[Tensor, "B *?S"]
     ) -> tuple[Float[Tensor, "B *?M"], ...]:
         """Return the actions and the next states."""
+        # Consumed from the front, in the order of `states`: histories first, then recurrent ones.
         given = list(states)
         after = []
         values: dict[Any, Tensor] = {}
@@ -117,26 +125,33 @@ class ExportedPolicy(nn.Module):
             terms = []
             for column in columns:
                 frame = obs_BL[:, start : start + column.size]
+                # The frame has terms side by side, in the order of the groups.
                 start += column.size
                 if column.length > 1:
+                    # Oldest first; the oldest frame drops out of the next state.
                     frames = torch.cat((given.pop(0), frame[:, None]), 1)
                     after.append(frames[:, 1:])
+                    # Every `stride`-th of (length - 1) * stride + 1 frames: `length` of them, the newest
+                    # among them.
                     frame = frames[:, :: column.stride].flatten(1)
                 terms.append(frame)
             values[group] = torch.cat(terms, -1)
         actions: list[Tensor] = []
         for part in self.parts:
+            # Recurrent modules step by formula, as they wait for resets that an export has not.
             if isinstance(part, RecurrentModule):
                 features, kept = _recurrent(part, values, [given.pop(0) for _ in part.state_keys])
                 values[part.feature_key] = features
                 after += kept
             elif isinstance(part, ProbabilisticTensorDictModule):
+                # The distribution is last: its parameters become the deterministic action.
                 actions = _best(part, values)
             else:
                 found = part.module(*(values[key] for key in part.in_keys))
                 if not isinstance(found, tuple):
                     found = (found,)
                 values |= dict(zip(part.out_keys, found, strict=True))
+                # TD3 and its like end in a network that writes the action itself.
                 if "action" in part.out_keys:
                     actions = [values["action"]]
                 else:
@@ -147,6 +162,7 @@ class ExportedPolicy(nn.Module):
 def _parts(module: Any) -> Iterator[Any]:
     """Return the parts of nested sequences in the order in which they run."""
     inner = getattr(module, "module", None)
+    # Before the general case: both are TensorDictModules, too.
     if isinstance(module, RecurrentModule | ProbabilisticTensorDictModule):
         yield module
     elif isinstance(inner, nn.ModuleList | list | tuple):
@@ -164,6 +180,7 @@ def _parts(module: Any) -> Iterator[Any]:
 def _best(part: Any, values: dict[Any, Tensor]) -> list[Tensor]:
     """Return the deterministic action of each distribution, as `ExplorationType.DETERMINISTIC` does."""
     if mixed := _mixed_head(part):
+        # Each head finds its parameters under the key of its action.
         found = []
         heads = cast(Any, mixed.heads)
         for key, head in zip(mixed.action_keys, heads, strict=True):
@@ -186,6 +203,7 @@ def _mixed_head(part: Any) -> MixedHead | None:
 
 
 def _row(action: Tensor) -> Tensor:
+    # Choices are whole numbers of shape [B]; files hold one float32 row per action.
     return (action.flatten(1) if action.ndim > 1 else action[:, None]).float()
 
 
@@ -196,27 +214,32 @@ def _recurrent(
     network = part.module
     cfg = part.cfg
     features = side_by_side([values[key] for key in part.obs_keys])
+    # As in training: the normalizer is a part of the module.
     if network.normalizer is not None:
         features = network.normalizer(features)
     after: list[tuple[Tensor, ...]] = []
     for layer in range(cfg.num_layers):
+        # In torch's own layout: gates are stacked in rows, so that they are split below.
         weights = [
             network.get_parameter(f"{name}_l{layer}")
             for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
         ]
         x = functional.linear(features, weights[0], weights[2])
         h = functional.linear(state[0][:, layer], weights[1], weights[3])
+        # Torch's order of gates: input, forget, cell, output.
         if cfg.kind == "lstm":
             i, f, g, o = (x + h).chunk(4, -1)
             cell = f.sigmoid() * state[1][:, layer] + i.sigmoid() * g.tanh()
             features = o.sigmoid() * cell.tanh()
             after.append((features, cell))
         else:
+            # Torch's order: reset, update, new; the reset gate scales the recurrent part with its bias.
             (rx, zx, nx) = x.chunk(3, -1)
             (rh, zh, nh) = h.chunk(3, -1)
             r = (rx + rh).sigmoid()
             z = (zx + zh).sigmoid()
             n = (nx + r * nh).tanh()
+            # Equal to (1 - z) n + z h.
             features = n + z * (state[0][:, layer] - n)
             after.append((features,))
     return features, [torch.stack(parts, 1) for parts in zip(*after, strict=True)]
@@ -224,12 +247,14 @@ def _recurrent(
 
 def write(policy: ExportedPolicy, folder: Path) -> None:
     """Write `policy.onnx` and `policy.pt2`; their batch has any size."""
+    # Weights are copied into the files; `eval` stops normalizers from learning.
     policy = policy.to("cpu").eval()
     # Two rows: a batch of one would be taken for a constant.
     example = (torch.zeros(2, policy.obs_dim), *(torch.zeros(2, *state.shape) for state in policy.states))
     batch = torch.export.Dim("batch", min=1, max=2**20)
-    # One entry per parameter of `forward`; the states are a tuple of their own.
+    # One entry per parameter of `forward`; the states are one parameter, a tuple.
     shapes: tuple[Any, ...] = ({0: batch}, tuple({0: batch} for _ in policy.states))
+    # No gradients; warnings of the exporter are not for users.
     with torch.no_grad(), _quiet():
         program = torch.export.export(policy, example, dynamic_shapes=shapes if policy.states else shapes[:1])
         # They name the folders of this machine, in files that are made to be given away.
@@ -254,7 +279,8 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Leave out what the exporter says about its own workings."""
+    """Silence the exporter's messages about its own workings."""
+    # Both ways of speaking are closed: loggers and warnings.
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -281,21 +307,26 @@ def greatest_difference(policy: ExportedPolicy, path: Path) -> float:
     carried: dict[Any, Tensor] = {}
     states: list[np.ndarray] = []
     frames: list[np.ndarray] = []
+    # Batches of ROWS make CHECKED observations; each batch is one step of all episodes.
     for step in range(CHECKED // ROWS):
         frames.append((mean + std * draws.standard_normal((ROWS, policy.obs_dim))).astype(np.float32))
+        # States begin with the first frame, as they do on a robot.
         if not step:
             states = [_first(state, frames[0]) for state in policy.states]
         feed = dict(zip(policy.input_names, [frames[-1], *states], strict=True))
         actions, *states = (np.asarray(value) for value in session.run(policy.output_names, feed))
+        # Recurrent modules clear their state where this is true, at the first step.
         asked = TensorDict({RESET_KEY: torch.full((ROWS, 1), not step)}, batch_size=[ROWS])
         start = 0
         for group, columns in policy.groups.items():
+            # Histories are put together from the kept frames, not taken from the states under test.
             terms = []
             for column in columns:
                 back = [column.stride * k for k in reversed(range(column.length))]
                 terms += [frames[max(step - k, 0)][:, start : start + column.size] for k in back]
                 start += column.size
             asked[group] = torch.from_numpy(np.concatenate(terms, -1))
+        # The recurrent state that the actor gave at the step before, zeros at first.
         for part in policy.parts:
             if isinstance(part, RecurrentModule):
                 zeros = torch.zeros(ROWS, part.cfg.num_layers, part.cfg.hidden_dim)
@@ -303,10 +334,12 @@ def greatest_difference(policy: ExportedPolicy, path: Path) -> float:
                     asked[key] = carried.get(key, zeros)
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             answer = policy.actor(asked)
+        # TorchRL's modules give the state of the next step under "next".
         carried = {
             key: answer["next", *key] for part in policy.parts for key in getattr(part, "state_keys", ())
         }
         wanted = torch.cat([_row(answer[key]) for key in policy.action_keys], -1).numpy()
+        # `max` of numpy passes NaN on; `max` of Python would not.
         # Also where one of the two is NaN.
         difference = (np.abs(actions - wanted) / np.maximum(np.abs(wanted), 1.0)).max()
         worst = max(worst, float("inf") if np.isnan(difference) else float(difference))
@@ -319,6 +352,7 @@ def _statistics(policy: ExportedPolicy) -> tuple[np.ndarray, np.ndarray]:
     std = np.ones(policy.obs_dim)
     for module in policy.actor.modules():
         whole = sum(column.size * column.length for column in policy.columns)
+        # The normalizer that covers the whole observation, histories included.
         if isinstance(module, ObservationNormalizer) and module.dim == whole:
             newest = []
             stop = 0
@@ -326,6 +360,7 @@ def _statistics(policy: ExportedPolicy) -> tuple[np.ndarray, np.ndarray]:
                 stop += column.size * column.length
                 newest += range(stop - column.size, stop)
             mean = module.mean.detach().cpu().double().numpy()[newest]
+            # A column that never moved has no spread; it is drawn a little about its mean.
             std = module.var.detach().cpu().double().sqrt().clamp(min=1e-3).numpy()[newest]
     return mean, std
 

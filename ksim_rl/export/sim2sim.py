@@ -19,6 +19,7 @@ from ksim_rl.physics import load_spec
 from ksim_rl.terminal import printable, show
 from ksim_rl.trainers.other_physics import half_time_step, other_integrator, same_time_step
 
+# The figures that are compared, by the beginnings of their names.
 TABLE = ("return", "length", "fell", "reward/", "metric/", "torque/", "contact/")
 
 
@@ -26,7 +27,7 @@ TABLE = ("return", "length", "fell", "reward/", "metric/", "torque/", "contact/"
 class Report:
     """Means over episodes, recorded (`ours`) and on MuJoCo's C engine (`theirs`), and why they differ.
 
-    `standard_error` is that of `return_ratio`, by the pairs of episodes that began alike.
+    `standard_error` belongs to `return_ratio`, by the pairs of episodes that began alike.
     """
 
     task: str
@@ -54,6 +55,7 @@ class Report:
         for name, value in self.theirs.items():
             if name in self.ours:
                 own = self.ours[name]
+                # Near zero a relative difference says nothing.
                 if abs(own) > 1e-6:
                     share = f"{value / own - 1.0:+.1%}"
                 else:
@@ -65,6 +67,7 @@ class Report:
             lines.append("likely causes:")
             lines += [f"  {cause}" for cause in self.causes]
         else:
+            # Three standard errors, and 0.1 % for what float32 rounds differently.
             beyond = abs(self.return_ratio - 1.0) > 3.0 * self.standard_error + 1e-3
             if beyond:
                 what = "but the returns differ by more than chance"
@@ -87,10 +90,12 @@ def sim2sim(
     if episodes < 1:
         raise ValueError(f"--episodes {episodes}: expected at least 1")
     meta = read_json(folder / "export.json")
+    # Everything of the folder is checked here, before a second process opens it.
     ours = _recorded(meta, folder)
     check_closed(folder / "robot.xml")
     physics, words = _other_physics(meta, load_spec(folder / "robot.xml").option)
     note(f"running {episodes} episodes")
+    # Our own runner, not that of the folder, which may be a stranger's.
     with tempfile.TemporaryDirectory() as temporary:
         program, output, replay = (Path(temporary) / name for name in ("runner.py", "out.json", "replay.npz"))
         program.write_text(runner_source())
@@ -99,10 +104,12 @@ def sim2sim(
         # Isolated: PYTHONPATH adds no modules either, as the runner needs none of this library.
         done = run_python(["-I", str(program), *arguments])
         if done.returncode:
+            # The runner says in one line why it refused; that line becomes ours.
             last = (done.stderr.strip() or "no message").splitlines()[-1]
             said = last.removeprefix("runner.py: error: ")
             raise ValueError(said if str(folder.absolute()) in said else f"{folder}: {said}")
         found = json.loads(output.read_text())
+        # Arrays of wrong shapes fail anywhere in the comparison: it is the files that are wrong.
         try:
             causes = find_causes(meta, read_arrays(folder / "trace.npz"), read_arrays(replay))
         except (*MISFITS, ValueError) as error:
@@ -114,6 +121,7 @@ def sim2sim(
     for name in found[0]:
         if name.startswith(TABLE):
             theirs[name] = np.array([one[name] for one in found])
+    # Only terms that both sides have: the recorded return also has those without a description.
     described = [own[name] for name in own if name.startswith("reward/") and name in theirs]
     own["return"] = np.sum(described, axis=0) if described else np.zeros(episodes)
     return Report(
@@ -129,12 +137,14 @@ def sim2sim(
 
 
 def _other_physics(meta: Mapping[str, Any], option: mujoco.MjOption) -> tuple[list[str], str]:
-    """Return the runner's arguments by which the C engine judges an export, and how to say what they mean."""
+    """Return the runner's arguments by which the C engine judges an export, and the words for them."""
     # Warp is other physics already.
     if meta.get("engine") != "c":
         return [], ""
+    # The engine that trained it would agree with itself: judge by another integrator.
     integrator, words = other_integrator(option)
     laws = meta.get("actuators")
+    # Lags of actuators count substeps: half the step would be half the lag.
     late = isinstance(laws, list) and any(isinstance(law, dict) and law.get("delay") for law in laws)
     if late:
         return ["--integrator", integrator], f"{words}, {same_time_step(option.timestep)}"
@@ -143,12 +153,13 @@ def _other_physics(meta: Mapping[str, Any], option: mujoco.MjOption) -> tuple[li
 
 
 def _recorded(meta: Mapping[str, Any], folder: Path) -> dict[str, np.ndarray]:
-    """Return the figures of the recorded episodes [N] by name; a ValueError tells what an export does not write."""
+    """Return the figures of the recorded episodes [N] by name; a ValueError names a figure that no export writes."""
     ours = meta.get("ours")
     if not isinstance(ours, dict) or not ours.get("return"):
         raise ValueError(
             f"{folder}: exported without episodes: export the run once more, with --episodes 100"
         )
+    # The returns give the count that all other figures must have.
     returns = ours["return"]
     if isinstance(returns, list):
         count = len(returns)
@@ -170,6 +181,7 @@ def ratio_error(ours: np.ndarray, theirs: np.ndarray) -> float:
     mean = float(ours.mean())
     if len(ours) < 2 or mean == 0.0:
         return float("nan")
+    # Delta method: the spread of theirs around the ratio's line through the pairs.
     return float(np.std(theirs - ours * theirs.mean() / mean, ddof=1) / np.sqrt(len(ours)) / abs(mean))
 
 
@@ -204,4 +216,5 @@ def run_sim2sim(arguments: Sequence[str]) -> int:
     options: Any = parser.parse_args(arguments)
     report = sim2sim(options.folder, episodes=options.episodes, seed=options.seed)
     show(report.table())
+    # Differing returns alone are no failure: chance moves them.
     return 1 if report.causes else 0

@@ -14,10 +14,13 @@ import mujoco
 import numpy as np
 
 Array = np.ndarray
+# 1 GiB: a file of more, or one that unpacks to more, is refused before it fills the memory.
 MOST_BYTES = 2**30
 # Far more than an export has of anything that is counted, such as actions or steps of a delay.
 MOST = 1_000_000
+# Tags by which MuJoCo would load other files or code, and "<!", which begins an XML entity.
 LEAVES_THE_FOLDER = re.compile(rb"<!|<\s*(include|extension|plugin|attach|model)\b", re.IGNORECASE)
+# Attributes of MJCF that name a file or a folder.
 PATHS = re.compile(r"\b(?:file\w*|content_type|\w*dir)\s*=\s*[\"']([^\"']*)[\"']")
 # What an export writes of the model's fields where worlds differ: numbers, and none by which C finds other numbers.
 _FIELDS = {
@@ -45,8 +48,10 @@ CHOICE = "geom_dataid"
 
 def read(path: Path, most: int = MOST_BYTES) -> bytes:
     """Return the bytes of a regular file of limited size; links, pipes and devices are refused."""
+    # No link is followed, and a pipe does not block until somebody writes to it.
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW), "rb") as file:
+            # Asked of the open file, not of its path, which could be another file by then.
             about = os.fstat(file.fileno())
             if not stat.S_ISREG(about.st_mode) or about.st_size > most:
                 raise ValueError(f"{path}: expected a regular file of at most {most} bytes")
@@ -57,8 +62,10 @@ def read(path: Path, most: int = MOST_BYTES) -> bytes:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return an export's metadata; a ValueError says what is wrong with the file."""
+    # 64 MiB, far more than the largest description.
     content = read(path, 2**26)
     try:
+        # Deep nesting raises RecursionError in the parser.
         found = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from None
@@ -69,9 +76,11 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def read_arrays(path: Path) -> dict[str, Array]:
     """Return the arrays of numbers of an .npz file."""
+    # Refuses links and pipes; the content is read below.
     read(path)
     try:
         with zipfile.ZipFile(path) as archive:
+            # Deflate packs zeros a thousandfold: the sum of unpacked sizes is what will be allocated.
             if sum(entry.file_size for entry in archive.infolist()) > MOST_BYTES:
                 raise ValueError(f"{path}: unpacked larger than {MOST_BYTES} bytes")
             return {
@@ -83,6 +92,7 @@ def read_arrays(path: Path) -> dict[str, Array]:
 
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
     """Return one array, once its header claims no more than the file holds."""
+    # Header first: numpy allocates the whole shape before it reads.
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
         headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -90,8 +100,10 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
             raise ValueError(f"{entry.filename}: version {version} of the format")
         shape, _, dtype = headers[version](file)
         claimed = math.prod(shape) * dtype.itemsize
+        # Floats, signed and unsigned integers, booleans. Objects would be unpickled, which runs code.
         if dtype.kind not in "fiub" or min(shape, default=0) < 0 or claimed > entry.file_size:
             raise ValueError(f"{entry.filename}: {shape} of {dtype}")
+    # Opened again, since a compressed entry is read from its beginning.
     with archive.open(entry) as file:
         return np.lib.format.read_array(file, allow_pickle=False)
 
@@ -99,6 +111,7 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
 def read_model(folder: Path) -> mujoco.MjModel:
     """Return the model of `robot.xml`, which may name regular files of its own folder only."""
     path = folder / "robot.xml"
+    # Before MuJoCo sees it: its parser opens the files that it names.
     check_closed(path)
     try:
         return mujoco.MjModel.from_xml_path(str(path))
@@ -107,22 +120,26 @@ def read_model(folder: Path) -> mujoco.MjModel:
 
 
 def check_closed(path: Path) -> None:
-    """Refuse a model that takes in others, or names what is no regular file of its own folder."""
+    """Refuse a model that takes in others, or names anything but regular files of its own folder."""
     folder = path.parent
     text = read(path, 2**28)
     if found := LEAVES_THE_FOLDER.search(text):
         raise ValueError(f"{path}: {found.group().decode()!r}: an exported model stands for itself")
+    # Meshes, textures and height fields: resolved, so that ".." and links do not lead out.
     for name in PATHS.findall(text.decode(errors="replace")):
         named = folder / name
         inside = named.resolve().is_relative_to(folder.resolve())
+        # "&" could spell a path by an entity, which this search does not see.
         if not inside or os.path.isabs(name) or "&" in name:
             raise ValueError(f"{path}: {name!r} is outside of the folder")
+        # Also refuses pipes, links and huge files in the places of meshes.
         if named.exists() and not named.is_dir():
             read(named)
 
 
 def check_count(what: str, value: Any) -> int:
     """Return a whole number of 0 to a million, or refuse it."""
+    # bool is a subclass of int in Python.
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MOST:
         raise ValueError(f"export.json: {what} is {str(value)[:40]}: expected a whole number of 0 to {MOST}")
     return value
@@ -131,20 +148,23 @@ def check_count(what: str, value: Any) -> int:
 def check_record(
     path: Path, record: Mapping[str, Array], meta: Mapping[str, Any], mj_model: mujoco.MjModel
 ) -> int:
-    """Return how many episodes a record has, or refuse it: what it writes into the model has to fit.
+    """Return how many episodes a record has, or refuse it: everything that it writes into the model has to fit.
 
     A model's field is one of `FIELDS`, of finite numbers and the model's own shape.
     """
+    # All shapes follow from the model and the metadata, which were checked before.
     joints = len(meta["joints"]["names"])
     shapes = {"qpos": (mj_model.nq,), "qvel": (mj_model.nv,), "ctrl": (mj_model.nu,), "act": (mj_model.na,)}
     shapes |= {"mocap_pos": (mj_model.nmocap, 3), "mocap_quat": (mj_model.nmocap, 4), "gravity": (3,)}
     shapes |= {"encoder_bias": (joints,), "default_pos": (joints,)}
+    # Its first axis is the number of episodes, which all others must have.
     if "start/qpos" not in record or record["start/qpos"].ndim != 2 or not len(record["start/qpos"]):
         raise ValueError(f"{path}: no 'start/qpos' of [episodes, {mj_model.nq}] numbers")
     episodes = len(record["start/qpos"])
     for name, value in record.items():
         kind, _, rest = name.partition("/")
         if kind == "start":
+            # By joint, in the export's order: gains and limits of the laws.
             if rest.startswith("actuator/"):
                 shape = (joints,)
             else:
@@ -154,11 +174,13 @@ def check_record(
             if shape is None:
                 raise ValueError(f"{path}: {name!r}: no part of the start of an episode")
             _check_shape(path, name, value, (episodes, *shape))
+    # [episodes, steps, size]: steps may be any number, but at least one for `reset` to read.
     for name, command in meta["commands"].items():
         values = record.get(f"command/{name}", np.zeros(0))
         if values.ndim != 3 or values.shape[0] != episodes or values.shape[1] < 1:
             raise ValueError(f"{path}: no 'command/{name}' of [{episodes}, steps, {command['size']}] numbers")
         _check_shape(path, f"command/{name}", values, (*values.shape[:2], command["size"]))
+    # Rows of episode, step, change of qvel [nv].
     pushes = record.get("pushes", np.zeros(0))
     _check_shape(path, "pushes", pushes, (len(pushes), 2 + mj_model.nv))
     return episodes
@@ -168,6 +190,7 @@ def _check_field(path: Path, field: str, value: Array, mj_model: mujoco.MjModel)
     """Return the shape that a field of the model has, as an export writes it; refuse one that none writes."""
     if field not in FIELDS | {CHOICE}:
         raise ValueError(f"{path}: 'start/model/{field}' is no field that an export writes")
+    # Refused above unless it is one of the list, so this reads no other attribute.
     own = getattr(mj_model, field)
     if field == CHOICE:
         _check_choice(path, value, mj_model)
@@ -175,6 +198,7 @@ def _check_field(path: Path, field: str, value: Array, mj_model: mujoco.MjModel)
         raise ValueError(f"{path}: 'start/model/{field}' is {value.dtype}: expected floats")
     # MuJoCo Warp has matrices where C has rows of nine.
     shape = value.shape[1:]
+    # The same count and the same first axis: only trailing axes may be folded differently.
     if math.prod(shape) != own.size or shape[:1] != own.shape[:1]:
         raise ValueError(
             f"{path}: 'start/model/{field}' is {shape} in each episode, and {own.shape} in the model"
@@ -183,11 +207,13 @@ def _check_field(path: Path, field: str, value: Array, mj_model: mujoco.MjModel)
 
 
 def _check_choice(path: Path, value: Array, mj_model: mujoco.MjModel) -> None:
+    # How many assets there are of each kind that geom_dataid can point at; other geoms have -1.
     counts = {mujoco.mjtGeom.mjGEOM_HFIELD: mj_model.nhfield, mujoco.mjtGeom.mjGEOM_MESH: mj_model.nmesh}
     for geom, kind in enumerate(mj_model.geom_type.tolist()):
         chosen = value[..., geom]
         own = mj_model.geom_dataid[geom]
         count = counts.get(mujoco.mjtGeom(kind), 0)
+        # Either unchanged, or an asset of the same kind that exists. C does not check the index.
         fits = (chosen == own) | ((chosen >= 0) & (chosen < count) & (own >= 0))
         if value.dtype.kind != "i" or not bool(np.all(fits)):
             raise ValueError(f"{path}: 'start/model/{CHOICE}' names what geom {geom} of the model cannot be")
@@ -196,5 +222,6 @@ def _check_choice(path: Path, value: Array, mj_model: mujoco.MjModel) -> None:
 def _check_shape(path: Path, name: str, value: Array, shape: tuple[int, ...]) -> None:
     if value.shape != shape:
         raise ValueError(f"{path}: {name!r} is {value.shape}: expected {shape}")
+    # MuJoCo would only warn about NaN, and reset the state.
     if not np.isfinite(value).all():
         raise ValueError(f"{path}: {name!r} holds numbers that are not finite")

@@ -3,7 +3,7 @@
     python runner.py [DIR] --episodes 100 --output result.json
 
 In a program of yours: `runner = Runner(DIR)`, `runner.reset()`, then `runner.step(runner.act())` at each env step.
-`export.json` says what is observed and what actions do; names, not numbers, say which joint is which. All files are
+`export.json` describes observations and actions; names, not numbers, say which joint is which. All files are
 data: nothing in them is executed, and none may lead out of the folder.
 """
 
@@ -25,8 +25,11 @@ from ksim_rl.export.standalone.files import Array, check_record, read_arrays
 from ksim_rl.export.standalone.network import Policy
 from ksim_rl.export.standalone.signals import INTEGRATORS, Lag, Noise, Signals
 
+# Recorded starts, commands and pushes, which an export writes beside the model.
 RECORD = "episodes.npz"
+# In this order targets lie side by side in a trace: rad (m for slides), rad/s, N m.
 KINDS = ("pos", "vel", "effort")
+# Fields of MjData that a recording may set.
 STATE = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
 
 
@@ -67,6 +70,7 @@ class Runner(Signals):
 
         def term(advances: bool) -> Array:
             value = read_it()
+            # As in training: noise on the raw value, then clip, scale and delay.
             if noise and self.noisy:
                 value = noise(value)
             value = np.clip(value, low, high) * scale
@@ -89,6 +93,7 @@ class Runner(Signals):
             return lambda action: np.clip(action, spec["low"], spec["high"])
         if spec["kind"] == "scale":
             return lambda action: action * np.asarray(spec["scale"]) + np.asarray(spec["offset"])
+        # Low-pass. A list of one, since the closure has to write it; None starts at the first action.
         kept: list[Any] = [None]
         self.resets.append(lambda: kept.__setitem__(0, spec["initial"]))
 
@@ -102,6 +107,7 @@ class Runner(Signals):
     def _action(self, spec: dict[str, Any]) -> Callable[[Array], None]:
         columns, kind, names = slice(*spec["columns"]), spec["kind"], spec["names"]
         shape = self._shaping(spec)
+        # The model's own actuator, driven without a law in between.
         if kind == "ctrl":
             at = [self.model.actuator(name).id for name in names]
 
@@ -110,6 +116,7 @@ class Runner(Signals):
 
             return control
         at = np.array([self.joints[name][0] for name in names])
+        # Some actions give a velocity target too: then the first half of the columns is position.
         second = self._shaping(spec["velocity"]) if spec.get("velocity") else None
 
         def joints(action: Array) -> None:
@@ -131,6 +138,7 @@ class Runner(Signals):
         def shaped(action: Array) -> Array:
             action = np.clip(action, low, high)
             action = (np.tanh(action) if spec["tanh"] else action) * scale
+            # Here the state is the scaled action, and begins at 0 in each episode.
             if alpha is not None:
                 kept[0] = action = kept[0] + alpha * (action - kept[0])
             return action + offset
@@ -138,18 +146,20 @@ class Runner(Signals):
         return shaped
 
     def _law(self, spec: dict[str, Any]) -> Callable[[], None]:
-        """Return what sets the controls of some joints' actuators from their targets before each substep."""
+        """Return a function that sets some actuators' controls from their joints' targets before each substep."""
         names, takes, kind = spec["joints"], spec["takes"], spec["kind"]
         pos = np.array([self.joints[name][0] for name in names], int)
         vel = np.array([self.joints[name][1] for name in names], int)
         ctrl = [self.model.actuator(name).id for name in spec["actuators"]]
         numbers = {key: np.asarray(value, np.float64) for key, value in spec["numbers"].items()}
+        # The closure below reads this dict, so a recorded start can replace gains in it.
         self.numbers = getattr(self, "numbers", []) + [(names, numbers)]
         lag = Lag(spec["delay"], self) if spec["delay"] else None
         self.lags += [lag] if lag else []
         # Exports of before 0.2.0 say nothing of these: there all servos were plain.
         scale, offset = np.asarray(spec.get("scale", 1.0)), np.asarray(spec.get("offset", 0.0))
 
+        # Targets stay the same for all substeps of an env step; measured state does not.
         def law() -> None:
             target = {}
             for key in KINDS:
@@ -157,14 +167,17 @@ class Runner(Signals):
             if lag:
                 late = lag(np.concatenate([target[key] for key in takes]))
                 target |= dict(zip(takes, np.split(late, len(takes)), strict=True))
+            # MuJoCo's own servo computes the effort; it only takes a target in the control's units.
             if kind == "builtin":
                 self.data.ctrl[ctrl] = target[takes[0]] * scale + offset
                 return
+            # Ideal PD at the joint, with a feed-forward effort.
             now, moves = self.data.qpos[pos], self.data.qvel[vel]
             effort = target["effort"] + numbers["stiffness"] * (target["pos"] - now)
             effort = effort + numbers["damping"] * (target["vel"] - moves)
             limit = numbers["effort_limit"]
             low, high = -limit, limit
+            # Torque-speed line: the torque left at a speed falls to none at the no-load speed.
             if kind == "dc_motor":
                 stall = numbers["saturation_effort"]
                 lost = stall * moves / numbers["velocity_limit"]
@@ -178,6 +191,7 @@ class Runner(Signals):
     def reset(self, start: dict[str, Array] | None = None) -> Array:
         """Begin an episode at the default pose, or where a recorded one began; return the first frame."""
         mujoco.mj_resetData(self.model, self.data)
+        # An export's keyframe 0 is the default pose; the model's own qpos0 need not be.
         if self.model.nkey:
             mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         for name, value in (start or {}).items():
@@ -191,6 +205,7 @@ class Runner(Signals):
             part.reset()
         for forget in self.resets:
             forget()
+        # Forces and accelerations read 0 until the first substep: `refresh` does not compute them.
         self.data.sensordata[:] = 0.0
         self.refresh()
         self.frame = self.observe(advances=False)
@@ -205,6 +220,7 @@ class Runner(Signals):
         elif kind == "model":
             whole = getattr(self.model, field)  # one that `check_record` lets through
             whole[:] = np.reshape(value, np.shape(whole))
+            # Recompute derived constants. It overwrites the data that it gets, hence not ours.
             mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
         elif kind == "encoder_bias":
             self.bias = dict(zip(self.joints, value, strict=True))
@@ -217,7 +233,7 @@ class Runner(Signals):
                     numbers[field] = np.array([by_joint[n] for n in names])
 
     def refresh(self) -> None:
-        """Recompute what follows from position and velocity; contacts and forces stay those of the last substep."""
+        """Recompute all that follows from position and velocity; contacts and forces stay from the last substep."""
         model, data = self.model, self.data
         for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
             compute(model, data)
@@ -231,7 +247,8 @@ class Runner(Signals):
     def step(
         self, action: Array, command: dict[str, Array] | None = None, *, observes: bool = True
     ) -> dict[str, Any]:
-        """Run one env step; return rewards by term, metrics and what ended. `command` holds from the next frame on."""
+        """Run one env step; return rewards by term, metrics and the ending. `command` holds from the next frame on."""
+        # Stages of the chain hold memory: run each of them once per env step.
         for stage in self.chain:
             action = stage(action)
         self.last_action, self.action = self.action, np.asarray(action, np.float64)
@@ -245,17 +262,20 @@ class Runner(Signals):
             for tracker in self.contacts.values():
                 if tracker.every:
                     tracker.update(self.data, dt, starts=not substep)
+        # mj_step integrates last: derived poses and sensors lag behind qpos by a substep.
         self.refresh()
         self.steps += 1
         for tracker in self.contacts.values():
             if not tracker.every:
                 tracker.update(self.data, self.step_dt, starts=True)
+        # Endings come before rewards, since a reward may read whether the episode was terminated.
         ended = [name for name, (_, value) in self.endings.items() if bool(value()[0])]
         finite = bool(np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all())
         self.terminated = not finite or any(not self.endings[name][0] for name in ended)
         unit = self.step_dt if self.meta["scale_rewards_by_dt"] else 1.0
         rewards = {name: float(weight * unit * value()[0]) for name, (weight, value) in self.rewards.items()}
         metrics = {name: float(value()[0]) for name, value in self.metrics.items()}
+        # Rewards above belong to the old command; the next frame already shows the new one.
         self.command |= command or {}
         if observes:
             self.frame = self.observe()
@@ -282,7 +302,7 @@ class Runner(Signals):
             self.data.qvel[:] += push[2:]
 
     def episode(self, record: dict[str, Array], number: int) -> dict[str, float]:
-        """Run a recorded episode once more: its start, commands and pushes, with noise and lags drawn anew."""
+        """Run a recorded episode once more: its start, commands and pushes, with noise and lags drawn again."""
         self._begin(record, number)
         sums: dict[str, float] = {}
         joints = [at for _, at in self.joints.values()]
@@ -307,7 +327,7 @@ class Runner(Signals):
         return {"return": sum(earned.values()), **ended, **earned, **means}
 
     def replay(self, record: dict[str, Array], number: int, lag: int) -> dict[str, Array]:
-        """Return what this model makes of each recorded step by itself: frames, actions, targets, efforts, next states.
+        """Run each recorded step by itself in this model; return frames, actions, targets, efforts, next states.
 
         Every step starts at the recorded state, with the recorded frame and action; lags are `lag` as far as they may.
         """

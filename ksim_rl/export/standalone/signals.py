@@ -1,4 +1,4 @@
-"""Computes what the descriptions of an exported folder say from MuJoCo's state."""
+"""Computes the values that an exported folder describes from MuJoCo's state."""
 
 import math
 from collections.abc import Callable
@@ -11,10 +11,12 @@ import numpy as np
 from ksim_rl.export.standalone.files import Array, check_count, read_json, read_model
 
 Value = Callable[[], Array]
+# An export is a stranger's file: deeper nesting would exhaust Python's stack, more parts its memory.
 MOST_DEPTH, MOST_NODES = 40, 100_000
 INTEGRATORS = {
     name.removeprefix("mjINT_").lower(): kind for name, kind in mujoco.mjtIntegrator.__members__.items()
 }
+# Only these can be called from an export: names map to fixed functions, never to attributes of numpy.
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     name: getattr(np, name)
     for name in (
@@ -22,15 +24,18 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
         *("negative", "absolute", "square", "sqrt", "exp", "log1p", "sin", "cos", "sign"),
     )
 }
+# Truth values are 0.0 and 1.0, so that they can be weighted and added like any other value.
 FUNCTIONS |= {
     "greater": lambda a, b: (a > b) * 1.0,
     "less": lambda a, b: (a < b) * 1.0,
     "any": lambda a: np.atleast_1d(np.any(a > 0) * 1.0),
     "mean": lambda a: np.atleast_1d(a.mean()),
     "concat": lambda *parts: np.concatenate(parts),
+    # The small bound keeps a zero vector finite.
     "normalize": lambda a: a / max(float(np.linalg.norm(a)), 1e-12),
     "subtract_point": lambda a, b: (a.reshape(-1, 3) - b).ravel(),
     "rotate": lambda quat, vector: rotated(quat, vector),
+    # The conjugate of a unit quaternion is its inverse.
     "rotate_inverse": lambda quat, vector: rotated(quat * np.array([1.0, -1.0, -1.0, -1.0]), vector),
 }
 
@@ -51,6 +56,7 @@ def _norm(blocks: Array) -> Array:
 def rotated(quat: Array, vector: Array) -> Array:
     """Return a vector turned by a quaternion (w, x, y, z)."""
     result = np.zeros(3)
+    # MuJoCo reads both as raw doubles in a row, and writes into `result`.
     mujoco.mju_rotVecQuat(
         result, np.ascontiguousarray(vector, np.float64), np.ascontiguousarray(quat, np.float64)
     )
@@ -72,20 +78,24 @@ class Lag:
 
     def _draw(self) -> int:
         # Those that share a lag draw it once.
+        # The age is in the key, so a later draw of the same group is a new one.
         drawn, key = self.signals.drawn, (self.spec.get("shared") or id(self), self.age)
         if key not in drawn:
             drawn[key] = int(self.signals.draws.integers(self.spec["min"], self.most + 1))
+            # Not at the first draw: there is no earlier lag to hold.
             if self.age and self.signals.draws.random() < self.spec["hold_probability"]:
                 drawn[key] = self.lag
         return drawn[key]
 
     def __call__(self, value: Array, advances: bool = True) -> Array:
-        """Return what arrives now, as `value` sets out."""
+        """Return the value that arrives now, as `value` sets out."""
         self.age += advances
+        # 0 keeps an episode's lag to its end.
         every = self.spec["resample_every"]
         if advances and every and self.age % every == 0:
             self.lag = self._draw()
         first = value if self.spec["initial"] is None else np.full_like(value, self.spec["initial"])
+        # Newest first. The list is filled up at the first call, so that every lag finds a value.
         self.kept = [value, *(self.kept or [first] * self.most)][: self.most + 1]
         return self.kept[self.lag]
 
@@ -97,6 +107,7 @@ class Noise:
         self.spec, self.signals, self.bias, self.walk, self.last = spec, signals, None, 0.0, None
 
     def _sample(self, spec: dict[str, Any], size: int) -> Array:
+        # Uniform draws lie in [0, 1), gaussian ones have std 1; offset and spread map them to the range.
         draws = self.signals.draws
         unit = {"uniform": draws.random, "gaussian": draws.standard_normal, "none": np.zeros}[spec["draw"]](
             size
@@ -109,18 +120,23 @@ class Noise:
 
     def __call__(self, value: Array) -> Array:
         """Return the reading of a value."""
+        # There is no last reading before the first one of an episode.
         spec, first = self.spec, self.last is None
+        # A constant error of the episode, such as of calibration: drawn once, then kept.
         if spec["bias"]:
             self.bias = self._sample(spec["bias"], len(value)) if self.bias is None else self.bias
             value = value * self.bias if spec["bias"]["operation"] == "multiply" else value + self.bias
+        # A random walk: it begins at 0 and grows by one draw per reading.
         if not first:
             self.walk = self.walk + np.asarray(spec["walk_std"]) * self.signals.draws.standard_normal(
                 len(value)
             )
         value, sample = value + self.walk, self._sample(spec, len(value))
         value = value * sample if spec["operation"] == "multiply" else value + sample
+        # Round to the steps of the converter; where the resolution is 0 the value passes unchanged.
         grain = np.broadcast_to(spec["resolution"], value.shape)
         value = np.where(grain > 0, np.round(value / np.where(grain > 0, grain, 1.0)) * grain, value)
+        # A lost reading repeats the last one or reads 0; the first has nothing to repeat.
         if not first and spec["dropout"] and self.signals.draws.random() < spec["dropout"]:
             value = np.asarray(self.last) if spec["lost"] == "last" else np.zeros_like(value)
         self.last = value
@@ -128,10 +144,12 @@ class Noise:
 
 
 class Contacts:
-    """What one contact sensor of the export has seen: values by field, one per element, or three."""
+    """The readings of one contact sensor of the export: values by field, one per element, or three."""
 
     def __init__(self, spec: dict[str, Any], mj_model: mujoco.MjModel) -> None:
         self.strongest, self.every = spec["strongest"], spec["every_substep"]
+        # One MuJoCo sensor reads found, force and position (7 numbers); of the strongest
+        # contact also normal and tangent (13).
         first = [mj_model.sensor(name).adr[0] for name in spec["elements"]]
         self.index = np.add.outer(first, np.arange(13 if self.strongest else 7))
         self.reset()
@@ -146,26 +164,33 @@ class Contacts:
         self.fields["peak_history"] = np.zeros(1)
 
     def update(self, data: mujoco.MjData, dt: float, starts: bool) -> None:
+        # "found" is needed at the next update, to tell landing from standing.
         """Let `dt` seconds pass; `starts` where this begins an env step."""
         reading, kept = data.sensordata[self.index], self.fields
         force = reading[:, 1:4]
+        # The force of the strongest contact is in the contact's own axes: turn it into the world's.
         if self.strongest:
             normal, tangent = reading[:, 7:10], reading[:, 10:13]
             axes = np.stack((normal, tangent, np.cross(normal, tangent)), -1)
             force = np.einsum("nij,nj->ni", axes, force)
         kept["force"] = force.ravel()
+        # Peaks since this env step began; each entry is the largest norm of one update.
         self.history = ([] if starts else self.history) + [
             float(np.linalg.norm(force, axis=1).max(initial=0.0))
         ]
         kept["peak_history"] = np.array(self.history)
+        # Rising and falling edges of contact.
         touches, touched = reading[:, 0] > 0, kept["found"] > 0
         lands, leaves = touches & ~touched, touched & ~touches
+        # The time up to and including this update, so that a landing reports the whole flight.
         flight = kept["air_time"] + dt
+        # Elements that stood from the start have flown for no time: that is no flight.
         kept["last_air_time"] = np.where(lands & (kept["air_time"] > 0), flight, kept["last_air_time"])
         kept["last_contact_time"] = np.where(leaves, kept["contact_time"], kept["last_contact_time"])
         kept["air_time"] = np.where(touches, 0.0, flight)
         kept["contact_time"] = np.where(touches, kept["contact_time"] + dt, 0.0)
         kept["found"] = touches * 1.0
+        # Events of any substep count for the whole env step, else a short touch would be lost.
         for name, event in (("first_contact", lands), ("first_air", leaves)):
             kept[name] = event * 1.0 if starts else np.maximum(kept[name], event)
 
@@ -180,13 +205,19 @@ class Signals:
         self.data = mujoco.MjData(model)
         self.draws = np.random.default_rng(seed)
         self.decimation = check_count("decimation", meta["decimation"])
+        # First everything that is counted: a wrong number is refused before arrays of that size exist.
         self.limit = check_count("episode_steps", meta["episode_steps"])
+        # Filled by values that keep memory; `reset` calls them all.
         self.resets: list[Callable[[], None]] = []
+        # Shared lags of this episode by group and age, see `Lag`.
         self.drawn: dict[Any, int] = {}
         self._nodes = 0
+        # Addresses differ from joint numbers as soon as there is a free or ball joint.
         names = meta["joints"]["names"]
         self.joints = {n: (int(model.joint(n).qposadr[0]), int(model.joint(n).dofadr[0])) for n in names}
+        # Errors of joint encoders, rad, which a recorded start may set.
         self.default = dict(zip(names, meta["joints"]["default_pos"], strict=True))
+        # Commands are zero until the caller gives one.
         self.bias = dict.fromkeys(names, 0.0)
         sizes = {n: check_count(f"commands.{n}.size", c["size"]) for n, c in meta["commands"].items()}
         self.command: dict[str, Array] = {name: np.zeros(size) for name, size in sizes.items()}
@@ -195,6 +226,7 @@ class Signals:
             check_count("policy.num_actions", meta["policy"]["num_actions"])
         )
         self.steps, self.terminated = 0, False
+        # Height fields are the terrain; where there is none, the ground is the plane z = 0.
         self.ground = [g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_HFIELD]
 
     @property
@@ -204,6 +236,7 @@ class Signals:
 
     def change_physics(self, integrator: str, refine: int) -> None:
         """Integrate by another of MuJoCo's integrators, "" for the model's own, in `refine` times as many substeps."""
+        # The length of an env step stays the same: the policy's rate is part of what it learned.
         option = self.model.opt
         if integrator:
             option.integrator = int(INTEGRATORS[integrator])
@@ -211,7 +244,8 @@ class Signals:
         self.decimation *= refine
 
     def value(self, node: Any, depth: int = 0) -> Value:
-        """Return what computes a description; a ValueError says what is no description."""
+        """Return a function that computes a description; a ValueError shows a part that is not one."""
+        # Parts are counted over all descriptions of the export, not for each one.
         self._nodes += 1
         if depth > MOST_DEPTH or self._nodes > MOST_NODES:
             raise ValueError("export.json: a description has too many parts")
@@ -222,10 +256,12 @@ class Signals:
             if "quantity" in node:
                 return self._quantity(node["quantity"], node)
             return self._op(node["op"], node, [self.value(part, depth + 1) for part in node["of"]])
+        # A description is data of a stranger: a missing key or a wrong type is told with its text.
         except (KeyError, TypeError) as error:
             raise ValueError(f"export.json: {str(node)[:200]}: {error}") from None
 
     def _op(self, name: str, node: dict[str, Any], parts: list[Value]) -> Value:
+        # Values are flat; `width` says how many numbers belong to one item, such as 3 for a vector.
         width = node.get("width")
         if name in ("sum", "norm"):
             power = _norm if name == "norm" else _sum
@@ -235,9 +271,11 @@ class Signals:
             return lambda: _in_blocks(parts[0](), width)[:, wanted].ravel()
         if name == "clip":
             return lambda: np.clip(parts[0](), node["low"], node["high"])
+        # Rows times the matrix is the transpose's product: from world axes into the body's.
         if name == "into":
             body = self.model.body(node["body"]).id
             return lambda: (parts[0]().reshape(-1, 3) @ self.data.xmat[body].reshape(3, 3)).ravel()
+        # These keep a value from step to step, and so have to forget it at a reset.
         if name in ("previous", "peak", "low_pass"):
             return self._remembering(name, node, parts)
         function = FUNCTIONS[name]
@@ -248,6 +286,7 @@ class Signals:
         return applied
 
     def _remembering(self, name: str, node: dict[str, Any], parts: list[Value]) -> Value:
+        # None until the first call of an episode.
         kept: list[Any] = [None]
         self.resets.append(lambda: kept.__setitem__(0, None))
 
@@ -257,6 +296,7 @@ class Signals:
             return before
 
         def peak() -> Array:
+            # Height of the swing so far; a landing gives the peak once and starts again at 0.
             height, found, landed = (part() for part in parts)
             before = np.zeros_like(height) if kept[0] is None else kept[0]
             highest = np.where(found > 0, before, np.maximum(before, height))
@@ -264,6 +304,7 @@ class Signals:
             return highest
 
         def low_pass() -> Array:
+            # Exact for a first-order filter at any step length.
             gain = 1.0 - math.exp(-self.step_dt / node["time_constant"])
             kept[0] = parts[0]() if kept[0] is None else kept[0] + gain * (parts[0]() - kept[0])
             return kept[0]
@@ -272,10 +313,12 @@ class Signals:
 
     def _quantity(self, name: str, node: dict[str, Any]) -> Value:
         data, model = self.data, self.model
+        # Readings of joints, rad and rad/s (m and m/s for slides), in the order of the names.
         if "joints" in node:
             names = node["joints"]
             pos = np.array([self.joints[joint][0] for joint in names], int)
             vel = np.array([self.joints[joint][1] for joint in names], int)
+            # Only measured angles have encoder errors; rewards read true ones.
             biased = bool(node.get("biased"))
             of_joints = {
                 "joint_pos": lambda: data.qpos[pos] + ([self.bias[n] for n in names] if biased else 0.0),
@@ -287,6 +330,7 @@ class Signals:
                 default = np.array([self.default[joint] for joint in names])
                 return lambda: of_joints["joint_pos"]() - default
             return of_joints[name]
+        # Bodies and sites, in the world frame. `data` is the same object for good, so its arrays may be kept.
         if "bodies" in node or "sites" in node:
             if "bodies" in node:
                 kind = "body"
@@ -298,24 +342,31 @@ class Signals:
                 ids = [model.site(name).id for name in node["sites"]]
             return {
                 f"{kind}_pos": lambda: where[ids].ravel(),
+                # Above the ground below each point, not above z = 0.
                 f"{kind}_height": lambda: where[ids][:, 2] - [self.ground_at(p) for p in where[ids]],
+                # mj_objectVelocity gives angular velocity first, linear second.
                 f"{kind}_lin_vel": lambda: self._velocities(kind, ids)[:, 3:].ravel(),
                 f"{kind}_ang_vel": lambda: self._velocities(kind, ids)[:, :3].ravel(),
                 "body_quat": lambda: data.xquat[ids].ravel(),
+                # The first two axes of each body: six numbers fix an orientation without jumps.
                 "body_axes": lambda: data.xmat[ids].reshape(-1, 3, 3).transpose(0, 2, 1)[:, :2].ravel(),
                 "com_pos": lambda: data.subtree_com[ids].ravel(),
             }[name]
+        # The root, in its own axes where the frame says so.
         if "body" in node:
             body, local = model.body(node["body"]).id, node.get("frame") == "root"
             return {
+                # Gravity's direction (0, 0, -1) in the body's axes is the matrix's last row, negated.
                 "projected_gravity": lambda: -data.xmat[body].reshape(3, 3)[2],
                 "root_lin_vel": lambda: self._velocities("body", [body], local)[0, 3:],
                 "root_ang_vel": lambda: self._velocities("body", [body], local)[0, :3],
                 "height_scan": lambda: self._scan(body, np.asarray(node["points"])),
             }[name]
+        # A sensor of the model, any width.
         if name == "sensor":
             start = int(model.sensor(node["sensor"]).adr[0])
             stop = start + int(model.sensor(node["sensor"]).dim[0])
+            # A copy: the array would change under a lag that keeps it.
             return lambda: data.sensordata[start:stop].copy()
         if name == "contact":
             tracker, field = self.contacts[node["sensor"]], node["field"]
@@ -335,6 +386,7 @@ class Signals:
 
     def _velocities(self, kind: str, ids: list[int], local: bool = False) -> Array:
         """Return angular, then linear velocity of the frames of bodies or sites, [N, 6]."""
+        # mjOBJ_XBODY is the body's own frame; mjOBJ_BODY would be that of its inertia.
         of_kind = mujoco.mjtObj.mjOBJ_XBODY if kind == "body" else mujoco.mjtObj.mjOBJ_SITE
         found = np.zeros((len(ids), 6))
         for row, number in zip(found, ids, strict=True):
@@ -343,18 +395,23 @@ class Signals:
 
     def _scan(self, body: int, points: Array) -> Array:
         """Return how far the ground is below a body at points [N, 2] that turn with its yaw."""
+        # The scan turns with yaw only: pitch and roll of the body leave its points in place.
         axis, origin = self.data.xmat[body].reshape(3, 3)[:, 0], self.data.xpos[body]
         yaw = math.atan2(axis[1], axis[0])
         turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+        # The inverse rotation, since points are rows that multiply from the left.
         return origin[2] - np.array([self.ground_at(p) for p in origin[:2] + points @ turn])
 
     def ground_at(self, point: Array) -> float:
-        """Return the height of the terrain below a point: 0 on a plane, beyond an edge that of the nearest point."""
+        """Return the terrain's height below a point: 0 on a plane; beyond an edge, the nearest point's height."""
+        # Without a height field the list has the plane's 0; with one it has only the fields' own heights.
         heights = [0.0] * (not self.ground)
         for geom in self.ground:
             size = self.model.hfield_size[self.model.geom_dataid[geom]]
+            # Just inside of the field: a ray on its edge misses it.
             near = np.clip(point[:2] - self.data.geom_xpos[geom][:2], -size[:2] + 1e-6, size[:2] - 1e-6)
             above = np.append(near + self.data.geom_xpos[geom][:2], 1e3)
+            # Down from 1 km above all terrain; a miss returns a negative distance.
             distance = mujoco.mj_rayHfield(self.model, self.data, geom, above, np.array([0.0, 0.0, -1.0]))
             heights += [1e3 - distance] * (distance >= 0)
         return max(heights, default=0.0)
