@@ -50,8 +50,10 @@ def capacities(
     """
     njmax = sim.njmax
     nconmax = sim.nconmax
+    # The probe takes about a second, and is left out where both numbers are given.
     if njmax is None or nconmax is None:
         probed_njmax, probed_nconmax = probe(_rubbing(mj_model, per_world_fields))
+        # A number that is given stays, even if the other one is probed.
         njmax = njmax or probed_njmax
         nconmax = nconmax or probed_nconmax
     if mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE:
@@ -83,6 +85,7 @@ def remember(
     njmax, nconmax = probe(probed)
     wanted_njmax = njmax
     wanted_nconmax = nconmax
+    # Only needs whose bits were raised count: the maxima alone may have fit.
     if sim.njmax is None and any(report.worlds[name] for name in OF_ROWS):
         needed = max(report.nefc, report.njmax)
         wanted_njmax = max(njmax, _round_up(REHEARSED_MARGIN * needed))
@@ -97,9 +100,11 @@ def _rubbing(mj_model: mujoco.MjModel, per_world_fields: Sequence[str]) -> mujoc
     """Return the model as worlds may be that differ in dry friction: each hinge, slide and tendon may have a row."""
     if not {"dof_frictionloss", "tendon_frictionloss"} & set(per_world_fields):
         return mj_model
+    # Any positive value makes a row; how much it rubs does not matter for the count.
     rubbing = copy.copy(mj_model)
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     scalar = np.isin(mj_model.jnt_type[mj_model.dof_jntid], kinds)
+    # Entries that rub already keep their value.
     rubbing.dof_frictionloss[scalar & (rubbing.dof_frictionloss == 0.0)] = 1e-3
     rubbing.tendon_frictionloss[rubbing.tendon_frictionloss == 0.0] = 1e-3
     return rubbing
@@ -108,7 +113,9 @@ def _rubbing(mj_model: mujoco.MjModel, per_world_fields: Sequence[str]) -> mujoc
 def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
     """Return how many constraint rows and contacts a world of this model needs, with margin. Cached per model."""
     key = _key(mj_model)
+    # The cache may hold more than a probe found: `remember` raises its numbers.
     if key not in _cache:
+        # Random states make MuJoCo warn; nobody needs to read it.
         with caught_warnings():
             posed = Need(mj_model)
             fallen = Need(mj_model)
@@ -135,6 +142,7 @@ def _key(mj_model: mujoco.MjModel) -> bytes:
 
 
 def _round_up(needed: float) -> int:
+    # A model of which no contact or row was seen has room for a few, too.
     return MULTIPLE * math.ceil((needed + EXTRA) / MULTIPLE)
 
 
@@ -142,6 +150,7 @@ def _most_limits(mj_model: mujoco.MjModel) -> int:
     """Return how many limits may have a row at once: both of one joint where its range is within its margins."""
     joints = mj_model.jnt_limited.astype(bool)
     margin = mj_model.jnt_margin
+    # Within twice the margin, a joint may violate both limits together.
     is_narrow = joints & (np.ptp(mj_model.jnt_range, axis=1) < 2.0 * margin)
     return int(joints.sum() + is_narrow.sum() + mj_model.tendon_limited.sum())
 
@@ -149,6 +158,7 @@ def _most_limits(mj_model: mujoco.MjModel) -> int:
 def _inactive_equality_rows(mj_model: mujoco.MjModel) -> int:
     """Return how many rows the equality constraints have that are off at first, and may be switched on."""
     is_off = mj_model.eq_active0 == 0
+    # Connect ties a point (3 rows), weld a frame (6); others tie a scalar.
     rows = {mujoco.mjtEq.mjEQ_CONNECT: 3, mujoco.mjtEq.mjEQ_WELD: 6}
     return sum(rows.get(mujoco.mjtEq(kind), 1) for kind in mj_model.eq_type[is_off])
 
@@ -171,8 +181,10 @@ class Need:
 
 def _look_at_poses(mj_model: mujoco.MjModel, need: Need) -> None:
     """Show the model's own poses, and random ones in the ground, of which a few go on."""
+    # A fixed seed, so that a model has the same capacity in every process.
     rng = np.random.default_rng(0)
     mj_data = mujoco.MjData(mj_model)
+    # Key -1 is the model's own pose, qpos0.
     for key in range(-1, mj_model.nkey):
         _put_to_key(mj_model, mj_data, key)
         if np.isin(mujoco.mjtGeom.mjGEOM_HFIELD, mj_model.geom_type):
@@ -183,10 +195,12 @@ def _look_at_poses(mj_model: mujoco.MjModel, need: Need) -> None:
     for index, qpos in enumerate(random_qpos(mj_model, RANDOM_STATES, rng)):
         mujoco.mj_resetData(mj_model, mj_data)
         mj_data.qpos[:] = qpos
+        # The middle of a height field may be flat, and would show too few contacts.
         scatter(mj_model, mj_data, rng)
         put_in_ground(mj_model, mj_data, depth=DEPTH * rng.random())
         mujoco.mj_fwdPosition(mj_model, mj_data)
         need.look_at(mj_data)
+        # A few go on as a simulation does: contacts of a first impact and after it.
         if index < DROPS:
             mj_data.ctrl[:] = random_ctrl(mj_model, rng)
             for _ in range(DROP_STEPS):
@@ -201,17 +215,21 @@ def _look_at_falls(mj_model: mujoco.MjModel, need: Need) -> None:
     """
     rng = np.random.default_rng(1)
     mj_data = mujoco.MjData(mj_model)
+    # More gravity presses bodies on the ground and against their limits, which closes more contacts.
     heavy = copy.copy(mj_model)
     heavy.opt.gravity *= PRESSURE
+    # The size of the moving part, m, bounds the height of the fall.
     is_moving = mj_model.body_weldid[mj_model.geom_bodyid] != 0
     mujoco.mj_kinematics(mj_model, mj_data)
     if is_moving.any():
         size = float(np.ptp(mj_data.geom_xpos[is_moving], axis=0).max(initial=0.0))
     else:
         size = 0.0
+    # Large models fall for fewer steps, so that the probe takes about a second for each.
     work = mj_model.nv + mj_model.ngeom + mj_model.nflexvert + 1
     steps = min(FALL_STEPS, max(1, MOST_WORK // (FALLS * work)))
     for index, qpos in enumerate(random_qpos(mj_model, FALLS, rng)):
+        # Every other fall starts from one of the model's own poses.
         if index % 2:
             mujoco.mj_resetData(mj_model, mj_data)
             mj_data.qpos[:] = qpos
@@ -220,11 +238,13 @@ def _look_at_falls(mj_model: mujoco.MjModel, need: Need) -> None:
         scatter(mj_model, mj_data, rng)
         put_in_ground(mj_model, mj_data, depth=-rng.uniform(0.0, size))
         mj_data.qvel[:] = rng.normal(scale=FALL_SPEED, size=mj_model.nv)
+        # In turn: no control, random control, the extremes of control.
         draw = (None, random_ctrl, extreme_ctrl)[index // 2 % 3]
         for step in range(steps):
             if draw is not None and step % HOLD == 0:
                 mj_data.ctrl[:] = draw(mj_model, rng)
             mujoco.mj_step(mj_model if step < steps // 2 else heavy, mj_data)
+            # MuJoCo has reset a state that diverged: this fall is over.
             if mj_data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
                 break
             need.look_at(mj_data, pairs_too=step % HOLD == 0)
@@ -246,9 +266,11 @@ class CandidatePairs:
 
     def __init__(self, mj_model: mujoco.MjModel) -> None:
         self.mj_model = mj_model
+        # All pairs of geoms, each once, [N].
         first, second = np.triu_indices(mj_model.ngeom, k=1)
         body_1 = mj_model.geom_bodyid[first]
         body_2 = mj_model.geom_bodyid[second]
+        # Bodies that are welded together are one rigid body, which does not collide with itself.
         weld_1 = mj_model.body_weldid[body_1]
         weld_2 = mj_model.body_weldid[body_2]
         parent_1 = mj_model.body_weldid[mj_model.body_parentid[weld_1]]
@@ -256,15 +278,19 @@ class CandidatePairs:
         affine = (mj_model.geom_contype[first] & mj_model.geom_conaffinity[second]) | (
             mj_model.geom_contype[second] & mj_model.geom_conaffinity[first]
         )
+        # Pairs collide if one's contype meets the other's conaffinity; see MuJoCo's filters.
         keep = (affine != 0) & (weld_1 != weld_2)
         if not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+            # The world (0) is nobody's parent for this filter, so that robots collide with what is fixed to it.
             keep &= ~((weld_1 != 0) & (weld_2 != 0) & ((weld_1 == parent_2) | (weld_2 == parent_1)))
         keep &= ~np.isin((body_1 << 16) + body_2, mj_model.exclude_signature)
+        # Explicit <pair>s come on top, whatever the filters say.
         self.first = np.concatenate([first[keep], mj_model.pair_geom1])
         self.second = np.concatenate([second[keep], mj_model.pair_geom2])
         self.margin = np.maximum(mj_model.geom_margin[self.first], mj_model.geom_margin[self.second])
         is_plane = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self.plane_1, self.plane_2 = is_plane[self.first], is_plane[self.second]
+        # A plane has a radius of 0; its distance is measured along the normal below.
         self.reach = mj_model.geom_rbound[self.first] + mj_model.geom_rbound[self.second] + self.margin
 
     def count(self, mj_data: mujoco.MjData) -> int:
@@ -273,6 +299,7 @@ class CandidatePairs:
             return 0
         offset = mj_data.geom_xpos[self.second] - mj_data.geom_xpos[self.first]
         distance = np.linalg.norm(offset, axis=1)
+        # The third columns of the rotation matrices: z axes, which are the normals of planes.
         normals = mj_data.geom_xmat[:, [2, 5, 8]]
         distance = np.where(self.plane_1, (offset * normals[self.first]).sum(1), distance)
         distance = np.where(self.plane_2, -(offset * normals[self.second]).sum(1), distance)

@@ -36,13 +36,17 @@ def align_steep_capsules(
     is along the tangents, and is turned with them.
     """
     contact = wp.tid()
+    # The launch has a thread for each place of the pool, of which the first `nacon` are in use.
     if contact >= nacon[0]:
         return
+    # Geoms of a contact are -1 where flexes touch.
     plane, capsule = geom[contact][0], geom[contact][1]
     if plane < 0 or capsule < 0 or geom_type[plane] != PLANE or geom_type[capsule] != CAPSULE:
         return
     turn, normal = geom_xmat[world[contact], capsule], frame[contact][0]
+    # The capsule's axis is the z axis of its frame.
     axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+    # Its projection on the plane, of a length from 0 (upright) to 1.
     tangent = axis - wp.dot(axis, normal) * normal
     # MuJoCo Warp does so itself from a length of 0.5 on.
     if wp.length(tangent) >= 0.5:
@@ -54,8 +58,10 @@ def align_steep_capsules(
     if wp.length(tangent) <= UPRIGHT:
         return
     tangent = wp.normalize(tangent)
+    # Normal, tangent and second tangent are right-handed.
     second = wp.cross(normal, tangent)
     if surfaces_move:
+        # The same velocity in the old tangents, expressed in the new ones.
         along = surfacevel[contact]
         glide = along[0] * frame[contact][1] + along[1] * frame[contact][2]
         surfacevel[contact] = wp.vec3(wp.dot(glide, tangent), wp.dot(glide, second), along[2])
@@ -80,9 +86,11 @@ def drop_upper_corners(
     plane, box = geom[contact][0], geom[contact][1]
     if plane < 0 or box < 0 or geom_type[plane] != PLANE or geom_type[box] != BOX:
         return
+    # The plane's normal, world frame.
     owner = world[contact]
     turn = geom_xmat[owner, plane]
     normal = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+    # Corners farther up than the box's centre are above it.
     if dist[contact] > wp.dot(normal, geom_xpos[owner, box] - geom_xpos[owner, plane]):
         kind[contact] = kind[contact] & ~HAS_ROWS
 
@@ -105,6 +113,7 @@ def take_the_law_of_priority(
     a, b = geom[contact][0], geom[contact][1]
     if a < 0 or b < 0 or geom_priority[a] == geom_priority[b]:
         return
+    # A <pair> of its own has its own law, and heeds no priority.
     for pair in range(pair_geom1.shape[0]):
         first, second = pair_geom1[pair], pair_geom2[pair]
         if (first == a and second == b) or (first == b and second == a):
@@ -153,6 +162,7 @@ def sparse_velocity(
 ):
     """Multiply each world's sparse matrix by qvel; its pattern is the world's own, or shared by all."""
     world, row = wp.tid()
+    # A pattern of one row is shared by all worlds.
     pattern = world % rownnz.shape[0]
     total = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
     for i in range(rowadr[pattern, row], rowadr[pattern, row] + rownnz[pattern, row]):

@@ -77,9 +77,11 @@ class Substeps:
         self._models: dict[Sensors, mjw.Model] = dict.fromkeys(get_args(Sensors), everything)
         if not self._always_senses:
             self._models["none"] = upstream.without_sensors(warp_model)
+            # Each variant leaves out the kernels whose results nobody reads after that substep.
             self._models["contacts"] = upstream.with_contact_sensors_only(warp_model)
             self._models["kept"] = upstream.without_limit_sensors(self._refresh.kept_by_substep)
         if not self._refresh.needs_cameras:
+            # Cameras are placed on refresh where something reads them, see `Refresh`.
             self._alter(ncam=0, nlight=0)
         if one_kernel_solver:
             # A world without constraints reaches that acceleration in one step.
@@ -95,6 +97,7 @@ class Substeps:
             contacts = ContactReadings(mj_model, warp_model, warp_data_E, self.contact_lists)
             if own_broad_phase:
                 collide = collisions(warp_model, warp_data_E, self.contact_lists)
+        # Sensors that our kernels read, and those that are mended, must not be computed again by MuJoCo Warp's.
         ours = [] if contacts is None else contacts.sensors
         mended = mend_sensors(mj_model, warp_model, warp_data_E, read=ours, lists=self.contact_lists)
         if ours or mended:
@@ -103,6 +106,7 @@ class Substeps:
         if warp_model.opt.run_rne_postconstraint or self._models["kept"].sensor_rne_postconstraint:
             # A sensor is left that needs forces of all bodies: our own kernels read accelerometers without them.
             self._refresh.on_demand |= FORCES_OF_BODIES
+        # Corrections of rows are made after MuJoCo Warp's; our own rows need none.
         mend = _mending(mj_model, warp_model, warp_data_E, expanded)
         self._integrates = one_kernel_integration
         if one_kernel_integration:
@@ -132,8 +136,10 @@ class Substeps:
 
     def advance(self, *, sensors: Sensors, is_last: bool = True) -> None:
         """Launch one physics step. Sensors never change the state that it reaches; after the last, all may be read."""
+        # First, since collisions and kinematics read where these geoms are.
         self.place_fixed_geoms()
         m = self._models[sensors]
+        # It may have been switched on since these variants were made.
         m.opt.run_rne_postconstraint = self.warp_model.opt.run_rne_postconstraint
         if sensors in ("kept", "all"):
             m.sensor_rne_postconstraint |= self.refreshed_on_demand >= FORCES_OF_BODIES
@@ -142,6 +148,7 @@ class Substeps:
         if calls_back(self.warp_model):
             stages = dataclasses.replace(stages, dynamics=None)
         if stages.dynamics is None:
+            # Our kernel has computed velocities before the rows; MuJoCo Warp's step has not.
             self._prepare_ties()
         else:
             dynamics = partial(
@@ -150,6 +157,7 @@ class Substeps:
                 empties_pool=stages.collide is not None and m.opt.run_collision_detection,
             )
             stages = dataclasses.replace(stages, dynamics=dynamics)
+        # Delayed sensors have to sample at every substep, whichever sensors were asked for.
         always = self._always_senses
         substep.run(
             stages,
@@ -168,6 +176,7 @@ class Substeps:
 
     def _is_read(self, warp_model: mjw.Model, sensors: Sensors, *, is_last: bool) -> bool:
         """Whether anything but our own kernels reads what the dynamics of this substep write."""
+        # Where a stage is MuJoCo Warp's, it reads every array.
         if self.stages.make_rows is None or not self._integrates:
             return True
         if self._always_senses or warp_model.opt.run_rne_postconstraint:
@@ -175,6 +184,7 @@ class Substeps:
         if sensors == "contacts":
             # Contact sensors that follow MuJoCo Warp's may be of sites, and of velocities.
             return self._reads_contacts or warp_model.sensor_contact_acc_adr.size > 0
+        # Otherwise sensors, or whoever reads views after the last substep, do.
         return is_last or sensors != "none"
 
     def place_fixed_geoms(self) -> None:
@@ -208,6 +218,7 @@ def _mending(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
     """Return what launches the corrections of MuJoCo Warp's rows and transmissions, or None where they are right."""
+    # The first two change rows of MuJoCo Warp's; the last one appends rows.
     of_rows = (
         weighing_of_ties(mj_model, warp_model, warp_data_E),
         stilling_of_ties(mj_model, warp_model, warp_data_E),

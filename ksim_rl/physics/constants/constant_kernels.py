@@ -40,7 +40,7 @@ _SOURCE = files("ksim_rl.physics.constants").joinpath("constants_of_inertia.cpp"
     )
 )
 class Constants:
-    """What the kernels read of a model and write into it, and their own memory; `axis` and `anchor` are per dof."""
+    """The arrays of a model that the kernels read and write, and their own memory; `axis` and `anchor` are per dof."""
 
     mask: wp.array[bool]
     sums_masses: bool
@@ -66,11 +66,14 @@ def frames(c: Constants):
     world = wp.tid()
     if not c.mask[world]:
         return
+    # The world body is the root frame.
     c.xpos[world, 0] = wp.vec3(0.0, 0.0, 0.0)
     c.xquat[world, 0] = wp.quat(1.0, 0.0, 0.0, 0.0)
+    # Bodies are ordered so that parents come before their children.
     for body in range(1, c.nbody):
         parent = c.body_parentid[body]
         turn = c.xquat[world, parent]
+        # Fields have one row that all worlds share, or one for each world: hence the modulo.
         pos = c.xpos[world, parent] + rot_vec_quat(c.body_pos[world % c.body_pos.shape[0], body], turn)
         quat = mul_quat(turn, c.body_quat[world % c.body_quat.shape[0], body])
         for joint in range(c.body_jntadr[body], c.body_jntadr[body] + c.body_jntnum[body]):
@@ -80,12 +83,14 @@ def frames(c: Constants):
             row = world % c.qpos0.shape[0]
             pivot = c.jnt_pos[world % c.jnt_pos.shape[0], joint]
             if kind == FREE:
+                # A free joint's pose is in qpos0 itself, world frame, whatever the body's own frame is.
                 pos = wp.vec3(c.qpos0[row, q], c.qpos0[row, q + 1], c.qpos0[row, q + 2])
                 quat = wp.normalize(
                     wp.quat(
                         c.qpos0[row, q + 3], c.qpos0[row, q + 4], c.qpos0[row, q + 5], c.qpos0[row, q + 6]
                     )
                 )
+                # Its translations are along the world's axes, its rotations about the body's.
                 for i in range(3):
                     unit = wp.vec3(0.0, 0.0, 0.0)
                     unit[i] = 1.0
@@ -93,18 +98,22 @@ def frames(c: Constants):
                     c.anchor[world, dof + i] = pos
                     c.axis[world, dof + 3 + i] = rot_vec_quat(unit, quat)
                     c.anchor[world, dof + 3 + i] = pos
+            # A ball turns about its anchor, which stays in place.
             elif kind == BALL:
                 place = pos + rot_vec_quat(pivot, quat)
+                # `qpos0` may be turned, and need not be a unit quaternion.
                 turned = wp.quat(
                     c.qpos0[row, q], c.qpos0[row, q + 1], c.qpos0[row, q + 2], c.qpos0[row, q + 3]
                 )
                 quat = mul_quat(quat, wp.normalize(turned))
+                # The body's origin moves around the anchor.
                 pos = place - rot_vec_quat(pivot, quat)
                 for i in range(3):
                     unit = wp.vec3(0.0, 0.0, 0.0)
                     unit[i] = 1.0
                     c.axis[world, dof + i] = rot_vec_quat(unit, quat)
                     c.anchor[world, dof + i] = place
+            # A hinge or slide at qpos0 does not move the body, whatever number qpos0 is.
             else:
                 c.anchor[world, dof] = pos + rot_vec_quat(pivot, quat)
                 c.axis[world, dof] = rot_vec_quat(c.jnt_axis[world % c.jnt_axis.shape[0], joint], quat)
@@ -116,15 +125,18 @@ def frames(c: Constants):
 def _add_up_body(world: int, body: int, c: Constants):
     """The mass of all that hangs on a body, its centre of mass, and its inertia about that, in the world frame."""
     mass = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
+    # Bodies of a subtree are numbered one after the other.
     for other in range(body, body + c.body_subtreenum[body]):
         mass += c.body_mass[world % c.body_mass.shape[0], other]
     if c.sums_masses:
         c.body_subtreemass[world, body] = mass
+    # Frames are shared by all worlds unless a field that moves them differs.
     frame = world % c.xpos.shape[0]
     turn = c.xquat[frame, body]
     c.xipos[world, body] = c.xpos[frame, body] + rot_vec_quat(
         c.body_ipos[world % c.body_ipos.shape[0], body], turn
     )
+    # Principal moments, turned into the world frame.
     axes = quat_to_mat(mul_quat(turn, c.body_iquat[world % c.body_iquat.shape[0], body]))
     moments = c.body_inertia[world % c.body_inertia.shape[0], body]
     c.inertia[world, body] = axes @ wp.diag(moments) @ wp.transpose(axes)
@@ -147,6 +159,7 @@ def _subtree_com(world: int, body: int, c: Constants) -> wp.vec3:
         mass = c.body_mass[world % c.body_mass.shape[0], other]
         moment += mass * c.xipos[world, other]
         total += mass
+    # A massless subtree has no centre of mass: as in C, the body's own stands for it.
     if total < MINVAL:
         return c.xipos[world, body]
     return moment / total
@@ -156,6 +169,7 @@ def _subtree_com(world: int, body: int, c: Constants) -> wp.vec3:
 def _references(world: int, body: int, target: int, pos: wp.vec3, c: Constants):
     """Return a place on a body from that body and from the centre of mass that it tracks, world axes, m."""
     frame = world % c.xpos.shape[0]
+    # A negative target means that the camera tracks its own body.
     tracked = wp.where(target < 0, body, target)
     offset = rot_vec_quat(pos, c.xquat[frame, body])
     return offset, c.xpos[frame, body] + offset - _subtree_com(world, tracked, c)
@@ -194,23 +208,28 @@ def mend_weights(c: Constants):
     """Give bodies the weights that C does where mujoco_warp.set_const gives others, by the frames at `qpos0`."""
     world, body = wp.tid()
     row = world % c.body_invweight0.shape[0]
+    # A body on slides alone moves as a point mass, free of rotation.
     if c.slides_alone[body]:
         weight = 1.0 / c.body_mass[world % c.body_mass.shape[0], body]
         c.body_invweight0[row, body] = wp.vec2(weight, 0.0)
         last = c.last_dof[body]
+        # All degrees of freedom of the body itself get that weight, too.
         while last >= 0 and c.dof_bodyid[last] == body:
             c.dof_invweight0[world % c.dof_invweight0.shape[0], last] = weight
             last = c.dof_parentid[last]
         return
     frame = world % c.xpos.shape[0]
+    # The centre of mass at qpos0, world frame, m.
     com = c.xpos[frame, body] + rot_vec_quat(
         c.body_ipos[world % c.body_ipos.shape[0], body], c.xquat[frame, body]
     )
     fastest, turns = float(0.0), float(0.0)  # noqa: UP018 (Warp: variables that change in a loop)
     dof = c.last_dof[body]
+    # From the body's last degree of freedom up to the root.
     while dof >= 0:
         turns = wp.max(turns, c.dof_rotates[dof])
         velocity = c.axis[frame, dof]
+        # A rotation moves the centre of mass by its lever; a slide by its axis.
         if c.dof_rotates[dof] > 0.0:
             velocity = wp.cross(velocity, com - c.anchor[frame, dof])
         fastest = wp.max(fastest, wp.length(velocity))
@@ -226,6 +245,7 @@ def mend_weights(c: Constants):
 
 def floats_per_world(nv: int, nbody: int) -> int:
     """Return the floats that the C++ works on, in the order in which it lays them out."""
+    # The factor of the inertia matrix and its inverse, then 9 floats per dof and 27 per body.
     return 2 * nv**2 + 9 * nv + 27 * nbody
 
 
@@ -235,6 +255,7 @@ def constants_kernel(nv: int, nbody: int, lanes: int, on_chip: bool) -> wp.Kerne
 
     What it works on is on the chip (in shared memory), or else in the scratch memory of its `Constants`.
     """
+    # Sizes are compile-time constants, so that arrays in shared memory have them; the cache keeps one kernel for each.
     sizes = f"NV = {nv}, NB = {nbody}, FLOATS = {floats_per_world(nv, nbody)}, LANES = {lanes}, ON_CHIP = {+on_chip}"
 
     @wp.func_native(f"constexpr int {sizes};\n{_SOURCE}")
@@ -245,8 +266,10 @@ def constants_kernel(nv: int, nbody: int, lanes: int, on_chip: bool) -> wp.Kerne
         world, lane = wp.tid()
         if not c.mask[world]:
             return
+        # Each lane takes every `lanes`-th body.
         for body in range(lane, c.nbody, lanes):
             _add_up_body(world, body, c)
+        # The C++ below reads subtree masses and inertias of other lanes.
         _wait_for_all()
         if groups & INERT0:
             constants_of_inertia(world, lane, c)

@@ -42,6 +42,7 @@ def rows_of_ancestors(mj_model: mujoco.MjModel) -> Rows:
     columns: list[int] = []
     entry = np.full((m.nv, m.nv), -1, dtype=np.int32)
     for dof in range(m.nv):
+        # From the degree of freedom up to the root, then reversed.
         row = [dof]
         while m.dof_parentid[row[-1]] >= 0:
             row.append(int(m.dof_parentid[row[-1]]))
@@ -49,15 +50,18 @@ def rows_of_ancestors(mj_model: mujoco.MjModel) -> Rows:
         entry[dof, row] = np.arange(len(columns), len(columns) + len(row))
         count[dof] = len(row)
         columns += row
+    # Rows lie one after the other in one array.
     start = (np.cumsum(count) - count).astype(np.int32)
     return Rows(start=start, count=count, column=np.array(columns, dtype=np.int32), entry=entry)
 
 
 def full_rows_matter(mj_model: mujoco.MjModel, warp_model: mjw.Model) -> bool:
     """Return whether an implicit integrator leaves out derivatives that C has."""
+    # Lone bodies lack the derivatives of actuators and tendons in either integrator.
     if warp_model.body_freeadr.size and _may_act_on_lone_bodies(mj_model):
         return True
     acts = mj_model.nu > 0 or mj_model.ntendon > 0 or bool(warp_model.has_fluid)
+    # A simple body's rows are shorter than its ancestors are many.
     is_simple = bool((mj_model.M_rownnz < rows_of_ancestors(mj_model).count).any())
     return acts and is_simple and warp_model.opt.integrator == mjw.IntegratorType.IMPLICIT
 
@@ -83,14 +87,17 @@ def implicit_with_full_rows(
     d = warp_data_E
     rows = rows_of_ancestors(mj_model)
     full = _with_rows(mj_model, m, rows)
+    # The inertia matrix in full rows, [E, N], which entries absent from `M` leave zero.
     inertia_E = wp.zeros((d.nworld, rows.column.size), dtype=float)
     full_E = dataclasses.replace(d, M=inertia_E)
+    # For each entry of `M`, its place among the full rows.
     stored = np.zeros(mj_model.nC, dtype=np.int32)
     for dof in range(mj_model.nv):
         first = mj_model.M_rowadr[dof]
         place = slice(first, first + mj_model.M_rownnz[dof])
         stored[place] = rows.entry[dof, mj_model.M_colind[place]]
     places = wp.array(stored, dtype=int)
+    # Of lone bodies, derivatives by actuators alone are added to the inertia before they are solved for.
     lone = wp.array(_entries_of_lone_bodies(m, rows.start, rows.count), dtype=int)
     by_actuators = _without_other_derivatives(full)
     slowed_E = wp.zeros_like(inertia_E)
@@ -113,6 +120,7 @@ def implicit_with_full_rows(
             mjw.implicit(full, full_E)
 
         return integrate
+    # MuJoCo Warp's "implicitfast" solves in the rows of `M`, so only lone bodies take full rows.
     entries = _entries_of_lone_bodies(m, mj_model.M_rowadr, mj_model.M_rownnz)
     stored_lone = wp.array(entries, dtype=int)
     system_E = wp.zeros_like(d.M)
@@ -135,6 +143,7 @@ def implicit_with_full_rows(
 
 def _with_rows(mj_model: mujoco.MjModel, warp_model: mjw.Model, rows: Rows) -> mjw.Model:
     """Return a model whose matrices have these rows."""
+    # `D` is the full, unsymmetric matrix: both triangles look up the same entry here.
     of_full_matrix = np.full(mj_model.nD, -1, dtype=np.int32)
     for dof in range(mj_model.nv):
         first = mj_model.D_rowadr[dof]
@@ -157,6 +166,7 @@ def _entries_of_lone_bodies(warp_model: mjw.Model, start: np.ndarray, count: np.
     found = [np.zeros(0, dtype=np.int32)]
     for body in warp_model.body_freeadr.numpy():
         first = warp_model.body_dofadr.numpy()[body]
+        # A free joint has six degrees of freedom.
         for dof in range(first, first + 6):
             found.append(np.arange(start[dof], start[dof] + count[dof], dtype=np.int32))
     return np.concatenate(found)

@@ -55,15 +55,18 @@ def integrator(
         integrate = _implicit(mj_model, warp_model, warp_data_E)
     else:
         integrate = _explicit(warp_model, warp_data_E, mend)
+    # Where trees may sleep, MuJoCo Warp computes some readings once more after the step.
     opt = warp_model.opt
     if opt.enableflags & mjw.EnableBit.SLEEP and not opt.disableflags & mjw.DisableBit.ISLAND:
         integrate = _keeping_readings(integrate, warp_data_E, READ_ONCE)
     elif opt.integrator == _KINDS.RK4:
         integrate = _keeping_readings(integrate, warp_data_E, FORCES_OF_STAGES)
+    # MuJoCo Warp moves activations of disabled actuators; C does not.
     columns = still_activations(mj_model)
     if columns.size == 0:
         return integrate
     still = wp.array(columns, dtype=int)
+    # Allocated once: graphs keep its address.
     kept_E = wp.empty_like(warp_data_E.act)
     dim = (warp_data_E.nworld, columns.size)
 
@@ -98,6 +101,7 @@ def _explicit(
     kind = _KINDS(int(warp_model.opt.integrator))
     if kind == _KINDS.RK4:
         return mended_runge_kutta(warp_model, warp_data_E, mend)
+    # Kinds other than Runge-Kutta and "discrete" are Euler here.
     if kind == _KINDS.DISCRETE:
         launch = mjw.discrete
     else:
@@ -114,6 +118,7 @@ def _implicit(
     inputs = _inputs_of_gains(mj_model, warp_model, warp_data_E)
     if inputs is not None:
         gather, gathered_E = inputs
+    # Our rows of ancestors are needed only where derivatives couple what `M` keeps apart.
     launch = partial(mjw.implicit, of_integration, gathered_E)
     if full_rows_matter(mj_model, of_integration):
         launch = implicit_with_full_rows(mj_model, of_integration, gathered_E)
@@ -135,13 +140,16 @@ def _with_all_derivatives(warp_model: mjw.Model) -> mjw.Model:
     bits = mjw.DisableBit
     flags = int(m.opt.disableflags)
     changes = {}
+    # A model without actuators has no derivative of theirs; their forces have been computed before.
     if flags & bits.ACTUATION:
         changes["nactuator"] = 0
+    # Zero damping has no derivative; passive forces were computed with the model's own.
     if flags & bits.DAMPER:
         for name in _DAMPING_FIELDS:
             changes[name] = wp.zeros_like(getattr(m, name))
     if not changes:
         return m
+    # The flags would leave out all derivatives; the fields above leave out those of the disabled parts.
     opt = dataclasses.replace(m.opt, disableflags=flags & ~int(bits.ACTUATION | bits.DAMPER))
     return dataclasses.replace(m, opt=opt, **changes)
 
@@ -155,12 +163,14 @@ def _inputs_of_gains(
     """
     m = warp_model
     flags = int(m.opt.disableflags)
+    # Only a gain that depends on velocity multiplies a control in the derivative.
     if flags & mjw.DisableBit.ACTUATION or not _gain_depends_on_velocity(m):
         return None
     if not flags & mjw.DisableBit.CLAMPCTRL:
         ranges = mj_model.actuator_ctrllimited
     else:
         ranges = np.zeros(0)
+    # In range and one for each actuator, the controls are right as they are.
     if not np.any(ranges) and _has_own_controls(mj_model):
         return None
     if np.any(mj_model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR) and not _has_own_controls(
@@ -171,6 +181,7 @@ def _inputs_of_gains(
             "integrators mix their controls up; choose integrator='euler', or drop one of the two actuators"
         )
     d = warp_data_E
+    # One gathered control for each actuator, [E, nu].
     gathered = wp.zeros((d.nworld, m.nactuator), dtype=float)
     inputs = [
         *(m.actuator_ctrladr, m.actuator_ctrlnum, m.actuator_ctrllimited, m.actuator_ctrlrange),
@@ -184,6 +195,7 @@ def _inputs_of_gains(
 
 
 def _gain_depends_on_velocity(warp_model: mjw.Model) -> bool:
+    # Only affine gains without an activation have their velocity term in the derivative.
     affine = warp_model.actuator_gaintype.numpy() == mujoco.mjtGain.mjGAIN_AFFINE
     stateless = warp_model.actuator_dyntype.numpy() == mujoco.mjtDyn.mjDYN_NONE
     gains = warp_model.actuator_gainprm

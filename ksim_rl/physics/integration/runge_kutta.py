@@ -21,6 +21,7 @@ def hook_after_rows(warp_model: mjw.Model) -> str:
     """
     flags = int(warp_model.opt.disableflags)
     bits = mjw.DisableBit
+    # Passive forces are called back only if there are springs or dampers.
     if flags & bits.SPRING and flags & bits.DAMPER:
         return "control"
     return "passive"
@@ -36,6 +37,7 @@ def mended_runge_kutta(
     of the stage's own time.
     """
     d = warp_data_E
+    # Whether actuation is on: a disabled one calls no callback of controls.
     acts = not int(warp_model.opt.disableflags) & mjw.DisableBit.ACTUATION
     hooks: dict[str, list[Callable[[], None]]] = {}
     mends = [] if mend is None else [mend]
@@ -48,6 +50,7 @@ def mended_runge_kutta(
     keeps_rate = acts and warp_model.na > 0
     last_rate_E = wp.zeros_like(d.act_dot)
     if keeps_rate:
+        # Each stage overwrites the copy, so that the last one's is left.
         hooks.setdefault("act_dyn", []).append(lambda: wp.copy(last_rate_E, d.act_dot))
     clock = _StageClock(warp_model, warp_data_E)
     # Without actuators nothing calls the second of these, and nothing is delayed that a stage reads.
@@ -55,6 +58,7 @@ def mended_runge_kutta(
         hooks.setdefault("control", []).append(clock.advance)
         hooks.setdefault("act_dyn", []).append(clock.put_back)
 
+    # With actuation off, the control hook is called only if actuators seem to act.
     if hook == "control" and not acts:
         changes = _idle_actuators(warp_model)
     else:
@@ -62,6 +66,7 @@ def mended_runge_kutta(
 
     def launch(substep_warp_model: mjw.Model) -> None:
         clock.start()
+        # Hooks are set for this call alone, so that the program's own callbacks stay visible.
         callback = _with_hooks(substep_warp_model.callback, hooks)
         mjw.rungekutta4(dataclasses.replace(substep_warp_model, callback=callback, **changes), d)
         if keeps_rate:
@@ -94,6 +99,7 @@ class _StageClock:
     """The time of the worlds while a stage reads delayed controls: MuJoCo Warp lets it stand still."""
 
     def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+        # The Data's own clock is moved, since kernels of delays read it.
         self._time_E = warp_data_E.time
         self._before_E = wp.zeros_like(warp_data_E.time)
         self._timestep = warp_model.opt.timestep
@@ -119,6 +125,7 @@ class _StageClock:
 def _with_hooks(callback: Any, hooks: dict[str, list[Callable[[], None]]]) -> Any:
     """Return a copy of the callbacks in which hooks precede the program's own callback of that name."""
     hooked: dict[str, Callable[..., None]] = {}
+    # The program's own callback still runs, after ours.
     for name, launches in hooks.items():
         hooked[name] = _in_turn(launches, vars(callback)[name])
     return dataclasses.replace(callback, **hooked)

@@ -20,6 +20,7 @@ from torch import Tensor
 from ksim_rl.checked import Checked, Count, Filled
 from ksim_rl.physics.views import SUBSTEP_INPUTS
 
+# A world is watched, has failed in this step, or has failed and its fields have been kept.
 _WATCHED = 0
 _FAILED = 1
 _KEPT = 2
@@ -56,6 +57,7 @@ class NanReport:
 def keep_rows(rows: wp.array2d[float], failed: wp.array[int], count: wp.array[int], ring: wp.array3d[float]):
     """Write each world's row into the next place of its ring, unless the world has failed."""
     world, i = wp.tid()
+    # A failed world's ring stands still, so that its last substeps stay readable.
     if failed[world] == 0:
         ring[world, count[world] % ring.shape[1], i] = rows[world, i]
 
@@ -73,6 +75,7 @@ def mark_failed(
     world = wp.tid()
     if failed[world] == 0:
         count[world] = count[world] + 1
+        # One sum instead of a test of each number: a NaN or an infinity in any makes the sum non-finite.
         total = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
         for i in range(qpos.shape[1]):
             total += qpos[world, i]
@@ -101,9 +104,11 @@ class NanGuard:
     ) -> None:
         self.cfg = cfg
         self._mj_model = mj_model
+        # Found now, so that a missing package is named at construction.
         self._failures = _failures(cfg)
         self._launches = by_warp
         self._folder = Path(cfg.folder)
+        # A folder that cannot be made fails here, before a run of hours.
         self._folder.mkdir(parents=True, exist_ok=True)
         self._written = 0
         self._names = [name for name in SUBSTEP_INPUTS if name in state and state[name].numel()]
@@ -115,6 +120,7 @@ class NanGuard:
         self._reached = {name: wp.zeros_like(rows) for name, rows in self._reached_from.items()}
         self._failed_E, self._count_E = wp.to_torch(self._failed), wp.to_torch(self._count)
         self._fields = dict(fields)
+        # A reset draws new fields before the report is read: those of the failure are copied.
         self._kept_fields = {name: tensor.clone() for name, tensor in fields.items()}
 
     def before_substep(self) -> None:
@@ -139,6 +145,7 @@ class NanGuard:
 
     def _keep_rows(self) -> None:
         """Do by torch what `keep_rows` does, where no kernel is to be compiled."""
+        # Row numbers may wait for the device here, since this is the path of the C engine on a CPU.
         watched_E = (self._failed_E == _WATCHED).nonzero().flatten()
         places_E = (self._count_E % self.cfg.history)[watched_E].long()
         for rows, ring in zip(self._rows, self._rings, strict=True):
@@ -157,9 +164,11 @@ class NanGuard:
 
     def keep_fields(self) -> None:
         """Copy the model fields of the worlds that just failed, before a reset draws new ones."""
+        # A mask and no row numbers, for which the host would wait.
         fails_E = self._failed_E == _FAILED
         for name, field in self._fields.items():
             kept = self._kept_fields[name]
+            # A mask [E] broadcasts over the leaf dims of the field.
             torch.where(fails_E.view(-1, *[1] * (field.ndim - 1)), field, kept, out=kept)
         self._failed_E.masked_fill_(fails_E, _KEPT)
 
@@ -175,14 +184,17 @@ class NanGuard:
         files = []
         messages = []
         try:
+            # At most `max_files` over the life of the guard, so that a broken run does not fill the disk.
             for world in worlds[: max(self.cfg.max_files - self._written, 0)]:
                 files.append(self._write(world))
                 messages.append(
                     f"world {world} became non-finite: python -m ksim_rl.physics.nan_guard.replay {files[-1]}"
                 )
+        # A full disk must not end the run: the failure is still named.
         except OSError as error:
             messages.append(f"world {worlds[len(files)]} became non-finite, and could not be saved: {error}")
         self._failed_E.zero_()
+        # Their rings start again from the first place.
         self._count_E[list(worlds)] = 0
         return NanReport(worlds=worlds, files=tuple(files), messages=tuple(messages))
 

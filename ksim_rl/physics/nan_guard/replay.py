@@ -75,15 +75,19 @@ def replay(failure: Failure) -> Replay:
     """Run each kept substep on the C engine, which says what it finds instead of starting anew."""
     mj_model = failure.mj_model
     write_fields(mj_model, failure.fields)
+    # C would reset a diverged state by itself, which hides what is looked for.
     mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     mj_model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     data = mujoco.MjData(mj_model)
+    # Each substep reaches the state from which the next one starts; the last one's was kept apart.
     reached_qvel = [*failure.states["qvel"][1:], failure.reached["qvel"]]
+    # Overflows in numpy and warnings of MuJoCo are the subject here, not faults.
     with np.errstate(all="ignore"), caught_warnings():
         substeps = tuple(_substep(data, failure, k, reached) for k, reached in enumerate(reached_qvel))
     before = _broken_dofs(mj_model, failure.states["qpos"][-1], failure.states["qvel"][-1])
     after = _broken_dofs(mj_model, failure.reached["qpos"], failure.reached["qvel"])
     finite = np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()
+    # Warp's solver spreads NaN over all dofs, so that their numbers say nothing of where it began.
     spread = len(after) in (0, mj_model.nv) and not before
     return Replay(
         substeps=substeps,
@@ -98,6 +102,7 @@ def dof_name(mj_model: mujoco.MjModel, dof: int) -> str:
     """Return the name of a dof: its joint's, with the place in it for joints of several dofs."""
     joint = int(mj_model.dof_jntid[dof])
     name = mj_model.joint(joint).name or f"joint {joint}"
+    # A free joint has six dofs and a ball three: their place is shown.
     several = mj_model.jnt_type[joint] in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
     if several:
         return f"{name}[{dof - int(mj_model.jnt_dofadr[joint])}]"
@@ -161,6 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _substep(data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.ndarray) -> Substep:
     mj_model = failure.mj_model
+    # Warm starts and warnings of the substep before must not leak into this one.
     mujoco.mj_resetData(mj_model, data)
     for name, values in failure.states.items():
         if name == "time":
@@ -170,9 +176,11 @@ def _substep(data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.nda
             target[:] = values[k].reshape(target.shape)
     speed = _largest(data.qvel)
     control = _largest(data.ctrl)
+    # The C engine zeroes all controls if one is too large: acceleration is taken with clipped ones.
     given = data.ctrl.copy()
     data.ctrl[:] = np.clip(np.nan_to_num(given), -MOST_CONTROL, MOST_CONTROL)
     mujoco.mj_forward(mj_model, data)
+    # The step itself gets the controls as they were.
     data.ctrl[:] = given
     energy = float(data.energy.sum())
     contacts = int(data.ncon)
@@ -195,6 +203,7 @@ def _largest(values: np.ndarray) -> tuple[float, int]:
     """Return the largest magnitude and its place; what is not finite is the largest."""
     if not values.size:
         return 0.0, -1
+    # Non-finite numbers sort as the largest.
     size = np.where(np.isfinite(values), np.abs(values), np.inf)
     place = int(np.argmax(size))
     return float(size[place]), place
@@ -205,9 +214,11 @@ def _broken_dofs(mj_model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -
     for joint in range(mj_model.njnt):
         start = int(mj_model.jnt_qposadr[joint])
         if joint + 1 < mj_model.njnt:
+            # Positions of a joint lie between its address and the next one's.
             end = int(mj_model.jnt_qposadr[joint + 1])
         else:
             end = mj_model.nq
+        # A broken position counts for all dofs of its joint, unless a velocity tells which one.
         if not np.isfinite(qpos[start:end]).all() and not broken[mj_model.dof_jntid == joint].any():
             broken[mj_model.dof_jntid == joint] = True
     return tuple(int(dof) for dof in np.flatnonzero(broken))

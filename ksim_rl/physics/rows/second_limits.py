@@ -39,7 +39,7 @@ OUT_OF_NONZEROS = wp.constant(int(mjw.OverflowType.NJMAX_NNZ))
     ),
 )
 class Limits:
-    """What the kernel reads of a model and its worlds, and the rows to which it adds."""
+    """The arrays of a model and its worlds that the kernel reads, and the rows to which it adds."""
 
     joints: wp.array[int]
     tendons: wp.array[int]
@@ -49,8 +49,10 @@ class Limits:
 
 def _narrow(limited: np.ndarray, ranges: np.ndarray, margins: np.ndarray, *, differs: bool) -> np.ndarray:
     """Return which of those with limits may be within the margins of both, in the model or where its fields differ."""
+    # Fields of each world may be drawn at any time: then the width of today proves nothing.
     differs = differs or len(ranges) > 1 or len(margins) > 1
     width = ranges[0, :, 1] - ranges[0, :, 0]
+    # Both hold together only where the range is narrower than both margins.
     both = (width < 2.0 * margins[0]) | differs
     return limited[both[limited]]
 
@@ -76,10 +78,12 @@ def room_for_nonzeros(warp_model: mjw.Model, expanded: Collection[str], *, njmax
 
     That has one row for each limit, and none for dry friction that the model itself does not have.
     """
+    # Rows of the second limits, and of friction that a world draws, are unknown to MuJoCo Warp's estimate.
     between = (
         joints_between_limits(warp_model, expanded).size + tendons_between_limits(warp_model, expanded).size
     )
     if between or {"dof_frictionloss", "tendon_frictionloss"}.intersection(expanded):
+        # Every row may have all columns: an upper bound that needs no look at the tree.
         return njmax * warp_model.nv
     return None
 
@@ -87,12 +91,13 @@ def room_for_nonzeros(warp_model: mjw.Model, expanded: Collection[str], *, njmax
 def adding_of_second_limits(
     warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
-    """Return what launches it after MuJoCo Warp's rows, with arrays in their final place; None if no row lacks."""
+    """Return a launcher of it after MuJoCo Warp's rows, with arrays in their final place; None if no row lacks."""
     m = warp_model
     d = warp_data_E
     bits = mjw.DisableBit
     joints = joints_between_limits(m, expanded)
     tendons = tendons_between_limits(m, expanded)
+    # C makes no rows of limits under these flags either.
     if not joints.size + tendons.size or m.opt.disableflags & (bits.CONSTRAINT | bits.LIMIT):
         return None
     own = {
@@ -113,6 +118,7 @@ def adding_of_second_limits(
 @wp.func
 def _slot_of(world: int, kind: int, owner: int, c: Limits) -> int:
     """Return the row of the nearer limit, or -1 if there was no room for it."""
+    # Rows stand in the order equality, friction, limits; `ne`, `nf` and `nl` count them, even beyond the room.
     first = c.ne[world] + c.nf[world]
     for row in range(first, wp.min(first + c.nl[world], c.njmax)):
         if c.efc_type[world, row] == kind and c.efc_id[world, row] == owner:
@@ -124,6 +130,7 @@ def _slot_of(world: int, kind: int, owner: int, c: Limits) -> int:
 def _free_address(world: int, rows: int, c: Limits) -> int:
     """Return the address behind the nonzeros of the present rows."""
     address = int(0)  # noqa: UP018 (Warp: a variable that changes in a loop)
+    # Nonzeros of a row are contiguous, but rows need not be in the order of their addresses.
     for row in range(wp.min(rows, c.njmax)):
         address = wp.max(address, c.efc_J_rowadr[world, row] + c.efc_J_rownnz[world, row])
     return address
@@ -135,10 +142,12 @@ def _appended(world: int, nonzeros: int, c: Limits) -> int:
     row = c.nefc[world]
     address = int(0)  # noqa: UP018
     if c.is_sparse:
+        # The row's entries go behind all others.
         address = _free_address(world, row, c)
         if address + nonzeros > c.njmax_nnz:
             c.overflow[world] = c.overflow[world] | OUT_OF_NONZEROS
             return -1
+    # Counted before the check, so that the report of overflow knows how many rows were needed.
     c.nefc[world] = row + 1
     if row >= c.njmax:
         return -1
@@ -146,6 +155,7 @@ def _appended(world: int, nonzeros: int, c: Limits) -> int:
         c.efc_J_rowadr[world, row] = address
         c.efc_J_rownnz[world, row] = nonzeros
     if c.has_blocks:
+        # A block of one row, so that the solver adds this row up as it does the others.
         block = c.efc_jtdaj_nblock[world]
         c.efc_jtdaj_nblock[world] = block + 1
         c.efc_jtdaj_adr[world, block] = row
@@ -157,9 +167,11 @@ def _appended(world: int, nonzeros: int, c: Limits) -> int:
 def _write_limit(world: int, row: int, kind: int, owner: int, distance: float, sign: float, c: Limits):
     """Write a row of a limit: the Jacobian of its joint or tendon, times the sign of the side, and its law."""
     velocity = float(0.0)  # noqa: UP018
+    # A dense row may hold leftovers of another step's row.
     if not c.is_sparse:
         for dof in range(c.nv):
             c.efc_J[world, row, dof] = 0.0
+    # The Jacobian of a hinge or slide has one entry, of 1 or -1.
     if kind == LIMIT_JOINT:
         dof = c.jnt_dofadr[owner]
         velocity = sign * c.qvel[world, dof]
@@ -172,6 +184,7 @@ def _write_limit(world: int, row: int, kind: int, owner: int, distance: float, s
         invweight = c.dof_invweight0[world % c.dof_invweight0.shape[0], dof]
         solref = c.jnt_solref[world % c.jnt_solref.shape[0], owner]
         solimp = c.jnt_solimp[world % c.jnt_solimp.shape[0], owner]
+    # A tendon's Jacobian is a sparse row that the substep has computed.
     else:
         for i in range(c.ten_J_rownnz[owner]):
             entry = c.ten_J_rowadr[owner] + i
@@ -187,6 +200,7 @@ def _write_limit(world: int, row: int, kind: int, owner: int, distance: float, s
         invweight = c.tendon_invweight0[world % c.tendon_invweight0.shape[0], owner]
         solref = c.tendon_solref_lim[world % c.tendon_solref_lim.shape[0], owner]
         solimp = c.tendon_solimp_lim[world % c.tendon_solimp_lim.shape[0], owner]
+    # The law of the row (D, aref) is MuJoCo Warp's own, so that both rows have it in common.
     efc_row(
         c.disableflags,
         world,
@@ -219,10 +233,13 @@ def _write_limit(world: int, row: int, kind: int, owner: int, distance: float, s
 def _add_second(
     world: int, kind: int, owner: int, value: float, bounds: wp.vec2, margin: float, nonzeros: int, c: Limits
 ):
+    # Distances to both limits, rad or m; a row exists below the margin.
     lower = value - bounds[0]
     upper = bounds[1] - value
+    # One limit alone is what MuJoCo Warp handles.
     if lower >= margin or upper >= margin:
         return
+    # MuJoCo Warp's row may be of either side: it is written again as the lower one.
     slot = _slot_of(world, kind, owner, c)
     last = _appended(world, nonzeros, c)
     # Sensors of limits read the slot's, and C the lower one.

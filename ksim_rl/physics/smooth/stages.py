@@ -61,11 +61,13 @@ AFFINE = {
 def unsuited(warp_model: mjw.Model) -> str | None:
     """Return why the kernel cannot compute this model's smooth dynamics, or None where it can."""
     m = warp_model
+    # The order is that of the report: the first reason that holds is named.
     reasons = {
         "there are flexes": m.nflex > 0,
         "there are tendons": m.ntendon > 0,
         "there are no degrees of freedom": m.nv == 0,
         "there is a fluid": m.has_fluid,
+        # Adhesion is a force of contacts, which the kernel does not know.
         "contacts adhere": bool(m.flg_adhesion),
         "joints yield": bool(m.nplastic),
         "an actuator is delayed": m.nhistory > 0,
@@ -85,6 +87,7 @@ def one_kernel_dynamics_unavailable(
 ) -> str | None:
     """Return why MuJoCo Warp's own kernels compute a model's smooth dynamics, or None where one kernel does."""
     on_gpu = warp_model.qpos0.device.is_cuda
+    # On the CPU, MuJoCo Warp's stages are the default.
     if not (on_gpu if sim.one_kernel_dynamics is None else sim.one_kernel_dynamics):
         return f"sim.one_kernel_dynamics is {sim.one_kernel_dynamics}{'' if on_gpu else ', on the CPU'}"
     if solver_unavailable is not None:
@@ -97,6 +100,7 @@ def one_kernel_integration_unavailable(
 ) -> str | None:
     """Return why MuJoCo Warp's own kernels integrate, or None where one kernel does."""
     if dynamics_unavailable is None and warp_model.opt.integrator == mjw.IntegratorType.IMPLICIT:
+        # "implicit" takes the derivative of Coriolis forces, too, which the kernel does not compute.
         return "the integrator is mjINT_IMPLICIT"
     return dynamics_unavailable
 
@@ -104,9 +108,9 @@ def one_kernel_integration_unavailable(
 def smooth_dynamics(
     warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None, mask: wp.array | None = None
 ) -> Callable[..., None]:
-    """Return what launches the smooth dynamics of a model that is not `unsuited`, with arrays in their final place.
+    """Return a launcher of the smooth dynamics of a model that is not `unsuited`, with arrays in their final place.
 
-    It computes what MuJoCo Warp's `fwd_position`, `fwd_velocity`, `fwd_actuation` and `fwd_acceleration` do, but for
+    It does the work of MuJoCo Warp's `fwd_position`, `fwd_velocity`, `fwd_actuation` and `fwd_acceleration`, but for
     cameras, lights, contacts, constraint rows and `qacc_smooth`. With `forces_too=False` it computes of these what
     positions and velocities alone decide, and with `sums_momenta=True` what `subtree_vel` does as well; with
     `goes_on=False` only what collisions need, `geom_xpos` and `geom_xmat`; and with `places_geoms=False` all but these
@@ -114,6 +118,7 @@ def smooth_dynamics(
     other kernels of a substep read. `lanes` is how many threads share a world on CUDA; None takes the usual.
     """
     if mask is None:
+        # An empty mask stands for all worlds: the kernel takes an array in any case.
         mask = wp.empty(0, dtype=bool, device=warp_data_E.qpos.device)
     launch = _launcher(SMOOTH, warp_model, warp_data_E, lanes, {"mask": mask})
     return partial(launch, **WHOLE)
@@ -126,7 +131,7 @@ def integration(
     lanes: int | None = None,
     record: Mapping[str, wp.array] | None = None,
 ) -> Callable[[], None]:
-    """Return what launches the integration of a model for which it is available: MuJoCo Warp's `euler` or `implicit`.
+    """Return a launcher of the integration of a model for which it is available: MuJoCo Warp's `euler` or `implicit`.
 
     It updates the arrays of a `record` of overflow, too. Each sum has one order, whatever the number of lanes. Where
     MuJoCo Warp differs from the C engine it follows C: with forces disabled (activations without actuation keep still,
@@ -147,6 +152,7 @@ def _launcher(
     d = warp_data_E
     sizes = _sizes(m)
     device = d.qpos.device
+    # On the CPU one lane does the work of all.
     if device.is_cuda:
         if lanes:
             block = (lanes, 64)
@@ -156,7 +162,9 @@ def _launcher(
         block = (1, 1)
     assert block is not None, "the model is unsuited"
     lanes, threads = block
+    # The degree of freedom that each actuator drives: all transmissions are joints here, see `unsuited`.
     driven = m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]
+    # For each degree of freedom, its actuators are a slice of `drivers`, so that sums have one order.
     tables = {
         "moving_geoms": _moving_geoms(m),
         "first_driver": np.searchsorted(np.sort(driven), range(m.nv + 1)),
@@ -166,8 +174,10 @@ def _launcher(
     arrays = {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
     own = {**WHOLE, **given, **arrays}
     constants = {**_ENUMS, **sizes, "floats": _floats(parts, sizes, lanes)}
+    # The bound was measured to pay for dynamics in small blocks; see LANES.
     is_small = parts == SMOOTH and threads == 64 and constants["floats"] * (64 // lanes) <= SMALL_BLOCK_FLOATS
     parents = ", ".join(map(str, m.body_parentid.numpy()))
+    # Without a record of overflow, its part is not compiled.
     parts += ("record",) if "sticky" in given else ()
     source = f"constexpr int PARENTS[] = {{{parents}}};\n" + native.source_of("smooth", parts)
     most = REGISTERS if is_small else None
@@ -175,7 +185,7 @@ def _launcher(
 
 
 def _sizes(warp_model: mjw.Model) -> dict[str, int]:
-    """Return what of a model is compiled into its kernels: its sizes, and what it has of MuJoCo's features."""
+    """Return the constants that are compiled into a model's kernels: sizes, and which features it uses."""
     m = warp_model
     flags = int(m.opt.disableflags)
     bits = mjw.DisableBit
@@ -223,37 +233,47 @@ def _floats(parts: tuple[str, ...], sizes: Mapping[str, int], lanes: int) -> int
 
 def _num_free_bodies(warp_model: mjw.Model) -> int:
     """Return how many bodies have nothing but a free joint, and are solved for each on its own."""
+    # Euler takes free bodies with all others.
     if warp_model.opt.integrator == mjw.IntegratorType.EULER:
         return 0
     return warp_model.body_freeadr.size
 
 
 def _elimination(warp_model: mjw.Model) -> dict[str, Sequence[int] | np.ndarray]:
-    """Return the degrees of freedom to eliminate, the last first, those in no other's row, and what each changes."""
+    """Return the dofs to eliminate, the last first, those in no other's row, and the entries that each changes."""
     m = warp_model
+    # A change packs the entry that it changes and two places of the row, of 7 bits each, into one int.
     changes = []
     first = [0]
+    # Free bodies are solved on their own, outside of this elimination.
     alone = m.body_freeadr.numpy()[: _num_free_bodies(m)]
+    # From leaves to roots, as the sparse factorization of an inertia matrix goes: it has no fill-in then.
     order = np.flatnonzero(~np.isin(m.dof_bodyid.numpy(), alone))[::-1]
+    # Rows of `M` have a column for each ancestor and, last, for the degree of freedom itself.
     row = m.M_hinit_i.numpy()
     column = m.M_colind.numpy()
     starts = m.M_rowadr.numpy()
     for dof in order:
         *ancestors, _ = column[row == dof]
+        # The outer product of a row updates the rows of its ancestors.
         for other, ancestor in enumerate(ancestors):
             changes += [starts[ancestor] + place << 14 | place << 7 | other for place in range(other + 1)]
+            # Entries beyond the matrix are those of the right-hand side, which is eliminated with it.
             changes.append(column.size + ancestor << 14 | other << 7 | len(ancestors))
         first.append(len(changes))
+    # Lanes substitute back along the chains of these in parallel.
     leaves = np.setdiff1d(order, column[row != column])
     return {"eliminated": order, "leaves": leaves, "changes": changes, "first_change": first}
 
 
 def _has_affine_actuators(warp_model: mjw.Model) -> bool:
+    # MuJoCo Warp's types are compared by number; a switched-off actuator has one of our own.
     m = warp_model
     for enum, names in AFFINE.items():
         known = [SWITCHED_OFF, *(native.names_of(enum)[name] for name in names)]
         if not np.isin(getattr(m, f"actuator_{enum.__name__[3:].lower()}type").numpy(), known).all():
             return False
+    # Balls and free joints have transmissions of several columns.
     return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())
 
 
@@ -263,6 +283,7 @@ def _block(parts: tuple[str, ...], sizes: Mapping[str, int], worlds: int) -> tup
     least = LANES_OF_FEW[parts] if is_few else 0
     for threads, lanes in itertools.product((32,) if is_few else (64, 32), LANES):
         if lanes == 8:
+            # Eight lanes pay only where shared memory does not limit the blocks; see LANES.
             most = SMALL_BLOCK_FLOATS
         else:
             most = SHARED_FLOATS
