@@ -39,7 +39,9 @@ _SENSORS = {
     **dict.fromkeys(("FRAMEXAXIS", "FRAMEZAXIS", "SUBTREECOM", "SUBTREELINVEL"), POLAR),
     **dict.fromkeys(("FRAMEQUAT", "BALLQUAT"), QUATERNION),
 }
+# By quantity of `ImuReading`.
 _IMU = {"ang_vel": AXIAL, "lin_acc": POLAR, "quat": QUATERNION, "projected_gravity": POLAR}
+# Above the rounding of float32 angles, far below any asymmetry that is meant.
 _TOLERANCE = 1e-4
 
 
@@ -54,6 +56,7 @@ def mirror_maps(
     """
     inner = part(env, ManagerBasedRlEnv)
     specs = group_specs(env)
+    # Terms are read from the config, which only this env has.
     if inner is None:
         raise ValueError(
             f"mirror_maps of a {type(env).__name__}: needs a ManagerBasedRlEnv, whose terms it reads"
@@ -63,6 +66,7 @@ def mirror_maps(
         if group not in specs:
             raise ValueError(f"no observation group {group!r}: {near(str(group), map(str, specs))}")
         terms = inner.cfg.observations[str(group)].terms
+        # A group's terms, each with its own image; `mirror_group` puts them together by the group's spec.
         images: dict[NestedKey, MirrorMap] = {
             name: _named(f"observations.{group}.{name}", cfg.term, inner) for name, cfg in terms.items()
         }
@@ -78,7 +82,7 @@ def _named(where: str, term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
 
 @functools.singledispatch
 def term_mirror(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
-    """Return the mirror image of what an observation term reads, a command gives, or an action term takes.
+    """Return the mirror image of an observation term's reading, a command, or the input of an action term.
 
     Example:
         >>> @term_mirror.register
@@ -90,6 +94,7 @@ def term_mirror(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
     )
 
 
+# Images that do not depend on the term's fields.
 _FIXED = {
     **dict.fromkeys((mdp.RootPos, mdp.RootLinVel, mdp.ProjectedGravity), POLAR),
     mdp.RootAngVel: AXIAL,
@@ -98,8 +103,10 @@ _FIXED = {
     mdp.UniformVelocityCommand: PLANAR_VELOCITY,
 }
 for _kind, _image in _FIXED.items():
+    # The default binds the image now; a plain closure would see the last one.
     term_mirror.register(_kind, lambda term, env, image=_image: image)
 
+# Images that depend on the term's fields or on the env.
 _RULES: Mapping[type, Callable[[Any, ManagerBasedRlEnv], MirrorMap]] = {
     mdp.ImuReading: lambda term, env: _IMU[term.quantity],
     mdp.Command: lambda term, env: term_mirror(env.cfg.commands[term.command], env),
@@ -116,6 +123,7 @@ for _kind, _rule in _RULES.items():
 
 @term_mirror.register
 def _(term: mdp.SensorReading, env: ManagerBasedRlEnv) -> MirrorMap:
+    # By the kind of sensor: vectors along (polar) or about (axial) an axis, or quaternions.
     sensor = env.view.world.mj_model.sensor(term.sensor)
     kind = mujoco.mjtSensor(int(sensor.type[0])).name.removeprefix("mjSENS_")
     if kind not in _SENSORS:
@@ -128,6 +136,7 @@ def _(term: mdp.HeightScan, env: ManagerBasedRlEnv) -> MirrorMap:
     points_N3 = grid_points(term.size, term.resolution)
     # Rows along x, one after the other along y.
     rows = len(np.unique(points_N3[:, 1].round(6)))
+    # Rows run from right to left; the mirror image has them in reverse order.
     columns = np.arange(len(points_N3)).reshape(rows, -1)[::-1].ravel()
     return MirrorMap(source=tuple(map(int, columns)))
 
@@ -140,16 +149,21 @@ def _(term: JointAction, env: ManagerBasedRlEnv) -> MirrorMap:
     else:
         mirror = _joints(env, term.joints)
     view = env.view
+    # `source` permutes columns, `signs` turns those that move the other way.
     (source, signs) = mirror.tensors(env.view.device)
     scale = per_joint(view, "scale", term.scale, term.joints)
     if isinstance(scale, Tensor) and source is not None:
+        # Left and right must be scaled alike, or an image of an action would not be an action.
         _check_symmetric("scale", scale, scale[source])
     offset = per_joint(view, "offset", term.offset, term.joints)
+    # Adding 0 * signs broadcasts a single offset to all columns.
     _check_symmetric("offset", signs * 0.0 + offset, mirror(signs * 0.0 + offset))
+    # With a sign of -1 the clip's ends swap: only a symmetric one stays itself.
     if term.clip is not None and term.clip[0] != -term.clip[1] and bool((signs < 0).any()):
         raise ValueError(
             f"clip={term.clip} is not symmetric, and some joints turn the other way in the mirror"
         )
+    # Positions and velocities of one term have the same image, one after the other.
     return concatenate([mirror] * (term.size(view) // mirror.size))
 
 
@@ -163,6 +177,7 @@ def _joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
 
 def _relative_joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
     mirror = _joints(env, joints)
+    # All envs start with the same default pose here: the first row stands for all.
     default_K = env.view.joints(joints).default_pos_EL[0]
     _check_symmetric("the default pose", default_K, mirror(default_K))
     return mirror
@@ -189,9 +204,11 @@ _BY_NAME: Mapping[Any, Any] = {**_BODIES, **_SITES, **_CONTACTS}
 
 def _of_names(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
     resolver = env.view.resolver
+    # A contact sensor knows the names of its own elements.
     if isinstance(term, tuple(_CONTACTS)):
         contact = env.cfg.scene.sensors[term.sensor]
         assert isinstance(contact, ContactSensor)
+        # Subtrees are named by their bodies.
         names = contact.elements(resolver.names("geom" if contact.kind == "geom" else "body"))
     else:
         is_body = isinstance(term, tuple(_BODIES))
@@ -202,6 +219,7 @@ def _of_names(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
             kind = "site"
             patterns = term.sites
         names = [resolver.names(kind)[i] for i in resolver.ids(kind, patterns)]
+    # The first kind that fits: images of vectors are polar or axial, None keeps single numbers as they are.
     return mirror_by_name(names, next(image for kind, image in _BY_NAME.items() if isinstance(term, kind)))
 
 

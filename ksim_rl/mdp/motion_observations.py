@@ -25,6 +25,7 @@ class PlayMotion(OfMotion, EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         start_E = motion_start_time(view, self.file)
+        # Env e starts at frame e: the envs together are the whole motion.
         frame_s_E = torch.arange(view.num_envs, device=view.device) * view.step_dt
         start_E.copy_(torch.where(mask_E, frame_s_E, start_E))
         qpos_EL, qvel_EL = view.motion(self.file).sample(start_E)
@@ -37,9 +38,10 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L
 
     Envs of their own, on a plane, are put into the motion's states, and the group's terms and transforms compute what
     they always do; noise is off. Terms that read more than positions and velocities (commands, actions, contacts,
-    forces) read what they have after a reset. The given env, around a `ManagerBasedRlEnv`, stays as it is; `file` is a
+    forces) read their values after a reset. The given env, around a `ManagerBasedRlEnv`, stays as it is; `file` is a
     motion as `view.motion` reads it, at least as long as an env step.
     """
+    # Transforms around the env are not the env itself, whose config is needed.
     base = part(env, ManagerBasedRlEnv)
     if base is None:
         raise ValueError(
@@ -48,6 +50,7 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L
     cfg = base.cfg
     device = base.device
     assert device is not None
+    # On the CPU: only its length is needed here.
     duration_s = load_motion(file, base.world.mj_model, torch.device("cpu")).duration_s
     # The least bit more, so that rounding does not cost the last frame.
     frames = 1 + int(duration_s / base.step_dt + 1e-6)
@@ -55,10 +58,12 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L
         raise ValueError(
             f"motion {file}: lasts {duration_s:g} s, less than an env step of {base.step_dt:g} s"
         )
+    # A terrain would move the motion's states to its origins; a plane keeps them.
     if cfg.scene.terrain is not None:
         ground = PlaneTerrain()
     else:
         ground = None
+    # The same terms, in as many envs as there are frames, without anything that acts, ends or rewards.
     played = dataclasses.replace(
         cfg,
         scene=dataclasses.replace(cfg.scene, num_envs=frames, terrain=ground),
@@ -68,12 +73,16 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L
         terminations={},
         curriculum={},
         metrics={},
+        # No time-out: a single reset is all that happens.
         episode_length_s=0.0,
         viewer=dataclasses.replace(cfg.viewer, env_index=0),
+        # A fixed seed; noise is off in evaluation mode.
         seed=0,
     )
     player = build(played, device=device)
+    # Noise of observations is for training only.
     player.eval()
+    # A clone outlives the env that is closed next.
     seen_FL = player.reset().get(group).clone()
     player.close(raise_if_closed=False)
     return seen_FL

@@ -1,6 +1,6 @@
 """These terms begin, read, rate and end episodes that follow a reference motion.
 
-`file` is a motion, as `view.motion` reads it. Kernels are from Peng et al., "DeepMimic" (2018), with scales k written as
+`file` is a motion that `view.motion` reads. Kernels are from Peng et al., "DeepMimic" (2018), with scales k written as
 std = 1 / sqrt(k): joint positions 2, joint velocities 0.1, ends of limbs 40, root or centre of mass 10.
 """
 

@@ -253,7 +253,7 @@ class CameraImage(OfSensor, ObservationTerm, is_image=True):
 
 @dataclass(frozen=True, kw_only=True)
 class RayDistance(OfSensor, ObservationTerm):
-    """Distances to the first hits of rays, m, `max_distance` of the sensor where there is none, [E, N]; position stage."""
+    """Distances to the rays' first hits, m, the sensor's `max_distance` where there is none, [E, N]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.rays(self.sensor).state.distance_EN

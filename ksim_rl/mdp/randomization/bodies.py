@@ -36,6 +36,7 @@ class RandomizeBodyMass(RandomizeBodyField, field="body_mass", lowest=_LEAST_MAS
 
     def _follower(self, view: EnvView) -> tuple[Tensor, Sequence[float]]:
         ids = self.ids(view)
+        # Inertia per kg of the model's own body: the mass scales it, the shape stays.
         per_mass_N3 = view.world.mj_model.body_inertia[list(ids)] / _masses(view, ids)[:, None]
         return view.field("body_inertia"), per_mass_N3.ravel().tolist()
 
@@ -60,15 +61,20 @@ class RandomizeBodyInertia(RandomizeBodyField, field="body_inertia", columns=3, 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids = self.ids(view)
         pairs = self.ranges_by_column()
+        # Factors of 1 stand in for the model's own moments, since the draws are factors themselves.
         self._check_reach(view, np.ones((len(ids), 3)), pairs)
+        # Columns without a range keep the factor 1.
         factor_EN3 = torch.ones(view.num_envs, 1 if self.shared else len(ids), 3, device=view.device)
         drawn_ENC = self.draw(view, len(ids), list(pairs.values()))
         factor_EN3[..., index_constant(tuple(pairs), view.device)] = drawn_ENC
+        # From the model's own values, not the present ones: draws must not pile up over resets.
         own_N3 = array_constant(second_moments(view, ids), view.device)
         own_mass_N = array_constant(_masses(view, ids), view.device)
+        # Mass may differ between worlds already; its ratio to the model's own scales all moments.
         mass_EN = view.field("body_mass")
         ratio_EN = mass_EN[:, index_constant(ids, view.device)] / own_mass_N
         spread_EN3 = own_N3 * factor_EN3 * ratio_EN[..., None]
+        # Each principal moment is the sum of the spreads along the two other axes.
         inertia_EN3 = spread_EN3.sum(-1, keepdim=True) - spread_EN3
         write_entries(view.field("body_inertia"), ids, range(3), mask_E, inertia_EN3)
 
@@ -113,6 +119,8 @@ class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shi
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        # Per-body constants of the model: mass [N, 1], centre of mass [N, 3], principal axes [N, 4] and
+        # spread [N, 3].
         ids = view.resolver.ids("body", self.bodies)
         model = view.world.mj_model
         rows = list(ids)
@@ -120,11 +128,14 @@ class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shi
         com_N3 = array_constant(model.body_ipos[rows], view.device)
         axes_N4 = array_constant(model.body_iquat[rows], view.device)
         spread_N3 = array_constant(second_moments(view, ids), view.device)
+        # Ten parameters per body, in columns: alpha, 3 of stretch, 3 of shear, 3 of shift.
         drawn = self.draw(
             view, len(ids), [self.alpha, *[self.stretch] * 3, *[self.shear] * 3, *[self.shift] * 3]
         )
+        # The mass is J's lower right entry, which U scales by exp(alpha) from both sides.
         density_EN1 = torch.exp(2.0 * drawn[..., 0:1])
         shift_EN3 = drawn[..., 7:10]
+        # The upper left 3 x 3 block of U / exp(alpha): stretch on the diagonal, shear above it.
         map_EN33 = torch.diag_embed(torch.exp(drawn[..., 1:4]))
         map_EN33[..., 0, 1:] = drawn[..., 4:6]
         map_EN33[..., 1, 2] = drawn[..., 6]
@@ -134,6 +145,7 @@ class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shi
         trace_EN = spread_EN33.diagonal(dim1=-2, dim2=-1).sum(-1)
         inertia_EN33 = torch.diag_embed(trace_EN[..., None].expand(*trace_EN.shape, 3)) - spread_EN33
         moments_EN3, turn_EN4 = principal_axes(inertia_EN33)
+        # From the principal axes of the model's own body back into the body's frame.
         values = {
             "body_mass": mass_N1 * density_EN1,
             "body_ipos": com_N3 + quaternion.rotate(axes_N4[None], shift_EN3),
@@ -146,16 +158,17 @@ class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shi
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeGravity(RandomizeModelField, field="gravity", columns=3, operation="add"):
-    """Gravity of each world, m/s^2, by axis x, y, z. Projected gravity, a direction, stays that of the -z axis."""
+    """Gravity of each world, m/s^2, by axis x, y, z. Projected gravity, a direction, stays the -z axis."""
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
+        # The options have one row for the whole model.
         return (0,)
 
     def nominal(self, view: EnvView) -> np.ndarray:
         return view.world.mj_model.opt.gravity[None]
 
 
-# How many of its three sizes a geom of each kind has; those of other kinds cannot differ between worlds.
+# How many of its three sizes a geom of each kind has; sizes of other kinds cannot differ between worlds.
 NUM_SIZES = {
     mujoco.mjtGeom.mjGEOM_SPHERE: 1,
     mujoco.mjtGeom.mjGEOM_CAPSULE: 2,
@@ -175,7 +188,10 @@ class RandomizeGeomSize(RandomizeModelField, field="geom_size", columns=3):
         model = view.world.mj_model
         for row, geom in enumerate(self.ids(view)):
             kind = mujoco.mjtGeom(int(model.geom_type[geom]))
+            # Meshes and height fields have no sizes that may differ.
             count = NUM_SIZES.get(kind, 0)
+            # By column, a range must not name a size that this kind of geom lacks; one pair for all skips
+            # those.
             if not count or (isinstance(self.ranges, Mapping) and max(pairs) >= count):
                 raise ValueError(
                     f"RandomizeGeomSize.ranges={self.ranges!r}: geom {model.geom(geom).name!r}, a "

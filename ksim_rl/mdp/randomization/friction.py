@@ -22,7 +22,7 @@ class RandomizeGeomFriction(
     """Friction of geoms; columns: 0 sliding, 1 torsional (m), 2 rolling (m). One pair for all is for sliding.
 
     In a contact the geom of higher `priority` says it, and of equal ones that with the larger number, for each column:
-    what is drawn below the ground's friction does nothing unless the geom's priority is higher.
+    values below the ground's friction do nothing unless the geom's priority is higher.
     """
 
     geoms: Patterns
@@ -33,7 +33,9 @@ class RandomizeGeomFriction(
         lines: list[str] = []
         for column, pair in self.ranges_by_column().items():
             own_N = self.nominal(view)[:, column]
+            # Ends of the range for each geom, from its own value.
             low_N, high_N = self.reach(own_N, pair)
+            # Geoms with the same reason share a line of the report.
             found: dict[str, list[str]] = {}
             for geom, low, high in zip(rows, low_N, high_N, strict=True):
                 reason = _unfelt(model, geom, column, (float(low), float(high)))
@@ -72,15 +74,18 @@ def _needs(kind: int) -> str:
 
 
 def _unfelt(mj_model: mujoco.MjModel, geom: int, column: int, reach: tuple[float, float]) -> str:
-    """Return why fixed geoms feel none of what is drawn for a geom, or only the upper part; empty if all is felt."""
+    """Return why fixed geoms feel none of the values drawn for a geom, or only the upper part; empty if all is felt."""
+    # Bodies welded to the world: the ground, and whatever stands on it for good.
     fixed = np.flatnonzero(mj_model.body_weldid[mj_model.geom_bodyid] == 0)
     grounds = [int(other) for other in fixed if other != geom and _collide(mj_model, geom, int(other))]
+    # The lowest friction among the grounds of equal priority: from there on draws are felt.
     floor = np.inf
     felt_from = ""
     for ground in grounds:
         name = mj_model.geom(ground).name or f"number {ground}"
         own = int(mj_model.geom_priority[geom])
         other = int(mj_model.geom_priority[ground])
+        # MuJoCo's rule: the geom of higher priority decides alone, equal ones by the larger value.
         if own > other:
             condim = int(mj_model.geom_condim[geom])
         elif own < other:
@@ -89,12 +94,14 @@ def _unfelt(mj_model: mujoco.MjModel, geom: int, column: int, reach: tuple[float
             condim = int(mj_model.geom_condim[[geom, ground]].max())
         if condim < _DIMENSIONS[column]:
             return _needs(column)
+        # Own priority is higher: every draw is felt.
         if own > other:
             return ""
         friction = float(mj_model.geom_friction[ground, column])
         if friction < floor:
             floor = friction
             felt_from = name
+    # Even the lowest draw is above the ground's friction.
     if not grounds or reach[0] >= floor:
         return ""
     if reach[1] <= floor:
@@ -106,6 +113,7 @@ def _unfelt(mj_model: mujoco.MjModel, geom: int, column: int, reach: tuple[float
 
 def _collide(mj_model: mujoco.MjModel, geom: int, other: int) -> bool:
     """Whether two geoms may touch by their bits; explicit pairs have friction of their own."""
+    # MuJoCo lets two geoms collide if either one's type meets the other's affinity.
     types = mj_model.geom_contype
     affinities = mj_model.geom_conaffinity
     return bool(types[geom] & affinities[other]) or bool(types[other] & affinities[geom])

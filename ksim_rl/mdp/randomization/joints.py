@@ -31,8 +31,10 @@ class RandomizeJointField(OfJoints, RandomizeModelField, lowest=0.0):
     def ids(self, view: EnvView) -> tuple[int, ...]:
         """Return rows by joint, degree of freedom or generalized position, as the field's name says."""
         model = view.world.mj_model
+        # Fields start with the kind of their rows: "jnt" by joint, "dof" by velocity, "qpos0" by position.
         places = {"jnt": np.arange(model.njnt), "dof": model.jnt_dofadr, "qpos0": model.jnt_qposadr}
         scalar = scalar_joint_ids(model)
+        # The resolver counts hinges and slides only; the model's rows count all joints.
         joints = [scalar[i] for i in view.resolver.ids("joint", self.joints)]
         return tuple(int(i) for i in places[self.field.split("_")[0]][joints])
 
@@ -59,9 +61,10 @@ class RandomizeJointStiffness(RandomizeJointField, field="jnt_stiffness"):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeJointRange(RandomizeJointField, field="jnt_range", columns=2, operation="add"):
-    """Limits of joints that have any, rad or m; columns: 0 lower, 1 upper. Soft limits stay those of the model."""
+    """Limits of joints that have any, rad or m; columns: 0 lower, 1 upper. Soft limits stay as in the model."""
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
+        # The worst case of each end: the highest lower limit and the lowest upper limit must not cross.
         if 0 in pairs:
             lower = self.reach(nominal[:, 0], pairs[0])[1]
         else:
@@ -117,21 +120,23 @@ class RandomizeTendonArmature(RandomizeTendonField, field="tendon_armature"):
 class RandomizeDefaultJointPos(OfJoints, RandomizeNumber, operation="add"):
     """The default pose, rad or m: what resets, position actions and relative joint positions start from.
 
-    The model's own value is that of its first keyframe or, without one, `qpos0`. In mode "reset" let it run before the
+    The model's own value is from its first keyframe or, without one, `qpos0`. In mode "reset" let it run before the
     event that resets the joints.
     """
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.joints(self.joints)
         drawn_EN = self.draw(view, len(joints), [self.ranges])[..., 0]
+        # From the keyframe, not from the last draw.
         value_EN = self.combine(view.default_qpos_L[joints.qpos], drawn_EN)
         held_EN = joints.default_pos_EL
+        # Written in place, in the masked rows only.
         view.default_joint_pos_EL[:, joints.index] = torch.where(mask_E[:, None], value_EN, held_EN)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeEncoderBias(OfJoints, RandomizeNumber):
-    """Offset between a joint's position and what its encoder reads, rad or m; see `JointPosRel(biased=True)`."""
+    """Offset between a joint's position and its encoder's reading, rad or m; see `JointPosRel(biased=True)`."""
 
     operation: Literal["abs"] = "abs"
 
@@ -151,13 +156,17 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
     ) -> tuple[Tensor, list[int]]:
         """Draw a number for each joint, and write it where an explicit actuator has it; return the other places too."""
         joints = view.resolver.ids("joint", self.joints)
+        # An infinite limit has no nominal value that a factor could change.
         owners = view.actuator_params.joints(name, finite=finite)
+        # A shared draw has one column, which all joints take.
         drawn_EN = self.draw(view, len(joints), [pair])[..., 0].expand(-1, len(joints))
+        # Places among the matched joints, not ids.
         explicit = [i for i, joint in enumerate(joints) if joint in owners]
         if explicit:
             columns = index_constant([joints[i] for i in explicit], view.device)
             own_N = view.actuator_params.nominal(name)[columns]
             explicit_EN = drawn_EN[:, index_constant(explicit, view.device)]
+            # A negative gain would push away from the target; the gaussian's tails may reach there.
             value_EN = self.combine(own_N, explicit_EN).clamp(min=0.0)
             held_EL = view.actuator_param(name)
             held_EL[:, columns] = torch.where(mask_E[:, None], value_EN, held_EL[:, columns])
@@ -166,6 +175,7 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
     def _check_not_negative(self, field: str, names: Sequence[str], own: np.ndarray, pair: Pair) -> None:
         low, _ = self.reach(own, pair)
         if np.any(low < 0.0):
+            # The worst joint is named; `own` may have a low and a high end per joint.
             row = int(low.reshape(len(names), -1).min(-1).argmin())
             raise ValueError(
                 f"{type(self).__name__}.{field}={pair!r}: that of joint {names[row]!r} would reach {low.min():g}; "
@@ -178,7 +188,7 @@ class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
     """Gains of the servos that drive joints: stiffness, N m / rad or N / m; damping, N m s / rad or N s / m.
 
     Gains are meant at the joint, behind the gear. MuJoCo's position servo keeps its stiffness in its gain and its bias,
-    its velocity servo the damping; all places are written, so that targets mean what they did. Explicit actuators keep
+    its velocity servo the damping; all places are written, so that targets keep their meaning. Explicit actuators keep
     theirs in `EnvView.actuator_param`, never below 0. None leaves a gain alone.
     """
 
@@ -187,6 +197,7 @@ class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
     per_world_fields: ClassVar[tuple[str, ...]] = ("actuator_gainprm", "actuator_biasprm")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        # Stiffness first; each gain is drawn by itself.
         for name in self.drawn:
             if getattr(self, name) is not None:
                 self._write(view, mask_E, name, getattr(self, name))
@@ -198,13 +209,17 @@ class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
         model = view.world.mj_model
         names = [view.joints(self.joints).names[i] for i in builtin]
         servos = [_servo(model, model.joint(joint).id, name) for joint in names]
+        # MuJoCo's bias is (constant, -kp, -kd).
         column = 1 if name == "stiffness" else 2
+        # MuJoCo's bias acts on the actuator's length, gear * q, and its force through the gear again: hence
+        # the square.
         before_gear = -model.actuator_biasprm[servos, column]
         gear = model.actuator_gear[servos, 0]
         own = before_gear * gear * gear
         self._check_not_negative(name, names, own, pair)
         drawn_EN = drawn_EN[:, index_constant(builtin, view.device)]
         value_EN = self.combine(array_constant(own, view.device), drawn_EN)
+        # Back to before the gear.
         value_EN = _times(value_EN, 1.0 / (gear * gear))
         write_entries(view.field("actuator_biasprm"), servos, (column,), mask_E, -value_EN[..., None])
         # The gain and the constant of what holds a position, or a velocity alone, are in proportion to it.
@@ -241,7 +256,9 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
         for i in builtin:
             joint = model.joint(names[i]).id
             limited = [a for a in actuators_of_joint(model, joint) if model.actuator_forcelimited[a]]
+            # An effort limit may be kept in several places; all of them get the same draw.
             ranges["actuator_forcerange"] |= dict.fromkeys(limited, i)
+            # A joint's own limit acts on the sum of its actuators.
             if model.jnt_actfrclimited[joint]:
                 ranges["jnt_actfrcrange"][joint] = i
             elif not limited:
@@ -263,6 +280,7 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
             self._check_not_negative("ranges", [names[i] for i in places], own, self.ranges)
             limit_EN1 = drawn_EN[:, index_constant(places, view.device)][..., None]
             size_EN2 = self.combine(array_constant(own, view.device), limit_EN1).expand(-1, -1, 2)
+            # Lower bounds are negative again, and an actuator's range is before its gear.
             signs_N2 = array_constant(np.array((-1.0, 1.0)) / gear_N1, view.device)
             write_entries(view.field(field), rows, (0, 1), mask_E, size_EN2 * signs_N2)
 
@@ -275,10 +293,12 @@ def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> int:
         control = joint_control(mj_model, actuator)
         if control.refusal or control.kind == "effort":
             continue
+        # A servo with a bias against the position is a position servo.
         if _leading_column(mj_model, actuator) == 1:
             position = actuator
         else:
             velocity = actuator
+    # With both kinds on one joint, damping is the velocity servo's business.
     if gain == "damping" and velocity is not None:
         return velocity
     if position is not None:

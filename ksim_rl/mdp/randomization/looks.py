@@ -45,7 +45,7 @@ class RandomizeMaterialColor(
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeMaterialShine(RandomizeModelField, lowest=0.0, highest=1.0):
-    """How materials give back light, within [0, 1]: what they emit, how strongly or how sharply they reflect lights."""
+    """How materials give back light, within [0, 1]: emission, and how strongly or how sharply they reflect lights."""
 
     materials: Patterns
     part: Literal["emission", "specular", "shininess"] = "specular"

@@ -38,6 +38,7 @@ class RandomizeTurn(RandomizeField, columns=4):
         super()._check_fields()
         for angle, pair in self.ranges.items():
             self.check_range(f"ranges.{angle}", pair)
+        # Angles without a range are drawn from (0, 0), which a logarithm does not take.
         missing = [angle for angle in get_args(Angle) if angle not in self.ranges]
         if self.distribution == "log_uniform" and missing:
             raise ValueError(
@@ -47,14 +48,17 @@ class RandomizeTurn(RandomizeField, columns=4):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids = self.ids(view)
         own_NC = array_constant(self.nominal(view), view.device)
+        # All three angles, in the order of the turn; left-out ones are 0.
         pairs = [self.ranges.get(angle, (0.0, 0.0)) for angle in get_args(Angle)]
         turn_EN4 = quaternion.from_euler_xyz(*self.draw(view, len(ids), pairs).unbind(-1))
         value_ENC = self._turned(own_NC[None], turn_EN4)
         write_entries(view.field(self.field), ids, range(self.columns), mask_E, value_ENC)
 
     def _turned(self, own_1NC: Tensor, turn_EN4: Tensor) -> Tensor:
+        # In the orientation's place: the model's own plays no part.
         if self.operation == "abs":
             return turn_EN4
+        # On the right: about the element's own axes.
         return quaternion.multiply(own_1NC, turn_EN4)
 
 
@@ -66,8 +70,10 @@ class OfBodies(RandomizeField):
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
         model = view.world.mj_model
+        # A body that moves freely has its pose in qpos, where the model's field counts for nothing.
         ids = super().ids(view)
         for body in ids:
+            # A body's first joint decides; a free joint is always alone.
             free = model.jnt_type[model.body_jntadr[body]] == mujoco.mjtJoint.mjJNT_FREE
             if model.body_mocapid[body] >= 0 or (model.body_jntnum[body] and free):
                 raise ValueError(
@@ -140,4 +146,5 @@ class RandomizeLightDir(RandomizeTurn, field="light_dir", columns=3):
     operation: Literal["add"] = "add"
 
     def _turned(self, own_1NC: Tensor, turn_EN4: Tensor) -> Tensor:
+        # A light has a direction instead of a quaternion, [E, N, 3].
         return quaternion.rotate(turn_EN4, own_1NC)

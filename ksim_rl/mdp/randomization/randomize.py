@@ -53,6 +53,7 @@ class Randomize(EventTerm, mode="startup"):
     def _check_fields(self) -> None:
         super()._check_fields()
         for name in self.drawn:
+            # None means that this quantity is not drawn.
             if getattr(self, name) is not None:
                 self.check_range(name, getattr(self, name))
 
@@ -62,8 +63,10 @@ class Randomize(EventTerm, mode="startup"):
 
     def draw(self, view: EnvView, count: int, pairs: Sequence[Pair]) -> Float[Tensor, "E N C"]:
         """Draw `count` rows per world, or one if shared, with one column per range."""
+        # Zeros as own values, with the operation "abs": the kernel gives the plain draws.
         own_NC = np.zeros((1 if self.shared else count, len(pairs)))
         drawn_ENC = torch.empty(view.num_envs, *own_NC.shape, device=view.device)
+        # Columns are numbered from 0: the target is a table of its own.
         self._draw_into(drawn_ENC, view, own_NC, range(len(own_NC)), dict(enumerate(pairs)))
         return drawn_ENC
 
@@ -72,10 +75,14 @@ class Randomize(EventTerm, mode="startup"):
         operation: Operation = "abs", mask_E: Tensor | None = None,
         follower: tuple[Tensor | None, Sequence[float]] = (None, ()),
     ) -> None:  # fmt: skip
+        # The kernel reads floats from one table: both ends, then columns, rows, own values, and the
+        # follower's ratios.
         low, high = zip(*pairs.values(), strict=True)
         table_L = constant((*low, *high, *pairs, *ids, *own_NC.flat, *follower[1]), view.device)
+        # The kernel knows kinds and operations by their places in the literals.
         kinds = get_args(Distribution).index(self.distribution), get_args(Operation).index(operation)
         numbers = [*own_NC.shape, int(self.shared), *kinds]
+        # Keys of seed, stream and counter make draws the same whichever rows reset together.
         keys = view.next_keys()
         given = keys.seed, keys.counter, table_L, follower[0], numbers, CUT, keys.stream, keys.first_row
         draw_entries(field_ENC, mask_E, *given)
@@ -93,12 +100,14 @@ class Randomize(EventTerm, mode="startup"):
     def reach(self, nominal: np.ndarray, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest values that the draws can make of the model's own, shaped like these."""
         low, high = pair
+        # The cut makes even a gaussian's reach finite.
         if self.distribution == "gaussian":
             mean, deviation = pair
             low = mean - CUT * deviation
             high = mean + CUT * deviation
         if self.operation == "add":
             return nominal + low, nominal + high
+        # A negative own value swaps the ends.
         if self.operation == "scale":
             return np.minimum(nominal * low, nominal * high), np.maximum(nominal * low, nominal * high)
         return np.full_like(nominal, low), np.full_like(nominal, high)
@@ -121,12 +130,14 @@ class RandomizeField(Randomize):
     @property
     def kind(self) -> str:
         """The kind of element, as `NameResolver` calls it."""
+        # Fields are named "<kind>_<quantity>", but for some kinds that MuJoCo abbreviates.
         prefix = self.field.split("_")[0]
         return _KINDS.get(prefix, prefix)
 
     @property
     def elements(self) -> Patterns:
-        """Names or patterns of what is randomized."""
+        """Names or patterns of the elements that are randomized."""
+        # The subclass has a field of patterns, named in the plural.
         return getattr(self, {"body": "bodies"}.get(self.kind, f"{self.kind}s"))
 
     @property
@@ -140,6 +151,7 @@ class RandomizeField(Randomize):
     def nominal(self, view: EnvView) -> np.ndarray:
         """Return the model's own values of the rows that are meant, [N, columns]."""
         values = np.asarray(getattr(view.world.mj_model, self.field), dtype=np.float64)
+        # Fields with one number per row are [N] in the model; [N, 1] here.
         return values.reshape(-1, self.columns)[list(self.ids(view))]
 
 
@@ -152,7 +164,7 @@ class RandomizeModelField(RandomizeField):
 
     ranges: Pair | Mapping[int, Pair]
 
-    lowest: ClassVar[float | None] = None  # what a value must at least be to make sense
+    lowest: ClassVar[float | None] = None  # the least value that makes sense
     highest: ClassVar[float | None] = None  # and at most
     columns_of_one_pair: ClassVar[tuple[int, ...]] = ()
 
@@ -178,6 +190,7 @@ class RandomizeModelField(RandomizeField):
         if not pairs:
             return
         self._check_reach(view, nominal, pairs)
+        # Fields [E, rows] and [E, rows, columns] alike as [E, rows, columns].
         field_ENC = view.field(self.field).view(view.num_envs, -1, self.columns)
         own_NC = nominal[:, list(pairs)]
         follower = self._follower(view)
@@ -188,6 +201,7 @@ class RandomizeModelField(RandomizeField):
         return None, ()
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
+        # Both ends of each column against the bounds; the worst element is named.
         for column, pair in pairs.items():
             low, high = self.reach(nominal[:, column], pair)
             for values, place, bound, beyond, word in (
@@ -195,6 +209,7 @@ class RandomizeModelField(RandomizeField):
                 (high, high.argmax(), self.highest, 1.0, "most"),
             ):
                 if bound is not None and (values[place] - bound) * beyond > 0.0:
+                    # Rows are ids; the resolver gives their names.
                     rows = view.resolver.ids(self.kind, self.elements)
                     name = view.resolver.names(self.kind)[rows[int(place)]]
                     raise ValueError(
@@ -217,10 +232,12 @@ def write_entries(
         entries_ERC = field_E
     rows = index_constant(ids, field_E.device)
     across = index_constant(columns, field_E.device)
+    # A gather copies unless both are slices, which give a view to write into.
     held_ENC = entries_ERC[:, rows][..., across]
     if isinstance(rows, slice) and isinstance(across, slice):
         torch.where(mask_E[:, None, None], value_ENC, held_ENC, out=held_ENC)
         return
+    # Two index tensors are paired elementwise; a column of rows makes them an outer product.
     if isinstance(rows, Tensor) and isinstance(across, Tensor):
         rows = rows[:, None]
     entries_ERC[:, rows, across] = torch.where(mask_E[:, None, None], value_ENC, held_ENC)

@@ -12,7 +12,7 @@ from torch import Tensor
 from ksim_rl.checks import check_known
 from ksim_rl.device import recording
 
-# Numbers per env that an arena has room for; a wider buffer has one of its own.
+# Numbers per env that an arena has room for; a wider buffer has an arena to itself.
 ARENA_WIDTH = 128
 ENV = "env"
 """The owner of what managers keep, and no term writes."""
@@ -27,14 +27,16 @@ class Kept(NamedTuple):
 
 @contextmanager
 def only_in_rows(mask_E: Bool[Tensor, " E"], kept: Sequence[Kept], *, is_step: bool) -> Iterator[None]:
-    """Let the code inside change what is kept in the rows of `mask_E` only.
+    """Let the code inside change kept tensors in the rows of `mask_E` only.
 
-    What all envs share changes in steps only (`is_step`): a reset is no step of the envs that go on.
+    Tensors that all envs share change in steps only (`is_step`): a reset is no step of the envs that go on.
     """
+    # The code inside may write any row; the others are put back afterwards.
     before = [one.tensor.clone() for one in kept]
     yield
     for (tensor, has_rows), old in zip(kept, before, strict=True):
         if has_rows:
+            # The mask with as many dims as the tensor, to broadcast over a row.
             rows = mask_E.view(-1, *[1] * (tensor.ndim - 1))
             tensor.copy_(torch.where(rows, tensor, old))
         elif not is_step:
@@ -68,10 +70,12 @@ class Arena:
 
     def clear(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Zero the rows of `mask_E` in all buffers."""
+        # A recorded step fuses kernels by rows, which an arena's flat layout would prevent.
         if recording.is_recording():
             for taken in self._taken:  # each in the kernel that works on its rows
                 taken.masked_fill_(mask_E.view(-1, *[1] * (taken.ndim - 1)), 0)
             return
+        # One kernel for all buffers of the arena, each number masked by its env's row.
         self.values[: self._used].masked_fill_(mask_E.index_select(0, self._row_N), 0)
 
 
@@ -80,7 +84,7 @@ class Buffers:
 
     They come into being while the env is constructed (each term runs once then). Afterwards the set is frozen: an
     allocation inside a captured step would give another tensor to each replay. Those that start at zero lie in few
-    large tensors, so that a reset clears all of them at once.
+    large tensors, so that a reset clears all of them together.
     """
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
@@ -110,11 +114,14 @@ class Buffers:
         new after construction.
         """
         buffer = self._buffers.get(name)
+        # The first call makes it, while the env is constructed.
         if buffer is None:
             if self.is_frozen:
                 raise ValueError(
                     f"buffer {name!r} is new after construction: create it on every path of the term"
                 )
+            # An arena zeroes all that it holds: kept buffers and those with initial values stand by
+            # themselves.
             if keep or initial is not None:
                 buffer = torch.zeros(self._num_envs, *shape, dtype=dtype, device=self._device)
             else:
@@ -126,6 +133,7 @@ class Buffers:
             if initial is not None:
                 self._initial[name] = initial
                 buffer.copy_(initial.expand_as(buffer))
+        # Two terms that use one name for different things would overwrite each other.
         elif tuple(buffer.shape[1:]) != shape or buffer.dtype != dtype:
             raise ValueError(
                 f"buffer {name!r} is {buffer.dtype} {tuple(buffer.shape[1:])}, asked for {dtype} {shape}"
@@ -133,17 +141,19 @@ class Buffers:
         return buffer
 
     def freeze(self) -> None:
-        """Refuse new buffers from now on, and let the existing ones start anew."""
+        """Refuse new buffers from now on, and let the existing ones start again."""
         self.is_frozen = True
         for name, buffer in self._buffers.items():
+            # Construction has run each term once, which left its traces here.
             buffer.zero_()
             if name in self._initial:
                 buffer.copy_(self._initial[name].expand_as(buffer))
 
     def clear(self, mask_E: Bool[Tensor, " E"]) -> None:
-        """Let the rows of `mask_E` start anew in each buffer that is not kept."""
+        """Let the rows of `mask_E` start again in each buffer that is not kept."""
         for arena in self._arenas:
             arena.clear(mask_E)
+        # Arenas have cleared all others already.
         for name, initial in self._initial.items():
             if name not in self._kept:
                 buffer = self._buffers[name]
@@ -160,6 +170,7 @@ class Buffers:
 
     def _arena(self, width: int, dtype: torch.dtype) -> Arena:
         """Return an arena with room for so many numbers per env."""
+        # First fit: small buffers fill the rest of earlier arenas.
         if not any(arena.has_room(width, dtype) for arena in self._arenas):
             self._arenas.append(Arena(self._num_envs, max(width, ARENA_WIDTH), dtype, self._device))
         return next(arena for arena in self._arenas if arena.has_room(width, dtype))
@@ -190,6 +201,7 @@ class SharedValues:
         if tensor is None:
             if self._frozen:
                 raise ValueError(f"shared value {name!r} is new after construction: ask for it on every path")
+            # A tensor made in inference mode could not be written in place outside of it later.
             with torch.inference_mode(False):
                 tensor = torch.tensor(initial, dtype=torch.float32, device=self._device)
                 self._initial[name] = tensor.clone()
@@ -198,9 +210,10 @@ class SharedValues:
         return tensor
 
     def freeze(self) -> None:
-        """Refuse new tensors from now on, and let those of terms start anew, which ran while the env was made."""
+        """Refuse new tensors from now on, and let the terms' own start again: terms ran while the env was made."""
         self._frozen = True
         for name, tensor in self._tensors.items():
+            # Without an owner it is a curriculum's, which has not run yet.
             if self._owners[name]:
                 tensor.copy_(self._initial[name])
 
@@ -231,10 +244,16 @@ class ActuatorParams:
     def add(self, name: str, joints: Sequence[int], value: float) -> None:
         """Give some joints a number; during construction only."""
         if name not in self._buffers:
+            # Zero in the columns of joints without this number; these are never read.
             nominal_L = self._nominal[name] = torch.zeros(len(self._joint_names), device=self._device)
             self._buffers[name] = self._all_buffers.get(
-                f"actuators.{name}_EL", len(self._joint_names), keep=True, initial=nominal_L
+                # Kept over resets: an event's draw at startup must survive them.
+                f"actuators.{name}_EL",
+                len(self._joint_names),
+                keep=True,
+                initial=nominal_L,
             )
+        # The nominal numbers are the buffer's initial value; the buffer itself was filled before they changed.
         self._nominal[name][list(joints)] = value
         self._buffers[name].copy_(self._nominal[name].expand_as(self._buffers[name]))
         self._owners.setdefault(name, {}).update(dict.fromkeys(joints, value))

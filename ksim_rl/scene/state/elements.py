@@ -31,7 +31,7 @@ class _Elements:
 
 
 class JointTables(NamedTuple):
-    """Default positions, soft limits (low, high), and what encoders read too much, rad or m; events may write them."""
+    """Default positions, soft limits (low, high), and excess readings of encoders, rad or m; events may write them."""
 
     default_pos_EL: Float[Tensor, "E L"]
     soft_limits_L2: Float[Tensor, "L 2"]
@@ -57,12 +57,14 @@ class Joints(_Elements):
         device = state.world.device
         scalar = scalar_joint_ids(model)
         self._tables = tables
+        # Without one, it is all joints itself.
         self._every_joint = every_joint or self
         self.qpos = as_index([model.jnt_qposadr[scalar[i]] for i in ids], device)
         self.qvel = as_index([model.jnt_dofadr[scalar[i]] for i in ids], device)
 
     def some(self, ids: Sequence[int]) -> "Joints":
-        """Return those at some places among the model's hinges and slides; for all joints only."""
+        """Return the joints at some places among the model's hinges and slides; for all joints only."""
+        # Ids count all hinges and slides, which a part does not know.
         assert self is self._every_joint
         return Joints(self._state, ids, [self.names[i] for i in ids], self._tables, self)
 
@@ -89,6 +91,7 @@ class Joints(_Elements):
     @quantity
     def pos_rel_EL(self) -> Float[Tensor, "E L"]:
         """Positions minus the default pose."""
+        # Computed once for all joints, of which parts take columns.
         if self is self._every_joint:
             return self.pos_EL - self._tables.default_pos_EL
         return self._every_joint.pos_rel_EL[:, self.index]
@@ -133,6 +136,7 @@ class Bodies(_Elements):
     @quantity
     def axes_EN33(self) -> Float[Tensor, "E N 3 3"]:
         """The x, y and z axes of the bodies, a unit vector each."""
+        # MuJoCo's matrix has the axes as columns; rows are easier to pick.
         return self._state.derived().xmat_EL[:, self.index].transpose(-1, -2)
 
     @quantity
@@ -143,6 +147,7 @@ class Bodies(_Elements):
     @quantity
     def ang_vel_EN3(self) -> Float[Tensor, "E N 3"]:
         """Angular velocities, rad/s."""
+        # `cvel` is angular first, linear second.
         return self._state.derived().cvel_EL[:, self.index, 0:3]
 
     @quantity
@@ -152,6 +157,7 @@ class Bodies(_Elements):
 
     @quantity
     def subtree_com_vel_EN3(self) -> Float[Tensor, "E N 3"]:
+        # A sensor stage of MuJoCo, computed only if something asked for it in construction.
         """Velocities of the centres of mass of bodies with all that hangs on them, m/s; first read in construction."""
         return self._state.derived().view("subtree_linvel")[:, self.index]
 
@@ -160,6 +166,7 @@ class Body:
     """The body `name` with index `id` in the model: `view.body("torso").lin_vel_EL`; units as in `Bodies`."""
 
     def __init__(self, bodies: Bodies) -> None:
+        # Exactly one, or unpacking fails.
         (self.name,) = bodies.names
         (self.id,) = bodies.ids
         self._bodies = bodies
@@ -177,6 +184,7 @@ class Sites(_Elements):
     def __init__(self, state: Simulation, ids: Sequence[int], names: Sequence[str]) -> None:
         super().__init__(state, ids, names)
         bodies = [int(state.world.mj_model.site_bodyid[i]) for i in ids]
+        # Velocities of sites follow from their bodies'.
         self._bodies = torch.tensor(bodies, device=state.world.device, dtype=torch.int64)
 
     @quantity

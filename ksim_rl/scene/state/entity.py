@@ -36,23 +36,29 @@ class Entity:
         device = state.world.device
         self.name = name
         self.prefix = prefix
+        # Kinematic trees of the entity, by the prefix of their root bodies; body 0 is the world.
         roots = {r for r in model.body_rootid[1:].tolist() if model.body(r).name.startswith(prefix)}
+        # All bodies of these trees: parts of an attached model may have names without the prefix.
         bodies = [b for b in range(1, model.nbody) if model.body_rootid[b] in roots]
         if prefix and not bodies:
             raise ValueError(f"scene: {name!r} has no body: give it one, or put its geoms into the terrain")
         joints = [j for j in range(model.njnt) if model.body_rootid[model.jnt_bodyid[j]] in roots]
+        # MuJoCo allows a free joint as a body's first and only joint.
         self.free_root = bool(joints) and model.jnt_type[joints[0]] == mujoco.mjtJoint.mjJNT_FREE
         if self.free_root:
             root = int(model.jnt_bodyid[joints[0]])
         else:
+            # A model without bodies leaves the world itself as the root.
             root = (bodies or [0])[0]
         self.root = Body(Bodies(state, [root], [model.body(root).name]))
         self.root_qpos = slice(0, 0)
         self.root_qvel = slice(0, 0)
+        # A fixed root stands where its model puts it, relative to its parent.
         pose = torch.tensor([*model.body_pos[root], *model.body_quat[root]], device=device)
         if self.free_root:
             qpos = int(model.jnt_qposadr[joints[0]])
             qvel = int(model.jnt_dofadr[joints[0]])
+            # MuJoCo's layout: 3 of position and 4 of quaternion; velocities are 3 linear and 3 angular.
             self.root_qpos = slice(qpos, qpos + 7)
             self.root_qvel = slice(qvel, qvel + 6)
             pose = default_qpos_L[self.root_qpos]
@@ -63,6 +69,7 @@ class Entity:
     @quantity
     def root_pos_EL(self) -> Float[Tensor, "E 3"]:
         """Position of the root body's frame in the world, m."""
+        # From the state itself, which is current also between a write and the next refresh.
         if self.free_root:
             return self._free_qpos_EL[:, :3]
         return self.root.pos_EL
@@ -77,6 +84,7 @@ class Entity:
     @quantity
     def projected_gravity_EL(self) -> Float[Tensor, "E 3"]:
         """Unit vector of gravity (world -z) in the root body's frame."""
+        # The world's -z axis, also where a world's gravity points elsewhere.
         return quaternion.rotate_inverse(self.root_quat_EL, self._down.expand(self._state.world.num_envs, 3))
 
     @quantity
@@ -87,6 +95,7 @@ class Entity:
     @quantity
     def root_lin_vel_w_EL(self) -> Float[Tensor, "E 3"]:
         """Linear velocity of the root body's frame origin, world frame, m/s."""
+        # MuJoCo keeps a free joint's linear velocity in the world frame.
         if self.free_root:
             return self._free_qvel_EL[:, :3]
         return self.root.lin_vel_EL
@@ -99,6 +108,7 @@ class Entity:
     @quantity
     def root_ang_vel_w_EL(self) -> Float[Tensor, "E 3"]:
         """Angular velocity of the root body, world frame, rad/s."""
+        # The other way round than above: qvel has it in the body frame.
         if self.free_root:
             return quaternion.rotate(self.root_quat_EL, self.root_ang_vel_b_EL)
         return self.root.ang_vel_EL
@@ -126,6 +136,7 @@ class Entity:
     ) -> None:
         """Set the velocities (m/s, rad/s, world frame) of the free root body in the rows of `mask_E`."""
         self._require_free_root("write_root_velocity")
+        # With the orientation that is in qpos now: write the pose first, then the velocity.
         ang_vel_b_EL = quaternion.rotate_inverse(self._free_qpos_EL[:, 3:], ang_vel_w_EL)
         velocity_EL = torch.cat((lin_vel_w_EL, ang_vel_b_EL), dim=-1)
         self._state.write(self._state.world.qvel_EL, self.root_qvel, mask_E, velocity_EL)

@@ -32,10 +32,11 @@ class Ground:
         return self._zeros_E
 
     def heights(self, points_EN2: Float[Tensor, "E N 2"]) -> Float[Tensor, "E N"]:
-        """Return the height of the ground at x, y (world frame, m), m; beyond the edge that of the nearest point."""
+        """Return the height of the ground at x, y (world frame, m), m; beyond the edge, of the nearest point."""
         return torch.zeros_like(points_EN2[..., 0])
 
     def clearance(self, points_EN3: Float[Tensor, "E N 3"]) -> Float[Tensor, "E N"]:
+        # Flat ground needs no look-up: height above it is z.
         """Return how high points (world frame, m) are above the ground right below them, m."""
         height_EN = points_EN3[..., 2]
         if self.is_flat:

@@ -18,8 +18,8 @@ SMOOTHED = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.
 class JointControl(NamedTuple):
     """How an actuator's control follows from the target of its joint: `control = scale * target + offset`.
 
-    `kind` is what the control is a target for, `refusal` why no target can be turned into it, or empty. `stiffness`
-    (N m / rad or N / m) and `damping` (N m s / rad or N s / m) are what the joint feels, behind the gear. An activation
+    `kind` is the kind of target of the control, `refusal` why no target can be turned into it, or empty. `stiffness`
+    (N m / rad or N / m) and `damping` (N m s / rad or N s / m) are at the joint, behind the gear. An activation
     that `follows` rests at `activation_scale * position + activation_offset`. Motors have the scale 1: an effort is
     their control, before gear and gain.
     """
@@ -72,11 +72,14 @@ def _control(
     gaintype, gainprm = gain
     biastype, biasprm = bias
     is_affine = biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    # Without feedback of position or velocity it is no servo: the control is the effort.
     if not is_affine or (biasprm[1] == 0.0 and biasprm[2] == 0.0):
         return JointControl("effort", refusal=_no_motor(gaintype, biastype))
     constant, per_length, per_speed = (float(number) for number in biasprm[:3])
     force = float(gainprm[0])
+    # An integrator makes the activation a position, and the control its rate.
     integrates = dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
+    # Feedback of position alone decides; a servo may have damping as well.
     if per_length != 0.0 and not integrates:
         kind: TargetKind = "pos"
     else:

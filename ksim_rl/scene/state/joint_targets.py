@@ -45,7 +45,7 @@ _WORDS = {"pos": "a position", "vel": "a velocity", "effort": "an effort"}
 
 
 class Driven(NamedTuple):
-    """An actuator of a joint, and what its control means."""
+    """An actuator of a joint, and the meaning of its control."""
 
     actuator: int
     control: JointControl
@@ -97,15 +97,19 @@ class JointTargets:
         num_joints = default_joint_pos_EL.shape[1]
         self._world = world
         self._resolver = resolver
+        # A reset puts back the default pose, which events may have moved: `initial` is read each time.
         self.pos_EL = buffers.get("joint_pos_target_EL", num_joints, initial=default_joint_pos_EL)
         self.vel_EL = buffers.get("joint_vel_target_EL", num_joints)
         self.effort_EL = buffers.get("joint_effort_target_EL", num_joints)
         self._default_joint_pos_EL = default_joint_pos_EL
         self._default_state = default_state
         self._buffers = {"pos": self.pos_EL, "vel": self.vel_EL, "effort": self.effort_EL}
+        # Joints whose controls are written by a law before each substep, with the targets that it takes.
         self._driven_by_law: dict[int, Collection[TargetKind]] = {}
+        # Look-ups by kind and patterns are done once, since actions write in each step.
         self._routes: dict[tuple[TargetKind, tuple[str, ...]], _Route] = {}
 
+        # From the model's joint ids to places among hinges and slides.
         joint_of = {joint: number for number, joint in enumerate(scalar_joint_ids(model))}
         self._actuators: dict[int, list[Driven]] = {}
         for actuator in range(model.nu):
@@ -130,6 +134,7 @@ class JointTargets:
     def driven(self, kind: TargetKind, joint: int) -> Driven:
         """Return the actuator of a joint that takes this kind of target; a ValueError where no control means it."""
         found = self._actuators.get(joint, [])
+        # A joint may have several actuators, such as a position and a velocity servo.
         fitting = [driven for driven in found if driven.control.kind == kind]
         if not fitting:
             raise self._refusal(kind, joint, {driven.control.kind for driven in found})
@@ -146,15 +151,19 @@ class JointTargets:
     def leave_to_law(self, joints: Sequence[int], takes: Collection[TargetKind]) -> None:
         """Keep the targets of these joints away from the controls: a law reads them, and writes those itself."""
         self._driven_by_law |= dict.fromkeys(joints, takes)
+        # Remembered routes may lead to controls that now belong to the law.
         self._routes.clear()
         self._find_servos()
 
     def write(self, kind: TargetKind, patterns: Patterns, value_EK: Float[Tensor, "E K"]) -> None:
         """Set targets of joints in all rows, one column each in their order; a ValueError where one takes no such."""
         route = self._route_of(kind, patterns)
+        # Clamped before it is kept, so that the target that terms read is the one in force.
         if route.limits_K2 is not None:
             value_EK = torch.clamp(value_EK, route.limits_K2[:, 0], route.limits_K2[:, 1])
+        # All joints keep their targets here, also for laws that read them before each substep.
         self._buffers[kind][:, route.joints] = value_EK
+        # Built-in actuators have their controls written at once, in their own columns.
         if route.ctrl is not None:
             self._world.ctrl_EL[:, route.ctrl] = route.line.of(value_EK[:, route.columns])
 
@@ -172,7 +181,7 @@ class JointTargets:
                 )
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
-        """Let the rows of `mask_E` be asked for what the keyframe's controls say, until an action says otherwise.
+        """Set the targets in the rows of `mask_E` as the keyframe's controls have them, until an action sets others.
 
         Without a keyframe position servos hold the default pose. They follow a default pose that events have moved.
         """
@@ -180,37 +189,45 @@ class JointTargets:
         for kind, beyond_L in self._asked_beyond.items():
             target_EL = self._buffers[kind]
             if kind == "pos":
+                # The keyframe's deviation from its own pose, added to the default pose that holds now.
                 asked_EL = beyond_L + self._default_joint_pos_EL
             else:
                 asked_EL = beyond_L
             target_EL.copy_(torch.where(rows_E1, asked_EL, target_EL))
         ctrl_EL = self._world.ctrl_EL
+        # Controls of all actuators that are not position servos, as the keyframe has them.
         if self._start_ctrl_L is not None:
             ctrl_EL.copy_(torch.where(rows_E1, self._start_ctrl_L, ctrl_EL))
         if self._servo_ctrl is not None:
+            # Position servos follow the default pose of each env.
             held_EL = self._servo_line.of(self.pos_EL[:, self._servo_joints])
             ctrl_EL[:, self._servo_ctrl] = torch.where(rows_E1, held_EL, ctrl_EL[:, self._servo_ctrl])
 
     def _find_servos(self) -> None:
-        """Find the position servos, which follow the default pose, and what the default state asks for beyond it."""
+        """Find the position servos, which follow the default pose, and the targets of the default state beyond it."""
         device = self._world.device
         start = self._default_state
         num_joints = self.pos_EL.shape[1]
+        # Places of hinges and slides in qpos.
         addresses = self._world.mj_model.jnt_qposadr[scalar_joint_ids(self._world.mj_model)]
         beyond = {kind: np.zeros(num_joints) for kind in self._buffers}
         servos: list[tuple[int, Driven]] = []
         other_ctrl_L = start.ctrl_L.copy()
         for joint, found in self._actuators.items():
+            # A law computes the control from targets; nothing to write here.
             if joint in self._driven_by_law:
                 continue
             for driven in found:
                 if driven.control.refusal:
                     continue
+                # The keyframe's control as a target at the joint.
                 asked = driven.control.target(float(start.ctrl_L[driven.actuator]))
                 if driven.control.kind == "pos":
                     asked -= float(start.qpos_L[addresses[joint]])
                     servos.append((joint, driven))
+                    # Its control is computed from the default pose instead, in `reset`.
                     other_ctrl_L[driven.actuator] = 0.0
+                # Rounding alone asks for nothing.
                 if abs(asked) > ROUNDING:
                     beyond[driven.control.kind][joint] = asked
         self._asked_beyond = {
@@ -222,6 +239,7 @@ class JointTargets:
         self._start_ctrl_L = None
         if other_ctrl_L.any():
             self._start_ctrl_L = torch.tensor(other_ctrl_L, device=device, dtype=torch.float32)
+        # None where there is nothing to write, so that a reset launches no kernel for it.
         if servos:
             self._servo_ctrl = as_index([driven.actuator for _, driven in servos], device)
         else:
@@ -230,10 +248,11 @@ class JointTargets:
         self._servo_line = self._line([driven.control for _, driven in servos])
 
     def _line(self, controls: Sequence[JointControl]) -> _Line:
-        """Return the controls of targets, without what changes nothing."""
+        """Return the controls of targets, without numbers that change nothing."""
         scale = [control.scale for control in controls]
         offset = [control.offset for control in controls]
         device = self._world.device
+        # Plain servos have scale 1 and offset 0, and need no arithmetic in the step.
         is_scaled = any(number != 1.0 for number in scale)
         is_shifted = any(offset)
         return _Line(
@@ -253,10 +272,12 @@ class JointTargets:
         columns: list[int] = []
         controls: list[JointControl] = []
         for column, joint in enumerate(joints):
+            # The target is kept for the law; it has no column of the controls here.
             if joint in self._driven_by_law:
                 if kind not in self._driven_by_law[joint]:
                     raise self._refusal(kind, joint, self._driven_by_law[joint])
                 continue
+            # Refused where the joint's actuator takes another kind of target.
             driven = self.driven(kind, joint)
             ctrl.append(driven.actuator)
             controls.append(driven.control)
@@ -264,6 +285,7 @@ class JointTargets:
         model = self._world.mj_model
         device = self._world.device
         limits_K2 = None
+        # Only efforts are clamped here: a servo's control range does not clip its target.
         if kind == "effort" and any(model.actuator_ctrllimited[actuator] for actuator in ctrl):
             limits_K2 = torch.tensor([-torch.inf, torch.inf], device=device).repeat(len(joints), 1)
             for column, actuator in zip(columns, ctrl, strict=True):

@@ -1,4 +1,4 @@
-"""Follows a reference motion through an episode: when in the motion each env is, and what it shows then."""
+"""Follows a reference motion through an episode: when in the motion each env is, and the motion's pose then."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -9,6 +9,8 @@ from ksim_rl.scene.state.world_view import WorldView
 
 def motion_start_time(view: WorldView, file: str) -> Float[Tensor, " E"]:
     """Return the buffer of when in the motion each episode began, s; `ResetToMotion` writes it."""
+    # Zeroed at resets by the buffer itself; without `ResetToMotion` episodes follow the motion from its first
+    # frame.
     return view.buffers.get(f"motion/{file}.start_s_E")
 
 
@@ -21,6 +23,7 @@ def motion_joints(
     view: WorldView, file: str, joints: Patterns
 ) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E L"]]:
     """Return positions and velocities that joints have in the motion now; computed once per state."""
+    # The key holds the patterns as they were given; other spellings are computed separately.
     key = f"motion/{file}.joints {joints}"
     if key not in view.cache:
         index = view.joints(joints).index
@@ -36,6 +39,7 @@ def motion_bodies(
     if key not in view.cache:
         index = view.bodies(bodies).index
         shift_E3 = motion_shift(view)
+        # Orientations are not shifted: origins differ in position only.
         pos_EN3, quat_EN4 = view.motion(file).sample_bodies(motion_time(view, file), index)
         view.cache[key] = (pos_EN3 if shift_E3 is None else pos_EN3 + shift_E3[:, None]), quat_EN4
     return view.cache[key]
@@ -43,6 +47,7 @@ def motion_bodies(
 
 def motion_shift(view: WorldView) -> Float[Tensor, "E 3"] | None:
     """Return how far motions are moved in each env, m: to its origin, if the robot's root can go there."""
+    # A fixed root stays in place, and so must its motion.
     if view.terrain.is_flat or not view.robot.free_root:
         return None
     return view.terrain.origins_E3

@@ -13,6 +13,7 @@ def quantity(compute: Callable[[Any], Shaped[Tensor, "*shape"]]) -> property:
 
     def read(owner: Any) -> Tensor:
         value = owner.cache.get(name)
+        # The owner's cache is emptied at each change of the state, so that a hit is current.
         if value is None:
             value = owner.cache[name] = compute(owner)
         return value
@@ -31,6 +32,7 @@ class QuantityOf(property):
 def quantity_of(part: str, whole: property) -> QuantityOf:
     """Make a property that is the quantity `whole` of the object in the attribute `part`."""
     made = QuantityOf(lambda owner: whole.__get__(getattr(owner, part)), doc=whole.__doc__)
+    # Kept for whoever asks which cache a read goes to.
     made.part = part
     made.cached_as = getattr(whole.fget, "__name__", "")
     return made
@@ -38,4 +40,5 @@ def quantity_of(part: str, whole: property) -> QuantityOf:
 
 def first_of(part: str, whole: property) -> property:
     """Make a property that is the first of the N elements whose quantity [E, N, ...] the object in `part` has."""
+    # The part has a single element: [E, 1, ...] becomes [E, ...].
     return property(lambda owner: whole.__get__(getattr(owner, part))[:, 0], doc=whole.__doc__)

@@ -25,13 +25,13 @@ class Simulation:
     (`refreshed`); what derives cannot be read in between. A term runs inside `scope`, which names its buffers.
 
     Attributes:
-        ground: what heights are measured from.
+        ground: the ground that heights are measured from.
         reader: who reads at the moment, for the error about stale quantities.
         is_writing: whether `write` is at work, which is the only way to write positions and velocities.
         is_frozen: whether construction has ended.
         physics_dt, step_dt: s, of a substep and of an env step.
         max_episode_length: env steps; 0 for no limit.
-        buffers, shared_values: what is kept from step to step, with and without a row per env.
+        buffers, shared_values: tensors that are kept from step to step, with and without a row per env.
         seed, step_count: int64 []; of all draws, and how many env steps have begun.
         reset_count_E, episode_step_E: int64 [E]; how often each env was reset, and env steps since then.
         time_out_offset_E: int64 [E]; env steps by which a staggered episode times out earlier.
@@ -43,6 +43,7 @@ class Simulation:
         self.world = world
         self.num_envs = world.num_envs
         self.device = world.device
+        # From the compiled model: `SimCfg` may have set another time step.
         self.physics_dt = float(world.mj_model.opt.timestep)
         self.step_dt = step_dt
         self.max_episode_length = max_episode_length
@@ -53,15 +54,18 @@ class Simulation:
         self.step_count = torch.zeros_like(self.seed)
         self.reset_count_E = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self.episode_step_E = torch.zeros_like(self.reset_count_E)
+        # Kept by a manager, so that no term may write it.
         self.time_out_offset_E = self.buffers.get("time_out_offset_E", dtype=torch.int64, owner=ENV)
         self.before_substep: list[Callable[[], None]] = []
         self.after_substep: list[Callable[[], None]] = []
         self.substep_sensors: Literal["last", "contacts", "every"] = "last"
+        # Draws before the first step have a counter to themselves.
         self.startup_counter = torch.zeros_like(self.seed)
         self.reader = ""
         self.is_frozen = False
         self._is_stale = False
         self._caches: list[dict[str, Tensor]] = []
+        # The tree of each body; its centre of mass is the reference of `cvel`.
         self._body_root = torch.tensor(world.mj_model.body_rootid, device=self.device, dtype=torch.int64)
         self._counter = self.startup_counter
         self._scope = ""
@@ -76,6 +80,7 @@ class Simulation:
 
     def derived(self) -> World:
         """Return the world for reading what derives from the state; a RuntimeError if a write has made that stale."""
+        # A stale quantity would be wrong in silence, and only in the rows that were written.
         if self._is_stale:
             raise RuntimeError(
                 f"{self.reader or 'a term'} reads a derived quantity (pose of a body or site, sensor) after state was "
@@ -106,6 +111,7 @@ class Simulation:
         value_EN: Float[Tensor, "E N"],
     ) -> None:
         """Copy the rows of `mask_E` into some columns of the state."""
+        # Shapes are checked by hand: a wrong one would broadcast in silence.
         width = _width(columns, state_EL.shape[1])
         if (
             value_EN.ndim != 2
@@ -118,8 +124,10 @@ class Simulation:
             )
         self.is_writing = True
         try:
+            # `where` over all rows, since a captured step cannot index by a mask.
             state_EL[:, columns] = torch.where(mask_E[:, None], value_EN, state_EL[:, columns])
         finally:
+            # Also after an error, or later writes would pass unnoticed.
             self.is_writing = False
         self.changed()
 
@@ -127,8 +135,10 @@ class Simulation:
         """Return the velocities of points fixed to bodies, world frame, m/s."""
         # MuJoCo's cvel is (angular, linear) about the centre of mass of the body's kinematic tree.
         world = self.derived()
+        # [E, N, 6]: angular first, then linear.
         cvel_EN6 = world.cvel_EL[:, body]
         lever_EN3 = point_EN3 - world.subtree_com_EL[:, self._body_root[body]]
+        # Rigid body: v = v_com + omega x lever.
         return cvel_EN6[..., 3:] + torch.linalg.cross(cvel_EN6[..., :3], lever_EN3)
 
     @contextmanager
@@ -145,10 +155,12 @@ class Simulation:
 
         `counter` keys the draws (the step count unless given), and `draws` tells apart the moments of one term whose
         counters may coincide. `part` is what runs, if what it writes is to be watched, and `mask_E` the rows that it
-        may write. Gives what the part has written of its own, by name, where it was watched (see `watch`).
+        may write. Gives the tensors that the part has written of its own, by name, where it was watched (see `watch`).
         """
+        # Buffers are named by the term, draws by the term and the moment.
         self._scope = name
         self._draw_scope = f"{name}@{draws}"
+        # The number of a draw within the term is part of its stream.
         self._draws = 0
         self.reader = name
         if counter is None:
@@ -167,6 +179,7 @@ class Simulation:
         except Exception as error:
             error.add_note(f"(in {name.replace('/', '.')})")  # of the same class, which others look for
             raise
+        # Outside of a term nobody reads or owns buffers.
         finally:
             self._scope = self.reader = ""
 
@@ -189,6 +202,7 @@ class Simulation:
 
     def next_keys(self) -> random.RowKeys:
         """Return the keys of the next draw of the term that runs."""
+        # The order of draws within a term counts, not the order of terms.
         stream = random.stream_id(f"{self._draw_scope}#{self._draws}")
         self._draws += 1
         return random.row_keys(self.seed, stream, self._counter, self.num_envs)
@@ -203,5 +217,6 @@ class Simulation:
 def _width(columns: Index, of_all: int) -> int:
     """Return how many columns an index picks of so many, without picking them."""
     if isinstance(columns, slice):
+        # `indices` clips a slice to the columns there are.
         return len(range(*columns.indices(of_all)))
     return columns.numel()

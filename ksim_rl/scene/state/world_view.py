@@ -28,15 +28,15 @@ Points = TypeVar("Points", Bodies, Sites)
 class WorldView:
     """A typed view of the worlds: names, joints, bodies, sites, entities, clocks, buffers, keyed draws and writes.
 
-    Position- and velocity-stage quantities (poses, velocities, most sensors) are those of the current state.
+    Position- and velocity-stage quantities (poses, velocities, most sensors) are of the current state.
     Acceleration-stage ones (contact sensors, accelerometers, actuator forces) belong to the last physics substep, and
     read zero in rows that were just reset. Each is computed at most once per state. All values are float32 on the env's
     device unless stated otherwise. Clocks are described in `Simulation`.
 
     Attributes:
-        cache: a dict for quantities of one's own; it is emptied whenever the state changes.
+        cache: a dict for a term's own quantities; it is emptied whenever the state changes.
         entities: robots and objects by name; `robot` is the first, whose quantities and writes the view has too.
-        joint_pos_target_EL, joint_vel_target_EL, joint_effort_target_EL: what joints are asked for; SI units.
+        joint_pos_target_EL, joint_vel_target_EL, joint_effort_target_EL: targets of joints; SI units.
     """
 
     def __init__(
@@ -46,6 +46,7 @@ class WorldView:
         soft_joint_pos_limit_factor: float = 1.0,
         entities: Sequence[str] = (),
     ) -> None:
+        # Shared with the simulation: these are its own tensors, not copies.
         self._simulation = simulation
         self.world = simulation.world
         self.num_envs = simulation.num_envs
@@ -61,9 +62,11 @@ class WorldView:
         self.time_out_offset_E = simulation.time_out_offset_E
         self.resolver = NameResolver(self.world.mj_model, self.device)
         self.cache = simulation.new_cache()
+        # Look-ups by patterns are remembered, since terms repeat them in each step.
         self._named: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._motions: dict[str, ReferenceMotion] = {}
 
+        # MuJoCo keeps all sensors in one array; names give their slices.
         model = self.world.mj_model
         joints = scalar_joint_ids(self.world.mj_model)
         self.num_joints = len(joints)
@@ -71,10 +74,12 @@ class WorldView:
         slices = (slice(first, first + size) for first, size in places)
         self._sensor_slices = dict(zip(self.resolver.names("sensor"), slices, strict=True))
 
+        # The state that resets restore comes before the targets, which start from it.
         self.default_state = DefaultState(simulation)
         self.default_qpos_L = torch.tensor(self.default_state.qpos_L, device=self.device, dtype=torch.float32)
         self.default_qvel_L = torch.tensor(self.default_state.qvel_L, device=self.device, dtype=torch.float32)
         default_joint_pos_L = self.default_qpos_L[as_index(model.jnt_qposadr[joints].tolist(), self.device)]
+        # A buffer with a row per env: events may move the default pose, and resets keep it.
         self.default_joint_pos_EL = self.buffers.get(
             "default_joint_pos_EL", self.num_joints, keep=True, initial=default_joint_pos_L
         )
@@ -88,23 +93,28 @@ class WorldView:
         self.joint_pos_target_EL = self.targets.pos_EL
         self.joint_vel_target_EL = self.targets.vel_EL
         self.joint_effort_target_EL = self.targets.effort_EL
+        # Zeros and infinities take the place of limits that a model does not have.
         self.actuator_params = ActuatorParams(self.buffers, self.resolver.names("joint"), self.device)
         ctrl_range = torch.tensor(model.actuator_ctrlrange, device=self.device, dtype=torch.float32)
         self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
         self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
+        # Zero unless an event draws it.
         self.encoder_bias_EL = self.buffers.get("encoder_bias_EL", self.num_joints, keep=True)
+        # One object for all joints; parts share its tables.
         tables = JointTables(self.default_joint_pos_EL, self.soft_joint_pos_limits_L2, self.encoder_bias_EL)
         self._every_joint = Joints(simulation, range(self.num_joints), self.resolver.names("joint"), tables)
         self.entities = {
             name: Entity(
                 simulation,
                 name=name,
+                # A single entity keeps its plain names.
                 prefix=f"{name}/" if len(entities) > 1 else "",
                 default_qpos_L=self.default_qpos_L,
                 every_joint=self._every_joint,
             )
             for name in entities or ("robot",)
         }
+        # The first entity is the robot that terms mean without a name.
         self.robot = next(iter(self.entities.values()))
         self.free_root = self.robot.free_root
         self.write_root_pose = self.robot.write_root_pose
@@ -140,6 +150,7 @@ class WorldView:
         return Site(self.sites(name))
 
     def _points(self, kind: type[Points], element: str, patterns: Patterns) -> Points:
+        # Bodies and sites of the same patterns are different entries.
         key = (element, as_patterns(patterns))
         if key not in self._named:
             ids = self.resolver.ids(element, patterns)
@@ -182,8 +193,10 @@ class WorldView:
 
     def at_origins(self, qpos_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
         """Return generalized positions in which all free roots have moved with the origins of their envs."""
+        # A copy: the given positions may be the model's own.
         qpos_EL = qpos_EL.clone()
         for entity in self.entities.values():
+            # Fixed roots are part of the model, and stay where they are.
             if entity.free_root:
                 start = entity.root_qpos.start
                 qpos_EL[:, start : start + 3] += self.terrain.origins_E3
@@ -198,7 +211,8 @@ class WorldView:
         return self._simulation.derived().sensordata_EL[:, self._sensor_slices[name]]
 
     def parts(self) -> dict[str, object]:
-        """Return what holds the quantities and tables of the view, by how a term spells it."""
+        # For messages about a term that writes where it only may read.
+        """Return the objects that hold the quantities and tables of the view, by how a term spells them."""
         parts: dict[str, object] = {
             "view": self,
             "view.joints()": self._every_joint,
@@ -219,6 +233,7 @@ class WorldView:
 
     def motion(self, file: str) -> ReferenceMotion:
         """Return the reference motion of an .npz file; it is read once, while the env is constructed."""
+        # Reading a file belongs to construction: a captured step could not do it.
         if file not in self._motions:
             self._motions[file] = load_motion(file, self.world.mj_model, self.device)
         return self._motions[file]
@@ -233,7 +248,7 @@ class WorldView:
     def actuator_param(self, name: str, joints: Patterns | None = None) -> Float[Tensor, "E L"]:
         """Return a number of explicit actuators, such as "stiffness", that all `joints` have, to read or write.
 
-        What an event writes holds from the next substep on, and until it is written again: resets leave it alone.
+        A value that an event writes holds from the next substep until it is written again: resets leave it alone.
         Built-in actuators have model fields instead (`actuators.builtin`).
         """
         return self.actuator_params.get(name, () if joints is None else self.resolver.ids("joint", joints))
@@ -245,8 +260,9 @@ class WorldView:
     ) -> Shaped[Tensor, " E *shape"]:
         """Return a buffer that belongs to the calling term; rows that reset are zeroed unless `keep`.
 
-        What a term writes into it in each call advances once per env step.
+        A value that a term writes in each call advances once per env step.
         """
+        # Prefixed by the running term, so that two terms may use the same name.
         full_name = self._simulation.scoped(name)
         owner = self._simulation.reader
         return self.buffers.get(full_name, *shape, dtype=dtype, keep=keep, owner=owner)
@@ -282,7 +298,9 @@ class WorldView:
     def restore_default(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Put the rows of `mask_E` into the default state, on a terrain at their envs' origins; not their controls."""
         self.default_state.restore(mask_E)
+        # On flat ground all origins are zero.
         if not self.terrain.is_flat:
+            # All free roots move, also those of objects.
             self.write_qpos(mask_E, self.at_origins(self.default_qpos_L.expand(self.num_envs, -1)))
 
     def write_qpos(self, mask_E: Bool[Tensor, " E"], qpos_EL: Float[Tensor, "E L"]) -> None:
@@ -302,7 +320,7 @@ class WorldView:
         self.targets.write("vel", joints, target_EK)
 
     def write_joint_effort_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:
-        """Ask joints for efforts, N m or N, in all rows; those of the MJCF's motors are clamped, then geared."""
+        """Ask joints for efforts, N m or N, in all rows; efforts of the MJCF's motors are clamped, then geared."""
         self.targets.write("effort", joints, target_EK)
 
     def field(self, name: str) -> Shaped[Tensor, " E *shape"]:
@@ -313,11 +331,13 @@ class WorldView:
         """Shrink the joint ranges about their middles; unlimited joints get infinite limits. [L, 2]."""
         model = self.world.mj_model
         limits = torch.tensor(model.jnt_range[joints], device=self.device, dtype=torch.float32).view(-1, 2)
+        # Shrunk about the middle, so that both ends give way alike.
         middle = limits.mean(-1)
         half = (limits[:, 1] - limits[:, 0]) / 2 * factor
         return self._limited(torch.stack((middle - half, middle + half), dim=-1), model.jnt_limited[joints])
 
     def _limited(self, limits_L2: Float[Tensor, "L 2"], is_limited: np.ndarray) -> Tensor:
-        """Make the limits of what has none infinite, [L, 2]."""
+        """Make the limits of elements without any infinite, [L, 2]."""
+        # [L, 1], to choose both ends together.
         mask_L1 = torch.tensor(is_limited, device=self.device, dtype=torch.bool).view(-1, 1)
         return torch.where(mask_L1, limits_L2, torch.tensor([-torch.inf, torch.inf], device=self.device))
