@@ -21,6 +21,7 @@ from ksim_rl.scene.robots.analysis import TRIAL_S
 from ksim_rl.scene.robots.strangers_model import robot_name
 from ksim_rl.terminal import show
 
+# Stands in the robot's `model` until its repr is replaced by the name MODEL.
 MODEL = "@model@"
 
 
@@ -41,14 +42,17 @@ def new(arguments: list[str]) -> int:
     folder = options.output or Path(name)
     task = f"{name}_velocity_flat"
     _check_name(name, task)
+    # Before the analysis, which takes longer: never write into a folder that exists.
     if folder.exists():
         raise ValueError(f"{folder}: exists already; choose another folder with --output")
     with shown_working(f"analysing {options.model}"):
         found = analyse(options.model, pose=options.pose)
     robot = replace(found.robot, name=name, model=MODEL)
+    # Standing through the whole trial; else the package has no test that asks for it.
     stands = found.stands_s >= TRIAL_S
     model = Path(options.model).expanduser()
     is_file = model.exists()
+    # The package finds its copy of the model wherever it is installed.
     path = f'str(files("{name}").joinpath("{name}.xml"))'
     words = {
         "name": name,
@@ -63,6 +67,7 @@ def new(arguments: list[str]) -> int:
         + (", as long as it was watched." if stands else " only: see to gains and stance first."),
         "and_stands": ", and it stands" if stands else "",
     }
+    # Paths of the package, and their texts from templates of `new_robot`.
     texts = {
         "pyproject.toml": _text("pyproject.toml", words),
         "README.md": _text("README.md", words),
@@ -71,6 +76,7 @@ def new(arguments: list[str]) -> int:
             "robot.py", words, "from importlib.resources import files\n" if is_file else ""
         ),
         f"{name}/tasks.py": _text("tasks.py", words),
+        # A test of standing is written only for a robot that does.
         f"tests/test_{name}.py": _text("test.py", words, "import torch\n" if stands else "")
         + (_text("test_stands.py", words) if stands else ""),
     }
@@ -88,6 +94,7 @@ def new(arguments: list[str]) -> int:
 def copy_model(source: Path, target: Path) -> None:
     """Write a model as one MJCF file, with the meshes, textures and height fields it names, in `assets`."""
     spec = load_spec(source)
+    # Files that the model names, with the folder that they are relative to.
     assets = [(spec.meshdir, entry) for entry in (*spec.meshes, *spec.hfields, *spec.skins) if entry.file]
     assets += [(spec.texturedir, entry) for entry in spec.textures if entry.file]
     names: dict[Path, str] = {}
@@ -99,9 +106,11 @@ def copy_model(source: Path, target: Path) -> None:
             names[asset] = asset.name if asset.name not in names.values() else f"{len(names)}_{asset.name}"
         entry.file = names[asset]
         shutil.copy(asset, target.parent / "assets" / entry.file)
+    # A model without files is copied as it is; written by MuJoCo it would lose its comments.
     if not assets and source.suffix == ".xml" and "<include" not in _read(source):
         shutil.copyfile(source, target)  # with its comments
         return
+    # MuJoCo writes only what it has compiled, and checks the copied files by it.
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(target.parent)
     spec.compile()
@@ -114,6 +123,7 @@ def _read(model: Path) -> str:
 
 def _text(name: str, words: dict[str, object], imports: str = "") -> str:
     template = files("ksim_rl.cli").joinpath("new_robot", f"{name}.txt").read_text()
+    # A template without imports leaves two blank lines too many.
     return Template(template).substitute(words, imports=imports).replace('"""\n\n\n', '"""\n\n')
 
 
@@ -122,5 +132,6 @@ def _check_name(name: str, task: str) -> None:
         raise ValueError(f"--name {name}: expected a name for a Python package: small letters, digits and _")
     if task in envs.names():
         raise ValueError(f"--name {name}: there is a task {task!r} already; choose another name")
+    # A name that shadows an installed package would import the wrong one.
     if importlib.util.find_spec(name) is not None:
         raise ValueError(f"--name {name}: Python knows a package of this name already; choose another name")

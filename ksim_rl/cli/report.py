@@ -32,7 +32,9 @@ FAR = 4
 
 def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None = None) -> int:
     """Train with progress on the terminal, say how it ended, and return the exit code."""
+    # All ranks write into the folder of rank 0.
     folder = Path(ranks.run_folder(str(folder)))
+    # torchrun starts all ranks again after a fault: go on from the last checkpoint.
     if ranks.restarted() and checkpoint.saved(folder / "checkpoint"):
         resume_from = checkpoint.load_latest(folder)
     if resume_from is None:
@@ -51,11 +53,13 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
         f"{cfg.task_name}: {cfg.num_envs} envs x {length} steps = {each} env states per iteration{all_ranks}, "
         f"on {cfg.device}; run folder {shown(folder)}"
     )
+    # A rollout far from the tuned one is often a forgotten setting after a change of num_envs.
     if own := _far_from(cfg, length):
         progress.note(
             f"rollouts of {length} steps are far from the {own}: collector.rollout_length keeps to that"
         )
     try:
+        # `watched` shows the training in a browser, where the config asks for it.
         with compile_notice(progress.status), watched(cfg, progress.note) as hooks:
             outcome = run(
                 cfg,
@@ -63,24 +67,29 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
                 progress=progress,
                 hooks=hooks,
                 resume_from=resume_from,
+                # Before the first iteration, when a term can still be changed.
                 before=lambda trainer: say_lacks(cfg, trainer.collector.env, progress.note),
             )
     except KeyboardInterrupt as stopped:
         number = interruption(stopped)
         progress.note(f"{number.name}: {_what_is_saved(folder)}")
+        # The code that shells give to a program that a signal ended.
         return 128 + int(number)
     if cfg.logger.wandb is not None and not ranks.rank():
         from ksim_rl.zoo.wandb_runs import upload  # it writes ONNX files, which most runs do not
 
         upload(cfg.logger.wandb, folder, note=progress.note)
+    # One rank speaks for all.
     for line in () if ranks.rank() else _summary(cfg, outcome, folder):
         progress.note(line)
     if outcome.interrupted_by is not None:
         return 128 + int(outcome.interrupted_by)
+    # `stop_at` is the user's own aim, so it counts before the threshold of the task.
     if outcome.target_met is None:
         reached = outcome.solved
     else:
         reached = outcome.target_met
+    # None means that there was nothing to reach.
     return 1 if reached is False else 0
 
 
@@ -118,6 +127,7 @@ def verdict(evaluation: Evaluation, threshold: float | None) -> str:
 
 def shown(path: Path) -> str:
     """Return a path as short as it can be written from here, and in one line."""
+    # A path of many ".." is harder to read than the absolute one.
     relative = os.path.relpath(path)
     return printable(str(path) if relative.startswith("..") else relative)
 
@@ -133,6 +143,7 @@ def _far_from(cfg: RunCfg, length: int) -> str:
     else:
         trainings = [task.training, *task.other_trainings]
     for training in trainings:
+        # Another algorithm has other rollouts: nothing to compare with.
         if isinstance(training, TrainingCfg) and type(training.objective) is type(cfg.objective):
             own = training.data.rollout_length(training.num_envs)
             if not own / FAR <= length <= own * FAR:
@@ -157,6 +168,7 @@ def _summary(cfg: RunCfg, outcome: Outcome, folder: Path) -> list[str]:
         lines.append(f"{name}: everything is saved; continue with: ksim-rl resume {shown(folder)}")
     elif outcome.evaluation is not None:
         lines.append(verdict(outcome.evaluation, solved_at(cfg)))
+    # Only faults that were found: nothing is said of a healthy run.
     if (seen := one_line(folder, shown(folder))).startswith("diagnosis"):
         lines.append(seen)
     lines.append(f"{shown(folder)}: {', '.join(sorted(entry.name for entry in folder.iterdir()))}")

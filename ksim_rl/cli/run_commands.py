@@ -42,6 +42,7 @@ def resume(arguments: list[str]) -> int:
     parser.add_argument(
         "--trust", action="store_true", help="the folder is yours: it may hold links, and say where to write"
     )
+    # Intermixed, since overrides may stand before and after flags.
     options = parser.parse_intermixed_args(arguments)
     saved = checkpoint.load_latest(options.run, note=say)
     overrides = list(options.overrides)
@@ -49,12 +50,14 @@ def resume(arguments: list[str]) -> int:
         overrides.append(f"trainer.num_iterations={options.num_iterations}")
     fields = conf.fields_of(overrides)
     for field in fields:
+        # The first word of a field says which part of the config it changes.
         if field.partition(".")[0] in KEPT:
             raise ValueError(
                 f"{field}: a resumed run keeps it: start a new run from these weights, "
                 f"ksim-rl train --config-dir {options.run} checkpoint={options.run} {field}=..."
             )
     folder = saved.run_folder
+    # A folder of somebody else may hold links that lead our writing elsewhere.
     if not options.trust:
         check_links(folder, below=FOLDERS)
         check_run_tree(saved.config, saved.path, given=fields)
@@ -63,26 +66,31 @@ def resume(arguments: list[str]) -> int:
         cfg = conf.changed(tree, saved.path, overrides)
     else:
         cfg = RunCfg.from_tree(tree)
+    # The device of this machine, not that of the machine where the run began.
     cfg = dataclasses.replace(_on_these_ranks(cfg, saved), device=str(cfg.resolved_device()))
     if cfg.trainer.num_iterations < saved.iteration:
         raise ValueError(
             f"trainer.num_iterations={cfg.trainer.num_iterations}: expected at least {saved.iteration}, those that are "
             "done"
         )
+    # Models of the run's own copies, so that a changed file of the user changes no run.
     cfg = with_kept_models(cfg, folder, note=say)
     check_sources(cfg, resumes=True)
     return run_and_report(cfg, folder.resolve(), resume_from=saved)
 
 
 def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
-    """Share the envs out anew where a run goes on with another number of ranks: the dataset of all stays as large."""
+    """Share the envs out again where a run goes on with another number of ranks: the whole dataset stays as large."""
+    # Checkpoints of before there were ranks say nothing of them: they had one.
     before = saved.state.get(checkpoint.RANKS, {"size": 1})["size"]
     now = ranks.size()
     if before == now:
         return cfg
     data = cfg.data
     objective = cfg.objective
+    # Sizes in the config are those of one rank: the share changes, the whole stays.
     size = ranks.share_of(data, "num_env_states_per_minibatch", before)
+    # At least one shard, also where there are now more ranks than shards were.
     shards = data.shards * before // now
     data = dataclasses.replace(data, num_env_states_per_minibatch=size, shards=max(1, shards))
     if isinstance(objective, AMPCfg):
@@ -96,6 +104,7 @@ def evaluate(arguments: list[str]) -> int:
     """Evaluate a policy and print the verdict."""
     parser = _parser("eval", "Evaluate a policy: deterministic actions, fresh envs, whole episodes.")
     number = parser.add_mutually_exclusive_group()
+    # Episodes and trials are two kinds of evaluation: only one can be meant.
     number.add_argument("--episodes", type=int, help="default: as the run was configured")
     number.add_argument("--trials", type=int, help="of a tracking run: how many follow the motion to its end")
     parser.add_argument("--pushes", action="store_true", help="of trials: push the robot as in training")
@@ -109,6 +118,7 @@ def evaluate(arguments: list[str]) -> int:
             check_count(f"--{name}", getattr(options, name))
     if options.pushes and options.trials is None:
         raise ValueError("--pushes: it is of trials: give their number, --trials 1024")
+    # Everything that compiles or loads is inside, so that the wait is explained.
     with shown_working("evaluating"):
         run = locate(options.run, note=say)
         saved = checkpoint.load_latest(run, note=say)
@@ -119,16 +129,19 @@ def evaluate(arguments: list[str]) -> int:
             how = {"trials": options.trials, "seed": options.seed, "pushes": options.pushes, "note": say}
             show(f"{judged}: {run_trials(policy.cfg, policy.actor, **how)}")
             return 0
+        # From the command line, else as the run was configured; a run without evaluations gets 100.
         episodes = options.episodes or policy.cfg.trainer.eval_episodes or 100
         how = {"episodes": episodes, "seed": options.seed, "note": say}
         evaluate = build_evaluator(policy.cfg, policy.actor, **how)
         evaluation = evaluate()
+        # Before the env goes out of scope: contacts that found no room spoil the result.
         losses = losses_of(evaluate.env)
     for text in losses:
         say(f"warning: {text}")
     assert evaluation is not None
     threshold = solved_at(policy.cfg)
     show(f"{judged}: {verdict(evaluation, threshold)}")
+    # Code 1 is for a policy that misses the threshold, so that scripts can ask.
     if threshold is None or evaluation.return_mean >= threshold:
         return 0
     return 1
@@ -137,10 +150,11 @@ def evaluate(arguments: list[str]) -> int:
 def _in_physics(
     saved: checkpoint.Checkpoint, overrides: Sequence[str], *, device: str
 ) -> tuple[RunCfg | None, str]:
-    """Return a run's config with overrides of its physics, None without, and what the verdict says about them."""
+    """Return a run's config with overrides of its physics, None without, and the verdict's words for them."""
     if not overrides:
         return None, ""
     fields = conf.fields_of(overrides)
+    # An evaluation judges the policy as it was trained: only physics may differ.
     check_physics_alone(fields, "eval")
     check_run_tree(saved.config, saved.path, given=fields)
     cfg = conf.changed({**saved.config, "device": device}, saved.path, overrides)
@@ -153,13 +167,14 @@ def _in_physics(
 
 
 def list_envs(arguments: list[str]) -> int:
-    """List the tasks, or print what one is made of."""
+    """List the tasks, or print the managers of one."""
     parser = OneLineParser(
         prog="ksim-rl envs", description="List the tasks, or print what one of them is made of."
     )
     parser.add_argument("task", nargs="?", help="build this one and print its managers as tables")
     options = parser.parse_args(arguments)
     if options.task is not None:
+        # Building compiles kernels, and one env is enough for its tables.
         with shown_working(f"building {options.task}"):
             if torch.cuda.is_available():
                 device = "cuda"
@@ -174,6 +189,7 @@ def list_envs(arguments: list[str]) -> int:
     broken = []
     for name in envs.names():
         task = envs.task(name)
+        # Configs are built for the list; a task that cannot be built must not hide the others.
         try:
             cfg = task.cfg()
         except Exception as error:  # of a plug-in, or of its robot's file: the other tasks are listed
@@ -213,11 +229,13 @@ def robot(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.picture is not None and options.picture.suffix != ".png":
         raise ValueError(f"--picture {options.picture}: expected a file that ends in .png")
+    # Trials of several poses take seconds.
     with shown_working(f"analysing {options.model}"):
         found = analyse(options.model, pose=options.pose)
     show(found.code() if options.code else found.table(), end="")
     if options.picture is not None:
         found.draw(options.picture)
+    # Standing for the whole trial is the least that a task needs.
     return 0 if found.stands_s >= TRIAL_S else 1
 
 

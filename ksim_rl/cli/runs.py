@@ -29,6 +29,7 @@ def runs(arguments: list[str]) -> int:
     found = [listing.summarize(run) for folder in options.folders for run in listing.find(folder)]
     chosen = [summary for summary in found if options.task in (None, summary.task)]
     field = ORDERS[options.sort]
+    # Runs without a figure come first, as the last lines are the ones that are seen.
     ordered = sorted(
         chosen, key=lambda summary: (getattr(summary, field) is not None, getattr(summary, field) or 0.0)
     )
@@ -53,6 +54,7 @@ def compare(arguments: list[str]) -> int:
         raise ValueError(f"--output {options.output}: expected a file that ends in .png")
     for folder in options.runs:
         if not (folder / listing.CONFIG).exists():
+            # Not `find`: these folders were named, so a wrong name is an error.
             raise ValueError(f"{folder}: expected a run folder, which has a {listing.CONFIG}")
     head, *rows = comparison.figures(options.runs)
     print_table(head, rows)
@@ -68,6 +70,7 @@ class TableOfJobs(Callback):
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         """Print the runs in the sweep's folder, by the numbers of their jobs."""
         folder = Path(str(config.hydra.sweep.dir))
+        # Jobs are called "<number>_<overrides>": by length first, so that 10 comes after 9.
         found = sorted(listing.find(folder), key=lambda run: (len(run.name.partition("_")[0]), run.name))
         print_table(listing.HEADS, (listing.line(listing.summarize(run), name=run.name) for run in found))
         show(f"{shown(folder)}: ksim-rl runs {shown(folder)} --sort return")
@@ -77,8 +80,10 @@ def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print rows under heads; in a pipe nothing is wrapped, so that each row stays one line."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for index, head in enumerate(heads):
+        # Only the first column may not wrap: it has the name that is copied.
         table.add_column(Text(head), no_wrap=index == 0)
     for row in rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     console = Console(highlight=False)
+    # A pipe has no width of its own.
     Console(highlight=False, width=None if console.is_terminal else 400).print(table)

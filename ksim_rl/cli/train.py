@@ -36,6 +36,7 @@ def train(arguments: list[str]) -> int:
     A job that fails says why; the others still run. A ValueError names a group, name, field or value that is wrong;
     nothing was built or written then.
     """
+    # Groups and classes go into Hydra's store before it composes anything.
     conf.register()
     flags, unknown = parse_flags(arguments)
     if unknown:
@@ -45,12 +46,14 @@ def train(arguments: list[str]) -> int:
         began = Path(flags.config_dir)
     else:
         began = None
+    # A config of the user's own is not known before Hydra reads it.
     if not (flags.help or flags.hydra_help or flags.shell_completion or own_config):
         builds = flags.cfg is None and flags.info is None
         multirun = flags.multirun or not builds
         for cfg in conf.check_command_line(flags.overrides, name=name, multirun=multirun, values=builds):
             check_sources(_with_models_of(began, cfg, note=lambda _: None))
 
+    # Checked now, since Hydra composes each job of a multirun on its own.
     groups = _folders_of_groups(flags, own_config)
     given = conf.fields_of(flags.overrides)
     codes: list[int] = []

@@ -13,22 +13,25 @@ from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.scene.rendering.rendering import pose_env
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer, visible_groups
 
+# Room of MuJoCo's scene; geoms beyond it are dropped.
 MOST_GEOMS = 20_000
 _KIND = mujoco.mjtGeom
 # Kinds whose shape stands in the model's data.
 _OF_MODEL = (_KIND.mjGEOM_MESH, _KIND.mjGEOM_SDF, _KIND.mjGEOM_HFIELD)
 # A line has no width in m; this is what it is drawn with.
 _LINE_RADIUS = 0.004
+# Sides of round shapes: more cost time in the browser and look the same.
 _SHADES = 24
 _GROUND: dict[str, Any] = {
     "cell_size": 0.25, "cell_color": (180, 184, 190), "section_color": (166, 172, 180),
     "plane_color": (226, 230, 235), "plane_opacity": 1.0, "shadow_opacity": 0.25,
 }  # fmt: skip
+# Vertices [V, 3] in m, and triangles [F, 3] of their indices.
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
 class SceneOfEnv:
-    """What one env looks like: a `mujoco.MjvScene` of its state, with what its terms draw for debugging."""
+    """The look of one env: a `mujoco.MjvScene` of its state, with the drawings of its terms for debugging."""
 
     def __init__(self, env: ManagerBasedRlEnv) -> None:
         self._env = env
@@ -42,17 +45,21 @@ class SceneOfEnv:
     def fill(self, env_index: int, *, drawn: Collection[str], contacts: bool) -> None:
         """Take over the state of one env; `drawn` are the names in `drawings` that are drawn."""
         pose_env(self.mj_model, self.data, self._env.world, env_index)
+        # Contacts are drawn only where they were computed for this state, below.
         self.option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = contacts
         if contacts:
             mujoco.mj_collision(self.mj_model, self.data)
+        # No camera and no mouse: a browser has its own of both.
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         nothing = (mujoco.MjvPerturb(), mujoco.MjvCamera())
         mujoco.mjv_updateScene(self.mj_model, self.data, self.option, *nothing, everything, self.mjv)
+        # Drawn behind the model's own geoms, into the same list.
         visualizer = DebugVisualizer(self.mj_model, self.mjv)
         self._env.update_visualizers(visualizer, env_index, drawn=drawn)
 
     def center(self, body: str | None) -> np.ndarray:
         """Return where a camera looks that follows a body, by default the first that moves: m, world frame."""
+        # Bodies that are welded to the world do not move; 0 is the world itself.
         moving = np.flatnonzero(self.mj_model.body_weldid)
         if body is not None:
             index = self.mj_model.body(body).id
@@ -73,6 +80,7 @@ class BrowserScene:
         self._scene = scene
         self._mj_model = mj_model
         self._root = scene.add_frame("/env", show_axes=False)
+        # By key: the handle of the mesh, and the arrays that the browser has now.
         self._batches: dict[tuple[Any, ...], tuple[viser.BatchedMeshHandle, dict[str, np.ndarray]]] = {}
         self._labels: list[viser.LabelHandle] = []
         self._planes: dict[int, viser.GridHandle] = {}
@@ -80,43 +88,52 @@ class BrowserScene:
 
     def show(self, mjv: mujoco.MjvScene, *, center: np.ndarray) -> None:
         """Show the scene, moved so that `center` (m) is above the origin, at which cameras look."""
+        # One message for each mesh is far cheaper than one for each geom.
         batches: dict[tuple[Any, ...], list[mujoco.MjvGeom]] = {}
         labels = []
         for index in range(mjv.ngeom):
             geom = mjv.geoms[index]
             if geom.type == _KIND.mjGEOM_LABEL:
                 labels.append(geom)
+            # Planes are no meshes: a grid is drawn once, and stays.
             elif geom.type == _KIND.mjGEOM_PLANE and geom.rgba[3] > 0:
                 self._plane(geom)
             elif (key := self._key(geom)) is not None:
                 batches.setdefault(key, []).append(geom)
+        # The frame above all geoms is moved, so that no instance is sent again when the robot walks.
         self._root.position = (-float(center[0]), -float(center[1]), 0.0)
+        # Also the meshes that have no geom any more: their instances have to vanish.
         for key in batches.keys() | self._batches.keys():
             self._batch(key, batches.get(key, []))
         self._write_labels(labels)
 
     def _key(self, geom: mujoco.MjvGeom) -> tuple[Any, ...] | None:
-        """Return what geoms of one mesh share: kind, data, the shape of what cannot be scaled, transparency."""
+        """Return the key that geoms of one mesh share: kind, data, sizes that cannot be scaled, transparency."""
+        # Two digits, so that fading geoms do not open a mesh for each shade.
         alpha = round(float(geom.rgba[3]), 2)
         kind = int(geom.type)
         if alpha == 0.0 or kind == _KIND.mjGEOM_NONE:
             return None
         if kind in _OF_MODEL:
             return kind, geom.dataid, alpha
+        # A capsule cannot be scaled: its caps would become ellipsoids.
         if kind == _KIND.mjGEOM_CAPSULE:
             return kind, round(float(geom.size[0]), 4), round(float(geom.size[2]), 4), alpha
         if kind in _PRIMITIVES:
             return kind, alpha
+        # Remembered by name; such geoms are not drawn.
         self.unknown.add(mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower())
         return None
 
     def _batch(self, key: tuple[Any, ...], geoms: list[mujoco.MjvGeom]) -> None:
         """Show these geoms as instances of one mesh; those that it had more of before shrink to nothing."""
         known = self._batches.get(key)
+        # Batches only grow: another number of instances means a new mesh in the browser.
         count = max(len(geoms), 0 if known is None else len(known[1]["batched_positions"]))
         if known is not None and len(known[1]["batched_positions"]) < count:
             known[0].remove()
             known = None
+        # Rows without a geom keep these values: they are scaled to almost nothing.
         values = {
             "batched_positions": np.zeros((count, 3), np.float32),
             "batched_wxyzs": np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
@@ -141,19 +158,23 @@ class BrowserScene:
                 batched_scales=values["batched_scales"],
                 batched_colors=values["batched_colors"],
                 opacity=key[-1] if key[-1] < 1.0 else None,
+                # Boxes have sharp edges; shared vertices would round them off.
                 flat_shading=key[0] == _KIND.mjGEOM_BOX,
                 cast_shadow=key[-1] == 1.0,
+                # A height field has no underside, and a camera may look from below.
                 side="double" if key[0] == _KIND.mjGEOM_HFIELD else "front",
                 lod="off",
             )
         else:
             handle = known[0]
+            # The most of a scene stands still: only arrays that changed are sent.
             for name, value in values.items():
                 if not np.array_equal(value, known[1][name]):
                     setattr(handle, name, value)
         self._batches[key] = (handle, values)
 
     def _mesh(self, key: tuple[Any, ...]) -> Mesh:
+        # Height fields count by their own number.
         if key[0] == _KIND.mjGEOM_HFIELD:
             return height_field_mesh(self._mj_model, key[1])
         if key[0] in _OF_MODEL:
@@ -161,12 +182,15 @@ class BrowserScene:
             return mesh_of_model(self._mj_model, key[1] // 2)
         if key[0] == _KIND.mjGEOM_CAPSULE:
             body = trimesh.creation.capsule(height=2 * key[2], radius=key[1], count=(12, 12))
+            # Trimesh's capsule begins at its lower cap; MuJoCo's centre is in the middle.
             return np.asarray(body.vertices) - [0, 0, body.bounds.mean(axis=0)[2]], np.asarray(body.faces)
         return _PRIMITIVES[key[0]]
 
     def _plane(self, geom: mujoco.MjvGeom) -> None:
+        # Planes do not change while an env is shown.
         if geom.objid in self._planes:
             return
+        # In MuJoCo a size of 0 means an infinite plane.
         infinite = geom.size[0] <= 0 or geom.size[1] <= 0
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, np.asarray(geom.mat, dtype=np.float64).ravel())
@@ -187,6 +211,7 @@ class BrowserScene:
         self._planes[geom.objid] = grid
 
     def _write_labels(self, geoms: list[mujoco.MjvGeom]) -> None:
+        # Handles of labels are kept, as creating one takes a message of its own.
         while len(self._labels) < len(geoms):
             self._labels.append(self._scene.add_label(f"/env/label_{len(self._labels)}", ""))
         for row, handle in enumerate(self._labels):
@@ -197,6 +222,7 @@ class BrowserScene:
 
 
 def _scale(kind: int, size: np.ndarray) -> tuple[float, float, float]:
+    # These have their size in their mesh.
     if kind in _OF_MODEL or kind == _KIND.mjGEOM_CAPSULE:
         return 1.0, 1.0, 1.0
     if kind == _KIND.mjGEOM_LINE:
@@ -210,6 +236,7 @@ def mesh_of_model(mj_model: mujoco.MjModel, mesh: int) -> Mesh:
     count = mj_model.mesh_facenum[mesh]
     corners = mj_model.mesh_face[first : first + count].reshape(-1)
     normals = mj_model.mesh_facenormal[first : first + count].reshape(-1)
+    # Vertices that share place and normal become one; corners of an edge stay several.
     pairs, faces = np.unique(np.stack([corners, normals], axis=1), axis=0, return_inverse=True)
     start = mj_model.mesh_vertadr[mesh]
     return mj_model.mesh_vert[start + pairs[:, 0]], faces.reshape(-1, 3).astype(np.uint32)
@@ -219,12 +246,14 @@ def height_field_mesh(mj_model: mujoco.MjModel, field: int) -> Mesh:
     """Return the surface of a height field as triangles, m, in the frame of its geom."""
     rows = int(mj_model.hfield_nrow[field])
     columns = int(mj_model.hfield_ncol[field])
+    # Half extents in m, and the height of a sample of 1; the fourth is the depth below, which is not drawn.
     half_x, half_y, rise, _ = mj_model.hfield_size[field]
     start = mj_model.hfield_adr[field]
     height = mj_model.hfield_data[start : start + rows * columns] * rise
     y, x = np.meshgrid(
         np.linspace(-half_y, half_y, rows), np.linspace(-half_x, half_x, columns), indexing="ij"
     )
+    # Of each cell the lower left corner; two triangles fill it, wound to face up.
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     lower = np.stack([corner, corner + 1, corner + columns + 1], axis=1)
     upper = np.stack([corner, corner + columns + 1, corner + columns], axis=1)

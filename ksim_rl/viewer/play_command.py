@@ -33,7 +33,7 @@ VIDEO_SUFFIXES = (".mp4", ".gif")
 
 @dataclass(frozen=True, kw_only=True)
 class Played:
-    """What is played: a run's policy, or an agent in a task (`actor` is None, and `agent` its kind)."""
+    """A policy or agent to play: a run's policy, or an agent in a task (`actor` is None, and `agent` its kind)."""
 
     cfg: RunCfg
     title: str
@@ -42,7 +42,7 @@ class Played:
     agent: str = ""
 
     def policy(self, env: EnvBase) -> TensorDictModuleBase:
-        """Return what acts in an env of `cfg`."""
+        """Return the policy that acts in an env of `cfg`."""
         if self.actor is None:
             return UntrainedAgent(self.agent, env)
         return self.actor
@@ -51,18 +51,22 @@ class Played:
 def play(arguments: list[str]) -> int:
     """Run `ksim-rl play <arguments>` and return its exit code."""
     options = _parser().parse_args(arguments)
+    # Faults of the command line before anything is compiled.
     _check(options)
     progress = RunProgress(1)
     with compile_notice(progress.status):
+        # Kernels may compile for minutes: the notice says so.
         played = _find(options)
         if options.viewer is None:
             return _record(played, options, progress)
         session = session_of(played, num_envs=options.num_envs, seed=options.seed)
     try:
         if options.viewer == "native":
+            # Imported here: each needs packages or a display that the other does not.
             importlib.import_module("ksim_rl.viewer.native").show(session, note=progress.note)
         else:
             serve(session, host=options.host, port=options.port, note=progress.note)
+    # Ctrl-C is the way to close a viewer, not a failure.
     except KeyboardInterrupt:
         progress.note("closed")
     finally:
@@ -76,9 +80,10 @@ def demo(arguments: list[str]) -> int:
 
 
 def session_of(played: Played, *, num_envs: int, seed: int) -> Session:
-    """Make a session of what is played, in so many envs."""
+    """Make a session of a policy or agent, in so many envs."""
 
     def make_env(conditions: Conditions) -> EnvBase:
+        # Conditions change the task, so each change builds another env.
         cfg = dataclasses.replace(played.cfg, task=conditions.apply(played.cfg.task))
         return build_env(cfg, num_envs=num_envs, seed=seed)
 
@@ -87,6 +92,7 @@ def session_of(played: Played, *, num_envs: int, seed: int) -> Session:
 
 def serve(session: Session, *, host: str, port: int, note: Callable[[str], None]) -> None:
     """Serve a session to browsers until Ctrl-C."""
+    # viser is an extra.
     from ksim_rl.viewer.browser import BrowserViewer
 
     with closing(BrowserViewer(host=host, port=port, label=session.title)) as viewer:
@@ -99,6 +105,7 @@ def serve(session: Session, *, host: str, port: int, note: Callable[[str], None]
 def addresses(viewer: str, pad: str) -> list[str]:
     """Return the lines that say where the viewer is, and how to reach it from another machine."""
     ports = [urlsplit(address).port for address in (viewer, pad)]
+    # Both ports, since the page for keyboard and gamepad has its own.
     forwarded = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
     return [
         f"viewer: {viewer}; with keyboard and gamepad: {pad} (Ctrl-C closes it)",
@@ -152,6 +159,7 @@ def _parser() -> OneLineParser:
 
 
 def _check(options: argparse.Namespace) -> None:
+    # Options that make no sense for a viewer.
     of_video = {"--seconds": options.seconds, "--fps": options.fps, "--output": options.output}
     given = {name: value for name, value in of_video.items() if value is not None}
     for name in ("--seconds", "--fps"):
@@ -161,6 +169,7 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError(
             f"--output {options.output}: expected a file that ends in {' or '.join(VIDEO_SUFFIXES)}"
         )
+    # A missing package, display or port is told now, not after minutes of compiling.
     if options.viewer == "browser":
         check_viser()
         importlib.import_module("ksim_rl.viewer.gate").check_listens(options.host, options.port)
@@ -173,6 +182,7 @@ def _check(options: argparse.Namespace) -> None:
 def _find(options: argparse.Namespace) -> Played:
     """Find the run or the task, with the changes to its config."""
     first, *overrides = options.what
+    # A path may hold "=", so one that exists is a run.
     if "=" in first and not Path(first).exists():
         if options.agent is None or not any(text.startswith("task=") for text in options.what):
             raise ValueError(
@@ -181,16 +191,20 @@ def _find(options: argparse.Namespace) -> Played:
         return _without_policy(conf.compose([*options.what, f"device={options.device}"]), options.agent)
     changed = None
     physics = ""
+    # `locate` also takes names of the zoo.
     saved = checkpoint.load_latest(locate(first))
     if overrides:
         fields = conf.fields_of(overrides)
+        # A run's folder may be a stranger's: its config must not reach outside.
         check_run_tree(saved.config, saved.path, given=fields)
         changed = conf.changed({**saved.config, "device": options.device}, saved.path, overrides)
         changed = dataclasses.replace(changed, device=options.device)
+        # Another engine brings another integrator and time step, which the title tells.
         if ENGINE in fields:
             changed, words = judged_by(changed, trained=trained_with(saved.config), given=fields)
             physics = f", {words}"
     policy = policy_of(saved, device=options.device, cfg=changed)
+    # An agent in a run's task: the policy is dropped, its config stays.
     if options.agent is not None:
         return _without_policy(policy.cfg, options.agent)
     title = f"{policy.cfg.task_name}, iteration {policy.iteration}{physics}"
@@ -204,9 +218,11 @@ def _without_policy(cfg: RunCfg, agent: str) -> Played:
 
 
 def _record(played: Played, options: argparse.Namespace, progress: RunProgress) -> int:
+    # The video is written into the run's folder, which may hold links that lead elsewhere.
     if options.output is None and played.actor is not None:
         check_links(played.folder, below=())
     path = options.output or played.folder / "play.mp4"
+    # A policy of an agent needs an env for its action spec; the video builds its own.
     probe = build_env(played.cfg, num_envs=1, seed=options.seed)
     actor = played.policy(probe)
     probe.close()
@@ -217,6 +233,7 @@ def _record(played: Played, options: argparse.Namespace, progress: RunProgress) 
         else:
             status = progress.status
         written = record_video(played.cfg, actor, path, status=status, **how)
+    # Exit code 3: the run failed; the reason was told by `note`.
     if written is None:
         return 3
     progress.note(f"{played.title}: {min(str(written), os.path.relpath(written), key=len)}")

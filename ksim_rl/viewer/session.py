@@ -31,7 +31,7 @@ MOST_LAG_S = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """What disturbs the policy: each can be switched off. Curricula are always off, as in evaluations.
+    """The disturbances of a policy: each can be switched off. Curricula are always off, as in evaluations.
 
     `randomization` are events that run at startup or write the model's fields, `pushes` those that run at intervals.
     """
@@ -42,19 +42,22 @@ class Conditions:
     pushes: bool = True
 
     def apply(self, cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
-        """Return the config of an env without what is switched off."""
+        """Return the config of an env without the disturbances that are switched off."""
         replace = dataclasses.replace
         groups = {}
+        # Noise and delay sit in the groups of observations, or in transforms of the env.
         for name, group in cfg.observations.items():
             noise = group.enable_noise and self.noise
             groups[name] = replace(group, enable_noise=noise)
             if not self.delay:
                 terms = {key: replace(term, delay=None) for key, term in group.terms.items()}
                 groups[name] = replace(groups[name], delay=None, terms=terms)
+        # Transforms of the user's own stay, whatever they do.
         dropped = () if self.noise else (ObservationNoise,)
         dropped += () if self.delay else (ObservationDelay, ActionDelay)
         kept = [name for name, own in cfg.transforms.items() if not issubclass(own.transform, dropped)]
         transforms = {name: cfg.transforms[name] for name in kept}
+        # None stands for a task without events.
         events = cfg.events
         if events is not None:
             events = {
@@ -71,6 +74,7 @@ class UntrainedAgent(TensorDictModuleBase):
 
     def __init__(self, kind: str, env: EnvBase) -> None:
         super().__init__()
+        # The specs of the env know the shape, the device and the bounds of actions.
         self._draw = {"zero": env.action_spec.zero, "random": env.action_spec.rand}[kind]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -86,11 +90,11 @@ class Session:
     from `play` to `change` are such requests.
 
     Attributes:
-        make_env: builds the env for given conditions; called anew when these change.
+        make_env: builds the env for given conditions; called again when these change.
         agent: writes "action" into a root of the env; it acts deterministically.
         env_index: the env that is shown, pushed and plotted.
         rewards: the weighted reward terms of that env in the last step.
-        note: what is said beside the figures, such as how old the policy is.
+        note: a remark beside the figures, such as how old the policy is.
         refused: how many requests found no room.
     """
 
@@ -107,6 +111,7 @@ class Session:
         self.note = ""
         self._make_env = make_env
         self._make_agent = make_agent
+        # Set from the viewer's thread through `ask`, and read between two steps.
         self.conditions = Conditions()
         self.playing = True
         self.speed = 1.0
@@ -121,6 +126,7 @@ class Session:
         self._steered: dict[str, dict[str, float]] = {}
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue(MOST_REQUESTS)
         self.refused = 0
+        # Clock and pace: the time of the last `advance`, steps that are due, and points of (s, steps).
         self._last: float | None = None
         self._due = 0.0
         self._paces: list[tuple[float, int]] = []
@@ -137,6 +143,7 @@ class Session:
     @property
     def observations(self) -> Mapping[str, Float[Tensor, " ?L"]]:
         """The clean reading of each observation term that is a vector, of the shown env."""
+        # The root of the next step, which is what a policy sees now. Images are left out.
         terms = self._root_E.get("obs")
         return {key: terms.get(key)[self.env_index] for key in terms.keys() if terms.get(key).ndim == 2}
 
@@ -147,6 +154,7 @@ class Session:
 
     def ask(self, request: Callable[[], None]) -> None:
         """Let `request` run between two steps, if fewer than `MOST_REQUESTS` wait; from any thread."""
+        # Never wait: the thread of a browser's connection must go on.
         try:
             self._requests.put_nowait(request)
         except queue.Full:
@@ -157,6 +165,7 @@ class Session:
         self.playing = playing
         self.error = ""
         self.trace = ""
+        # The pause must not count as time that has to be made up for.
         self._last = None
 
     def toggle(self) -> None:
@@ -172,6 +181,7 @@ class Session:
         """Start new episodes in all envs."""
         with torch.no_grad():
             self._root_E = self.env.reset()
+        # Figures begin again with the episode.
         self.episode_return = 0.0
         self.rewards = {}
 
@@ -189,6 +199,7 @@ class Session:
         A robot that stands on a fixed base gets its first joint pushed instead, in rad/s or m/s. Raises ValueError for
         a speed or direction that is not finite.
         """
+        # Values come from a browser: NaN would spoil the state of the world for good.
         check_in_range("speed", speed)
         if direction is not None:
             check_in_range("direction", direction)
@@ -198,12 +209,16 @@ class Session:
         else:
             angle = torch.tensor(direction)
         robot = ours.view.entity("")
+        # A free root has velocities of the world first: x, y and z in m/s.
         if robot.free_root:
             first = robot.root_qvel.start
             kick = speed * torch.stack((torch.cos(angle), torch.sin(angle)))
             ours.world.qvel_EL[self.env_index, first : first + 2] += kick.to(ours.world.qvel_EL)
         else:
+            # The direction chooses the sign only.
             ours.world.qvel_EL[self.env_index, 0] += speed * float(torch.sign(torch.cos(angle)))
+        # The driver caches what depends on the state: it learns of the change before and after the
+        # recomputation.
         ours.driver.changed()
         ours.world.refresh()
         ours.driver.refreshed()
@@ -211,32 +226,39 @@ class Session:
     def steer(self, command: str, values: Mapping[str, float] | None) -> None:
         """Hold the fields of a drawn command at these values in all envs; None lets it be drawn again.
 
-        Fields are those of the term's `ranges`, in its units: both ends of a range become the value. Draws that are
-        the term's own, such as which envs stand still, then fall on the last choice, that of none.
+        Fields are the keys of the term's `ranges`, in its units: both ends of a range become the value. Draws that are
+        the term's own, such as which envs stand still, then fall on the last choice, which is none.
         """
         ours = self.ours
         term = ours.cfg.commands[command]
         driver = ours.driver
+        # [2, N]: the lower ends, then the upper ends, by field.
         own = torch.tensor(list(term.ranges.values()), dtype=torch.float32).T
+        # In the term's own scope, where its draws and buffers are found.
         with driver.scope(f"commands/{command}", draws="step"):
             shared_2N = term.shared_ranges(ours.view)
+            # Ranges as configured, then shares in [0, 1] of the term's own draws.
             shared_2N[:, : own.shape[1]] = own.to(shared_2N)
             shared_2N[:, own.shape[1] :] = torch.tensor([[0.0], [1.0]]).to(shared_2N)
             if values is not None:
+                # Empty ranges: every draw gives the upper end, which for the term's own draws means no kind.
                 shared_2N[0] = shared_2N[1]
                 for column, field in enumerate(term.ranges):
                     shared_2N[:, column] = values[field]
             everybody_E = torch.ones(ours.num_envs, dtype=torch.bool, device=shared_2N.device)
+            # Without waiting for the next time that the command is drawn.
             term.resample(ours.view, everybody_E)
         ours.command_manager.refresh(everybody_E)
         if values is None:
             self._steered.pop(command, None)
         else:
+            # Kept, so that a rebuilt env is steered as this one is.
             self._steered[command] = dict(values)
 
     def change(self, conditions: Conditions) -> None:
-        """Build the env anew under other conditions, and start new episodes in it."""
+        """Build the env again under other conditions, and start new episodes in it."""
         self.conditions = conditions
+        # Worlds are freed first: two envs at a time might not fit into the memory.
         self.env.close(raise_if_closed=False)
         self._build()
 
@@ -245,16 +267,19 @@ class Session:
         self._last = None
 
     def advance(self, after_step: Callable[[], None] = lambda: None) -> bool:
-        """Do what was asked for, then the steps that are due by now; return whether anything changed."""
+        """Run the waiting requests, then the steps that are due by now; return whether anything changed."""
         changed = False
+        # Requests first, so that they act on the steps of this call.
         while not self._requests.empty():
             self._guarded(self._requests.get_nowait())
             changed = True
         now = time.monotonic()
+        # After a pause time begins here.
         if self._last is None or not self.playing:
             self._last = now
             self._due = 0.0
             self._paces = [(now, self.steps)]
+        # Steps that are due: real seconds times the speed, over the length of a step.
         self._due += min(now - self._last, MOST_LAG_S) * self.speed / self.ours.step_dt
         self._last = now
         # No display is kept waiting for long by steps that take longer than they last.
@@ -263,7 +288,9 @@ class Session:
             changed = True
             self._guarded(self._step)
             after_step()
+        # What could not be kept up with is dropped, not made up for later.
         self._due = min(self._due, 1.0)
+        # The pace over the last 61 calls is shown beside the speed that was asked for.
         self._paces = [*self._paces[-60:], (now, self.steps)]
         (start, first) = self._paces[0]
         (end, last) = self._paces[-1]
@@ -287,9 +314,11 @@ class Session:
 
     def _build(self) -> None:
         self.env = self._make_env(self.conditions)
+        # The new env may have fewer rows.
         self.env_index = min(self.env_index, self.ours.num_envs - 1)
         self.agent = self._make_agent(self.env)
         self.built += 1
+        # The same seed, so that two conditions are compared on the same starts.
         self.env.set_seed(self.seed)
         self.reset()
         for command, values in self._steered.copy().items():
@@ -298,11 +327,13 @@ class Session:
     def _step(self) -> None:
         sums_ER = self.ours.reward_manager.episode_sums_ER
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            # Weighted terms are read as the growth of their sums, which all episodes keep anyway.
             before_R = sums_ER[self.env_index].clone()
             stepped_E = self.env.step(self.agent(self._root_E))
             # Sums of episodes that ended are cleared by the reset, so they are read before.
             rewards_R = (sums_ER[self.env_index] - before_R).tolist()
             next_E = stepped_E.get("next")
+            # One transfer from the device per step of a viewer is no loss.
             reward, done = (float(next_E.get(key)[self.env_index]) for key in ("reward", "done"))
             self._root_E = self.env.maybe_reset(self.env.step_mdp(stepped_E))
         self.rewards = dict(zip(self.ours.reward_manager.names, rewards_R, strict=True))
