@@ -1,4 +1,4 @@
-"""Applies Hydra overrides to the config trees of tasks; Hydra is loaded with this module, when some are first given."""
+"""Applies Hydra overrides to the config trees of tasks; imported late, as Hydra loads slowly."""
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
@@ -27,10 +27,12 @@ def register(names: tuple[str, ...], make_tree: MakeTree) -> None:
 
 def with_overrides(name: str, make_tree: MakeTree, overrides: Sequence[str]) -> Any:
     """Return the tree of a registered task with overrides applied; a ValueError names the one that is not valid."""
+    # Our own check first: it names near fields, which Hydra's errors do not.
     check_overrides({"task": make_tree(name)}, overrides)
     with initialize(version_base="1.3", config_path=None):
         try:
             composed = compose(config_name=_CONFIG, overrides=[f"task={name}", *overrides])
         except ConfigCompositionException as error:
+            # Hydra's own text says where, and its cause says what is wrong.
             raise ValueError(f"{error}: {error.__cause__}") from error
     return OmegaConf.to_container(composed.task, resolve=True)

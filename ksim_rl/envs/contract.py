@@ -1,9 +1,9 @@
 """The parts of an env that trainers, collectors, evaluators and adapters may use.
 
-An env is a TorchRL `EnvBase` of batch size [E] whose roots and steps are EnvStates: that alone trains. What is below
-are optional parts. An env has a part if it is an instance of its class, by inheritance or by `Part.register(MyEnv)`;
-`ManagerBasedRlEnv` has all of them. `part(env, EpisodeClock)` finds one in any env, however it is wrapped, and is the
-only way in which other modules look at what kind of env they were given.
+An env is a TorchRL `EnvBase` of batch size [E] whose roots and steps are EnvStates: that is enough to train. The
+parts below are optional. An env has a part if it is an instance of its class, by inheritance or by
+`Part.register(MyEnv)`; `ManagerBasedRlEnv` has all of them. `part(env, EpisodeClock)` finds a part in any env,
+however it is wrapped; other modules find out in no other way what kind of env they were given.
 """
 
 from abc import ABC, abstractmethod
@@ -60,7 +60,7 @@ class EpisodeSums(ABC):
 
     @abstractmethod
     def episode_log_reset_(self) -> None:
-        """Start the sums anew."""
+        """Start the sums again at 0."""
 
     def non_finite_terms(self) -> Sequence[str]:
         """Return a line for each term that gave a number that is not finite, as `non_finite_terms` counts them."""
@@ -68,7 +68,7 @@ class EpisodeSums(ABC):
 
 
 class DifficultyLevels(ABC):
-    """What curricula have come to."""
+    """The present levels of curricula."""
 
     without: ClassVar[str] = "no curricula: nothing about difficulty is logged"
 
@@ -106,12 +106,13 @@ PARTS = (EpisodeClock, EpisodeSums, DifficultyLevels, SimulatedWorld, Pictures)
 
 def part(env: EnvBase, kind: type[Part]) -> Part | None:
     """Return the env inside all wrappers if it has the part `kind` (or is of this class), else None."""
+    # Wrappers add no parts of their own, so only the innermost env is asked.
     inner = innermost(env)
     return inner if isinstance(inner, kind) else None
 
 
 def missing_parts(env: EnvBase) -> list[str]:
-    """Return one line for each part that the env lacks, which says what a run goes without."""
+    """Return one line for each part that the env lacks, which says what a run cannot do then."""
     return [
         f"{type(innermost(env)).__name__} has {kind.without}" for kind in PARTS if part(env, kind) is None
     ]

@@ -15,7 +15,7 @@ Drawing = CommandTerm | RewardTerm | SensorTracker
 def drawings(
     cfg: ManagerBasedRlEnvCfg, sensors: Mapping[str, SensorTracker], rewards: Collection[str]
 ) -> dict[str, Drawing]:
-    """Return what draws itself and that `viewer.draw` asks for, by "commands/<name>", "rewards/..." or "sensors/...".
+    """Return the parts that draw themselves and that `viewer.draw` names, by "commands/<name>", "rewards/..." etc.
 
     `sensors` are the readers of the env's, and `rewards` those that are computed; others have no quantities to draw.
     """
@@ -26,6 +26,7 @@ def drawings(
         ("sensors", SensorTracker, sensors),
     ):
         for name, part in parts.items():
+            # A part that keeps the empty `draw_debug` of its base draws nothing.
             wanted = any(re.fullmatch(pattern, f"{room}/{name}") for pattern in cfg.viewer.draw)
             if wanted and type(part).draw_debug is not base.draw_debug:
                 found[f"{room}/{name}"] = part
@@ -41,6 +42,7 @@ def draw(
     drawn: Collection[str] | None,
 ) -> None:
     """Let parts draw one env, all of them or those of the names `drawn`; a ValueError names one that moves it."""
+    # Drawing must not move the robot. Only torch's writes, as the other check would slow each picture down.
     with driver.guard.watching(past_torch=False):
         for name, part in parts.items():
             if drawn is not None and name not in drawn:

@@ -18,7 +18,7 @@ from ksim_rl.scene.state.simulation import Simulation
 
 
 class EnvDriver(Simulation):
-    """A `Simulation` with `readings`, what managers and sensors write, and `view`, what terms read.
+    """A `Simulation` with `readings`, which managers and sensors write, and `view`, which terms read.
 
     The `parts` are the other arguments of the view; see `WorldView`.
     """
@@ -35,7 +35,9 @@ class EnvDriver(Simulation):
         for name, sensor in sensors.items():
             tracker = self.readings.sensors[name] = sensor.track(name, self.view)
             if tracker.every_substep:
+                # Such a sensor reads after each substep, where all sensors or only contacts must be computed.
                 self.after_substep.append(partial(self._update_in_substep, name, tracker))
+                # One sensor that needs more than contacts decides for all.
                 only = tracker.contacts_only and self.substep_sensors != "every"
                 if only:
                     self.substep_sensors = "contacts"
@@ -55,10 +57,11 @@ class EnvDriver(Simulation):
     def freeze(self) -> None:
         """End construction: no new buffers."""
         super().freeze()
+        # Values during construction are of no state that anybody sees.
         self.non_finite.start()
 
     def watch(
         self, part: object, mask_E: Bool[Tensor, " E"] | None
     ) -> AbstractContextManager[Mapping[str, Kept]]:
-        """Refuse what a part must not write, wherever that is watched: see `TermGuard`."""
+        """Watch the writes of a part, and refuse those that it must not make: see `TermGuard`."""
         return self.guard.watch(self.reader, part, mask_E)

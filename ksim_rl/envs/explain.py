@@ -47,12 +47,14 @@ def explain(
         widths = []
         for name, term_cfg in group_cfg.terms.items():
             shape = tuple(shapes[name][1:])
+            # History stacks frames of a vector side by side.
             if len(shape) == 1:
                 shape = (shape[0] * group_cfg.num_frames(name),)
             widths.append(shape)
             chain = _parameters(term_cfg, without=("term",))
             rows.append((name, str(shape), chain, _described(term_cfg.term)))
         # An image stands alone in its group; vectors are concatenated.
+        # The shape that the policy sees under the group's key.
         whole = widths[0]
         if len(widths) > 1:
             whole = (sum(shape[0] for shape in widths),)
@@ -69,6 +71,7 @@ def explain(
     show("commands", ("term", "shape", "resampled every", "parameters"), rows)
 
     weights = driver.readings.reward_weights
+    # The present weights, which a curriculum may have changed.
     shown = {
         name: f"{float(weights[name]):g}" if name in weights else "0: not computed" for name in cfg.rewards
     }
@@ -87,6 +90,7 @@ def explain(
         (name, ends if term.time_out else "terminated", _described(term, ("time_out",)))
         for name, term in cfg.terminations.items()
     ]
+    # The guard is no term of the config, but ends episodes like one.
     rows.append(("non_finite", "terminated", "always: the physics or the action is not finite"))
     show("terminations", ("term", "marks", "parameters"), rows)
 
@@ -102,6 +106,7 @@ def explain(
     rows = [(name, term.reduce, _described(term, ("reduce",))) for name, term in cfg.metrics.items()]
     show("metrics", ("term", "reduced by", "parameters"), rows)
 
+    # Groups first, as observations pass them first.
     of_groups = compile_groups(cfg.observations)
     rows = [("(groups)", _keys(transform), type(transform).__name__) for transform in of_groups]
     rows += [(name, _keys(each.build()), _call(each)) for name, each in cfg.transforms.items()]
@@ -151,6 +156,7 @@ def _show(console: Console, title: str, columns: tuple[str, ...], rows: list[tup
     for index, row in enumerate(rows):
         table.add_row(str(index), *row)
     if not rows:
+        # An empty manager has a row, so that one sees that it is empty on purpose.
         table.add_row("-", "none", *[""] * (len(columns) - 1))
     console.print(table)
 
@@ -169,6 +175,7 @@ def _parameters(value: Any, *, without: tuple[str, ...] = ()) -> str:
         given = getattr(value, field.name)
         default = field.default
         if field.default_factory is not dataclasses.MISSING:
+            # A default that is made anew each time is compared by value.
             default = field.default_factory()
         if field.name not in without and given != default:
             parts.append(f"{field.name}={_shown(given)}")

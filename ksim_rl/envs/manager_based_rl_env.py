@@ -49,7 +49,7 @@ RENDER_MODES = (None, "rgb_array")
 
 
 class _Closed:
-    """Stands in the place of each part of an env that was closed, and says so."""
+    """Replaces each part of a closed env, and says so in an error."""
 
     def __getattr__(self, name: str) -> Any:
         raise RuntimeError("the env is closed, and the memory of its worlds is free: make another one")
@@ -126,7 +126,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             ),
         )
 
-    # -- what it is made of --------------------------------------------------------------------------------------
+    # -- parts ---------------------------------------------------------------------------------------------------
 
     def load_managers(self) -> None:
         """Build the managers: events and commands, then actions and observations, then the rest.
@@ -194,9 +194,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         return self.view.episode_step_E
 
     def watching_terms(self) -> AbstractContextManager[None]:
-        """Return a context in which each term that writes what is not its own is refused by a ValueError, by name.
+        """Return a context in which a ValueError names each term that writes memory other than its own.
 
-        While an env is built and while its step is compiled or captured, that is so anyway. It takes much time.
+        While an env is built and while its step is compiled or captured, this is always so. It takes much time.
         """
         return self.driver.guard.watching()
 
@@ -219,7 +219,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         )
         # Also false for NaN. Beyond this bound MuJoCo's C engine, too, calls a state bad and resets it.
         finite_E = finite_E & ((world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1)).abs() < mujoco.mjMAXVAL)
-        # Clearing failed worlds at once keeps everything that is computed from here on finite.
+        # Failed worlds are cleared before anything is computed from them, so that all of it is finite.
         world.reset(~finite_E)
         world.refresh()
         driver.refreshed()
@@ -231,6 +231,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         reward_E = self.reward_manager.step(finite_E)
         self.metric_manager.step(finite_E)
         self._log.step(done_E)
+        # Last, so that rewards and terminations see the command that the policy saw.
         self.command_manager.step(~done_E)
         return self._env_state(
             reward=reward_E[:, None],
@@ -247,6 +248,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             mask_E = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         driver.forget()
         driver.reset_count_E.add_(mask_E)
+        # Curricula first: they judge the episode that ended, and what they change holds for the next one.
         self.curriculum_manager.reset(mask_E)
         self.world.reset(mask_E)
         self.view.restore_default(mask_E)
@@ -255,6 +257,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.joint_drives.reset(mask_E)
         driver.episode_step_E.masked_fill_(mask_E, 0)
         driver.changed()
+        # Events write the state; poses and sensors derived from it are refreshed once, after all of them.
         self.event_manager.reset(mask_E)
         self.view.default_state.follow_pose(mask_E)
         self.command_manager.resample(mask_E)
@@ -286,7 +289,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     # -- seeds ---------------------------------------------------------------------------------------------------
 
     def _set_seed(self, seed: int | None) -> None:
-        """Seed all draws and redo the startup events. What curricula have learned stays."""
+        """Seed all draws and redo the startup events. The levels of curricula stay."""
         seed = secrets.randbelow(2**31) if seed is None else seed
         self.cfg = dataclasses.replace(self.cfg, seed=seed)
         self.driver.seed.fill_(seed)
@@ -304,18 +307,18 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
                 share_E = self.view.uniform(1)[:, 0]
             self.driver.time_out_offset_E.copy_((share_E * self.max_episode_length).long())
 
-    # -- what trainers read --------------------------------------------------------------------------------------
+    # -- for trainers --------------------------------------------------------------------------------------------
 
     def episode_log(self) -> dict[str, Float[Tensor, ""]]:
         """Return sums over the episodes that ended since `episode_log_reset_`; see `EpisodeLog`."""
         return self._log.read()
 
     def episode_log_reset_(self) -> None:
-        """Start the sums of `episode_log` anew."""
+        """Start the sums of `episode_log` again at 0."""
         self._log.clear()
 
     def values_by_term(self) -> dict[str, Float[Tensor, " E"] | Bool[Tensor, " E"]]:
-        """Return what each reward, metric and termination has given in the episodes so far, [E], written in place."""
+        """Return reward sums, metrics and termination flags of the running episodes, [E] each, written in place."""
         values = {f"rewards.{name}": sum_E for name, sum_E in self.view.episode_rewards.items()}
         held = zip(self.metric_manager.names, self.metric_manager.held_EM.unbind(-1), strict=True)
         values |= {f"metrics.{name}": held_E for name, held_E in held}
@@ -386,7 +389,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         return counters | shared | driver.buffers.by_name()
 
     def explain(self, *, width: int = WIDTH) -> str:
-        """Return what the env is made of: a table per manager with index, name, shape, weight, mode and parameters."""
+        """Return the parts of the env as tables, one per manager, with index, name, shape, weight, mode, parameters."""
         spec = self.observation_spec
         return explain(
             self.cfg,

@@ -25,7 +25,7 @@ Seed = Annotated[int, Within(low=0, high=2**63 - 1)] | None
 
 @dataclass(frozen=True, kw_only=True)
 class ManagerBasedRlEnvCfg(Checked):
-    """What an env is made of: terms by name, of which each action term takes its columns of `"action"` in this order.
+    """The parts of an env: terms by name; action terms take their columns of `"action"` in the order of the mapping.
 
     The env emits each observation term once as `("obs", term)`, clean; `envs.make` compiles the groups into transforms
     that add noise, delay and history and write one vector per group. It appends `transforms` to these, in this order:
@@ -56,6 +56,7 @@ class ManagerBasedRlEnvCfg(Checked):
             raise ValueError(
                 f"viewer.env_index={self.viewer.env_index}: expected less than scene.num_envs={self.scene.num_envs}"
             )
+        # Without a length a time-out never comes, which is a mistake of the config.
         timed = [name for name, term in self.terminations.items() if term.time_out]
         if timed and self.episode_length_s == 0.0:
             raise ValueError(
@@ -65,6 +66,7 @@ class ManagerBasedRlEnvCfg(Checked):
         shared: dict[str, object] = {}
         for group_name, group in self.observations.items():
             for term_name, term_cfg in group.terms.items():
+                # The env emits each term once, by name, so two groups cannot mean two things by one name.
                 if shared.setdefault(term_name, term_cfg.term) != term_cfg.term:
                     raise ValueError(
                         f"observations.{group_name}.terms.{term_name}: another group has a different term of this "

@@ -38,9 +38,11 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         *args: Any,
         **kwargs: Any,
     ) -> None:
+        # TorchRL's constructor takes a single transform only.
         if isinstance(transform, Sequence):
             transform = Compose(*transform)  # pyright: ignore[reportArgumentType]
         super().__init__(base_env, transform, *args, **kwargs)
+        # A base env that draws its own random actions keeps doing so.
         if type(base_env).rand_action is not EnvBase.rand_action:
             object.__setattr__(self, "rand_action", functools.partial(TransformedEnv.rand_action, self))
 
@@ -59,6 +61,7 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seed the base env and each transform; return the next seed, as TorchRL does."""
+        # Transforms with draws, such as noise, start from the same seed.
         if seed is not None:
             seed_transforms(self, seed)
         return self.base_env.set_seed(seed, static_seed=static_seed)
@@ -70,6 +73,7 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
             _TRANSFORM: self.transform.state_dict(*args, **kwargs),
         }
         if self.last_root is not None:
+            # Without the policy's leaves, which are no state of the env.
             keys = [*self.full_observation_spec.keys(True, True), *self.full_done_spec.keys(True, True)]
             parts[_ROOT] = self.last_root.select(*keys, strict=False).flatten_keys("/")
         return OrderedDict(
@@ -82,6 +86,7 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         """Load what `state_dict` returned; a KeyError names an entry that belongs to no part of the env."""
         parts: dict[str, OrderedDict[str, Any]] = {p: OrderedDict() for p in (_BASE, _TRANSFORM, _ROOT)}
         for key, value in state_dict.items():
+            # The first part of each name says whose entry it is.
             prefix = next((prefix for prefix in parts if key.startswith(prefix)), None)
             if prefix is None and not strict:
                 continue
@@ -93,6 +98,7 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         self.base_env.load_state_dict(parts[_BASE], strict=strict, **kwargs)
         self.transform.load_state_dict(parts[_TRANSFORM], strict=strict, **kwargs)
         if parts[_ROOT]:
+            # Clones: the saved tensors must not change with the next step.
             leaves = {key: value.clone() for key, value in parts[_ROOT].items()}
             root = TensorDict(leaves, batch_size=self.batch_size, device=self.device).unflatten_keys("/")
             self.last_root = self._labelled(root)

@@ -1,4 +1,4 @@
-"""Watches the values of terms: one that is not finite is named, with env and step."""
+"""Watches the values of terms: a term that returns NaN or an infinity is named, with env and step."""
 
 from collections.abc import Sequence
 
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator
 
+# Beyond any place, so that a minimum over places replaces it.
 _NEVER = 2**62
 
 
@@ -41,7 +42,7 @@ _count = as_operator("count_non_finite", _count_now, lambda *_: None, mutates=("
 
 
 class NonFiniteTerms:
-    """Counts, on the device and without a sync, the numbers that are not finite by the term that gave them."""
+    """Counts non-finite numbers by term, on the device and without a sync."""
 
     def __init__(self, num_envs: int, step_count: Int64[Tensor, ""]) -> None:
         self._num_envs = num_envs
@@ -58,6 +59,7 @@ class NonFiniteTerms:
         """Look at the values of some terms of a kind, side by side; before `start` it only learns their names."""
         key = kind, *names
         if self._is_learning:
+            # For each column of the table the number of its term; a term may have several columns.
             columns = [
                 len(self._names) + i for i, n in enumerate(widths or [1] * len(names)) for _ in range(n)
             ]
@@ -65,11 +67,12 @@ class NonFiniteTerms:
             self._names += [f"{kind} {name!r}" for name in names]
             return
         if table_EL.dtype != torch.float32 or not table_EL.is_contiguous():
+            # The kernel reads float32 rows that lie one behind the other.
             table_EL = table_EL.float().contiguous()
         _count(table_EL, self._columns[key], self._step, self._first_N, self._count_N)
 
     def start(self) -> None:
-        """Count from here: what terms give while an env is constructed is of no state that anybody sees."""
+        """Count from here on: values during the construction of an env are of no state that anybody sees."""
         self._is_learning = False
         self._count_N = self._count_N.new_zeros(len(self._names))
         self._first_N = torch.full_like(self._count_N, _NEVER)
@@ -79,8 +82,9 @@ class NonFiniteTerms:
         return (self._count_N > 0).sum(dtype=torch.float32)
 
     def lines(self) -> list[str]:
-        """Return a line for each of these terms; reads the device."""
+        """Return a line for each of these terms; waits for the device."""
         return [
+            # One number tells both: step * num_envs + env.
             f"{name} is not finite: first in env {first % self._num_envs} at its step {first // self._num_envs}, "
             f"{count} numbers so far"
             for name, count, first in zip(

@@ -1,4 +1,4 @@
-"""Lists what of an env is Python that a step runs, by name, and what of it is read once, while the env is built."""
+"""Lists the Python objects that a step of an env runs, by name, and those that are read only while it is built."""
 
 from collections.abc import Iterator
 from dataclasses import fields
@@ -50,10 +50,12 @@ def python_parts(env: EnvBase) -> dict[str, Any]:
     parts: dict[str, Any] = {}
     transforms: list[Transform] = []
     inner: Any = env
+    # From the outermost wrapper inwards.
     while isinstance(inner, TransformedEnv):
         parts[f"wrapper {len(parts)}"] = Listed(inner, partial(_of_wrapper, inner))
         transforms += _leaves(inner.transform)
         inner = inner.base_env
+    # The number keeps two transforms of one class apart.
     for number, transform in enumerate(transforms):
         parts[f"transforms[{number}] {type(transform).__name__}"] = transform
     if isinstance(inner, ManagerBasedRlEnv):
@@ -76,7 +78,7 @@ def terms(cfg: ManagerBasedRlEnvCfg) -> Iterator[tuple[str, Any]]:
 
 
 def why_not(change: Change) -> str | None:
-    """Return what to do instead of a change that has no effect on an env which is built; None where it has one."""
+    """Return advice for a change that has no effect on an env that is built already; None where it has one."""
     if all(name.startswith(f"{CFG}.") for name in change.names):
         return "an env reads its config once: build another one (`dataclasses.replace`)"
     if all(name.startswith(f"{OPTIONS}.") for name in change.names):
@@ -99,12 +101,14 @@ def _of_wrapper(wrapper: TransformedEnv) -> dict[str, Any]:
 
 
 def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """Return what calls the terms of an env, and what they read beside tensors."""
+    """Return the objects that call the terms of an env, and the values other than tensors that they read."""
     driver = env.driver
     parts = {
         "env": Listed(env, partial(_of_env, env)),
         "view": Listed(env.view, partial(_public, env.view)),
+        # Only these: the rest of the driver are tensors, or parts that are listed on their own.
         "driver": Listed(driver, lambda: {name: getattr(driver, name) for name in _OF_DRIVER}),
+        # The code of a config does not run in a step, only its values count.
         CFG: Listed(env.cfg, partial(_read_once, env), reads_code=False),
     }
     for name, (owner, read) in env.world.recorded_python().items():
@@ -116,8 +120,10 @@ def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Any]:
 
 
 def _of_env(env: ManagerBasedRlEnv) -> dict[str, Any]:
+    # The config is a part of its own, since most of its fields are read once.
     left_out = ("cfg", _KEYS_OF_SPECS)
     own = {name: value for name, value in attributes_of(env).items() if name not in left_out}
+    # The one field of the config that each step reads.
     return own | {"cfg.decimation": env.cfg.decimation}
 
 

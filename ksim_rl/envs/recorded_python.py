@@ -1,4 +1,4 @@
-"""Keeps a recorded step true to the Python that it was recorded from: what changes is noticed and named."""
+"""Keeps a recorded step true to the Python that it was recorded from: changes are noticed and named."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -26,9 +26,9 @@ EAGER = "or let the Python of each step run, which takes longer: collector.eager
 
 
 class FrozenPythonError(ValueError):
-    """Python that would be frozen by a recording, or has been; the message names it, and what to write instead.
+    """Raised for Python that a recording would freeze, or has frozen; the message names it, and an alternative.
 
-    The last `rollouts` may have been made with what was frozen.
+    The last `rollouts` may have been made with frozen Python.
     """
 
     def __init__(self, message: str, *, rollouts: int = 0) -> None:
@@ -41,7 +41,7 @@ class RecordedPython:
 
     A recorded step (kernels, a CUDA graph) runs none of it. So it has to be the same at each step, which the second
     step shows: `calling` is around each of the first ones. After those, `changes` says what somebody has changed from
-    outside, such as an attribute of a term, or a transform more; then the step has to be recorded anew.
+    outside, such as an attribute of a term, or one more transform; then the step has to be recorded again.
 
     `others` are objects whose Python becomes part of the recording as well, by name: a policy. A step that puts a
     tensor in the place of another one may still be recorded, if it writes it before it reads it. Where the numbers of
@@ -66,24 +66,27 @@ class RecordedPython:
 
     @contextmanager
     def calling(self) -> Iterator[None]:
-        """Be around one of the first steps; a FrozenPythonError after the second where it changed or asked the host.
+        """Enclose one of the first steps; a FrozenPythonError after the second where it changed or asked the host.
 
         What the first one changes may be a cache that it fills.
         """
+        # The first step may fill caches; only the second one is judged.
         if self._calls != 1:
             yield
         else:
             with host_calls(self._parts()) as calls:
                 yield
+            # Compared with the values right after the first step.
             changes = self._watch.changes()
             if self._is_compared:
                 self._replaced = {_place(change) for change in changes if change.is_of_tensors}
             self._refuse(calls, [change for change in changes if _place(change) not in self._replaced])
         self._calls += 1
+        # Values as they are after this step: later changes come from outside.
         self._watch.look(self._parts())
 
     def forget(self) -> None:
-        """Let the next two steps show anew what Python does."""
+        """Let the next two steps show again what Python does."""
         self._calls = 0
 
     def changes(self) -> list[Change]:
@@ -118,10 +121,10 @@ def _place(change: Change) -> tuple[int, Any]:
 
 
 class FollowedGraph:
-    """A CUDA graph of a step of an env, which is recorded anew where the Python has changed that it was recorded from.
+    """A CUDA graph of a step of an env, recorded again when the Python that it was recorded from has changed.
 
-    On the CPU, and where graphs are not wanted, Python runs at each step, and there is nothing to follow. `others` see
-    `RecordedPython`.
+    On the CPU, and where graphs are not wanted, Python runs at each step, and there is nothing to follow. For `others`
+    see `RecordedPython`.
     """
 
     def __init__(self, env: EnvBase, graph: Captured, others: Mapping[str, Any] | None = None) -> None:
@@ -130,7 +133,7 @@ class FollowedGraph:
         self._records = graph.device.type == "cuda" and not graph.is_eager
 
     def calling(self) -> AbstractContextManager[None]:
-        """Be around a step in Python; see `RecordedPython`."""
+        """Return a context for a step in Python; see `RecordedPython`."""
         if self._python.is_known or not self._records:
             return nullcontext()
         return self._python.calling()
@@ -138,5 +141,6 @@ class FollowedGraph:
     def follow(self) -> None:
         """Forget the graph if Python has changed; a FrozenPythonError if that cannot have an effect any more."""
         if self._records and self._python.is_known and self._python.changes():
+            # The next call is eager again, then the graph is captured from the new Python.
             self._graph.forget()
             self._python.forget()

@@ -28,6 +28,7 @@ OWN_TASKS = ("ksim_rl.tasks", "ksim_rl.suites", "ksim_rl.tracking")
 
 
 def _tasks() -> dict[str, Task]:
+    # The names are the key of the cache: a plug-in that comes later brings its tasks.
     return _tasks_with(plugins.named())
 
 
@@ -36,12 +37,14 @@ def _tasks_with(_named: tuple[str, ...]) -> dict[str, Task]:
     """Import all task modules once, ours and those of other packages, and collect their `Task`s."""
     found: dict[str, tuple[str, Task]] = {}
     packages = map(importlib.import_module, OWN_TASKS)
+    # Ours first, so that a task of another package cannot take the place of one of ours.
     inside = (info for own in packages for info in pkgutil.iter_modules(own.__path__, f"{own.__name__}."))
     ours = ((info.name, importlib.import_module(info.name)) for info in inside)
     for origin, module in (*ours, *plugins.modules(plugins.TASKS)):
         held = [value for value in vars(module).values() if isinstance(value, Task)]
         for value in (*held, *vars(module).get("TASKS", ())):
             first, known = found.setdefault(value.name, (origin, value))
+            # The same object may be imported into several modules; only another task is refused.
             if known is not value:
                 raise ValueError(
                     f"two tasks are called {value.name!r}: in {first} and in {origin}; rename one"
@@ -84,6 +87,7 @@ def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
 
     A ValueError names the task or field that does not exist, or the value that is not valid, before models compile.
     """
+    # Without Hydra, which takes long to load.
     if not overrides:
         return cfg_of(name)
     from ksim_rl.envs import composed
@@ -106,8 +110,10 @@ def build(
     foreign: dict[str, Transform] = {}
     for name, described in cfg.transforms.items():
         transform = described.build(name)
+        # Transforms of others are tried out below, ours and TorchRL's are not.
         if not type(transform).__module__.startswith(("ksim_rl.", "torchrl.")):
             foreign[name] = transform
+        # What scales with difficulty reads the env's own tensor.
         follow_level([transform], level)
         try:
             _check_reads(transform, env)
@@ -130,8 +136,9 @@ def build(
 
 
 def _check_writes(env: MaskedTransformedEnv, foreign: Mapping[str, Transform]) -> None:
-    """Refuse what transforms of others make of a first root, if their specs say something else."""
+    """Refuse foreign transforms whose outputs in a first root do not match their specs."""
     try:
+        # Specs are what a transform declares; only a run shows what it does.
         root = env.reset()
     except Exception as error:
         error.add_note(f"(in the first reset, with task.transforms.{', '.join(foreign)})")
@@ -149,7 +156,7 @@ def _writes(transform: Transform, key: NestedKey) -> bool:
 
 
 def _check_reads(transform: Transform, env: MaskedTransformedEnv) -> None:
-    """Refuse a transform that reads what the env does not emit, which TorchRL finds out in the first step."""
+    """Refuse a transform that reads a key that the env does not emit; TorchRL would fail in the first step only."""
     specs = (env.full_observation_spec, env.full_reward_spec, env.full_done_spec, env.full_action_spec)
     known = {unravel_key(key) for spec in specs for key in spec.keys(True, True)}
     for key in transform.in_keys or ():
@@ -167,7 +174,7 @@ def make(
     overrides: Sequence[str] = (),
     render_mode: str | None = None,
 ) -> MaskedTransformedEnv:
-    """Build a registered task, ready to train on, with keys `"actor"`, `"critic"` (or what groups it has), `"action"`.
+    """Build a registered task, ready to train on, with keys `"actor"`, `"critic"` (or its own groups), `"action"`.
 
     `seed` is of all draws; None keeps the task's own, and if that is None too, draws one. `overrides` are Hydra's, of
     the task's config. A ValueError names the task, field or value that is wrong and what would be valid.

@@ -1,4 +1,4 @@
-"""Runs each term of a new env where nobody looks, so that one that writes what is not its own is refused at once."""
+"""Runs each term of a new env once, so that a term that writes memory of others is refused before the first step."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -21,12 +21,14 @@ def rehearse(
 
     `writing` are the managers of terms that write the worlds, `reading` those of terms that only read them.
     """
+    # Watches all writes, and puts the state back at the end.
     with driver.guard.rehearsal():
         for manager in writing:
             manager.rehearse()
             # The next ones may read what derives from the state.
             driver.world.refresh()
             driver.refreshed()
+        # Motor models and sensors, in the order of an env step.
         laws.apply()
         driver.update_sensors()
         # Twice: what a term changes in a quantity that it is the first to read shows the second time.

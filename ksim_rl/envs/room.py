@@ -1,7 +1,7 @@
-"""Makes an env whose worlds have room for all contacts and constraint rows, as a rehearsal with random actions finds.
+"""Makes an env whose worlds have room for all contacts and constraint rows that a rehearsal finds.
 
-What a model's probe sees are poses of the model alone. What an env's resets, commands and actions make of it may need
-more, which the first steps show: before anything is captured, since room is never added to a world that exists.
+A model's probe sees poses of the model only. Resets, commands and actions of an env may need more room, which the
+first steps with random actions show. This runs before anything is captured, since a world cannot grow later.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ MOST_BUILDS = 5
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Room:
-    """What worlds have room for, and why MuJoCo Warp's own solver solves their constraints, if it does."""
+    """The room of worlds, and the reason why MuJoCo Warp's own solver solves their constraints, if it does."""
 
     njmax: int
     nconmax: int
@@ -46,9 +46,11 @@ def with_room(make: Callable[[], EnvBase], *, note: Callable[[str], None]) -> En
         return env
     first = _room_of(base)
     report = rehearse_room(base)
+    # A contact that is lost also hides its constraint rows, so more may be needed in the next round.
     for _ in range(MOST_BUILDS - 1):
         if not base.world.remember_needs(report):
             break
+        # Before the next build, so that two envs are never in memory together.
         env.close(raise_if_closed=False)
         env = make()
         base = part(env, ManagerBasedRlEnv)
@@ -81,8 +83,11 @@ def _grown(first: _Room, last: _Room) -> str:
 def rehearse_room(env: ManagerBasedRlEnv) -> OverflowReport:
     """Reset all envs, let them take random actions for a second, and put everything back; return what was needed."""
     steps = min(MOST_STEPS, math.ceil(SECONDS / env.step_dt))
+    # Everything below is undone from this state.
     saved = env.state_dict()
+    # Clears what was counted before.
     env.world.overflow_report()
+    # An own generator on the CPU: the same actions on each machine, and the run's draws are not touched.
     generator = torch.Generator().manual_seed(0)
     if env.device.type == "cuda":
         devices = [env.device]
@@ -108,6 +113,7 @@ def _random_actions(env: ManagerBasedRlEnv, generator: torch.Generator) -> Float
     bounds_L2 = env.action_manager.bounds_L2
     if bounds_L2 is None:
         return torch.randn(shape_EL, generator=generator).to(env.device)
+    # Drawn on the host, then moved: the same numbers on each device.
     share_EL = torch.rand(shape_EL, generator=generator).to(env.device)
     low_L, high_L = bounds_L2.unbind(-1)
     return torch.lerp(low_L, high_L, share_EL)

@@ -1,4 +1,4 @@
-"""Finds the keys under which an env says what a step was worth and whether the episode ended."""
+"""Finds the keys of an env's reward and of its flags for the end of an episode."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ class SignalKeys(NamedTuple):
 
     @property
     def following(self) -> list[NestedKey]:
-        """Where reward, done and terminated lie in an env state."""
+        """The keys of reward, done and terminated in an env state."""
         return [unravel_key(("next", key)) for key in self[:3] if key is not None]
 
     def renamed(self, rollout_ET: TensorDictBase) -> TensorDictBase:
@@ -41,10 +41,12 @@ def signal_keys(env: EnvBase) -> SignalKeys:
             f"{type(env).__name__} has the rewards {env.reward_keys}: expected one; add them up, e.g. by TorchRL's "
             "LineariseRewards"
         )
+    # `done_keys` are sorted by depth, so the first match lies highest; nested keys end with the name.
     done, terminated, truncated = (
         next((key for key in env.done_keys if key == name or key[-1] == name), None)
         for name in ("done", "terminated", "truncated")
     )
+    # An env may have only one of the two; then it stands for both.
     ended = done or terminated
     assert ended is not None, "TorchRL completes the flags of every env"
     return SignalKeys(env.reward_keys[0], ended, terminated or ended, truncated)

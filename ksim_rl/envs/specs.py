@@ -1,4 +1,4 @@
-"""Makes the specs of an env: shapes, dtypes and dim names of what it takes and gives, `["E"]`."""
+"""Makes the specs of an env: shapes, dtypes and dim names of its inputs and outputs, `["E"]`."""
 
 from collections.abc import Mapping
 
@@ -30,6 +30,7 @@ def make_specs(
     def unbounded(value: Shaped[Tensor, "*shape"]) -> Unbounded:
         return Unbounded(shape=value.shape, dtype=value.dtype, device=device)
 
+    # An env without commands has no empty "command" in its specs.
     groups = {
         group: composite({name: unbounded(value) for name, value in values.items()})
         for group, values in readings.items()
@@ -37,6 +38,7 @@ def make_specs(
     }
     shape_E1 = torch.Size((*batch_size, 1))
     shape_EL = torch.Size((*batch_size, size))
+    # Only where all columns have bounds; see `ActionManager`.
     action: Unbounded | Bounded = Unbounded(shape=shape_EL, device=device)
     if bounds_L2 is not None:
         low_EL, high_EL = (edge_L.expand(shape_EL).clone() for edge_L in bounds_L2.unbind(-1))
@@ -48,13 +50,14 @@ def make_specs(
     leaves = (groups, {"action": action}, {"reward": Unbounded(shape=shape_E1, device=device)}, flags)
     specs = tuple(map(composite, leaves))
     for spec in specs:
+        # Labels, so that EnvStates made from specs are labelled, too.
         spec.names = [dims.E]
     observation, action_spec, reward, done = specs
     return observation, action_spec, reward, done
 
 
 def misfit(value: object, spec: TensorSpec) -> str:
-    """Return how a value differs from what its spec says of type, dtype and shape, or nothing."""
+    """Return how a value differs from its spec in type, dtype or shape, or nothing."""
     if not isinstance(value, Tensor):
         given = type(value).__name__
     elif value.dtype != spec.dtype or value.shape != spec.shape:

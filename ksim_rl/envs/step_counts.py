@@ -1,4 +1,4 @@
-"""What a config counts in env steps is checked against the length of an episode, which depends on the model, too."""
+"""Checks step counts of a config against the length of an episode, which depends on the model's time step."""
 
 import math
 from collections.abc import Iterator
@@ -16,6 +16,7 @@ def episode_steps(cfg: ManagerBasedRlEnvCfg, step_dt: float) -> int:
     Raises ValueError for more than are counted, and for a delay by which nothing arrives within an episode.
     """
     steps = cfg.episode_length_s / step_dt
+    # Written so that NaN is refused, too.
     if not steps <= MOST_STEPS:
         raise ValueError(
             f"episode_length_s={cfg.episode_length_s:g} is {steps:.3g} env steps of {step_dt:g} s: expected at most "
@@ -24,6 +25,7 @@ def episode_steps(cfg: ManagerBasedRlEnvCfg, step_dt: float) -> int:
     # Rounding first keeps 20 s / 0.02 s at 1000 steps in floating point.
     count = math.ceil(round(steps, 6))
     for where, delay in _delays(cfg):
+        # Without a time limit (0) any delay ends at some time.
         if 0 < count <= delay.max_lag:
             raise ValueError(
                 f"{where}.delay.max_lag={delay.max_lag}: an episode has {count} env steps, so that nothing would "
@@ -39,6 +41,7 @@ def _delays(cfg: ManagerBasedRlEnvCfg) -> Iterator[tuple[str, DelayCfg]]:
         for key, term in group.terms.items():
             if term.delay is not None:
                 yield f"observations.{name}.terms.{key}", term.delay
+    # Transforms have a delay only as an argument of that name.
     for name, transform in cfg.transforms.items():
         delay = transform.arguments.get("delay")
         if isinstance(delay, DelayCfg):

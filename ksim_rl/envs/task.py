@@ -8,7 +8,7 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 
 
 class Training(Protocol):
-    """What this room knows of the settings of training, which stand in rooms above."""
+    """The part of the training settings that this room reads; their classes are in rooms above."""
 
     @property
     def num_envs(self) -> int: ...  # noqa: D102
@@ -25,8 +25,8 @@ class Task:
     `name` is as in `task=<name>`, `description` one line for the table of tasks.
 
     Attributes:
-        training: how it is trained, a `ksim_rl.trainers.TrainingCfg`; the command line overrides it. Other algorithms
-            than its `objective`'s take of it what fits them. None leaves all to the defaults.
+        training: the settings of training, a `ksim_rl.trainers.TrainingCfg`; the command line overrides them. Other
+            algorithms than its `objective` use the fields that fit them. None leaves all to the defaults.
         other_trainings: the same with the settings of other algorithms.
         solved_at: the mean evaluation return that counts as solved; None if there is no such figure.
         suite: the suite of another package that the task is of; "" for our own tasks.

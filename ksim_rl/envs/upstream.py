@@ -17,6 +17,7 @@ from ksim_rl.transforms.innermost import innermost
 
 def can_reset_nothing(env: EnvBase) -> bool:
     """Whether an env resets the rows of any mask: simulators of others and batches of processes reset at least one."""
+    # Their reset is a call of foreign code, which resets at least one.
     if isinstance(innermost(env), _EnvWrapper | BatchedEnvBase):
         return False
     # One "done" at the root, beside "terminated".
@@ -52,6 +53,7 @@ def let_none_keep_names() -> None:
         if len(names) == self.batch_dims and Ellipsis not in names:
             refined = []
             for new, old in zip(names, self.names, strict=True):
+                # None keeps the present name.
                 refined.append(old if new is None else new)
             names = tuple(refined)
         return refine_names(self, *names)

@@ -1,4 +1,4 @@
-"""The view that terms read: the worlds, and what sensors and managers have computed from them."""
+"""The view that terms read: the worlds, and values that sensors and managers compute from them."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -24,7 +24,7 @@ Tracker = TypeVar("Tracker", bound=SensorTracker)
 
 
 class Readings:
-    """What an `EnvView` shows beyond the worlds; managers fill it while the env is constructed, then write in place."""
+    """Values of an `EnvView` beyond the worlds; managers fill it while the env is constructed, then write in place."""
 
     def __init__(self, simulation: Simulation) -> None:
         num_envs = simulation.num_envs
@@ -37,14 +37,16 @@ class Readings:
         self.terminations: dict[str, Bool[Tensor, " E"]] = {}
         self.terminated_E = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.truncated_E = torch.zeros_like(self.terminated_E)
+        # No columns yet: the action manager puts its buffers here.
         self.action_EL = torch.zeros(num_envs, 0, device=device)
         self.last_action_EL = torch.zeros_like(self.action_EL)
+        # Saved with the env, as it is the state of a curriculum.
         self.level = simulation.shared_values.get("curriculum.level", 1.0)
         self.command_cache = simulation.new_cache()
 
 
 class EnvView(WorldView):
-    """The typed view of an env that each term is called with: a `WorldView` with sensors, commands and what was earned.
+    """The typed view of an env that each term is called with: a `WorldView` with sensors, commands and rewards.
 
     Attributes:
         sensors: the readers of `scene.sensors` by name; `contact`, `imu`, `rays` and `camera` give them by kind.
@@ -57,7 +59,7 @@ class EnvView(WorldView):
             time-out, bool [E]; `is_finite_horizon` does not matter here.
         level: the difficulty in [0, 1] that a curriculum drives, [] on the device; 1 where none does. It is one tensor
             for the life of the env, changed in place, so that what scales with difficulty may hold on to it.
-        command_cache: what is computed from commands alone; emptied when they change.
+        command_cache: values that depend on commands only; emptied when these change.
     """
 
     def __init__(self, simulation: Simulation, readings: Readings, **parts: Any) -> None:
@@ -107,6 +109,7 @@ class EnvView(WorldView):
         """Return the reader of a sensor of `cfg.scene.sensors`; a ValueError if there is none of this kind."""
         tracker = self.sensors.get(name)
         if not isinstance(tracker, kind):
+            # Suggest sensors of the right kind only.
             names = [other for other, present in self.sensors.items() if isinstance(present, kind)]
             raise ValueError(f"no {described} {name!r} in scene.sensors: {near(name, names)}")
         return tracker
