@@ -35,12 +35,12 @@ class CollectorCfg(Checked):
     """Options of `RolloutCollector` that a config may set.
 
     `require_graphs` fails where CUDA graphs are unavailable, instead of running slower with a warning.
-    `compile` makes few kernels of what terms and transforms compute, which are compared with the env's own steps before
-    they are used, and again after 1, 2, 4, 8 ... rollouts: rollouts take less time, and are those of the env to
-    rounding. None does so for envs with a `SimulatedWorld`. `eager` runs the Python of each step instead, without
-    kernels and graphs, which takes much longer: for looking for a fault, and for Python that changes from step to step.
-    `stagger_episodes` spreads the time-outs of the envs over an episode's length at the first reset, where the env
-    offers it. The first `warmup` rollouts on CUDA run eagerly. In the config of a run, `rollout_length` may be given
+    `compile` fuses the operations of terms and transforms into few kernels, which are compared with the env's own steps
+    before they are used, and again after 1, 2, 4, 8 ... rollouts: rollouts take less time, and equal the env's own up
+    to rounding. None does so for envs with a `SimulatedWorld`. `eager` runs the Python of each step instead, without
+    kernels and graphs, which takes much longer: for debugging, and for Python that changes from step to step.
+    `stagger_episodes` spreads the time-outs of the envs over an episode's length at the first reset, if the env can
+    do so. The first `warmup` rollouts on CUDA run eagerly. In the config of a run, `rollout_length` may be given
     instead of the dataset's size, which then follows from it and the number of envs.
     """
 
@@ -63,6 +63,7 @@ def _compiles(env: EnvBase, cfg: CollectorCfg) -> bool:
     """Whether the env's step is to become kernels; a ValueError where that is asked for and cannot be."""
     simulated = part(env, SimulatedWorld)
     records = simulated is not None and simulated.world.can_be_recorded
+    # By default exactly where it can be done.
     if cfg.compile is None:
         return records
     if cfg.compile and simulated is not None and not records:
@@ -80,9 +81,9 @@ class RolloutCollector:
     """Runs `policy` in `env` for T steps at a time; envs that end are reset within the rollout.
 
     On CUDA the T steps of policy, physics, terms, transforms and resets are one graph: the first rollouts run eagerly
-    (they warm the kernels up and are as good as any), the next is captured, and from then on each is one launch. On CPU
-    each control step's physics is one Warp graph and torch stays eager. What was recorded is kept true to the Python
-    that it was recorded from; see `Recording`. A FrozenPythonError names Python that cannot be recorded.
+    (they warm the kernels up, and their data count), the next is captured, and from then on each is one launch. On CPU
+    each control step's physics is one Warp graph and torch stays eager. When Python changes, the recording is made
+    again; see `Recording`. A FrozenPythonError names Python that cannot be recorded.
 
     The rollout is the same as that of `EnvBase.rollout(T, policy, break_when_any_done=False, auto_reset=False)`. On
     CUDA the env's `step_and_maybe_reset` must not synchronize (`ManagerBasedRlEnv`, `MaskedTransformedEnv`); on CPU any
@@ -104,6 +105,7 @@ class RolloutCollector:
         if len(env.batch_size) != 1:
             raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E]")
         cfg = cfg or CollectorCfg()
+        # Looked up now, so that a missing clock is an error of the constructor.
         if cfg.stagger_episodes:
             self._clock = part(env, EpisodeClock)
         else:
@@ -123,6 +125,7 @@ class RolloutCollector:
         self._leaves: list[tuple[NestedKey, Tensor]] = []
         device = env.device or torch.device("cpu")
         compiles = _compiles(env, cfg)
+        # In an eager context the graph runs its Python at each call.
         with eagerly(cfg.eager):
             self._run = Captured(
                 self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs
@@ -144,7 +147,9 @@ class RolloutCollector:
         """Run T steps and return the rollout, `["E","T"]`, whose memory the next call overwrites."""
         self.warm_up()
         assert self._root is not None
+        # Python has changed: leaves and reset values may be others, so storage and kernels are made again.
         if self._recording.before_rollout(self._root, self._act):
+            # New transforms may need a reset before the first step with them.
             self._renew_root()
             self._is_allocated = False
             self.warm_up()
@@ -157,6 +162,7 @@ class RolloutCollector:
     @torch.no_grad()
     def warm_up(self) -> None:
         """Compile the env's step, if that has not been done and is wanted; env and draws are left as they were."""
+        # A first reset gives the root, in whose memory all later roots are written.
         if self._root is None:
             self.reset()
         if not self._recording.wants_kernels:
@@ -167,9 +173,10 @@ class RolloutCollector:
             self._allocate(self.compiled_step.env_state_E)
 
     def _act(self) -> TensorDictBase:
-        """Return what the policy makes of the present root; draws do not count."""
+        """Return the policy's output for the present root; random numbers drawn meanwhile are put back."""
         assert self._root is not None
         device = self._run.device
+        # A copy of the tree, as the policy adds its leaves to it.
         with torch.random.fork_rng([device] if device.type == "cuda" else []), _exploring():
             return self.policy(self._root.copy())
 
@@ -200,12 +207,14 @@ class RolloutCollector:
         device = self._run.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             env_state_E = self.policy(self.env.fake_tensordict())
+        # Fills all T rows with the same EnvState, which is enough for kernels to compile.
         for t in range(self.rollout_length):
             self._store(t, env_state_E)
         return self._stored_rollout()
 
     def _stored_rollout(self) -> TensorDict:
         assert self._storage_TE is not None
+        # Stored as [T, E], so that each step writes one dense piece; seen as [E, T] by the algorithms.
         return dims.name(self._storage_TE.transpose(0, 1), dims.E, dims.T)
 
     def __iter__(self) -> Iterator[TensorDict]:
@@ -242,6 +251,7 @@ class RolloutCollector:
 
     def _rollout(self) -> None:
         assert self._root is not None
+        # The policy's leaves are dropped between steps, so that they do not pile up in the root.
         root_keys = list(self._root.keys(True, True))
         root_E = self._root.copy()
         with _exploring(), getattr(self.policy, "steady", nullcontext)():
@@ -252,16 +262,19 @@ class RolloutCollector:
                     self._store(t, self.compiled_step(env_state_E))
                 return
             for t in range(self.rollout_length):
+                # The env's own Python; the first calls are watched for values that a graph would freeze.
                 with self._recording.calling():
                     env_state_E, root_E = self.env.step_and_maybe_reset(self.policy(root_E))
                 self._store(t, env_state_E)
                 root_E = root_E.select(*root_keys)
+        # A graph reads the next rollout's root from the same memory, so it is copied and not replaced.
         for key in root_keys:
             self._root.get(key).copy_(root_E.get(key))
 
     def _store(self, t: int, env_state_E: TensorDictBase) -> None:
         if not self._is_allocated:
             self._allocate(env_state_E)
+        # Policy leaves and env leaves are stored by two calls, so either may lack some of the keys.
         kept = []
         values = []
         for key, leaf_TE in self._leaves:
@@ -273,6 +286,7 @@ class RolloutCollector:
         copy_rows(kept, values)
 
     def _allocate(self, env_state_E: TensorDictBase) -> None:
+        # Here all keys of a step are known: a wrong name in `keys` is an error.
         produced = list(env_state_E.keys(True, True))
         for key in self._keys or []:
             if key not in produced:
@@ -281,6 +295,7 @@ class RolloutCollector:
                 )
         kept_E = env_state_E.select(*(self._keys or produced))
         self._is_allocated = True
+        # Keep the memory where it fits, since algorithms and graphs hold its addresses.
         if self._storage_TE is not None and not self._is_for_others(kept_E):
             return
         storage_TE: Any = kept_E.new_zeros(torch.Size([self.rollout_length, *kept_E.batch_size]))
@@ -288,9 +303,9 @@ class RolloutCollector:
         self._leaves = list(storage_TE.items(True, True))
 
     def _is_for_others(self, kept_E: TensorDictBase) -> bool:
-        """Whether the memory that there is was made for other leaves; a ValueError where one has another shape now.
+        """Whether the present memory was made for other leaves; a ValueError where a leaf has another shape now.
 
-        Who reads rollouts may hold on to their memory, and was made for leaves of these shapes.
+        Readers of rollouts may hold on to their memory, and were made for leaves of these shapes.
         """
         assert self._storage_TE is not None
         present = _kinds(self._storage_TE[0])

@@ -53,7 +53,7 @@ class Update(Protocol):
         """Learn from a rollout `["E","T"]`, without a host sync; on CUDA it is the same memory at each call."""
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured, each a tensor [] on the device, `update/skipped_steps` among them."""
+        """Return the measurements of the last update, each a tensor [] on the device, with `update/skipped_steps`."""
         ...
 
     def check(self, metrics: Mapping[str, float]) -> None:
@@ -72,7 +72,7 @@ class Update(Protocol):
 
 @runtime_checkable
 class HasNotes(Protocol):
-    """An update that has something to say at the start of a run, such as why it is slower than it could be."""
+    """An update with notes for the start of a run, such as why it is slower than it could be."""
 
     @property
     def notes(self) -> Sequence[str]: ...  # noqa: D102
@@ -87,13 +87,13 @@ class HasWarmUp(Protocol):
 
 @runtime_checkable
 class HasProgress(Protocol):
-    """An update that depends on what share of the run, in [0, 1], is done before it, such as by its learning rate."""
+    """An update that depends on the share of the run, in [0, 1], that is done, such as by its learning rate."""
 
     def set_progress(self, done: float) -> None: ...  # noqa: D102
 
 
 def notes_of(update: Update, *, warm_up: bool) -> list[str]:
-    """Return what is to be said of an update at the start of a run, one line each."""
+    """Return the notes about an update for the start of a run, one line each."""
     lacks = f"trainer.warm_up=true does nothing here: {type(update).__name__} has no warm_up(rollout_ET)"
     if isinstance(update, HasNotes):
         own = update.notes
@@ -110,7 +110,7 @@ class Algorithm:
 
     A module of a registered package that holds one at its top level registers it. The third argument of `update` is the
     `state_dict` of the update that a resumed run goes on from, for parts that are made from it; the trainer loads it
-    afterwards. None begins anew.
+    afterwards. None begins from scratch.
     """
 
     name: str  # as in `objective=<name>`
@@ -135,12 +135,14 @@ def part_of(cfg: RunCfg, field: str, kind: type[Part]) -> Part:
 
 def algorithm_of(cfg: RunCfg) -> Algorithm:
     """Return the algorithm of a run; a ValueError where none is registered for its objective."""
+    # By name, as the registry imports this module.
     return importlib.import_module(REGISTRY).serving(type(cfg.objective))
 
 
 def make_update(cfg: RunCfg, env: EnvBase, *, resumed: Mapping[str, Any] | None = None) -> Update:
     """Build everything that learns in a run, with all its memory allocated; see `Algorithm.update`."""
     algorithm = algorithm_of(cfg)
+    # Without means over ranks each would train a policy of its own, unnoticed.
     if ranks.size() > 1 and not algorithm.on_ranks:
         raise ValueError(f"objective={algorithm.name} trains on one rank only: start it without torchrun")
     return algorithm.update(cfg, env, resumed)

@@ -43,15 +43,18 @@ def build(
 
     With `collector.eager` nothing is recorded: the Python of rollouts, evaluations and updates runs each time.
     Torch's global seed, matmul precision and number of CPU threads are set from the config. Without a `run_folder`
-    nothing is written; without `resume_from` the run starts anew, with the weights of `cfg.checkpoint` if it has one.
+    nothing is written; without `resume_from` a new run starts, with the weights of `cfg.checkpoint` if it has one.
     Raises ValueError where a logger's package is missing, or a checkpoint is of another network or env.
     """
+    # First what is cheap to refuse.
     check_installed(cfg.logger)
+    # Before any network is made, as the weights are drawn from it.
     torch.manual_seed(cfg.seed)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     torch.set_num_threads(cfg.trainer.num_threads or default_threads(cfg.resolved_device()))
 
     said: list[str] = []
+    # "auto" may choose the C engine for few envs, which kernels cannot step.
     if cfg.collector.compile and cfg.task.sim.engine == "auto":
         cfg = with_engine(cfg, "warp")
         said.append("collector.compile=true: MuJoCo Warp simulates, as no kernel steps MuJoCo's C engine")
@@ -64,6 +67,7 @@ def build(
         update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
     if cfg.trainer.stop_at and not hooks:  # which may log figures of their own
         check_targets(cfg, update.metrics())
+    # It stores only the leaves that the update reads.
     collector = RolloutCollector(
         env,
         update.behavior,
@@ -89,6 +93,7 @@ def build(
         update.warm_up(collector.made_up_rollout())
     if cfg.trainer.warm_up or collector.compiled_step is not None:
         trainer.warm_up_s = time.monotonic() - began
+    # A resumed run loads everything; a run from a checkpoint only the networks.
     if resume_from is not None:
         with fitting(resume_from.path):
             trainer.load_state_dict(resume_from.state)
@@ -111,12 +116,13 @@ def default_threads(device: torch.device) -> int:
 def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None = None) -> EnvBase:
     """Build the env of a run, with another number of envs and another seed.
 
-    It carries what a recurrent policy remembers, and tells recurrent networks where episodes begin.
+    It carries the memory of a recurrent policy, and tells recurrent networks where episodes begin.
     """
     scene = dataclasses.replace(cfg.task.scene, num_envs=num_envs)
     task = dataclasses.replace(cfg.task, scene=scene, seed=seed)
     env = envs.build(task, device=cfg.resolved_device(), render_mode=render_mode)
     if cfg.modules.recurrent:
+        # Only an actor acts in the env, so only its memory has to travel with the env states.
         actor = cfg.modules.recurrent_actor
         if actor is None:
             primers = []
@@ -135,20 +141,23 @@ def build_evaluator(
     seed: int | None = None,
     note: Callable[[str], None] | None = None,
 ) -> Evaluator:
-    """Build envs for evaluation, without sensor noise and curricula, and what runs a policy in them.
+    """Build an evaluator with its own envs, without sensor noise and curricula.
 
     Weights and ranges are those of the config, whatever curricula have come to in training. With a `note`, which is
     told so, the worlds get room as those of training do, which they have already in the process of a run.
     """
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET
+    # Curricula adapt to training episodes, and must not move in an evaluation.
     cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, curriculum={}))
     all_ranks = episodes or cfg.trainer.eval_episodes
+    # The episodes are shared by the ranks, rounded up.
     make = partial(build_env, cfg, num_envs=-(-all_ranks // ranks.size()), seed=seed)
     if note is None:
         env = make()
     else:
         env = envs.with_room(make, note=note)
+    # Transforms with noise leave it out in this mode.
     env.eval()
     clock = part(env, EpisodeClock)
     max_steps = (clock and clock.max_episode_length) or UNLIMITED_EPISODE_STEPS

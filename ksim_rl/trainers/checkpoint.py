@@ -36,16 +36,16 @@ Columns = Mapping[str, Mapping[str, Sequence[int]]]
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that is absent, damaged, or of another format; the message says which, and what to do."""
+    """Raised for a checkpoint that is absent, damaged, or of another format; the message says which, and what to do."""
 
 
 class UnknownFormatError(CheckpointError):
-    """A checkpoint of a format that this version does not read, and which may be whole."""
+    """Raised for a checkpoint of a format that this version does not read; it may be undamaged."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """What `load` returns: the state as nested dicts, the config and the iteration it was saved after."""
+    """A loaded checkpoint: the state as nested dicts, the config, and the iteration after which it was saved."""
 
     path: Path
     iteration: int
@@ -69,15 +69,17 @@ def save(
 ) -> Path:
     """Write one more checkpoint into `folder`, and drop all but the newest `keep`; an OSError leaves these alone.
 
-    The newest one of those up to the iteration `trusted` stays as well: whether what came later is right is not known
-    yet. With several ranks it has the state of all, which all of them pass here, and rank 0 writes.
+    The newest one up to the iteration `trusted` stays as well, since later iterations are not verified yet. With
+    several ranks all of them call this; the checkpoint has the state of all, and rank 0 writes.
     """
+    # Each rank adds what differs from rank 0's tensors; only then rank 0 comes back here to write.
     if ranks.size() > 1 and RANKS not in state:
         whole = {**state, RANKS: ranks.gathered(state_tree.split(state)[0])}
         given = {"iteration": iteration, "config": config, "keep": keep, "trusted": trusted}
         return Path(ranks.by_first(lambda: str(save(folder, whole, **given))))
     folder.mkdir(exist_ok=True)
     tensors, values = state_tree.split(state)
+    # In memory first: the hash is of exactly the bytes that are written.
     tensor_bytes = safetensors.torch.save(tensors)
     manifest_bytes = _seal(
         {
@@ -89,6 +91,7 @@ def save(
         }
     )
 
+    # Never over an older checkpoint: a resumed run may reach the same iteration again.
     name = _unused_name(folder, iteration)
     temporary = folder / f"{WRITING}{name}"
     try:
@@ -96,14 +99,17 @@ def save(
         _write_durably(temporary / TENSORS, tensor_bytes)
         _write_durably(temporary / MANIFEST, manifest_bytes)
         _flush_folder(temporary)
+        # Atomic on one file system: the valid name appears with whole content or not at all.
         os.replace(temporary, folder / name)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         with suppress(OSError):
             folder.rmdir()  # only where no checkpoint is in it yet
         raise
+    # The new name must be on disk before an older checkpoint goes.
     _flush_folder(folder)
 
+    # Drop old ones, but for the newest that is known to be right.
     last_trusted = newest_until(folder, iteration if trusted is None else trusted)
     for old in saved(folder)[:-keep]:
         if old == last_trusted:
@@ -116,7 +122,7 @@ def save(
 
 
 def own_part(state: Mapping[str, Any], live: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Return what of a checkpoint's state is this rank's; `live` gives the state of the run that takes it."""
+    """Return this rank's part of a checkpoint's state; `live` returns the state of the run that loads it."""
     if RANKS not in state and ranks.size() == 1:
         return state
     tensors, values = state_tree.split({name: part for name, part in state.items() if name != RANKS})
@@ -127,12 +133,15 @@ def load(path: Path) -> Checkpoint:
     """Read a checkpoint of any format, every byte verified first; a CheckpointError says what is damaged or unknown."""
     manifest = _read_manifest(path)
     files = manifest["files"]
+    # An extra file is refused: it could be anything, and its hash is nowhere.
     surplus = {entry.name for entry in path.iterdir()} - {MANIFEST, *files}
     if surplus:
         raise CheckpointError(
             f"{path}: unexpected file {sorted(surplus)[0]!r}; a checkpoint holds only its own"
         )
+    # The limit keeps a forged manifest from filling the memory.
     tensor_bytes = _read_regular_file(path / TENSORS, limit=min(files[TENSORS]["bytes"], MOST_TENSOR_BYTES))
+    # Size before hash, as it tells a truncated copy apart from other damage.
     if len(tensor_bytes) != files[TENSORS]["bytes"]:
         raise CheckpointError(
             f"{path / TENSORS}: damaged: {len(tensor_bytes)} bytes, the manifest says {files[TENSORS]['bytes']}"
@@ -145,6 +154,7 @@ def load(path: Path) -> Checkpoint:
     except (SafetensorError, ValueError) as error:
         raise CheckpointError(f"{path / TENSORS}: not a valid tensor file: {error}") from error
     with fitting(path):
+        # Only after all bytes are verified is an older format brought up to date.
         state, config = checkpoint_formats.migrate(
             state, manifest["config"], version=manifest["format_version"]
         )
@@ -153,7 +163,7 @@ def load(path: Path) -> Checkpoint:
 
 @contextmanager
 def fitting(path: Path) -> Iterator[None]:
-    """Say that a checkpoint is of no such run where what is made of its state lacks a part, or meets another kind.
+    """Turn errors about missing parts or wrong types in a checkpoint's state into a CheckpointError.
 
     A manifest with a right hash may hold anything: hashes have no key.
     """
@@ -187,9 +197,11 @@ def load_latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> C
     if (path / MANIFEST).exists():
         return load(path)
     damage: list[CheckpointError] = []
+    # Newest first, in a run folder or in its folder of checkpoints.
     for candidate in reversed(saved(path / "checkpoint") or saved(path)):
         try:
             found = load(candidate)
+        # An older checkpoint would be taken in silence otherwise, and the run would lose iterations.
         except UnknownFormatError:
             raise
         except CheckpointError as error:
@@ -226,6 +238,7 @@ def check_columns(saved: Columns, own: Columns) -> None:
             faults.append(f"group {group!r}: only the checkpoint has {', '.join(surplus)}")
         if missing:
             faults.append(f"group {group!r}: only this run has {', '.join(missing)}")
+        # A missing term moves all others, so moves are only told on their own.
         if moved and not surplus and not missing:
             places = ", ".join(f"{n} at {list(theirs[n])}, here {list(ours[n])}" for n in moved)
             faults.append(f"group {group!r}: the checkpoint has {places}")
@@ -245,6 +258,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     raw = _read_regular_file(path / MANIFEST, limit=_MAX_MANIFEST_BYTES)
     try:
         manifest = json.loads(raw)["manifest"]
+        # Sealed again and compared byte by byte, so there is only one spelling of a manifest.
         intact = _seal(manifest) == raw
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise CheckpointError(f"{path / MANIFEST}: damaged: {type(error).__name__}: {error}") from error
@@ -254,6 +268,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         version = manifest.get("format_version")
     else:
         version = None
+    # After the hash and before the fields, which other formats may have otherwise.
     if reason := checkpoint_formats.refusal(version):
         raise UnknownFormatError(f"{path}: {reason}")
     files = manifest.get("files")
@@ -297,6 +312,7 @@ def _flush_folder(folder: Path) -> None:
 
 
 def _order(name: str) -> tuple[int, int] | None:
+    # Names are "<iteration>" or "<iteration>_<repeat>"; anything else is no checkpoint.
     number, _, repeat = name.partition("_")
     if number.isdecimal() and (not repeat or repeat.isdecimal()):
         return int(number), int(repeat or 0)

@@ -45,10 +45,10 @@ INTERRUPTED = "sum/interrupted"  # how many ranks were asked to stop
 class Hook:
     """Something to do between iterations: an evaluation, a schedule of your own, a message to somebody.
 
-    When a hook is called, the run is settled: what the device was asked for is done, `trainer.metrics` are those of the
-    present iteration, and the hook may change whatever it likes. CUDA graphs keep the numbers that they were captured
-    with, and are captured anew where these have changed; what changes often, such as a learning rate, reaches them in
-    no time through the tensors that they read: `copy_` into those. Example:
+    When a hook is called, the device has done all queued work, `trainer.metrics` are the present iteration's, and the
+    hook may change anything. CUDA graphs keep the numbers that they were captured with, and are captured again where
+    these have changed, which takes time. Numbers that change often, such as a learning rate, should be tensors that
+    the graphs read: `copy_` into those. Example:
 
         class Annealing(Hook):
             interval = 10
@@ -71,7 +71,7 @@ class Hook:
         """Act once after the last iteration, also of an interrupted run."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what later calls depend on: tensors and plain data, nested; a checkpoint keeps it."""
+        """Return the state that later calls depend on: tensors and plain data, nested; a checkpoint keeps it."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -79,7 +79,7 @@ class Hook:
 
 
 class EvaluationHook(Hook):
-    """Judges the policy in envs of its own, probes the networks in the last rollout, and logs the figures."""
+    """Evaluates the policy in separate envs, probes the networks in the last rollout, and logs the figures."""
 
     def __init__(self, evaluator: Evaluator, *, interval: int) -> None:
         self.evaluator = evaluator
@@ -136,7 +136,7 @@ class CheckpointHook(Hook):
 
 
 class Trainer:
-    """Collects, learns, and beside that logs, evaluates and saves.
+    """The training loop: collects and learns, and logs, evaluates and saves meanwhile.
 
     The metrics of an iteration come to the host in one copy. On CUDA they are read while the next iteration runs, so
     that the device never waits for logs; before a hook is called the run is settled first.
@@ -263,7 +263,7 @@ class Trainer:
         )
 
     def iterate(self) -> None:
-        """Collect a rollout, learn from it, and report what happened: where iterations overlap, in the one before."""
+        """Collect a rollout, learn from it, and report metrics: of the iteration before, where iterations overlap."""
         self.collecting.begin(self.iteration + 1)
         try:
             self.rollout_ET = rollout_ET = self.collector.collect()
@@ -284,7 +284,7 @@ class Trainer:
         self._report(all_but=1 if self._overlaps else 0)
 
     def settle(self) -> None:
-        """Wait until the device has done all that it was asked for, and report it."""
+        """Wait until the device has done all queued work, and report it."""
         self._report(all_but=0)
 
     def log(self, figures: Mapping[str, float]) -> None:
@@ -354,7 +354,7 @@ class Trainer:
         )
 
     def _ask(self, logger: MetricLogger, call: Callable[..., Any], *arguments: Any) -> None:
-        """Call a logger; a full disk or a server that is gone costs what it would have written, not the run."""
+        """Call a logger; a full disk or a server that is gone loses its records, but does not end the run."""
         try:
             call(*arguments)
         except Exception as error:
@@ -380,7 +380,7 @@ class Trainer:
                 self._warn_once(name, f"stop_at: {name!r} is no metric: {near(name, self.metrics)}")
 
     def _warn(self, losses: Sequence[str], metrics: Mapping[str, float], iteration: int) -> None:
-        """Say what went wrong in this iteration, each kind once; the counts stay in the metrics."""
+        """Warn of problems in this iteration, each kind once; the counts stay in the metrics."""
         texts = warnings_of(losses, metrics)
         if (found := metrics.get("sum/non_finite_terms", 0.0)) > self._non_finite_terms:
             self._non_finite_terms = found
