@@ -25,7 +25,7 @@ class DatasetCfg(Checked):
     """How many env states one RL update uses, and in how many gradient steps an epoch splits them.
 
     Recurrent networks learn on `sequence_length` successive steps of an env, None for the whole rollout, whose first
-    state is the stored one, or renewed by `burn_in` steps before it. With several ranks all sizes are those of each.
+    state is the stored one, or renewed by `burn_in` steps before it. With several ranks all sizes are per rank.
     With `shards`, one process draws its minibatches from so many equal parts of its envs, as so many ranks would.
     """
 
@@ -52,6 +52,7 @@ class DatasetCfg(Checked):
 
     def with_rollout_length(self, length: int, num_envs: int) -> "DatasetCfg":
         """Return as many minibatches, of the size that makes T `length`; a ValueError where there is none."""
+        # D = T * E must be M whole minibatches.
         size, rest = divmod(length * num_envs, self.num_minibatches)
         if rest:
             step = self.num_minibatches // math.gcd(num_envs, self.num_minibatches)
@@ -94,6 +95,7 @@ def _near_multiples(value: int, factor: int) -> str:
 
 
 def _near_divisors(number: int, value: int) -> str:
+    # Divisors come in pairs around the square root.
     small = [divisor for divisor in range(1, math.isqrt(number) + 1) if number % divisor == 0]
     divisors = sorted({*small, *(number // divisor for divisor in small)})
     near = [divisor for divisor in divisors if divisor < value][-1:]
@@ -152,7 +154,9 @@ class DatasetBuffer(ReplayBuffer):
                 raise ValueError(
                     f"the data lacks {missing}; it has {sorted(map(str, data.keys(True, True)))}"
                 )
+            # Leaves that no loss reads are not copied; a mask of the data is kept where there is one.
             data = data.select(*self._keys, ("collector", "mask"), strict=False)
+        # Before anything is written, so that a refused rollout leaves the dataset as it was.
         if isinstance(self.sampler, SequenceSampler):
             self.sampler.begin(data.batch_size, batch_size=self.cfg.num_env_states_per_minibatch)
         return super().extend(data, update_priority=update_priority)
@@ -168,6 +172,7 @@ class DatasetBuffer(ReplayBuffer):
 
     def epoch(self) -> Iterator[TensorDictBase]:
         """Yield `num_minibatches` minibatches, as of `sample`, that cover the dataset exactly once, in a new order."""
+        # A minibatch left over from an epoch that was not finished must not begin this one.
         if isinstance(self.sampler, EpochSampler):
             self.sampler.restart()
         # One gather for all minibatches: a quarter of the kernels, and each minibatch is a contiguous slice.
@@ -187,8 +192,9 @@ class DatasetBuffer(ReplayBuffer):
 
 
 def _labelled(data: TensorDictBase, info: dict[Any, Any]) -> TensorDictBase:
-    """Name the dims of a sample `["B"]` or `["B","T"]`, and write into it what its sampler says of burn-in."""
+    """Name the dims of a sample `["B"]` or `["B","T"]`, and write into it the burn-in flags of its sampler."""
     if BURN_IN_KEY in info:
         data.set(BURN_IN_KEY, info[BURN_IN_KEY])
+        # Steps of the burn-in have no loss of their own.
         data.set(MASK_KEY, data.get(MASK_KEY) & info[MASK_KEY])
     return dims.name(data, *(dims.B, dims.T)[: data.batch_dims])

@@ -14,7 +14,7 @@ from ksim_rl import dims
 
 
 class Stateless:
-    """The part of TorchRL writers and samplers without a state of their own: all that they know is the storage's."""
+    """The part of TorchRL writers and samplers that have no state: all that they know is in the storage."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return nothing."""
@@ -64,21 +64,25 @@ class DatasetStorage(TensorStorage):
                 f"the dataset holds {self.max_size} env states, the data has {data.numel()}: batch_size "
                 f"{tuple(data.batch_size)}"
             )
+        # The mask is kept apart: it is computed below, from the data's own and from the finite rows.
         leaves: dict[Any, Tensor] = dict(data.items(include_nested=True, leaves_only=True))
         mask = leaves.pop(MASK_KEY, None)
         if not self.initialized:
             self._allocate(data.exclude(MASK_KEY))
         stored = self._stored_leaves(leaves, data.batch_dims)
+        # Copied into the batch dims of the data, which spares a flattened copy of a time-major rollout.
         for key, leaf_D in stored.items():
             leaf_D.unflatten(0, data.batch_size).copy_(leaves[key])
 
         finite_D1 = _finite_rows(stored.values())
         mask_D1: Tensor = self._storage.get(MASK_KEY)
+        # A row takes part if it is finite, and if the data does not mask it.
         mask_D1.copy_(finite_D1)
         if mask is not None:
             mask_D1.logical_and_(mask.reshape(-1, 1).to(mask_D1.device))
         _replace_rows(stored.values(), keep_D1=finite_D1, donor_D1=mask_D1)
         self.non_finite_count.add_((~finite_D1).sum())
+        # Bookkeeping of TorchRL's storages, which its buffers read.
         self._len = self.max_size
         self._bump_mutation_revision()
         return torch.arange(self.max_size, device=self.device)
@@ -90,6 +94,7 @@ class DatasetStorage(TensorStorage):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue where `state_dict` was taken."""
         super().load_state_dict(state_dict)
+        # The counter follows the content, whose device is known now.
         if self.device == "auto" and self.initialized:
             self.device = self._storage.get(MASK_KEY).device
             self.non_finite_count = self.non_finite_count.to(self.device)
@@ -99,6 +104,7 @@ class DatasetStorage(TensorStorage):
         if self.device == "auto":
             self.device = next(iter(data.values(True, True))).device
             self.non_finite_count = self.non_finite_count.to(self.device)
+        # Zeros, so that all rows are finite from the start.
         content: Any = data.new_zeros(torch.Size([self.max_size]), device=self.device)
         content.set(MASK_KEY, torch.ones((self.max_size, 1), dtype=torch.bool, device=self.device))
         self._storage = dims.name(content, dims.D)
@@ -123,7 +129,7 @@ class DatasetStorage(TensorStorage):
 
 
 class DatasetWriter(Stateless, Writer):
-    """Hands data to the `write` of its storage, which takes a whole dataset or rollout at once."""
+    """Hands data to the `write` of its storage, which takes a whole dataset or rollout."""
 
     _storage: Any
     refusal: ClassVar[str] = (
@@ -167,5 +173,6 @@ def _replace_rows(leaves_D: Iterable[Tensor], *, keep_D1: Tensor, donor_D1: Tens
         row = leaf_D.index_select(0, donor_1)
         if leaf_D.is_floating_point():
             row = row.nan_to_num(0.0, 0.0, 0.0)
+        # Flags per row, broadcast over the dims of the leaf.
         keep = keep_D1.reshape(-1, *[1] * (leaf_D.ndim - 1))
         torch.where(keep, leaf_D, row, out=leaf_D)

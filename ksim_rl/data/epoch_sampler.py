@@ -27,7 +27,7 @@ class EpochSampler(Sampler):
     needs no generator, makes no host sync, can be captured in a CUDA graph (the epoch counter is a device tensor;
     capture whole epochs), and resumes from four integers.
 
-    With `shards`, it draws as so many ranks would: what is stored is so many equal parts, one after the other, and each
+    With `shards`, it draws as so many ranks would: the elements are so many equal parts, one after the other, and each
     of the `num_minibatches` of an epoch has as many elements of each.
     """
 
@@ -89,18 +89,22 @@ class EpochSampler(Sampler):
         self._size = size
         if self._epoch is None or self._epoch.device != device:
             self._epoch = torch.full((), self._first_epoch, dtype=torch.int64, device=device)
+        # The counter on the device keys the draws, so that a replayed graph draws new orders each time.
         orders_KD = self._orders(self._epoch + torch.arange(count, device=device), size)
+        # Without shuffling all orders are the same, and there is nothing to count.
         self._epoch.add_(count * self.shuffle)
         return orders_KD
 
     def _next_part(self, size: int, batch_size: int, device: torch.device) -> Tensor:
         """Return the next `batch_size` elements of the epoch's order of `range(size)`, on the device."""
+        # Another size, or the end of the order: a new epoch begins.
         if size != self._size or self._position == 0:
             self._order_D = self.epoch_orders(1, size, device=device)[0]
         assert self._order_D is not None
         index = self._order_D[self._position : self._position + batch_size]
         self._position += batch_size
         left = size - self._position
+        # TorchRL's iteration over a buffer reads this flag, and how many batches remain.
         self.ran_out = left <= 0 or (self.drop_last and left < batch_size)
         if self.ran_out:
             self._position = 0
@@ -117,10 +121,12 @@ class EpochSampler(Sampler):
         elif size % self.shards:
             raise ValueError(f"{size} elements are no whole number for each of {self.shards} shards")
         else:
+            # A permutation for each shard and epoch, of elements within the shard.
             keys = random.row_keys(epochs.new_full((), self.seed), _STREAM, epochs, self.shards)
             orders_KD = random.permutations(keys, size // self.shards).view(-1, size)
         if self.shards == 1:
             return orders_KD
+        # From shard by shard to minibatch by minibatch: [K, shards, M, B / shards] to [K, M, shards, ...].
         return orders_KD.unflatten(1, (self.shards, self.num_minibatches, -1)).transpose(1, 2).flatten(1)
 
     def state_dict(self) -> dict[str, int]:
@@ -145,6 +151,7 @@ class EpochSampler(Sampler):
         if self._epoch is not None:
             self._epoch.fill_(self._first_epoch)
         if self._position > 0:
+            # The counter is one ahead of the epoch whose order is in use.
             previous = torch.full((1,), self._first_epoch - 1, dtype=torch.int64, device=device)
             self._order_D = self._orders(previous, self._size)[0]
 
@@ -155,7 +162,7 @@ class EpochSampler(Sampler):
         write_whole(folder / "epoch_sampler.json", json.dumps(self.state_dict()))
 
     def loads(self, path: str | Path) -> None:
-        """Read what `dumps` wrote."""
+        """Read the state that `dumps` wrote."""
         self.load_state_dict(
             json.loads(read_bytes(Path(path) / "epoch_sampler.json", limit=MOST_STATE_BYTES))
         )
@@ -181,8 +188,8 @@ class SequenceSampler(EpochSampler):
     """Yields sequences of L successive steps of one env, each once per epoch, in a new random order each epoch.
 
     A rollout of T steps is cut into T / L sequences, so each epoch has every env state exactly once; None is one of T.
-    The indices are [S, L], S the sequences of a minibatch, and so is what a buffer returns. The state that a recurrent
-    network begins a sequence with is the one stored with its first step.
+    The indices are [S, L], S the sequences of a minibatch, and a buffer returns data of that shape. The state that a
+    recurrent network begins a sequence with is the one stored with its first step.
 
     With a burn-in of k, at most L, the indices are [S, k + L]: the k steps before each sequence come with it, so that a
     network can renew its state from the one stored there (Kapturowski et al., "Recurrent experience replay in
@@ -241,16 +248,20 @@ class SequenceSampler(EpochSampler):
         # Within a rollout; negative where there is nothing before it.
         offset_T = torch.arange(-self.burn_in, length, device=device)
         step_ST = (sequence_S * length % steps)[:, None] + offset_T
+        # Which env a sequence is of, as rollouts lie one after the other.
         rollout_S1 = (sequence_S * length // steps)[:, None]
+        # Before the first step there is nothing to read: it stands there instead, and is masked.
         clamped_ST = step_ST.clamp_min(0)
         index: Any = rollout_S1 * steps + clamped_ST
         if storage.ndim > 1:
+            # A storage of two dims is indexed by step and env.
             index = (clamped_ST, rollout_S1.expand_as(clamped_ST))
         if not self.burn_in:
             return index, {}
         before_T = offset_T < 0
         return index, {
             MASK_KEY: (~before_T).expand_as(step_ST).unsqueeze(-1),
+            # Only true steps before a sequence renew its state.
             BURN_IN_KEY: (before_T & (step_ST >= 0)).unsqueeze(-1),
         }
 

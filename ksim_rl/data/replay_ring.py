@@ -24,8 +24,8 @@ class ReplaySampler(Stateless, Sampler):
     """Draws env states of a `ReplayStorage`, each with the same probability, with replacement.
 
     A place is drawn among all that may hold an env state. Those that do not (terminal observations, env states that are
-    not finite) are drawn again, up to `tries` times; what is left then is masked: with a share q of such places,
-    q^tries of a minibatch. The first that holds one is taken, so what is drawn is exactly uniform over the env states.
+    not finite) are drawn again, up to `tries` times; any that are left then are masked: with a share q of such places,
+    q^tries of a minibatch. The first that holds one is taken, so the draw is exactly uniform over the env states.
     Makes no host sync; numbers come from torch's default generator of the device. With `shards`, minibatches of
     `minibatch` have as many of each of so many equal parts of the envs, as ranks would draw.
     """
@@ -39,27 +39,33 @@ class ReplaySampler(Stateless, Sampler):
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
         """Return indices [B] and an empty info dict."""
         assert isinstance(storage, ReplayStorage)
+        # All tries are drawn together: to draw again where a place is empty would need the host.
         shape = (self.tries, batch_size)
         device = storage.device
         env = ranks.randint(storage.num_envs // self.shards, shape, dim=1, device=device)
         if self.shards > 1:
             first_S = torch.arange(0, storage.num_envs, storage.num_envs // self.shards, device=device)
+            # Part s of the batch is from the envs of shard s.
             env += first_S.repeat_interleave(batch_size // self.shards)
         # float64: float32 cannot tell the places of a ring of more than 2^24.
         unit = ranks.rand(shape, dim=1, dtype=torch.float64, device=device)
+        # No place older than the fullest ring's oldest; envs that ended more episodes fill sooner.
         oldest = ranks.most_of(storage.filled_E.amax())
+        # Age 1 is the newest env state: the place of the newest observation holds none.
         age = 1 + (unit * oldest.clamp_min(1)).to(torch.int64)
         index = storage.index(env, age)
+        # The first try that holds an env state, or try 0 where none does.
         first = storage.available[index].to(torch.uint8).argmax(0, keepdim=True)
         index_B = index.gather(0, first).squeeze(0)
         if self.shards > 1:
+            # From shard by shard to minibatch by minibatch, each with its part of every shard.
             in_shards = index_B.view(self.shards, -1, self.minibatch // self.shards)
             index_B = in_shards.transpose(0, 1).reshape(-1)
         return index_B, {}
 
 
 class PrioritySampler(SavedByStateDict, Sampler):
-    """Draws what is stored in proportion to (priority + eps)^alpha (Schaul et al., arXiv 1511.05952), with replacement.
+    """Draws entries in proportion to (priority + eps)^alpha (Schaul et al., arXiv 1511.05952), with replacement.
 
     It stands in for TorchRL's `PrioritizedSampler` in any replay buffer whose storage has one dim, with the default
     priority of the paper: the highest so far, 1 at the start. Give it priorities by the buffer's
@@ -87,6 +93,7 @@ class PrioritySampler(SavedByStateDict, Sampler):
         self.beta = beta
         self.eps = eps
         self._priority_N = torch.zeros(max_capacity, device=device)
+        # The highest priority so far, which new entries get, so that each is drawn soon.
         self._highest = torch.zeros((), device=device)
 
     @torch.no_grad()
@@ -115,9 +122,11 @@ class PrioritySampler(SavedByStateDict, Sampler):
         index_B = torch.as_tensor(index, device=device).reshape(-1)
         priority_B = torch.as_tensor(priority, dtype=torch.float32, device=device).reshape(-1)
         priority_B = priority_B.expand(index_B.shape[0])
+        # A loss that is not finite says nothing about its entry.
         valid_B = priority_B.isfinite() & (priority_B >= 0.0)
         self._highest.copy_(torch.maximum(self._highest, torch.where(valid_B, priority_B, 0.0).amax()))
         priority_B = torch.where(valid_B, priority_B, self._default())
+        # The highest of several: an order of writes would differ from run to run.
         self._priority_N.scatter_reduce_(0, index_B, priority_B, "amax", include_self=False)
 
     @torch.no_grad()
@@ -128,7 +137,7 @@ class PrioritySampler(SavedByStateDict, Sampler):
                 f"the storage has ndim={storage.ndim}: PrioritySampler draws from storages of one dim; use ndim=1 and "
                 "extend by data with one batch dim"
             )
-        # (priority + eps)^alpha of what is stored, and 0 elsewhere.
+        # (priority + eps)^alpha of stored entries, and 0 elsewhere.
         score_N = (self._priority_N.to(torch.float64) + self.eps).pow(self.alpha)
         is_ring = isinstance(storage, ReplayStorage)
         if is_ring:
@@ -139,6 +148,7 @@ class PrioritySampler(SavedByStateDict, Sampler):
         unit = score_N.amax().clamp_min(1e-300) * (score_N.shape[0] / 2.0**62)
         upto_N = (score_N / unit).to(torch.int64).cumsum(0)
         device = upto_N.device
+        # Stratified draws: number i lies in share i of B equal parts.
         share_B = torch.arange(batch_size, dtype=torch.float64, device=device)
         share_B = (share_B + torch.rand(batch_size, dtype=torch.float64, device=device)) / batch_size
         # Rounding could lead past the last entry that has a score.
@@ -146,7 +156,7 @@ class PrioritySampler(SavedByStateDict, Sampler):
         index_B = torch.searchsorted(upto_N, (share_B * upto_N[-1]).to(torch.int64), right=True)
         index_B = torch.minimum(index_B, last)
         lowest = torch.where(score_N > 0.0, score_N, torch.inf).amin()
-        # Where nothing has a score, what is drawn is masked: a finite weight keeps the losses' means finite.
+        # Where nothing has a score, the draws are masked: a finite weight keeps the losses' means finite.
         weight_B = (score_N[index_B] / lowest).pow(-self.beta).clamp_max(1.0).to(torch.float32)
         return index_B, {"priority_weight": weight_B}
 
@@ -185,19 +195,19 @@ class ReplayCfg(Checked):
     num_env_states_per_minibatch: Count
     num_minibatches: Count  # per iteration
     num_steps: Count = 1  # of each env per iteration
-    capacity: Count = 1024  # env states per env; an episode's end takes one more, for what it ends with
+    capacity: Count = 1024  # env states per env; an episode's end takes one more, for its last observation
     n_step: Count = 1  # rewards that a target sums before it bootstraps
     learning_starts: Count = 10  # steps of each env with random actions before the first gradient step
     prioritized: bool = False  # by the last temporal-difference error (Schaul et al., arXiv 1511.05952)
     priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
     priority_beta: Share = 0.4  # how far the weights of the losses undo that; 1 is wholly
     save_replay: bool = True
-    shards: Count = 1  # equal parts of the envs, of which minibatches have as many each: what ranks do
+    shards: Count = 1  # equal parts of the envs, of which minibatches have as many each, as with ranks
 
     def _check_fields(self) -> None:
         """Refuse a ring that is too small for its rollouts."""
         super()._check_fields()
-        # A rollout whose episodes all end at once takes two places per env state, and must not overwrite itself.
+        # A rollout whose episodes all end together takes two places per env state, and must not overwrite itself.
         least = 2 * self.num_steps + self.n_step
         if self.capacity < least:
             raise ValueError(
@@ -222,7 +232,7 @@ class ReplayCfg(Checked):
 
 
 class ReplayRing(ReplayBuffer):
-    """Holds the last env states of each env and yields minibatches of B of them, with what follows n steps later.
+    """Holds the last env states of each env and yields minibatches of B of them, with their successors n steps later.
 
     Its TorchRL parts are `ReplayStorage`, whose other arguments are `of_storage`, `ReplaySampler` or `PrioritySampler`,
     and `ReplayWriter`. `extend` takes rollouts `["E","T"]`. None of its methods makes a host sync, so all can be

@@ -36,13 +36,13 @@ class ReplayStorage(SavedByStateDict, Storage):
     """A TorchRL storage of the last `capacity` env states of E envs, at addresses that never change.
 
     Each env has a ring of places. An env state takes one: its observation, action, reward and flags. The observation
-    that follows it lies in the next place, as that of the next env state; only where an episode ends is a place spent
+    that follows it lies in the next place, with the next env state; only where an episode ends is a place spent
     on the terminal observation. So an env state costs its observation once, not twice: for Go1 (120 observed numbers,
     12 actions) 535 bytes instead of 1015, 2.2 GB for 1000 env states of 4096 envs. One more place holds the newest one.
 
     `write` and `get` make no host sync and can be captured in a CUDA graph: the next one's place is on the device.
 
-    `get` returns env states with what follows `n_step` steps later: ("next", "reward") is the sum of discounted rewards
+    `get` returns env states and their successors `n_step` steps on: ("next", "reward") is the sum of discounted rewards
     until then, and "steps_to_next_obs" says how many they are, as TorchRL's losses read it. The sum ends early at the
     end of an episode, whose terminal observation follows, at an env state that is not finite, and at the newest one.
 
@@ -61,6 +61,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         gamma: float = 0.99,
         device: torch.device | str = "cpu",
     ) -> None:
+        # One more, for the newest observation, whose env state is not complete yet.
         self.places = capacity + 1
         super().__init__(self.places * num_envs)
         self.num_envs = num_envs
@@ -69,6 +70,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         self.device = torch.device(device)
         self.observations = list(observations)
         self.content: TensorDict | None = None
+        # By place: whether it holds an env state. By env: the newest observation's place, and how many are filled.
         self.available = torch.zeros(self.max_size, dtype=torch.bool, device=self.device)
         self.head_E = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.filled_E = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
@@ -96,41 +98,49 @@ class ReplayStorage(SavedByStateDict, Storage):
             self._allocate(rollout_ET)
         assert self.content is not None
 
+        # An env state takes one place, and at the end of an episode one more for the terminal observation.
         done_ET = rollout_ET.get(DONE).reshape(self.num_envs, length)
         places_ET = 1 + done_ET.to(torch.int64)
+        # Places taken by the rollout before each step, so that all of it is written in one go.
         before_ET = places_ET.cumsum(1) - places_ET
         place_ET = self.head_E[:, None] + before_ET
+        # A place of an env is a row of the storage at place * num_envs + env.
         index_N = (place_ET % self.places * self.num_envs + self._env_E[:, None]).flatten()
         following_N = ((place_ET + 1) % self.places * self.num_envs + self._env_E[:, None]).flatten()
 
         self._cut_where_not_continued(rollout_ET)
+        # One element that is not finite makes its env state invalid, whichever leaf it is in.
         finite_N = torch.ones(self.num_envs * length, dtype=torch.bool, device=self.device)
         for key, leaf in self.content.items(True, True):
             if key in self.observations:
-                # What follows the last env state of a rollout is the newest observation, until the next rollout
+                # The successor of a rollout's last env state is the newest observation, until the next rollout
                 # brings it as its first.
                 finite_N &= self._put(leaf, following_N, rollout_ET.get(_next(key)))
             finite_N &= self._put(leaf, index_N, rollout_ET.get(key))
+        # First all successors, of which many are env states of this rollout and become available next.
         self.available.index_fill_(0, following_N, False)
         self.available.index_copy_(0, index_N, finite_N)
         self.non_finite_count.add_((~finite_N).sum())
+        # In place: a captured write finds the next places where this one has left them.
         taken_E = places_ET.sum(1)
         self.head_E.add_(taken_E).remainder_(self.places)
         self.filled_E.add_(taken_E).clamp_max_(self.places - 1)
-        # After the end of an episode the newest observation's place still has what was there a round ago.
+        # After the end of an episode the newest observation's place still has its env state of a round ago.
         self.available.index_fill_(0, self._head_index(), False)
         return index_N
 
     @torch.no_grad()
     def get(self, index: Any) -> TensorDict:
-        """Return env states with what follows them, `["B"]`, for their indices int64 [B]."""
+        """Return env states with their successors, `["B"]`, for their indices int64 [B]."""
         if self.content is None:
             raise RuntimeError("the replay is empty: extend it before sampling")
         index_B = torch.as_tensor(index, device=self.device).reshape(-1)
         reward_B, done_B, terminated_B, steps_B = self._return(index_B)
+        # Rows of one env are num_envs apart, and the ring closes at the end of the storage.
         following_B = (index_B + steps_B * self.num_envs) % self.max_size
         sample = TensorDict({}, batch_size=index_B.shape, device=self.device)
         for key, leaf in self.content.items(True, True):
+            # Rewards and flags cover all steps up to the successor, and are set below.
             if key not in _LEAVES:
                 sample.set(key, leaf[index_B])
             if key in self.observations:
@@ -172,6 +182,7 @@ class ReplayStorage(SavedByStateDict, Storage):
                 f"the checkpoint's replay has {state_dict['available'].numel()} places, this run's "
                 f"{self.max_size}: num_envs and data.capacity must be those of the checkpoint"
             )
+        # The ring may not exist yet in this run, or be filled where the checkpoint's is empty.
         content = {tuple(name.split("/")): leaf for name, leaf in state_dict["content"].items()}
         if not content:
             self._empty()
@@ -199,8 +210,9 @@ class ReplayStorage(SavedByStateDict, Storage):
         missing = [key for key in needed if key not in produced]
         if missing:
             raise ValueError(f"the rollout lacks {missing}; it has {sorted(map(str, produced))}")
+        # Under "next" only rewards and flags are stored: observations there lie in the next place.
         kept_ET = rollout_ET.select(*(key for key in produced if key[0] != "next" or key in _LEAVES))
-        # Asked for as a whole first: a refusal then names what all of it takes, and not its first leaf.
+        # Asked for as a whole first: a refusal then names the size of all of it, and not of its first leaf.
         row = sum(leaf[0, 0].nbytes for leaf in kept_ET.values(True, True))
         torch.empty(self.max_size * row, dtype=torch.uint8, device=self.device)
         self.content = kept_ET.new_zeros(torch.Size([self.max_size]), device=self.device)
@@ -210,9 +222,10 @@ class ReplayStorage(SavedByStateDict, Storage):
         return self.head_E * self.num_envs + self._env_E
 
     def _cut_where_not_continued(self, rollout_ET: TensorDictBase) -> None:
-        """Drop the newest env state of envs that were reset in between: what followed it is about to be overwritten."""
+        """Drop the newest env state of envs that were reset in between: its successor is about to be overwritten."""
         assert self.content is not None
         head_E = self._head_index()
+        # The env was not reset in between if its newest observation is the first one of this rollout.
         newest_E = self.index(self._env_E, torch.ones_like(self._env_E))
         continued_E = self.available[newest_E]
         for key in self.observations:
@@ -232,13 +245,14 @@ class ReplayStorage(SavedByStateDict, Storage):
         return values_N.isfinite().reshape(index_N.numel(), -1).all(1)
 
     def _return(self, start_B: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the sum of rewards, done, terminated and the number of steps until what follows, each [B]."""
+        """Return the sum of rewards, done, terminated and the number of steps to the successor, each [B]."""
         assert self.content is not None
         rewards, dones, ends = (self.content.get(key).reshape(-1) for key in _LEAVES)
         reward_B = rewards[start_B]
         done_B = dones[start_B]
         terminated_B = ends[start_B]
         steps_B = torch.ones_like(start_B)
+        # A sum goes on while the env states are stored and the episode lasts.
         going_B = self.available[start_B] & ~done_B
         for step in range(1, self.n_step):
             index_B = (start_B + step * self.num_envs) % self.max_size

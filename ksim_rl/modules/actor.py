@@ -41,12 +41,12 @@ class ActorCfg(OnPolicyNetworkCfg):
 
     Attributes:
         distribution: of continuous actions: "gaussian", or within bounds "tanh_gaussian" or "truncated_gaussian".
-            "categorical" where all actions are discrete; beside continuous ones, discrete ones always are.
+            "categorical" where all actions are discrete; discrete ones among continuous ones always are.
         action_bound: the bounded distributions lie in [-action_bound, action_bound] where the env's action spec has no
             bounds; None refuses such a spec.
         init_std: standard deviation of each action at the start, in units of the action; of the bounded distributions
             in units of half the range, before the tanh or the truncation.
-        min_std: what no standard deviation falls below, in units of `init_std`: how broadly it always explores.
+        min_std: lower bound of standard deviations, in units of `init_std`: how broadly it always explores.
         std_type: "scalar" learns the standard deviation itself, "log" its logarithm.
         state_dependent_std: predict the standard deviation from the state instead of learning one per action.
         output_gain: scale of the last layer's weights. Small, so that the first policy acts around zero (the default
@@ -100,6 +100,7 @@ class GaussianHead(nn.Module):
                 offset = math.log(init_std)
             else:
                 offset = math.log(math.expm1(init_std))
+            # Gain zero: the standard deviation begins the same in every state.
             self.std_layer = linear(feature_dim, action_dim, gain=0.0, device=device)
             nn.init.constant_(self.std_layer.bias, offset)
         else:
@@ -182,6 +183,7 @@ class TruncatedGaussianHead(TanhGaussianHead):
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
         """Return `(loc, scale)`."""
         loc, scale = super().forward(features)
+        # The unbounded output of the layer becomes a mean inside of the box.
         center = (self.high + self.low) / 2
         half_range = (self.high - self.low) / 2
         return center + half_range * torch.tanh(loc), half_range * scale
@@ -233,7 +235,7 @@ class MixedHead(nn.Module):
         return tuple(parameter for head in self.heads for parameter in head(features))
 
     def distribution(self, params: TensorDictBase) -> CompositeDistribution:
-        """Return the distribution of all actions; `params` is what stands under "params"."""
+        """Return the distribution of all actions; `params` is the entry at "params"."""
         parts: dict[Any, Any] = {}
         for key, head in zip(self.action_keys, self.heads, strict=True):
             parameters = {name: params.get((*path_of(key), name)) for name in head.parameter_names}  # type: ignore[union-attr]
@@ -247,7 +249,7 @@ def action_range(
     """Return the lowest and highest action: the bounds of the spec, or -bound and bound where it has none.
 
     Off-policy methods need bounded actions: their critics are asked about whatever the policy proposes, and there is no
-    trust region that keeps it near what was tried. `bound` is in the units of the action, before its term's own scale.
+    trust region that keeps it near tried actions. `bound` is in the units of the action, before its term's own scale.
     """
     low, high = (getattr(getattr(spec, "space", None), name, None) for name in ("low", "high"))
     shape = spec.shape[-1:]
@@ -297,7 +299,7 @@ def _leaves(action_spec: TensorSpec) -> dict[NestedKey, tuple[TensorSpec, torch.
     if isinstance(action_spec, Composite):
         batch_dims = len(action_spec.shape)
         return {key: (leaf, leaf.shape[batch_dims:]) for key, leaf in action_spec.items(True, True)}
-    # An index has no dim of its own.
+    # An index adds no dim.
     if type(action_spec) is specs.Categorical:
         own_dims = 0
     else:
@@ -341,6 +343,7 @@ def _continuous(
         raise ValueError(f"action {key!r} has shape {shape}: expected one dim")
     if cfg.distribution == "gaussian":
         return GaussianHead(cfg, action_dim=shape[0], **layer)
+    # Without `action_bound` a spec without bounds gives infinite ones, which are refused below.
     low_L, high_L = action_range(leaf, math.inf if cfg.action_bound is None else cfg.action_bound)
     if not bool((low_L.isfinite() & high_L.isfinite()).all()):
         raise ValueError(
@@ -375,7 +378,7 @@ def make_actor(
 
     It reads `cfg.in_keys`, `obs_dim` numbers side by side, and writes the parameters of the distribution (`loc` and
     `scale`, or `logits`), `action` and `action_log_prob` [...]. Of several actions it writes each at its key, with
-    `<key>_log_prob` beside it, and the parameters under `("params", *key)`: the layout of `CompositeDistribution`. It
+    `<key>_log_prob`, and the parameters under `("params", *key)`: the layout of `CompositeDistribution`. It
     samples unless TorchRL's exploration type says otherwise; `ExplorationType.DETERMINISTIC` gives the mean, the median
     or the mode. `action_spec` is the env's `full_action_spec`, or the spec of its one action; `action_dim` stands for
     one action without bounds. Raises ValueError where `cfg.distribution` does not go with the spec.

@@ -61,13 +61,14 @@ class BoundedActor(ObservingNetwork):
     ) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
         self.cfg = cfg
+        # Persistent buffers: a checkpoint for other bounds is refused by them.
         low, high = action_range(action_spec, cfg.action_bound, device=device)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.layers = cfg.build(obs_dim, self.outputs_per_action * action_spec.shape[-1], device=device)
 
     def output(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch output_dim"]:
-        """Return what the last layer says."""
+        """Return the outputs of the last layer, in float32 at least."""
         # Half precision would round the squashed action, and its density.
         out = self.layers(self.observe(obs))
         return out.to(torch.promote_types(out.dtype, torch.float32))
@@ -80,6 +81,7 @@ class DeterministicPolicy(BoundedActor):
         """Return the action, in [low, high]."""
         center = (self.high + self.low) / 2
         half_range = (self.high - self.low) / 2
+        # The tanh keeps actions in the box, and lets gradients through everywhere.
         return center + half_range * self.output(obs).tanh()
 
 

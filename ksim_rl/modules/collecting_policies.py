@@ -17,7 +17,7 @@ class ExploringPolicy(TensorDictModuleBase):
     """Lets a policy act with noise on its actions, and before learning starts with random actions instead.
 
     Each env has its own scale of noise, drawn uniformly from [noise_min, noise_max], in units of half the range of an
-    action, and drawn anew at the end of an episode, so that one batch of envs explores both timidly and boldly (Seo et
+    action, and drawn again at the end of an episode, so that one batch of envs explores both timidly and boldly (Seo et
     al., "FastTD3", arXiv 2505.22642). Zeros add none, for policies that draw their actions themselves. Draws come from
     torch's default generator; nothing here makes a host sync.
     """
@@ -43,6 +43,7 @@ class ExploringPolicy(TensorDictModuleBase):
         self.noise_max = noise_max
         self._low_L = low_L
         self._high_L = high_L
+        # On the device, so that a captured step follows when learning starts.
         self.register_buffer("random", torch.ones((), dtype=torch.bool, device=low_L.device))
         self.register_buffer("noise_scale_E1", self._draw_scales(num_envs))
 
@@ -54,17 +55,19 @@ class ExploringPolicy(TensorDictModuleBase):
             half_range = (self._high_L - self._low_L) / 2
             noise = ranks.randn(action.shape, device=action.device) * self.noise_scale_E1 * half_range
             action = torch.maximum(torch.minimum(action + noise, self._high_L), self._low_L)
+        # Uniform actions are drawn always: a branch on `random` would read it on the host.
         anything = self._low_L + ranks.rand(action.shape, device=action.device) * (self._high_L - self._low_L)
         return tensordict.set("action", torch.where(self.random, anything, action))
 
     @torch.no_grad()
     def end_episodes_(self, done_E: Bool[Tensor, " E"]) -> None:
         """Draw new scales of noise for the envs that `done_E` marks."""
+        # Drawn for all envs, taken where an episode ends: no size depends on data.
         fresh_E1 = self._draw_scales(done_E.shape[0])
         self.noise_scale_E1.copy_(torch.where(done_E[:, None], fresh_E1, self.noise_scale_E1))
 
     def exploration_state(self) -> dict[str, Shaped[Tensor, "*?shape"]]:
-        """Return what is this policy's own, without its actor: tensors that `load` may copy into."""
+        """Return this policy's own state, without its actor: tensors that `load` may copy into."""
         return {"random": self.random, "noise_scale": self.noise_scale_E1}
 
     def _draw_scales(self, num_envs: int) -> Tensor:
@@ -76,7 +79,7 @@ class MixedPolicy(TensorDictModuleBase):
     """Lets the teacher act with a chance of `share` in each env state, and the student otherwise.
 
     That is the policy that DAgger collects with (Ross et al., arXiv 1011.0686, algorithm 3.1). All but the action is
-    what the student writes. The teacher reads `teacher_keys` and acts deterministically; None leaves all to the
+    written by the student. The teacher reads `teacher_keys` and acts deterministically; None leaves all to the
     student. `share` may change in place. With `explores=False` the student takes the actions that it finds best. Draws
     come from torch's default generator; nothing here makes a host sync.
     """
@@ -102,7 +105,8 @@ class MixedPolicy(TensorDictModuleBase):
         self.register_buffer("share", share)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write "action" [E, action_dim], and beside it what the student writes."""
+        """Write "action" [E, action_dim], and all other outputs of the student."""
+        # Before the student writes, which may change keys that the teacher reads.
         seen = tensordict.select(*self._teacher_keys)
         with set_exploration_type(exploration_type() if self.explores else ExplorationType.DETERMINISTIC):
             acted = self.student(tensordict)
@@ -112,5 +116,6 @@ class MixedPolicy(TensorDictModuleBase):
             shown = self.teacher(seen).get("action")
         action = acted.get("action")
         helped_E = ranks.rand(acted.batch_size, device=action.device) < self.share
+        # One draw per env state, for all dims of its action.
         helped = helped_E.reshape(*acted.batch_size, *[1] * (action.ndim - acted.batch_dims))
         return acted.set("action", torch.where(helped, shown, action))

@@ -1,4 +1,4 @@
-"""Builds networks that judge: values of states and of actions, and transitions beside those of a motion."""
+"""Builds networks that judge: values of states and of actions, and how much transitions look like a motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -68,7 +68,7 @@ class QNetworkCfg(OffPolicyNetworkCfg):
 
 
 class QNetwork(ObservingNetwork):
-    """Maps observation [..., L] and action [..., action_dim] to what N networks predict, with atoms at `support`."""
+    """Maps observation [..., L] and action [..., action_dim] to predictions of N networks, with atoms at `support`."""
 
     support: Tensor | None
 
@@ -86,8 +86,10 @@ class QNetwork(ObservingNetwork):
         self, obs: Float[Tensor, "*batch L"], action: Float[Tensor, "*batch action_dim"]
     ) -> Float[Tensor, "*batch N"] | Float[Tensor, "*batch N A"]:
         """Return action values [..., N], or with atoms the logits of their probabilities [..., N, A]."""
+        # Actions are not normalized: the bounds of the env fix their range.
         features = torch.cat((self.observe(obs), action), dim=-1)
         batch = features.shape[:-1]
+        # One copy of the features for all networks, then [N, B, A] to [..., N, A].
         out = self.layers(features.reshape(1, -1, features.shape[-1])).transpose(0, 1).unflatten(0, batch)
         if self.support is None:
             return out.squeeze(-1)
@@ -122,10 +124,11 @@ class Discriminator(nn.Module):
     ) -> None:
         super().__init__()
         self.normalizer = ObservationNormalizer(dim, device=device)
+        # One normalizer for both frames: a feature has the same scale before and after the step.
         self.layers = mlp(2 * dim, hidden_dims, 1, activation=activation, device=device)
 
     def normalized(self, transition: Float[Tensor, "*batch 2 L"]) -> Float[Tensor, "*batch L+L"]:
-        """Return what the layers read of transitions."""
+        """Return the inputs of the layers for transitions: normalized, side by side."""
         return self.normalizer(transition).flatten(-2)
 
     def judge(self, normalized: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch"]:

@@ -48,7 +48,7 @@ class VectorDistribution(Distribution):
 
 
 class BoundedDistribution(VectorDistribution, ABC):
-    """The base of those whose components lie in [low, high], both numbers or both tensors [L]."""
+    """The base of distributions whose components lie in [low, high], both numbers or both tensors [L]."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class BoundedDistribution(VectorDistribution, ABC):
 
     @abstractmethod
     def _prepare(self, low: Any, high: Any) -> None:
-        """Compute once what several quantities need."""
+        """Compute quantities that several methods share, once."""
 
     def _clamp(self, value: Tensor) -> Tensor:
         return value.clamp(self.low, self.high)  # type: ignore[arg-type]
@@ -167,11 +167,11 @@ class TanhGaussian(BoundedDistribution):
         return self._squash(latent), self._log_density(latent)
 
     def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
-        """Return the log density in nats, of a value beyond the bounds that of the last value inside."""
+        """Return the log density in nats; a value beyond the bounds has the density of the last value inside."""
         return self._log_density(self.latent(value))
 
     def latent(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*value L"]:
-        """Return the `u` of a value, of one beyond the bounds that of the last value inside."""
+        """Return the `u` of a value; a value beyond the bounds has the `u` of the last value inside."""
         # Of the value: parameters of fewer bits would take most actions near a bound for others.
         inside = 1.0 - torch.finfo(value.dtype).eps
         return torch.atanh(((value - self._center) / self._half_range).clamp(-inside, inside))
@@ -181,6 +181,7 @@ class TanhGaussian(BoundedDistribution):
         return self._clamp(self._center + self._half_range * latent.tanh())
 
     def _log_density(self, latent: Tensor) -> Tensor:
+        # The logarithm of 1 - tanh(u)^2, in a form that is exact for large |u| too.
         log_slope = 2.0 * (math.log(2.0) - latent - functional.softplus(-2.0 * latent))
         half_range = self._half_range
         if isinstance(half_range, Tensor):
@@ -189,7 +190,7 @@ class TanhGaussian(BoundedDistribution):
             log_half_range = math.log(half_range)
         terms = self.base.log_densities(latent) - log_slope - log_half_range
         if torch.compiler.is_compiling():
-            # The compiler would compute what a sum adds up by few, long threads. No product rounds float64.
+            # The compiler would add up the terms of a sum by few, long threads. No product rounds float64.
             ones = torch.ones(terms.shape[-1], 1, dtype=torch.float64, device=terms.device)
             return (terms.to(torch.float64) @ ones).squeeze(-1).to(terms.dtype)
         return terms.sum(-1)
@@ -213,6 +214,7 @@ class TruncatedGaussian(BoundedDistribution):
     def _prepare(self, low: Any, high: Any) -> None:
         left = (low - self.loc) / self.scale
         right = (high - self.loc) / self.scale
+        # Left of loc both distribution functions are small, and their difference keeps its digits.
         mirrored = left + right > 0.0
         self._sign = torch.where(mirrored, -1.0, 1.0).to(self.loc.dtype)
         # The bounds in standard deviations from loc, in the mirror image where that is taken.
@@ -238,22 +240,26 @@ class TruncatedGaussian(BoundedDistribution):
         return self.scale.square() * (second - first.square())
 
     def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
-        """Draw; the gradients are those of the value at a fixed probability (Figurnov et al., arXiv 1805.08498)."""
+        """Draw; gradients are of the value at a fixed probability (Figurnov et al., arXiv 1805.08498)."""
         shape = torch.Size(sample_shape) + self.loc.shape
         with torch.no_grad():
             a = self._a
             b = self._b
             eps = torch.finfo(self.loc.dtype).eps
             share = ranks.rand(shape, dim=len(sample_shape), dtype=self.loc.dtype, device=self.loc.device)
+            # Zero would be the lower bound itself, whose logarithm may be minus infinity.
             share = share.clamp_min(eps)
+            # The share is mapped between both ends of the distribution function, in logarithms.
             cdf_ratio = (self._log_cdf_a - self._log_cdf_b).exp()
             log_cdf = self._log_cdf_b + (share + (1.0 - share) * cdf_ratio).log()
             z = torch.minimum(torch.maximum(_inverse_log_ndtr(log_cdf), a), b)
             value = self._clamp(self.loc + self._sign * self.scale * z)
+            # How much each bound pulls the value along when loc or scale move.
             weight_a = (1.0 - share) * (0.5 * (z.square() - a.square())).exp()
             weight_b = share * (0.5 * (z.square() - b.square())).exp()
             by_loc = 1.0 - weight_a - weight_b
             by_scale = self._sign * (z - a * weight_a - b * weight_b)
+        # Value zero, slope one: the terms add gradients to a value that was drawn without any.
         return value + (self.loc - self.loc.detach()) * by_loc + (self.scale - self.scale.detach()) * by_scale
 
     def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
@@ -291,7 +297,7 @@ def _inverse_log_ndtr(log_cdf: Tensor) -> Tensor:
 
 @register_kl(TruncatedGaussian, TruncatedGaussian)
 def _kl_truncated(p: TruncatedGaussian, q: TruncatedGaussian) -> Tensor:
-    # The bounds have to be the same: what p can give and q cannot would make it infinite.
+    # The bounds have to be the same: a value that p can give and q cannot would make it infinite.
     first, second = p._moments()
     gap = (p.loc - q.loc) / q.scale
     ratio = p.scale / q.scale
@@ -306,7 +312,7 @@ class Categorical(Distribution):
     for the device. Samples are drawn by the largest of the logits plus Gumbel noise (Maddison et al., arXiv 1411.0030)
     from torch's default generator of the device. Logits of several choices, [..., N], stand side by side, in K parts of
     the given `sizes`: samples are [..., K], or [...] for one choice. With `one_hot` they mark the options instead,
-    [..., N]. Their `dtype` is that of the action spec.
+    [..., N]. Their `dtype` comes from the action spec.
     """
 
     arg_constraints = {"logits": constraints.real_vector}  # type: ignore[assignment]
@@ -350,7 +356,7 @@ class Categorical(Distribution):
 
     @property
     def probs(self) -> Float[Tensor, "*batch N"]:
-        """The probabilities; those of each choice sum to 1."""
+        """The probabilities, which sum to 1 for each choice."""
         return torch.cat([log_probs.exp() for log_probs in self._log_probs], -1)
 
     @property

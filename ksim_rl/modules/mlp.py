@@ -45,8 +45,8 @@ def mlp(
     and `output_gain` alone sets the scale of the first outputs (Andrychowicz et al., "What matters in on-policy
     reinforcement learning?", 2021: the gain of the last policy layer matters most, and should be small). `layer_norm`
     normalizes before each activation, which keeps the values of actions that were never tried from growing without
-    bound (Ball et al., "Efficient online reinforcement learning with offline data", 2023). N networks of this shape at
-    once map [N, B, input_dim] to [N, B, output_dim].
+    bound (Ball et al., "Efficient online reinforcement learning with offline data", 2023). N networks of this shape
+    together map [N, B, input_dim] to [N, B, output_dim].
     """
     check_value("hidden_dims", hidden_dims, Sequence[Count])
     check_choice("activation", activation, ACTIVATIONS)
@@ -56,12 +56,14 @@ def mlp(
     if num_networks is not None:
         layer = partial(EnsembleLinear, num_networks)
         norm = partial(EnsembleLayerNorm, num_networks)
+    # `Layers` has kernels for ensembles and norms only; a plain perceptron stays torch's own module.
     if num_networks is None and not layer_norm:
         layers = nn.Sequential()
     else:
         layers = Layers()
     width = input_dim
     for hidden_dim in hidden_dims:
+        # Gain sqrt(2) keeps the scale of the signal behind a ReLU, which halves its mean square.
         layers.append(layer(width, hidden_dim, gain=math.sqrt(2.0), device=device))
         if layer_norm:
             layers.append(norm(hidden_dim, device=device))
@@ -98,13 +100,14 @@ class EnsembleLinear(nn.Module):
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """Draw the weights anew."""
+        """Draw the weights again."""
+        # Stored as [inputs, outputs] for the batched product, so that the drawn matrix is turned over.
         for network in self.weight:
             network.copy_(nn.init.orthogonal_(torch.empty(network.shape[::-1]), self.gain).t())
         self.bias.zero_()
 
     def forward(self, features_NBL: Float[Tensor, "#N B L"]) -> Float[Tensor, "N B M"]:
-        """Return what each layer gives for its own input."""
+        """Return the outputs of each layer for its own input."""
         return torch.baddbmm(self.bias, features_NBL.expand(len(self.weight), -1, -1), self.weight)
 
 
@@ -128,19 +131,20 @@ class EnsembleLayerNorm(nn.Module):
 
 
 class Layers(nn.Sequential):
-    """Linear layers, norms and activations in a row, which take [..., input_dim], or those of ensembles in a row.
+    """Linear layers, norms and activations in a row, of one network, which takes [..., input_dim], or of an ensemble.
 
     With autocast on CUDA products are in bfloat16, and a norm, the bias before it and the activation after it are one
     kernel. An activation that the kernel does not have follows it.
     """
 
     def forward(self, features: Float[Tensor, "#*batch L"]) -> Float[Tensor, "*batch M"]:
-        """Return what the last layer gives."""
+        """Return the outputs of the last layer."""
         if not rounds(features):
             return super().forward(features)
         # Not above: Triton comes with torch for CUDA only.
         from ksim_rl.modules.norm_kernels import FUSED, Normalized
 
+        # A single network runs as an ensemble of one, so that one path serves both.
         alone = not isinstance(self[0], EnsembleLinear)
         if alone:
             out = features.reshape(1, -1, features.shape[-1])
@@ -157,10 +161,12 @@ class Layers(nn.Sequential):
             if not isinstance(layer, nn.Linear | EnsembleLinear):
                 out = layer(out)
                 continue
+            # The exact weights get the gradients; their rounded copies are what is multiplied.
             out = _Product.apply(out, layer.weight, rounded.pop(0))
             if not parts or not isinstance(parts[0], nn.LayerNorm | EnsembleLayerNorm):
                 out = out + layer.bias.to(out.dtype)
                 continue
+            # Bias, norm and activation are one kernel, which numbers its activations from 1; 0 leaves it out.
             norm = parts.pop(0)
             kind = type(parts[0]) if parts else None
             if kind in FUSED:
@@ -175,16 +181,16 @@ class Layers(nn.Sequential):
 
 
 def rounds(features: Float[Tensor, "*batch L"]) -> bool:
-    """Whether products of these are to be in bfloat16, on a device with kernels for what follows."""
+    """Whether products of these are to be in bfloat16, on a device with kernels for the norm after them."""
     return features.is_cuda and torch.is_autocast_enabled("cuda")
 
 
 class _Product(Function):
     """The products [N, B, M] of features [N, B, K] and weights [N, K, M], which are there `rounded` as well.
 
-    Features [1, B, K] are those of all networks. Weights of one network are [M, K], as torch has them. The gradient of
+    Features [1, B, K] are shared by all networks. Weights of one network are [M, K], as torch has them. The gradient of
     the weights is a sum over env states in SPLITS parts, or as many as have OUTPUTS numbers: fewer would occupy a part
-    of the GPU. It lies in memory as the weights do, since autograd copies what does not.
+    of the GPU. It lies in memory as the weights do, since autograd copies any other layout.
     """
 
     @staticmethod
@@ -207,16 +213,19 @@ class _Product(Function):
         d_out = _padded(d_out, -fan_out % 8)
         d_features = d_weight = None
         if ctx.needs_input_grad[0]:
+            # The rounded weights of the forward pass again, padded columns cut off.
             d_features = torch.bmm(d_out, rounded.mT)[..., :fan_in].to(ctx.dtype)
             if ctx.is_shared:
                 d_features = d_features.sum(0, keepdim=True)
         if ctx.needs_input_grad[1]:
             networks, rows = features.shape[:2]
+            # The split has to divide the rows, since each part is one product of a batch.
             splits = math.gcd(SPLITS * max(OUTPUTS // rounded.numel(), 1), rows)
             parts = [part.reshape(networks * splits, rows // splits, -1) for part in (features, d_out)]
             if ctx.alone:
                 parts, fan_in, fan_out = parts[::-1], fan_out, fan_in
             sums = torch.bmm(parts[0].mT, parts[1]).unflatten(0, (networks, splits))
+            # Parts are added up in float32: their sum would lose digits in bfloat16.
             d_weight = sums[..., :fan_in, :fan_out].sum(1, dtype=torch.float32)
             d_weight = d_weight[0] if ctx.alone else d_weight
         return d_features, d_weight, None

@@ -69,6 +69,7 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None
 
     Networks are actors, critics, or any other modules, which are searched for owners of a `normalizer`.
     """
+    # A normalizer that several networks share counts each env state once.
     seen: dict[int, ObservationNormalizer] = {}
     for network in networks:
         for module in network.modules():
@@ -79,13 +80,15 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None
                 seen[id(normalizer)] = normalizer
                 # Step by step, as the memory of a rollout is.
                 normalizer.count_rows(_observation(tensordict, module, normalizer.dim).transpose(0, -2))
+    # All at the end: ranks merge all statistics in one collective.
     publish([*seen.values()])
 
 
 def _observation(tensordict: TensorDictBase, module: TensorDictModule, dim: int) -> Tensor:
-    """Return what a network normalizes: its first inputs, as many as make up `dim` numbers."""
+    """Return the observations that a network normalizes: its first inputs, up to `dim` numbers."""
     observations: list[Tensor] = []
     for key in module.in_keys:
+        # A critic of actions reads the action last, which its normalizer does not cover.
         if sum(obs.shape[-1] for obs in observations) < dim:
             observations.append(tensordict.get(key))
     return side_by_side(observations)
@@ -123,6 +126,7 @@ class OnPolicyNetworkCfg(NetworkCfg):
         """Make the keys hashable, and refuse one that comes twice."""
         super()._check_fields()
         keys = tuple(_hashable(key) for key in self.in_keys)
+        # Read twice, an observation would count twice in `obs_dim`, by mistake more likely than by intent.
         if len(set(keys)) < len(keys):
             raise ValueError(f"in_keys={keys!r}: each key can be read once")
         object.__setattr__(self, "in_keys", keys)
@@ -142,7 +146,7 @@ class OffPolicyNetworkCfg(NetworkCfg, hidden_dims=(256, 256), activation="relu")
 
 
 class ObservingNetwork(nn.Module):
-    """The base of networks that normalize what they read by their `normalizer`, if they have one."""
+    """The base of networks that normalize their observations by their `normalizer`, if they have one."""
 
     def __init__(self, cfg: NetworkCfg, *, obs_dim: int, device: Device = None) -> None:
         super().__init__()
@@ -153,7 +157,7 @@ class ObservingNetwork(nn.Module):
             self.normalizer = None
 
     def observe(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
-        """Return what the first layer reads: observations side by side, normalized."""
+        """Return the inputs of the first layer: observations side by side, normalized."""
         obs = self.joined(*observations)
         if self.normalizer is None:
             return obs
@@ -174,13 +178,13 @@ FEATURES = "features"
 
 @dataclass(frozen=True, kw_only=True)
 class SharedTrunkCfg(OnPolicyNetworkCfg):
-    """Layers below actor and critic, which read what they write: the key "features"."""
+    """Layers below actor and critic, which read the outputs of these layers at "features"."""
 
     hidden_dims: Annotated[tuple[Count, ...], Filled("expected at least one width")] = (512, 256)
 
 
 class LayeredNetwork(ObservingNetwork):
-    """Maps observations [..., L_i] to what an MLP of the config's layers makes of them; `options` are its others."""
+    """Maps observations [..., L_i] to the outputs of an MLP of the config's layers; `options` are for `mlp`."""
 
     def __init__(
         self, cfg: NetworkCfg, *, obs_dim: int, output_dim: int | None, device: Device = None, **options: Any

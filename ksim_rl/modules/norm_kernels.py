@@ -17,8 +17,8 @@ from torch.autograd import Function
 # In the order in which the kernels number them, from 1; 0 is none.
 FUSED = (nn.ReLU, nn.SiLU)
 EPS = tl.constexpr(1e-5)  # torch's
-# What a thread has at once of a chunk of three, and of two, which leave it more registers; and how many programs there
-# are on the way there. On the way back, where threads need all registers that they can have, half as many run at once.
+# Elements per thread of a chunk of three, and of two, which leave it more registers; and how many programs there are
+# forward. Backward, where threads need all registers that they can have, half as many run at the same time.
 ELEMENTS = {3: 8, 2: 16}
 PROGRAMS = 2048
 # Columns that a program of `sum_parts` adds up: two sectors of memory, and as many programs as a GPU has room for.
@@ -28,7 +28,7 @@ ON_GPU = tl.constexpr(torch.cuda.is_available())
 
 @triton.jit
 def _sigmoid(value):
-    # 3 instructions, not Triton's 12, for which these kernels wait. It errs by 3e-4, an eighth of what bfloat16 rounds.
+    # 3 instructions, not Triton's 12, for which these kernels wait. Its error is 3e-4, an eighth of bfloat16's.
     if ON_GPU:
         return tl.inline_asm_elementwise(
             "tanh.approx.f32 $0, $1; fma.rn.f32 $0, $0, 0f3F000000, 0f3F000000;",
@@ -39,6 +39,7 @@ def _sigmoid(value):
 
 @triton.jit
 def _of_columns(weights, WIDTH: tl.constexpr, CHUNKS: tl.constexpr, LANES: tl.constexpr):
+    # A tuple of chunks stays in registers: loops over chunks are unrolled.
     found, at = (), weights + tl.program_id(1) * WIDTH
     for chunk in tl.static_range(CHUNKS):  # pyright: ignore[reportGeneralTypeIssues]
         column = chunk * LANES + tl.arange(0, LANES)[None, :]
@@ -63,12 +64,14 @@ def normalize_rows(
     Program (i, n) is of network n. `moments` [N, num_rows, 2] get the mean and one over the standard deviation of each
     row, for the way back.
     """
+    # Loaded once for all rows of the program.
     biases, gains = _of_columns(bias, WIDTH, CHUNKS, LANES), _of_columns(gain, WIDTH, CHUNKS, LANES)
     offsets = _of_columns(offset, WIDTH, CHUNKS, LANES)
     first = tl.program_id(1).to(tl.int64) * num_rows
     features, out, moments = features + first * WIDTH, out + first * WIDTH, moments + 2 * first
     for step in tl.range(0, STEPS, num_stages=3):  # pyright: ignore[reportGeneralTypeIssues]
         row = (tl.program_id(0) * STEPS + step) * ROWS + tl.arange(0, ROWS)  # pyright: ignore[reportGeneralTypeIssues]
+        # Mean first, then squares about it: a difference of mean squares would cancel.
         values, errors, total, square = (), (), 0.0, 0.0
         for chunk in tl.static_range(CHUNKS):
             at, keep = _chunk(row, num_rows, chunk, WIDTH, LANES)  # pyright: ignore[reportGeneralTypeIssues]
@@ -76,6 +79,7 @@ def normalize_rows(
             total += values[chunk]
         mean = tl.sum(total, 1) / WIDTH
         for chunk in tl.static_range(CHUNKS):
+            # Columns beyond the width are no part of the row; their error would be minus the mean.
             inside = chunk * LANES + tl.arange(0, LANES)[None, :] < WIDTH
             errors = errors + (tl.where(inside, values[chunk] - mean[:, None], 0.0),)
             square += errors[chunk] * errors[chunk]
@@ -84,6 +88,7 @@ def normalize_rows(
         tl.store(moments + 2 * row + 1, scale, mask=row < num_rows)
         for chunk in tl.static_range(CHUNKS):
             at, keep = _chunk(row, num_rows, chunk, WIDTH, LANES)
+            # Scale, offset and activation, on the values that are in registers already.
             value = errors[chunk] * scale[:, None] * gains[chunk] + offsets[chunk]
             if ACTIVATION == 1:
                 value = tl.maximum(value, 0.0)
@@ -119,10 +124,12 @@ def normalize_rows_back(
             at, keep = _chunk(row, num_rows, chunk, WIDTH, LANES)  # pyright: ignore[reportGeneralTypeIssues]
             value = tl.load(features + at, mask=keep, other=0.0).to(tl.float32) + biases[chunk]
             slope = tl.load(d_out + at, mask=keep, other=0.0).to(tl.float32)
+            # Computed again from the features: storing it would take as much memory traffic as reading them.
             unit = (value - mean) * scale
             value = unit * gains[chunk] + offsets[chunk]
             if ACTIVATION == 1:
                 slope = tl.where(value > 0.0, slope, 0.0)
+            # The derivative of v s(v) is s + v s (1 - s).
             if ACTIVATION == 2:
                 share = _sigmoid(value)
                 slope *= share + value * (share - share * share)
@@ -135,6 +142,7 @@ def normalize_rows_back(
         mean_along, mean_slope = tl.sum(along, 1)[:, None] / WIDTH, tl.sum(total, 1)[:, None] / WIDTH
         for chunk in tl.static_range(CHUNKS):
             at, keep = _chunk(row, num_rows, chunk, WIDTH, LANES)
+            # The gradient through mean and standard deviation: both components that the norm removes are taken out.
             slope = (slopes[chunk] - mean_slope - units[chunk] * mean_along) * scale
             tl.store(d_features + at, slope.to(d_features.dtype.element_ty), mask=keep)
             of_bias = of_bias + (slope,)
@@ -147,6 +155,7 @@ def normalize_rows_back(
         for part in tl.static_range(3 * CHUNKS):
             column = part % CHUNKS * LANES + tl.arange(0, LANES)
             of = part // CHUNKS * tl.num_programs(1) + tl.program_id(1)
+            # One row per program, so that the sum over them has a fixed order.
             to = partials + (of * tl.num_programs(0) + tl.program_id(0)) * WIDTH + column
             tl.store(to, tl.sum(sums[part], 0), mask=column < WIDTH)
 
@@ -167,8 +176,8 @@ def sum_parts(parts, sums, count, width, ROWS: tl.constexpr, COLUMNS: tl.constex
 class Normalized(Function):
     """Rows of N networks with a bias added, normalized (Ba et al., arXiv 1607.06450), scaled, offset and activated.
 
-    Features keep their dtype; bias, gain and offset are float32 with N * L elements. The `activation` counts those of
-    `FUSED` from 1, and 0 is none. Gradients are the same bits each time.
+    Features keep their dtype; bias, gain and offset are float32 with N * L elements. The `activation` counts entries
+    of `FUSED` from 1, and 0 is none. Gradients are the same bits each time.
     """
 
     @staticmethod
@@ -194,7 +203,7 @@ class Normalized(Function):
 
     @staticmethod
     def backward(ctx: Any, d_out_NBL: Float[Tensor, "N B L"]) -> tuple[Any, ...]:
-        """Return the gradients; those of the weights where they learn."""
+        """Return the gradients, for the weights only where they learn."""
         features, *weights, _ = ctx.saved_tensors
         learns = any(ctx.needs_input_grad[1:4])
         networks, rows, width = features.shape
@@ -215,6 +224,7 @@ class Normalized(Function):
 
 def _cut(networks: int, rows: int, width: int, most: int) -> tuple[int, dict[str, int]]:
     """Return how many programs take the rows of a network, some `most` for all of them, and their tiles."""
+    # The next power of two; three quarters of it, in three chunks, waste less where they suffice.
     power = max(1 << (width - 1).bit_length(), 4)
     if 4 * width <= 3 * power:
         chunks = 3
@@ -222,6 +232,7 @@ def _cut(networks: int, rows: int, width: int, most: int) -> tuple[int, dict[str
     else:
         chunks = 2
         lanes = power // 2
+    # Narrow rows share a warp; wide ones get several warps.
     tall = max(32 * ELEMENTS[chunks] // lanes, 1)
     warps = max(lanes // (32 * ELEMENTS[3]), 1)
     steps = -(-rows * networks // (tall * most))

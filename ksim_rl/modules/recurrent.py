@@ -31,7 +31,7 @@ from ksim_rl.modules.recurrent_cells import GRU, LSTM
 
 
 class RecurrentStatePrimer(TensorDictPrimer):
-    """TorchRL's primer, free of host syncs: each episode begins with zeros, each step goes on with what was written."""
+    """TorchRL's primer, free of host syncs: each episode begins with zeros, each step goes on from the stored one."""
 
     def __init__(self, primers: Composite) -> None:
         super().__init__(primers, expand_specs=True)
@@ -48,6 +48,7 @@ class RecurrentStatePrimer(TensorDictPrimer):
                 before = None
             else:
                 before = tensordict.get(key, None)
+            # A where keeps the states of the rows that go on; a mask of rows would be read on the host.
             if mask is not None and before is not None:
                 zero = torch.where(mask.reshape(*zero.shape[:-2], 1, 1), zero, before)
             tensordict_reset.set(key, zero)
@@ -55,7 +56,7 @@ class RecurrentStatePrimer(TensorDictPrimer):
 
 
 def recurrent_transforms(env: EnvBase, *primers: TensorDictPrimer) -> list[Transform]:
-    """Return what an env needs to carry recurrent states: `is_init` where it has none yet, and the primers."""
+    """Return the transforms that carry recurrent states in an env: `is_init` where it has none yet, and the primers."""
     if "is_init" in env.observation_spec.keys():
         tracker = []
     else:
@@ -63,7 +64,7 @@ def recurrent_transforms(env: EnvBase, *primers: TensorDictPrimer) -> list[Trans
     return [*tracker, *primers]
 
 
-# What the state of each kind consists of, and how many gates it has.
+# The parts of the state of each kind, and how many gates it has.
 STATES = {"lstm": ("h", "c"), "gru": ("h",)}
 _NUM_GATES = {"lstm": 4, "gru": 3}
 STATE_KEY = "recurrent_state"
@@ -99,6 +100,7 @@ class RecurrentNetwork(nn.Module):
             self.normalizer = ObservationNormalizer(obs_dim, device=device)
         else:
             self.normalizer = None
+        # Named as torch names them, so that weights of `torch.nn.LSTM` and `torch.nn.GRU` can be loaded.
         for layer in range(cfg.num_layers):
             input_dim = cfg.hidden_dim if layer else obs_dim
             for name, value in _layer_parameters(cfg, input_dim).items():
@@ -118,6 +120,7 @@ class RecurrentNetwork(nn.Module):
             features_TBH = obs_TBL
         else:
             features_TBH = self.normalizer(obs_TBL)
+        # Layer by layer over all steps, since each layer reads the features of the one below.
         states_N: list[tuple[Tensor, ...]] = []
         for layer in range(self.cfg.num_layers):
             state_BH = tuple(part_BNH[:, layer] for part_BNH in state_BNH)
@@ -134,6 +137,7 @@ class RecurrentNetwork(nn.Module):
             self.get_parameter(f"{name}_l{layer}")
             for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
         )
+        # The input projection of all steps is one product; only the recurrent part runs step by step.
         lstm = self.cfg.kind == "lstm"
         gates_TBG = functional.linear(features_TBH, weight_ih, bias_ih + bias_hh if lstm else bias_ih)
         # Under autocast only the projection is rounded: errors of a state add up over the steps.
@@ -196,6 +200,7 @@ class RecurrentModule(TensorDictModule):
                 f"the data has no {self.state_keys}: give the env `recurrent_transforms`, which begin episodes with a "
                 "state of zeros, before the first reset"
             )
+        # Sequences where a loss learns, single steps where an env is acted in.
         if recurrent_mode():
             run = self._sequences
         else:
@@ -241,14 +246,14 @@ class RecurrentModule(TensorDictModule):
 def make_recurrent_actor(
     cfg: RecurrentCfg, actor: ActorCfg, *, obs_dim: int, **options: Any
 ) -> ProbabilisticTensorDictSequential:
-    """Build a policy behind a recurrent module, which reads and normalizes what the policy would; see `make_actor`."""
+    """Build a policy behind a recurrent module, which normalizes the policy's observations; see `make_actor`."""
     return _made_behind(make_actor, cfg, actor, obs_dim=obs_dim, name="actor", options=options)
 
 
 def make_recurrent_critic(
     cfg: RecurrentCfg, critic: CriticCfg, *, obs_dim: int, **options: Any
 ) -> TensorDictModule:
-    """Build a critic behind a recurrent module of its own; as `make_recurrent_actor`."""
+    """Build a critic behind its own recurrent module; as `make_recurrent_actor`."""
     return _made_behind(make_critic, cfg, critic, obs_dim=obs_dim, name="critic", options=options)
 
 
@@ -293,6 +298,7 @@ def _made_behind(
     make: Any, cfg: RecurrentCfg, network: AnyCfg, *, obs_dim: int, name: str, options: dict[str, Any]
 ) -> Any:
     """Return a network that `make` builds, behind a recurrent module whose features it reads, not observations."""
+    # The module in front takes over observations and normalizer; the network then reads features.
     reads = {"in_keys": network.in_keys, "obs_normalization": network.obs_normalization}
     recurrent = RecurrentModule(cfg, obs_dim=obs_dim, name=name, device=options.get("device"), **reads)
     network = replace(network, in_keys=(recurrent.feature_key,), obs_normalization=False)
@@ -305,6 +311,7 @@ def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:
     hidden = cfg.hidden_dim
     bias_hh = torch.zeros(gates, hidden)
     if cfg.kind == "lstm":
+        # The forget gate is the second of torch's four: input, forget, cell, output.
         bias_hh[1] = 1.0
     return {
         "weight_ih": torch.cat([nn.init.orthogonal_(torch.empty(hidden, input_dim)) for _ in range(gates)]),
@@ -317,13 +324,14 @@ def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:
 class CarriedState:
     """The states of networks that do not act, such as a critic: no rollout holds them.
 
-    A critic runs through a rollout when advantages are estimated, all steps at once, from the state in which it left
+    A critic runs through a rollout when advantages are estimated, all steps together, from the state in which it left
     the rollout before. That state is kept here. `is_init` at the first step says where it must not be used. Networks
     that are a part of `acting` have theirs in the rollouts. Raises ValueError where a recurrent module of `network`
     does not give the state after each step of a sequence.
     """
 
     def __init__(self, network: nn.Module, *, acting: nn.Module) -> None:
+        # Modules that act have their states in the rollouts already.
         acts = recurrent_modules(acting)
         self._recurrent = [module for module in recurrent_modules(network) if module not in acts]
         for module in recurrent_modules(network):
@@ -345,6 +353,7 @@ class CarriedState:
         num_envs, num_steps = rollout_ET.batch_size
         for module in self._recurrent:
             for key in module.state_keys:
+                # The first rollout tells the number of envs; its first step begins from zeros.
                 if key not in self._state_E:
                     shape = (num_envs, module.cfg.num_layers, module.cfg.hidden_dim)
                     self._state_E[key] = torch.zeros(shape, device=rollout_ET.device)
@@ -357,6 +366,7 @@ class CarriedState:
         for key in self.keys:
             after_ET = rollout_ET.get(("next", *key))
             state_E = self._state_E[key]
+            # The state before a step is the one after the step before it, and zero where an episode begins.
             before_ET = torch.cat([state_E.unsqueeze(1), after_ET[:, :-1]], 1)
             rollout_ET.set(key, before_ET.masked_fill_(rollout_ET.get(RESET_KEY).unsqueeze(-1), 0.0))
             state_E.copy_(after_ET[:, -1])
@@ -371,6 +381,7 @@ class CarriedState:
         """Continue where `state_dict` was taken; tensors keep their addresses."""
         keys = {".".join(key): key for key in self.keys}
         for name in keys.keys() & state.keys():
+            # A new run has no tensors yet to copy into.
             self._state_E.setdefault(keys[name], torch.empty_like(state[name], device=device))
         if state:
             copy_into(self.state_dict(), state, what="recurrent state")
@@ -390,8 +401,10 @@ def burnt_in(
     """
     if not steps:
         return sequences_BT
+    # The steps of the burn-in come first in each sequence.
     length = sequences_BT.batch_size[1] - steps
     before_BT, rest_BT = sequences_BT.split([steps, length], 1)
+    # Sequences at the start of a rollout have no steps before them, and keep the stored state.
     renewed_B1 = before_BT.get(key)[:, -1]
     for module in recurrent_modules(*networks):
         with set_recurrent_mode(True):

@@ -34,15 +34,18 @@ class LSTM(Function):
         reset_TB1: Bool[Tensor, "T B 1"] | None,
     ) -> tuple[Float[Tensor, "T B H"], ...]:
         """Return h and c after each step."""
+        # The first state is kept: the backward pass needs the state before every step.
         h0_BH = h_BH
         c0_BH = c_BH
         steps: list[tuple[Tensor, Tensor, Tensor]] = []
         for t, gates_BG in enumerate(gates_TBG.unbind(0)):
+            # The reset comes before the step: an episode begins with this step's input and no past.
             h_BH, c_BH = (_kept(state_BH, reset_TB1, t) for state_BH in (h_BH, c_BH))
             h_BH, c_BH, activations_BG = _lstm_step(gates_BG, h_BH @ weight_hh_GH.t(), c_BH)
             steps.append((h_BH, c_BH, activations_BG))
         h_TBH, c_TBH, activations_TBG = (torch.stack(column) for column in zip(*steps, strict=True))
         ctx.save_for_backward(weight_hh_GH, h0_BH, c0_BH, h_TBH, c_TBH, activations_TBG, reset_TB1)
+        # Most losses read h only: the gradient of c then stays None instead of zeros.
         ctx.set_materialize_grads(False)
         return h_TBH, c_TBH
 
@@ -57,6 +60,7 @@ class LSTM(Function):
         dh_BH = torch.zeros_like(h0_BH)
         dc_BH = torch.zeros_like(c0_BH)
         dgates_TBG = torch.empty_like(activations_TBG)
+        # Back through time: gradients from above join those from the step after.
         for t in reversed(range(h_TBH.shape[0])):
             if grad_h_TBH is not None:
                 dh_BH = dh_BH + grad_h_TBH[t]
@@ -66,7 +70,9 @@ class LSTM(Function):
                 dh_BH, dc_BH, c_before_TBH[t], c_TBH[t], activations_TBG[t]
             )
             dgates_TBG[t] = dgates_BG
+            # No gradient flows back over a reset, before which lies another episode.
             dh_BH, dc_BH = (_kept(d_BH, reset_TB1, t) for d_BH in (dgates_BG @ weight_hh_GH, dc_BH))
+        # One product over all steps for the recurrent weights.
         h_before_TBH = _before(h0_BH, h_TBH, reset_TB1)
         return dgates_TBG, _outer(dgates_TBG, h_before_TBH), dh_BH, dc_BH, None
 
@@ -105,12 +111,14 @@ class GRU(Function):
         weight_hh_GH, h0_BH, h_TBH, workspace_TBG, reset_TB1 = ctx.saved_tensors
         dh_BH = torch.zeros_like(h0_BH)
         dinput: list[Tensor] = []
+        # Input and recurrent gates differ in the new gate, whose recurrent part the reset gate scales.
         drecurrent: list[Tensor] = []
         for t in reversed(range(h_TBH.shape[0])):
             dinput_BG, drecurrent_BG, dh_BH = _gru_step_backward(dh_BH + grad_h_TBH[t], workspace_TBG[t])
             dinput.append(dinput_BG)
             drecurrent.append(drecurrent_BG)
             dh_BH = _kept(torch.addmm(dh_BH, drecurrent_BG, weight_hh_GH), reset_TB1, t)
+        # Gathered from the last step to the first.
         dinput_TBG = torch.stack(dinput[::-1])
         drecurrent_TBG = torch.stack(drecurrent[::-1])
         dweight_hh_GH = _outer(drecurrent_TBG, _before(h0_BH, h_TBH, reset_TB1))
@@ -143,6 +151,7 @@ def _lstm_step(gates_BG: Tensor, recurrent_BG: Tensor, c_BH: Tensor) -> tuple[Te
     """Return h and c after the step, and the activated gates."""
     if gates_BG.is_cuda:
         return upstream.fused_lstm_cell(gates_BG, recurrent_BG, c_BH)
+    # The formulas of `torch.nn.LSTM`, for the CPU.
     i_BH, f_BH, g_BH, o_BH = (gates_BG + recurrent_BG).chunk(4, -1)
     i_BH = i_BH.sigmoid()
     f_BH = f_BH.sigmoid()
@@ -164,6 +173,7 @@ def _lstm_step_backward(
     i_BH, f_BH, g_BH, o_BH = activations_BG.chunk(4, -1)
     tanh_c_BH = c_BH.tanh()
     dc_BH = dc_BH + dh_BH * o_BH * (1.0 - tanh_c_BH.square())
+    # Each by the derivative of its activation: s (1 - s) for sigmoids, 1 - t^2 for the tanh.
     dgates = [
         dc_BH * g_BH * i_BH * (1.0 - i_BH),
         dc_BH * c_before_BH * f_BH * (1.0 - f_BH),
@@ -174,9 +184,10 @@ def _lstm_step_backward(
 
 
 def _gru_step(gates_BG: Tensor, recurrent_BG: Tensor, h_BH: Tensor) -> tuple[Tensor, Tensor]:
-    """Return h after the step, and what the backward step needs."""
+    """Return h after the step, and the workspace that the backward step reads."""
     if gates_BG.is_cuda:
         return upstream.fused_gru_cell(gates_BG, recurrent_BG, h_BH)
+    # The formulas of `torch.nn.GRU`: the reset gate acts behind the recurrent product.
     (rx_BH, zx_BH, nx_BH) = gates_BG.chunk(3, -1)
     (rh_BH, zh_BH, nh_BH) = recurrent_BG.chunk(3, -1)
     r_BH = (rx_BH + rh_BH).sigmoid()
@@ -190,6 +201,7 @@ def _gru_step_backward(dh_BH: Tensor, workspace_BG: Tensor) -> tuple[Tensor, Ten
     if dh_BH.is_cuda:
         return upstream.fused_gru_cell_backward(dh_BH, workspace_BG, False)[:3]
     r_BH, z_BH, n_BH, h_BH, nh_BH = workspace_BG.chunk(5, -1)
+    # Gradients before the activations of new, update and reset gate.
     dn_BH = dh_BH * (1.0 - z_BH) * (1.0 - n_BH.square())
     dz_BH = dh_BH * (h_BH - n_BH) * z_BH * (1.0 - z_BH)
     dr_BH = dn_BH * nh_BH * r_BH * (1.0 - r_BH)

@@ -45,11 +45,12 @@ class FusedDataset:
         self.size = size
         self._mirror = mirror
         self._networks = networks
+        # Images take the second half of the rows.
         rows = size if mirror is None else 2 * size
         self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
         self.records = torch.zeros(rows, 3 * layout.out + 8, device=device)
         self._signals = torch.zeros(4, size, device=device)
-        # What kernels get, by the names of their parameters.
+        # The arguments of kernels, by the names of their parameters.
         self._arguments: dict[str, Any] = {
             **dict(zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)),
             **{name.upper(): getattr(layout, name) for name in ("actions", "out", "stored")},
@@ -78,23 +79,27 @@ class FusedDataset:
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
         """
+        # First the observations, which are normalized by the statistics that the rollout was collected with.
         for part_ET, first in self._parts(rollout_ET):
             for network, faults_D in enumerate(self._arguments["faults"]):
                 self._take_observations(network, part_ET, self.obs[network, first:], faults=faults_D[first:])
         following = rollout_ET.get("next")
         num_envs, length = rollout_ET.batch_size
+        # Values of all env states, and of the next observations that differ from the following step's.
         next_obs = torch.empty_like(self.obs[1, : self.size])
         evaluate(self.obs[1, : self.size], self._signals[0])
         self._arguments["count"].zero_()
         self._take_observations(1, following, next_obs, num_envs=num_envs, LISTED=bool(self.listed))
         evaluate(next_obs, self._signals[1], **self.listed)
         programs = parts(num_envs, ENVS)
+        # Each program leaves the moments of its advantages, which standardize those of all ranks.
         moments = self.records.new_empty(programs, 3)
         signals = {key: _time_major(following.get(key)) for key in ("reward", "done", "terminated")}
         sizes = {"num_envs": num_envs, "STEPS": length, "BLOCK": ENVS}
         given = self._arguments | signals | sizes
         launch(estimate_advantages, (programs,), given, num_warps=1, moments=moments)
         moments = torch.cat(ranks.gather(moments))
+        # Last the records: standardized advantages need the moments of all parts.
         left_out = [self._take_records(part_ET, first, moments) for part_ET, first in self._parts(rollout_ET)]
         return reduce(add, (own.sum(dtype=torch.int32) for own in left_out))
 
@@ -116,6 +121,7 @@ class FusedDataset:
         own |= {"moments": moments, "num_moments": len(moments), "left_out": left_out, "BLOCK": block}
         keys = ("action", "loc", "scale", "action_log_prob")
         acted = {key: _time_major(part_ET.get(key)) for key in keys}
+        # Kernels know the gaussian before the tanh only, so that stored actions are taken back through it.
         if self._networks.squashed is not None:
             policy = self._networks.squashed(acted["loc"], acted["scale"])
             acted["action"] = action = policy.latent(acted["action"])

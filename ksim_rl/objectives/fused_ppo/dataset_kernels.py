@@ -32,12 +32,15 @@ def read_observations(
         source, row[:, None], column, keep[:, None], mean, var, eps, obs, WIDTH, NORMALIZED, TF32
     )
     if LISTED:
+        # The memory is time-major: one step later is `num_envs` rows further on.
         later = row + num_envs
         follows = (later < num_rows)[:, None] & (column < STORED)
         begun = tl.load(known + later[:, None] * STORED + column, mask=follows, other=0.0)
+        # Where no reset lies between, the next observation is what the next step begins with.
         same = (later < num_rows) & (tl.sum(tl.where(value == begun, 0, 1), 1) == 0)
         tl.store(next_values + row, tl.load(values + later, mask=same, other=0.0), mask=same)
         keep = keep & (same == 0)
+        # The others are packed: each program reserves its places by one atomic addition.
         ones = tl.where(keep, 1, 0)
         at = (tl.atomic_add(count, tl.sum(ones)) + tl.cumsum(ones, 0) - 1).to(tl.int64)
         tl.store(places + at, row.to(tl.int32), mask=keep)
@@ -61,10 +64,12 @@ def write_records(
     """
     rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = rows < num_rows
+    # Images have the advantages of the env states that they mirror.
     estimated = (first + rows) % size
     advantage = tl.load(advantages + estimated, mask=valid, other=0.0)
     if STANDARDIZED:
         part = tl.arange(0, MOMENTS)
+        # Moments of the parts, of all ranks, are merged into one mean and one std.
         known = part < num_moments
         counts = tl.load(moments + 3 * part, mask=known, other=0.0)
         means = tl.load(moments + 3 * part + 1, mask=known, other=0.0)
@@ -75,13 +80,16 @@ def write_records(
         std = tl.sqrt(squares / tl.maximum(count - 1.0, 1.0))
         advantage = (advantage - mean) / tl.maximum(std, min_advantage_std)
     row, column = rows[:, None], tl.arange(0, RECORD_LANES)[None, :]
+    # Which of action, mean and std a column belongs to, and of which action it is.
     kind, output = column // OUT, column % OUT
     own, used = row * ACTIONS + output, valid[:, None] & (output < ACTIONS)
+    # A std of 1 has a logarithm and an inverse; all else is neutral as zero.
     neutral = tl.where(kind == 2, 1.0, 0.0)
     record = tl.where(used, 0.0, neutral)
     record += tl.load(action + own, mask=used & (kind == 0), other=0.0)
     record += tl.load(loc + own, mask=used & (kind == 1), other=0.0)
     record += tl.load(scale + own, mask=used & (kind == 2), other=0.0)
+    # The columns behind the three blocks are single numbers.
     signal = column - 3 * OUT
     log_prob = tl.load(action_log_prob + rows, mask=valid, other=0.0)
     value = tl.load(values + estimated, mask=valid, other=0.0)
@@ -95,12 +103,14 @@ def write_records(
     inside = valid[:, None] & (lane < STORED)
     of_actor = obs + row * STORED + lane
     of_critic = of_actor + num_obs.to(tl.int64) * STORED
+    # The record and both networks' observations have to be finite.
     odd = _counted_odd(record)
     odd += tl.load(faults + first + rows, mask=valid, other=0)
     odd += tl.load(faults + num_obs + first + rows, mask=valid, other=0)
     is_odd = (odd > 0)[:, None]
     record = tl.where(is_odd, neutral, record)
     tl.store(records + row * RECORD + column, record, mask=valid[:, None] & (column < RECORD))
+    # Rare, so that most programs skip these stores.
     if tl.sum(odd) > 0:
         tl.store(of_actor, 0.0, mask=inside & is_odd)
         tl.store(of_critic, 0.0, mask=inside & is_odd)

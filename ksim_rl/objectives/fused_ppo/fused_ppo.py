@@ -1,6 +1,6 @@
 """Makes each gradient step of a PPO update in a few Triton kernels, for most networks.
 
-It computes what `GAE`, `ClipPPOLoss` and `ppo_step` compute for an actor and a critic of `FusedNetworks`, from the same
+It has the results of `GAE`, `ClipPPOLoss` and `ppo_step` for an actor and a critic of `FusedNetworks`, from the same
 config, in the same order of env states, and on the state of the same optimizer: a run can change from one to the other
 at any update. Where they are multiplied, weights, observations, hidden layers and their gradients are rounded to 8
 significant bits with bfloat16, with float32 to 11 (TF32); parameters, sums, losses and Adam stay float32.
@@ -56,7 +56,7 @@ from ksim_rl.objectives.fused_ppo.step_kernels import (
 from ksim_rl.objectives.gradient_step import StepGuard, rate_bounds
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
-# Sums that each block leaves beside its gradients.
+# Sums that each block leaves in addition to its gradients.
 NUM_STATISTICS = 16
 MOMENTS = "exp_avg", "exp_avg_sq"
 # Points of the quadrature for the entropy of squashed actions: it is good to 1e-3 nats for standard deviations to 1.5
@@ -65,10 +65,10 @@ NODES = 16
 
 
 class FusedParameters:
-    """Flat and padded forms (see `FusedLayout`) of what an update changes.
+    """Flat and padded forms (see `FusedLayout`) of the tensors that an update changes.
 
     Parameters of the modules and moments of the optimizer are views of the flat form: checkpoints, evaluation and
-    collection see what they always see. `load` makes the padded form of it, and `store` tells how many steps were made.
+    collection see the same as ever. `load` makes the padded form of it, and `store` tells how many steps were made.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class FusedParameters:
 
     @torch.no_grad()
     def load(self) -> None:
-        """Take over what modules and optimizer hold."""
+        """Take over the parameters of the modules and the state of the optimizer."""
         for parameter, *views in zip(self._parameters, *self._views, strict=True):
             state = self._optimizer.state[parameter]
             held = [parameter, *(state[name] for name in MOMENTS)]
@@ -129,17 +129,17 @@ class FusedParameters:
 
 
 class Ahead(triton.AsyncCompileMode):
-    """Threads compile what `launch` is given in some work; loading it, too, would break the capture of a graph."""
+    """Threads compile the kernels that some work launches; loading them, too, would break the capture of a graph."""
 
     def add(self, work: Callable[[], object]) -> None:
-        """Do `work`, and begin to compile what it would launch."""
+        """Do `work`, and begin to compile the kernels that it would launch."""
         context = copy_context()
         context.run(only_compiles.set, True)
         context.run(self.__enter__)  # whose exit waits
         context.run(work)
 
     def submit(self, key: str, compile_fn: Callable[[], Any], finalize_fn: Callable[[Any], None]) -> Any:
-        """Compile a kernel, and what launches it, for which some versions of Triton start gcc."""
+        """Compile a kernel and its launcher, for which some versions of Triton start gcc."""
         driver: Any = triton.runtime.driver.active
 
         def compiled() -> Any:
@@ -150,12 +150,12 @@ class Ahead(triton.AsyncCompileMode):
         return super().submit(key, compiled, finalize_fn)
 
     def wait(self) -> None:
-        """Wait for all that was added, and raise what went wrong."""
+        """Wait for all that was added, and raise its errors."""
         self.__exit__(None, None, None)
 
 
 def _squashing(networks: FusedNetworks, zeros_A: Tensor) -> dict[str, Any]:
-    """Return what kernels get for the entropy of squashed actions."""
+    """Return the arguments of kernels for the entropy of squashed actions."""
     if networks.squashed is None:
         return {"nodes": None, "log_range": 0.0, "NODES": 0}
     policy, (points, weights) = networks.squashed(zeros_A, zeros_A + 1.0), hermegauss(NODES)
@@ -168,7 +168,7 @@ def _squashing(networks: FusedNetworks, zeros_A: Tensor) -> dict[str, Any]:
 class FusedPPO:
     """Makes the gradient steps of one update after another; all memory is allocated once, and nothing syncs.
 
-    `why_not_fused` has no reason against its config. Moments, step counts and learning rate are those of `optimizer`,
+    `why_not_fused` has no reason against its config. Moments, step counts and learning rate belong to `optimizer`,
     from `make_optimizer`. A symmetry of the config needs the `mirror`; else a ValueError is raised.
     """
 
@@ -233,7 +233,7 @@ class FusedPPO:
             self._ahead.add(launch_all)
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
-        """Return what kernels get in every step, by the names of their parameters; `rows` are those of a minibatch."""
+        """Return the arguments of kernels in every step, by name; `rows` is the number of rows of a minibatch."""
         cfg, layout, tuning = self.cfg, self.layout, self.tuning
         dataset, parameters = self.dataset, self.parameters
         zeros = partial(torch.zeros, device=dataset.records.device)
@@ -311,7 +311,7 @@ class FusedPPO:
         """Make all gradient steps of an update.
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as a collector's. `orders_KD` has for each epoch the
-        env states in the order of the minibatches, counted env by env; a GPU does what is `aside` beside the steps.
+        env states in the order of the minibatches, counted env by env; a GPU calls `aside` during the steps.
         Returned are means over the steps that were made, by the names of `SUMMARY`, how many in a row were not at most,
         both in the same memory each time, and how many env states took no part as an element was not finite.
         """
@@ -385,7 +385,7 @@ class FusedPPO:
             launch(weight_gradients, grid, given, num_warps=tuning.tile_warps, ROWS=split)
 
     def _multiply_by_layers(self, given: Mapping[str, Any]) -> None:
-        """Leave what `minibatch_gradients` leaves, with kernels of each layer."""
+        """Leave the results of `minibatch_gradients`, with kernels of each layer."""
         layout, tuning, index_B = self.layout, self.tuning, given["order"]
         weights, biases = self.parameters.weights, self.parameters.biases_2N
         seen = given["inputs"][: 2 * len(index_B) * layout.inputs].view(2, len(index_B), -1)

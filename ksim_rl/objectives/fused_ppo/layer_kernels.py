@@ -51,6 +51,7 @@ def layer(
     gradients are sums over columns of `slopes`, with the next layer's weights; they take the place of the slopes.
     """
     block = tl.program_id(0)
+    # 64 bits: the places of the second network can exceed 2^31.
     network = tl.program_id(2).to(tl.int64)
     rows = block * BLOCK + tl.arange(0, BLOCK)
     column = tl.program_id(1) * TILE + tl.arange(0, TILE)
@@ -63,10 +64,12 @@ def layer(
     dtype = slopes.dtype.element_ty
     acc = tl.zeros((BLOCK, TILE), dtype=tl.float32)
     if FORWARD:
+        # Weights are [outputs, inputs]: forward, a column of the product is a row of them.
         right = weights + column[None, :] * length
         acc = _product(input_rows + read_at, right, keep, inside, length, 1, acc, DEPTH, TILE_STAGES)
         value = acc + tl.load(biases + network * NUM_PADDED + column, mask=column < width, other=0.0)[None, :]
         hidden = activate(value, ACTIVATION)
+        # The slope of SiLU needs its input, which is gone once the output is stored.
         if ACTIVATION == 3:
             gate = tl.sigmoid(value)
             slope = gate + hidden * (1.0 - gate)
@@ -75,6 +78,7 @@ def layer(
         tl.store(input_rows + (output_at + column[None, :]), operand(hidden, dtype, TF32), mask=keep & inside)
         tl.store(slope_to, slope.to(dtype), mask=keep & inside)
     else:
+        # Back, the same weights are read across: elements of a column are a row apart.
         right = weights + column[None, :]
         acc = _product(slope_rows + read_at, right, keep, inside, length, width, acc, DEPTH, TILE_STAGES)
         gradient = acc * tl.load(slope_to, mask=keep & inside, other=0.0).to(tl.float32)
@@ -112,9 +116,11 @@ def output_gradients(
     statistics = d_std_at + OUT
     dtype = slopes.dtype.element_ty
     slope_rows = slopes + wide * num_rows * GRADIENTS + (rows[:, None] * GRADIENTS + slope_at)
+    # The last hidden layer of these rows.
     left = inputs + rows[:, None] * INPUTS
     out = _linear(left, weights, biases, output, keep, fan_in, BLOCK, OUT, DEPTH, TILE_STAGES)
     record = records + tl.load(order + rows, mask=valid, other=0).to(tl.int64) * RECORD
+    # Which rows have a loss of their own; images have the mirror loss only.
     judged = valid
     if MIRROR:
         judged = rows < num_rows // 2

@@ -20,20 +20,21 @@ from ksim_rl.ranks.running_moments import RunningMoments
 MIN_WIDTH = 16
 # In the order in which the kernels number them.
 ACTIVATIONS = (nn.ELU, nn.ReLU, nn.Tanh, nn.SiLU)
-# What a program of the chained kernels holds in registers as a whole: the observation, and the second hidden layer.
+# A program of the chained kernels holds in registers as a whole the observation and the second hidden layer.
 CHAINED_OBS = 256
 CHAINED_SECOND = (16, 32, 64, 128, 256)
 MAX_WIDTH = 1024
 # In float32: as TF32 wider layers are no faster than torch's.
 MAX_TF32_WIDTH = 256
 MAX_ACTIONS = 64
+# Kernels count places in 32 bits.
 MAX_PLACES = 2**31
 only_compiles = ContextVar("only_compiles", default=False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observer:
-    """What the first layer of a network takes: what `read` gives, [..., L], normalized by the `moments`, if any."""
+    """The inputs of a network's first layer: the result of `read`, [..., L], normalized by the `moments`, if any."""
 
     read: Callable[[TensorDictBase], Float[Tensor, "*batch L"]]
     moments: RunningMoments | None = None
@@ -41,7 +42,7 @@ class Observer:
 
     @property
     def moments_given(self) -> dict[str, Any]:
-        """What kernels get to normalize with, by the names of their parameters."""
+        """The arguments by which kernels normalize, by the names of their parameters."""
         if self.moments is None:
             mean = None
             var = None
@@ -53,11 +54,11 @@ class Observer:
 
 @dataclass(frozen=True, kw_only=True)
 class FusedNetworks:
-    """What the kernels need to know of an actor and a critic: two MLPs of as many layers, and a gaussian.
+    """The description of an actor and a critic for the kernels: two MLPs of as many layers, and a gaussian.
 
     The activation follows each linear layer but the last. The standard deviations, or their logarithms, are a parameter
-    `std_A`, or what a `std_layer` makes of the last hidden layer: logarithms, or what a softplus makes positive. The
-    gradient passes the bound `min_std`. The `observers` say what is read; `squashed`, if any, makes a `TanhGaussian`.
+    `std_A`, or the outputs of a `std_layer` on the last hidden layer: logarithms, or inputs of a softplus. The
+    gradient passes the bound `min_std`. The `observers` read the inputs; `squashed`, if any, makes a `TanhGaussian`.
     """
 
     actor: Sequence[nn.Linear]
@@ -85,6 +86,7 @@ class FusedNetworks:
     @property
     def chained(self) -> bool:
         """Whether one program can take env states through all layers; else each layer is a kernel."""
+        # Chained kernels are written for three hidden layers of the same widths in both networks.
         hidden = [layer.out_features for layer in self.actor[:-1]]
         return (
             self.std_layer is None
@@ -113,8 +115,8 @@ class LayerPlace:
 class FusedLayout:
     """Sizes and places of the parameters of `FusedNetworks`.
 
-    There are two forms. The flat one, [N], has the parameters end to end as they are, which is what the optimizer
-    works on. The padded one, [2, P], has a row for the actor and one for the critic, each with first all weights and
+    There are two forms. The flat one, [N], has the parameters end to end as they are: the optimizer works on
+    this form. The padded one, [2, P], has a row for the actor and one for the critic, each with first all weights and
     then all biases and the std, in blocks whose sizes are the same in both rows: the outputs are padded to `out`,
     a power of two, and so is the observation to `obs` where the kernels are `chained`, though it is `stored` as a
     multiple of 16; what else differs between both, or is no multiple of 16, is padded to one. The outputs of a
@@ -150,11 +152,13 @@ class FusedLayout:
         else:
             self.head = self.obs
             self.rest = 0
+        # Outputs of both networks share one width, though the critic uses one column only.
         self.out = power_of_two(max(self.actions, MIN_WIDTH))
         if networks.std_layer is None:
             outputs = self.out
         else:
             outputs = 2 * self.out
+        # Each layer's blocks begin where those of the layer before it end.
         widths = (self.obs, *self.hidden, outputs)
         self.places: list[LayerPlace] = []
         weight = bias = column = gradient = 0
@@ -163,6 +167,7 @@ class FusedLayout:
             self.places.append(LayerPlace(fan_in=fan_in, fan_out=fan_out, **at))
             weight = weight + fan_in * fan_out
             bias = bias + fan_out
+            # The chained kernels never store the first hidden layer, nor its gradients.
             column += 0 if self.chained and number == 1 else fan_in
             gradient += 0 if self.chained and number == 0 else fan_out
         self.num_weights = weight
@@ -176,6 +181,7 @@ class FusedLayout:
 
     def padded_index(self, networks: FusedNetworks) -> Int32[Tensor, " N"]:
         """Return for each element of the flat form its place in the padded one, on the CPU."""
+        # The places themselves are cut up like the padded form; the cuts are then the index.
         places = torch.arange(2 * self.num_padded, dtype=torch.int32).view(2, self.num_padded)
         index: list[Tensor] = []
         std_at = self.num_padded - self.out
@@ -185,6 +191,7 @@ class FusedLayout:
                 block = row[at.weight :][: at.fan_in * at.fan_out].view(at.fan_out, at.fan_in)
                 index.append(block[: layer.out_features, : layer.in_features])
                 index.append(row[self.num_weights + at.bias :][: layer.out_features])
+            # After the last layer, in the order of `FusedNetworks.parameters`.
             if layers is networks.actor:
                 if networks.std_layer is not None:
                     index.append(block[self.out : self.out + actions, : layer.in_features])
@@ -192,7 +199,7 @@ class FusedLayout:
         return torch.cat([places.reshape(-1) for places in index])
 
     def weight_tiles(self, tile: int) -> Int32[Tensor, "tiles 8"]:
-        """Return what each program of the weight gradient's kernel computes, on the CPU.
+        """Return the work of each program of the weight gradient's kernel, on the CPU.
 
         Columns: network, first column among the layer inputs, first among the gradients, first place in the padded
         form, width of the layer's input, how many columns of inputs and of gradients the tile has, and the place of the
@@ -210,6 +217,7 @@ class FusedLayout:
                     for column in range(0, max(fan_in, 1), tile):
                         first = network, at.input + column, at.gradient + row
                         used = min(tile, fan_in - column), min(tile, at.fan_out - row)
+                        # Only the first tile of a row of tiles adds up the biases' gradients.
                         if column:
                             bias = -1
                         else:
@@ -249,12 +257,13 @@ class Tuning:
 
     @classmethod
     def of(cls, layout: FusedLayout, dtype: torch.dtype) -> "Tuning":
-        """Return what suits a layout: chained, the first and the third width must be whole numbers of chunks."""
+        """Return sizes that suit a layout: chained, the first and the third width must be whole numbers of chunks."""
         # An element of float32 takes twice the registers and shared memory: so two programs share a multiprocessor.
         if dtype is torch.float32:
             wide: Any = {"stages": 2, "tile": 64, "tile_warps": 4}
         else:
             wide = {}
+        # Layers that run one at a time have no chunks.
         if not layout.chained:
             return cls(block=64 if wide else 128, **wide)
         chunk = math.gcd(cls.chunk, layout.hidden[0], layout.hidden[2])
@@ -276,6 +285,7 @@ def why_not_fused(
     """Return why the kernels cannot make the gradient steps of `cfg`, or None if they can."""
     if cfg.kernels == "torch":
         return "kernels='torch'"
+    # Settings for which there are no kernels.
     refused = {
         "advantage": cfg.advantage != "gae",
         "estimate_each_epoch": cfg.estimates_each_epoch,
@@ -296,6 +306,7 @@ def why_not_fused(
     if widest > MAX_WIDTH or networks.actor[-1].out_features > MAX_ACTIONS:
         return f"a hidden layer is wider than {MAX_WIDTH}, or there are more than {MAX_ACTIONS} actions"
     if cfg.precision == "float32":
+        # The user asked for exact products, which tensor cores do not have.
         if torch.get_float32_matmul_precision() == "highest":
             return "precision='float32' with matmul_precision='highest', and the kernels multiply float32 as TF32"
         if widest > MAX_TF32_WIDTH:
@@ -321,6 +332,7 @@ def launch(
         run = partial(kernel.warmup, grid=grid)
     else:
         run = kernel[grid]
+    # Only the kernel's own parameters: callers pass everything they know.
     run(**{name: given[name] for name in kernel.arg_names}, num_warps=num_warps)
 
 

@@ -35,6 +35,7 @@ def policy_gradient(
     output = tl.arange(0, OUT)[None, :]
     action_dims = output < ACTIONS
     keep = valid[:, None]
+    # The columns of the record, in its order; rows beyond the minibatch read harmless values.
     action = tl.load(record[:, None] + output, mask=keep, other=0.0)
     loc_old = tl.load(record[:, None] + (OUT + output), mask=keep, other=0.0)
     scale_old = tl.load(record[:, None] + (2 * OUT + output), mask=keep, other=1.0)
@@ -48,15 +49,18 @@ def policy_gradient(
         std = tl.maximum(raw_std, 0.0) + tl.log(1.0 + tl.exp(-tl.abs(raw_std)))
     else:
         std = raw_std
+    # The floor holds forward only: the gradient below passes it, so that a std under it can come back.
     bounded = tl.maximum(std, MIN_STD)
     inverse = 1.0 / bounded
     log_scale = tl.log(bounded)
+    # The log-probability of the stored action, summed over the dims that exist.
     error = (action - loc) * inverse
     log_prob = tl.sum(tl.where(action_dims, -0.5 * error * error - log_scale - HALF_LOG_2_PI, 0.0), 1)
     # Padding and rows that take no part may be anything, and zero times infinity is NaN.
     counts = mask > 0.0
     log_ratio = tl.where(counts, log_prob - log_prob_old, 0.0)
     clipped = tl.minimum(tl.maximum(log_ratio, log_ratio_low), log_ratio_high)
+    # The clipped objective of PPO is the smaller of these two.
     gain = tl.exp(log_ratio) * advantage
     clipped_gain = tl.exp(clipped) * advantage
     inside = clipped == log_ratio
@@ -64,13 +68,16 @@ def policy_gradient(
     slope = tl.where(inside | (gain < clipped_gain), -gain, 0.0) * mask
 
     error = tl.where(counts[:, None], error, 0.0)
+    # By the chain rule, the slope at the log-probability times its derivatives at mean and std.
     d_loc = slope[:, None] * error * inverse
     d_std = (slope[:, None] * (error * error - 1.0) - entropy_coeff * mask[:, None]) * inverse
     log_slope = tl.zeros_like(loc)
     if NODES:  # the mean of log(1 - tanh(u)^2) over the gaussian
         for node in range(NODES):
             at, share = tl.load(nodes + 2 * node), tl.load(nodes + 2 * node + 1)
+            # Each node is one value before the tanh, at a fixed number of standard deviations from the mean.
             latent = loc + bounded * at
+            # From |u| alone, so that the exponential never overflows: the function is even.
             fold = tl.exp(-2.0 * tl.abs(latent))
             log_slope += share * 2.0 * (LOG_2 - tl.abs(latent) - tl.log(1.0 + fold))
             change = tl.where(latent < 0.0, 2.0, -2.0) * (1.0 - fold) / (1.0 + fold) * share
@@ -80,12 +87,15 @@ def policy_gradient(
         d_std = d_std * std
     elif STATE_STD:
         d_std = d_std * tl.sigmoid(raw_std)
+    # Padded actions have no std, whose gradient must not leave rubbish in the padding.
     d_std = tl.where(action_dims, d_std, 0.0)
     tl.store(d_std_at + tl.arange(0, OUT), tl.sum(d_std, 0))
 
+    # The divergence of the new policy from the one that collected, dim by dim, in nats.
     log_std_ratio = tl.where(counts[:, None], tl.log(scale_old) - log_scale, 0.0)
     drift = tl.where(counts[:, None], (loc_old - loc) * inverse, 0.0)
     divergence = 0.5 * (tl.exp(2.0 * log_std_ratio) + drift * drift - 1.0) - log_std_ratio
+    # Sums over the block; `sum_gradients` divides them by the number of rows that take part.
     tl.store(statistics, tl.sum(mask))
     tl.store(statistics + 1, -tl.sum(tl.minimum(gain, clipped_gain) * mask))
     tl.store(statistics + 2, tl.sum(tl.sum(tl.where(action_dims, divergence, 0.0), 1) * mask))
@@ -100,6 +110,7 @@ def policy_gradient(
 @triton.jit
 def _store_moments(at, values, mask, count):
     total = tl.sum(values * mask)
+    # The mean of this block: blocks are merged later by their sums and squares (Chan et al., 1979).
     gap = (values - total / tl.maximum(count, 1.0)) * mask
     tl.store(at, total)
     tl.store(at + 1, tl.sum(gap * gap))
@@ -116,6 +127,7 @@ def value_gradient(
     and that of squares about their mean, which does not cancel as that about zero does.
     """
     output = tl.arange(0, OUT)[None, :]
+    # A tile has no indexing: the first column is picked by a masked sum.
     value = tl.sum(tl.where(output == 0, out, 0.0), 1)
     target = tl.load(record + (3 * OUT + TARGET), mask=valid, other=0.0)
     mask = tl.load(record + (3 * OUT + MASK), mask=valid, other=0.0)
@@ -124,10 +136,12 @@ def value_gradient(
     slope = 2.0 * error
     if CLIP_VALUE:
         value_old = tl.load(record + (3 * OUT + VALUE), mask=valid, other=0.0)
+        # The clipped loss of rsl_rl: the larger of the errors of the free and of the held value.
         change = tl.where(mask > 0.0, value - value_old, 0.0)
         held = tl.minimum(tl.maximum(change, -clip_value), clip_value)
         held_error = value_old + held - target
         held_loss = held_error * held_error
+        # Where the held loss is larger and the value is held, nothing moves it.
         slope = tl.where((held == change) | (loss > held_loss), slope, 0.0)
         loss = tl.maximum(loss, held_loss)
     slope = slope * mask * critic_coeff
@@ -155,14 +169,17 @@ def estimate_advantages(
     counts = tl.zeros((BLOCK,), dtype=tl.float32)
     means = tl.zeros((BLOCK,), dtype=tl.float32)
     squares = tl.zeros((BLOCK,), dtype=tl.float32)
+    # From the last step to the first: each advantage contains the one after it.
     for back in range(1, STEPS + 1):
         at = (STEPS - back) * num_envs + env
         value = tl.load(values + at, mask=inside, other=0.0)
         following = gamma * tl.load(next_values + at, mask=inside, other=0.0)
         ended = tl.load(done + at, mask=inside, other=1) != 0
+        # A where instead of a product: after a termination the next value may be NaN.
         bootstrap = tl.where(tl.load(terminated + at, mask=inside, other=1) != 0, 0.0, following)
         delta = tl.load(reward + at, mask=inside, other=0.0) + bootstrap - value
         finite = tl.abs(delta) < float("inf")
+        # Nothing is carried over the end of an episode, or over a step that is not finite.
         carried = tl.where(finite & (ended == 0), decay, 0.0) * advantage
         advantage = tl.where(finite, delta, 0.0) + carried
         tl.store(targets + at, advantage + value, mask=inside)
@@ -173,6 +190,7 @@ def estimate_advantages(
         gap = tl.where(counted, advantage - means, 0.0)
         means += gap / tl.maximum(counts, 1.0)
         squares += gap * tl.where(counted, advantage - means, 0.0)
+    # The envs' own moments are merged into those of the program.
     count = tl.sum(counts)
     mean = tl.sum(counts * means) / tl.maximum(count, 1.0)
     moments += tl.program_id(0) * 3

@@ -18,8 +18,10 @@ from ksim_rl.objectives.fused_ppo.loss_kernels import policy_gradient, value_gra
 def operand(value, dtype, TF32: tl.constexpr):
     """Return `value` as products take it; with TF32 rounded to 11 significant bits, as `as_tf32` does."""
     if TF32:
+        # Half of the 13 bits that are cut off is added first, which rounds to the nearest.
         bits = value.to(tl.int32, bitcast=True)
         rounded = ((bits + 0x1000) & -0x2000).to(tl.float32, bitcast=True)
+        # NaN stays NaN, where the addition could carry into its sign.
         value = tl.where(value == value, rounded, value)
     return value.to(dtype)
 
@@ -58,6 +60,7 @@ def read_rows(
     used = column < WIDTH
     value = tl.load(source + (row * WIDTH + column), mask=keep & used, other=0.0)
     if NORMALIZED:
+        # Normalized in float32, before the cast to the dtype of the products.
         shift = tl.load(mean + column, mask=used, other=0.0)
         value = (value - shift) / tl.sqrt(tl.load(var + column, mask=used, other=1.0) + eps)
     return operand(value, like.dtype.element_ty, TF32)
@@ -81,6 +84,7 @@ def _outputs(
     column2 = tl.arange(0, H2)
     output = tl.arange(0, OUT)
     at = rows[:, None]
+    # Observations are read as one or two powers of two of columns: a single one would be mostly padding.
     observed = read_rows(seen, at, head_column, keep, mean, var, eps, weights, WIDTH, NORMALIZED, TF32)
     if STORE:
         tl.store(inputs + (input_rows + head_column), observed, mask=keep)
@@ -93,6 +97,7 @@ def _outputs(
     # Biases are loaded a chunk ahead: those of the same chunk each thread would copy to shared memory, like weights.
     bias = tl.load(biases + column)
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
+        # A chunk of the first hidden layer is computed, activated, and directly multiplied into the second.
         row = (first + column)[None, :] * OBS
         hidden = tl.dot(observed, tl.load(weights + (row + head_column[:, None])))
         if REST:
@@ -102,6 +107,7 @@ def _outputs(
         bias = tl.load(biases + (first + CHUNK) % H1 + column)
         hidden = operand(activate(hidden, ACTIVATION), dtype, TF32)
         acc = tl.dot(hidden, weight2, acc)
+    # The second hidden layer is kept as a whole: each chunk of the third one needs all of it.
     second = activate(acc + tl.load(biases + H1 + column2)[None, :], ACTIVATION)
     second = operand(second, dtype, TF32)
     if STORE:
@@ -109,6 +115,7 @@ def _outputs(
     out = tl.zeros((BLOCK, OUT), dtype=tl.float32)
     bias = tl.load(biases + H1 + H2 + column)
     for first in tl.range(0, H3, CHUNK, num_stages=STAGES):
+        # Chunks of the third layer go straight into the outputs, in the same way.
         weight3 = tl.load(weights + (THIRD_AT + (first + column)[None, :] * H2 + column2[:, None]))
         weight4 = tl.load(weights + (OUT_AT + output[None, :] * H3 + (first + column)[:, None]))
         hidden = tl.dot(second, weight3) + bias[None, :]
@@ -131,6 +138,7 @@ def network_outputs(
     """Write what a network makes of rows of `obs` [D, WIDTH] to `outputs` [D, COLUMNS]; LISTED, `count` to `places`."""
     rows = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     if LISTED:
+        # The number of rows is known on the device only; programs beyond it have nothing to do.
         num_rows = tl.load(count)
     if tl.program_id(0) * BLOCK >= num_rows:
         return
@@ -140,6 +148,7 @@ def network_outputs(
         H1, H2, H3, OUT, CHUNK, STAGES, ACTIVATION, TF32, False
     )  # fmt: skip
     if LISTED:
+        # Row i of the list is of the env state at `places[i]`.
         rows = tl.load(places + rows, mask=valid, other=0)
     column = tl.arange(0, OUT)[None, :]
     tl.store(outputs + (rows[:, None] * COLUMNS + column), out, mask=valid[:, None] & (column < COLUMNS))
@@ -176,6 +185,7 @@ def minibatch_gradients(
     rows = block * BLOCK + tl.arange(0, BLOCK)
     valid = rows < num_rows
     keep = valid[:, None]
+    # The minibatch is a list of env states: rows are gathered, and never copied together.
     index = tl.load(order + rows, mask=valid, other=0).to(tl.int32)
     weights += network * NUM_PADDED
     biases += network * NUM_PADDED
@@ -195,6 +205,7 @@ def minibatch_gradients(
 
     record = records + index.to(tl.int64) * RECORD
     if network == 0:
+        # The std follows the biases; padding has the neutral value 1, or 0 as a logarithm.
         raw_std = tl.load(
             biases + H1 + H2 + H3 + OUT + output, mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
         )[None, :]
@@ -204,12 +215,14 @@ def minibatch_gradients(
         )  # fmt: skip
     else:
         d_out = value_gradient(out, record, valid, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
+    # Gradients of the outputs, from here on the first factor of the products back.
     d_out = operand(d_out, dtype, TF32)
     tl.store(slopes + (gradient_rows + (H2 + H3 + output[None, :])), d_out, mask=keep)
     # From here on threads read hidden layers that others of the block have written.
     tl.debug_barrier()
     acc = tl.zeros((BLOCK, H2), dtype=tl.float32)
     for first in tl.range(0, H3, CHUNK, num_stages=STAGES):
+        # Back through the third layer chunk by chunk; `acc` collects the gradient of the second.
         weight4 = tl.load(weights + (OUT_AT + output[:, None] * H3 + (first + column)[None, :]))
         weight3 = tl.load(weights + (THIRD_AT + (first + column)[:, None] * H2 + column2[None, :]))
         hidden = tl.load(inputs + (input_rows + (OBS + H2 + first + column[None, :])), mask=keep, other=0.0)
@@ -242,6 +255,7 @@ def lower_gradients(
     split = tl.program_id(1)
     network = tl.program_id(2)
     SECOND_AT: tl.constexpr = H1 * OBS
+    # Transposed: elements of the hidden layer are rows, env states columns.
     element = (tl.program_id(0) * LOWER + tl.arange(0, LOWER))[:, None]
     head_column = tl.arange(0, HEAD)[None, :]
     column2 = tl.arange(0, H2)[None, :]
@@ -262,11 +276,13 @@ def lower_gradients(
     for first in tl.range(0, ROWS, LOWER_DEPTH, num_stages=LOWER_STAGES):
         rows = (split * ROWS + first + tl.arange(0, LOWER_DEPTH))[:, None]
         observed = tl.load(inputs + (rows * INPUTS + head_column), mask=rows < num_rows, other=0.0)
+        # Gradients at the second hidden layer, which `minibatch_gradients` has left.
         above = tl.load(slopes + (rows * GRADIENTS + column2), mask=rows < num_rows, other=0.0)
         hidden = tl.dot(weight1, tl.trans(observed))
         if REST:
             rest = tl.load(inputs + (rows * INPUTS + rest_column), mask=rows < num_rows, other=0.0)
             hidden = tl.dot(weight_rest, tl.trans(rest), hidden)
+        # Forward again for these elements, then back to them through the second layer's weights.
         hidden = operand(activate(hidden + bias, ACTIVATION), observed.dtype, TF32)
         slope = tl.dot(weight2, tl.trans(above))
         # Beside which a GPU takes the slopes of the activation: a product that adds up is not waited for.
@@ -294,6 +310,7 @@ def weight_gradients(
     A split has ROWS rows of the minibatch. Of several splits each writes its own sum, [splits, 2, NUM_PADDED], so that
     the result does not depend on who is first. Biases have an input of one.
     """
+    # The columns of `FusedLayout.weight_tiles`. Widths are multiples of 16, which allows wide loads.
     tile = tiles + tl.program_id(0) * 8
     split = tl.program_id(1)
     network = tl.load(tile)

@@ -23,6 +23,7 @@ SUMMARY = (
     "skipped_in_a_row",
     "loss_mirror",
 )
+# Kernels read globals only as constants of their own type.
 LOSS = tl.constexpr(SUMMARY.index("loss"))
 LEARNING_RATE = tl.constexpr(SUMMARY.index("learning_rate"))
 GRAD_NORM = tl.constexpr(SUMMARY.index("grad_norm"))
@@ -39,9 +40,11 @@ EPS = tl.constexpr(1.1920929e-07)
 def _block_sums(
     partials, column, inside, WIDTH: tl.constexpr, BLOCKS: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
 ):  # fmt: skip
+    # Each row of the tile adds up its share of the blocks; the rows are added last, in a fixed order.
     sums = tl.zeros((ROWS, COLUMNS), dtype=tl.float32)
     for first in range(0, BLOCKS, ROWS):
         block = (first + tl.arange(0, ROWS))[:, None]
+        # A block has two rows, one per network; this is the actor's.
         keep = (block < BLOCKS) & inside[None, :]
         sums += tl.load(partials + (block * 2 * WIDTH + column[None, :]), mask=keep, other=0.0)
     return tl.sum(sums, 0)
@@ -103,19 +106,23 @@ def sum_gradients(
     if program < 2 * PROGRAMS:
         network = program // PROGRAMS
         at = (program % PROGRAMS) * SIZE + tl.arange(0, SIZE)
+        # The std that is no output of a layer has its gradient from the policy's loss, in the branch below.
         kept = at < (NUM_PADDED if STATE_STD else STD_AT)
         total = tl.zeros((SIZE,), dtype=tl.float32)
+        # In the order of the splits, so that the same sums have the same bits each time.
         for split in tl.static_range(SPLITS):
             place = (split * 2 + network) * NUM_PADDED + at
             total += tl.load(weight_partials + place, mask=kept, other=0.0)
         total = total / divisor
         tl.store(gradients + (network * NUM_PADDED + at), total, mask=kept)
+        # Partial squares of the norm, which `adam_step` adds up.
         tl.store(squares + program, tl.sum(total * total))
     elif program == 2 * PROGRAMS:
         output = tl.arange(0, OUT)
         column = tl.arange(0, NUM_STATISTICS)
         sums = _block_sums(block_partials, OUT + column, column < 6, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
         if not STATE_STD:
+            # The std is shared by all rows: its gradient is a sum over all blocks.
             d_std = _block_sums(block_partials, output, output >= 0, WIDTH, BLOCKS, ROWS, OUT) / divisor
             tl.store(gradients + STD_AT + output, d_std)
             tl.store(squares + program, tl.sum(d_std * d_std))
@@ -128,6 +135,7 @@ def sum_gradients(
             entropy = _column(policy, 4, NUM_STATISTICS)
         else:
             acts = output < ACTIONS
+            # The entropy of a shared std is the same in each row, and computed once from the parameter.
             raw = tl.load(biases + (NUM_BIASES - OUT + output), mask=acts, other=0.0 if LOG_STD else 1.0)
             std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
             entropy = tl.sum(tl.where(acts, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0)) * (counted / number)
@@ -138,14 +146,17 @@ def sum_gradients(
         tl.store(summary + 4, _column(policy, 3, NUM_STATISTICS))
         if MIRROR:
             tl.store(summary + LOSS_MIRROR, _column(policy, 5, NUM_STATISTICS))
+        # Several ranks adapt the rate in `take_means`, from the divergence of all of them.
         alone: tl.constexpr = ADAPTIVE and RANKS == 1
         tl.store(summary + LEARNING_RATE, _adapt(learning_rate, kl, desired_kl, rate_bounds, alone))
     else:
+        # The last program has the value's statistics: loss, and the moments of targets and errors.
         count = tl.zeros((ROWS,), dtype=tl.float32)
         loss, target, error, target_squares, error_squares = count, count, count, count, count
         for first in range(0, BLOCKS, ROWS):
             block = first + tl.arange(0, ROWS)
             keep = block < BLOCKS
+            # Past the row of the actor and the critic's unused columns of the std.
             row = block_partials + (block * 2 * WIDTH + WIDTH + OUT)
             size = tl.load(row, mask=keep, other=0.0)
             loss += tl.load(row + 1, mask=keep, other=0.0)
@@ -155,7 +166,9 @@ def sum_gradients(
             error, error_squares = _merged(count, error, error_squares, size, total, own)
             count += size
         counted = tl.sum(count)
+        # With more ranks the division by the rows that took part waits until sums of all ranks are there.
         number = tl.maximum(counted, 1.0) if RANKS == 1 else divisor
+        # The share of the targets' variance that the critic leaves unexplained.
         left = _variance(count, error, error_squares) / (_variance(count, target, target_squares) + EPS)
         tl.store(summary + 1, critic_coeff * tl.sum(loss) / number)
         tl.store(summary + 5, (1.0 - left) * (counted / number))
@@ -167,6 +180,7 @@ def take_means(
     NUM_GRADIENTS: tl.constexpr, ADAPTIVE: tl.constexpr, SIZE: tl.constexpr,
 ):  # fmt: skip
     """Take squares and means of what `sum_gradients` left, added up over ranks, and adapt the learning rate."""
+    # Gradients and statistics lie end to end, so that one collective adds up both over the ranks.
     sums = gradients + NUM_GRADIENTS
     at = tl.program_id(0) * SIZE + tl.arange(0, SIZE)
     gradient = tl.load(gradients + at, mask=at < NUM_GRADIENTS, other=0.0)
@@ -219,11 +233,14 @@ def adam_step(
     correction1 = (1.0 - tl.exp(steps_made * log_beta1)).to(tl.float32)
     correction2 = (1.0 - tl.exp(steps_made * log_beta2)).to(tl.float32)
 
+    # Means of the rows that took part, clipped by the norm of all gradients.
     gradient = gradient / share * (tl.minimum(max_grad_norm / (norm + 1e-6), 1.0) if CLIP else 1.0)
+    # As torch's Adam: the decay is a part of the gradient, not decoupled as in AdamW.
     gradient += weight_decay * parameter
     new_mean = mean + (gradient - mean) * (1.0 - beta1)
     new_variance = beta2 * variance + (1.0 - beta2) * gradient * gradient
     change = (rate / correction1) * new_mean / (tl.sqrt(new_variance) / tl.sqrt(correction2) + adam_eps)
+    # A step that is not finite writes back what was there.
     parameter = tl.where(made, parameter - change, parameter)
     tl.store(parameters + at, parameter)
     tl.store(means + at, tl.where(made, new_mean, mean))
@@ -231,10 +248,12 @@ def adam_step(
     tl.store(weights + place, operand(parameter, weights.dtype.element_ty, TF32), mask=inside)
     tl.store(exact_weights + place, parameter, mask=inside)
     if tl.program_id(0) == 0:
+        # One program keeps the counters and the summary of this step.
         miss = tl.where(made, 0, 1).to(tl.int64)
         in_a_row = (tl.load(skipped_in_a_row) + miss) * miss
         tl.store(skipped, tl.load(skipped) + miss)
         tl.store(skipped_in_a_row, in_a_row)
+        # The next step reads its number here: the kernel is launched with the place one further on.
         tl.store(steps + 1, tl.where(made, step + 1.0, step))
         tl.store(summary + LOSS, loss)
         tl.store(summary + GRAD_NORM, norm)
@@ -249,6 +268,7 @@ def mean_steps(
     """Write the means of all columns over the steps that were made, and how many in a row were skipped at most."""
     row = tl.arange(0, POWER_OF_STEPS)[:, None]
     at, inside = summary + row * COLUMNS, row < STEPS
+    # Rows beyond the steps count as skipped.
     made = tl.load(at + SKIPPED, mask=inside, other=1.0) == 0.0
     # What a skipped step measured would spoil the means.
     column = tl.arange(0, COLUMNS)
