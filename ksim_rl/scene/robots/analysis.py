@@ -1,4 +1,4 @@
-"""Analyses an unknown robot: what its model says, and all that a walking task needs."""
+"""Analyses an unknown robot: the facts of its model, and all that a walking task needs."""
 
 import dataclasses
 import io
@@ -52,7 +52,7 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True, kw_only=True)
 class JointAnalysis:
-    """One joint as it is in the model, and from `stance` on what is proposed for it; rad, N m and kg m^2 (or m, N, kg).
+    """One joint as it is in the model, and from `stance` on as it is proposed; rad, N m and kg m^2 (or m, N, kg).
 
     `gains` are stiffness and damping of the model's own `actuator`, `load` is the torque that holds the joint in the
     stance, and `sag` how far it is from its target after standing.
@@ -81,13 +81,13 @@ class RobotAnalysis:
     Attributes:
         mass, height: kg, and m from the lowest point to the highest in the model's own pose.
         com_height: m of the centre of mass above the soles in the stance.
-        pitch_joints: those of the legs that turn about y.
+        pitch_joints: joints of the legs that turn about y.
         ankle_stiffness_ratio: of all ankles about y, over m g h; a biped needs more than 1 to stand without a policy.
         knee_sag: rad, the most that a pitch joint gives way.
         stands_s, drift: s until it falls with zero actions in MuJoCo's C engine (at most 5), and m that it moves.
         pose: the keyframe that the stance was found from, or "qpos0".
-        passive_joints: those without a motor, in the model and in what is proposed.
-        notes: what was assumed, changed or left out.
+        passive_joints: joints without a motor, in the model and in the proposal.
+        notes: assumptions, changes and omissions.
     """
 
     robot: ModelRobot
@@ -192,6 +192,7 @@ def analyse(source: Source, *, pose: str | None = None) -> RobotAnalysis:
     found: list[RobotAnalysis] = []
     refused: list[ValueError] = []
     for start in starting_poses(model.mj_model, pose):
+        # A pose in which the robot cannot stand is refused; another one may do.
         try:
             found.append(_analyse_from(model, start))
         except ValueError as error:
@@ -199,6 +200,7 @@ def analyse(source: Source, *, pose: str | None = None) -> RobotAnalysis:
             continue
         if found[-1].stands_s >= TRIAL_S:
             return found[-1]
+    # The first refusal is of the pose that was meant most.
     if not found:
         raise refused[0]
     return max(found, key=lambda analysis: analysis.stands_s)
@@ -212,10 +214,12 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
     legs = anatomy.legs
     biped = len(anatomy.legs) == 2
     passive = passive_joints(mj_model)
+    # From here on in the stance: all soles flat, the centre of mass over them.
     data = posed(mj_model, find_stance(mj_model, legs, given, passive=passive))
     names = {j: mj_model.joint(j).name for j in scalar_joint_ids(mj_model) if j not in passive}
     of_legs = []
     for leg in legs:
+        # Legs may share joints, which must count once.
         of_legs += [j for j in leg.joints if j in names and j not in of_legs]
     dof = mj_model.jnt_dofadr
     com_height = float(data.subtree_com[0, 2])
@@ -232,6 +236,7 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
         load -= jacobian[2] * weight / len(legs)
     most = MOST_EFFORT * weight * com_height
     given_drives = {j: _drive(mj_model, j, most=most) for j in names}
+    # For joints whose file names no limit: half of m g h, to three digits for small robots.
     usual = 0.5 * weight * com_height
     if usual > 1.0:
         usual = round(usual, 1)
@@ -239,22 +244,28 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
         usual = _short(usual)
     efforts = {j: limit or usual for j, (_, _, limit) in given_drives.items()}
     inertias = {j: _short(mj_model.dof_armature[dof[j]] or ARMATURE_PER_EFFORT * efforts[j]) for j in names}
+    # Stiffness by joint: the largest of three needs.
     gains = {}
     for j in names:
+        # What a joint must carry: a leg's joint the whole robot, any other joint its own subtree.
         if j not in of_legs:
             over = mj_model.jnt_bodyid[j]
         else:
             over = 0
+        # Two legs share the load; on four, toppling over a single joint is not to be feared.
         if j not in of_legs:
             share = 1.0
         elif biped:
             share = 0.5
         else:
             share = 0.0
+        # Only height over a horizontal axis topples: m of lever per rad.
         lever = np.hypot(*data.xaxis[j, :2]) * max(0.0, data.subtree_com[over, 2] - data.xanchor[j, 2])
         topples = share * mj_model.body_subtreemass[over] * GRAVITY * lever
+        # First need: a natural frequency for the motor alone, but too soft to saturate below an error of `SOFTEST`.
         own = min(inertias[j] * (2.0 * math.pi * FREQUENCY) ** 2, efforts[j] / SOFTEST)
         gains[j] = max(own, abs(load[dof[j]]) / MOST_SAG, 2.0 * topples)
+    # Left and right get the same gains, joint by joint from the hip down.
     for joints in zip(*(leg.joints for leg in legs), strict=False):
         alike = [j for j in joints if j in gains]
         gains |= dict.fromkeys(alike, max((gains[j] for j in alike), default=0.0))
@@ -278,6 +289,7 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
         trials.append((standing.seconds, -sag, standing, robot, servos, mj_stand))
     _, sag, standing, robot, servos, mj_stand = max(trials, key=lambda trial: trial[:2])
 
+    # The last pitch joint of a leg is its ankle.
     ankles = sum(servos[joints[-1]]["stiffness"] for joints in pitch if joints)
     assumed = {
         "effort limit, half of weight times height": [
@@ -338,7 +350,9 @@ def _robot(
     mj_model = data.model
     every_joint = scalar_joint_ids(mj_model)
     root_at = int(mj_model.jnt_qposadr[mj_model.jnt_type.argmin()])
+    # Adding 0 turns -0 into 0, for code that is read by people.
     w, x, y, z = (round(float(value), 6) + 0.0 for value in data.qpos[root_at + 3 : root_at + 7])
+    # Joints with equal servos share an entry.
     alike: dict[tuple[float, ...], list[int]] = {}
     for j, servo in servos.items():
         alike.setdefault(tuple(servo.values()), []).append(j)
@@ -347,6 +361,7 @@ def _robot(
     sites = []
     for leg in anatomy.legs:
         foot = data.body(leg.foot)
+        # The middle of the tread, in the foot's own frame.
         tread = (leg.points(data).mean(0) - foot.xpos) @ foot.xmat.reshape(3, 3)
         sites.append(Site(name=leg.foot, body=leg.foot, pos=rounded(tread)))
     if not any(site.name == "imu" for site in model.spec.sites):
@@ -382,6 +397,7 @@ def _robot(
         free_root=model.frees_root,
         root_turn=model.root_turn,
     )
+    # Hulls that touch in the stance would push the robot apart: their bodies pass through each other.
     trial = robot.spec().compile()
     contacts = posed(trial, trial.key_qpos[0]).contact.geom
     touching = set()
@@ -412,6 +428,7 @@ def _drive(
             gains = abs(control.stiffness), abs(control.damping)
         if mj_model.actuator_forcelimited[a]:
             limits.append(gear * np.abs(mj_model.actuator_forcerange[a]).max())
+        # A motor's control range limits its force where no force range does.
         elif mj_model.actuator_ctrllimited[a] and target == "effort":
             limits.append(
                 gear * np.abs(mj_model.actuator_gainprm[a, 0] * mj_model.actuator_ctrlrange[a]).max()

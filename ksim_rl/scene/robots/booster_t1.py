@@ -1,6 +1,6 @@
 """Booster T1: the menagerie's model with position servos per joint group and lean collisions.
 
-Frames: the root is `Trunk` (x forward, y left, z up). Masses, joints, ranges and torque limits are those of
+Frames: the root is `Trunk` (x forward, y left, z up). Masses, joints, ranges and torque limits are from
 mujoco_menagerie/booster_t1. Its one stiffness for all joints lets the ankles give way under the body's weight, so the
 gains here are chosen per group: legs and waist stiff enough to stand on, arms and head soft.
 """

@@ -92,7 +92,7 @@ class Walker(ShippedModel, name="walker"):
 class Arm(ShippedModel, name="arm"):
     """Four joints on a fixed base at the origin, with position servos, and a rod as pusher with the site "tip".
 
-    Its weight is compensated, as that of many small arms is. The tip reaches 0.6 m from the shoulder, 0.16 m above the
+    Its weight is compensated, as in many small arms. The tip reaches 0.6 m from the shoulder, 0.16 m above the
     table, and points straight down in the ready pose. Only the pusher collides, with whatever has `contype` 1.
     """
 

@@ -32,16 +32,19 @@ class CollisionGeom:
     quat: Vector = (1.0, 0.0, 0.0, 0.0)
     fromto: Vector | None = None
     """The two ends of a capsule or cylinder, in place of `pos` and `quat`."""
+    # MuJoCo's own defaults, since a body's default class may have others.
     friction: Vector = (1.0, 0.005, 0.0001)
     condim: int = 3
     priority: int = 0
     solref: Vector = (0.02, 1.0)
     solimp: Vector = (0.9, 0.95, 0.001, 0.5, 2.0)
     margin: float = 0.0
+    # Group 3 is hidden in viewers by custom: collision geoms are not for show.
     group: int = 3
 
     def __rich_repr__(self) -> Iterator[tuple[str, Any, Any]]:
         """Yield name, value and default of each field, so that code shows what differs."""
+        # Without `field.default` each geom would be printed in full.
         yield from ((field.name, getattr(self, field.name), field.default) for field in fields(self))
 
     def __post_init__(self) -> None:
@@ -93,8 +96,10 @@ class Site:
 
 
 def reflected_inertia(inertias: Sequence[float], ratios: Sequence[float]) -> float:
-    """Return what a joint feels of a gear train, kg m^2: of its rotor, and what turns with each stage's output."""
+    """Return the inertia of a gear train at its joint, kg m^2: of its rotor, and of each stage's output."""
     total = 0.0
+    # From the rotor outwards: inertia before a stage counts by the square of its ratio; the output has no
+    # stage after it.
     for inertia, ratio in zip(inertias, (*ratios, 1.0), strict=True):
         total = (total + inertia) * ratio**2
     return total
@@ -103,11 +108,12 @@ def reflected_inertia(inertias: Sequence[float], ratios: Sequence[float]) -> flo
 def spread(
     table: Mapping[str, float], names: Sequence[str], *, default: float | None = None
 ) -> dict[str, float]:
-    """Return one value per name: that of the one pattern in `table` that fully matches it, else `default`."""
+    """Return one value per name: from the one pattern in `table` that fully matches it, else `default`."""
     owners = {pattern: match_names("name", (pattern,), names) for pattern in table}
     values = {}
     for index, name in enumerate(names):
         found = [table[pattern] for pattern, matches in owners.items() if index in matches]
+        # Two matches would make the value depend on the table's order.
         if len(found) > 1 or (not found and default is None):
             if found:
                 hint = ""
@@ -121,7 +127,7 @@ def spread(
 
 
 def root_sensors(*, imu: str, root: str) -> tuple[Sensor, ...]:
-    """Return what walking tasks read: an IMU at a site, and the angular momentum of all that hangs on the root."""
+    """Return the sensors that walking tasks read: an IMU at a site, and the angular momentum of the root's subtree."""
     site = mujoco.mjtObj.mjOBJ_SITE
     body = mujoco.mjtObj.mjOBJ_BODY
     kinds = mujoco.mjtSensor
@@ -130,6 +136,7 @@ def root_sensors(*, imu: str, root: str) -> tuple[Sensor, ...]:
         "imu_lin_vel": kinds.mjSENS_VELOCIMETER,
         "imu_lin_acc": kinds.mjSENS_ACCELEROMETER,
     }
+    # World z in the axes of the IMU's site: which way is up.
     up: dict[str, Any] = {"objtype": body, "objname": "world", "reftype": site, "refname": imu}
     return (
         *(Sensor(name=name, type=kind, objtype=site, objname=imu) for name, kind in at_imu.items()),
@@ -144,8 +151,9 @@ def reset_options(spec: mujoco.MjSpec) -> None:
 
 
 def clear_joint_losses(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
-    """Take damping and dry friction from every joint that an actuator drives; those of passive joints stay."""
+    """Take damping and dry friction from every joint that an actuator drives; passive joints keep theirs."""
     joints = {joint.name: joint for joint in _single_dof_joints(spec)}
+    # Losses are the business of the new actuators, which bring their own.
     for _, names in driven_joints(actuators, list(joints)):
         for name in names:
             joints[name].damping = [0.0, 0.0, 0.0]
@@ -155,9 +163,11 @@ def clear_joint_losses(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> No
 def drop_other_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
     """Delete the model's actuators that none of `actuators` replaces: of tendons, sites, bodies and other joints."""
     joints = [joint.name for joint in _single_dof_joints(spec)]
+    # Actuators of driven joints stay for now: `set_actuators` replaces them and keeps their sensors.
     replaced = {name for _, names in driven_joints(actuators, joints) for name in names}
     for actuator in list(spec.actuators):
         if actuator.trntype not in TO_JOINTS or actuator.target not in replaced:
+            # Sensors of a deleted actuator would keep the spec from compiling.
             drop_references(spec, mujoco.mjtObj.mjOBJ_ACTUATOR, {actuator.name})
             spec.delete(actuator)
 
@@ -185,11 +195,14 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
     for geom in geoms:
         check_known("body", geom.body, bodies)
     colliding = [geom for geom in spec.geoms if geom.contype or geom.conaffinity]
+    # Before deleting: inertia may be inferred from the geoms that go.
     _keep_inertia(spec, [geom.parent for geom in colliding])
     for pair in list(spec.pairs):
         spec.delete(pair)
+    # Tendons would not compile without the geoms that they wrap around.
     wrapped = _wrapped_geoms(spec)
     deleted = {geom.name for geom in colliding if geom.name not in wrapped}
+    # Geoms without names have no references.
     drop_references(spec, mujoco.mjtObj.mjOBJ_GEOM, deleted - {""})
     for geom in colliding:
         if geom.name in wrapped:
@@ -199,7 +212,9 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
     for geom in geoms:
         # Each attribute is written: the body's default class may hold others.
         attributes = {name: value for name, value in vars(geom).items() if name not in ("body", "fromto")}
+        # MuJoCo wants three sizes, whatever the kind.
         attributes["size"] = [*geom.size, 0.0, 0.0, 0.0][:3]
+        # Without mass: the body's inertia is written down already.
         placed = bodies[geom.body].add_geom(contype=1, conaffinity=1, mass=0.0, **attributes)
         if geom.fromto is not None:
             placed.fromto = geom.fromto
@@ -212,19 +227,22 @@ def _wrapped_geoms(spec: mujoco.MjSpec) -> set[str]:
 
 
 def _keep_inertia(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody]) -> None:
-    """Write down the inertia of those of the bodies that have it from their geoms."""
+    """Write down the inertia of the bodies that have it from their geoms."""
     from_geoms = spec.compiler.inertiafromgeom
     if not bodies or from_geoms == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE:
         return
-    # Then explicit inertias are ignored, those of bodies whose geoms stay too.
+    # Then explicit inertias are ignored, also for bodies whose geoms stay.
     all_inferred = from_geoms == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    # Without the world, whose inertia plays no part.
     present = list(spec.bodies)[1:]
     inferred = [all_inferred or (body in bodies and not body.explicitinertial) for body in present]
     if not any(inferred):
         return
     mj_model = compiled_bodies(spec)
+    # Otherwise the compiler would infer inertia from the new geoms.
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     for number, (body, is_inferred) in enumerate(zip(present, inferred, strict=True), 1):
+        # A body without mass cannot have an explicit inertia.
         if is_inferred and mj_model.body_mass[number] > 0.0:
             ipos = mj_model.body_ipos[number]
             iquat = mj_model.body_iquat[number]
@@ -234,7 +252,7 @@ def _keep_inertia(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody]) -> None
 def compiled_bodies(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Return the compiled model of a spec with each of its bodies, in the spec's order, and the masses it writes."""
     twin = spec.copy()
-    # Fused bodies have no inertia of their own, and the compiler scales what is written down from here once more.
+    # Fused bodies have no inertia of their own, and the compiler scales the masses written down from here once more.
     twin.compiler.fusestatic = False
     twin.compiler.settotalmass = -1
     with caught_warnings():
@@ -244,7 +262,7 @@ def compiled_bodies(spec: mujoco.MjSpec) -> mujoco.MjModel:
 def write_inertia(
     body: mujoco.MjsBody, mj_model: mujoco.MjModel, number: int, *, ipos: np.ndarray, iquat: np.ndarray
 ) -> None:
-    """Write down a body's mass and principal inertia, those of body `number`; the axes lie at `ipos` (m), `iquat`."""
+    """Write down a body's mass and principal inertia, from body `number`; the axes lie at `ipos` (m), `iquat`."""
     body.explicitinertial = True
     body.mass = mj_model.body_mass[number]
     body.inertia = mj_model.body_inertia[number]
@@ -269,6 +287,7 @@ def set_sites(spec: mujoco.MjSpec, sites: Iterable[Site]) -> None:
     bodies = {body.name: body for body in spec.bodies}
     for site in sites:
         check_known("body", site.body, bodies)
+        # Sites cannot change their parent: delete, and add again below.
         placed = present.get(site.name)
         if placed is not None and placed.parent != bodies[site.body]:
             spec.delete(placed)
@@ -276,6 +295,7 @@ def set_sites(spec: mujoco.MjSpec, sites: Iterable[Site]) -> None:
         placed = placed or bodies[site.body].add_site(name=site.name)
         placed.pos = site.pos
         placed.size = [site.radius] * 3
+        # Hidden in viewers by default.
         placed.group = 5
 
 
@@ -290,10 +310,11 @@ def set_keyframe(
 ) -> None:
     """Replace all keyframes by one: the root pose, `joint_pos`, and the controls of servos that hold those joints.
 
-    Needs a robot with one free joint, that of its root; balls stand as the model has them.
+    Needs a robot whose only free joint is its root's; balls stand as the model has them.
     """
     for key in list(spec.keys):
         spec.delete(key)
+    # In the order of the joints, which is the order of qpos.
     qpos: list[float] = []
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
@@ -306,6 +327,7 @@ def set_keyframe(
     for actuator in spec.actuators:
         control = control_of_spec(actuator)
         drives_joint = actuator.trntype in TO_JOINTS and actuator.target in joint_pos
+        # Only position servos hold a joint; a motor's control of 0 exerts nothing.
         holds = drives_joint and control.kind == "pos" and not control.refusal
         ctrl.append(control.of(joint_pos[actuator.target]) if holds else 0.0)
     spec.add_key(name=name, qpos=qpos, ctrl=ctrl)

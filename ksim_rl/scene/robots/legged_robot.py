@@ -22,7 +22,7 @@ class LeggedRobot(Protocol):
 
     name: ClassVar[str]
     root_body: ClassVar[str]  # the body with the free joint
-    joint_names: ClassVar[tuple[str, ...]]  # in policy order: that of actions and joint observations
+    joint_names: ClassVar[tuple[str, ...]]  # in policy order, as in actions and joint observations
     foot_geoms: ClassVar[tuple[str, ...]]  # what treads on the ground; their friction is drawn
     foot_sites: ClassVar[tuple[str, ...]]  # one per foot, near its sole
 

@@ -1,6 +1,6 @@
 """Unitree G1 with 29 joints: the menagerie's model with reflected motor inertia and position servos.
 
-Frames: the root is `pelvis` (x forward, y left, z up). Masses, joints and ranges are those of
+Frames: the root is `pelvis` (x forward, y left, z up). Masses, joints and ranges are from
 mujoco_menagerie/unitree_g1. Servo gains follow from the motors' gear trains and a chosen 10 Hz, as in BeyondMimic
 (Liao et al., 2025) and mjlab 1.6.0, whose figures these are, the stance and the collision set included.
 """
@@ -13,6 +13,7 @@ from ksim_rl.scene.actuators import Actuator, PositionActuator
 from ksim_rl.scene.robots.edit import CollisionGeom, Site, capsule, reflected_inertia, sphere, spread
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 
+# The model's order: legs, waist, arms, left before right.
 SIDES = ("left", "right")
 _LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 _ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
@@ -80,7 +81,9 @@ def _foot_geoms(side: str) -> tuple[CollisionGeom, ...]:
             f"{side}_foot{number}_collision",
             f"{side}_ankle_roll_link",
             0.01,
+            # Both ends lie in the plane of the sole.
             (*first, _SOLE_Z, *second, _SOLE_Z),
+            # Sliding, torsional (m) and rolling (m); the feet's priority makes it hold on any ground.
             friction=(0.6, 0.005, 0.0001),
             priority=1,
         )
@@ -89,6 +92,7 @@ def _foot_geoms(side: str) -> tuple[CollisionGeom, ...]:
 
 
 def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
+    # The hand leans inwards, so that its y changes sign with the side.
     y = 1.0 if side == "left" else -1.0
     legs = (
         ("hip", "hip_roll", 0.06, (0.02, 0, 0, 0.02, 0, -0.08)),
@@ -103,9 +107,11 @@ def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
         ("hand", "wrist_yaw", 0.035, (0.07, 0, 0, 0.15, -0.02 * y, 0)),
     )
     limbs = [
+        # One dimension: limbs push each other apart without friction.
         capsule(f"{side}_{name}_collision", f"{side}_{link}_link", radius, ends, condim=1)
         for name, link, radius, ends in (*legs, *arms)
     ]
+    # Feet stand between legs and arms.
     return (*limbs[: len(legs)], *_foot_geoms(side), *limbs[len(legs) :])
 
 

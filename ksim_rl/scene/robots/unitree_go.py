@@ -2,7 +2,7 @@
 
 Frames: the root is `trunk` (Go1) or `base` (Go2): x forward, y left, z up, origin at the body frame, not at the center
 of mass. Legs are FR, FL, RR, RL; each has hip (abduction, about x), thigh and calf (about y). Masses, joints, ranges
-and Go2's torque limits are those of mujoco_menagerie; friction and damping of the joints are left to the motors.
+and Go2's torque limits are from mujoco_menagerie; friction and damping of the joints are left to the motors.
 """
 
 from collections.abc import Mapping
