@@ -103,7 +103,7 @@ class Captured:
     The first `warmup` calls run eagerly on a side stream (their work counts), the next one records the graph, and
     from then on each call replays it. So `body` must be fit for replay: it reads and writes tensors that stay where
     they are, allocates no size that depends on data, and neither syncs with the host nor branches on tensor values.
-    What it does in Python happens only while it is eager or recorded; where that changes, `forget` the graph. It may
+    Its Python runs only while it is eager or recorded; where that changes, `forget` the graph. It may
     draw from the device's default random generator. The graphs of a device have their temporaries in the same memory:
     no two may run at the same time, and a tensor that one makes lasts as long as something refers to it. With
     `require_graphs`, a CUDA device without graphs is refused instead of a warning and eager calls. Calls are eager
@@ -184,7 +184,7 @@ class Captured:
         warp_side = warp_stream(stream)
         # Work in flight may use memory that is freed next.
         torch.cuda.synchronize(self.device)
-        # What the eager calls took: graphs have a pool of their own, and would take it again.
+        # Give back the memory of the eager calls: graphs have a pool of their own, and would take it again.
         upstream.free_cublas_workspaces()
         torch.cuda.empty_cache()
         graph = torch.cuda.CUDAGraph()
@@ -270,7 +270,7 @@ class WarpGraphs:
             wp.capture_launch(self._graphs[key], stream=stream)
 
     def clear(self) -> None:
-        """Forget all graphs, and free what they hold."""
+        """Forget all graphs, and free their memory."""
         self._graphs.clear()
         self._warm.clear()
         self._joined.clear()

@@ -15,7 +15,7 @@ GOLDEN = 0x9E3779B9
 
 
 class Keys(NamedTuple):
-    """What is mixed into the bits of each row: two numbers of 32 bits, [E] each."""
+    """The keys that are mixed into the bits of each row: two numbers of 32 bits, [E] each."""
 
     first_E: Tensor
     second_E: Tensor

@@ -12,7 +12,7 @@ ADVICE = "delete it, or set WARP_CACHE_PATH to another folder"
 
 @cache
 def mend_damages() -> None:
-    """Let Warp compile again what it cannot read in its cache."""
+    """Let Warp compile modules again that it cannot read in its cache."""
     upstream.watch_loads(_remove)
 
 

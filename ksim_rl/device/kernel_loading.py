@@ -46,9 +46,11 @@ class CompileLogger:
     def info(self, message: str) -> None:
         """Drop Warp's information lines, and report those that tell of a compiled module."""
         match = upstream.COMPILED_LINE.match(message)
+        # Lines of modules that come from the cache are dropped, too.
         if match is None:
             return
         now = time.monotonic()
+        # A new burst is counted from 1.
         if now - self.last_time > BURST_GAP_S:
             self.count = 0
             self.seconds = 0.0
@@ -86,6 +88,7 @@ if upstream.has_default_logger():  # one that the program set itself stays
 def compile_notice(hook: CompileHook) -> Iterator[None]:
     """Call `hook` with one line of text after each kernel module that Warp compiles in this block, counted from 1."""
     saved = _logger.hook
+    # The next compilation begins a new burst for this hook.
     _logger.hook = hook
     _logger.last_time = -BURST_GAP_S
     try:
@@ -104,10 +107,12 @@ def loaded_together(device: torch.device) -> Iterator[None]:
     found: dict[tuple[wp.Kernel, int | None], None] = {}
 
     def note(kernel: wp.Kernel, dim: Any, block_dim: int | None) -> None:
+        # A dim may be a single number.
         if isinstance(dim, (tuple, list)):
             size = dim
         else:
             size = (dim,)
+        # An empty launch loads nothing, and a generic kernel has no types before its launch.
         if all(size) and not kernel.is_generic:
             found[kernel, None if device.type == "cpu" else block_dim] = None
 

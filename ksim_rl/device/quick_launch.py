@@ -1,6 +1,6 @@
 """Launches kernels in C++ at little cost from Python, on Warp, which is imported at the first launch.
 
-`wp.launch` packs every argument anew, which takes longer than most small kernels run. Warp can record a launch and
+`wp.launch` packs every argument each time, which takes longer than most small kernels run. Warp can record a launch and
 issue it again; then only the bytes of its arguments are written, in one go.
 """
 
@@ -69,13 +69,14 @@ class QuickLaunch:
         """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""
         if 0 in dim:
             return
+        # As an operator, the recording would have noted it; as a launch, it would be lost.
         assert not recording.is_recording(), "a kernel that is no operator of torch cannot be recorded"
         kernel = self._kernel or self._made()
         kernel.launch(device, dim, values)
 
     @property
     def loadable(self) -> "tuple[wp.Module, int]":
-        """What Warp compiles, and for blocks of which size."""
+        """The module that Warp compiles, and the size of blocks."""
         kernel = self._kernel or self._made()
         return kernel.loadable
 
@@ -83,6 +84,7 @@ class QuickLaunch:
         # Warp takes a second to import, and may be absent where nobody launches anything.
         from ksim_rl.device.native_kernel import NativeKernel
 
+        # Two threads may make the first launch at the same time.
         with self._making:
             if self._kernel is None:
                 self._kernel = NativeKernel(self._arguments, self._source, self._indices, self._block_dim)
@@ -91,9 +93,10 @@ class QuickLaunch:
 
 @cache
 def has_warp() -> bool:
-    """Whether Warp is installed; where it is not, torch computes what operators do."""
+    """Whether Warp is installed; where it is not, torch does the work of operators."""
     try:
         import warp  # noqa: F401
+    # A package that Warp itself lacks is another fault, which is not to be hidden.
     except ModuleNotFoundError as error:
         if error.name != "warp":
             raise
@@ -122,6 +125,7 @@ def as_operator(
         chosen = launch
     else:
         chosen = _by_kernel_or_torch(launch, in_torch)
+    # The operator exists for tracing and recording only.
     operator = torch.library.custom_op(f"ksim_rl::{name}", chosen, mutates_args=mutates)
     operator.register_fake(fake)
 
@@ -133,7 +137,7 @@ def as_operator(
 
 
 def _by_kernel_or_torch(launch: Callable[..., Any], in_torch: Callable[..., Any]) -> Callable[..., Any]:
-    # Its signature, which torch reads, is that of `launch`.
+    # It keeps the signature of `launch`, which torch reads.
     @wraps(launch)
     def run(*arguments: Any) -> Any:
         work = launch if has_warp() else in_torch

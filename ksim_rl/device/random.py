@@ -56,7 +56,7 @@ def row_keys(
     """Name the coordinates of one draw for each env row; with several ranks, rows are counted over all of them.
 
     Two streams (see `stream_id`) never share numbers. The counter has shape [] (all rows at the same count) or [E].
-    What is `shared` is drawn alike by all ranks.
+    With `shared`, all ranks draw the same numbers.
     """
     return RowKeys(seed, stream, counter, num_rows, 0 if shared else group.first_row(num_rows))
 
@@ -72,6 +72,7 @@ def uniform(
         return torch.lerp(low, high, uniform(keys, n))
     if isinstance(low, Tensor) or isinstance(high, Tensor):
         return low + uniform(keys, n) * (high - low)
+    # Numbers of the kernel itself are scaled there, in the same launch.
     return _drawn(*keys, n, _UNIFORM, float(low), float(high), 0, 1)
 
 
@@ -89,6 +90,7 @@ def integers(
         if not 0 <= high - low < 1 << 31:
             raise ValueError(f"low={low}, high={high}: expected low <= high < low + 2^31")
         return _drawn(*keys, n, _INTEGER, 0.0, 1.0, low, high - low + 1)
+    # 32 random bits times the span, whose upper half is the number.
     return low + ((_drawn(*keys, n, _INTEGER, 0.0, 1.0, 0, 1 << 32) * (high - low + 1)) >> 32)
 
 
@@ -96,6 +98,7 @@ def permutations(keys: RowKeys, n: int) -> Int64[Tensor, "E L"]:
     """Draw for each count an order of `n` numbers per row: row 0 has 0 to n - 1, row 1 the next n, and so on."""
     # Short halves need more rounds until all orders of few numbers are about equally likely.
     bits = max((n - 1).bit_length(), 2)
+    # A permutation of its own for each count, and for each row within it.
     keys = keys._replace(num_rows=keys.counter.numel() * keys.num_rows)
     return _drawn(*keys, n, _ORDER, 0.0, 1.0, bits, 8 if bits > 6 else 24)
 
@@ -128,6 +131,7 @@ def _draw_now(
     start: int,
     span: int,
 ) -> Tensor:
+    # Checked before, since the kernel trusts the sizes.
     counts = _number_of_counts(seed, counter, num_rows, kind)
     if kind == _ORDER:
         stride = num_rows // counts
@@ -135,6 +139,7 @@ def _draw_now(
         stride = counter.ndim
     out_EL = _empty(seed, num_rows, n, kind)
     counter = counter.contiguous()
+    # A GPU has a thread for each number.
     if seed.device.type == "cpu":
         rows = num_rows
         columns = n
@@ -174,13 +179,14 @@ def _draw_in_torch(
     start: int,
     span: int,
 ) -> Tensor:
-    """Draw what the kernel draws; for orders, `start` is a number of bits and `span` one of rounds."""
+    """Draw the kernel's numbers by torch; for orders, `start` is a number of bits and `span` one of rounds."""
     counts = _number_of_counts(seed, counter, num_rows, kind)
     if kind == _ORDER:
         rows = num_rows // counts
         orders = []
         for count in counter.reshape(-1):
             keys = in_torch.keys_of(seed, stream, count, num_rows=rows, first_row=first_row)
+            # Row r has the numbers from r n on.
             first_number_E = torch.arange(rows, device=seed.device)[:, None] * n
             orders.append(first_number_E + in_torch.permuted(keys, n, start, span))
         return torch.cat(orders)
@@ -194,6 +200,7 @@ def _draw_in_torch(
 
 
 def _empty(seed: Tensor, num_rows: int, n: int, kind: int) -> Tensor:
+    # Kinds from integers on are whole numbers.
     return seed.new_empty((num_rows, n), dtype=torch.int64 if kind >= _INTEGER else torch.float32)
 
 

@@ -28,7 +28,7 @@ _recording = _Recording()
 
 
 def is_recording() -> bool:
-    """Whether this thread writes down what torch computes: then every kernel has to be an operator of torch."""
+    """Whether this thread writes down torch's operations: then every kernel has to be an operator of torch."""
     return _recording.recorder is not None
 
 
@@ -46,6 +46,7 @@ def launched(launch: Callable[[], None]) -> bool:
     if recorder is None:
         return False
     with recorder.paused():
+        # It runs now, too: later operations of the recording need its results.
         launch()
     recorder.entries.append(launch)
     return True
@@ -74,6 +75,7 @@ class Operation:
         """Do it once more, in the same memory."""
         result = self.function(*self.args, **self.kwargs)
         if self.made:
+            # Results that are written arguments hold the new numbers already.
             written = {id(old) for old in self.written}
             again = [new for new in _tensors(result) if id(new) not in written]
             for old, new in zip(self.made, again, strict=True):
@@ -95,6 +97,7 @@ class Recorder(TorchDispatchMode):
     def paused(self) -> Iterator[None]:
         """Write nothing down in this block."""
         _recording.recorder = None
+        # Without this thread's recorder, and outside of its dispatch mode: the block runs as if nothing was recorded.
         try:
             with _disable_current_modes():
                 yield
@@ -103,16 +106,20 @@ class Recorder(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
+        # A number that Python reads would be a constant in the recording.
         if func.overloadpacket.__name__ in _HOST_READS:
             raise RuntimeError(f"{func} reads the device on the host, at {_place()}")
+        # Operators that this one calls are part of it, and are no entries of their own.
         _recording.recorder = None
         try:
             result = func(*args, **kwargs)
         finally:
             _recording.recorder = self
+        # An operator in place returns an argument, which it did not make.
         read = {id(tensor) for tensor in _tensors((args, kwargs))}
         made = [tensor for tensor in _tensors(result) if id(tensor) not in read]
         written = written_by(func, args, kwargs)
+        # Views make tensors, too; only operators without any effect are left out.
         if made or written:
             self.entries.append(Operation(func, args, kwargs, made, written))
         return result
@@ -122,6 +129,7 @@ class _HostMethods(TorchFunctionMode):
     """Refuses methods of tensors by which Python reads numbers, which would become constants of the recording."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        # Methods that bypass the dispatcher are seen here alone.
         if func in _HOST_METHODS and is_recording():
             raise RuntimeError(f"{func.__name__} reads the device on the host, at {_place()}")
         return func(*args, **(kwargs or {}))
@@ -129,6 +137,7 @@ class _HostMethods(TorchFunctionMode):
 
 def _place() -> str:
     """Return file and line of the code that runs, outside of torch."""
+    # The frames of torch itself tell a user nothing.
     frame = sys._getframe(1)
     while frame.f_back is not None and any(part in frame.f_code.co_filename for part in _INTERNAL):
         frame = frame.f_back
@@ -138,6 +147,7 @@ def _place() -> str:
 def written_by(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Shaped[Tensor, "*?shape"]]:
     """Return the tensors among the arguments of an operator that it writes."""
     written: list[Tensor] = []
+    # The schema of an operator says which arguments it writes.
     for place, argument in enumerate(func._schema.arguments):
         if argument.alias_info is not None and argument.alias_info.is_write:
             if place < len(args):
@@ -150,7 +160,7 @@ def written_by(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list
 
 @contextmanager
 def recorded() -> Iterator[Recorder]:
-    """Write down what torch computes in this block, and what Warp launches."""
+    """Write down torch's operations and Warp's launches in this block."""
     assert _recording.recorder is None, "recordings do not nest"
     recorder = _recording.recorder = Recorder()
     try:

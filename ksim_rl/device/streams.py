@@ -2,7 +2,7 @@
 
 On CUDA, Warp launches on the very stream that torch uses, so neither waits for the other. The wrappers of streams are
 kept for ever: a temporary one that dies unregisters the CUDA stream ("unknown stream"). On CPU, two threads that
-launch Warp work at once abort the process, so one process-wide lock lets them in one at a time.
+launch Warp work at the same time abort the process, so one process-wide lock lets them in one by one.
 """
 
 import os

@@ -42,10 +42,10 @@ def current_stream_handle(device: torch.device) -> int:
 
 
 def free_cublas_workspaces() -> None:
-    """Forget the memory that matrix products took, on Hopper 32 MiB for each stream; the next one takes it anew.
+    """Forget the memory that matrix products took, on Hopper 32 MiB for each stream; the next one takes it again.
 
     Torch keeps it for ever. Its own graph trees do this before a capture, so that it lies in a graph's pool. The name
-    is that of torch 2.13.
+    is torch 2.13's.
     """
     torch._C._cuda_clearCublasWorkspaces()
 
@@ -71,10 +71,12 @@ def put_apart(kernels: Collection[wp.Kernel]) -> None:
     """
     for module in {kernel.module for kernel in kernels}:
         some = {kernel for kernel in kernels if kernel.module is module}
+        # A loaded module must stay as it is; one whose kernels are all wanted has nothing to leave out.
         if module.execs or some >= {*module.kernels.values()}:
             continue
         # The one of this name if there is one: on the CPU, what is loaded is told apart by the names of modules.
         own = wp.get_module(f"{module.name}.{min(kernel.key for kernel in some)}")
+        # The kernels keep the options that they were written with.
         own.options |= module.options
         own.has_unresolved_static_expressions |= module.has_unresolved_static_expressions
         for kernel in some:
@@ -96,10 +98,12 @@ def watch_loads(mend: Callable[[Path, Exception, int], None]) -> None:
     def load_or_mend(
         self: wp.Module, device: Any, block_dim: int | None = None, *given: Any, **named: Any
     ) -> Any:
+        # The hook raises when another attempt is in vain.
         for attempt in itertools.count(1):
             try:
                 return load(self, device, block_dim, *given, **named)
             except Exception as error:
+                # The folder name depends on the module's hash and block size.
                 folder = Path(wp.config.kernel_cache_dir) / self.get_module_identifier(block_dim)
                 # What is no JSON or no text is a ValueError; what does not compile is none of these.
                 is_read = folder.exists() and (isinstance(error, ValueError) or UNLOADABLE in str(error))
@@ -130,12 +134,14 @@ def launches_diverted(instead: Callable[[wp.Kernel, Any, int | None], None]) -> 
         while_body(**kwargs)
 
     def for_this_thread(original: Callable[..., Any], replacement: Callable[..., None]) -> Callable[..., Any]:
+        # Other threads go on launching.
         return lambda *args, **kwargs: (replacement if threading.get_ident() == thread else original)(
             *args, **kwargs
         )
 
     namespace: Any = vars(wp)
     replacements = {"launch": note, "launch_tiled": note, "capture_while": loop_once}
+    # One diversion at a time: overlapping ones would restore each other's replacements.
     with _diversion:
         saved = {name: namespace[name] for name in replacements}
         namespace.update({name: for_this_thread(saved[name], new) for name, new in replacements.items()})

@@ -1,4 +1,4 @@
-"""Simulates many worlds of one MuJoCo model at once, whose states are torch tensors.
+"""Simulates many worlds of one MuJoCo model together, whose states are torch tensors.
 
 This engine knows nothing of learning: it needs torch, numpy, jaxtyping, MuJoCo, MuJoCo Warp and Warp. `World` says how
 worlds are stepped, read, written and reset; the names below are all that a program needs:
@@ -9,7 +9,7 @@ worlds are stepped, read, written and reset; the names below are all that a prog
     world.step(10)
     world.qpos_EL                # the state that is reached
     world.reset(fallen_E)        # puts the worlds back where the mask is true
-    world.refresh()              # makes poses and sensors those of the present state
+    world.refresh()              # brings poses and sensors to the present state
     world.overflow_report().ok   # whether no contact and no constraint was dropped
 
 With `SimCfg(engine="c")` MuJoCo's C engine computes the same worlds on the CPU, in float64. `examples/worlds.py` is a

@@ -76,7 +76,7 @@ def is_certain(mj_model: mujoco.MjModel, sim: SimCfg, *, njmax: int) -> bool:
 def remember(
     mj_model: mujoco.MjModel, sim: SimCfg, per_world_fields: Sequence[str], report: OverflowReport
 ) -> bool:
-    """Let later `capacities` of this model have room for what worlds needed, where it was too little.
+    """Let later `capacities` of this model have the room that worlds needed, where it was too little.
 
     Numbers that `sim` gives do not change. Returns whether others do.
     """
@@ -124,7 +124,7 @@ def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
         rows = max(
             MARGIN * posed.rows,
             FALLS_MARGIN * fallen.rows,
-            # All limits at once.
+            # All limits together.
             max(posed.rows_without_limits, fallen.rows_without_limits) + _most_limits(mj_model),
         )
         nconmax = max(

@@ -16,12 +16,12 @@ Hook = Callable[[mjw.Model, mjw.Data], None]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mending:
-    """What a collision pass calls at its end.
+    """The hooks that a collision pass calls at its end.
 
     Attributes:
-        always: append contacts that MuJoCo Warp does not find, and change those of everyone.
-        of_theirs: change what MuJoCo Warp's narrow phase has written, of the pairs that the model lists.
-        at_last: change what the others have left.
+        always: append contacts that MuJoCo Warp does not find, and change everyone's.
+        of_theirs: change contacts that MuJoCo Warp's narrow phase has written, of the pairs that the model lists.
+        at_last: change the contacts that the others have left.
     """
 
     always: tuple[Hook, ...]
@@ -43,6 +43,7 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
 
     It changes the model in place: call it before anything copies it.
     """
+    # First, since the steps below read the lists of pairs that these change.
     upstream.collide_boxes_exactly(warp_model)
     upstream.take_pairs_as_written(warp_model)
     upstream.measure_without_contacts(warp_model)
@@ -50,6 +51,7 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
     ways = (take_over_height_fields, take_over_measured_boxes, rows_left_out)
     always = tuple(filter(None, [way(warp_model) for way in ways]))
     of_theirs = corrections(warp_model, warp_model.nxn_geom_pair_filtered, warp_model.nxn_pairid_filtered)
+    # Last, when it is known which contacts have rows.
     loosen = loose_contacts(warp_model)
     at_last = () if loosen is None else (loosen,)
     mending = Mending(always=always, of_theirs=of_theirs, at_last=at_last)
@@ -59,13 +61,14 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
 
 
 def corrections(warp_model: mjw.Model, pairs: wp.array, pair_ids: wp.array) -> tuple[Hook, ...]:
-    """Return what corrects the contacts that MuJoCo Warp's narrow phase finds of pairs, listed as in the model."""
+    """Return the hooks that correct MuJoCo Warp's contacts of pairs, which are listed as in the model."""
     listed = pairs.numpy(), pair_ids.numpy()
+    # Each correction is launched only for models that need it: most need none.
     return tuple(hook for hook, is_needed in CORRECTIONS.items() if is_needed(warp_model, *listed))
 
 
 def align_steep_capsules(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-    """Launch what turns the contacts of steep capsules with planes, which our own narrow phase need not."""
+    """Launch the turning of contacts of steep capsules with planes, which our own narrow phase need not."""
     contact = warp_data_E.contact
     inputs = [warp_model.geom_type, warp_data_E.geom_xmat, contact.geom, contact.worldid, warp_data_E.nacon]
     inputs.append(bool(warp_model.flg_surfacevel))
@@ -74,12 +77,13 @@ def align_steep_capsules(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
 
 
 def _have_capsules_on_planes(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray) -> bool:
+    # Sorted by type, since a pair may name either geom first.
     types = np.sort(warp_model.geom_type.numpy()[pairs])
     return bool((types == (kernels.PLANE, kernels.CAPSULE)).all(-1).any())
 
 
 def drop_upper_corners(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-    """Launch what drops contacts of planes with upper corners of boxes, which our own narrow phase does not make."""
+    """Drop contacts of planes with upper corners of boxes, which our own narrow phase does not make."""
     contact = warp_data_E.contact
     inputs = [warp_model.geom_type, warp_data_E.geom_xpos, warp_data_E.geom_xmat]
     inputs += [contact.geom, contact.worldid, contact.dist, warp_data_E.nacon]
@@ -92,7 +96,7 @@ def _have_boxes_on_planes(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np
 
 
 def take_the_law_of_priority(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-    """Launch what gives contacts the `solref` of the geom with priority, which our own narrow phase does itself."""
+    """Give contacts the `solref` of the geom with priority, which our own narrow phase does itself."""
     m = warp_model
     contact = warp_data_E.contact
     inputs = [m.geom_priority, m.geom_solref, m.pair_geom1, m.pair_geom2]
@@ -103,6 +107,7 @@ def take_the_law_of_priority(warp_model: mjw.Model, warp_data_E: mjw.Data) -> No
 
 def _have_direct_laws_of_priority(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray) -> bool:
     """Return whether geoms of different priority may touch, one of which gives stiffness and damping directly."""
+    # A <pair> has a law of its own, which no priority changes.
     pairs = pairs[pair_ids[:, 0] == upstream.NO_PAIR]
     differs = np.diff(warp_model.geom_priority.numpy()[pairs])[:, 0] != 0
     # Each world may draw a law of its own at any time.
@@ -113,7 +118,7 @@ def _have_direct_laws_of_priority(warp_model: mjw.Model, pairs: np.ndarray, pair
 
 
 def rows_left_out(warp_model: mjw.Model) -> Hook | None:
-    """Return what keeps contacts from constraint rows that no joint can heed, as in C; None where there are none.
+    """Return a hook that keeps contacts that no joint can heed out of the rows, as in C; None where there are none.
 
     Only a <pair> can name geoms of one rigid body, or of bodies that never move. In C sensors still read such contacts.
     """
@@ -121,6 +126,7 @@ def rows_left_out(warp_model: mjw.Model) -> Hook | None:
     rigid_body = m.body_weldid.numpy()[m.geom_bodyid.numpy()]
     # All bodies that no joint moves are one.
     rigid_body[~m.body_isdofancestor.numpy()[rigid_body, : m.nv].any(-1)] = 0
+    # Without such a <pair>, no kernel needs to be launched.
     if not (rigid_body[m.pair_geom1.numpy()] == rigid_body[m.pair_geom2.numpy()]).any():
         return None
     of_geoms = wp.array(rigid_body, dtype=int)
@@ -136,13 +142,13 @@ def rows_left_out(warp_model: mjw.Model) -> Hook | None:
 
 
 def has_rowless_contacts(warp_model: mjw.Model) -> bool:
-    """Return whether contacts may have no rows: what sensors of distances measure, and upper corners of boxes."""
+    """Return whether contacts may have no rows: those for sensors of distances, and upper corners of boxes."""
     pairs, pair_ids = upstream.geom_pairs(warp_model)
     return warp_model.nsensorcollision > 0 or _have_boxes_on_planes(warp_model, pairs, pair_ids)
 
 
 def loose_contacts(warp_model: mjw.Model) -> Hook | None:
-    """Return what keeps geoms from sticking at contacts without rows; None where nothing could stick there.
+    """Return a hook that keeps geoms from sticking at contacts without rows; None where nothing could stick there.
 
     MuJoCo Warp has a contact for each distance that it measures, and each corner of a box on a plane, and lets geoms
     with adhesion pull at all of them.

@@ -1,4 +1,4 @@
-"""Chooses the engine where the settings leave it open: by device, by what is asked for, and by size."""
+"""Chooses the engine where the settings leave it open: by device, by the features that are asked for, and by size."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ def choose_engine(
     device: torch.device,
     warp_alone: Sequence[str] = (),
 ) -> tuple[str, str]:
-    """Return the engine, "warp" or "c", and why; `warp_alone` names what is asked for and C cannot do."""
+    """Return the engine, "warp" or "c", and why; `warp_alone` names features that are asked for and C does not have."""
     if sim.engine != "auto":
         return sim.engine, f"task.sim.engine={sim.engine}"
     if device.type != "cpu":

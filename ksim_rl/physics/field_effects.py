@@ -87,7 +87,7 @@ def _turns_about_centre(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def _not_simple(mj_model: mujoco.MjModel, field: str, body: int, how: str) -> ValueError:
-    """Return what refuses a field that moves a joint of a body that was compiled as simple."""
+    """Return the error that refuses a field that moves a joint of a body that was compiled as simple."""
     name = mj_model.body(body).name or f"number {body} (unnamed)"
     return ValueError(
         f"per_world_fields has {field!r}, but body {name!r} is compiled as simple, {how}: "

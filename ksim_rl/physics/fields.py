@@ -62,7 +62,7 @@ def fields_to_expand(fields: Sequence[str], mj_model: mujoco.MjModel) -> tuple[s
 
 
 def prepare_spec(spec: mujoco.MjSpec, per_world_fields: Iterable[str]) -> None:
-    """Switch off what MuJoCo's compiler would specialize on a field that is to differ between worlds.
+    """Switch off specializations of MuJoCo's compiler on fields that are to differ between worlds.
 
     Call it before the spec is compiled, with the names that `World` gets as `per_world_fields`.
     A body that floats about its centre of mass, or slides along axes at right angles, is compiled as "simple", with a

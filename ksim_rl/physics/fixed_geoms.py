@@ -30,7 +30,7 @@ def fixed_geoms(warp_model: mjw.Model) -> np.ndarray:
 def placing_of_fixed_geoms(
     warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
-    """Return what launches it, with arrays in their final place; None where no field of `expanded` moves any."""
+    """Return a launcher of it, with arrays in their final place; None where no field of `expanded` moves any."""
     m = warp_model
     d = warp_data_E
     ids = np.flatnonzero(fixed_geoms(m))

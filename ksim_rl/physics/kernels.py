@@ -1,4 +1,4 @@
-"""These Warp kernels do what a substep or reset of MuJoCo Warp leaves undone."""
+"""Warp kernels for work that a substep or reset of MuJoCo Warp leaves undone."""
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false

@@ -44,7 +44,7 @@ def load_spec(source: Source) -> mujoco.MjSpec:
 
 
 def load_model(source: Source, sim: SimCfg | None = None) -> mujoco.MjModel:
-    """Compile what `load_spec` parses, and check that its numbers make sense and MuJoCo Warp can simulate it.
+    """Compile the spec of `load_spec`, and check that its numbers make sense and MuJoCo Warp can simulate it.
 
     Settings of `sim` are laid over its own first, such as a solver that MuJoCo Warp has. What a few words make enormous
     is refused unless the environment variable KSIM_RL_LARGEST_MODEL allows it.
@@ -130,7 +130,7 @@ def _at_line(text: str, number: int) -> str:
 
 
 def _refuse_serious(message: str, mj_model: mujoco.MjModel, label: str, text: str) -> None:
-    """Refuse what MuJoCo only warns of, though no simulation of it can be right."""
+    """Refuse models that MuJoCo only warns of, though no simulation of them can be right."""
     if found := _SINGULAR.search(message):
         joint = mj_model.joint(int(mj_model.dof_jntid[int(found["dof"])])).name
         raise ValueError(

@@ -25,7 +25,7 @@ ENUM_FIELDS = {
     "sensor_type": mujoco.mjtSensor,
 }
 MOST_TIMESTEP = 0.1
-# What nobody means with a sign.
+# Numbers that nobody means to be negative.
 _OPTIONS = (
     "iterations ls_iterations ccd_iterations noslip_iterations sdf_iterations sdf_initpoints density viscosity "
     "impratio"
@@ -102,7 +102,7 @@ def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None =
 
 
 def check_flags(mj_model: mujoco.MjModel) -> None:
-    """Refuse flags that MuJoCo Warp does not have, with NotImplementedError: its own check names no two at once."""
+    """Refuse flags that MuJoCo Warp does not have, with NotImplementedError: its own check names no two together."""
     opt = mj_model.opt
     names = []
     for flags, kind, theirs in (

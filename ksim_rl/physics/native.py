@@ -24,7 +24,7 @@ def source_of(folder: str, parts: tuple[str, ...]) -> str:
 
 
 def names_of(*enums: Any) -> dict[str, int]:
-    """Return the members of enums of MuJoCo's, without what their names begin with."""
+    """Return the members of enums of MuJoCo's, without the prefixes of their names."""
     return {name.partition("_")[2]: int(kind) for enum in enums for name, kind in enum.__members__.items()}
 
 
@@ -40,10 +40,10 @@ def launcher(
     fast_math: bool = False,
     max_registers: int | None = None,
 ) -> Callable[..., None]:
-    """Return what launches C++ over (worlds, lanes) in blocks of `threads`, with arrays in their final place.
+    """Return a launcher of C++ over (worlds, lanes) in blocks of `threads`, with arrays in their final place.
 
     The C++ is the body of a function of `world`, `lane` and `problem`; before it stand the constants, by their names in
-    capitals, with LANES and THREADS. What it calls `problem.x` is x of `own`, or else of the model, its options or its
+    capitals, with LANES and THREADS. Its `problem.x` is x of `own`, or else of the model, its options or its
     worlds; see `values_of`. A launch may change scalars of `own`, by name.
     """
     names = dict.fromkeys(re.findall(r"\bproblem\.(\w+)", source))

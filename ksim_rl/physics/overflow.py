@@ -20,7 +20,7 @@ OUT_OF = {
     "OUT_OF_PAIRS": int(mjw.OverflowType.BROADPHASE),
     "OUT_OF_CONTACTS": int(mjw.OverflowType.NARROWPHASE),
 }
-# What njmax makes room for, and nconmax.
+# The bits of too small an njmax, and of too small an nconmax.
 OF_ROWS = ("NEFC", "NJMAX_NNZ")
 OF_POOL = ("BROADPHASE", "NARROWPHASE", "CCD")
 # In the order of the bits, lowest first.
@@ -29,7 +29,7 @@ BIT_NAMES = tuple(name for name, bit in mjw.OverflowType.__members__.items() if 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OverflowReport:
-    """What the physics needed since the last report, beside what it has.
+    """How much room the physics needed since the last report, and how much there is.
 
     `worlds` counts those that raised each overflow bit. Of all substeps, `nefc` is the most constraint rows of any
     world, which has `njmax`, and `ncon` the most contacts or candidate pairs in the pool of all worlds, which has
@@ -129,7 +129,7 @@ class OverflowRecord:
         return torch.cat([worlds, self.most_nefc_E.max().view(1), self.most_pool])
 
     def explain(self, numbers: Sequence[int]) -> OverflowReport:
-        """Say what `counts`, read on the host, mean."""
+        """Make the report of `counts` that were read on the host."""
         d = self._warp_data_E
         worlds = dict(zip(BIT_NAMES, numbers, strict=False))
         nefc = numbers[len(BIT_NAMES)]

@@ -134,7 +134,7 @@ class BatchCamera:
 
     @property
     def segmentation_EHW2(self) -> Int32[Tensor, "E H W 2"]:
-        """MuJoCo's object id and object type of what is hit, -1 for nothing."""
+        """MuJoCo's id and type of the object that is hit, -1 for nothing."""
         return wp.to_torch(self._context.seg_data).view(*self._shape, 2)
 
     def _launch(self) -> None:

@@ -1,4 +1,4 @@
-"""Launches the refresh of a world: what derives from the present state, without a collision pass."""
+"""Launches the refresh of a world: quantities that follow from the present state, without a collision pass."""
 
 from collections.abc import Callable
 
@@ -22,16 +22,16 @@ TENDON_VELOCITY = "ten_velocity"
 
 
 class Refresh:
-    """What recomputes position- and velocity-stage quantities and sensors, with arrays in their final place.
+    """Recomputes position- and velocity-stage quantities and sensors, with arrays in their final place.
 
     Args:
-        dynamics: what launches our kernel of the smooth dynamics; None takes MuJoCo Warp's kernels.
-        limits: what reads the sensors of limits.
-        place_fixed_geoms: what launches the places of geoms that are fixed to the world; None where they are fixed.
+        dynamics: launches our kernel of the smooth dynamics; None takes MuJoCo Warp's kernels.
+        limits: reads the sensors of limits.
+        place_fixed_geoms: launches the places of geoms that are fixed to the world; None where they are fixed.
 
     Attributes:
         kept_by_substep: a model on the same arrays with those sensors alone that no refresh computes.
-        on_demand: the names of what is computed because something reads it.
+        on_demand: the names of arrays that are computed because something reads them.
         needs_cameras: whether a sensor reads where cameras are.
     """
 
@@ -72,7 +72,7 @@ class Refresh:
         return transmissions_of_refresh(warp_model, self._warp_data_E)
 
     def _read_by_sensors(self, warp_model: mjw.Model, sensor_type: np.ndarray) -> set[str]:
-        """Return the names of what sensors need, though nothing else may."""
+        """Return the names of the arrays that sensors need, though nothing else may."""
         names: set[str] = set()
         reads_tendons = (sensor_type == mujoco.mjtSensor.mjSENS_TENDONVEL).any()
         if reads_tendons or self._limits.reads_tendons:

@@ -64,7 +64,7 @@ def empty_contacts(
 
 
 def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Callable[[], None]:
-    """Return what puts the worlds of `mask`, bool [E], to the model's `qpos0`, at rest, time 0, without contacts.
+    """Return a launcher that puts the worlds of `mask`, bool [E], to `qpos0`, at rest, time 0, without contacts.
 
     `mjw.reset_data` must have run once: what sleeps or is awake stays as it is, unless the model has more.
     """

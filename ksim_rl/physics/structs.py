@@ -12,7 +12,7 @@ def struct_with(*parts: tuple[str, type, str]) -> Callable[[type], Any]:
     """Make a class a Warp struct that has, besides its own fields, some of MuJoCo Warp's dataclasses.
 
     Args:
-        parts: each with what comes before the names, the dataclass, and the names of its fields, with blanks between.
+        parts: each with a prefix of the names, the dataclass, and the names of its fields, with blanks between.
     """
 
     def decorate(cls: type) -> Any:
@@ -25,7 +25,7 @@ def struct_with(*parts: tuple[str, type, str]) -> Callable[[type], Any]:
 
 
 def values_of(names: Iterable[str], *owners: Any) -> dict[str, Any]:
-    """Return what the first owner has that has it, by name; worlds have `contact_...` and `efc_...`, too."""
+    """Return the value of each name in the first owner that has it; worlds have `contact_...` and `efc_...`, too."""
     fields: list[Any] = []
     for owner in owners:
         fields.append(owner if isinstance(owner, Mapping) else vars(owner))
@@ -37,7 +37,7 @@ def values_of(names: Iterable[str], *owners: Any) -> dict[str, Any]:
 
 
 def filled(struct: Any, *owners: Any) -> Any:
-    """Return a struct in which each field is that of its name in the first owner that has it; see `values_of`."""
+    """Return a struct whose fields have the values of their names in the first owner that has them; see `values_of`."""
     instance = struct()
     for name, value in values_of(struct.vars, *owners).items():
         setattr(instance, name, value)

@@ -16,7 +16,7 @@ from ksim_rl.physics.sensors.limit_sensors import LimitSensors
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Stages:
-    """What launches the stages of a substep.
+    """The launchers of the stages of a substep.
 
     Attributes:
         solve: accelerations and forces from the constraint rows; see `newton.solver`.
@@ -24,10 +24,10 @@ class Stages:
         dynamics: smooth dynamics as one kernel; None for MuJoCo Warp's kernels.
         make_rows: the constraint rows as one kernel, which needs `dynamics`; None for MuJoCo Warp's kernels.
         collide: a collision pass other than MuJoCo Warp's.
-        contacts: what reads contact sensors and accelerometers from lists of contacts; None for MuJoCo Warp's kernels.
-        limits: what reads the sensors of limits.
-        mend: what mends MuJoCo Warp's constraint rows and transmissions, where these are wrong.
-        aside: a stream for what can run in parallel with the rest.
+        contacts: reads contact sensors and accelerometers from lists of contacts; None for MuJoCo Warp's kernels.
+        limits: reads the sensors of limits.
+        mend: mends MuJoCo Warp's constraint rows and transmissions, where these are wrong.
+        aside: a side stream for work that can run in parallel with the rest.
     """
 
     solve: Callable[..., None]
@@ -51,7 +51,7 @@ def run(
 ) -> None:
     """Launch a substep. Sensors, computed or not, never change the state that is reached.
 
-    On the stream `aside`, the solver orders the worlds, by the last substep, and dynamics of few worlds go on in
+    On the side stream, the solver orders the worlds, by the last substep, and dynamics of few worlds go on in
     parallel with collisions; then it solves in parallel with some sensors. `accelerometers` are left out where they are
     not wanted, if `contacts` reads them.
     """
@@ -128,7 +128,7 @@ def _read_state(stages: Stages, warp_model: mjw.Model, warp_data_E: mjw.Data) ->
         mjw.camlight(warp_model, warp_data_E)
     warp_data_E.sensordata.zero_()
     if stages.limits is not None:
-        # Before the others, among which MuJoCo Warp delays what is to be delayed.
+        # Before the others, among which MuJoCo Warp delays those with a history.
         stages.limits.read_state()
     mjw.sensor_pos(warp_model, warp_data_E)
     upstream.energy_of_position(warp_model, warp_data_E)

@@ -39,8 +39,8 @@ class Substeps:
     `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
     `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints. Then, with `one_kernel_rows`,
     one makes their rows, and `contact_lists` besides, from which contact sensors are read, with `own_broad_phase` one
-    finds contacts, and with `one_kernel_integration` one kernel integrates and keeps a `record` of overflow. What can
-    run beside the rest of a substep does so on the stream `aside`.
+    finds contacts, and with `one_kernel_integration` one kernel integrates and keeps a `record` of overflow. Work
+    that can run in parallel with the rest of a substep does so on the stream `aside`.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Substeps:
 
     @property
     def refreshed_on_demand(self) -> set[str]:
-        """The names of what `refresh` computes because something reads it, to add to."""
+        """The names of arrays that `refresh` computes because something reads them, to add to."""
         return self._refresh.on_demand
 
     def _alter(self, **fields: Any) -> None:
@@ -175,7 +175,7 @@ class Substeps:
             mjw.com_vel(self.warp_model, self.warp_data_E)
 
     def _is_read(self, warp_model: mjw.Model, sensors: Sensors, *, is_last: bool) -> bool:
-        """Whether anything but our own kernels reads what the dynamics of this substep write."""
+        """Whether anything but our own kernels reads the arrays that the dynamics of this substep write."""
         # Where a stage is MuJoCo Warp's, it reads every array.
         if self.stages.make_rows is None or not self._integrates:
             return True
@@ -188,12 +188,12 @@ class Substeps:
         return is_last or sensors != "none"
 
     def place_fixed_geoms(self) -> None:
-        """Launch what places the geoms that are fixed to the world, where fields that move them differ."""
+        """Launch the places of the geoms that are fixed to the world, where fields that move them differ."""
         if self._place_fixed_geoms is not None:
             self._place_fixed_geoms()
 
     def refresh(self, *, masked: bool = False) -> None:
-        """Launch what recomputes position- and velocity-stage quantities from the present qpos and qvel.
+        """Launch position- and velocity-stage quantities from the present qpos and qvel.
 
         No collision pass: contacts, forces and the sensors that read them stay as the last substep left them. `masked`
         leaves worlds alone that are not in the mask, where that takes less time.
@@ -217,7 +217,7 @@ def _solve_as_they_do(
 def _mending(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
-    """Return what launches the corrections of MuJoCo Warp's rows and transmissions, or None where they are right."""
+    """Return a launcher of the corrections of MuJoCo Warp's rows and transmissions, or None where they are right."""
     # The first two change rows of MuJoCo Warp's; the last one appends rows.
     of_rows = (
         weighing_of_ties(mj_model, warp_model, warp_data_E),

@@ -18,7 +18,7 @@ from jaxtyping import Float32
 from mujoco_warp._src.bvh import build_hfield_bvh
 from mujoco_warp._src.collision_core import contact_params as contact_params
 
-# What lies between its broad phase and its narrow one, and the second.
+# The lists between its broad phase and its narrow one, and the narrow phase.
 from mujoco_warp._src.collision_core import create_collision_context as create_collision_context
 
 # Its search for the distance of convex shapes, and what that needs.
@@ -31,7 +31,7 @@ from mujoco_warp._src.collision_gjk import support as support
 # The law of a constraint row.
 from mujoco_warp._src.constraint import _efc_row as efc_row  # noqa: F401
 
-# What an implicit integrator subtracts from the inertia matrix.
+# The derivatives that an implicit integrator subtracts from the inertia matrix.
 from mujoco_warp._src.derivative import deriv_smooth_vel as derivative_of_smooth_forces  # noqa: F401
 
 # How it ends, and what `forward` does between the stages that it shows.
@@ -174,7 +174,7 @@ def sensors_by_refresh(
 
     Contact, limit, touch-grid and geom-distance sensors read rows or contacts of the last substep's collision pass.
     They, and those of `skip` (bool [nsensor]), keep that substep's value; rows that reset since then read zero. Sensors
-    can only be switched off all at once, so the lists that `put_model` makes, one for each kernel, are replaced.
+    can only be switched off all together, so the lists that `put_model` makes, one for each kernel, are replaced.
     """
     none = wp.zeros(0, dtype=int)
     stages = {name: getattr(warp_model, name).numpy() for name in ("sensor_pos_adr", "sensor_vel_adr")}
@@ -199,7 +199,7 @@ def sensors_by_refresh(
 
 
 def with_contact_sensors_only(warp_model: mjw.Model) -> mjw.Model:
-    """Return a model on the same arrays that computes no sensors but those of contacts."""
+    """Return a model on the same arrays that computes contact sensors only."""
     none = wp.zeros(0, dtype=int)
     lists = ("pos", "vel", "acc", "touch", "limitpos", "limitvel", "limitfrc", "tendonactfrc")
     flags = ("sensor_rne_postconstraint", "sensor_subtree_vel", "sensor_e_potential", "sensor_e_kinetic")
@@ -248,7 +248,7 @@ def take_pairs_as_written(warp_model: mjw.Model) -> None:
     """Let all <pair>s make contacts, in place, with the normal from the first geom to the second as in C.
 
     `put_model` keeps one number for two geoms, the last one's. The others stand at the end of the lists, beyond those
-    that are found by their geoms. What sensors of distances measure keeps the order of the geoms, on which they count.
+    that are found by their geoms. Pairs that sensors measure keep the order of the geoms, on which these count.
     """
     m = warp_model
     repeated = repeated_pairs(warp_model)

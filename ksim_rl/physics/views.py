@@ -13,7 +13,7 @@ from ksim_rl.checks import check_known
 
 # Left as they were by mujoco_warp.reset_data, though they belong to the episode that ended.
 _ACCELERATION_STAGE = "actuator_force qfrc_actuator qfrc_constraint qfrc_passive cacc cfrc_int cfrc_ext"
-# What a substep depends on: integrated, or set by the user.
+# The arrays that a substep depends on: integrated, or set by the user.
 _INPUTS = "time qpos qvel act ctrl qfrc_applied xfrc_applied mocap_pos mocap_quat qacc_warmstart"
 # The rest of the state of a world, then results of the last substep that `refresh` does not recompute, but terms may
 # read before the next one.
@@ -60,7 +60,7 @@ def nbytes(warp_data_E: mjw.Data) -> int:
 
 
 def arrays(data: object, prefix: str = "") -> dict[str, wp.array]:
-    """Return the Warp arrays of a Data by dotted name, with those of its contacts and constraints."""
+    """Return the Warp arrays of a Data by dotted name, its contacts and constraints among them."""
     found: dict[str, wp.array] = {}
     for field in dataclasses.fields(data):  # type: ignore[arg-type]
         value = getattr(data, field.name)
@@ -72,7 +72,7 @@ def arrays(data: object, prefix: str = "") -> dict[str, wp.array]:
 
 
 class DataViews:
-    """The torch views of a Data, float32, named as MuJoCo names them; they show each change at once."""
+    """The torch views of a Data, float32, named as MuJoCo names them; they show each change immediately."""
 
     qpos_EL: Tensor
     qvel_EL: Tensor

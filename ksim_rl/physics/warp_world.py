@@ -46,7 +46,7 @@ class WarpWorld(World):
         njmax, nconmax: constraint rows and contacts that a world has room for.
         one_kernel_unavailable: why MuJoCo Warp's own solver solves the constraints, several times slower on CUDA; None
             where one kernel does (`SimCfg.one_kernel_solver`). That one computes no `qacc_smooth`, which stays zero.
-        one_kernel_dynamics_unavailable: why MuJoCo Warp's own kernels compute what precedes the constraints; None where
+        one_kernel_dynamics_unavailable: why MuJoCo Warp's own kernels compute the smooth dynamics; None where
             one kernel does (`SimCfg.one_kernel_dynamics`).
         one_kernel_rows_unavailable: the same of the constraint rows.
         one_kernel_collisions_unavailable: why MuJoCo Warp's own kernels find contacts, or some of them.
@@ -165,7 +165,7 @@ class WarpWorld(World):
         Sensors are computed on the last one, but for those that `refresh` computes, which read zero until then; with
         those of contacts on every one, which until the last computes nothing else; or all on every one. Hooks are
         called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when `refresh`
-        has not run: `qpos` and `qvel` are those of the state reached, poses and sensors those that the substep computed
+        has not run: `qpos` and `qvel` are of the state reached, poses and sensors as the substep computed them
         on its way. With hooks the substeps are launches of their own, with the hooks' torch work in between; without,
         all of them are one. Inside an outer capture both become part of its graph.
         """
@@ -199,7 +199,7 @@ class WarpWorld(World):
     def view(self, name: str) -> Shaped[Tensor, "*shape"]:
         """Return the view of an array that is current after `refresh`, and let `refresh` compute it from now on.
 
-        Forces of bodies (`cfrc_ext` and the like) are those of the last substep, from the next one on. A RuntimeError
+        Forces of bodies (`cfrc_ext` and the like) belong to the last substep, from the next one on. A RuntimeError
         once the world is frozen, if nothing has read that array before.
         """
         if name in views.ON_DEMAND - self._substeps.refreshed_on_demand:
@@ -269,7 +269,7 @@ class WarpWorld(World):
         return (*self.plan.lines(), self._chosen_line())
 
     def recorded_python(self) -> Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]:
-        """Return the callbacks and options of the model, each with what reads its values, by name."""
+        """Return the callbacks and options of the model, each with a reader of its values, by name."""
         callback = self.warp_model.callback
         opt = self.warp_model.opt
         return {
@@ -293,7 +293,7 @@ class WarpWorld(World):
         self._graphs.run("record_overflow", self._overflow.record)
 
     def overflow_counts(self, *, clear: bool = True) -> Int[Tensor, " N"]:
-        """Return what `explain_overflow` explains, whole numbers on the device, without waiting for it."""
+        """Return the numbers that `explain_overflow` explains, on the device, without waiting for it."""
         counts = self._overflow.counts()
         if clear:
             self._overflow.clear()
@@ -309,7 +309,7 @@ class WarpWorld(World):
         return capacity.is_certain(self.mj_model, self.sim, njmax=self.njmax)
 
     def remember_needs(self, report: OverflowReport) -> bool:
-        """Let later worlds of this model in this process have room for what was needed; whether they get more."""
+        """Let later worlds of this model in this process have the room that was needed; whether they get more."""
         return capacity.remember(self.mj_model, self.sim, self._expanded, report)
 
     def nan_count(self) -> Int[Tensor, ""]:
@@ -351,7 +351,7 @@ class WarpWorld(World):
         self.drop_views()
 
     def _load_kernels(self) -> None:
-        """Compile and load what steps, refreshes, resets and `set_const` launch, before any of them runs."""
+        """Compile and load the kernels of steps, refreshes, resets and `set_const`, before any of them runs."""
         with warp_scope(self.device), loaded_together(self.device):
             self._launch_once()
             for sensors in get_args(Sensors):
@@ -362,7 +362,7 @@ class WarpWorld(World):
                 self._masked_constants.launch(~FIXED)
 
     def _launch_once(self) -> None:
-        """Launch what has to run before anything else."""
+        """Launch the kernels that have to run before anything else."""
         mjw.reset_data(self.warp_model, self.warp_data_E)
         if self._masked_constants is not None:
             self._masked_constants.place_frames()
@@ -370,7 +370,7 @@ class WarpWorld(World):
     def _record_resets(self) -> None:
         """Refresh, and record the graphs of `reset` and `refresh`, which warm-ups of outer captures run per env step.
 
-        Launched one by one, resets take longer than the substeps: MuJoCo Warp makes their kernels anew each time.
+        Launched one by one, resets take longer than the substeps: MuJoCo Warp makes their kernels again each time.
         """
         nowhere_E = torch.zeros_like(self._reset_mask_E)
         for _ in range(2):

@@ -35,22 +35,22 @@ class World(views.DataViews):
     a row for each world: the attributes of `DataViews`, such as `qpos_EL` and `ctrl_EL`, and any other by `view(name)`.
     Write `qpos_EL`, `qvel_EL`, `ctrl_EL` and applied forces in place, and call `step`.
 
-    Position- and velocity-stage quantities (poses, velocities, their sensors) are those of the present state after
+    Position- and velocity-stage quantities (poses, velocities, their sensors) belong to the present state after
     `refresh`. Acceleration-stage ones (`qacc`, actuator and contact forces, contact sensors, accelerometers) belong to
     the last substep; rows that reset since then read zero. All views keep their address for the life of the world and
     are changed in place, float32.
 
     The model fields named in `per_world_fields`, by MuJoCo's names, and gravity may differ between worlds, and with
-    them what MuJoCo derives from them at compile time: call `set_const` after writing.
+    them the constants that MuJoCo derives at compile time: call `set_const` after writing.
 
     Args:
         mj_model: as `load_model` returns it; it is copied.
         num_envs: E, the number of worlds.
         device: "cpu", "cuda" or "cuda:<index>".
-        sim: settings that are laid over those of the model; None leaves them.
+        sim: settings that override the model's; None leaves them.
         per_world_fields: names of model fields that may differ between worlds, such as "body_mass".
-        warp_alone: what else will be asked of the worlds that only MuJoCo Warp can do, such as cameras, in words; with
-            engine "auto" it is Warp then.
+        warp_alone: features that only MuJoCo Warp has and that will be used, such as cameras, in words; with any,
+            engine "auto" is Warp.
 
     Attributes:
         mj_model: the copy of the model, with the settings of `sim`.
@@ -131,8 +131,8 @@ class World(views.DataViews):
 
         Sensors are computed on the last one, but for those that `refresh` computes; with those of contacts on every
         one; or all on every one. Hooks are called, in order, before each substep (such as a motor model that writes
-        `ctrl`) and after it, when `refresh` has not run: `qpos` and `qvel` are those of the state reached, poses and
-        sensors those that the substep computed on its way.
+        `ctrl`) and after it, when `refresh` has not run: `qpos` and `qvel` are of the state reached, poses and sensors
+        as the substep computed them on its way.
         """
 
     @abstractmethod
@@ -182,12 +182,12 @@ class World(views.DataViews):
         """Keep the overflow bits and needs of the last substep for the next report, as each substep does by itself."""
 
     def overflow_report(self, *, clear: bool = True) -> OverflowReport:
-        """Read what the physics needed since the last report; one transfer to the host. Call it once per rollout."""
+        """Read the needs of the physics since the last report; one transfer to the host. Call it once per rollout."""
         return self.explain_overflow(self.overflow_counts(clear=clear).tolist())
 
     @abstractmethod
     def overflow_counts(self, *, clear: bool = True) -> Int[Tensor, " N"]:
-        """Return what `explain_overflow` explains, whole numbers on the device, without waiting for it."""
+        """Return the numbers that `explain_overflow` explains, on the device, without waiting for it."""
 
     @abstractmethod
     def explain_overflow(self, numbers: Sequence[int]) -> OverflowReport:
@@ -200,7 +200,7 @@ class World(views.DataViews):
 
     @abstractmethod
     def remember_needs(self, report: OverflowReport) -> bool:
-        """Let later worlds of this model in this process have room for what was needed; whether they get more."""
+        """Let later worlds of this model in this process have the room that was needed; whether they get more."""
 
     @abstractmethod
     def nan_count(self) -> Int[Tensor, ""]:
@@ -237,7 +237,7 @@ class World(views.DataViews):
 
     @abstractmethod
     def recorded_python(self) -> Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]:
-        """Return the objects whose Python a recorded step depends on, each with what reads its values, by name."""
+        """Return the objects whose Python a recorded step depends on, each with a reader of its values, by name."""
 
     @abstractmethod
     def memory(self) -> Iterator[tuple[str, Shaped[Tensor, "*?shape"] | None, int, int]]:
@@ -261,7 +261,7 @@ def _choice(
     warp_alone: Sequence[str] = (),
     **_: Any,
 ) -> tuple[str, str]:
-    """Choose the engine by arguments that nobody has checked yet; what is wrong with them, either engine says."""
+    """Choose the engine by arguments that nobody has checked yet; either engine says which of them is wrong."""
     sim = sim if isinstance(sim, SimCfg) else SimCfg()
     if not isinstance(mj_model, mujoco.MjModel) or not isinstance(num_envs, int):
         return "warp", ""

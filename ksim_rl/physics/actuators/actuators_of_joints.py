@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 ADDED_FIELDS = frozenset(("actuator_armature", "actuator_damping", "actuator_dampingpoly"))
-# What MuJoCo notes where no actuator adds, and where several do.
+# MuJoCo's marks where no actuator adds, and where several do.
 NONE = -1
 SEVERAL = -2
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)

@@ -22,12 +22,12 @@ CONSTRAINT = int(upstream.ContactType.CONSTRAINT)
 
 
 def miscounts_contacts(warp_model: mjw.Model) -> bool:
-    """Whether MuJoCo Warp's transmissions count what has no rows as contacts of a body."""
+    """Whether MuJoCo Warp's transmissions count contacts without rows as contacts of a body."""
     return warp_model.nacttrnbody > 0 and has_rowless_contacts(warp_model)
 
 
 def transmissions_of_contacts(warp_model: mjw.Model, warp_data_E: mjw.Data) -> Callable[[], None]:
-    """Return what launches MuJoCo Warp's `transmission` with contacts alone, once there are constraint rows."""
+    """Return a launcher of MuJoCo Warp's `transmission` with contacts alone, once there are constraint rows."""
     contact = warp_data_E.contact
     geom = wp.empty_like(contact.geom)
     hiding = dataclasses.replace(warp_data_E, contact=dataclasses.replace(contact, geom=geom))
@@ -45,7 +45,7 @@ def transmissions_of_contacts(warp_model: mjw.Model, warp_data_E: mjw.Data) -> C
 
 
 def transmissions_of_refresh(warp_model: mjw.Model, warp_data_E: mjw.Data) -> Callable[[], None]:
-    """Return what launches MuJoCo Warp's `transmission` for all actuators but those that adhere to a body."""
+    """Return a launcher of MuJoCo Warp's `transmission` for all actuators but those that adhere to a body."""
     m = warp_model
     d = warp_data_E
     if m.nacttrnbody == 0:
@@ -77,7 +77,7 @@ def _gather_moments(
 def _scatter_moments(
     actuators: wp.array[int], rowadr: wp.array2d[int], kept: wp.array3d[float], moment: wp.array2d[float]
 ):
-    """Put back what `_gather_moments` has copied."""
+    """Put back the moments that `_gather_moments` has copied."""
     world, place, dof = wp.tid()
     moment[world, rowadr[world, actuators[place]] + dof] = kept[world, place, dof]
 

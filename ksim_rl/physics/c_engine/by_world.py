@@ -34,7 +34,7 @@ def left_out(mj_model: mujoco.MjModel) -> frozenset[str]:
 
 
 class ByWorld:
-    """Some of those arrays, [E, body, ...], filled from what the batch's simulations hold."""
+    """Some of those arrays, [E, body, ...], filled from the data of the batch's simulations."""
 
     def __init__(self, batch: mujoco.batch.Batch) -> None:
         self._batch = batch

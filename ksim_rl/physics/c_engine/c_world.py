@@ -27,9 +27,9 @@ from ksim_rl.physics.world import ENGINES, World
 _STAGE_NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
 _STAGE_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 _STAGE_ACC = int(mujoco.mjtStage.mjSTAGE_ACC)
-# What a step reads of its worlds, and writes back.
+# The arrays that a step reads of its worlds, and writes back.
 _STATE = (*views.SUBSTEP_INPUTS, "eq_active", "userdata", "history", "plastic", "plugin_state")
-# What MuJoCo Warp alone has, or calls by another name.
+# Arrays that MuJoCo Warp alone has, or that C calls by another name.
 _NOT_OF_C = frozenset(("nbody_awake", "ntree_awake", "nv_awake", "overflow"))
 # Fields that move or resize geoms within their bodies, whose trees of bounds MuJoCo's compiler makes once.
 _MOVES_GEOMS = frozenset(("geom_size", "geom_pos", "geom_quat"))
@@ -402,7 +402,7 @@ def _check_suits(sim: SimCfg, device: torch.device) -> None:
 
 @contextmanager
 def _told() -> Iterator[None]:
-    """Keep MuJoCo's warnings from the terminal; a RuntimeError where its memory was too small for what it computed.
+    """Keep MuJoCo's warnings from the terminal; a RuntimeError where its memory was too small.
 
     Of a state that is not finite the env tells.
     """

@@ -46,7 +46,7 @@ class Mirror:
     def push_changes(self) -> bool:
         """Write those numbers that somebody has changed since the last copy; whether there are any.
 
-        The others keep what rounding to float32 takes away.
+        The others keep the digits that rounding to float32 takes away.
         """
         changed = self.tensor.ne(self._seen)
         if self.tensor.is_floating_point():

@@ -33,7 +33,7 @@ EDGE_PAIRS = wp.constant(144)
 
 @wp.struct
 class Gap:
-    """What lies between two boxes, in the first one's frame: a place on each, and the distance between them."""
+    """The gap between two boxes, in the first one's frame: a place on each, and the distance between them."""
 
     distance: float
     own: wp.vec3
@@ -81,12 +81,14 @@ def gap_between(half: wp.vec3, other_half: wp.vec3, turn: wp.mat33, place: wp.ve
     gap = Gap()
     gap.distance = FAR
     back = wp.transpose(turn)
+    # Each corner of either box against the other, where clamping in its frame finds the closest place.
     for corner in range(8):
         point = place + turn @ corner_of(corner, other_half)
         gap = nearer(gap, wp.max(wp.min(point, half), -half), point)
         own = corner_of(corner, half)
         inside = back @ (own - place)
         gap = nearer(gap, own, place + turn @ wp.max(wp.min(inside, other_half), -other_half))
+    # Each edge of one box against each of the other.
     for pair in range(EDGE_PAIRS):
         start, along = start_of_edge(pair // 12, half), along_edge(pair // 12, half)
         other_start = place + turn @ start_of_edge(pair % 12, other_half)
@@ -101,6 +103,7 @@ def overlap_of(half: wp.vec3, other_half: wp.vec3, turn: wp.mat33, place: wp.vec
     """Return the best of the 15 axes that can separate two boxes (Gottschalk et al., "OBBTree", 1996)."""
     best = Overlap()
     best.distance = -FAR
+    # Axes 0 to 2 are the first box's, 3 to 5 the second's, the others cross products of one edge of each.
     for axis in range(AXES):
         normal = wp.vec3()
         if axis < 3:
@@ -112,8 +115,10 @@ def overlap_of(half: wp.vec3, other_half: wp.vec3, turn: wp.mat33, place: wp.vec
             edge[(axis - 6) // 3] = 1.0
             normal = wp.cross(edge, wp.vec3(turn[0, other], turn[1, other], turn[2, other]))
         length = wp.length(normal)
+        # Parallel edges have no common normal, and the normals of the faces cover that case.
         if length > PARALLEL:
             normal = normal / length
+            # Half the extents of both boxes along the axis, then the distance between their centres.
             reach = wp.dot(wp.abs(normal), half) + wp.dot(wp.abs(wp.transpose(turn) @ normal), other_half)
             offset = wp.dot(normal, place)
             distance = wp.abs(offset) - reach
@@ -125,10 +130,12 @@ def overlap_of(half: wp.vec3, other_half: wp.vec3, turn: wp.mat33, place: wp.vec
 
 @wp.kernel(module="unique", enable_backward=False)
 def forget_touching_boxes(c: Measured):
-    """Let sensors not read what a collision pass found of touching boxes, which is another depth than the least."""
+    """Hide contacts of touching boxes from sensors: the collision pass finds another depth than the least."""
     contact = wp.tid()
+    # The pool has a place for each thread; the first `nacon` are in use.
     if contact >= c.nacon[0]:
         return
+    # Geoms of a contact are -1 where flexes touch.
     first, second = c.contact_geom[contact][0], c.contact_geom[contact][1]
     if first < 0 or second < 0 or c.geom_type[first] != BOX or c.geom_type[second] != BOX:
         return
@@ -194,7 +201,7 @@ def measure_boxes(c: Measured):
 
 
 def take_over_measured_boxes(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None] | None:
-    """Return what appends the distances of boxes after MuJoCo Warp's collision pass; None where no sensor reads any."""
+    """Return a hook that appends distances of boxes after a collision pass; None where no sensor reads any."""
     pairs, pair_ids = upstream.geom_pairs(warp_model)
     are_boxes = (warp_model.geom_type.numpy()[pairs] == BOX).all(-1)
     measured = are_boxes & (pair_ids[:, 1] > upstream.NO_SENSOR)
@@ -207,4 +214,5 @@ def take_over_measured_boxes(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.
         wp.launch(forget_touching_boxes, dim=warp_data_E.naconmax, inputs=[everything])
         wp.launch(measure_boxes, dim=(warp_data_E.nworld, int(measured.sum())), inputs=[everything])
 
+    # Launched after the collision pass, since it clears bits that the pass has set.
     return append

@@ -49,6 +49,7 @@ def broad_phase_unavailable(
 
 def pairs_left(warp_model: mjw.Model) -> str | None:
     """Return whose contacts MuJoCo Warp's narrow phase finds after our broad one, or None."""
+    # Types whose contacts our narrow phase does not find have a count of 0.
     left = {" and ".join(kinds) for *_, kinds, most in _pairs(warp_model) if not most}
     if left:
         return f"{', '.join(sorted(left))} meet, whose contacts they alone find"
@@ -60,6 +61,7 @@ def _pairs(warp_model: mjw.Model) -> Iterator[tuple[int, int, list[str], int]]:
     pairs = warp_model.nxn_geom_pair_filtered.numpy()
     types = warp_model.geom_type.numpy()
     for pair, (_, sensor) in zip(pairs.tolist(), warp_model.nxn_pairid_filtered.numpy(), strict=True):
+        # The lower type first, as in the keys of MOST_CONTACTS.
         a, b = sorted(pair, key=types.__getitem__)
         kinds = [mjw.GeomType(types[geom]).name.lower() for geom in (a, b)]
         # A sensor that measures a pair reads contacts that have no rows, too.
@@ -70,7 +72,7 @@ def _pairs(warp_model: mjw.Model) -> Iterator[tuple[int, int, list[str], int]]:
 def collisions(
     warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists, *, lanes: int | None = None
 ) -> Callable[[], None]:
-    """Return what launches `mjw.collision` for a model for which it is available, with arrays in their final place.
+    """Return a launcher of `mjw.collision` for a model for which it is available, with arrays in their final place.
 
     The pool has to be empty (`nacon`). Places in it are others, as in each run on a GPU; contacts are appended to the
     lists, unless others come to the pool. `lanes` is how many threads share a world on CUDA; None takes the usual.
@@ -80,6 +82,7 @@ def collisions(
     device = d.qpos.device
     aabb = m.geom_aabb
     pairs = np.array([(a, b, most) for a, b, _, most in _pairs(m)], dtype=np.int32).reshape(-1, 3)
+    # Pairs that our narrow phase leaves to MuJoCo Warp are handed over by the broad phase.
     are_theirs = pairs[:, 2] == 0
     others = pairs[are_theirs, :2]
     context = upstream.create_collision_context(d.naconmax if others.size else 0)
@@ -96,6 +99,7 @@ def collisions(
         lanes = lanes or LANES
         threads = CUDA_THREADS
         most = REGISTERS
+    # The CPU compiles the same source for one lane.
     else:
         lanes = 1
         threads = 1
@@ -111,18 +115,22 @@ def collisions(
         "has_rows": HAS_ROWS,
     }
     collide = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)
+    # MuJoCo Warp's narrow phase launches kernels by these counts: only of the pairs that are left.
     theirs = dataclasses.replace(m, geom_pair_type_count=upstream.pair_type_counts(m, others))
     their_ids = wp.array(m.nxn_pairid_filtered.numpy()[are_theirs], dtype=wp.vec2i, device=device)
     of_theirs = corrections(m, wp.array(others, dtype=wp.vec2i, device=device), their_ids)
 
     def launch() -> None:
+        # The hook is read at each launch, since a program may set one of its own.
         hook = m.callback.contactfilter
         if isinstance(hook, Mending):
             # Our own contacts need no corrections.
             own_hook = dataclasses.replace(hook, of_theirs=of_theirs)
             hook = own_hook if own_hook.hooks() else None
+        # Appended in the collision pass, lists need no second look at the pool; hooks may change it afterwards.
         lists.are_appended = not others.size and hook is None
         if others.size:
+            # The counter of pairs that the broad phase hands over.
             d.ncollision.zero_()
         collide(lists=int(lists.are_appended))
         if others.size:

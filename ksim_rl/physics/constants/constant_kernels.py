@@ -1,6 +1,6 @@
 """These Warp kernels recompute the constants that MuJoCo derives at `qpos0`, in the worlds of a mask only.
 
-What follows from the joint-space inertia is computed in C++, see `constants_of_inertia.cpp`.
+Constants that follow from the joint-space inertia are computed in C++, see `constants_of_inertia.cpp`.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
@@ -123,7 +123,7 @@ def frames(c: Constants):
 
 @wp.func
 def _add_up_body(world: int, body: int, c: Constants):
-    """The mass of all that hangs on a body, its centre of mass, and its inertia about that, in the world frame."""
+    """Write the mass of a body's subtree, its own centre of mass, and its inertia about it, in the world frame."""
     mass = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
     # Bodies of a subtree are numbered one after the other.
     for other in range(body, body + c.body_subtreenum[body]):
@@ -148,7 +148,7 @@ __syncthreads();
 #endif
 """)
 def _wait_for_all() -> None:
-    """Let the lanes of a world see what all have written."""
+    """Wait until all lanes of a world have written: a barrier of the block."""
 
 
 @wp.func
@@ -253,7 +253,7 @@ def floats_per_world(nv: int, nbody: int) -> int:
 def constants_kernel(nv: int, nbody: int, lanes: int, on_chip: bool) -> wp.Kernel:
     """Return the kernel that recomputes constants; launch it over (worlds, lanes), in blocks of as many lanes.
 
-    What it works on is on the chip (in shared memory), or else in the scratch memory of its `Constants`.
+    Its arrays are on the chip (in shared memory), or else in the scratch memory of its `Constants`.
     """
     # Sizes are compile-time constants, so that arrays in shared memory have them; the cache keeps one kernel for each.
     sizes = f"NV = {nv}, NB = {nbody}, FLOATS = {floats_per_world(nv, nbody)}, LANES = {lanes}, ON_CHIP = {+on_chip}"

@@ -76,13 +76,13 @@ class MaskedConstants:
         self._constants = filled(kernels.Constants, own, warp_model)
 
     def place_frames(self) -> None:
-        """Launch what must have run once before `launch`, in all worlds."""
+        """Launch the frames at `qpos0` of all worlds, which must have run once before `launch`."""
         self._constants.mask = self._everywhere
         wp.launch(kernels.frames, dim=self._everywhere.shape[0], inputs=[self._constants])
         self._constants.mask = self._mask
 
     def mend_weights(self) -> None:
-        """Launch what gives all worlds the inverse weights of C after `mujoco_warp.set_const`."""
+        """Launch the kernel that gives all worlds the inverse weights of C after `mujoco_warp.set_const`."""
         self.place_frames()
         wp.launch(kernels.mend_weights, dim=self._constants.xipos.shape, inputs=[self._constants])
 
@@ -94,7 +94,7 @@ class MaskedConstants:
         return (self._inert or not groups & INERT0) and not (moves and self._ties_bodies)
 
     def launch(self, groups: int) -> None:
-        """Launch what recomputes the constants of `groups` in the rows of the mask."""
+        """Launch the constants of `groups` in the rows of the mask."""
         if groups & FIXED and self._resizes:
             # Cheap, and the same bits again in rows whose fields did not change.
             set_fixed_constants(self._warp_model)

@@ -40,7 +40,7 @@ TOO_MANY = wp.constant(int(mjw.OverflowType.HFIELD))
     ("", mjw.Model, MODEL_FIELDS), ("", mjw.Data, DATA_FIELDS), ("contact_", mjw.Contact, CONTACT_FIELDS)
 )
 class Collisions:
-    """What the kernel reads of a model and its worlds, and the contacts that it appends to."""
+    """The arrays of a model and its worlds that the kernel reads, and the contacts that it appends to."""
 
     pairs: wp.array[wp.vec2i]
     pair_ids: wp.array[wp.vec2i]
@@ -48,15 +48,17 @@ class Collisions:
 
 @wp.func
 def core_of(kind: int, size: wp.vec3, center: wp.vec3, turn: wp.mat33) -> Core:
-    """Return what of a sphere, a capsule or a box collides."""
+    """Return the core of a sphere, a capsule or a box."""
     core = Core()
     core.center = center
     core.turn = turn
+    # All 12 edges and 8 corners; a box has no radius.
     if kind == BOX:
         core.half = size
         core.num_edges = 12
         core.corner_step = 1
         return core
+    # A sphere's centre is all 8 corners of a box without size: one of them is enough.
     core.radius = size[0]
     core.corner_step = 8
     if kind == CAPSULE:
@@ -76,6 +78,7 @@ def height_field_contacts(c: Collisions):
     patch = c.geom_dataid[world % c.geom_dataid.shape[0], ground]
     size = c.hfield_size[patch]
     field_turn = c.geom_xmat[world, ground]
+    # In the frame of the field, where its lattice is aligned with the axes.
     center = wp.transpose(field_turn) @ (c.geom_xpos[world, geom] - c.geom_xpos[world, ground])
     bound = c.geom_rbound[world % c.geom_rbound.shape[0], geom]
     geoms, margin, gap, condim, friction, solref, solreffriction, solimp, adhesion = contact_params(
@@ -105,6 +108,7 @@ def height_field_contacts(c: Collisions):
         # The parameters of the geom with priority hold alone, which MuJoCo Warp's function does not know of this one.
         stronger = wp.where(c.geom_priority[ground] > c.geom_priority[geom], ground, geom)
         solref = c.geom_solref[world % c.geom_solref.shape[0], stronger]
+    # Contacts exist up to this distance, m; the bounding sphere rules most pairs out.
     reach = margin + gap
     if center[2] - bound > size[2] + reach or center[2] + bound < -size[3] - reach:
         return
@@ -118,11 +122,12 @@ def height_field_contacts(c: Collisions):
         center,
         wp.transpose(field_turn) @ c.geom_xmat[world, geom],
     )
-    # How far the geom is from its centre along each axis, and what it may touch there.
+    # How far the geom is from its centre along each axis, with the distance at which contacts exist.
     span = wp.vec3()
     for axis in range(3):
         row_of_turn = wp.vec3(core.turn[axis, 0], core.turn[axis, 1], core.turn[axis, 2])
         span[axis] = wp.dot(wp.abs(row_of_turn), core.half) + core.radius + reach
+    # The cells of the lattice below the geom's box.
     low_column = wp.max(int(wp.floor((center[0] - span[0] + field.half_x) / field.dx)), 0)
     low_row = wp.max(int(wp.floor((center[1] - span[1] + field.half_y) / field.dy)), 0)
     high_column = wp.min(int(wp.floor((center[0] + span[0] + field.half_x) / field.dx)), field.columns - 2)
@@ -132,11 +137,13 @@ def height_field_contacts(c: Collisions):
         for column in range(low_column, high_column + 1):
             for half in range(2):
                 prism = prism_of(field, c.hfield_data, row, column, half)
+                # The whole prism is below the geom.
                 if wp.max(wp.max(prism.a[2], prism.b[2]), prism.c[2]) < center[2] - span[2]:
                     continue
                 touch = touch_of_core(prism, core, reach)
                 if touch.distance >= reach:
                     continue
+                # C stops here in silence; a bit of the report of overflow tells of it.
                 if found == MOST:
                     wp.atomic_or(c.overflow, world, TOO_MANY)
                     return
@@ -180,18 +187,21 @@ def height_field_contacts(c: Collisions):
 def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None] | None:
     """Take the pairs of height fields away from MuJoCo Warp, in place.
 
-    Returns what appends their contacts instead after its collision pass, or None where there are no such pairs. Pairs
+    Returns a hook that appends their contacts after its collision pass, or None where there are no such pairs. Pairs
     with signed distance fields stay with MuJoCo Warp, as do all where surfaces move.
     """
     geom_type = warp_model.geom_type.numpy()
+    # The kernel expects the height field first.
     pairs, pair_ids = upstream.geom_pairs(warp_model)
     types = geom_type[pairs]
     height_first = np.where(types[:, :1] == HEIGHT_FIELD, pairs, pairs[:, ::-1])
     others = geom_type[height_first[:, 1]]
+    # Pairs that only a sensor measures are left to MuJoCo Warp.
     touches = (types == HEIGHT_FIELD).any(-1) & (pair_ids[:, 0] > upstream.NO_CONTACT)
     is_exact = touches & np.isin(others, (SPHERE, CAPSULE, BOX))
     is_convex = touches & np.isin(others, convex_contacts.TYPES)
     taken = is_exact | is_convex
+    # Our kernels write no velocity of a surface.
     if not taken.any() or warp_model.flg_surfacevel:
         return None
     upstream.drop_contacts(warp_model, taken)

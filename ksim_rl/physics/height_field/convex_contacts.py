@@ -36,7 +36,7 @@ TYPES = tuple(GEOM_TYPES[name] for name in ("CYLINDER", "ELLIPSOID", "MESH"))
 MESH = GEOM_TYPES["MESH"]
 MOST = wp.constant(int(mujoco.mjMAXCONPAIR))
 TOO_MANY = wp.constant(int(mjw.OverflowType.HFIELD))
-# Searches at once on a GPU, each of which has memory of its own, about 5 kB.
+# Searches in parallel on a GPU, each of which has memory of its own, about 5 kB.
 SEARCHES = 8192
 # Below this depth, m, the direction from one closest place to the other is rounding of float32.
 TOUCHING = wp.constant(1.0e-6)
@@ -52,7 +52,7 @@ MESH_FIELDS = (
     ("contact_", mjw.Contact, CONTACT_FIELDS),
 )
 class Searches:
-    """What the kernel reads of a model and its worlds, the memory of searches, and the contacts that it appends to."""
+    """The arrays that the kernel reads, the memory of searches, and the contacts that it appends to."""
 
     pairs: wp.array[wp.vec2i]
     pair_ids: wp.array[wp.vec2i]
@@ -76,6 +76,7 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
     patch = c.geom_dataid[world % c.geom_dataid.shape[0], ground]
     size = c.hfield_size[patch]
     field_turn = c.geom_xmat[world, ground]
+    # In the frame of the field, where its lattice is aligned with the axes.
     center = wp.transpose(field_turn) @ (c.geom_xpos[world, geom] - c.geom_xpos[world, ground])
     bound = c.geom_rbound[world % c.geom_rbound.shape[0], geom]
     geoms, margin, gap, condim, friction, solref, solreffriction, solimp, adhesion = contact_params(
@@ -105,6 +106,7 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
         # The parameters of the geom with priority hold alone, which MuJoCo Warp's function does not know of this one.
         stronger = wp.where(c.geom_priority[ground] > c.geom_priority[geom], ground, geom)
         solref = c.geom_solref[world % c.geom_solref.shape[0], stronger]
+    # The bounding sphere rules most pairs out before any search.
     reach = margin + gap
     if center[2] - bound > size[2] + reach or center[2] + bound < -size[3] - reach:
         return
@@ -112,6 +114,7 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
         return
 
     kind = c.geom_type[geom]
+    # MuJoCo Warp's own description of both geoms, which its search takes.
     below, shape = geom_collision_pair(
         c.geom_type,
         c.geom_dataid,
@@ -135,14 +138,17 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
         geoms,
         world,
     )
+    # The geom is moved into the frame of the field.
     shape.pos = center
     shape.rot = wp.transpose(field_turn) @ shape.rot
+    # The prism, as a mesh of six points whose place and axes are those of the field.
     below.pos = wp.vec3(0.0)
     below.rot = wp.identity(n=3, dtype=float)
     below.vert = c.corners[slot]
     below.vertadr = 0
     below.vertnum = 6
     below.graphadr = -1
+    # The geom's box along the axes, grown by the distance at which contacts exist.
     low, high = wp.vec3(), wp.vec3()
     for axis in range(3):
         along = wp.vec3()
@@ -150,6 +156,7 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
         low[axis] = support(shape, kind, -along).point[axis] - reach
         high[axis] = support(shape, kind, along).point[axis] + reach
 
+    # The cells of the lattice below that box.
     field = field_of(size, c.hfield_nrow[patch], c.hfield_ncol[patch], c.hfield_adr[patch])
     low_column = wp.max(int(wp.floor((low[0] + field.half_x) / field.dx)), 0)
     low_row = wp.max(int(wp.floor((low[1] + field.half_y) / field.dy)), 0)
@@ -161,13 +168,16 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
         for column in range(low_column, high_column + 1):
             for half in range(2):
                 prism = prism_of(field, c.hfield_data, row, column, half)
+                # The whole prism is below the geom.
                 if wp.max(wp.max(prism.a[2], prism.b[2]), prism.c[2]) < low[2]:
                     continue
                 middle = wp.vec3()
+                # The search starts from a point inside of each shape: of the prism, the mean of its corners.
                 for corner in range(6):
                     point = corner_of_prism(prism, corner)
                     c.corners[slot, corner] = point
                     middle = middle + point / 6.0
+                # Supports that the search remembers belong to the prism before.
                 below.index = -1
                 shape.index = -1
                 distance, count, own, other, _ = ccd(
@@ -191,12 +201,15 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
                     world,
                     c.overflow,
                 )
+                # Beyond the reach, or no distance was found.
                 if count == 0 or distance >= reach:
                     continue
                 if found == MOST:
                     wp.atomic_or(c.overflow, world, TOO_MANY)
                     return
+                # From the field to the geom, also where they are in each other.
                 normal = wp.where(distance < 0.0, own - other, other - own)
+                # So close, the two places say nothing: the direction between the centres has to do.
                 if wp.abs(distance) < TOUCHING:
                     normal = shape.pos - middle
                 write_contact(
@@ -238,7 +251,8 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
 
 @wp.kernel(module="unique", enable_backward=False)
 def convex_height_field_contacts(c: Searches):
-    """Search through all pairs of all worlds, as many at once as there is memory for."""
+    """Search through all pairs of all worlds, as many in parallel as there is memory for."""
+    # Each thread takes every `slots`-th pair, since it owns the memory of one search.
     slot = wp.tid()
     pairs = c.pairs.shape[0]
     item = int(slot)
@@ -258,11 +272,13 @@ def append(own: Mapping[str, wp.array], warp_model: mjw.Model, warp_data_E: mjw.
 
 def memory_for(warp_model: mjw.Model, warp_data_E: mjw.Data, *, num_pairs: int) -> dict[str, wp.array]:
     """Return the memory of searches: vertices, faces and edges of their polytopes. On a CPU there is one at a time."""
+    # Memory for each pair at the same time would be too much on a GPU.
     if warp_data_E.qpos.device.is_cuda:
         slots = min(SEARCHES, warp_data_E.nworld * num_pairs)
     else:
         slots = 1
     iterations = int(warp_model.opt.ccd_iterations)
+    # The sizes by which MuJoCo Warp's search indexes these arrays.
     faces = 6 + MJ_MAX_EPAFACES * iterations
     vertices = 10 + 2 * iterations
     return {

@@ -1,7 +1,7 @@
-"""Launches MuJoCo Warp's implicit integrators with all derivatives of what acts on simple bodies.
+"""Launches MuJoCo Warp's implicit integrators with all derivatives of the forces on simple bodies.
 
 The inertia matrix of such a body has a diagonal alone: rows of `M` leave out the others, and MuJoCo Warp's derivatives
-with them. C has these for "implicit", and with both integrators for a lone body, whose only joint is a free one. For
+with them. C has these for "implicit", and with both integrators for a single body, whose only joint is a free one. For
 that one MuJoCo Warp leaves out all that actuators and tendons do, too, whether it is simple or not. Here rows have an
 entry for each ancestor of a degree of freedom.
 """
@@ -77,7 +77,7 @@ def _may_act_on_lone_bodies(mj_model: mujoco.MjModel) -> bool:
 def implicit_with_full_rows(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
 ) -> Callable[[], None]:
-    """Return what launches an implicit integrator.
+    """Return a launcher of an implicit integrator.
 
     Args:
         warp_model: the model that it takes, in which nothing is disabled that has a derivative.
@@ -108,7 +108,7 @@ def implicit_with_full_rows(
         wp.launch(kernels.spread_columns, dim=d.M.shape, inputs=[places, d.M], outputs=[inertia_E])
         if lone.size == 0:
             return
-        # What solves for lone bodies adds the other derivatives to this matrix.
+        # The solver of single bodies adds the other derivatives to this matrix.
         upstream.derivative_of_smooth_forces(by_actuators, full_E, slowed_E)
         dim = (d.nworld, lone.size)
         wp.launch(kernels.copy_columns, dim=dim, inputs=[lone, slowed_E], outputs=[inertia_E])
@@ -162,7 +162,7 @@ def _with_rows(mj_model: mujoco.MjModel, warp_model: mjw.Model, rows: Rows) -> m
 
 
 def _entries_of_lone_bodies(warp_model: mjw.Model, start: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return the entries of lone bodies in rows that start at `start` and have `count` entries, int [N]."""
+    """Return the entries of single bodies in rows that start at `start` and have `count` entries, int [N]."""
     found = [np.zeros(0, dtype=np.int32)]
     for body in warp_model.body_freeadr.numpy():
         first = warp_model.body_dofadr.numpy()[body]

@@ -1,11 +1,11 @@
 """Launches MuJoCo Warp's integrators so that they reach the C engine's state; docs/upstream.md shows why.
 
-What its implicit integrators leave out is given back by a shallow variant of the model:
+A shallow variant of the model gives back the derivatives that its implicit integrators leave out:
 
-* Without actuation, or without dampers, they take no derivative at all. C drops the derivative of what is disabled.
+* Without actuation, or without dampers, they take no derivative at all. C drops only the derivatives of disabled parts.
 * They multiply a gain that depends on velocity by controls out of their range, and by those of another actuator where
   one has several controls or none.
-* Of simple bodies, and of those with a free joint alone, they leave out what couples degrees of freedom; see
+* Of simple bodies, and of those with a free joint alone, they leave out the coupling of degrees of freedom; see
   `full_rows`.
 
 And an activation of a disabled actuator is put back, and where trees may sleep what the substep read: MuJoCo Warp then
@@ -46,7 +46,7 @@ def integrator(
     *,
     mend: Callable[[], None] | None = None,
 ) -> Callable[[mjw.Model], None]:
-    """Return what launches the integrator of a model, with arrays in their final place.
+    """Return a launcher of the integrator of a model, with arrays in their final place.
 
     It takes the variant of the model that the substep used. `mend` follows the constraint rows of each stage of
     Runge-Kutta. ValueError where C's derivative cannot be had.
@@ -81,7 +81,7 @@ def integrator(
 def _keeping_readings(
     integrate: Callable[[mjw.Model], None], warp_data_E: mjw.Data, names: Sequence[str]
 ) -> Callable[[mjw.Model], None]:
-    """Return what launches an integrator and puts back arrays that the substep read before it."""
+    """Return a launcher of an integrator and puts back arrays that the substep read before it."""
     arrays = [getattr(warp_data_E, name) for name in names]
     kept = [wp.empty_like(array) for array in arrays]
 
@@ -135,7 +135,7 @@ def _nothing() -> None:
 
 
 def _with_all_derivatives(warp_model: mjw.Model) -> mjw.Model:
-    """Return a model in which what is disabled has no velocity to depend on, so that nothing needs to be disabled."""
+    """Return a model in which disabled parts depend on no velocity, so that nothing needs to be disabled."""
     m = warp_model
     bits = mjw.DisableBit
     flags = int(m.opt.disableflags)
@@ -157,7 +157,7 @@ def _with_all_derivatives(warp_model: mjw.Model) -> mjw.Model:
 def _inputs_of_gains(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
 ) -> tuple[Callable[[], None], mjw.Data] | None:
-    """Return what gathers the control of each actuator, within its range, and worlds that have these as `ctrl`.
+    """Return a launcher that gathers each actuator's control, within its range, and worlds with these as `ctrl`.
 
     None where no derivative reads a control.
     """

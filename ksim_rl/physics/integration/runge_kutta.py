@@ -1,4 +1,4 @@
-"""Launches MuJoCo Warp's Runge-Kutta, and mends what its stages leave wrong."""
+"""Launches MuJoCo Warp's Runge-Kutta, and mends the readings that its stages leave wrong."""
 
 import dataclasses
 from collections.abc import Callable
@@ -30,9 +30,9 @@ def hook_after_rows(warp_model: mjw.Model) -> str:
 def mended_runge_kutta(
     warp_model: mjw.Model, warp_data_E: mjw.Data, mend: Callable[[], None] | None
 ) -> Callable[[mjw.Model], None]:
-    """Return what launches `mjw.rungekutta4`, and `mend` after the rows of each of its stages.
+    """Return a launcher of `mjw.rungekutta4`, and `mend` after the rows of each of its stages.
 
-    Rows that tie bodies are made a second time, when the velocities are those of the stage and not of the one before.
+    Rows that tie bodies are made a second time, when the velocities belong to the stage and not to the one before.
     It leaves the `act_dot` of the last stage, as C does, and not the mean of all four, and delayed controls are those
     of the stage's own time.
     """
@@ -106,7 +106,7 @@ class _StageClock:
         self._stage = 0
 
     def start(self) -> None:
-        """Take the present time as that of the first stage."""
+        """Take the present time as the first stage's."""
         self._stage = 0
         wp.copy(self._before_E, self._time_E)
 

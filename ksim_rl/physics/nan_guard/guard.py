@@ -1,4 +1,4 @@
-"""The NaN guard keeps the last substeps of each world on the device, and writes those of failed worlds to files."""
+"""The NaN guard keeps the last substeps of each world on the device, and writes them to files for failed worlds."""
 
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportAssignmentType=false, reportCallIssue=false
@@ -28,7 +28,7 @@ _KEPT = 2
 
 @dataclass(frozen=True, kw_only=True)
 class NanGuardCfg(Checked):
-    """Keep the last `history` substeps of each world, and save those of a world whose state became non-finite.
+    """Keep the last `history` substeps of each world, and save them for a world whose state became non-finite.
 
     That takes, on the device, 4 bytes for each number of a world's state, controls and applied forces (Go1: 0.7 kB per
     world and substep). Of one world batch at most `max_files` failures are saved; further ones are only counted.
@@ -120,7 +120,7 @@ class NanGuard:
         self._reached = {name: wp.zeros_like(rows) for name, rows in self._reached_from.items()}
         self._failed_E, self._count_E = wp.to_torch(self._failed), wp.to_torch(self._count)
         self._fields = dict(fields)
-        # A reset draws new fields before the report is read: those of the failure are copied.
+        # A reset draws new fields before the report is read: the failed world's are copied.
         self._kept_fields = {name: tensor.clone() for name, tensor in fields.items()}
 
     def before_substep(self) -> None:
@@ -144,7 +144,7 @@ class NanGuard:
         )
 
     def _keep_rows(self) -> None:
-        """Do by torch what `keep_rows` does, where no kernel is to be compiled."""
+        """Do the work of `keep_rows` by torch, where no kernel is to be compiled."""
         # Row numbers may wait for the device here, since this is the path of the C engine on a CPU.
         watched_E = (self._failed_E == _WATCHED).nonzero().flatten()
         places_E = (self._count_E % self.cfg.history)[watched_E].long()
@@ -152,7 +152,7 @@ class NanGuard:
             wp.to_torch(ring)[watched_E, places_E] = wp.to_torch(rows)[watched_E]
 
     def _mark_failed(self) -> None:
-        """Do by torch what `mark_failed` does."""
+        """Do the work of `mark_failed` by torch."""
         watched_E = self._failed_E == _WATCHED
         self._count_E += watched_E
         reached = {name: wp.to_torch(rows) for name, rows in self._reached_from.items()}

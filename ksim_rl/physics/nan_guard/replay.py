@@ -55,7 +55,7 @@ class Substep:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """What the C engine makes of a failure; the last of `substeps` is the one that broke on Warp.
+    """A failure as the C engine replays it; the last of `substeps` is the one that broke on Warp.
 
     `dofs` are those whose velocities or positions are not finite after it. `first` is the dof that broke first: Warp's
     solver spreads a non-finite number over all dofs of a world within one substep, so it is then the one with the
@@ -72,7 +72,7 @@ class Replay:
 
 
 def replay(failure: Failure) -> Replay:
-    """Run each kept substep on the C engine, which says what it finds instead of starting anew."""
+    """Run each kept substep on the C engine, which reports bad states instead of resetting them."""
     mj_model = failure.mj_model
     write_fields(mj_model, failure.fields)
     # C would reset a diverged state by itself, which hides what is looked for.
@@ -200,7 +200,7 @@ def _substep(data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.nda
 
 
 def _largest(values: np.ndarray) -> tuple[float, int]:
-    """Return the largest magnitude and its place; what is not finite is the largest."""
+    """Return the largest magnitude and its place; a number that is not finite is the largest."""
     if not values.size:
         return 0.0, -1
     # Non-finite numbers sort as the largest.

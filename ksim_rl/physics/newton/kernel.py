@@ -1,7 +1,7 @@
 """Makes the one kernel of MuJoCo's Newton solver, in which a warp solves one world until it has converged.
 
 MuJoCo Warp launches about ten kernels per iteration, over all worlds, until the last of them has converged; here no
-world waits for another, and what an iteration computes stays in shared memory. The algorithm is the same, with the same
+world waits for another, and the results of an iteration stay in shared memory. The algorithm is the same, with the same
 tests of convergence, but for a line search that is no more exact than iterations need; costs agree within the
 tolerance. It is written in C++, since its matrix lies in registers, which needs loops that are unrolled, shuffles and
 shared memory; the CPU compiles the same source, for a warp of one lane. Read its `_PARTS` in their order.
@@ -29,7 +29,7 @@ _SOURCE = native.source_of("newton", _PARTS)
 
 
 class Invariant(enum.IntFlag):
-    """What holds in every solve of finite numbers; a debug build notes for each world what did not."""
+    """Invariants of every solve of finite numbers; a debug build notes for each world which ones broke."""
 
     ROWS_ARE_WHOLE = enum.auto()
     """Rows have a positive D, a bound >= 0 on dry friction, and columns among the degrees of freedom."""
@@ -48,17 +48,19 @@ class Invariant(enum.IntFlag):
 def layout(
     nv: int, njmax: int, limbs: Limbs, *, ntendon: int, elliptic: bool, rows_on_chip: int
 ) -> dict[str, int]:
-    """Return the sizes of what the lanes of a world share, by the names of the C++, and all of it in `FLOATS`."""
+    """Return the sizes of the arrays that a world's lanes share, by names of the C++, and their sum in `FLOATS`."""
+    # Arms couple a limb to each degree of freedom of the trunk; one more has the gradient.
     arms = len(limbs.trunk) + 1
     chains = len(limbs.chains)
     trunk = padded(len(limbs.trunk))
     limb = len(limbs.chains[-1]) if chains else 1
     stride = row_stride(nv)
+    # Rows of one limb have columns of the trunk and of that limb only.
     if chains:
         narrow = row_stride(trunk + limb)
     else:
         narrow = stride
-    # A column of a whole block has the entries of the block twice; one more is that of the gradient.
+    # A column of a whole block has the entries of the block twice; one more is the gradient's.
     column = padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
     # Part 4 of the C++ has blocks and arms of limbs, then the trunk; part 6 has two columns, or in the end two rows.
     of_limbs = chains * (limb + arms) * padded(limb) + max(padded(arms * (arms + 1) // 2), 2 * narrow)
@@ -69,12 +71,14 @@ def layout(
         lanes = 1 << (CUDA_LANES // chains).bit_length() - 1
     else:
         lanes = 0
+    # Padded, so that lanes load four floats in one go.
     rows = padded(njmax)
     if len(limbs.trunk) + limb <= min(lanes + 1, 12):
         tile = lanes
     else:
         tile = 0
     bounds = rows if elliptic else padded(min(nv + ntendon, njmax))  # of cones, or else of dry friction
+    # The inertia matrix and one vector, rows of the Jacobian, workspace, a vector by limbs, bounds, numbers per row.
     floats = (nv + 1) * stride + rows_on_chip * narrow + workspace + spread + bounds + 4 * rows + rows // 2
     return {
         "NV": nv,
@@ -105,15 +109,16 @@ def launcher(
     max_registers: int | None,
     checked: bool,
 ) -> Callable[[], None]:
-    """Return what launches the kernel.
+    """Return a launcher of the kernel.
 
-    The `sizes` are those of a `layout`. There are 32 lanes on CUDA and 1 on the CPU. Rows that find no room in
+    The `sizes` come from `layout`. There are 32 lanes on CUDA and 1 on the CPU. Rows that find no room in
     shared memory are in the scratch. A `checked` (debug) build writes each world's broken `Invariant`s. Of `own` it
     takes `efc_J_colind` and `efc_J`, the `scratch`, the tables of `limbs`, the `order` in which the worlds are taken
     up, and `broken`.
     """
     states = mujoco.mjtConstraintState
     rows = mujoco.mjtConstraint
+    # Names of the C++ that are MuJoCo's enums, and the limits of the solver.
     constants = {
         **sizes,
         "MOST_TRIALS": warp_model.opt.ls_iterations,

@@ -15,7 +15,7 @@ from ksim_rl.physics.sim_cfg import SimCfg
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
-# What a world may have of a multiprocessor's shared memory: ten such worlds live there at once. Of many eleven do, if
+# Floats of shared memory of a world, so that ten live on a multiprocessor together. Of many worlds eleven do, if
 # an eighth of the rows fit (H200, 32768 worlds of G1, own substeps: 11.88 ms; with ten 11.93, with twelve 12.14).
 FLOATS_PER_WORLD = 5536
 FLOATS_OF_MANY = 5048
@@ -39,6 +39,7 @@ INTEGRATORS = (
 
 def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
     """Return why the kernel cannot solve this model, or None where it can."""
+    # The layout with no row in shared memory is the least that the kernel needs.
     opt = mj_model.opt
     nv = mj_model.nv
     elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
@@ -70,11 +71,13 @@ def one_kernel_unavailable(mj_model: mujoco.MjModel, sim: SimCfg, *, njmax: int)
 
 def takes_conditional_nodes(warp_model: mjw.Model, *, supported: bool) -> bool:
     """Whether the loop of MuJoCo Warp's own solver is to end when all worlds have converged."""
+    # Up to that many iterations, a fixed loop is faster than a test after each.
     return supported and int(warp_model.opt.iterations) > MOST_UNCONDITIONAL_ITERATIONS
 
 
 def most_registers(floats: int, num_worlds: int) -> int | None:
-    """Return how many registers let as many worlds run at once as shared memory does, or None for any number."""
+    """Return how many registers let as many worlds run in parallel as shared memory does, or None for any number."""
+    # Blocks per multiprocessor by shared memory, of one warp each, then registers by the warps of a quarter, in eights.
     at_once = SHARED_BYTES // (4 * floats + 1024)
     most = max(LEAST_REGISTERS[num_worlds > FEW_WORLDS], 512 // -(-at_once // 4) // 8 * 8)
     return most if most <= MOST_REGISTERS else None
@@ -87,13 +90,13 @@ def solver(
     rows_on_chip: int | None = None,
     broken: wp.array | None = None,
 ) -> Callable[..., None]:
-    """Return what launches the solver: accelerations and forces from the constraint rows, which must be sparse.
+    """Return a launcher of the solver: accelerations and forces from the constraint rows, which must be sparse.
 
     On CUDA it orders the worlds before: with `solves=False` it does that alone, with `orders=False` it does not.
 
     Args:
         warp_model, warp_data_E: a model that is not `unsuited`, and its worlds, with arrays in their final place.
-        rows_on_chip: None is what was measured to be best: half of the rows, which few worlds exceed, where they fit.
+        rows_on_chip: None takes the measured best: half of the rows, which few worlds exceed, where they fit.
         broken: int32 [E], makes a debug build, which adds to each world's number the `Invariant`s that do not hold.
     """
     m = warp_model
@@ -104,23 +107,28 @@ def solver(
     on_cuda = d.qpos.device.is_cuda
     limbs = limbs_of(m.dof_parentid.numpy().tolist())
     sizes_with = partial(layout, m.nv, d.njmax, limbs, ntendon=m.ntendon, elliptic=elliptic)
+    # Shared memory without any row of the Jacobian; the rest is filled with rows.
     sizes = sizes_with(rows_on_chip=0)
     stride = sizes["STRIDE"]
     narrow = sizes["NARROW"]
     if rows_on_chip is None:
+        # Of many worlds, eleven run at the same time if an eighth of the rows finds room; see FLOATS_OF_MANY.
         is_tight = d.nworld > FEW_WORLDS and sizes["FLOATS"] + d.njmax // 8 * narrow <= FLOATS_OF_MANY
         room = (FLOATS_OF_MANY if is_tight else FLOATS_PER_WORLD) - sizes["FLOATS"]
         if on_cuda:
+            # Half of the rows suffice: few worlds have more.
             rows_on_chip = min(-(-d.njmax // 2), max(0, room // narrow))
         else:
             rows_on_chip = d.njmax
     sizes = sizes_with(rows_on_chip=rows_on_chip)
+    # Rows beyond are in global memory, in rows of full width.
     far_floats = (d.njmax - rows_on_chip * narrow // stride) * stride
     own = {
         "efc_J_colind": efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": efc.J.reshape((d.nworld, -1)),
         "scratch": wp.empty((d.nworld, far_floats), dtype=float, device=device),
         **{name: wp.array(table, dtype=int, device=device) for name, table in limbs.tables(m.nv).items()},
+        # The order of the worlds is that of their numbers until the first sort.
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
     }
@@ -133,6 +141,7 @@ def solver(
     solve = launcher(m, d, own, sizes, lanes=lanes, max_registers=registers, checked=broken is not None)
 
     def launch(*, orders: bool = True, solves: bool = True) -> None:
+        # The CPU takes the worlds one after the other, so that an order gains nothing.
         if orders and on_cuda:
             put_longest_first(own["order"], d)
         if solves:

@@ -48,10 +48,10 @@ def one_kernel_rows_unavailable(warp_model: mjw.Model, *, dynamics_unavailable: 
 def constraint_rows(
     warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists, *, lanes: int | None = None
 ) -> Callable[[], None]:
-    """Return what launches `mjw.make_constraint` for a model with sparse rows, with arrays in their final place.
+    """Return a launcher of `mjw.make_constraint` for a model with sparse rows, with arrays in their final place.
 
-    It also makes the contact lists. What only MuJoCo Warp's own solver reads (`jtdaj_*`, `Jqvel`, `dof_frictionadr`) is
-    not written. `lanes` is how many threads share a world on CUDA; None takes the usual.
+    It also makes the contact lists. Arrays that only MuJoCo Warp's own solver reads (`jtdaj_*`, `Jqvel`,
+    `dof_frictionadr`) are not written. `lanes` is how many threads share a world on CUDA; None takes the usual.
     """
     m = warp_model
     d = warp_data_E

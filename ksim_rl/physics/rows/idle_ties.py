@@ -18,7 +18,7 @@ import warp as wp
 
 from ksim_rl.physics.rows.tie_weights import EQUALITY, tied_bodies
 
-# What rounding makes of a tie that holds, in m and rad. C has forces of what is further apart.
+# The error that rounding makes in a tie that holds, m and rad. Beyond it, C has forces.
 ROUNDING = wp.constant(1.0e-5)
 LEAST_WEIGHT = 1e-10
 NOT_A_TIE = 0
@@ -53,7 +53,7 @@ def _moves(mj_model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
 def stilling_of_ties(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
 ) -> Callable[[], None] | None:
-    """Return what launches it after MuJoCo Warp's rows, with arrays in their final place; None where none is idle."""
+    """Return a launcher of it after MuJoCo Warp's rows, with arrays in their final place; None where none is idle."""
     m = warp_model
     d = warp_data_E
     kinds = kinds_of_ties(mj_model)

@@ -32,7 +32,7 @@ def tied_bodies(mj_model: mujoco.MjModel) -> np.ndarray:
 def weighing_of_ties(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
 ) -> Callable[[], None] | None:
-    """Return what launches it after MuJoCo Warp's rows, with arrays in their final place; None where they are right."""
+    """Return a launcher of it after MuJoCo Warp's rows, with arrays in their final place; None where they are right."""
     m = warp_model
     d = warp_data_E
     bodies = tied_bodies(mj_model)

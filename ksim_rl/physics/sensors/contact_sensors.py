@@ -45,7 +45,7 @@ def read_by_us(mj_model: mujoco.MjModel) -> tuple[list[int], list[int]]:
 
 
 class ContactReadings:
-    """What a substep reads of its contacts, and of accelerations, once their forces are known.
+    """Readings of contacts and of accelerations in a substep, once their forces are known.
 
     Attributes:
         sensors: the ids of the sensors that `read_sensors` reads, and MuJoCo Warp need not.
@@ -102,6 +102,6 @@ class ContactReadings:
             self._read_sensors(accelerates=accelerometers)
 
     def rne_postconstraint(self, warp_model: mjw.Model) -> None:
-        """Do what MuJoCo Warp's function of that name does; only what equalities and tendons exert has no order."""
+        """Do the work of MuJoCo Warp's function of that name; only forces of equalities and tendons have no order."""
         self._sum_forces()
         mjw.rne_postconstraint(warp_model, self._without_pool)

@@ -32,7 +32,7 @@ PI = wp.constant(float(np.pi))
 
 
 class LimitSensors:
-    """What launches the reading of a model's limit sensors, with arrays in their final place.
+    """Launches the reading of a model's limit sensors, with arrays in their final place.
 
     Attributes:
         reads_tendons: whether one of them needs `ten_velocity`.
@@ -41,6 +41,7 @@ class LimitSensors:
     def __init__(self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
         self._warp_model = warp_model
         self._warp_data_E = warp_data_E
+        # C reads zero under these flags; sensordata is zeroed before.
         bits = mujoco.mjtDisableBit
         without = bits.mjDSBL_SENSOR | bits.mjDSBL_CONSTRAINT | bits.mjDSBL_LIMIT
         reads_any = not int(mj_model.opt.disableflags) & without
@@ -99,6 +100,7 @@ class LimitSensors:
 def _cut(value: float, cutoff: float, datatype: int) -> float:
     if cutoff <= 0.0:
         return value
+    # A positive quantity has no lower bound but zero.
     if datatype == POSITIVE:
         return wp.min(value, cutoff)
     return wp.clamp(value, -cutoff, cutoff)
@@ -106,7 +108,8 @@ def _cut(value: float, cutoff: float, datatype: int) -> float:
 
 @wp.func
 def _nearest(lower: float, upper: float, margin: float, rate: float, wants_speed: bool) -> float:
-    """Return what the first row of a scalar has: that of its lower limit, or else of its upper one, or zero."""
+    """Return the number in a scalar's first row, of its lower limit or else its upper one; zero without rows."""
+    # C's row of the lower limit comes first, and has the sign of the rate.
     if lower < margin:
         return rate if wants_speed else lower - margin
     if upper < margin:
@@ -159,10 +162,12 @@ def _read_state(
             axis = wp.vec3(turn[1], turn[2], turn[3])
             sine = wp.length(axis)
             angle = 2.0 * wp.atan2(sine, turn[0])
+            # The shorter way around.
             if angle > PI:
                 angle -= 2.0 * PI
             direction = wp.sign(angle) * wp.normalize(axis)
             spin = wp.vec3(qvel[world, v], qvel[world, v + 1], qvel[world, v + 2])
+            # A ball's range is one angle; the other number is zero.
             distance = wp.max(limits[0], limits[1]) - wp.abs(angle)
             if distance < margin:
                 value = -wp.dot(direction, spin) if wants_speed else distance - margin
@@ -192,11 +197,13 @@ def _read_forces(
     world, place = wp.tid()
     sensor = sensors[place]
     kind = TENDON_ROW if sensor_type[sensor] == TENDON_FRC else JOINT_ROW
+    # Rows stand in the order equality, friction, limits; those beyond njmax were not made.
     first = ne[world] + nf[world]
     end = wp.min(first + nl[world], njmax)
     value = float(0.0)  # noqa: UP018 (Warp: a variable that changes)
     found = bool(False)  # noqa: UP018 (Warp: a variable that changes in a loop)
     for row in range(first, end):
+        # Where both limits hold, the first row counts, which is the lower limit's.
         if not found and efc_type[world, row] == kind and efc_id[world, row] == sensor_objid[sensor]:
             value = efc_force[world, row]
             found = True

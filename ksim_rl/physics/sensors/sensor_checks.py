@@ -58,7 +58,7 @@ def check_delayed(mj_model: mujoco.MjModel) -> None:
 
 
 def check_sites_of_meshes(mj_model: mujoco.MjModel) -> None:
-    """Refuse sensors of what is in a site with the shape of a mesh, of which MuJoCo Warp knows no inside."""
+    """Refuse sensors of things inside a site with the shape of a mesh, of which MuJoCo Warp knows no inside."""
     kinds = mujoco.mjtSensor
     m = mj_model
     for sensor in np.flatnonzero(np.isin(m.sensor_type, (kinds.mjSENS_CONTACT, kinds.mjSENS_INSIDESITE))):

@@ -60,7 +60,7 @@ def mend_sensors(
 ) -> list[int]:
     """Let MuJoCo Warp's sensors be followed by ours, in place, and return those that it need not read.
 
-    `read` are those that something else reads, and `lists` those of contacts, if something else makes them.
+    `read` are the sensors that something else reads, and `lists` the contact lists, if something else makes them.
     """
     contact_sensors = contact_sensors_left(mj_model, read)
     hooks: list[Callable[[], None]] = []

@@ -61,7 +61,7 @@ AFFINE = {
 def unsuited(warp_model: mjw.Model) -> str | None:
     """Return why the kernel cannot compute this model's smooth dynamics, or None where it can."""
     m = warp_model
-    # The order is that of the report: the first reason that holds is named.
+    # The first reason that holds is the one that is reported.
     reasons = {
         "there are flexes": m.nflex > 0,
         "there are tendons": m.ntendon > 0,
@@ -135,7 +135,7 @@ def integration(
 
     It updates the arrays of a `record` of overflow, too. Each sum has one order, whatever the number of lanes. Where
     MuJoCo Warp differs from the C engine it follows C: with forces disabled (activations without actuation keep still,
-    and implicitfast has the derivatives of what is left), and with controls out of range, whose derivative is that of
+    and implicitfast has the derivatives of what is left), and with controls out of range, whose derivative is taken at
     the clamped ones.
     """
     return _launcher(INTEGRATION, warp_model, warp_data_E, lanes, record or {})
@@ -227,7 +227,7 @@ def _floats(parts: tuple[str, ...], sizes: Mapping[str, int], lanes: int) -> int
     needed = sizes["poses"] + sizes["joints"] + 9 * sizes["num_bodies"] + 6 * sizes["num_dofs"]
     if parts == INTEGRATION:
         needed = sizes["num_entries"] + 2 * sizes["num_dofs"]
-    # Worlds of a warp begin in other banks: those of one lie side by side for its lanes.
+    # Worlds of a warp begin in other banks: floats of one world lie side by side for its lanes.
     return needed + (lanes - needed) % 32
 
 
@@ -258,7 +258,7 @@ def _elimination(warp_model: mjw.Model) -> dict[str, Sequence[int] | np.ndarray]
         # The outer product of a row updates the rows of its ancestors.
         for other, ancestor in enumerate(ancestors):
             changes += [starts[ancestor] + place << 14 | place << 7 | other for place in range(other + 1)]
-            # Entries beyond the matrix are those of the right-hand side, which is eliminated with it.
+            # Entries beyond the matrix belong to the right-hand side, which is eliminated with it.
             changes.append(column.size + ancestor << 14 | other << 7 | len(ancestors))
         first.append(len(changes))
     # Lanes substitute back along the chains of these in parallel.
