@@ -1,4 +1,4 @@
-"""The updates share what is here: their datasets, gradient steps, what these measured, and what a checkpoint holds."""
+"""The parts that updates share: datasets, gradient steps, the means of their measurements, and checkpoints."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from ksim_rl.objectives import NonFiniteStepsError, StepGuard, anneal_learning_r
 
 
 def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[Tensor, " steps"]]:
-    """Return what steps measured, each quantity as a tensor [steps]."""
+    """Return the measurements of steps, each quantity as a tensor [steps]."""
     columns = {}
     for name in steps[0]:
         measured = [step[name].detach() for step in steps]
@@ -49,19 +49,21 @@ class StepMeans(dict[str, Tensor]):
         made = steps["skipped"] == 0.0
         logged = {name: own for name, own in self._names.items() if name in steps}
         # A skipped step is counted; its numbers would spoil the means.
+        # A where instead of a product: a skipped step may have measured NaN.
         totals = torch.where(made, torch.stack([steps[name] for name in logged]), 0.0).sum(1)
         means = (totals / made.sum().clamp_min(1)).unbind()
         for own in (own for own in logged.values() if own not in self):
             self[own] = torch.zeros_like(means[0])
+        # In place, as a captured graph writes to the same tensors each time.
         torch._foreach_copy_([self[own] for own in logged.values()], means)
 
 
 class RolloutUpdate(ABC):
-    """What the updates have in common: each is one piece of work on a rollout, without a host sync.
+    """The base of all updates: each is one piece of work on a rollout, without a host sync.
 
-    On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, which is
-    what `RolloutCollector` gives. Where somebody changes an attribute of a loss, a network or an optimizer from
-    outside, the next one is captured anew. The `networks` are all that learn, by the names that a checkpoint gives
+    On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, as
+    `RolloutCollector` gives it. Where somebody changes an attribute of a loss, a network or an optimizer from
+    outside, the next one is captured again. The `networks` are all that learn, by the names that a checkpoint gives
     them; so many as `max_skipped_steps` in a row that are not finite, which `guard` counts, end the run. The env's own
     keys of reward and flags are `signals`; see `signal_keys`. The `logged` are names of logged means, by the names that
     steps measure.
@@ -83,7 +85,9 @@ class RolloutUpdate(ABC):
         self._means = StepMeans(logged)
         self._max_skipped_steps = max_skipped_steps
         self._rollout_ET: TensorDictBase | None = None
+        # The guard's own count is of the last step only; an update may have had a longer row of skips.
         self._longest_skip = torch.zeros((), dtype=torch.int64, device=self.device)
+        # `_update` is all of the work, so that on CUDA it becomes one graph.
         self._run = Captured(self._update, device=self.device)
         self._work = [self._run]  # all that is captured
         # Plain numbers of an update are its counters, which change with each call.
@@ -97,22 +101,26 @@ class RolloutUpdate(ABC):
             self._run()
 
     def warm_up(self, rollout_ET: TensorDictBase) -> None:
-        """Compile and capture what updates run, on a made-up rollout, which leaves no trace.
+        """Compile and capture the work of updates, on a made-up rollout, which leaves no trace.
 
-        Networks, optimizers, data and counters are afterwards what they were, and draws did not count. On CUDA the
+        Networks, optimizers, data and counters are afterwards as before, and draws did not count. On CUDA the
         rollout must be in the memory of those that follow, whose updates then replay graphs from the first.
         """
+        # A copy of everything that the work below changes.
         kept = state_tree.join(*state_tree.split(self.state_dict()))
         self._rollout_ET = rollout_ET
         if self.device.type == "cuda":
             devices = [self.device]
         else:
             devices = []
+        # Draws of the warm-up must not move the generators of the run.
         with torch.random.fork_rng(devices), self._watched.watched():
             for work in self._work:
+                # The runs before a capture, and the one that captures.
                 for _ in range(work.warmup + 1):
                     work()
         self.load_state_dict(kept)
+        # Means are no part of the state, and would show what the made-up rollout measured.
         for tensor in (*self._means.values(), self._longest_skip):
             tensor.zero_()
 
@@ -131,7 +139,7 @@ class RolloutUpdate(ABC):
         return self.signals.renamed(self._rollout_ET)
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
+        """Return the measurements of the last update, each a tensor [] on the device; means are over the steps made."""
         skipped = {"update/skipped_steps": self.guard.skipped, "update/skipped_in_a_row": self._longest_skip}
         return {**self._means, **skipped}
 
@@ -160,7 +168,7 @@ class RolloutUpdate(ABC):
 
 
 class DatasetUpdate(RolloutUpdate):
-    """What the updates have in common that make epochs of gradient steps on the dataset of each rollout.
+    """The base of updates that make epochs of gradient steps on the dataset of each rollout.
 
     The loss says which leaves the dataset keeps; recurrent networks learn on sequences. The `seed` is of the order of
     the env states in the minibatches; `shared` are the other arguments of `RolloutUpdate`.
@@ -180,9 +188,11 @@ class DatasetUpdate(RolloutUpdate):
         self.cfg = cfg
         self.loss = loss
         self.num_env_states = data.num_env_states
+        # One optimizer for all networks, so that their gradients are clipped by one norm.
         self.optimizer = make_optimizer(cfg, *networks.values())
         self._recurrent = recurrent_modules(*networks.values())
         sampler = None
+        # Recurrent networks need steps in order: minibatches are then whole sequences.
         if self._recurrent:
             sizes = ("sequence_length", "burn_in", "shards", "num_minibatches")
             sampler = SequenceSampler(seed=seed, **{name: getattr(data, name) for name in sizes})
@@ -191,23 +201,25 @@ class DatasetUpdate(RolloutUpdate):
         )
 
     def set_progress(self, done: float) -> None:
-        """Say what share of the run is done before the next update: where the learning rate is annealed, it follows."""
+        """Set the share of the run that is done before the next update; a learning rate that is annealed follows it."""
         anneal_learning_rate_(self.cfg, self.optimizer, done=done)
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured; see `RolloutUpdate`."""
+        """Return the measurements of the last update; see `RolloutUpdate`."""
         return super().metrics() | {
             "update/learning_rate": self.optimizer.param_groups[0]["lr"],
             "update/non_finite_env_states": self.dataset.non_finite_count,
         }
 
     def _epoch(self, loss: Any) -> list[dict[str, Tensor]]:
-        """Make a gradient step on each minibatch of an epoch; return what each measured, with `skipped_in_a_row`."""
+        """Make a gradient step on each minibatch of an epoch; return their measurements, with `skipped_in_a_row`."""
         steps = []
         for minibatch_B in self.dataset.epoch():
+            # States are renewed by the present networks, as stored ones are of older weights.
             if self._recurrent:
                 minibatch_B = burnt_in(minibatch_B, *self._recurrent, steps=self.dataset.cfg.burn_in)
             step = ppo_step(loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
+            # A copy: the guard counts in place.
             steps.append(step | {"skipped_in_a_row": self.guard.skipped_in_a_row.clone()})
         return steps
 
@@ -241,6 +253,7 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, A
     group = optimizer.param_groups[0]
     parameters = optimizer.param_groups[0]["params"]
     moments = {int(index): entry for index, entry in state["moments"].items()}
+    # All checks before the first copy, so that a refused state leaves the optimizer as it was.
     if set(moments) != set(range(len(parameters))):
         raise ValueError(
             f"{what}: {len(moments)} parameters in the checkpoint, {len(parameters)} in this run"
@@ -252,9 +265,10 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, A
                     f"{what}: {name} of parameter {index} has shape {list(moments[index][name].shape)} in the "
                     f"checkpoint and {list(parameter.shape)} in this run"
                 )
-    if state.get("initial_learning_rate") in (None, group.get("initial_lr")):  # or else it is given anew
+    if state.get("initial_learning_rate") in (None, group.get("initial_lr")):  # or else it is given again
         group["lr"].copy_(torch.as_tensor(state["learning_rate"]))
     for index, parameter in enumerate(parameters):
+        # In place where there are moments, whose addresses a captured graph holds.
         own = optimizer.state[parameter]
         for name, tensor in moments[index].items():
             own.setdefault(name, torch.empty_like(tensor, device=parameter.device)).copy_(tensor)

@@ -1,4 +1,4 @@
-"""Finds the algorithms by name: ours, those of plug-ins, and those that a program registers itself."""
+"""Finds the algorithms by name: ours, plug-ins, and any that a program registers itself."""
 
 import importlib
 import pkgutil
@@ -35,7 +35,7 @@ def algorithm(name: str) -> Algorithm:
 
 
 def serving(cfg: type[AlgorithmCfg]) -> Algorithm:
-    """Return the algorithm whose settings these are: that of the class itself, or of its nearest base."""
+    """Return the algorithm whose settings these are: by the class itself, or by its nearest base."""
     by_class = {algorithm.cfg: algorithm for _, algorithm in _algorithms().values()}
     for base in cfg.__mro__:
         if base in by_class:

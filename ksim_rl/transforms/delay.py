@@ -19,7 +19,7 @@ from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys,
 class DelayCfg(Checked):
     """A lag in env steps, drawn uniformly from {min_lag, ..., max_lag}, per env when that env resets.
 
-    Without `per_env` all envs share one, which changes when all reset at once, not when some do. Within an episode a
+    Without `per_env` all envs share one, which changes when all reset together, not when some do. Within an episode a
     new lag is drawn every `resample_every` env steps (0 keeps it) since the env's reset, or since all envs last reset
     together; with `hold_probability` such a draw leaves the lag as it is. `by_level` draws from
     {min_lag, ..., min_lag + round(level * (max_lag - min_lag))} (see `FollowsLevel`).
@@ -56,6 +56,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         self._register_rows("lag_E")
         self._register_rings()
         self.delay = delay
+        # The newest value and max_lag older ones.
         self.num_slots = delay.max_lag + 1
         # Unlike the count of steps that keys the draws, no seed turns the ages back: they show where the rings stand.
         for name in ("shared_count", "shared_age"):
@@ -63,13 +64,14 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         self._register_level(is_used=delay.by_level)
 
     def seed_(self, seed: int) -> Self:
-        """Set the seed and start the counters of draws anew, in place."""
+        """Set the seed and start the counters of draws again, in place."""
         self.shared_count.zero_()
         return super().seed_(seed)
 
     def _size_rows(self, specs: Composite) -> None:
         super()._size_rows(specs)
         self._size_buffer("lag_E", torch.int64)
+        # One lag only needs no draws.
         if self._is_fixed:
             self.lag_E.fill_(self.delay.min_lag)
 
@@ -81,6 +83,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
     def _advance(self) -> None:
         """Draw new lags for the env step to come, where they are due."""
         delay = self.delay
+        # Lags change within an episode only where a period is set.
         if not delay.resample_every or self._is_fixed:
             return
         self.step_count.add_(1)
@@ -90,6 +93,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         else:
             age = self.shared_age.add_(1)
         due = age % delay.resample_every == 0
+        # A draw that is due may be held, which makes the times of changes irregular.
         if delay.hold_probability:
             chance = random.uniform(self._step_keys("step/hold", shared=not delay.per_env), 1)[:, 0]
             due = due & (chance >= delay.hold_probability)
@@ -97,7 +101,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         self.lag_E.copy_(torch.where(due, drawn_E, self.lag_E))
 
     def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
-        """Return which rows reset, bool [E], with what the rings do not do as these rows begin."""
+        """Return which rows reset, bool [E], and draw their lags where the rings do not."""
         if self._draws_in_ring:
             return RowTransform._rows_that_reset(self, tensordict, tensordict_reset)
         mask_E = super()._rows_that_reset(tensordict, tensordict_reset)
@@ -107,6 +111,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
             lag_E = self._draw(self._reset_keys("reset/lag"))
             self.lag_E.copy_(torch.where(mask_E, lag_E, self.lag_E))
             return mask_E
+        # A flag on the device: whether all reset is not read on the host.
         together = mask_E.all()
         self.shared_count.add_(together)
         self.shared_age.mul_(~together)
@@ -125,6 +130,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         delay = self.delay
         if not delay.by_level:
             return random.integers(keys, 1, delay.min_lag, delay.max_lag)[:, 0]
+        # At level 0 the lag is the smallest, at 1 all lags may come.
         reach = (self.level * (delay.max_lag - delay.min_lag)).round().long()
         return random.integers(keys, 1, delay.min_lag, delay.min_lag + reach)[:, 0]
 
@@ -139,7 +145,7 @@ class ObservationDelay(LaggedTransform):
     """Observations as they were some env steps ago; an env that just reset sees its reset observation until then.
 
     All keys of one transform share the lag. A larger lag than before shows older readings again, a smaller one skips
-    some. With `by_level` the range of the lag follows `follow_level_`. Delays in physics substeps are those of
+    some. With `by_level` the range of the lag follows `follow_level_`. Delays in physics substeps are given by
     `ksim_rl.scene.actuators.DelayedActuator`.
 
     Example:
@@ -192,6 +198,7 @@ class ActionDelay(LaggedTransform):
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         for index in range(len(self.in_keys_inv)):
             ring_EM: Tensor = getattr(self, f"ring_{index}")
+            # The ring begins full of the initial action, which the env gets until the first one arrives.
             self._through(index, torch.full_like(ring_EM[:, 0], self.initial), mask_E)
         return tensordict_reset
 

@@ -25,15 +25,15 @@ def clipped(value: Num[Tensor, "*leaf"], clip: Range) -> Num[Tensor, "*leaf"]:
 class _Map(CheckedKeys):
     @abstractmethod
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
-        """Return the spec of what becomes of the leaf of the in key with this index (for actions: was before)."""
+        """Return the new spec of the leaf of the in key with this index (for actions: the policy's spec)."""
 
     @abstractmethod
     def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
-        """Return what becomes of a value of that leaf."""
+        """Return the new value for a value of that leaf."""
 
 
 class _Outward(_Map):
-    """Base for what the env emits: floating-point leaves, replaced on batches of samples as in an env."""
+    """Base for outputs of the env: floating-point leaves, replaced on batches of samples as in an env."""
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for index, (key, out_key) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
@@ -66,13 +66,14 @@ class RewardMap(_Outward):
 
 
 class ActionMap(_Map):
-    """Base of those that replace the action on its way to the env; what the policy chose stays, in samples too."""
+    """Base of those that replace the action on its way to the env; the policy's own action stays, in samples too."""
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         self._replace_leaves(action_spec, self.new_spec, is_inverse=True, is_floating=True)
         return action_spec
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        # Samples of a replay hold the policy's actions, which must not be mapped a second time.
         if self._is_for_samples:
             return tensordict
         for index, (key, out_key) in enumerate(zip(self.in_keys_inv, self.out_keys_inv, strict=True)):
@@ -81,11 +82,12 @@ class ActionMap(_Map):
 
 
 class _Clip:
-    """The limits of each key, (low, high) of which one may be None, and what they do to values and specs."""
+    """The limits of each key, (low, high) of which one may be None, and their effect on values and specs."""
 
     ranges: Sequence[Range]
 
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        # Bounds are clipped as values are.
         low, high = (clipped(end, self.ranges[index]) for end in bounds(spec))
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
@@ -137,16 +139,18 @@ class ActionClip(_Clip, ActionMap):
         self.ranges = [clip] * len(self.in_keys_inv)
 
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
+        # The clip makes any number an action, so that the policy sees no bounds.
         return Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
 
 
 def check_clip(field: str, ends: Range) -> None:
-    """Refuse what is no pair (low, high) with low < high and at least one limit."""
+    """Refuse all but a pair (low, high) with low < high and at least one limit."""
     if not isinstance(ends, tuple | list) or len(ends) != 2 or ends[0] is None and ends[1] is None:
         raise ValueError(f"{field}={ends!r}: expected a pair (low, high), of which one may be None")
     for end in ends:
         if end is not None:
             checks.check_in_range(field, end)
+    # Equal limits would make the observation a constant.
     if ends[0] is not None and ends[1] is not None and ends[0] >= ends[1]:
         raise ValueError(f"{field}={ends!r}: expected low < high")
 
@@ -165,6 +169,7 @@ class ObservationScale(ObservationMap):
         factors = one_per_key("scale", scale, self.in_keys)
         for index, (key, factor) in enumerate(zip(self.in_keys, factors, strict=True)):
             check_scale(f"scale of {key!r}", factor)
+            # A buffer, as compiled code and other devices need the factor as a tensor.
             held = torch.tensor(factor, dtype=torch.float32)
             self.register_buffer(f"factor_{index}", held, persistent=False)
 
@@ -174,10 +179,12 @@ class ObservationScale(ObservationMap):
             leaf = spec.shape[self.batch_dims[index] :]
             _check_per_dim(f"scale of {self.in_keys[index]!r}", factor.shape[0], "observation", leaf)
         factors = factor.expand(spec.shape), factor.expand(spec.shape)
+        # A negative factor turns the bounds around.
         low, high = multiply_bounds(bounds(spec), factors)
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def new_value(self, index: int, value: Num[Tensor, "*leaf"]) -> Num[Tensor, "*leaf"]:
+        # The float32 factors must not widen a leaf of lower precision.
         return (value * getattr(self, f"factor_{index}")).to(value.dtype)
 
 
@@ -210,6 +217,7 @@ class RewardScale(FollowsLevel, RewardMap):
 
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
         low, high = bounds(spec)
+        # The bounds hold at every level, so that both ends of the range of scales count.
         scales = self.scale, self.scale if self.first_scale is None else self.first_scale
         factors = torch.full_like(low, min(scales)), torch.full_like(low, max(scales))
         low, high = (end + self.offset for end in multiply_bounds((low, high), factors))
@@ -261,6 +269,7 @@ class ActionScale(ActionMap):
         if self._buffers[f"scale_{index}"] is None:
             self._buffers[f"scale_{index}"] = scale
             self._buffers[f"offset_{index}"] = offset
+        # The policy's bounds are the env's, mapped back; a negative scale turns them around.
         ends = [(end - offset) / scale for end in bounds(spec)]
         low = torch.minimum(*ends)
         high = torch.maximum(*ends)
@@ -274,6 +283,7 @@ class ActionScale(ActionMap):
             low, high = bounds(spec)
             if not bool((torch.isfinite(low) & torch.isfinite(high) & (low < high)).all()):
                 raise ValueError(f"ActionScale: {key!r} has no finite bounds: give scale")
+            # Half the range and the center map [-1, 1] to the bounds.
             return (high - low) / 2, (high + low) / 2
         for name, value in (("scale", self.scale), ("offset", self.offset)):
             if isinstance(value, Sequence):
@@ -298,7 +308,7 @@ class ActionScale(ActionMap):
 
 
 def check_scale(field: str, scale: PerDim) -> None:
-    """Refuse what is neither a finite number nor a tuple of them."""
+    """Refuse all but a finite number or a tuple of them."""
     for index, factor in enumerate(scale if isinstance(scale, tuple | list) else [scale]):
         checks.check_in_range(f"{field}[{index}]" if isinstance(scale, tuple | list) else field, factor)
 

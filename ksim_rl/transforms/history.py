@@ -32,7 +32,7 @@ class RingTransform(RowTransform):
 
     def _register_rings(self) -> None:
         self._register_rows("age_E", *self._per_key("ring"))
-        # What all frames of an observation take in memory, where several are in one ring.
+        # The bytes of all frames of an observation, where several are in one ring.
         self.register_buffer("part_bytes", None, persistent=False)
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
@@ -52,9 +52,11 @@ class RingTransform(RowTransform):
         self._size_buffer("age_E", torch.int64)
         shapes = [leaf.shape[specs.ndim :] for leaf in leaves]
         dtypes = [leaf.dtype for leaf in leaves]
+        # One ring is one launch, whatever the number of signals.
         self._is_joined = joins and len(shapes) > 1 and len(set(dtypes)) == 1
         if self._is_joined:
             sizes = [shape.numel() for shape in shapes]
+            # With one frame the order in memory is the order of the signals, and no parts are needed.
             if self.num_frames > 1:
                 part_bytes = torch.tensor([size * dtypes[0].itemsize for size in sizes], dtype=torch.int32)
                 self._buffers["part_bytes"] = part_bytes.to(self._row_device)
@@ -65,10 +67,11 @@ class RingTransform(RowTransform):
             self._size_buffer(f"ring_{index}", dtype, (self.num_slots, *shape))
 
     def _pass(self, tensordict: TensorDictBase, mask_E: Tensor | None) -> TensorDictBase:
-        """Send the values through the rings, and write what comes out; a mask says which rows begin with them."""
+        """Send the values through the rings, and write the results; a mask says which rows begin with them."""
         values = [tensordict.get(key) for key in self.in_keys]
         if self._is_joined:
             joined_EL = self._through(0, side_by_side(values, self.num_rows), mask_E)
+            # Each signal's frames lie together, so that splitting makes views.
             sizes = [self.num_frames * value.numel() // self.num_rows for value in values]
             found = joined_EL.split(sizes, dim=1)
         else:
@@ -78,7 +81,7 @@ class RingTransform(RowTransform):
         return tensordict
 
     def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
-        """Write this step's value [E, ...] and return what is due, [E, N * L]; masked rows begin with it."""
+        """Write this step's value [E, ...] and return the frames due, [E, N * L]; masked rows begin with it."""
         buffers: dict[str, Any] = self._buffers
         ring_EM = buffers[f"ring_{index}"]
         age_E = buffers["age_E"]
@@ -91,6 +94,7 @@ class RingTransform(RowTransform):
             draws = self._draws(index)
         else:
             draws = ring.NO_DRAWS
+        # All rings share one age, which only the last launch of a step counts on.
         layout = self.num_frames, self.stride, buffers["part_bytes"], begins or index == self._num_rings - 1
         return ring.turn(ring_EM, age_E, value_E, buffers.get("lag_E"), mask_E, *layout, *draws)
 
@@ -99,7 +103,7 @@ class RingTransform(RowTransform):
         return ring.NO_DRAWS
 
     def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
-        """Return what comes out in the shape that the env emits."""
+        """Return the frames in the shape that the env emits."""
         if found_EL.shape == value.shape:
             return found_EL
         return found_EL.reshape(value.shape)
@@ -117,7 +121,7 @@ class HistoryCfg(Checked):
 
 
 class ObservationHistory(RingTransform):
-    """The last frames of observations (see `HistoryCfg`); those from before a reset are the reset observation.
+    """The last frames of observations (see `HistoryCfg`); frames from before a reset are the reset observation.
 
     Example:
         >>> history = ObservationHistory(["joint_pos"], ["joint_pos_history"], length=10)
@@ -132,6 +136,7 @@ class ObservationHistory(RingTransform):
         self.num_frames = self.length = length
         self.stride = stride
         self.flat = flat
+        # From the newest frame back to the oldest, with the values between.
         self.num_slots = (length - 1) * stride + 1
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -158,6 +163,7 @@ class ObservationHistory(RingTransform):
         inner = self.batch_dims[index]
         if self.flat and outer == inner == 1:
             return found_EL
+        # Frames as a dim behind the batch, then moved behind the dims of a nested batch.
         stacked = found_EL.reshape(*batch_size, self.num_frames, *value.shape[outer:])
         if inner > outer:  # each frame of the env has one of each agent, say
             stacked = stacked.movedim(outer, inner)

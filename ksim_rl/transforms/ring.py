@@ -67,6 +67,7 @@ def _launch(
     else:
         size = math.prod(leaf)
     out_EL = torch.empty((num_rows, num_frames * size), dtype=value_E.dtype, device=device)
+    # Bytes, so that one kernel serves all dtypes.
     num_bytes = size * item_size
     value_stride = value_E.stride(0) * item_size
     value = value_E.data_ptr()
@@ -75,6 +76,7 @@ def _launch(
         width = 0
         lanes = 1
     else:
+        # The widest words of 16, 4 or 1 bytes that divide sizes and addresses of all rows.
         if parts is None:
             bits = num_bytes | value_stride | value
         else:
@@ -85,11 +87,13 @@ def _launch(
             width = 4
         else:
             width = 1
+        # A warp per row, unless each of its threads would copy more than 32 words per part.
         if num_frames * num_bytes <= 32 * _LANES * width * num_parts:
             lanes = _LANES
         else:
             lanes = _MANY_LANES
     layout = width, lanes, num_bytes, value_stride, num_slots, num_frames, stride, num_parts, counts
+    # Draws are keyed by the row among all ranks.
     first_row = ranks.first_row(num_rows)
     draws = first_row, stream, lowest, highest - lowest + 1, address(seed), address(draw_count_E)
     tensors = age_E.data_ptr(), address(lag_E), address(mask_E), address(parts), value
@@ -119,6 +123,7 @@ def _turn_in_torch(
     ring_EML = ring_EM.view(num_rows, num_slots, -1)
     value_EL = value_E.reshape(num_rows, -1)
     if mask_E is None:
+        # A step: all rows write, at the age that they reach.
         writes_E = torch.ones(num_rows, dtype=torch.bool, device=value_E.device)
         now_E = age_E.reshape(-1) + 1
         if lag_E is None:
@@ -126,25 +131,30 @@ def _turn_in_torch(
         else:
             newest_E = lag_E.reshape(-1)
     else:
+        # A reset: masked rows begin at age 0, and all frames are the value given.
         writes_E = mask_E.reshape(-1)
         now_E = torch.zeros_like(age_E).reshape(-1)
         newest_E = now_E
         stride = 0
         if seed is not None and draw_count_E is not None and lag_E is not None:
             _draw_lags_in_torch(lag_E, writes_E, seed, draw_count_E, stream, lowest, highest)
+    # The slot of the newest value, and how many steps back each frame lies, oldest first.
     slot_E = now_E % num_slots
     age_N = torch.arange(num_frames - 1, -1, -1, device=value_E.device) * stride
     # No frame reaches back beyond the reset.
     lag_EN = torch.minimum(newest_E[:, None] + age_N, now_E[:, None])
     place_EN = (slot_E[:, None] - lag_EN) % num_slots
+    # Read before the write: a lag of zero takes the value itself, not the slot.
     kept_ENL = ring_EML.gather(1, place_EN[..., None].expand(-1, -1, value_EL.shape[1]))
     frames_ENL = torch.where(lag_EN[..., None] == 0, value_EL[:, None], kept_ENL)
+    # Rows that do not write put back what the slot has: no size depends on the mask.
     rows_E = torch.arange(num_rows, device=value_E.device)
     ring_EML[rows_E, slot_E] = torch.where(writes_E[:, None], value_EL, ring_EML[rows_E, slot_E])
     if counts:
         age_E.copy_(torch.where(writes_E, now_E, age_E.reshape(-1)).view_as(age_E))
     if parts is None:
         return frames_ENL.reshape(num_rows, -1)
+    # Of joined signals, all frames of each one lie together.
     sizes = [size // value_E.element_size() for size in parts.tolist()]
     columns = [part.reshape(num_rows, -1) for part in frames_ENL.split(sizes, dim=2)]
     return torch.cat(columns, dim=1)
@@ -160,6 +170,7 @@ def _draw_lags_in_torch(
     highest: int,
 ) -> None:
     num_rows = len(begins_E)
+    # The resets that the rows reach, of which only those of masked rows are kept.
     count_E = draw_count_E.reshape(-1) + 1
     first_row = ranks.first_row(num_rows)
     keys = in_torch.keys_of(seed, stream, count_E, num_rows=num_rows, first_row=first_row)

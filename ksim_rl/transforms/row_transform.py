@@ -1,4 +1,4 @@
-"""The bases of transforms with state per env: buffers, draws of their own, a level to follow."""
+"""The bases of transforms with state per env: buffers, random draws, a level to follow."""
 
 import functools
 from abc import ABC, abstractmethod
@@ -26,7 +26,7 @@ _NO_SEED = -(1 << 63)
 class CheckedKeys(Transform):
     """Base of the transforms of this room: they read in keys, and write as many out keys, by default the same ones.
 
-    A key is a name, or a tuple for a nested one. Transforms of actions have `in_keys_inv`, what the env reads, and
+    A key is a name, or a tuple for a nested one. Transforms of actions have `in_keys_inv`, which the env reads, and
     `out_keys_inv`, where the policy writes. An out key that is missing (if `is_paired`) or repeats is refused.
     """
 
@@ -51,7 +51,7 @@ class CheckedKeys(Transform):
 
     def set_container(self, container: Transform | EnvBase) -> None:
         super().set_container(container)
-        # Replay buffers hold a chain that no env holds, and call its inverse on what they are given to store.
+        # Replay buffers hold a chain that no env holds, and call its inverse on the data that they store.
         self._is_for_samples = upstream.env_of(self) is None
 
     def _check_samples(self, tensordict: TensorDictBase, *, is_floating: bool = True) -> None:
@@ -75,7 +75,7 @@ class CheckedKeys(Transform):
         is_inverse: bool = False,
         is_floating: bool = False,
     ) -> list[TensorSpec]:
-        """Set the spec of each out key, in place, and return those of the in keys as they were.
+        """Set the spec of each out key, in place, and return the specs of the in keys as they were.
 
         `new_spec` takes the index of a key and its spec. The specs of actions (`is_inverse`) move to where the policy
         writes. Raises ValueError where `is_floating` and a spec is of another dtype.
@@ -85,6 +85,7 @@ class CheckedKeys(Transform):
         if is_inverse:
             in_keys = self.in_keys_inv
             out_keys = self.out_keys_inv
+        # All specs are read before one is written: an out key may be another's in key.
         found = [leaf_spec(specs, key, type(self).__name__) for key in in_keys]
         for key, spec in zip(in_keys, found, strict=True):
             if is_floating:
@@ -101,6 +102,7 @@ class CheckedKeys(Transform):
             self.batch_dims_inv = batch_dims
         else:
             self.batch_dims = batch_dims
+        # The policy's key takes the place of the env's key in the specs of actions.
         replaced = [new_spec(index, spec) for index, spec in enumerate(found)]
         for key, out_key in zip(in_keys, out_keys, strict=True):
             if is_inverse and key != out_key:
@@ -124,6 +126,7 @@ class RowTransform(CheckedKeys, ABC):
     def _register_rows(self, *names: str) -> None:
         """Name buffers that the env will size."""
         for name in names:
+            # None is a buffer without memory: a `state_dict` leaves it out until the env sizes it.
             self.register_buffer(name, None)
 
     def _per_key(self, name: str) -> list[str]:
@@ -154,6 +157,7 @@ class RowTransform(CheckedKeys, ABC):
 
         TorchRL may reset or resume an env before it asks for them.
         """
+        # The usual case costs one test per step.
         if not self.num_rows or self._is_for_samples:
             env = upstream.env_of(self)
             if env is None:
@@ -174,6 +178,7 @@ class RowTransform(CheckedKeys, ABC):
 
     def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
         """Return which rows reset, bool [E]; all of them where there is no mask."""
+        # Nearly every reset has one mask and nothing else: a look-up spares a walk through the keys.
         if len(tensordict.keys()) == 1 and (only := tensordict.get("_reset", None)) is not None:
             return _per_row(only, self.num_rows)
         masks = [
@@ -200,8 +205,9 @@ class RowTransform(CheckedKeys, ABC):
         )
 
     def clone(self) -> Self:
-        """Copy with buffers of its own: TorchRL rebuilds parts of an env from clones and may run them."""
+        """Copy, buffers included: TorchRL rebuilds parts of an env from clones and may run them."""
         copy = super().clone()
+        # The copy of TorchRL shares the tensors, which change in place.
         copy._buffers = {}
         for name, buffer in self._buffers.items():
             copy._buffers[name] = None if buffer is None else buffer.clone()
@@ -225,7 +231,7 @@ def _per_row(mask: Tensor, num_rows: int) -> Tensor:
 
 
 class KeyedTransform(RowTransform):
-    """Base of transforms with draws of their own, from a named `stream`; a config names it, else class and keys do.
+    """Base of transforms with random draws from a named `stream`; a config names it, else class and keys do.
 
     Draws in a step are keyed by `step_count`, which counts env steps; draws at a reset by `reset_count_E`, which counts
     each row's own resets. So a reset of one row never changes another row's numbers, and TorchRL's reset of the rows
@@ -234,7 +240,7 @@ class KeyedTransform(RowTransform):
     """
 
     purposes: ClassVar[tuple[str, ...]] = ()
-    """What the class draws, each from a stream of its own."""
+    """The purposes of the class's draws, each with a separate stream."""
 
     seed_value: Tensor
     step_count: Tensor
@@ -254,13 +260,14 @@ class KeyedTransform(RowTransform):
             self.stream = type(self).__name__ + "".join(map(str, every))
         else:
             self.stream = stream
+        # Streams are named, so that one more transform in a chain changes no draws of the others.
         self._stream_ids = {name: random.stream_id(f"{self.stream}/{name}") for name in self.purposes}
         self._is_seeded = seed is not None
         self.register_buffer("seed_value", torch.tensor(_NO_SEED if seed is None else seed))
         self.register_buffer("step_count", torch.zeros((), dtype=torch.int64))
 
     def seed_(self, seed: int) -> Self:
-        """Set the seed and start the counters anew, in place."""
+        """Set the seed and start the counters again, in place."""
         self._is_seeded = True
         self.seed_value.fill_(seed)
         self.step_count.zero_()
@@ -283,6 +290,7 @@ class KeyedTransform(RowTransform):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         super()._load_from_state_dict(state_dict, prefix, *args)
+        # The one value that no seed has stands for a state that was saved before any draw.
         self._is_seeded = bool(self.seed_value != _NO_SEED)
 
     def _size_rows(self, specs: Composite) -> None:
@@ -296,6 +304,7 @@ class KeyedTransform(RowTransform):
 
     def _step_keys(self, purpose: str, *, shared: bool = False) -> random.RowKeys:
         stream = self._stream_ids[purpose]
+        # A shared draw is one row, which broadcasts over all envs.
         rows = 1 if shared else self.num_rows
         return random.row_keys(self.seed_value, stream, self.step_count, rows, shared=shared)
 
@@ -314,7 +323,7 @@ def held_transforms(env: EnvBase, kind: type[Held]) -> Iterator[Held]:
 
 
 def seed_transforms(env: EnvBase, seed: int) -> None:
-    """Seed all transforms of an env that have draws or counters of their own."""
+    """Seed all transforms of an env that have draws or counters."""
     for transform in held_transforms(env, KeyedTransform):
         transform.seed_(seed)
 
@@ -328,7 +337,7 @@ class FollowsLevel(Transform):
         self.register_buffer("level", torch.ones(()), persistent=is_used)
 
     def follow_level_(self, level: Shaped[Tensor, "*any"] | float) -> Self:
-        """Follow a level: a number is copied; a tensor is read anew at every step, wherever it is changed in place.
+        """Follow a level: a number is copied; a tensor is read again at every step, wherever it is changed in place.
 
         Raises ValueError if a tensor is not float32 of shape [], or a number is outside [0, 1].
         """
@@ -337,6 +346,7 @@ class FollowsLevel(Transform):
                 raise ValueError(
                     f"level has shape {tuple(level.shape)} and dtype {level.dtype}: expected () and torch.float32"
                 )
+            # The tensor itself, so that a curriculum that changes it in place needs no call.
             self._buffers["level"] = level
         else:
             checks.check_in_range("level", level, low=0.0, high=1.0)
@@ -357,7 +367,7 @@ def by_level(
     end: float | Float32[Tensor, "*shape"],
     level: Float32[Tensor, "*level"],
 ) -> Float32[Tensor, "*found"]:
-    """Return what is `start` at level 0, `end` at level 1, and linear in between."""
+    """Return a value that is `start` at level 0, `end` at level 1, and linear in between."""
     if isinstance(start, Tensor) and isinstance(end, Tensor):
         return torch.lerp(start, end, level)
     return start + (end - start) * level
@@ -393,7 +403,7 @@ def checked_out_keys(
 
 
 def one_per_key(name: str, value: Any, keys: Sequence[NestedKey]) -> list[Any]:
-    """Return what a value is for each key: the same for all, or the entries of a mapping, which has to name all."""
+    """Return a value for each key: the same for all, or the entries of a mapping, which has to name all."""
     if not isinstance(value, Mapping):
         return [value] * len(keys)
     if set(value) != set(keys):
@@ -404,7 +414,7 @@ def one_per_key(name: str, value: Any, keys: Sequence[NestedKey]) -> list[Any]:
 def checked_action(
     tensordict: TensorDictBase, key: NestedKey, leaf: Sequence[int], dtype: torch.dtype
 ) -> Shaped[Tensor, "*leaf"]:
-    """Return the action, refused before it reaches a buffer: the env sees only what comes out of that."""
+    """Return the action, refused before it reaches a buffer: the env sees only the buffer's output."""
     action = tensordict.get(key)
     expected = (*tensordict.batch_size, *leaf)
     if tuple(action.shape) != expected or action.dtype != dtype:

@@ -24,14 +24,15 @@ def time_left(horizon: int, step_E: Shaped[Tensor, " E"]) -> Float32[Tensor, " E
 
 
 class _Tracker(RowTransform):
-    """What is kept of each episode, from 0 at its reset; copies go out, as the kept ones change in place."""
+    """The base of accounts of each episode, from 0 at its reset; copies go out, as the kept ones change in place."""
 
     @abstractmethod
     def _kept(self) -> list[Tensor]:
-        """Return what is kept, [E, ...], in the order of the out keys."""
+        """Return the kept tensors, [E, ...], in the order of the out keys."""
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         for kept_E in self._kept():
+            # A fill instead of a product: a sum that became NaN must not survive the reset.
             kept_E.masked_fill_(mask_E.reshape(-1, *[1] * (kept_E.ndim - 1)), 0)
         return self._write(tensordict_reset)
 
@@ -43,7 +44,7 @@ class _Tracker(RowTransform):
 
 
 class EpisodeTracker(_Tracker):
-    """The sum of rewards and the number of steps since the reset; where `done` is True, those of the whole episode.
+    """The sum of rewards and the number of steps since the reset; where `done` is True, of the whole episode.
 
     Both are part of `next`, and 0 at a reset; sums have the rewards' shapes and dtypes, the number of steps (left out
     by a `length_key` of None) is int64 [E, 1]. Nothing is read by the host: take the rows that are done after a
@@ -92,7 +93,7 @@ class EpisodeTracker(_Tracker):
         self._size_rows(observations)
         self._size_buffer("step_E", torch.int64)
         self._size_leaves("return", observations, leaves)
-        # One float32 reward per env is what nearly every env has: it is counted in one launch.
+        # Nearly every env has one float32 reward: it is counted in one launch.
         one = [spec.dtype for spec in leaves] == [torch.float32]
         self._is_usual = one and self.return_0.numel() == self.num_rows
         return output_spec
@@ -106,6 +107,7 @@ class EpisodeTracker(_Tracker):
         self._sized()
         if self._is_usual:
             return self._tally(next_tensordict, next_tensordict.get(self.in_keys[0]), None)
+        # The general case: any number of rewards, in their own shapes and dtypes.
         *totals, step_E1 = self._kept()
         step_E1.add_(1)
         for key, total_E in zip(self.in_keys, totals, strict=True):
@@ -125,7 +127,7 @@ class EpisodeTracker(_Tracker):
 
 
 class SuccessTracker(_Tracker):
-    """Whether an episode has succeeded, bool; where `done` is True, that of the whole episode.
+    """Whether an episode has succeeded, bool; where `done` is True, of the whole episode.
 
     In keys: observations, rewards, done flags; success is above the threshold, once an episode ("any") or now ("last").
 
@@ -151,6 +153,7 @@ class SuccessTracker(_Tracker):
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         output_spec = output_spec.clone()
         observations = output_spec["full_observation_spec"]
+        # Success may be read from any output of the env.
         everything = output_spec["full_done_spec"].clone()
         for part in ("full_reward_spec", "full_observation_spec"):
             everything.update(output_spec[part].clone())
@@ -166,6 +169,7 @@ class SuccessTracker(_Tracker):
         self._sized()
         for key, success_E in zip(self.in_keys, self._kept(), strict=True):
             now_E = (next_tensordict.get(key) > self.threshold).reshape(success_E.shape)
+            # The maximum of flags is "or": once reached, it stays for the episode.
             success_E.copy_(now_E if self.reduce == "last" else torch.maximum(success_E, now_E))
         return self._write(next_tensordict)
 
@@ -212,11 +216,13 @@ class TimeAwareObservation(_Tracker):
         spec = Bounded(0.0, high, shape, device=observation_spec.device, dtype=torch.float32)
         set_leaf_spec(observation_spec, self.out_keys[0], spec)
         self._size_rows(observation_spec)
+        # float32, as the observation is; whole numbers are exact in it up to 2^24.
         self._size_buffer("step_E", torch.float32)
         return observation_spec
 
     def _horizon(self) -> int:
         """Return the number of env steps of an episode, and remember it."""
+        # Asked for once: the answer cannot change while the env lives.
         if self.horizon is None:
             if self.container is None:
                 raise ValueError("horizon=None asks the env for its horizon: use the transform in an env")

@@ -39,6 +39,7 @@ def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "AMPUp
     objective: Any = cfg.objective
     ppo = make_ppo_update(cfg, env)
     motions = [observe_motion(env, group=objective.style_group, file=file) for file in objective.motions]
+    # Successive frames of each motion are the transitions; none joins the end of one motion to another.
     reference_N2L = torch.cat([torch.stack((seen_FL[:-1], seen_FL[1:]), 1) for seen_FL in motions])
     return AMPUpdate(objective, ppo=ppo, reference_N2L=reference_N2L, num_envs=cfg.num_envs)
 
@@ -75,13 +76,15 @@ class AMPUpdate(RolloutUpdate):
         networks = {"discriminator": self.discriminator}
         options: Any = {"device": ppo.device, "signals": ppo.signals, "logged": LOGGED}
         super().__init__(networks, max_skipped_steps=cfg.max_skipped_steps, **options)
-        # So that the first scores are of features in a fitting range. Ranks add up what they have counted.
+        # So that the first scores are of features in a fitting range. Ranks add up their counts.
         self.discriminator.normalizer.update(self.reference_N2L[ranks.rank() :: ranks.size()])
         rate = cfg.discriminator_learning_rate
         decay = cfg.discriminator_weight_decay
+        # The discriminator has its own rate and decay, and all else from the config of PPO.
         own = dataclasses.replace(cfg, learning_rate=rate, weight_decay=decay, schedule="fixed")
         self.optimizer = make_optimizer(own, self.discriminator)
         num_steps = ppo.num_env_states // num_envs
+        # Past transitions keep the discriminator from forgetting how earlier policies moved.
         kept = ReplayCfg(
             num_env_states_per_minibatch=cfg.num_transitions_per_step,
             num_minibatches=cfg.num_discriminator_steps,
@@ -104,7 +107,7 @@ class AMPUpdate(RolloutUpdate):
         return self.cfg.style_group, unravel_key(("next", self.cfg.style_group))
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured, each a tensor [] on the device.
+        """Return the measurements of the last update, each a tensor [] on the device.
 
         `style/reward` is the mean style reward of the rollout, in [0, 1]; the rest of `style/` are means over the
         discriminator's steps.
@@ -119,6 +122,7 @@ class AMPUpdate(RolloutUpdate):
         }
 
     def _update(self) -> None:
+        # The order matters: scores are by the discriminator that has not yet seen this rollout.
         self.ppo(self._rewarded(self.rollout_ET))
         self._learn_style(self.rollout_ET)
 
@@ -126,17 +130,20 @@ class AMPUpdate(RolloutUpdate):
     def _rewarded(self, rollout_ET: TensorDictBase) -> TensorDictBase:
         """Return the rollout with the sum of both rewards, which leaves the env's own as it was."""
         style_ET = style_reward(self.discriminator(_transitions(rollout_ET, *self._features))).unsqueeze(-1)
+        # Scores of env states that are not finite are NaN, and the dataset removes those rows.
         self._style.copy_(style_ET.nanmean())
         reward = self.signals.following[0]
         total_ET = self.cfg.task_coeff * rollout_ET.get(reward) + self.cfg.style_coeff * style_ET
         return rollout_ET.copy().set(reward, total_ET)
 
     def _learn_style(self, rollout_ET: TensorDictBase) -> None:
+        # The replay needs rewards and flags, by which it finds the ends of episodes.
         self.replay.extend(rollout_ET.select(*self._features, *STANDARD.following))
         net = self.discriminator
         made = []
         shown = []
         for minibatch_B in self.replay.minibatches(self.cfg.num_discriminator_steps):
+            # As many reference transitions as there are of the policy, drawn with replacement.
             drawn_B = ranks.randint(len(self.reference_N2L), minibatch_B.batch_size, device=self.device)
             reference_B2L = self.reference_N2L[drawn_B]
             policy_B2L = _transitions(minibatch_B, *self._features)
@@ -148,6 +155,7 @@ class AMPUpdate(RolloutUpdate):
                 gradient_penalty=self.cfg.gradient_penalty,
                 mask_B=mask_B,
             )
+            # A decay of the last layer only, which keeps the scores from growing without bound.
             last: Any = net.layers[-1]
             loss = loss + self.cfg.logit_decay * last.weight.square().sum()
             go_back({"loss": loss}, {"loss": self.optimizer}, mask=mask_B)
@@ -162,7 +170,7 @@ class AMPUpdate(RolloutUpdate):
         self._measure_(in_columns(made))
 
     def state_dict(self) -> state_tree.State:
-        """Return PPO's state, and beside it the discriminator with its optimizer and its replay."""
+        """Return PPO's state, and the discriminator with its optimizer and its replay."""
         return self.ppo.state_dict() | {
             "discriminator": self.discriminator.state_dict(),
             "discriminator_optimizer": optimizer_state(self.optimizer),
@@ -180,7 +188,7 @@ class AMPUpdate(RolloutUpdate):
         self.replay.load_state_dict(state["replay"])
 
     def load_weights(self, state: Mapping[str, Any]) -> None:
-        """Take only the networks of a `state_dict`; from a run of plain PPO, those of the policy."""
+        """Take only the networks of a `state_dict`; from a run of plain PPO, the networks of the policy."""
         self.ppo.load_weights(state)
         if "discriminator" in state:
             super().load_weights(state)

@@ -1,4 +1,4 @@
-"""A teacher is the policy of another run: its weights, and all that is needed to build it once more."""
+"""A teacher is the policy of another run: its weights, and all that is needed to build it again."""
 
 import json
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ class Teacher:
     """A policy that does not change, its normalizers included."""
 
     policy: TensorDictModuleBase
-    # The config of its run and the columns of what it reads, as JSON: enough to build it once more.
+    # The config of its run and the columns of its observations, as JSON: enough to build it again.
     description: Mapping[str, str] = field(default_factory=dict)
 
     def state_dict(self) -> state_tree.State:
@@ -52,11 +52,13 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
 
 def restored_teacher(state: Mapping[str, Any], env: EnvBase, *, cfg: RunCfg) -> Teacher:
     """Build the teacher of a `Teacher.state_dict`; see `load_teacher`."""
+    # Built by the config of its own run, on the device of this one.
     teacher_cfg = RunCfg.from_tree({**json.loads(state["config"]), "device": str(cfg.resolved_device())})
     read = teacher_cfg.modules.observation_keys("actor")
     theirs: Any = json.loads(state["columns"])
     ours: Any = observation_columns(env)
     shown: Any = env.observation_spec
+    # The groups that it reads have to exist here, and to have the same columns.
     for key in read:
         if key not in shown.keys(True):
             raise ValueError(

@@ -32,6 +32,7 @@ def make_distillation_update(
     objective: Any = cfg.objective
     data = part_of(cfg, "data", DatasetCfg)
     student = make_ppo_policy(cfg, env)
+    # A resumed run has its teacher in the checkpoint: the teacher's folder may be gone.
     if resumed is None:
         teacher = load_teacher(Path(objective.teacher), env, cfg=cfg)
     else:
@@ -48,11 +49,11 @@ def make_distillation_update(
 
 
 class DistillationUpdate(DatasetUpdate):
-    """Lets a student learn, from one rollout at a time, what its teacher would do there; see `DatasetUpdate`.
+    """Lets a student learn its teacher's actions, from one rollout at a time; see `DatasetUpdate`.
 
-    The student is any probabilistic module; a recurrent one learns on sequences. The teacher's actions must be those of
-    the student; its policy labels env states, and helps to collect where `teacher_share` says so. The `shared` are the
-    other arguments of `DatasetUpdate`.
+    The student is any probabilistic module; a recurrent one learns on sequences. The teacher's actions must be like
+    the student's; its policy labels env states, and helps to collect where `teacher_share` says so. The `shared` are
+    the other arguments of `DatasetUpdate`.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class DistillationUpdate(DatasetUpdate):
         return list(dict.fromkeys([*read, *self.signals.following]))
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured, each a tensor [] on the device; means are over the steps made.
+        """Return the measurements of the last update, each a tensor [] on the device; means are over the steps made.
 
         `update/action_error` is how far the student was from the teacher in the rollout, before it learned from it: the
         root mean square over actions, in their unit.
@@ -103,11 +104,13 @@ class DistillationUpdate(DatasetUpdate):
         return observation_keys(self.teacher.policy)
 
     def _update(self) -> None:
+        # Labels once per rollout: the teacher does not change while the student learns.
         labelled_ET = self.loss.label(self.rollout_ET)
         self._action_error.copy_(self.loss.action_error(labelled_ET))
         self.dataset.extend(labelled_ET)
         epochs = [self._epoch(self.loss) for _ in range(self.cfg.num_epochs)]
         self._measure_(in_columns([step for epoch in epochs for step in epoch]))
+        # In place: the behaviour policy reads the same tensor.
         self.teacher_share.mul_(self.cfg.teacher_share_decay)
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
         update_normalizers(self.rollout_ET, self.actor)

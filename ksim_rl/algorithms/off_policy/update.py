@@ -49,7 +49,7 @@ class OffPolicyUpdate(RolloutUpdate):
     Until each env has made `learning_starts` steps, rollouts have random actions and there are no gradient steps. From
     then on an update is `num_minibatches` gradient steps of the critics, each followed by one of the target networks,
     and by one of the actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`,
-    `mirror` has mirror images of what the networks read and of the action; `shared`, `RolloutUpdate`'s other arguments.
+    `mirror` has mirror images of the networks' inputs and of the action; `shared`, `RolloutUpdate`'s other arguments.
     """
 
     def __init__(
@@ -83,6 +83,7 @@ class OffPolicyUpdate(RolloutUpdate):
         self.behavior = behavior
         self.num_env_states = num_envs * data.num_steps
         self._observations: list[Any] = loss.observation_keys
+        # Each part by itself: backward passes and optimizer steps lie between them.
         fast: Any = partial(compiled, device=self.device, wanted=cfg.compile)
         self._images = None
         if cfg.symmetry == "augment":
@@ -100,12 +101,14 @@ class OffPolicyUpdate(RolloutUpdate):
             "actor": FlatAdamW(cfg, self.actor.parameters(), learning_rate=cfg.actor_learning_rate),
         }
         if isinstance(cfg, SACCfg) and isinstance(loss, SACLoss) and loss.log_alpha.requires_grad:
+            # A temperature that decays towards alpha = 1 would not be the one that the entropy asks for.
             free = replace(cfg, weight_decay=0.0)
             rate = cfg.alpha_learning_rate
             self.optimizers["alpha"] = FlatAdamW(free, [loss.log_alpha], learning_rate=rate)
         self.steps_made = 0
         # Zero until learning starts.
         self._means.update({name: torch.zeros((), device=self.device) for name in logged.values()})
+        # Two graphs: one for rollouts that are only stored, and one that learns as well.
         self._store_only = Captured(self._store, device=self.device)
         self._work.insert(0, self._store_only)
 
@@ -119,13 +122,14 @@ class OffPolicyUpdate(RolloutUpdate):
         """Learn from a rollout `["E","T"]`, or only keep it while the actions are random."""
         self._rollout_ET = rollout_ET
         self.steps_made += self.data.num_steps
+        # Counted on the host, which knows it without asking the device.
         learns = self.steps_made >= self.data.learning_starts
         with self._watched.watched():
             (self._run if learns else self._store_only)()
         self.behavior.random.fill_(not learns)
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured; see `RolloutUpdate`."""
+        """Return the measurements of the last update; see `RolloutUpdate`."""
         return super().metrics() | {
             "replay/env_states": self.replay.num_stored,
             "update/non_finite_env_states": self.replay.non_finite_count,
@@ -136,6 +140,7 @@ class OffPolicyUpdate(RolloutUpdate):
         self.replay.extend(rollout_ET)
         # Unlike on policy, gradient steps need not see the statistics that the actions were drawn with.
         update_normalizers(rollout_ET, self.actor, self.critic)
+        # An env that ended an episode anywhere in the rollout explores with another scale of noise from now on.
         self.behavior.end_episodes_(rollout_ET.get(("next", "done")).squeeze(-1).any(1))
 
     def _update(self) -> None:
@@ -143,11 +148,13 @@ class OffPolicyUpdate(RolloutUpdate):
         minibatches = self.replay.minibatches(self.data.num_minibatches, read=self._read)
         of_critic = []
         of_actor = []
+        # The actor learns on every `policy_delay`-th minibatch, after the critics have.
         for step, minibatch_B in enumerate(minibatches, start=1):
             of_critic.append(self._improve_critic(minibatch_B))
             if step % self.cfg.policy_delay == 0:
                 of_actor.append(self._improve_actor(minibatch_B))
         columns = in_columns(of_critic), in_columns(of_actor)
+        # Counted once for all steps, since each is skipped if either of its parts was.
         longest = self._count_(*(own["skipped"] for own in columns))
         self._measure_(columns[0] | {"skipped_in_a_row": longest.expand_as(columns[0]["skipped"])})
         self._means.take_(columns[1])
@@ -171,16 +178,17 @@ class OffPolicyUpdate(RolloutUpdate):
         return env_states_B
 
     def _improve_critic(self, minibatch_B: TensorDictBase) -> dict[str, Tensor]:
-        """Make one gradient step of critics and targets; return what it measured, and `skipped`, 0 or 1."""
+        """Make one gradient step of critics and targets; return its measurements, and `skipped`, 0 or 1."""
         with self._precision():
             loss, logged = self._critic_loss(minibatch_B)
         norm, skipped = self._descend({"critic": loss}, minibatch_B)["critic"]
+        # The loss has left the error of each env state in the minibatch.
         if self.data.prioritized:
             self.replay.update_priority(minibatch_B.get("index"), minibatch_B.get("td_error"))
         return logged | {"loss_qvalue": loss, "critic_grad_norm": norm, "skipped": skipped}
 
     def _improve_actor(self, minibatch_B: TensorDictBase) -> dict[str, Tensor]:
-        """Make one gradient step of the actor and the temperature; return what `_improve_critic` does."""
+        """Make one gradient step of the actor and the temperature; return the same as `_improve_critic`."""
         # Frozen here as well, where the compiler does not follow.
         with self._precision(), frozen(self.critic):
             losses, logged = self._actor_losses(minibatch_B)
@@ -188,6 +196,7 @@ class OffPolicyUpdate(RolloutUpdate):
         losses_of = {name: losses[f"loss_{name}"] for name in learning}
         steps = self._descend(losses_of, minibatch_B)
         norm, skipped = steps["actor"]
+        # A step counts as skipped if the temperature's was.
         if "alpha" in steps:
             skipped = torch.maximum(skipped, steps["alpha"][1])
         return logged | {"loss_actor": losses["loss_actor"], "actor_grad_norm": norm, "skipped": skipped}
@@ -223,6 +232,7 @@ class OffPolicyUpdate(RolloutUpdate):
             load_optimizer_state(optimizer, state["optimizers"][name], what=f"{name} optimizer")
         state_tree.copy_into(self.behavior.exploration_state(), state["exploration"], what="exploration")
         self.replay.load_state_dict(state["replay"])
+        # Without a replay the run has to collect random actions first, as at its start.
         if state["replay"]:
             self.steps_made = state["steps_made"]
         else:
@@ -231,6 +241,7 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def load_weights(self, state: Mapping[str, Any]) -> None:
         """Take networks and temperature of a `state_dict`; a ValueError names a tensor or action bound that differs."""
+        # Before any weight is copied.
         self._check_action_bounds(state["actor"])
         super().load_weights(state)
         if isinstance(self.loss, SACLoss):

@@ -39,9 +39,11 @@ def make_off_policy_update(
         action_dim=env.action_spec.shape[-1],
         device=cfg.resolved_device(),
     )
+    # The bounds of the actions are buffers of the actor, whatever modules wrap it.
     bounded = next(module for module in actor.modules() if isinstance(module, BoundedActor))
     bounds: dict[str, Any] = {"low_L": bounded.low, "high_L": bounded.high}
     learned: dict[str, Any] = {"support_A": critic.module.support}
+    # Both losses take the discount and the way in which critics are reduced.
     learned |= {name: getattr(objective, name) for name in ("gamma", "value_reduction")}
     noise = {}
     loss: OffPolicyLoss
@@ -59,6 +61,7 @@ def make_off_policy_update(
     else:
         target = {name: getattr(objective, name) for name in ("target_noise", "target_noise_clip")}
         loss = TD3Loss(actor, critic, **bounds, **target, **learned)
+        # SAC explores by its own draws; TD3's policy is deterministic, and needs noise.
         noise = {"noise_min": objective.exploration_noise_min, "noise_max": objective.exploration_noise_max}
     return OffPolicyUpdate(
         objective,

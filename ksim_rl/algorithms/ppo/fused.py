@@ -34,6 +34,7 @@ def make_fused_ppo(
     update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None = None
 ) -> "FusedPPO | NotFused":
     """Build the fused gradient steps of a PPO update, or say why torch has to make them."""
+    # The cheap reasons first: what the update runs on, and how it draws its minibatches.
     if update.device.type != "cuda" or importlib.util.find_spec("triton") is None:
         return NotFused("they need CUDA and Triton")
     if update.dataset.cfg.shards > 1:
@@ -67,7 +68,7 @@ def make_fused_ppo(
 
 
 class FusedBehavior(ProbabilisticTensorDictSequential):
-    """Acts as `actor`, with means that are bit for bit those of the first gradient step, by its chained kernels.
+    """Acts as `actor`, with means that are bit for bit as in the first gradient step, by its chained kernels.
 
     The weights are those that the actor has at each call, or where `steady` began.
     """
@@ -75,9 +76,11 @@ class FusedBehavior(ProbabilisticTensorDictSequential):
     def __init__(self, actor: ProbabilisticTensorDictSequential, fused: "FusedPPO") -> None:
         parts: list[Any] = [*cast(Any, actor).module]
         network = parts[0].module
+        # Only the first module of the actor is replaced; the others make the distribution and sample as before.
         keys = {"in_keys": parts[0].in_keys, "out_keys": parts[0].out_keys}
 
         def parameters_of(*observations: Tensor) -> tuple[Tensor, Tensor]:
+            # Someone may have changed the weights between two calls.
             if not self._is_steady:
                 self._fused.parameters.load()
             loc = self._fused.means(network.joined(*observations))
@@ -102,14 +105,16 @@ class FusedBehavior(ProbabilisticTensorDictSequential):
 def fused_networks(
     actor: ProbabilisticTensorDictSequential, critic: TensorDictModuleBase
 ) -> FusedNetworks | NotFused:
-    """Return what the kernels need to know of `make_actor`'s and `make_critic`'s networks, or why they are others."""
+    """Return the description of `make_actor`'s and `make_critic`'s networks for the kernels, or why they are others."""
     policy = getattr(actor[0], "module", None)
     value = getattr(critic, "module", None)
+    # Exact types: a subclass may compute something else.
     if type(policy) is not PolicyNetwork or type(value) is not ValueNetwork:
         return NotFused("the networks are not those of make_actor and make_critic")
     head: Any = policy.head
     if type(head) not in (GaussianHead, TanhGaussianHead):
         return NotFused(f"the policy is no {DiagonalGaussian.__name__} or {TanhGaussian.__name__}")
+    # The actor's head is its last layer; the std is handed over separately.
     layers = [*_layers(policy.trunk), head.loc], _layers(value.layers)
     activations = {type(part) for part in (*policy.trunk, *value.layers)} - {nn.Linear}
     if len(activations) != 1 or not activations <= {*ACTIVATIONS}:

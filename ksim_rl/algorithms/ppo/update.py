@@ -43,7 +43,7 @@ class PPOUpdate(DatasetUpdate):
     """Improves actor and critic with one rollout at a time; see `DatasetUpdate`.
 
     The actor is any probabilistic module, which writes actions, their log-probabilities and parameters of the
-    distribution; the critic writes `state_value`. For `cfg.symmetry`, `mirror` has the mirror images of what they read
+    distribution; the critic writes `state_value`. For `cfg.symmetry`, `mirror` has the mirror images of their inputs
     and of the action. The `shared` are the other arguments of `DatasetUpdate`.
     """
 
@@ -64,9 +64,10 @@ class PPOUpdate(DatasetUpdate):
         loss = make_loss(cfg, actor, critic)
         networks = {"actor": actor, "critic": critic}
         super().__init__(cfg, loss=loss, networks=networks, device=device, logged=LOGGED, **shared)
+        # Symmetry inside, precision outside: the mirrored half is computed in the same precision.
         losses = make_symmetric(cfg, loss, mirror, device=self.device)
         self._losses = in_precision(losses, cfg.precision, device=self.device)
-        # The rollouts hold the recurrent states of the actor, and not those of the critic.
+        # The rollouts hold the recurrent states of the actor, and not of the critic.
         self._carried = CarriedState(critic, acting=actor)
         # The kernels that make the gradient steps, or why torch makes them.
         self.fused = make_fused_ppo(self, mirror)
@@ -86,6 +87,7 @@ class PPOUpdate(DatasetUpdate):
         """The leaves of an env state that an update reads."""
         actor = self.actor
         written = [*actor.dist_sample_keys, *actor.log_prob_keys, *distribution_keys(actor)]
+        # States of a recurrent critic are carried from update to update, and are in no rollout.
         valued = [key for key in self.critic.in_keys if key not in self._carried.keys]
         following = [*(unravel_key(("next", key)) for key in valued), *self.signals.following]
         return list(dict.fromkeys([*observation_keys(actor), *valued, *written, *following]))
@@ -98,7 +100,7 @@ class PPOUpdate(DatasetUpdate):
         return [f"torch makes the gradient steps, not the fused kernels: {self.fused.reason}"]
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
-        """Return what the last update measured, each a tensor [] on the device; means are over the steps made."""
+        """Return the measurements of the last update, each a tensor [] on the device; means are over the steps made."""
         if self._scale_keys:
             std = {"policy/std": self._std}
         else:
@@ -112,6 +114,7 @@ class PPOUpdate(DatasetUpdate):
             self._count()
             self._measure_(steps)
         else:
+            # The kernels read the rollout themselves; of the dataset they need only the orders.
             orders_KD = self.dataset.epoch_orders(self.cfg.num_epochs)
             means, self._longest_skip, left_out = self.fused(rollout_ET, orders_KD, self._count)
             self._means.update({LOGGED[name]: own for name, own in means.items() if name in LOGGED})
@@ -119,7 +122,7 @@ class PPOUpdate(DatasetUpdate):
 
     def _count(self) -> None:
         if self._scale_keys:
-            # As `nanmean`, whose count copies all that it counts. The sign of what is no number is zero.
+            # As `nanmean`, whose count copies all that it counts. The sign of NaN is zero.
             scales = [self.rollout_ET.get(key) for key in self._scale_keys]
             means = [own.nansum() / own.sign().sum() for own in scales]
             self._std.copy_(torch.stack(means).mean())
@@ -127,7 +130,8 @@ class PPOUpdate(DatasetUpdate):
         update_normalizers(self.rollout_ET, self.actor, self.critic)
 
     def _torch_steps(self, rollout_ET: TensorDictBase) -> dict[str, Tensor]:
-        """Make all gradient steps with torch; return what each measured, [steps]."""
+        """Make all gradient steps with torch; return their measurements, [steps]."""
+        # The critic goes on from where it left the last rollout, and its states are stored with this one.
         self._carried.begin_(rollout_ET)
         rollout_ET = self.advantage(rollout_ET)
         self._carried.end_(rollout_ET)

@@ -1,4 +1,4 @@
-"""Builds PPO for a run: actor and critic for what its env observes and does, and their update."""
+"""Builds PPO for a run: actor and critic for the observations and actions of its env, and their update."""
 
 from functools import partial
 from typing import Any
@@ -51,13 +51,14 @@ def make_ppo_policy(cfg: RunCfg, env: EnvBase) -> ProbabilisticTensorDictSequent
 
 
 def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
-    """Build actor and critic for what an env observes and does; a ValueError refuses those of an off-policy method."""
+    """Build actor and critic for an env's observations and actions; a ValueError refuses an off-policy method's."""
     device = cfg.resolved_device()
     modules = cfg.modules
     actor_cfg = part_of(cfg, "modules.actor", ActorCfg)
     critic_cfg = part_of(cfg, "modules.critic", CriticCfg)
     spec: Any = env.observation_spec
 
+    # A trunk adds the width of its features to the inputs of both networks.
     trunk = None
     shared = 0
     if modules.trunk is not None:
@@ -84,5 +85,6 @@ def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSe
     critic = new_critic(critic_cfg, obs_dim=width(critic_cfg.in_keys), device=device)
     if trunk is None:
         return actor, critic
+    # Both operators run the same trunk, and so learn the same weights in it.
     both = ActorValueOperator(trunk, actor, critic)
     return both.get_policy_operator(), both.get_value_operator()  # type: ignore[return-value]
