@@ -25,6 +25,7 @@ def complete_keyframes(spec: mujoco.MjSpec) -> None:
 
     MuJoCo would read zeros, which throw the joints to where servos have their zero.
     """
+    # Without activations there is nothing that a keyframe could leave out of them.
     has_activations = any(actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE for actuator in spec.actuators)
     silent = [key for key in spec.keys if not len(key.ctrl) or (has_activations and not len(key.act))]
     if not silent or not len(spec.actuators):
@@ -33,7 +34,9 @@ def complete_keyframes(spec: mujoco.MjSpec) -> None:
     with caught_warnings():
         mj_model = load_model(spec)
     for key in silent:
+        # An empty qpos means the model's own pose.
         holding = held(mj_model, np.array(key.qpos) if len(key.qpos) else mj_model.qpos0)
+        # What the keyframe says itself stays.
         if not len(key.ctrl):
             key.ctrl = holding.ctrl_L
         if mj_model.na and not len(key.act):
@@ -51,10 +54,12 @@ def compile_keyframes(spec: mujoco.MjSpec) -> None:
 
 def let_new_servos_hold(spec: mujoco.MjSpec, new: Collection[str]) -> None:
     """Let the actuators that were added under these names hold the poses of keyframes that hold controls."""
+    # Compiled keyframes are complete, also where the spec leaves numbers out.
     with caught_warnings():
         mj_model = spec.compile()
     columns = [i for i in range(mj_model.nu) if mj_model.actuator(i).name in new]
     for key, qpos in zip(spec.keys, mj_model.key_qpos, strict=True):
+        # A keyframe without controls is completed as a whole later (`complete_keyframes`).
         if not len(key.ctrl):
             continue
         ctrl = np.array(key.ctrl)
@@ -71,6 +76,7 @@ def move_keyframe(
     """
     shift = np.array(pos_3)
     turn = np.array(quat_4)
+    # Joints below a free root keep their numbers: these are relative.
     free = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     if len(key.qpos):
         qpos = np.array(key.qpos)
@@ -78,6 +84,7 @@ def move_keyframe(
             pose = qpos[address : address + 7]
             pos = pose[:3].copy()
             quat = pose[3:].copy()
+            # A copy of the pose goes in, since the result is written over it.
             mujoco.mju_mulPose(pose[:3], pose[3:], shift, turn, pos, quat)
         key.qpos = qpos
     if len(key.qvel):
@@ -89,6 +96,7 @@ def move_keyframe(
         key.qvel = qvel
     if len(key.mpos):
         places = np.array(key.mpos).reshape(-1, 3)
+        # World frame: turned, then shifted.
         for place in places:
             mujoco.mju_rotVecQuat(place, place.copy(), turn)
             place += shift
@@ -96,6 +104,7 @@ def move_keyframe(
     if len(key.mquat):
         turns = np.array(key.mquat).reshape(-1, 4)
         for own in turns:
+            # On the left: turned in the world.
             mujoco.mju_mulQuat(own, turn, own.copy())
         key.mquat = turns.ravel()
 
@@ -104,5 +113,6 @@ def add_joined(spec: mujoco.MjSpec, name: str, starts: Sequence[mujoco.MjData]) 
     """Add one keyframe of the states of entities, in the order in which they were attached."""
     joined: dict[str, np.ndarray] = {}
     for attribute, field in _FIELDS.items():
+        # Entities were attached one after the other, and so their numbers lie in the joined model.
         joined[attribute] = np.concatenate([getattr(start, field).ravel() for start in starts])
     spec.add_key(name=name, time=starts[0].time, **joined)

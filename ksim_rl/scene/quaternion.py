@@ -14,6 +14,7 @@ def multiply(a: Float[Tensor, "*a 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor
     au = a[..., 1:]
     bw = b[..., :1]
     bu = b[..., 1:]
+    # Vector part: a_w b_u + b_w a_u + a_u x b_u.
     vector = torch.addcmul(torch.addcmul(torch.linalg.cross(au, bu), aw, bu), bw, au)
     return torch.cat((aw * bw - (au * bu).sum(-1, keepdim=True), vector), dim=-1)
 
@@ -28,6 +29,7 @@ def rotate(q: Float[Tensor, "*q 4"], v: Float[Tensor, "*v 3"]) -> Float[Tensor, 
     w = q[..., :1]
     u = q[..., 1:]
     across = torch.linalg.cross(u, v)
+    # Rodrigues: v + 2 (w (u x v) + u x (u x v)), which needs no conjugate.
     return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across), alpha=2.0)
 
 
@@ -36,6 +38,7 @@ def rotate_inverse(q: Float[Tensor, "*q 4"], v: Float[Tensor, "*v 3"]) -> Float[
     w = q[..., :1]
     u = q[..., 1:]
     across = torch.linalg.cross(u, v)
+    # The same with -w: the inverse turns the other way.
     return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across, value=-1.0), alpha=2.0)
 
 
@@ -43,12 +46,14 @@ def angle_between(a: Float[Tensor, "*a 4"], b: Float[Tensor, "*b 4"]) -> Float[T
     """Return the angle of the rotation that turns orientation `a` into `b`, [..., 4] each: rad in [0, pi], [...]."""
     # By the chord, which unlike the cosine is well-conditioned at 0. `b` and `-b` are the same orientation.
     chord = torch.minimum(torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1))
+    # A chord of 2 sin(angle / 4); rounding may lead beyond 1.
     return 4.0 * torch.asin((0.5 * chord).clamp(max=1.0))
 
 
 def yaw(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
     """Return the heading of quaternions [..., 4]: the angle of the rotated x axis in the xy plane, rad, [...]."""
     w, x, y, z = q.unbind(-1)
+    # Half of both arguments of the usual formula, which saves two products.
     return torch.atan2(torch.addcmul(w * z, x, y), 0.5 - torch.addcmul(y * y, z, z))
 
 

@@ -30,15 +30,18 @@ class Placement(Checked):
             raise ValueError(f"quat={self.quat!r}: expected a unit quaternion (w, x, y, z)")
 
     def move(self, spec: mujoco.MjSpec) -> None:
-        """Move all that stands in the spec's world, and what its keyframes say of that."""
+        """Move all that stands in the spec's world, and its poses in the keyframes."""
+        # Compiled first: `move_keyframe` finds free joints in the model.
         model = load_model(spec)
         world = spec.worldbody
+        # Elements inside of a frame move with that frame.
         loose = [
             element
             for kind in (world.frames, world.bodies, world.geoms, world.sites, world.cameras, world.lights)
             for element in kind
             if element.frame is None
         ]
+        # One frame for all: children keep their own poses.
         frame = world.add_frame(pos=self.pos, quat=self.quat)
         for element in loose:
             element.set_frame(frame)
@@ -48,7 +51,7 @@ class Placement(Checked):
 
 @runtime_checkable
 class Robot(Protocol):
-    """What a scene needs from a robot: its model, as a spec that can still be edited.
+    """A robot as a scene needs it: its model, as a spec that can still be edited.
 
     A robot whose joints are driven by entries of `ksim_rl.scene.actuators` has them in an attribute `actuators`, and
     its `spec` puts them into the model by `set_actuators`.
@@ -80,15 +83,15 @@ class MjcfRobot(Checked):
 class SceneCfg(Checked):
     """What is in each world, by name; gravity and the other options are the first robot's.
 
-    The elements of an entity (robot or object: a cube, a ball, a door) that is alone keep their names; those of several
+    The elements of an entity (robot or object: a cube, a ball, a door) that is alone keep their names; of several they
     get the prefix "<name>/". Entities without a placement stand where their own models put them. Sensors are for
-    `view.contact(name)` and its kin; those of the MJCF need no entry here.
+    `view.contact(name)` and its kin; sensors of the MJCF need no entry here.
     """
 
     robots: Annotated[Mapping[str, Robot], Filled("name at least one robot")]
     objects: Mapping[str, Robot] = field(default_factory=dict)
     placements: Mapping[str, Placement] = field(default_factory=dict)
-    terrain: Terrain | None = None  # None: the robot's own model has what it needs
+    terrain: Terrain | None = None  # None: the robot's own model has its ground
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     num_envs: Count = 1
     spacing: NonNegative = 2.0  # m between neighbouring envs when several are drawn in one picture
@@ -110,7 +113,7 @@ class SceneCfg(Checked):
 
 
 def warp_alone(cfg: SceneCfg) -> list[str]:
-    """Return what of a scene only MuJoCo Warp can do."""
+    """Return the parts of a scene that only MuJoCo Warp can do."""
     found = {sensor.warp_alone for sensor in cfg.sensors.values()}
     return sorted(found - {""})
 
@@ -118,8 +121,10 @@ def warp_alone(cfg: SceneCfg) -> list[str]:
 def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     """Assemble the scene's spec: robots and objects, then terrain, then sensors."""
     entities = {name: robot.spec() for name, robot in cfg.entities.items()}
+    # Placed before joining: afterwards entities share one world.
     for name, placement in cfg.placements.items():
         placement.move(entities[name])
+    # Names and complete keyframes are needed where entities are joined and compared.
     for entity in entities.values():
         _name_actuators(entity)
         complete_keyframes(entity)
@@ -128,6 +133,7 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     else:
         spec = next(iter(entities.values()))
     if cfg.terrain is not None:
+        # Sensors come last, since they may name the terrain.
         cfg.terrain.add_to(spec)
     for name, sensor in cfg.sensors.items():
         sensor.add_to(spec, name)
@@ -135,14 +141,16 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
 
 
 def _name_actuators(spec: mujoco.MjSpec) -> None:
-    """Name actuators that a file leaves without a name as what they drive, so that terms and exports can name them."""
+    """Name actuators without a name after the element that they drive, so that terms and exports can name them."""
     taken = {actuator.name for actuator in spec.actuators}
     for number, actuator in enumerate(spec.actuators):
         if actuator.name:
             continue
+        # Named after its target, else by its number.
         name = actuator.target
         if not name or name in taken:
             name = f"actuator{number}"
+        # A file may have given that name to another one.
         while name in taken:
             name += "_"
         actuator.name = name

@@ -32,6 +32,7 @@ class Drive:
         self._simulation = simulation
         self._view = view
         self._joints = view.joints().some(joint_ids)
+        # Columns of the controls, in the order of the joints.
         self._motors = as_index([view.targets.motor(i) for i in joint_ids], view.device)
         self._at_reset: list[Callable[[Bool[Tensor, " E"]], None]] = []
 
@@ -55,20 +56,22 @@ class Drive:
         return self._view.integers(n, low, high)
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
-        """Draw anew for the rows of `mask_E`."""
+        """Draw again for the rows of `mask_E`."""
         if self._at_reset:
+            # Keyed by the number of resets, which differs between episodes of an env.
             with self._simulation.scope(self.name, self._view.reset_count_E, draws="reset"):
                 for draw in self._at_reset:
                     draw(mask_E)
 
     def state(self) -> JointState:
         """Return where the joints are now, in the middle of an env step too."""
+        # From the state itself: derived quantities are stale in the middle of an env step.
         world = self._view.world
         joints = self._joints
         return JointState(world.qpos_EL[:, joints.qpos], world.qvel_EL[:, joints.qvel])
 
     def target(self) -> JointTarget:
-        """Return what the joints are asked for."""
+        """Return the targets of the joints."""
         targets = self._view.targets
         joints = self._joints.index
         return JointTarget(targets.pos_EL[:, joints], targets.vel_EL[:, joints], targets.effort_EL[:, joints])
@@ -82,14 +85,17 @@ class SubstepRing:
     """The last `depth` values of a signal, the newest first; before an episode's first value lies that value."""
 
     def __init__(self, drive: Drive, name: str, depth: int, width: int) -> None:
-        # Of a row that resets, what lies there is never read again, so there is no need to clear it.
+        # Of a row that resets, the old values are never read again, so there is no need to clear it.
         self._ring_EKL = drive.buffer(f"{name}_EKL", depth, width, keep=True)
+        # Cleared at resets, unlike the ring: it tells whether a row has a first value yet.
         self._started_E = drive.buffer(f"{name}_started_E", dtype=torch.bool)
 
     def push(self, value_EL: Float[Tensor, "E L"]) -> None:
         """Add the value of this substep."""
         newest_E1L = value_EL[:, None]
+        # The newest comes first, and the oldest falls out.
         shifted_EKL = torch.cat((newest_E1L, self._ring_EKL[:, :-1]), dim=1)
+        # Without a value before it, the first one fills the whole ring.
         self._ring_EKL.copy_(torch.where(self._started_E[:, None, None], shifted_EKL, newest_E1L))
         self._started_E.fill_(True)
 
@@ -97,6 +103,7 @@ class SubstepRing:
         """Return the value of `lag` substeps ago."""
         return self._ring_EKL[:, lag]
 
+    # `gather` wants an index as wide as its result.
     def at_rows(self, lag_E: Int64[Tensor, " E"]) -> Float[Tensor, "E L"]:
         """Return the value of each row's own number of substeps ago."""
         index_E1L = lag_E[:, None, None].expand(-1, 1, self._ring_EKL.shape[2])
@@ -130,6 +137,7 @@ class Actuator(Checked, ABC):
     @property
     def law_key(self) -> Hashable:
         """Entries with equal keys differ in `params` only, so that one law computes all their joints."""
+        # By default each entry has a law to itself.
         return id(self)
 
     @abstractmethod
@@ -138,7 +146,7 @@ class Actuator(Checked, ABC):
 
     @abstractmethod
     def law(self, drive: Drive) -> Law:
-        """Create what the law keeps, and return it."""
+        """Create the buffers of the law, and return it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,12 +168,14 @@ class JointActuator(Actuator):
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
         # Each attribute is written: the model's default class may hold others.
+        # A gear of 1: control, force and effort are the same number.
         actuator.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
         actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
         if self.effort_limit is not None:
             actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             actuator.forcerange = [-self.effort_limit, self.effort_limit]
+            # The actuator's limit takes the place of the joint's; both would cut in turn.
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         if self.armature is not None:
             joint.armature = self.armature
@@ -183,10 +193,12 @@ class ExplicitActuator(JointActuator, is_explicit=True):
 
     @property
     def params(self) -> Mapping[str, float]:
+        # Infinite rather than None, so that a clamp needs no case.
         return {"effort_limit": float("inf") if self.effort_limit is None else self.effort_limit}
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
         """Make a motor whose control is its effort; the law holds the limit, which may differ between worlds."""
         super().configure(actuator, joint)
         actuator.set_to_motor()
+        # The law clamps by a buffer; a fixed range in the model would hide what it allows.
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE

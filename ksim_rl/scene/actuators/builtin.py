@@ -20,6 +20,7 @@ class BuiltinActuator(JointActuator):
     """An actuator that MuJoCo computes from one kind of target."""
 
     def law(self, drive: Drive) -> Law:
+        # One kind of target only, as the subclass says.
         (kind,) = self.takes
         return lambda _, target: getattr(target, f"{kind}_EN")
 
@@ -28,8 +29,8 @@ class BuiltinActuator(JointActuator):
 class PositionActuator(BuiltinActuator, takes=frozenset({"pos"})):
     """MuJoCo's position servo: effort = stiffness * (target - position) - damping * velocity; SI units.
 
-    The control range that it writes is what can still change the effort at a joint limit, and does not clip: a clipped
-    target would hide from the policy what it asked for.
+    The control range that it writes is where it can change the effort at a joint limit, and does not clip: a clipped
+    target would hide the policy's own target from it.
     """
 
     stiffness: Positive
@@ -61,6 +62,7 @@ class PositionActuator(BuiltinActuator, takes=frozenset({"pos"})):
         super().configure(actuator, joint)
         actuator.set_to_position(kp=self.stiffness, kv=self.damping)
         if self.effort_limit is not None:
+            # The error at which the servo saturates, rad or m.
             reach = self.effort_limit / self.stiffness
             low, high = _range(joint)
             actuator.ctrlrange = [low - reach, high + reach]
@@ -94,5 +96,6 @@ class MotorActuator(BuiltinActuator, takes=frozenset({"effort"})):
         super().configure(actuator, joint)
         actuator.set_to_motor()
         if self.effort_limit is not None:
+            # A motor's control is its effort, so that its limit is one of the control as well.
             actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
             actuator.ctrlrange = [-self.effort_limit, self.effort_limit]

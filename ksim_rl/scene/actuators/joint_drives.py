@@ -19,15 +19,20 @@ def set_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
     Actuators of the model that drive the same joints are replaced, and their sensors read the new ones; the model's
     other actuators stay, in front. Keyframes keep the controls and activations of these, and new servos hold the poses.
     """
+    # Balls and free joints have no single position to drive.
     joints = {joint.name: joint for joint in spec.joints if joint.type in SCALAR_JOINTS}
     driven = driven_joints(actuators, list(joints))
     new_names = {name for _, names in driven for name in names}
     replaced: dict[str, str] = {}
+    # Only keyframes that hold controls or activations have something to lose.
     says_controls = bool(driven) and any(len(key.ctrl) or len(key.act) for key in spec.keys)
+    # Only a compiled spec knows which numbers of a keyframe belong to an actuator that goes.
     if says_controls:
         compile_keyframes(spec)
+    # A list, since the loop deletes from the spec.
     for old in list(spec.actuators):
         if old.trntype in TO_JOINTS and old.target in new_names:
+            # Remembered, so that sensors can follow to the new actuators.
             replaced[old.name] = old.target
             spec.delete(old)
     for sensor in spec.sensors:
@@ -35,8 +40,10 @@ def set_actuators(spec: mujoco.MjSpec, actuators: Sequence[Actuator]) -> None:
             sensor.objname = replaced[sensor.objname]
     for actuator, names in driven:
         for name in names:
+            # Named as its joint: terms and sensors find it by the joint's name.
             new = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             actuator.configure(new, joints[name])
+    # After all actuators are in: the spec is compiled again for the poses.
     if says_controls:
         let_new_servos_hold(spec, new_names)
 
@@ -47,6 +54,7 @@ def driven_joints(
     """Return which of the joints each entry drives, in the order of `joint_names`; a ValueError if two drive one."""
     driven: list[tuple[Actuator, list[str]]] = []
     entry_of: dict[str, int] = {}
+    # In the order of the joints, whatever the order of the patterns.
     for number, actuator in enumerate(actuators):
         found = match_names("joint", as_patterns(actuator.driven), joint_names)
         names = [joint_names[i] for i in sorted(found)]
@@ -64,7 +72,7 @@ class JointDrives:
     """Turns targets into the controls of motors before each physics substep.
 
     Only explicit actuators have work here; without any, no hook is set and substeps stay one launch. `actuators` are
-    those of each robot, by the prefix of its names.
+    the entries of each robot, by the prefix of its names.
     """
 
     def __init__(
@@ -73,17 +81,21 @@ class JointDrives:
         groups: dict[Hashable, tuple[Actuator, list[int]]] = {}
         names = view.joints().names
         for prefix, entries in actuators.items():
+            # Entries name joints without the robot's prefix.
             ids = {name.removeprefix(prefix): i for i, name in enumerate(names) if name.startswith(prefix)}
             for actuator, driven in driven_joints(entries, list(ids)):
                 if not actuator.is_explicit:
                     continue
                 joints = [ids[name] for name in driven]
+                # Entries with equal laws share one call per substep, for each robot.
                 groups.setdefault((prefix, actuator.law_key), (actuator, []))[1].extend(joints)
+                # Before the law is made: controls of these joints are the law's from here on.
                 view.targets.leave_to_law(joints, actuator.takes)
                 for name, value in actuator.params.items():
                     view.actuator_params.add(name, joints, value)
         self._simulation = simulation
         self._drives: list[tuple[Drive, Actuator, Law]] = []
+        # Numbered in the order of the entries: buffers and draws are named by it.
         for number, (actuator, joints) in enumerate(groups.values()):
             drive = Drive(f"actuators/{number}", simulation, view, sorted(joints))
             self._drives.append((drive, actuator, actuator.law(drive)))
@@ -99,6 +111,7 @@ class JointDrives:
     def apply(self) -> None:
         """Write the controls of the present state and targets, as before each substep."""
         for drive, actuator, law in self._drives:
+            # In the law's scope, so that its errors name it and its draws are its own.
             with self._simulation.scope(drive.name, part=actuator):
                 control_EN = law(drive.state(), drive.target())
             drive.write(control_EN)

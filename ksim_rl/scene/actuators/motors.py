@@ -32,11 +32,12 @@ class IdealPDActuator(ExplicitActuator, takes=frozenset({"pos", "vel", "effort"}
 
     @property
     def law_key(self) -> Hashable:
-        """All joints with this kind of motor are computed at once."""
+        """All joints with this kind of motor are computed together."""
         return type(self)
 
     def law(self, drive: Drive) -> Law:
         def effort_EN(state: JointState, target: JointTarget) -> Float[Tensor, "E N"]:
+            # Read at each substep: events may change it between worlds.
             limit_EN = drive.param("effort_limit")
             return pd_effort(drive, state, target).clamp(-limit_EN, limit_EN)
 
@@ -44,7 +45,8 @@ class IdealPDActuator(ExplicitActuator, takes=frozenset({"pos", "vel", "effort"}
 
 
 def pd_effort(drive: Drive, state: JointState, target: JointTarget) -> Float[Tensor, "E N"]:
-    """Return what a proportional-derivative controller asks its motors for, without limits."""
+    """Return the effort that a proportional-derivative controller asks for, without limits."""
+    # Effort + kp * (position error) + kd * (velocity error), in two fused kernels.
     asked_EN = torch.addcmul(target.effort_EN, drive.param("stiffness"), target.pos_EN - state.pos_EN)
     return torch.addcmul(asked_EN, drive.param("damping"), target.vel_EN - state.vel_EN)
 
@@ -71,7 +73,10 @@ class DCMotorActuator(IdealPDActuator):
         def effort_EN(state: JointState, target: JointTarget) -> Tensor:
             stall_EN = drive.param("saturation_effort")
             limit_EN = drive.param("effort_limit")
+            # Back-EMF: the effort that the voltage loses at this velocity.
             lost_EN = stall_EN * state.vel_EN / drive.param("velocity_limit")
+            # Voltage first, then current; beyond the no-load velocity the upper end is negative: it only
+            # brakes.
             highest_EN = (stall_EN - lost_EN).clamp(-limit_EN, limit_EN)
             lowest_EN = (-stall_EN - lost_EN).clamp(-limit_EN, limit_EN)
             return torch.clamp(pd_effort(drive, state, target), lowest_EN, highest_EN)
@@ -96,6 +101,7 @@ class DelayedActuator(Actuator):
     max_lag: WholeNumber
 
     def _check_fields(self) -> None:
+        # Equal bounds mean a fixed lag.
         super()._check_fields()
         if self.min_lag > self.max_lag:
             raise ValueError(f"min_lag={self.min_lag} exceeds max_lag={self.max_lag}")
@@ -116,18 +122,25 @@ class DelayedActuator(Actuator):
         self.actuator.configure(actuator, joint)
 
     def law(self, drive: Drive) -> Law:
+        # The inner law sees late targets, but the present state: only commands are delayed.
         inner = self.actuator.law(drive)
+        # Kept: it is drawn by `draw` at each reset, which a clear would undo.
         lag_E = drive.buffer("lag_E", dtype=torch.int64, keep=True)
+        # Only the targets that the inner actuator takes are stored.
         fields = [f"{kind}_EN" for kind in sorted(self.takes)]
+        # One more than the longest lag, since a lag of 0 takes the newest.
         ring = SubstepRing(drive, "targets", self.max_lag + 1, len(fields) * drive.num_joints)
 
         def draw(mask_E: Bool[Tensor, " E"]) -> None:
+            # Drawn for all rows, since shapes must not depend on the mask.
             drawn_E = drive.integers(1, self.min_lag, self.max_lag)[:, 0]
             lag_E.copy_(torch.where(mask_E, drawn_E, lag_E))
 
+        # Push first: with lag 0 this substep's target arrives now.
         def late_EN(state: JointState, target: JointTarget) -> Tensor:
             ring.push(torch.cat([getattr(target, field) for field in fields], dim=1))
             arrived = ring.at_rows(lag_E).chunk(len(fields), dim=1)
+            # Targets that it does not take pass through unchanged.
             return inner(state, target._replace(**dict(zip(fields, arrived, strict=True))))
 
         drive.on_reset(draw)

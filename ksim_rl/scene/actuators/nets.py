@@ -39,11 +39,13 @@ class NetFile:
 
     def __init__(self, file: str, sha256: str | None) -> None:
         try:
+            # A limit on the bytes keeps a wrong path from filling the memory.
             data = read_bytes(Path(file).expanduser(), limit=MOST_DATA_BYTES, follows_links=True)
         except ValueError as error:
             raise ValueError(f"file={file!r}: {error}: expected a safetensors file") from None
         digest = hashlib.sha256(data).hexdigest()
         self.where = f"file={file!r} (SHA-256 {digest})"
+        # Before the bytes are parsed: nothing of a wrong file is used.
         if sha256 is not None and digest != sha256.lower():
             raise ValueError(f"{self.where}: expected sha256={sha256!r}: the file is damaged, or another one")
         try:
@@ -60,18 +62,21 @@ class NetFile:
         if name not in self.tensors:
             raise ValueError(f"{self.where}: no tensor {name!r}: {near(name, self.tensors)}")
         tensor = self.tensors[name]
+        # A wanted size of -1 fits any.
         fits = tensor.ndim == len(shape) and all(
             wanted in (-1, found) for wanted, found in zip(shape, tensor.shape, strict=True)
         )
         if not fits:
             wanted = ", ".join(str(size) for size in shape).replace("-1", "any")
             raise ValueError(f"{self.where}: {name} has shape {tuple(tensor.shape)}: expected ({wanted})")
+        # A NaN in a weight would become a NaN in the state.
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{self.where}: {name} holds numbers that are not finite")
         return tensor
 
     def check_all_known(self, names: set[str]) -> None:
         """Refuse tensors that the net would not use, by a ValueError that names them."""
+        # A file for another kind of net would load in part, and mislead.
         unknown = sorted(self.tensors.keys() - names)
         if unknown:
             raise ValueError(f"{self.where}: unknown tensors {unknown}: expected {sorted(names)}")
@@ -105,14 +110,17 @@ class NetActuator(ExplicitActuator, takes=frozenset({"pos"})):
 
     def law(self, drive: Drive) -> Law:
         net = NetFile(self.file, self.sha256)
+        # Metadata is text; scales are numbers.
         position_scale, velocity_scale, effort_scale = (
             float(self.setting(net, name, 1.0)) for name in _SCALES
         )
+        # In construction: buffers are made now, and the weights go to the device.
         predict = self.load(net, drive)
 
         def effort_EN(state: JointState, target: JointTarget) -> Tensor:
             error_EN = (target.pos_EN - state.pos_EN) * position_scale
             predicted_EN = predict(error_EN, state.vel_EN * velocity_scale) * effort_scale
+            # Read at each substep: events may change it between worlds.
             limit_EN = drive.param("effort_limit")
             return predicted_EN.clamp(-limit_EN, limit_EN)
 
@@ -120,6 +128,7 @@ class NetActuator(ExplicitActuator, takes=frozenset({"pos"})):
 
     def setting(self, net: NetFile, name: str, default: Any = None) -> Any:
         """Return a field or, if that is None, the metadata of its name, as text, or the default."""
+        # The config wins over the file.
         value = getattr(self, name)
         if value is not None:
             return value
@@ -155,12 +164,16 @@ class MLPActuator(NetActuator):
         lags = self._lags(net)
         activation = self.setting(net, "activation")
         check_choice(f"{net.where}: activation", activation, ACTIVATIONS)
+        # A position error and a velocity for each lag.
         layers = _layers(net, 2 * len(lags), ACTIVATIONS[activation]).to(drive.device)
+        # As long as the longest lag, and the present; both signals side by side, [E, 2 N].
         seen = SubstepRing(drive, "seen", max(lags) + 1, 2 * drive.num_joints)
 
         def predict(error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]) -> Float[Tensor, "E N"]:
             seen.push(torch.cat((error_EN, vel_EN), dim=1))
+            # Two tuples of [E, N], one tensor per lag.
             errors, velocities = zip(*(seen.at(lag).chunk(2, dim=1) for lag in lags), strict=True)
+            # [E, N, F]: a linear layer works on the last dim, for all joints alike.
             return layers(torch.stack((*errors, *velocities), dim=-1))[..., 0]
 
         return predict
@@ -168,6 +181,7 @@ class MLPActuator(NetActuator):
     def _lags(self, net: NetFile) -> tuple[int, ...]:
         lags = self.setting(net, "input_lags")
         if isinstance(lags, str):
+            # Metadata is text, a list in JSON.
             name = f"{net.where}: input_lags"
             try:
                 lags = tuple(json.loads(lags))
@@ -181,16 +195,19 @@ class MLPActuator(NetActuator):
 
 def _layers(net: NetFile, num_inputs: int, activation: type[nn.Module]) -> nn.Sequential:
     """Build the network of a file, checked layer by layer."""
+    # `nn.Sequential` numbers activations too, so that numbers of layers have gaps.
     numbers = sorted(
         int(name.removesuffix(".weight"))
         for name in net.tensors
         if name.endswith(".weight") and name.removesuffix(".weight").isdecimal()
     )
     if not numbers:
+        # Fails with the message for a missing tensor.
         net.tensor("0.weight", -1, num_inputs)
     net.check_all_known({f"{number}.{part}" for number in numbers for part in ("weight", "bias")})
     layers: list[nn.Module] = []
     width = num_inputs
+    # Each layer takes as many numbers as the one before it gives; the last gives one.
     for number in numbers:
         weight = net.tensor(f"{number}.weight", 1 if number == numbers[-1] else -1, width)
         bias = net.tensor(f"{number}.bias", weight.shape[0])
@@ -199,6 +216,7 @@ def _layers(net: NetFile, num_inputs: int, activation: type[nn.Module]) -> nn.Se
         linear.bias.data = bias.clone()
         layers += [linear, activation()]
         width = weight.shape[0]
+    # No activation follows the last layer, and nothing here is trained.
     return nn.Sequential(*layers[:-1]).requires_grad_(False)
 
 
@@ -212,36 +230,45 @@ class LSTMActuator(NetActuator):
     """
 
     def load(self, net: NetFile, drive: Drive) -> Predictor:
+        # Layers are counted by their names.
         found = [re.fullmatch(r"lstm\.weight_ih_l(\d+)", name) for name in net.tensors]
         num_layers = max(1, sum(match is not None for match in found))
+        # The hidden size is the second dim of the recurrent weights.
         size = net.tensor("lstm.weight_hh_l0", -1, -1).shape[1]
         layers: list[list[Tensor]] = []
         for layer in range(num_layers):
+            # The first layer sees two numbers, later ones the layer below; four gates are stacked.
             shapes = ((4 * size, size if layer else 2), (4 * size, size), (4 * size,), (4 * size,))
             named = zip((f"lstm.{part}_l{layer}" for part in _LSTM_PARTS), shapes, strict=True)
             layers.append([net.tensor(name, *shape) for name, shape in named])
         names = {f"lstm.{part}_l{layer}" for part in _LSTM_PARTS for layer in range(num_layers)}
+        # After the layers, since their number decides which names are known.
         net.check_all_known(names | {"head.weight", "head.bias"})
         head = net.tensor("head.weight", 1, size)
         head_bias = net.tensor("head.bias", 1)
+        # Checked on the CPU, then moved.
         on_device = []
         for layer in layers:
             on_device.append([weight.to(drive.device) for weight in layer])
         layers = on_device
         head = head.to(drive.device)
         head_bias = head_bias.to(drive.device)
+        # An env's joint is a row of the batch: all share one net.
         num_rows = drive.num_envs * drive.num_joints
+        # Zeroed at resets, which is the state that `nn.LSTM` starts from.
         buffers = [
             tuple(drive.buffer(f"{kind}{layer}_ENH", drive.num_joints, size) for kind in ("hidden", "cell"))
             for layer in range(num_layers)
         ]
 
         def predict(error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]) -> Float[Tensor, "E N"]:
+            # Position error, then velocity, as in training.
             value = torch.stack((error_EN, vel_EN), dim=-1).view(num_rows, 2)
             for (hidden_ENH, cell_ENH), layer in zip(buffers, layers, strict=True):
                 hidden = hidden_ENH.view(num_rows, size)
                 cell = cell_ENH.view(num_rows, size)
                 value, next_cell = torch.lstm_cell(value, (hidden, cell), *layer)
+                # In place: the buffers are the env's state, which resets clear.
                 hidden.copy_(value)
                 cell.copy_(next_cell)
             return functional.linear(value, head, head_bias).view(drive.num_envs, drive.num_joints)

@@ -48,10 +48,12 @@ class ReferenceMotion:
 
         Between frames both are interpolated linearly, quaternions along the shorter arc and normalized.
         """
+        # Frame and share once, for all tables.
         low_E, share_E1 = self._between(time_E)
         before_EL = self.qpos_FL[low_E]
         after_EL = self.qpos_FL[low_E + 1]
         qpos_EL = torch.lerp(before_EL, after_EL, share_E1)
+        # A mean of quaternions has to be normalized, and may have to take the other sign.
         for start in self.quats:
             columns = slice(start, start + 4)
             qpos_EL[:, columns] = _blend(before_EL[:, columns], after_EL[:, columns], share_E1)
@@ -77,6 +79,7 @@ class ReferenceMotion:
             (_entries(table, low_E, bodies), _entries(table, low_E + 1, bodies))
             for table in (self.body_pos_FN3, self.body_quat_FN4)
         )
+        # [E, 1, 1], to broadcast over bodies and numbers.
         share_E11 = share_E1[:, None]
         return torch.lerp(pos_EN3, next_pos_EN3, share_E11), _blend(quat_EN4, next_quat_EN4, share_E11)
 
@@ -84,12 +87,14 @@ class ReferenceMotion:
         """Return the frame before each time, [E], and the part of the way to the next one, [E, 1]."""
         last = self.qpos_FL.shape[0] - 1
         frame_E = (time_E * self.fps).clamp(0.0, float(last))
+        # The last frame has no next one: the share is 1 there instead.
         low_E = frame_E.floor().long().clamp(max=last - 1)
         return low_E, (frame_E - low_E)[:, None]
 
 
 def motion_path(file: str) -> Path:
     """Return where a motion of this name lies in the package or, if there is none of this name, `file` as a path."""
+    # A name, not a path: a file may not lie outside of the package's folder.
     shipped = Path(__file__).parent / f"{file}.npz"
     if shipped.is_file() and shipped.parent == Path(__file__).parent:
         return shipped
@@ -102,6 +107,7 @@ def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device
     The file may be the name of a motion that comes with the package (`ksim_rl.scene.motions`).
     """
     arrays = _read(motion_path(str(file)))
+    # One number, also as an array.
     fps = arrays["fps"]
     if fps.size != 1 or not np.isfinite(fps).all() or fps.item() <= 0.0:
         raise ValueError(
@@ -119,6 +125,7 @@ def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device
         raise ValueError(
             f"motion {file}: qpos has {arrays['qpos'].shape[0]} frames and qvel {arrays['qvel'].shape[0]}"
         )
+    # Optional: a guard against a file for another robot or another order.
     names = arrays.get("joint_names")
     own = [mj_model.joint(i).name for i in range(mj_model.njnt)]
     for name in () if names is None else names:
@@ -128,16 +135,19 @@ def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device
         raise ValueError(
             f"motion {file}: joint_names={names.tolist()}: expected the model's joints in their order, {own}"
         )
+    # Where a joint's quaternion starts in its part of qpos; a free joint has its position before it.
     starts = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
     places = zip(mj_model.jnt_type.tolist(), mj_model.jnt_qposadr.tolist(), strict=True)
     quats = tuple(address + starts[kind] for kind, address in places if kind in starts)
     for start in quats:
+        # Float32 files round; a thousandth is far beyond that.
         norms = np.linalg.norm(arrays["qpos"][:, start : start + 4], axis=-1)
         if np.abs(norms - 1.0).max() > 1e-3:
             raise ValueError(
                 f"motion {file}: qpos[:, {start}:{start + 4}] holds quaternions of lengths {norms.min():g} to "
                 f"{norms.max():g}: expected unit quaternions (w, x, y, z)"
             )
+    # Bodies follow from qpos by kinematics, once on the host.
     body_pos_FN3, body_quat_FN4 = _body_poses(mj_model, arrays["qpos"])
     joints = scalar_joint_ids(mj_model)
 
@@ -163,6 +173,7 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
             f"motion {path}: no such file, and none of that name comes with the package: {shipped}"
         )
     try:
+        # Without pickles, since these run code when they are read.
         arrays = read_arrays(path, limit=MOST_DATA_BYTES)
     except ValueError as error:
         raise ValueError(f"motion {path}: cannot be read as .npz without pickles: {error}") from None
@@ -179,6 +190,7 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
 
 def _entries(table: Tensor, frame_E: Int64[Tensor, " E"], columns: Index) -> Tensor:
     """Return some columns of a table [F, N, ...] in each env's frame, [E, N, ...]."""
+    # A slice is a view: columns first, then one gather.
     if isinstance(columns, slice):
         return table[:, columns][frame_E]
     return table[frame_E[:, None], columns]
@@ -186,6 +198,7 @@ def _entries(table: Tensor, frame_E: Int64[Tensor, " E"], columns: Index) -> Ten
 
 def _blend(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     """Return unit quaternions [..., 4] between two, along the shorter arc."""
+    # A quaternion and its negative are the same orientation; the shorter arc has a positive dot product.
     sign = torch.where((first * second).sum(-1, keepdim=True) < 0.0, -1.0, 1.0)
     blend = torch.lerp(first, sign * second, share)
     return blend / torch.linalg.vector_norm(blend, dim=-1, keepdim=True)
@@ -198,6 +211,7 @@ def _body_poses(mj_model: mujoco.MjModel, qpos_FL: np.ndarray) -> tuple[np.ndarr
     quat_FN4 = []
     for qpos in qpos_FL:
         data.qpos[:] = qpos
+        # Kinematics alone: no forces are needed for poses.
         mujoco.mj_kinematics(mj_model, data)
         pos_FN3.append(data.xpos.copy())
         quat_FN4.append(data.xquat.copy())

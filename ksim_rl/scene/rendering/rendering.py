@@ -33,11 +33,14 @@ def choose_gl_platform() -> str:
     because a platform that fails cannot be exchanged for another in the same process.
     """
     if os.environ.get("MUJOCO_GL"):
+        # The user's choice is not tried.
         return os.environ["MUJOCO_GL"]
     said = []
+    # A display first, since it needs no driver for off-screen pictures.
     for platform in (["glfw"] if os.environ.get("DISPLAY") else []) + ["egl", "osmesa"]:
         environment = {"MUJOCO_GL": platform}
         try:
+            # In a child process: a platform that fails may abort its process.
             tried = run_python(["-c", _PROBE], environment=environment, seconds=_PROBE_SECONDS)
         except TimeoutExpired:
             said.append(f"{platform}: no answer in {_PROBE_SECONDS} s")
@@ -77,10 +80,13 @@ class OffscreenRenderer:
 
     def render(self, world: World, *, draw: Callable[[DebugVisualizer, int], None]) -> np.ndarray:
         """Return a picture of the current state, uint8 [H, W, 3]; `draw` adds the debug drawing of one env."""
+        # The context is opened at the first picture.
         renderer = self._open()
         first = self._cfg.env_index
+        # The world may have fewer envs than the viewer wants.
         last = min(self._cfg.env_index + self._cfg.num_envs, world.num_envs)
         pose_env(self._mj_model, self._data, world, first)
+        # Without a body to follow the camera looks at a fixed point.
         if self._body is None:
             target = self._cfg.lookat
         else:
@@ -91,13 +97,16 @@ class OffscreenRenderer:
             # It shines everywhere, but MuJoCo draws shadows near its place only.
             if light.type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
                 light.pos[:2] = target[:2]
+        # The first env is the scene itself; others are added beside it.
         draw(DebugVisualizer(self._mj_model, renderer.scene), first)
+        # About as many rows as columns.
         columns = int(np.ceil(np.sqrt(last - first)))
         for index in range(1, last - first):
             pose_env(self._mj_model, self._data, world, first + index)
             row, column = divmod(index, columns)
             offset = np.array([column * self._spacing, row * self._spacing, 0.0])
             add_geoms(self._mj_model, self._data, renderer.scene, offset)
+            # Height fields may differ between envs, and are static: they are not among the moving geoms.
             if self._mj_model.nhfield:
                 static = mujoco.mjtCatBit.mjCAT_STATIC
                 add_geoms(self._mj_model, self._data, renderer.scene, offset, category=static)
@@ -116,6 +125,7 @@ class OffscreenRenderer:
             try:
                 vis = self._mj_model.vis.global_
                 cfg = self._cfg
+                # MuJoCo refuses pictures that are larger than its off-screen buffer.
                 vis.offwidth, vis.offheight = max(vis.offwidth, cfg.width), max(vis.offheight, cfg.height)
                 self._renderer = mujoco.Renderer(self._mj_model, cfg.height, cfg.width, max_geom=20_000)
             except Exception as error:  # MuJoCo's platforms raise whatever their loader raises
@@ -124,7 +134,7 @@ class OffscreenRenderer:
 
 
 def pose_env(mj_model: mujoco.MjModel, data: mujoco.MjData, world: World, env: int) -> None:
-    """Take over what is visible of one env: its state, and its own fields, which are written into `mj_model`."""
+    """Take over the visible state of one env: its positions, and its own fields, which are written into `mj_model`."""
     write_fields(
         mj_model, {name: field[env].cpu().numpy() for name, field in world.per_world_fields().items()}
     )

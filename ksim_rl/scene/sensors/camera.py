@@ -26,8 +26,8 @@ class CameraSensor(Sensor):
         camera: a camera of the model; None puts a new one on `body`, such as "world", at `pos`, m, with the picture's
             right and up along `xyaxes`, all in the body's frame, and a vertical field of view of `fovy` degrees.
         width, height: pixels.
-        max_depth: m; what is farther, or not there at all, has this depth.
-        geom_groups, textures: what is visible; the model's sky counts as a texture.
+        max_depth: m; depth of things that are farther, and of the background.
+        geom_groups, textures: visible geoms and textures; the model's sky counts as a texture.
     """
 
     warp_alone: ClassVar[str] = "cameras of all worlds"
@@ -49,6 +49,7 @@ class CameraSensor(Sensor):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # A camera that draws nothing would fail where it is read.
         if not (self.rgb or self.depth or self.segmentation):
             raise ValueError("rgb=False, depth=False, segmentation=False: draw at least one of them")
 
@@ -73,6 +74,7 @@ class CameraTracker(SensorTracker):
         self._name = name
         self._sensor = sensor
         self._view = view
+        # The sensor's fields by the renderer's names.
         drawn = ("width", "height", "rgb", "depth", "segmentation", "geom_groups", "textures", "shadows")
         settings = {field: getattr(sensor, field) for field in drawn}
         self._camera = BatchCamera(view.world, sensor.camera or name, **settings)
@@ -96,21 +98,25 @@ class CameraTracker(SensorTracker):
         """Draw the camera's axes: right in red, up in green, and back in blue."""
         camera = view.world.mj_model.camera(self._sensor.camera or self._name).id
         origin = view.world.view("cam_xpos")[env_index, camera].cpu().numpy()
+        # MuJoCo's camera looks along -z: the third axis points back.
         visualizer.frame(origin, view.world.view("cam_xmat")[env_index, camera].cpu().numpy().reshape(3, 3))
 
     def _read(self, output: str) -> Tensor:
         cache = self._view.cache
         key = f"camera/{self._name}."
         if key + output not in cache:
+            # A picture that was not asked for is not drawn, and cannot be read.
             if not getattr(self._sensor, output):
                 raise ValueError(f"scene.sensors.{self._name}.{output}=False: set it to True to read it")
+            # Refuses to draw a state whose poses are stale.
             self._view.derived()
             self._camera.render()
+            # All pictures of the camera come from one pass.
             cache.update({key + name: picture for name, picture in self._pictures().items()})
         return cache[key + output]
 
     def _pictures(self) -> dict[str, Tensor]:
-        """Copy what was drawn last: the next drawing overwrites it."""
+        """Copy the last pictures: the next drawing overwrites them."""
         camera = self._camera
         sensor = self._sensor
         pictures = {}
@@ -119,7 +125,9 @@ class CameraTracker(SensorTracker):
         if sensor.depth:
             depth_EHW = camera.depth_EHW
             most = sensor.max_depth
+            # The renderer gives 0 where a ray hits nothing.
             pictures["depth"] = torch.where(depth_EHW > 0.0, depth_EHW.clamp(max=most), most)
         if sensor.segmentation:
+            # The first number is the geom's id.
             pictures["segmentation"] = camera.segmentation_EHW2[..., 0].clone()
         return pictures

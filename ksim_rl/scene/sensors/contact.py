@@ -27,11 +27,11 @@ class ContactSensor(Sensor):
     """Contact of N elements of the scene with another element, or with anything.
 
     Exactly one of `geoms`, `bodies` (with all their geoms) and `subtrees` (bodies with all their descendants: a limb,
-    or a whole robot) says what the elements are: names, or regular expressions that must match in full. Each pattern's
+    or a whole robot) gives the elements: names, or regular expressions that must match in full. Each pattern's
     matches come in the model's order, and give the N dim.
 
     Attributes:
-        against: the name of what they touch; None for anything, also for parts of their own robot.
+        against: the name of the element that they touch; None for anything, also for parts of their own robot.
         reduce: of several contacts, their "net" force, or the force of the "strongest" one. Within one subtree, as in
             self-collisions, each contact's direction is arbitrary, so only "strongest" has a meaning.
         every_substep: read at each physics substep, not only at the last one of an env step: the clocks run in physics
@@ -47,6 +47,7 @@ class ContactSensor(Sensor):
     every_substep: bool = False
 
     def __post_init__(self) -> None:
+        # A tuple of names would fail only deep inside of MuJoCo.
         if isinstance(self.against, (list, tuple)):
             raise ValueError(
                 f"against={self.against!r}: a contact sensor takes one {self.against_kind} there, not several: name a "
@@ -58,6 +59,7 @@ class ContactSensor(Sensor):
             raise ValueError(
                 f"geoms={self.geoms!r}, bodies={self.bodies!r}, subtrees={self.subtrees!r}: give exactly one of them"
             )
+        # Within one subtree each contact's direction is arbitrary, so that a sum means nothing.
         within_one = self.against_kind == "subtree" and self.against in self.subtrees
         if within_one and self.reduce == "net":
             raise ValueError(
@@ -67,7 +69,7 @@ class ContactSensor(Sensor):
 
     @property
     def kind(self) -> Literal["geom", "body", "subtree"]:
-        """What the elements are."""
+        """The kind of the elements."""
         if self.geoms:
             return "geom"
         if self.bodies:
@@ -84,12 +86,14 @@ class ContactSensor(Sensor):
         parts = {"geom": spec.geoms, "body": spec.bodies}
         with naming(f"scene.sensors.{name}"):
             elements = self.elements([part.name for part in parts[_TABLES[self.kind]]])
+        # Without `against` MuJoCo takes any other geom.
         other = {}
         if self.against is not None:
             table = _TABLES[self.against_kind]
             check_present(name, table, self.against, parts[table])
             other = {"reftype": MATCHED[self.against_kind], "refname": self.against}
         for element in elements:
+            # One per element: MuJoCo's sensor reports one element's contacts.
             spec.add_sensor(
                 name=f"{name}_{element}",
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -109,7 +113,7 @@ class ContactState(NamedTuple):
     found_EN: Float[Tensor, "E N"]
     """1 where the element touches, else 0, [E, N]."""
     force_EN3: Float[Tensor, "E N 3"]
-    """Force of the element on what it touches, N, world frame, [E, N, 3]: MuJoCo's sign, by which a robot's foot that
+    """Force of the element on the other one, N, world frame, [E, N, 3]: MuJoCo's sign, by which a robot's foot that
     carries weight reads negative z. The force on the element is the opposite."""
     position_EN3: Float[Tensor, "E N 3"]
     """Point of contact (weighted by force if there are several), m, world frame, [E, N, 3]; 0 without contact."""
@@ -145,18 +149,21 @@ class ContactTracker(SensorTracker):
         elements = sensor.elements(view.resolver.names(_TABLES[sensor.kind]))
         self._count = len(elements)
         found = [self._world.mj_model.sensor(f"{name}_{element}") for element in elements]
+        # All numbers of all elements, in one index, so that one gather reads them.
         columns = [int(one.adr[0]) + place for one in found for place in range(int(one.dim[0]))]
         self._columns = as_index(columns, view.device)
         self._clocks = {clock: view.buffers.get(f"{self._key}.{clock}", self._count) for clock in _CLOCKS}
         self._history_ESN3: Tensor | None = None
         self._substep = 0
         if sensor.every_substep:
+            # Env steps are whole numbers of substeps; the quotient may be rounded.
             substeps = round(view.step_dt / view.physics_dt)
             self._history_ESN3 = view.buffers.get(f"{self._key}.force_history", substeps, self._count, 3)
             self.every_substep = True
 
     def update(self) -> None:
         """Advance the clocks by one env step, unless they ran with the substeps."""
+        # With `every_substep` the clocks have run already.
         if self._history_ESN3 is None:
             self._advance(self._readings(), self._view.step_dt, starts=True)
 
@@ -164,6 +171,7 @@ class ContactTracker(SensorTracker):
     def state(self) -> ContactState:
         """The contacts of the last env step."""
         cache = self._view.cache
+        # Once per state, however many terms read it.
         if self._key not in cache:
             readings = self._readings()
             force_EN3 = self._force(readings)
@@ -184,35 +192,44 @@ class ContactTracker(SensorTracker):
         forces_N3 = state.force_EN3[env_index].cpu().numpy()
         positions_N3 = state.position_EN3[env_index].cpu().numpy()
         for force_3, position_3 in zip(forces_N3, positions_N3, strict=True):
+            # Only elements that touch.
             if np.linalg.norm(force_3) > 0.0:
+                # MuJoCo's sign is the force of the element; the arrow shows the force on it.
                 visualizer.arrow(position_3, position_3 - scale * force_3, rgba=_RGBA, width=0.01)
 
     def update_substep(self) -> None:
         """Advance the clocks by one substep, and keep its forces."""
         assert self._history_ESN3 is not None
         readings = self._readings()
+        # Events of the env step start again at its first substep.
         self._advance(readings, self._view.physics_dt, starts=self._substep == 0)
         # A world that fails in this substep must not leave its numbers to the terms that run after it was cleared.
         force_EN3 = torch.nan_to_num(self._force(readings), nan=0.0, posinf=0.0, neginf=0.0)
         self._history_ESN3[:, self._substep] = force_EN3
+        # Round again with the next env step.
         self._substep = (self._substep + 1) % self._history_ESN3.shape[1]
 
     def _advance(self, readings: Tensor, dt: float, *, starts: bool) -> None:
         """Let `dt` seconds pass; `starts` where this begins an env step."""
         clock = self._clocks
+        # MuJoCo's "found" counts contacts; more than 0 is a touch.
         touches = readings[..., 0] > 0
         touched = clock["found"] > 0
         lands = touches & ~touched
         leaves = touched & ~touches
+        # As if it went on flying; used only where it does, or lands just now.
         flight_EN = clock["air_time"] + dt
         # What stands on the ground at the start of an episode has not flown.
         ends_flight = lands & (clock["air_time"] > 0)
         clock["last_air_time"].copy_(torch.where(ends_flight, flight_EN, clock["last_air_time"]))
+        # Read before `contact_time` is set below.
         stood_EN = torch.where(leaves, clock["contact_time"], clock["last_contact_time"])
         clock["last_contact_time"].copy_(stood_EN)
         clock["air_time"].copy_(torch.where(touches, 0.0, flight_EN))
         clock["contact_time"].copy_(torch.where(touches, clock["contact_time"] + dt, 0.0))
+        # Last, since `touched` is read from it.
         clock["found"].copy_(touches)
+        # Within an env step an event stays set, in whichever substep it happened.
         for event, happens in (("first_contact", lands), ("first_air", leaves)):
             clock[event].copy_(happens if starts else torch.where(happens, 1.0, clock[event]))
 
@@ -223,7 +240,9 @@ class ContactTracker(SensorTracker):
     def _force(self, readings: Tensor) -> Tensor:
         if not self._strongest:
             return readings[..., 1:4]
+        # The strongest contact's force is in the contact's frame.
         normal = readings[..., 7:10]
         tangent = readings[..., 10:13]
+        # Columns are the contact's axes in the world; the third one follows from the first two.
         axes = torch.stack((normal, tangent, torch.linalg.cross(normal, tangent)), dim=-1)
         return product(axes, readings[..., 1:4, None])[..., 0]

@@ -25,6 +25,7 @@ class ImuSensor(MountedSensor):
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
         """Add the MJCF sensors `<name>_gyro`, `<name>_accelerometer` and `<name>_orientation`, and a site if needed."""
+        # The site first, if the sensor brings one: the others are attached to it.
         super().add_to(spec, name)
         for suffix, kind in _SENSORS.items():
             spec.add_sensor(
@@ -45,6 +46,7 @@ class ImuTracker(SensorTracker):
         self._name = name
         self._view = view
         self._site = site
+        # World -z: gravity's direction, whatever its strength.
         self._down = torch.tensor([0.0, 0.0, -1.0], device=view.device)
 
     @property
@@ -67,6 +69,7 @@ class ImuTracker(SensorTracker):
         """Unit vector of world -z; position stage."""
         cache = self._view.cache
         key = f"imu/{self._name}.projected_gravity"
+        # Computed once per state, however many terms read it.
         if key not in cache:
             cache[key] = quaternion.rotate_inverse(self.quat_EL, self._down.expand(self._view.num_envs, 3))
         return cache[key]

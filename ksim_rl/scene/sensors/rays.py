@@ -35,7 +35,7 @@ class GridPattern(RayPattern):
     """Parallel rays that start at the points of a grid, parallel to the sensor's xy plane and `height` (m) above it.
 
     Points run along x (forward) first, from back to front, and these rows along y, from right to left; `size` are the
-    edges along x and y, and `resolution` is the distance of neighbours, m. Rays that start low miss what is higher.
+    edges along x and y, and `resolution` is the distance of neighbours, m. Rays that start low miss higher geoms.
     """
 
     size: Annotated[tuple[float, float], Within(low=0.0)] = (1.6, 1.0)
@@ -45,11 +45,13 @@ class GridPattern(RayPattern):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # A direction of zero cannot be normalized.
         if not any(self.direction):
             raise ValueError(f"direction={self.direction!r}: expected a vector that is not zero")
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         start_N3 = grid_points(self.size, self.resolution) + np.array([0.0, 0.0, self.height])
+        # All rays are parallel.
         direction = np.asarray(self.direction) / np.linalg.norm(self.direction)
         return start_N3, np.broadcast_to(direction, start_N3.shape)
 
@@ -66,10 +68,13 @@ class PinholePattern(RayPattern):
     fovy: Annotated[float, Within(low=0.0, high=179.0, low_open=True)] = 60.0
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
+        # The edge of a pixel at a distance of 1.
         pixel = 2.0 * math.tan(math.radians(self.fovy) / 2) / self.height
+        # Middles of pixels; y is to the left, z upwards.
         left = ((self.width - 1) / 2 - np.arange(self.width)) * pixel
         up = ((self.height - 1) / 2 - np.arange(self.height)) * pixel
         up_N, left_N = (table.ravel() for table in np.meshgrid(up, left, indexing="ij"))
+        # The plane of the picture lies at x = 1.
         return _from_origin(np.stack((np.ones_like(left_N), left_N, up_N), axis=-1))
 
 
@@ -87,10 +92,12 @@ class RingPattern(RayPattern):
     elevations: Annotated[tuple[Elevation, ...], Filled("give at least one ring, such as (0.0,)")] = (0.0,)
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
+        # Without 2 pi itself, which is the direction of 0.
         around = 2 * np.pi * np.arange(self.num_rays) / self.num_rays
         up_N, around_N = (
             table.ravel() for table in np.meshgrid(np.radians(self.elevations), around, indexing="ij")
         )
+        # A higher ring has a smaller circle.
         flat_N = np.cos(up_N)
         return _from_origin(
             np.stack((flat_N * np.cos(around_N), flat_N * np.sin(around_N), np.sin(up_N)), axis=-1)
@@ -100,9 +107,12 @@ class RingPattern(RayPattern):
 def grid_points(size: tuple[float, float], resolution: float) -> np.ndarray:
     """Return the points of a grid about the origin, m, [N, 3]: rows along x, one after the other along y; z is 0."""
     along_x, along_y = (
+        # Centred: as many points on both sides.
         (np.arange(count + 1) - count / 2) * resolution
+        # A tiny bit more, so that 1.6 / 0.1 counts 16 cells.
         for count in (math.floor(edge / resolution + 1e-6) for edge in size)
     )
+    # "ij" with y first: x runs fastest.
     y_N, x_N = (table.ravel() for table in np.meshgrid(along_y, along_x, indexing="ij"))
     return np.stack((x_N, y_N, np.zeros_like(x_N)), axis=-1)
 
@@ -113,7 +123,7 @@ def _from_origin(direction_N3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class RayState(NamedTuple):
-    """What N rays hit first, float32 unless stated otherwise; position stage."""
+    """The first hits of N rays, float32 unless stated otherwise; position stage."""
 
     distance_EN: Float[Tensor, "E N"]
     """m from where the ray starts, [E, N]; `max_distance` where nothing is hit within it."""
@@ -153,6 +163,7 @@ class RayTracker(SensorTracker):
         self._key = f"rays/{name}"
         site = view.world.mj_model.site(sensor.mounting_site(name))
         self._site = int(site.id)
+        # On the device once, since patterns do not change.
         start_N3, direction_N3 = (
             torch.tensor(table, dtype=torch.float32, device=view.device) for table in sensor.pattern.rays()
         )
@@ -162,13 +173,15 @@ class RayTracker(SensorTracker):
             view.world,
             len(start_N3),
             geom_groups=sensor.geom_groups,
+            # Body -1 is none.
             exclude_body=int(site.bodyid[0]) if sensor.exclude_body else -1,
         )
 
     @property
     def state(self) -> RayState:
-        """What the rays hit in the current state."""
+        """The hits of the rays in the current state."""
         cache = self._view.cache
+        # Once per state, however many terms read it.
         if self._key not in cache:
             cache[self._key] = self._cast()
         return cache[self._key]
@@ -187,17 +200,20 @@ class RayTracker(SensorTracker):
                 visualizer.sphere(point, radius=0.015, rgba=(0.9, 0.2, 0.2, 1.0))
 
     def _cast(self) -> RayState:
-        """Cast, and copy what was found: the next cast overwrites it."""
+        """Cast, and copy the hits: the next cast overwrites them."""
         batch = self._batch
         most = self._sensor.max_distance
+        # Inputs of the batch are written in place, since its kernels are bound to them.
         batch.start_EN3.copy_(self.origin_E3[:, None] + self._turned(self._start_N3))
         batch.direction_EN3.copy_(self._turned(self._direction_N3))
         batch.cast()
+        # A negative distance means no hit.
         hit_EN = (batch.distance_EN >= 0.0) & (batch.distance_EN <= most)
         distance_EN = torch.where(hit_EN, batch.distance_EN, most)
         return RayState(
             distance_EN=distance_EN,
             hit_EN=hit_EN,
+            # Rays without a hit end at `max_distance`.
             point_EN3=batch.start_EN3 + distance_EN[..., None] * batch.direction_EN3,
             normal_EN3=torch.where(hit_EN[..., None], batch.normal_EN3, 0.0),
         )
@@ -206,12 +222,16 @@ class RayTracker(SensorTracker):
         """Turn vectors from the sensor's axes to the world's, [E, N, 3]."""
         if self._sensor.alignment == "world":
             return vectors_N3.expand(self._view.num_envs, -1, -1)
+        # Columns are the site's axes in the world.
         matrix_E33 = self._view.derived().site_xmat_EL[:, self._site].view(-1, 3, 3)
         if self._sensor.alignment == "yaw":
+            # The heading of the site's x axis.
             yaw_E1 = torch.atan2(matrix_E33[:, 1, 0], matrix_E33[:, 0, 0])[:, None]
             cos_E1 = torch.cos(yaw_E1)
             sin_E1 = torch.sin(yaw_E1)
+            # A turn about the world's z axis; z stays.
             x_N, y_N, z_N = vectors_N3.unbind(-1)
             turned = (cos_E1 * x_N - sin_E1 * y_N, sin_E1 * x_N + cos_E1 * y_N, z_N.expand(len(cos_E1), -1))
             return torch.stack(turned, dim=-1)
+        # Rows times the transpose: each vector turned by the matrix.
         return product(vectors_N3, matrix_E33.mT)

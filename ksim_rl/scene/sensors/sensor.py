@@ -22,7 +22,7 @@ class SensorTracker:
     """Reads one sensor. What it reads on demand belongs in `view.cache`, so that it is read once per state.
 
     With `every_substep`, `update_substep` runs after each physics substep, at which the worlds then compute their
-    sensors; those of contacts alone with `contacts_only`, if all such trackers have it, which takes less time.
+    sensors; contact sensors alone with `contacts_only`, if all such trackers have it, which takes less time.
     """
 
     every_substep: bool = False
@@ -32,7 +32,7 @@ class SensorTracker:
         """Advance by one env step; it runs in each step, after the refresh (nothing by default)."""
 
     def update_substep(self) -> None:
-        """Read what the last physics substep left (nothing by default); quantities of the view are not current."""
+        """Read the results of the last physics substep (nothing by default); quantities of the view are not current."""
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the reading of one env (nothing by default)."""
@@ -40,13 +40,13 @@ class SensorTracker:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor(Checked, ABC):
-    """A sensor of `scene.sensors`, where its key is its name; `warp_alone` says what of it only MuJoCo Warp can do."""
+    """A sensor of `scene.sensors`, where its key is its name; `warp_alone` names the part that needs MuJoCo Warp."""
 
     warp_alone: ClassVar[str] = ""
 
     @abstractmethod
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
-        """Add what the sensor needs to the scene's spec; a ValueError if the model lacks what the sensor names."""
+        """Add the sensor's elements to the scene's spec; a ValueError if the model lacks what the sensor names."""
 
     @abstractmethod
     def track(self, name: str, view: WorldView) -> SensorTracker:
@@ -58,6 +58,7 @@ def check_present(name: str, kind: str, wanted: str | None, elements: Sequence[A
     present = [element.name for element in elements]
     if wanted not in present:
         several: list[str] = []
+        # A pattern where a name is expected is a likely mistake, and gets its own message.
         with suppress(re.error):
             several = [other for other in present if other and re.fullmatch(str(wanted), other)]
         if several:
@@ -80,6 +81,7 @@ class MountedSensor(Sensor, ABC):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # With both, or none, the place would be unclear.
         if (self.site is None) == (self.body is None):
             raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
         if self.site is not None and any(self.pos):
@@ -89,6 +91,7 @@ class MountedSensor(Sensor, ABC):
 
     def mounting_site(self, name: str) -> str:
         """Return the name of the site at which the sensor `name` sits."""
+        # A new site is named after the sensor.
         return self.site or f"{name}_mount"
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:

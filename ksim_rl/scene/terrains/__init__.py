@@ -1,4 +1,4 @@
-"""Terrains are what a scene stands on: an endless plane, or a grid of patches of several kinds."""
+"""Terrains are the ground of a scene: an endless plane, or a grid of patches of several kinds."""
 
 from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.terrains.grid import PatchedGround, TerrainGrid

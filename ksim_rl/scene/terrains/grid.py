@@ -72,16 +72,18 @@ class TerrainGrid(Terrain):
     @property
     def columns(self) -> tuple[str, ...]:
         """The kind of each column."""
+        # The end of each kind's share on a line from 0 to the sum of all.
         shares = np.cumsum([patch.proportion for patch in self.patches.values()])
         names = tuple(self.patches)
         # Each kind gets one column, and the others go by the proportions.
         spare = self.num_columns - len(names)
+        # Evenly spaced points on that line; each falls into the share of one kind.
         middles = (np.arange(spare) + 0.5) / max(spare, 1) * shares[-1]
         extra = np.bincount(np.searchsorted(shares, middles), minlength=len(names))
         return tuple(name for name, more in zip(names, extra, strict=True) for _ in range(1 + more))
 
     def difficulty(self, level: int) -> float:
-        """Return the difficulty of a level, in [0, 1]; that of a single level is 1."""
+        """Return the difficulty of a level, in [0, 1]; a single level has 1."""
         if self.num_levels > 1:
             return level / (self.num_levels - 1)
         return 1.0
@@ -89,21 +91,26 @@ class TerrainGrid(Terrain):
     def heights(self, level: int, column: int) -> np.ndarray:
         """Return the heights of one patch, m, float64 [R, C]: rows along y, columns along x, lowest point 0."""
         patch = self.patches[self.columns[column]]
+        # Seeded by level and column, so that a patch does not depend on how many others there are.
         rng = np.random.default_rng((self.seed, level, column))
         heights_RC = patch.heights(Lattice(self.size, patch.cell), self.difficulty(level), rng)
+        # MuJoCo's height fields start at 0.
         return heights_RC - heights_RC.min()
 
     def spawn_height(self, heights_RC: np.ndarray) -> float:
         """Return the highest point of the cells of a patch that `spawn_width` reaches into, m."""
         lattice = Lattice(self.size, self.size / (len(heights_RC) - 1))
+        # One more point beyond the square: the ground is a triangle up to there.
         return float(heights_RC[lattice.ring_RC < self.spawn_width / 2 + lattice.spacing - TIE].max())
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add all patches as height fields, and the geom, with the steepest patch in place."""
+        # One pattern per metre.
         add_look(spec, repeat=1)
         steepest = ""
         most = -math.inf
         for name, heights_RC in self.named_heights():
+            # MuJoCo keeps heights as shares of the top, in [0, 1].
             top = max(float(heights_RC.max()), THINNEST)
             rows, columns = heights_RC.shape
             half = self.size / 2
@@ -114,7 +121,9 @@ class TerrainGrid(Terrain):
                 ncol=columns,
                 userdata=(heights_RC / top).ravel().tolist(),
             )
+            # Mean step between neighbours, by cells per edge: a slope in the same unit for all patches.
             gradient = (columns - 1) * float(np.abs(np.diff(heights_RC)).mean())
+            # Whoever looks at the compiled model alone sees the hardest patch.
             if gradient > most:
                 steepest = name
                 most = gradient
@@ -150,32 +159,38 @@ class PatchedGround(Ground):
         device = view.device
         self.num_levels = grid.num_levels
         self._num_columns = grid.num_columns
+        # A grid may have fewer levels than envs are asked to start at.
         max_initial_level = min(grid.max_initial_level, grid.num_levels - 1)
         spawn_heights = [grid.spawn_height(heights_RC) for _, heights_RC in grid.named_heights()]
         # A robot's own model may have height fields too.
         first = int(mj_model.hfield(patch_name(0, 0)).id)
+        # The patches' height fields are consecutive, since they were added in one loop.
         patches = slice(first, first + len(spawn_heights))
         self.half_width = float(mj_model.hfield_size[first, 0])
         self._geom = int(mj_model.geom(BODY).id)
+        # One row per world: writing it moves a world to another patch.
         self._fields = {name: view.world.field(name) for name in GEOM_FIELDS}
         self._of_patch = {
             name: torch.tensor(value[patches], device=device)
             for name, value in _geom_fields(mj_model).items()
         }
+        # The top of each number's own height field.
         tops = np.repeat(mj_model.hfield_size[:, 2], mj_model.hfield_nrow * mj_model.hfield_ncol)
         self._heights = torch.tensor(mj_model.hfield_data * tops, dtype=torch.float32, device=device)
         self._address_P = torch.tensor(mj_model.hfield_adr[patches], dtype=torch.int64, device=device)
         self._columns_P = torch.tensor(mj_model.hfield_ncol[patches], dtype=torch.int64, device=device)
         self._spawn_heights_P = torch.tensor(spawn_heights, dtype=torch.float32, device=device)
 
-        # By an env's place among those of all ranks.
+        # By an env's place among the envs of all ranks.
         place_E = torch.arange(view.num_envs, device=device) + ranks.first_row(view.num_envs)
         num_places = view.num_envs * ranks.size()
+        # Blocks of envs by column; the first place of a block is rounded up.
         self._column_E = place_E * self._num_columns // num_places
         first_E = -(-self._column_E * num_places // self._num_columns)
         self._first_level_E = (place_E - first_E) % (max_initial_level + 1)
-        # Buffers start at zero, so what is kept is how far each env has moved.
+        # Buffers start at zero, so that the kept number is how far each env has moved.
         self._moved_E = view.buffers.get("terrain.moved_E", dtype=torch.int64, keep=True)
+        # All worlds start with the steepest patch in place.
         self._place(torch.ones(view.num_envs, dtype=torch.bool, device=device))
 
     @property
@@ -191,25 +206,32 @@ class PatchedGround(Ground):
     def origins_E3(self) -> Float[Tensor, "E 3"]:
         """Where each env starts: (0, 0) at the height of the highest point around, world frame, m."""
         height_E = self._spawn_heights_P[self.patches_E]
+        # Patches lie about each world's own origin, so x and y are 0.
         return torch.stack((torch.zeros_like(height_E), torch.zeros_like(height_E), height_E), dim=-1)
 
     def heights(self, points_EN2: Float[Tensor, "E N 2"]) -> Float[Tensor, "E N"]:
-        """Return the height of the ground at x, y, exact on its triangles; beyond the edge that of the nearest one."""
+        """Return the height of the ground at x, y, exact on its triangles; beyond the edge, of the nearest one."""
         patch_E = self.patches_E
         columns_E1 = self._columns_P[patch_E][:, None]
         cells_E11 = (columns_E1 - 1)[..., None]
+        # From metres in [-half_width, half_width] to cells in [0, columns - 1].
         place_EN2 = (points_EN2 / self.half_width + 1.0) * (0.5 * cells_E11)
+        # The clamp gives points beyond the edge the height of the nearest edge.
         place_EN2 = torch.minimum(place_EN2.clamp(min=0.0), cells_E11)
+        # The last point belongs to the last cell.
         corner_EN2 = torch.minimum(place_EN2.long(), cells_E11 - 1)
         within_EN2 = place_EN2 - corner_EN2
         x_EN = within_EN2[..., 0]
         y_EN = within_EN2[..., 1]
+        # Rows run along y, columns along x.
         first_EN = self._address_P[patch_E][:, None] + corner_EN2[..., 1] * columns_E1 + corner_EN2[..., 0]
         # MuJoCo splits each cell along the diagonal from its first corner to the opposite one.
         second_EN = first_EN + torch.where(x_EN >= y_EN, 1, columns_E1)
+        # Corners of the triangle: first, the one along the longer step, and the opposite one.
         low_EN, mid_EN, high_EN = (
             self._heights[index] for index in (first_EN, second_EN, first_EN + columns_E1 + 1)
         )
+        # Barycentric: along the greater coordinate first, then along the smaller one.
         steep_EN = torch.maximum(x_EN, y_EN)
         flat_EN = torch.minimum(x_EN, y_EN)
         return low_EN + steep_EN * (mid_EN - low_EN) + flat_EN * (high_EN - mid_EN)
@@ -222,6 +244,7 @@ class PatchedGround(Ground):
         """Write the model fields of the patches into the rows of `mask_E`."""
         patch_E = self.patches_E
         for name, field in self._fields.items():
+            # The terrain's geom in all worlds: a view, so that writing it writes the field.
             row = field[:, self._geom]
             mask = mask_E.view(-1, *[1] * (row.ndim - 1))
             # The engines lay a box out in two rows of three numbers, or in one of six.
@@ -231,6 +254,7 @@ class PatchedGround(Ground):
 
 def _geom_fields(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
     """Return the values of `GEOM_FIELDS` that MuJoCo's compiler gives a geom of each height field, by name."""
+    # In float32, as the engines keep model fields.
     half_x, half_y, top, base = mj_model.hfield_size.astype(np.float32).T
     centre_P3 = np.stack((np.zeros_like(top), np.zeros_like(top), (top - base) / 2), axis=-1)
     half_P3 = np.stack((half_x, half_y, (top + base) / 2), axis=-1)

@@ -37,11 +37,13 @@ class Lattice:
     @property
     def spacing(self) -> float:
         """Distance between neighbouring points, m."""
+        # The nearest cell size that divides the edge.
         return self.size / self.num_cells
 
     @cached_property
     def x_RC(self) -> np.ndarray:
         """X of each point, m; columns run along x."""
+        # One more point than cells.
         line = np.linspace(-self.size / 2, self.size / 2, self.num_cells + 1)
         return np.broadcast_to(line, (line.size, line.size))
 

@@ -20,6 +20,7 @@ BODY = "terrain"
 
 def add_look(spec: mujoco.MjSpec, *, repeat: float) -> None:
     """Add sky (unless there is one), light and the material `MATERIAL`, whose pattern repeats so often per metre."""
+    # A second sky would not be shown; a robot's own scene may have one.
     if not any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         spec.add_texture(
             name="terrain_sky",
@@ -39,8 +40,10 @@ def add_look(spec: mujoco.MjSpec, *, repeat: float) -> None:
         width=256,
         height=256,
     )
+    # One texture per role, and only the colour's is set.
     textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
     textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = MATERIAL
+    # Uniform: the pattern is measured in metres, not stretched over the geom.
     spec.add_material(name=MATERIAL, textures=textures, texuniform=True, texrepeat=[repeat, repeat])
     spec.worldbody.add_light(pos=[0, 0, 4], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
@@ -86,4 +89,5 @@ class PlaneTerrain(Terrain):
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         add_look(spec, repeat=2)
+        # Size 0 along x and y means without end; the third number is the spacing of the grid that is drawn.
         add_ground(spec, friction=self.friction, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.01])
