@@ -33,6 +33,7 @@ def check_effects(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
                 f"per_world_fields has {field!r}, which says where past values lie and is the same in all worlds: "
                 "leave it out; delays are in actuator_delay and sensor_delay"
             )
+    # Each with the elements that lack the memory for it.
     lacking = {
         "jnt_springyield": (mj_model.jnt_plasticadr < 0, "no joint yields", "give one springyield"),
         "tendon_springyield": (mj_model.tendon_plasticadr < 0, "no tendon yields", "give one springyield"),
@@ -46,6 +47,7 @@ def check_effects(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
                 f"per_world_fields has {field!r}, but {what} in the model, so that it has no memory for that: {remedy} "
                 "in its XML, or leave the field out"
             )
+    # The mass of the moved fluid is compiled from the geom's size.
     fluid = mj_model.geom_fluid[:, 0] > 0.0
     if "geom_size" in expanded and mj_model.opt.density > 0.0 and fluid.any():
         geom = mj_model.geom(int(fluid.argmax())).name or f"number {int(fluid.argmax())} (unnamed)"
@@ -54,6 +56,7 @@ def check_effects(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
             'that size and is the same in all worlds: leave out fluidshape="ellipsoid" in its XML, or geom_size'
         )
     _warn_of_still_air(mj_model, expanded)
+    # A body on slides at right angles has a diagonal inertia matrix.
     slides = (mj_model.body_simple == 2) & (mj_model.body_dofnum > 1)
     if "jnt_axis" in expanded and slides.any():
         raise _not_simple(mj_model, "jnt_axis", int(slides.argmax()), "with slides at right angles")
@@ -97,6 +100,7 @@ def _not_simple(mj_model: mujoco.MjModel, field: str, body: int, how: str) -> Va
 
 def switch_on(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
     """Let a model look at fields that its own numbers do not ask for, in place, before MuJoCo Warp takes it over."""
+    # Flags that are compiled from the model's own numbers.
     mj_model.flg_gravcomp |= "body_gravcomp" in expanded
     mj_model.flg_surfacevel |= "geom_surfacevel" in expanded
     mj_model.flg_adhesion |= not {"geom_adhesion", "pair_adhesion"}.isdisjoint(expanded)
@@ -106,6 +110,7 @@ def switch_on(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
 def as_if_drawn(warp_model: mjw.Model, expanded: Collection[str]) -> Iterator[None]:
     """Show builders of kernels values of the fields that worlds may draw, instead of those that they begin with."""
     fields = {name: vars(warp_model)[name] for name in _LOOKED_AT if name in expanded}
+    # Restored after the block, so that worlds begin with the model's values.
     present = {name: wp.clone(array) for name, array in fields.items()}
     for name, array in fields.items():
         array.fill_(_LOOKED_AT[name])

@@ -37,6 +37,7 @@ def const_groups(fields: Iterable[str], mj_model: mujoco.MjModel) -> int:
     """Return the `SetConstGroup` bits of the constants that follow from `fields` in a model."""
     has_paths = bool(np.isin(mj_model.actuator_trntype, _PATH_TRANSMISSIONS).any())
     has_paths |= bool((mj_model.wrap_type != mujoco.mjtWrap.mjWRAP_JOINT).any())
+    # Joint tendons have no path in space, and others do.
     groups = 0
     for field in fields:
         groups |= GROUPS_OF_FIELD.get(field, 0)
@@ -58,6 +59,7 @@ def fields_to_expand(fields: Sequence[str], mj_model: mujoco.MjModel) -> tuple[s
     for field in fields:
         check_known("per-world model field", field, (*valid, GRAVITY))
     derived = derived_fields(const_groups(fields, mj_model))
+    # Gravity is expanded apart, since it is a field of the options.
     return tuple(dict.fromkeys([*(field for field in fields if field != GRAVITY), *derived]))
 
 
@@ -76,12 +78,14 @@ def prepare_spec(spec: mujoco.MjSpec, per_world_fields: Iterable[str]) -> None:
 def write_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> None:
     """Write one row of `World.per_world_fields` into a model of the C engine, in place, and what C derives from it."""
     _copy_fields(mj_model, fields)
+    # Constants do not follow from how things look, nor from gravity.
     shown = ("mat_", "light_", "cam_fovy", "cam_intrinsic", "geom_matid", "geom_rgba", GRAVITY)
     follows = [name for name in fields if name in GROUPS_OF_FIELD or not name.startswith(shown)]
     if follows and all(np.isfinite(value).all() for value in fields.values()):
         # Of frames that its compiler found equal C looks at one, and at gravity compensation if it found any; and the
         # inertia of simple bodies, and margins of whole bodies, are fields that no world has.
         mujoco.mj_setConst(mj_model, mujoco.MjData(mj_model))
+        # `mj_setConst` overwrites derived fields, of which the world has its own.
         _copy_fields(mj_model, fields)
 
 

@@ -38,6 +38,7 @@ def load_spec(source: Source) -> mujoco.MjSpec:
     "unitree_go1" or "unitree_go1/go1". Errors name the file and the element.
     """
     spec, _, label, caught = _parsed(source)
+    # Specs have no file name of their own: later messages need the label.
     _pass_on(caught, label)
     _labels[spec] = label
     return spec
@@ -50,15 +51,18 @@ def load_model(source: Source, sim: SimCfg | None = None) -> mujoco.MjModel:
     is refused unless the environment variable KSIM_RL_LARGEST_MODEL allows it.
     """
     spec, text, label, caught = _parsed(source)
+    # Before compiling, since the compiler reads options, too.
     if sim is not None:
         sim.apply_to(spec)
     with caught_warnings() as caught_later, _named(label, text):
         mj_model = spec.compile()
+    # Before the compiler's warnings, since this error names the number.
     check_finite(mj_model, label)
     for message in caught + caught_later:
         _refuse_serious(message, mj_model, label, text)
     check_meant(mj_model, label)
     _pass_on(caught + caught_later, label)
+    # A trial on the CPU finds features that Warp lacks.
     start_warp()
     with wp.ScopedDevice("cpu"), naming(label):
         warp_model_of(mj_model)
@@ -67,6 +71,7 @@ def load_model(source: Source, sim: SimCfg | None = None) -> mujoco.MjModel:
 
 def _parsed(source: Source) -> tuple[mujoco.MjSpec, str, str, list[str]]:
     """Return the spec, its XML text and its name for messages, and MuJoCo's warnings."""
+    # A spec is copied, so that settings do not change the caller's.
     if not isinstance(source, (str, Path)):
         if not isinstance(source, mujoco.MjSpec):
             kind = type(source).__name__
@@ -80,6 +85,7 @@ def _parsed(source: Source) -> tuple[mujoco.MjSpec, str, str, list[str]]:
     if is_urdf(text):
         with naming(label):
             text = ready_urdf(text, read.folder)
+    # Before MuJoCo reads the text, which may take minutes or all memory.
     included = check_text(text, read.folder, label)
     with caught_warnings() as caught, _named(label, text):
         if read.path is None:
@@ -102,20 +108,24 @@ def _named(label: str, text: str) -> Iterator[None]:
 
 def _readable(message: str, label: str, text: str) -> str:
     """Put MuJoCo's message on one line, with the source and the element."""
+    # The prefixes name parts of MuJoCo that a user does not know.
     message = message.strip()
     what = _PREFIXES.sub("", message.splitlines()[0])
+    # A parser's error knows the line of the text, but no element.
     if message.startswith("XML parse error"):
         line = _LINE.search(message)
         number = int(line["line"]) if line else 0
         return f"{label}: not well-formed XML{_at_line(text, number)}"
     if found := _ELEMENT.search(message):
         return f"{label}: {what} (element <{found['tag']}>{_at_line(text, int(found['line']))})"
+    # The compiler knows elements by name or number, and the line only sometimes.
     if found := _NAMED_ELEMENT.search(message):
         if found["name"]:
             called = f"{found['name']!r}"
         else:
             called = f"number {found['id']} (unnamed)"
         return f"{label}: {what} (element {called}{_at_line(text, int(found['line'] or 0))})"
+    # A missing file has no element: the first line that names it is shown.
     if found := _FILE_IN_MESSAGE.search(message):
         lines = [number for number, line in enumerate(text.splitlines(), 1) if found["file"] in line]
         return f"{label}: {what}{_at_line(text, lines[0]) if lines else ''}"
@@ -131,6 +141,7 @@ def _at_line(text: str, number: int) -> str:
 
 def _refuse_serious(message: str, mj_model: mujoco.MjModel, label: str, text: str) -> None:
     """Refuse models that MuJoCo only warns of, though no simulation of them can be right."""
+    # A body or joint without inertia would accelerate without bound.
     if found := _SINGULAR.search(message):
         joint = mj_model.joint(int(mj_model.dof_jntid[int(found["dof"])])).name
         raise ValueError(
@@ -142,6 +153,7 @@ def _refuse_serious(message: str, mj_model: mujoco.MjModel, label: str, text: st
 
 
 def _pass_on(caught: list[str], label: str) -> None:
+    # The same warning may come from parsing and from compiling.
     for text in dict.fromkeys(caught):
         warnings.warn(f"{label}: {text}", UserWarning, stacklevel=3)
 
@@ -154,9 +166,11 @@ def caught_warnings() -> Iterator[list[str]]:
     def keep(text: bytes | str) -> None:
         caught.append((text.decode(errors="replace") if isinstance(text, bytes) else text).strip())
 
+    # The program's own handler is put back afterwards.
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(keep)
     try:
+        # The bindings warn through Python, besides the C handler.
         with warnings.catch_warnings(record=True) as from_bindings:
             warnings.simplefilter("always")
             yield caught

@@ -43,7 +43,9 @@ FREE = mujoco.mjtJoint.mjJNT_FREE
 def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
     """Refuse a model with a number that is NaN, infinite, or too large for float32."""
     for field, values in _float_fields(mj_model):
+        # Compared in float64, in which a number beyond float32 is still finite.
         flat = np.asarray(values, dtype=np.float64).reshape(-1)
+        # Written so that NaN, which no comparison holds for, is bad as well.
         bad = np.flatnonzero(~(np.abs(flat) <= LARGEST))
         if bad.size:
             where = _element_of(mj_model, field, int(bad[0]), np.shape(values))
@@ -63,6 +65,7 @@ def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
     for name in NOT_NEGATIVE_OPTIONS:
         if (value := getattr(mj_model.opt, name)) < 0:
             raise ValueError(f"{source}: option.{name}={value:g} in <option>: expected at least 0")
+    # The first parameter of these gains is a factor; other gains use it in their own way.
     direct = np.isin(
         mj_model.actuator_gaintype, (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
     )
@@ -73,6 +76,7 @@ def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
         if bad.size:
             where = _element_of(mj_model, field, int(bad[0]), values.shape)
             raise ValueError(f"{source}: {field}={values.flat[bad[0]]:g} in {where}: expected at least 0")
+    # Without a callback, such an actuator has no law.
     for field, callback in CALLBACKS.items():
         user = ENUM_FIELDS[f"actuator_{field}type"].__members__[f"mj{field.upper()}_USER"]
         users = np.flatnonzero(getattr(mj_model, f"actuator_{field}type") == int(user))
@@ -86,6 +90,7 @@ def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
 
 def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None = None) -> mjw.Model:
     """Put a model on Warp's current device, or name the feature that MuJoCo Warp does not have, or has wrong."""
+    # Features that `put_model` takes and computes otherwise than C come first.
     check_sensors(mj_model)
     check_fluid(mj_model)
     _check_still_tendons(mj_model)
@@ -126,10 +131,12 @@ def check_fluid(mj_model: mujoco.MjModel) -> None:
     as well. A body with a free joint alone is solved for on its own, rightly.
     """
     opt = mj_model.opt
+    # Without a fluid, or with another integrator, nothing is computed wrong.
     if opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICIT or not (opt.density > 0 or opt.viscosity > 0):
         return
     for geom in np.flatnonzero(mj_model.geom_fluid[:, 0] > 0):
         body = int(mj_model.geom_bodyid[geom])
+        # All bodies of the tree, since the derivative couples its joints.
         tree = mj_model.body_rootid == mj_model.body_rootid[body]
         moving = np.flatnonzero(tree & (mj_model.body_dofnum > 0))
         is_lone = moving.size == 1 and mj_model.jnt_type[mj_model.body_jntadr[moving[0]]] == FREE
@@ -146,6 +153,7 @@ def _check_still_tendons(mj_model: mujoco.MjModel) -> None:
 
     Their rows are as hard as numbers allow, on a Jacobian of rounding errors, and what they do is noise, in C too.
     """
+    # Found once, since an equality may tie two such tendons.
     still = {tendon for tendon in range(mj_model.ntendon) if _is_still(mj_model, tendon)}
     for tendon in sorted(still):
         if why := _constraint_of_still_tendon(mj_model, tendon, still):
@@ -159,11 +167,13 @@ def _constraint_of_still_tendon(mj_model: mujoco.MjModel, tendon: int, still: Co
     m = mj_model
     if m.tendon_frictionloss[tendon] > 0.0:
         return "it has a frictionloss"
+    # Its length is a constant: the range is violated always or never.
     length = m.tendon_length0[tendon]
     margin = m.tendon_margin[tendon]
     low, high = m.tendon_range[tendon]
     if m.tendon_limited[tendon] and (length - low < margin or high - length < margin):
         return f"its length, {length:.3g}, violates its range"
+    # An equality of two tendons that are both still is as fixed as one of a single tendon.
     for equality in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_TENDON):
         other = int(m.eq_obj2id[equality])
         if m.eq_obj1id[equality] == tendon and (other < 0 or other in still):
@@ -176,6 +186,7 @@ def _is_still(mj_model: mujoco.MjModel, tendon: int) -> bool:
     first = mj_model.tendon_adr[tendon]
     bodies = set()
     for wrap in range(first, first + mj_model.tendon_num[tendon]):
+        # A joint in the path moves the tendon; a pulley belongs to no body.
         kind = mj_model.wrap_type[wrap]
         owner = mj_model.wrap_objid[wrap]
         if kind == mujoco.mjtWrap.mjWRAP_JOINT:
@@ -189,6 +200,7 @@ def _is_still(mj_model: mujoco.MjModel, tendon: int) -> bool:
 
 def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) -> None:
     """Refuse moving centres of mass of bodies whose inertia was compiled as diagonal: Warp would keep it so."""
+    # Body 0, the world, never moves.
     moving = sorted({"body_ipos", "body_iquat"} & set(per_world_fields))
     simple = np.flatnonzero(mj_model.body_simple[1:]) + 1
     if moving and simple.size:
@@ -218,12 +230,14 @@ def check_asleep(mj_model: mujoco.MjModel) -> None:
 
 
 def _float_fields(mj_model: mujoco.MjModel) -> Iterator[tuple[str, float | np.ndarray]]:
+    # Numbers of the options, then of the model itself.
     for name in dir(mj_model.opt):
         value = getattr(mj_model.opt, name)
         if not name.startswith("_") and isinstance(value, (float, np.ndarray)):
             yield f"option.{name}", value
     # What the compiler derives comes last, so that an error names the field that the user wrote.
     for name in sorted(dir(mj_model), key=lambda name: (name.endswith(DERIVED), name)):
+        # Textures hold pixels only.
         if name.startswith("_") or name.startswith("tex_"):
             continue
         value = getattr(mj_model, name)
@@ -235,8 +249,10 @@ def _element_of(mj_model: mujoco.MjModel, field: str, flat_index: int, shape: tu
     """Name the element that a number of a field belongs to."""
     if field.startswith("option."):
         return "<option>"
+    # Rows of a field with more dims hold several numbers.
     row = flat_index // max(1, int(np.prod(shape[1:])))
     prefix = field.split("_")[0]
+    # A degree of freedom or position has no name: its joint's is given.
     if prefix == "dof":
         prefix = "jnt"
         row = int(mj_model.dof_jntid[row])
@@ -260,6 +276,7 @@ def _element(mj_model: mujoco.MjModel, prefix: str, row: int) -> str:
 def _with_elements(mj_model: mujoco.MjModel, message: str) -> str:
     """Add the elements that use a feature named in a message of put_model, and what to do."""
     users = []
+    # The message has the names of enum members; which elements use them, it does not say.
     for field, enum in ENUM_FIELDS.items():
         for row, value in enumerate(getattr(mj_model, field)):
             if enum(int(value)).name in message:
@@ -274,6 +291,7 @@ def _with_elements(mj_model: mujoco.MjModel, message: str) -> str:
     else:
         used_by = ""
     remedy = "Remove it from the model, or replace it by a supported feature."
+    # The user can change a solver without touching the model.
     if "mjSOL_" in message:
         remedy = (
             "Lay a supported solver over it: load_model(..., sim=SimCfg(solver='newton')), or task.sim.solver=newton "

@@ -56,6 +56,7 @@ class _Files:
             data = read_bytes(path, limit=MOST_MODEL_BYTES, follows_links=True)
         with naming(f"{self.label}: included file {str(path)!r}"):
             text = decode_xml(data)
+        # MuJoCo reads UTF-8 only: other encodings are handed over as UTF-8.
         if text.encode() not in (data, data.removeprefix(codecs.BOM_UTF8)):
             self.recoded[called] = text.encode()
         return text
@@ -72,6 +73,7 @@ class _Files:
 
     def check_assets(self) -> None:
         """Refuse pipes and devices, at which MuJoCo would wait or never end, and files that are too large."""
+        # Every name is tried in every folder, so that their number is bounded, too.
         if len(self.below) > MOST_FOLDERS:
             raise ValueError(
                 f"{self.label}: {len(self.below)} folders of assets: expected {MOST_FOLDERS} at most"
@@ -116,6 +118,7 @@ def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> t
     """Return how many elements a text comes to, and how many numbers they have beside."""
     elements = numbers = attachments = user = 0
     largest_model = 0, 0
+    # How often the present element is there: a stack, since replicates nest.
     times = [1]
     read.folders.add(folder)
     for found in _TAG.finditer(text):
@@ -123,25 +126,30 @@ def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> t
         attributes = _attributes(found["rest"] or "")
         if tag is None:
             continue
+        # Names are collected from all elements, since MuJoCo resolves them later.
         read.below |= {attributes[name] for name in _FOLDERS if name in attributes}
         read.named |= {value for name, value in attributes.items() if name.startswith("file")}
         if found["close"]:
             if tag == "replicate" and len(times) > 1:
                 times.pop()
             continue
+        # A body within replicates counts once for each.
         elements += times[-1]
         if tag == "replicate" and not found["alone"]:
             times.append(times[-1] * _product(attributes.get("count", "")))
+        # A flexcomp makes several elements for each of its points.
         elif tag == "flexcomp":
             elements += 4 * times[-1] * _product(attributes.get("count", ""))
         elif tag == "attach":
             attachments += times[-1]
+        # Each element of the model may hold so much user data.
         elif tag == "size":
             user += sum(_product(n) for name, n in attributes.items() if name.startswith(("nuser", "nkey")))
         elif tag in _NUMBERS:
             names, power, each = _NUMBERS[tag]
             numbers += each * math.prod(_product(attributes.get(name, "")) for name in names) ** power
         elif tag in ("include", "model") and "file" in attributes:
+            # Resolved, so that a circle through links is found.
             path = (folder / attributes["file"]).resolve()
             if path in within:
                 raise ValueError(
@@ -155,6 +163,7 @@ def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> t
                     included = read.text(path, str(folder / attributes["file"]))
                     read.counts[path] = _count(included, path.parent, read, (*within, path))
             inner = read.counts[path]
+            # Which model an <attach> takes is not known here: the largest one is counted.
             if tag == "model":
                 largest_model = max(largest_model, inner)
             else:
@@ -178,4 +187,5 @@ def _product(text: str) -> int:
         values = [float(number) for number in text.split()]
     except ValueError:
         return 1
+    # Bounded, so that a product of such numbers ends; NaN differs from itself.
     return math.prod(max(1, int(min(abs(value), 1e18))) for value in values if value == value)

@@ -20,9 +20,11 @@ def random_qpos(mj_model: mujoco.MjModel, num_states: int, rng: np.random.Genera
                 start = adr + 3
             else:
                 start = adr
+            # Gaussian quaternions, once normalized, are uniform over all orientations.
             quat = rng.normal(size=(num_states, 4))
             qpos[:, start : start + 4] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
         elif mj_model.jnt_limited[joint]:
+            # A hinge or slide with limits, rad or m.
             qpos[:, adr] = rng.uniform(*mj_model.jnt_range[joint], size=num_states)
         else:
             if kind == mujoco.mjtJoint.mjJNT_HINGE:
@@ -56,6 +58,7 @@ def scatter(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Gen
     fields = np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
     if fields.size == 0:
         return
+    # Half the width of the field along x and y, m, away from its rim.
     half = mj_model.hfield_size[mj_model.geom_dataid[fields[0]], :2]
     for joint in np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
         address = mj_model.jnt_qposadr[joint]
@@ -72,17 +75,21 @@ def put_in_ground(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, *, depth: fl
     is_solid = _solid_geoms(mj_model)
     if not is_solid.any() or free_joints.size == 0:
         return
+    # Poses of geoms are needed before anything is moved.
     mujoco.mj_kinematics(mj_model, mj_data)
     ground = _ground_heights(mj_model, mj_data)
     lowest = _lowest_points(mj_model, mj_data)
+    # All geoms of a tree move with its free joint.
     roots = mj_model.body_rootid[mj_model.geom_bodyid]
     collides = (mj_model.geom_contype | mj_model.geom_conaffinity) != 0
     for joint in free_joints:
         body = mj_model.jnt_bodyid[joint]
         geoms = collides & (roots == mj_model.body_rootid[body])
         top = _highest_solid(mj_model, mj_data, is_solid, mj_data.xpos[body])
+        # For each geom of the tree, how deep it is in the ground below it.
         depths = np.maximum(ground[geoms], top) - lowest[geoms]
         deepest = depths.max(initial=-np.inf)
+        # No ground lies below: the body stays where it is.
         if np.isfinite(deepest):
             mj_data.qpos[mj_model.jnt_qposadr[joint] + 2] += deepest - depth
 
@@ -100,6 +107,7 @@ def _highest_solid(
     others = is_solid & (mj_model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
     if not others.any():
         return -np.inf
+    # A ray from above everything that is solid.
     highest = (mj_data.geom_xpos[others, 2] + mj_model.geom_rbound[others]).max() + 1.0
     start = np.array([point[0], point[1], highest])
     down = np.array([0.0, 0.0, -1.0])
@@ -119,6 +127,7 @@ def _highest_solid(
 def _ground_heights(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarray:
     """Return the height of the ground below each geom (the highest of 9 points), m; -inf where there is none."""
     ground = np.full(mj_model.ngeom, -np.inf)
+    # Planes are taken as level: their height is their origin's.
     planes = np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
     if planes.size:
         ground[:] = mj_data.geom_xpos[planes, 2].max()
@@ -126,6 +135,7 @@ def _ground_heights(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndar
     for field in np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD):
         above = mj_data.geom_xpos[field, 2] + mj_model.hfield_size[mj_model.geom_dataid[field], 2] + 1.0
         for geom, (x, y, _) in enumerate(mj_data.geom_xpos):
+            # The centre of the square around the bounding sphere, its corners and the middles of its sides.
             reach = mj_model.geom_rbound[geom]
             for dx, dy in np.ndindex(3, 3):
                 start = np.array([x + (dx - 1) * reach, y + (dy - 1) * reach, above])
@@ -137,12 +147,14 @@ def _ground_heights(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndar
 
 def _lowest_points(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarray:
     """Return the height of each geom's lowest point, in m; for other than round geoms, that of its bounding box."""
+    # The third row of a rotation matrix has the heights of its axes.
     up = mj_data.geom_xmat.reshape(-1, 3, 3)[:, 2]
     center = mj_model.geom_aabb[:, :3]
     half = mj_model.geom_aabb[:, 3:]
     box = mj_data.geom_xpos[:, 2] + (up * center).sum(1) - (np.abs(up) * half).sum(1)
     radius = mj_model.geom_size[:, 0]
     length = np.where(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE, mj_model.geom_size[:, 1], 0.0)
+    # A capsule's lower end is a half sphere around the end of its axis.
     round_end = mj_data.geom_xpos[:, 2] - radius - np.abs(up[:, 2]) * length
     is_round = np.isin(mj_model.geom_type, (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE))
     return np.where(is_round, round_end, box)

@@ -40,6 +40,7 @@ class RayBatch:
         self._groups = Groups(*map(float, self._chosen))
         self._exclude_body = exclude_body
         shape = (world.num_envs, num_rays)
+        # Arrays are allocated once: graphs keep their addresses.
         with warp_scope(world.device):
             self._start, self._direction, self._normal = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
             self._distance = wp.zeros(shape, dtype=float)
@@ -51,6 +52,7 @@ class RayBatch:
     def cast(self) -> None:
         """Cast all rays against the present poses of the geoms."""
         world = self._world
+        # Warp's rays are launches in order with the world's; C casts them on the host.
         if isinstance(world, WarpWorld):
             world.launch(self, partial(self._launch, world))
             return
@@ -110,8 +112,10 @@ class BatchCamera:
                 render_skybox=textures,
                 enabled_geom_groups=list(geom_groups),
                 cam_active=[camera],
+                # Rays may be computed once only if no world has a lens of its own.
                 use_precomputed_rays=not {"cam_fovy", "cam_intrinsic"} & fields.keys(),
             )
+            # The renderer has height fields of the model's own geoms only.
             if "geom_dataid" in fields:
                 add_height_fields(self._context, model)
         self._shape = (world.num_envs, height, width)
@@ -138,6 +142,7 @@ class BatchCamera:
         return wp.to_torch(self._context.seg_data).view(*self._shape, 2)
 
     def _launch(self) -> None:
+        # Bounding volumes follow the poses before rays are cast through them.
         m = self._world.warp_model
         d = self._world.warp_data_E
         mjw.refit_bvh(m, d, self._context)

@@ -50,6 +50,7 @@ class Refresh:
         self._limits = limits
         self._place_fixed_geoms = place_fixed_geoms
         sensor_type = mj_model.sensor_type
+        # A delayed sensor samples at substeps: no refresh may change it.
         has_history = np.any(mj_model.sensor_history > 0, axis=-1)
         self._warp_model, self.kept_by_substep = upstream.sensors_by_refresh(
             warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
@@ -60,6 +61,7 @@ class Refresh:
         # A model with sensors of them computes them with these, unless it has none computed.
         reads_sensors = not int(mj_model.opt.disableflags) & mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._sensors_sum_momenta = reads_sensors and bool(self._warp_model.sensor_subtree_vel)
+        # The lengths and moments of actuators are computed only where a sensor reads them.
         self._transmit = self._transmissions(warp_model, sensor_type)
         self._actuators_act = not int(mj_model.opt.disableflags) & mujoco.mjtDisableBit.mjDSBL_ACTUATION
         objects = (*mj_model.sensor_objtype, *mj_model.sensor_reftype)
@@ -89,8 +91,10 @@ class Refresh:
         """Launch it; `masked` leaves worlds alone that are not in the mask, where that takes less time."""
         m = self._warp_model
         d = self._warp_data_E
+        # First, so that the launches below read their present places.
         if self._place_fixed_geoms is not None:
             self._place_fixed_geoms()
+        # Momenta of subtrees may be read by terms, without any sensor.
         sums_momenta = bool(self.on_demand & SUBTREE_VELOCITIES)
         if self._dynamics is None:
             mjw.kinematics(m, d)
@@ -100,13 +104,16 @@ class Refresh:
             mjw.com_vel(m, d)
         else:
             self._dynamics(forces_too=False, sums_momenta=sums_momenta, masked=masked)
+        # After the kinematics, on which all of these build.
         self._launch_on_demand()
         if self._transmit is not None:
             self._transmit()
             self._launch_actuator_velocities()
+        # Our kernel has summed them; MuJoCo Warp's sensors sum them by themselves.
         if sums_momenta and self._dynamics is None and not self._sensors_sum_momenta:
             mjw.subtree_vel(m, d)
         self._limits.read_state(in_refresh=True)
+        # Sensors come last, when all that they read is present.
         mjw.sensor_pos(m, d)
         mjw.sensor_vel(m, d)
 
@@ -115,12 +122,14 @@ class Refresh:
         d = self._warp_data_E
         if self.on_demand & CAMERAS_AND_LIGHTS:
             mjw.camlight(m, d)
+        # The inertia matrix is a position-stage quantity: sensors of kinetic energy read it.
         if "M" in self.on_demand:
             mjw.crb(m, d)
             upstream.tendon_armature(m, d)
         if "qfrc_bias" in self.on_demand:
             upstream.bias_forces(m, d)
         if TENDON_VELOCITY in self.on_demand:
+            # All worlds have one pattern; the kernel expects rows of patterns.
             pattern = (m.ten_J_rownnz, m.ten_J_rowadr, m.ten_J_colind)
             shared = [array.reshape((1, -1)) for array in pattern]
             kernels.multiply_by_qvel(shared, d.ten_J, d.qvel, d.ten_velocity)

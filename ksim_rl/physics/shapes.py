@@ -14,6 +14,7 @@ TINY = wp.constant(1.0e-9)
 def corner_of(corner: int, half: wp.vec3) -> wp.vec3:
     """Return one of the 8 corners of a box."""
     return wp.vec3(
+        # Bits of the number are the signs along x, y and z.
         wp.where((corner & 1) == 0, -half[0], half[0]),
         wp.where((corner & 2) == 0, -half[1], half[1]),
         wp.where((corner & 4) == 0, -half[2], half[2]),
@@ -27,6 +28,7 @@ def start_of_edge(edge: int, half: wp.vec3) -> wp.vec3:
     start = wp.vec3()
     start[axis] = -half[axis]
     one, other = (axis + 1) % 3, (axis + 2) % 3
+    # The two axes across the edge: bits of its number are the signs.
     start[one] = wp.where((edge & 1) == 0, -half[one], half[one])
     start[other] = wp.where((edge & 2) == 0, -half[other], half[other])
     return start
@@ -45,6 +47,7 @@ def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.ve
     """Return the closest point of a triangle (Ericson, "Real-Time Collision Detection", 2005, 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
+    # Beyond corner a, then b, then along edge ab, and so on: the regions around a triangle.
     if d1 <= 0.0 and d2 <= 0.0:
         return a
     bp = p - b
@@ -64,6 +67,7 @@ def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.ve
     va = d3 * d6 - d5 * d4
     if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
         return b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
+    # Inside of the triangle, by barycentric coordinates.
     scale = 1.0 / (va + vb + vc)
     return a + ab * (vb * scale) + ac * (vc * scale)
 
@@ -76,9 +80,11 @@ def closest_of_segments(p: wp.vec3, d1: wp.vec3, q: wp.vec3, d2: wp.vec3):
     b, c = wp.dot(d1, d2), wp.dot(d1, r)
     denominator = a * e - b * b
     s = float(0.5)  # noqa: UP018 (Warp: a variable that changes)
+    # Segments that are not parallel; of parallel ones, any point will do, such as the middle.
     if denominator > TINY * a * e:
         s = wp.clamp((b * f - c * e) / denominator, 0.0, 1.0)
     t = (b * s + f) / e
+    # The parameter on the second segment is clamped, and the first one's follows from it.
     if t < 0.0:
         t = 0.0
         s = wp.clamp(-c / a, 0.0, 1.0)

@@ -58,12 +58,14 @@ def run(
     m = warp_model
     d = warp_data_E
     aside = stages.aside
+    # Stages of MuJoCo Warp, and callbacks, may touch any array, so that nothing runs in parallel with them.
     if stages.dynamics is None or m.callback.sensor:
         aside = None
     if stages.dynamics is None:
         _launch_their_dynamics(stages, m, d)
     else:
         _launch_our_dynamics(stages, stages.dynamics, m, d, aside)
+    # Sensors of positions and velocities do not read the solution, so that both run in parallel.
     with beside(aside if sensors else None, partial(_act_and_solve, stages, m, d)):
         if sensors:
             _read_state(stages, m, d)
@@ -72,8 +74,10 @@ def run(
 
 
 def _launch_their_dynamics(stages: Stages, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    # The same order as in MuJoCo Warp's own `forward`.
     upstream.wake_trees(warp_model, warp_data_E)
     mjw.fwd_position(warp_model, warp_data_E, factorize=False)
+    # Before velocities and forces, since rows and transmissions must be right for these.
     if stages.mend is not None:
         stages.mend()
     mjw.fwd_velocity(warp_model, warp_data_E)
@@ -93,10 +97,12 @@ def _launch_our_dynamics(
 ) -> None:
     # Where dynamics alone fill a GPU, placing bodies twice, for collisions first, takes longer than it saves.
     at_once = aside is not None and warp_data_E.nworld <= FEW_WORLDS
+    # While collisions run, the rest of the dynamics goes on without placing geoms a second time.
     if at_once:
         rest = [partial(dynamics, places_geoms=False)]
     else:
         rest = []
+    # The worlds are ordered while collisions run, since their order follows from the last substep.
     with beside(aside, partial(stages.solve, solves=False), *rest):
         dynamics(goes_on=not at_once)
         if warp_model.opt.run_collision_detection:
@@ -104,6 +110,7 @@ def _launch_our_dynamics(
                 stages.collide()
             else:
                 mjw.collision(warp_model, warp_data_E)
+    # MuJoCo Warp's rows are corrected; ours need no corrections.
     if stages.make_rows is None:
         mjw.make_constraint(warp_model, warp_data_E)
         if stages.mend is not None:
@@ -115,6 +122,7 @@ def _launch_our_dynamics(
 def _act_and_solve(stages: Stages, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     is_theirs = stages.dynamics is None
     if is_theirs:
+        # Callbacks of controls come before actuation, as in MuJoCo.
         if warp_model.callback.control and not warp_model.opt.disableflags & mjw.DisableBit.ACTUATION:
             warp_model.callback.control(warp_model, warp_data_E)
         mjw.fwd_actuation(warp_model, warp_data_E)
@@ -124,8 +132,10 @@ def _act_and_solve(stages: Stages, warp_model: mjw.Model, warp_data_E: mjw.Data)
 
 def _read_state(stages: Stages, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     """Launch the sensors that positions and velocities decide."""
+    # Our kernel of the dynamics leaves cameras and lights out.
     if stages.dynamics is not None:
         mjw.camlight(warp_model, warp_data_E)
+    # Sensors that compute nothing in this substep read zero.
     warp_data_E.sensordata.zero_()
     if stages.limits is not None:
         # Before the others, among which MuJoCo Warp delays those with a history.
@@ -140,6 +150,7 @@ def _read_forces(
     stages: Stages, warp_model: mjw.Model, warp_data_E: mjw.Data, *, sensors: bool, accelerometers: bool
 ) -> None:
     """Launch the sensors that accelerations and forces decide, and those forces of bodies that something reads."""
+    # Accelerations and forces of all bodies are computed only where something reads them.
     runs_rne = warp_model.opt.run_rne_postconstraint or (sensors and warp_model.sensor_rne_postconstraint)
     if runs_rne and stages.contacts is not None:
         stages.contacts.rne_postconstraint(warp_model)

@@ -83,6 +83,7 @@ def per_world_fields() -> tuple[str, ...]:
     """
     return tuple(
         field.name
+        # Annotations of such fields begin with "*" as the first size.
         for field in dataclasses.fields(mjw.Model)
         if (getattr(field.type, "shape", None) or ("",))[0] == "*"
     )
@@ -96,6 +97,7 @@ def drop_unread(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     m = warp_model
     d = warp_data_E
     kinds = mjw.IntegratorType
+    # The integrator "discrete" needs these arrays.
     if m.opt.integrator == kinds.DISCRETE:
         names = ""
     else:
@@ -104,6 +106,7 @@ def drop_unread(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     if not m.opt.enableflags & mjw.EnableBit.SLEEP:
         names += "map_iefc2efc map_efc2iefc efc_islandid map_idof2dof map_dof2idof dof_islandid"
         d.efc.island = wp.empty((0, d.njmax), dtype=int)
+    # Empty arrays of the same dims: kernels may still take them as arguments.
     for name in names.split():
         array = getattr(d, name)
         setattr(d, name, wp.empty((0, *array.shape[1:]), dtype=array.dtype))
@@ -115,6 +118,7 @@ def expand_gravity(warp_model: mjw.Model, num_envs: int) -> Float32[Tensor, "E 3
     `batch_sizes` refuses gravity, since it is a field of the options. Kernels index it modulo its length, and the flag
     tells MuJoCo Warp's helpers that its first dim is the world.
     """
+    # A copy, since an expanded view has one row in memory for all worlds.
     shared = wp.to_torch(warp_model.opt.gravity)
     gravity = wp.from_torch(shared.expand(num_envs, 3).contiguous(), dtype=wp.vec3)
     setattr(gravity, "_is_batched", True)  # noqa: B010
@@ -148,6 +152,7 @@ def bias_forces(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     Those that may be read are of the last substep.
     """
     d = warp_data_E
+    # Scratch arrays take the other outputs of `rne`.
     aside = dataclasses.replace(d, cacc=wp.empty_like(d.cacc), cfrc_int=wp.empty_like(d.cfrc_int))
     mjw.rne(warp_model, aside)
     tendon_bias(warp_model, d, d.qfrc_bias)
@@ -177,14 +182,17 @@ def sensors_by_refresh(
     can only be switched off all together, so the lists that `put_model` makes, one for each kernel, are replaced.
     """
     none = wp.zeros(0, dtype=int)
+    # Lists of ids, which are split by whether a refresh may compute the sensor.
     stages = {name: getattr(warp_model, name).numpy() for name in ("sensor_pos_adr", "sensor_vel_adr")}
     refreshed, kept = (
         {name: wp.array([i for i in ids if skip[i] == skips], dtype=int) for name, ids in stages.items()}
         for skips in (False, True)
     )
     lists = ("limitpos", "limitvel", "contact_pos", "contact_vel", "stage_pos", "stage_vel")
+    # Rangefinders have a count and no list: one of the two models has them all.
     keeps_rays = bool(np.any(skip & (sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER)))
     rays = warp_model.nrangefinder
+    # Contacts and limits belong to the last substep: their lists are empty here.
     of_refresh = dataclasses.replace(
         warp_model,
         **{f"sensor_{name}_adr": none for name in lists},
@@ -193,6 +201,7 @@ def sensors_by_refresh(
         nsensorcollision=0,
         nsensortaxel=0,
     )
+    # Only sensors of the refresh read these sums.
     sums = dict.fromkeys(("sensor_subtree_vel", "sensor_e_potential", "sensor_e_kinetic"), False)
     of_substep = dataclasses.replace(warp_model, **kept, **sums, nrangefinder=rays if keeps_rays else 0)
     return of_refresh, of_substep
@@ -215,6 +224,7 @@ def without(sensors: Sequence[int], warp_model: mjw.Model) -> mjw.Model:
     for stage in ("contact_pos", "contact_vel", "contact_acc", "acc"):
         ids = vars(m)[f"sensor_{stage}_adr"].numpy()
         left[f"sensor_{stage}_adr"] = ids[~np.isin(ids, sensors)]
+    # Forces of all bodies are costly, and needed by few sensors.
     reads_forces = not np.isin(m.sensor_type.numpy()[left["sensor_acc_adr"]], FORCELESS).all()
     lists = {name: wp.array(ids, dtype=int) for name, ids in left.items()}
     return dataclasses.replace(m, **lists, sensor_rne_postconstraint=reads_forces)
@@ -236,10 +246,13 @@ def geom_pairs(warp_model: mjw.Model) -> tuple[np.ndarray, np.ndarray]:
 
 def repeated_pairs(warp_model: mjw.Model) -> np.ndarray:
     """Return the <pair>s whose geoms a later <pair> has, too, int [N]."""
+    # Two geoms are a pair in either order.
     geoms = np.stack([warp_model.pair_geom1.numpy(), warp_model.pair_geom2.numpy()], axis=-1)
     low = geoms.min(-1)
     high = geoms.max(-1)
+    # One number for each unordered pair, in int64 since the product may exceed 32 bits.
     names = low.astype(np.int64) * warp_model.ngeom + high
+    # Of equal names, the last one counts; found from the end.
     _, last = np.unique(names[::-1], return_index=True)
     return np.setdiff1d(np.arange(names.size), names.size - 1 - last)
 
@@ -256,8 +269,10 @@ def take_pairs_as_written(warp_model: mjw.Model) -> None:
         return
     geoms = np.stack([m.pair_geom1.numpy(), m.pair_geom2.numpy()], axis=-1)
     pairs, pair_ids = (array.copy() for array in geom_pairs(m))
+    # Pairs without a sensor may be turned around without harm.
     as_written = (pair_ids[:, 0] > NO_PAIR) & (pair_ids[:, 1] == NO_SENSOR)
     pairs[as_written] = geoms[pair_ids[as_written, 0]]
+    # Earlier <pair>s of the same geoms are appended, without a sensor.
     own_ids = np.stack([repeated, np.full_like(repeated, NO_SENSOR)], axis=-1)
     pairs = np.concatenate([pairs, geoms[repeated]]).astype(np.int32)
     pair_ids = np.concatenate([pair_ids, own_ids]).astype(np.int32)
@@ -266,6 +281,7 @@ def take_pairs_as_written(warp_model: mjw.Model) -> None:
     if repeated.size:
         # To sweep and prune finds pairs by their geoms.
         m.opt.broadphase = mjw.BroadphaseType.NXN
+    # No pair is dropped: this makes the filtered lists again.
     drop_contacts(m, np.zeros(len(pairs), dtype=bool))
 
 
@@ -273,6 +289,7 @@ def pair_type_counts(warp_model: mjw.Model, pairs: np.ndarray) -> tuple[int, ...
     """Return the number of pairs of geoms [N, 2] by their types, in the order of a matrix's upper triangle."""
     types = warp_model.geom_type.numpy()[pairs]
     kinds = len(mjw.GeomType)
+    # The place in the upper triangle, row by row.
     low = types.min(-1)
     high = types.max(-1)
     places = (low * (2 * kinds - low - 1)) // 2 + high
@@ -287,6 +304,7 @@ def drop_contacts(warp_model: mjw.Model, dropped: np.ndarray) -> None:
     pairs, pair_ids = geom_pairs(warp_model)
     left_ids = pair_ids.copy()
     left_ids[dropped, 0] = NO_CONTACT
+    # MuJoCo Warp looks at these lists only, not at all pairs.
     may_touch = (left_ids[:, 0] > NO_CONTACT) | (left_ids[:, 1] > NO_SENSOR)
     warp_model.nxn_pairid = wp.array(left_ids, dtype=wp.vec2i)
     warp_model.nxn_pairid_filtered = wp.array(left_ids[may_touch], dtype=wp.vec2i)
@@ -314,6 +332,7 @@ def add_height_fields(context: mjw.RenderContext, mj_model: mujoco.MjModel) -> N
     ids = context.hfield_bvh_id.numpy()
     bounds = context.hfield_bounds_size.numpy()
     for field in range(mj_model.nhfield):
+        # Fields that the model itself shows are there already.
         if not ids[field]:
             mesh, bounds[field] = build_hfield_bvh(mj_model, field, constructor="cubql")
             context.hfield_registry[mesh.id] = mesh

@@ -70,6 +70,7 @@ class World(views.DataViews):
 
     def __new__(cls, *args: Any, sim: SimCfg | None = None, **kwargs: Any) -> Self:
         """Choose the engine."""
+        # `World(...)` chooses a subclass; a subclass itself is what was asked for.
         if cls is not World:
             return super().__new__(cls)
         name, _ = _choice(*args, sim=sim, **kwargs)
@@ -85,12 +86,14 @@ class World(views.DataViews):
         per_world_fields: Sequence[str] = (),
         warp_alone: Sequence[str] = (),
     ) -> None:
+        # Arguments are checked before anything is allocated or compiled.
         check_count("num_envs", num_envs)
         if not isinstance(mj_model, mujoco.MjModel):
             raise ValueError(f"mj_model={mj_model!r}: expected a mujoco.MjModel, as load_model returns it")
         if sim is not None and not isinstance(sim, SimCfg):
             raise ValueError(f"sim={sim!r}: expected a SimCfg, or None")
         self.device = checked_device(device)
+        # Once more, since a subclass may be called directly.
         name, why = _choice(mj_model, num_envs=num_envs, device=device, sim=sim, warp_alone=warp_alone)
         if name == self.engine:
             self.engine_because = why
@@ -99,13 +102,16 @@ class World(views.DataViews):
         self.sim = dataclasses.replace(sim or SimCfg(), engine=self.engine)
         self.num_envs = num_envs
         self.is_frozen = False
+        # Copied, so that neither settings nor later changes reach the caller's model.
         self.mj_model = copy.copy(mj_model)
         self.sim.apply_to(self.mj_model)
         self._expanded = fields_to_expand(per_world_fields, self.mj_model)
+        # Refused before kernels are compiled, which takes up to a minute.
         check_asleep(self.mj_model)
         check_touched_sites(self.mj_model)
         check_not_simple(self.mj_model, self._expanded)
         check_effects(self.mj_model, self._expanded)
+        # After the checks, since it changes flags of the model.
         switch_on(self.mj_model, self._expanded)
         self._fields: dict[str, Tensor] = {}
 
