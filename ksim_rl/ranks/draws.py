@@ -1,8 +1,8 @@
-"""Torch's random numbers are drawn here, by each rank the rows that are its own.
+"""Draws torch's random numbers, so that each rank gets its own rows.
 
-All ranks draw the rows of all, in step, so that their generators stay alike, and keep theirs: what one process with as
-many rows as all ranks together would see there. With one rank these are torch's functions. Rows are those of the dim
-`dim`; `options` are torch's dtype and device.
+All ranks draw the rows of all ranks, in step, so that their generators stay equal, and each keeps its own rows: the
+same numbers that one process with all rows would draw. With one rank these are torch's functions. Rows lie along
+the dim `dim`; `options` are torch's dtype and device.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,6 +38,7 @@ def exponential(shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped
 def _own(draw: Callable[..., Tensor], shape: Sequence[int], dim: int, options: dict[str, Any]) -> Tensor:
     if size() == 1:
         return draw(shape, **options)
+    # As many rows as all ranks have together.
     whole = list(shape)
     whole[dim] *= size()
     return draw(whole, **options).narrow(dim, first_row(shape[dim]), shape[dim])

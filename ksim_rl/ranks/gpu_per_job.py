@@ -1,4 +1,4 @@
-"""A run has a GPU to itself here, among those that a launcher starts side by side: `ksim-rl train --multirun`."""
+"""Gives each of several runs that a launcher starts side by side its own GPU: `ksim-rl train --multirun`."""
 
 import fcntl
 import itertools
@@ -34,15 +34,18 @@ def take_gpu(sweep: Path) -> None:
     count = torch.cuda.device_count()
     if _taken or count < 2 or torch.cuda.is_initialized():
         return
+    # The numbers of a scheduler stay, so that a job takes only GPUs that it was given.
     visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(count)))
     sweep.mkdir(parents=True, exist_ok=True)
     for slot in itertools.count():
         file = open_own(sweep / f".gpu-{slot}")
         try:
+            # A lock of the file, which the kernel frees when the process ends, however it ends.
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.close()
             continue
         _taken.append(file)
+        # It takes effect because CUDA has not been initialized yet; see above.
         os.environ["CUDA_VISIBLE_DEVICES"] = visible.split(",")[slot % count]
         return

@@ -1,7 +1,7 @@
-"""A thread of each rank tells the others that it lives and moves, and ends the process when one of them does not.
+"""Runs a thread on each rank that signals progress to the others, and ends the process when one of them stops.
 
 NCCL's own watchdog does not see collectives inside of a CUDA graph, and a rank that waits for one waits for ever. The
-beats go through the run's key-value store, beside all collectives.
+beats go through the run's key-value store, independently of all collectives.
 """
 
 import os
@@ -23,7 +23,7 @@ FAILED = 3
 
 _place = ["starting"]
 took: dict[int, float] = {}
-"""Seconds of each rank's last rollout, as its last beat had them."""
+"""Seconds of each rank's last rollout, from its last beat."""
 
 
 def at(place: str) -> None:
@@ -32,7 +32,7 @@ def at(place: str) -> None:
 
 
 class Store(Protocol):
-    """What is used of `torch.distributed.Store`: the part of this attempt, over a connection of the thread's own."""
+    """The used part of `torch.distributed.Store`: keys of this attempt, over a connection of the thread's own."""
 
     def set(self, key: str, value: str) -> None: ...  # noqa: D102
     def get(self, key: str) -> bytes: ...  # noqa: D102
@@ -40,13 +40,14 @@ class Store(Protocol):
 
 
 class Heartbeat:
-    """Beats while it is entered. `done` says that this rank may go silent, and `ended` why it went."""
+    """Beats while it is entered. `done` says that this rank may go silent, and `ended` why it failed."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._hung_s = float(os.environ.get("KSIM_RL_RANK_TIMEOUT_S", HUNG_S))
         self._stop = threading.Event()
         self._lock = threading.Lock()
+        # A daemon, so that it never keeps the process alive.
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def __enter__(self) -> "Heartbeat":
@@ -71,12 +72,15 @@ class Heartbeat:
     def _read(self, what: str, rank: int) -> str | None:
         key = f"{what}/{rank}"
         with self._lock:
+            # `get` would wait for a key that is not there.
             if self._store.check([key]):
                 return self._store.get(key).decode()
             return None
 
     def _run(self) -> None:
         others = set(range(group.size())) - {group.rank()}
+        # By rank its last beat and its last place, each with this host's time of the change: clocks of
+        # different machines are never compared.
         seen: dict[int, tuple[str, float]] = {}
         moved: dict[int, tuple[str, float]] = {}
         count = 0
@@ -85,6 +89,7 @@ class Heartbeat:
             try:
                 self._tell("beat", f"{count}|{_place[0]}|{took.get(group.rank(), 0.0)}")
                 for rank in sorted(others):
+                    # A rank that has finished may be silent for ever.
                     if self._read("done", rank) is not None:
                         others.discard(rank)
                         continue
@@ -94,8 +99,10 @@ class Heartbeat:
                     _, place, seconds = beat.split("|")
                     took[rank] = float(seconds)
                     now = time.monotonic()
+                    # A new count: the thread of that rank is alive.
                     if rank not in seen or seen[rank][0] != beat:
                         seen[rank] = beat, now
+                    # A new place: its main thread moves, too.
                     if rank not in moved or moved[rank][0] != place:
                         moved[rank] = place, now
                     if now - seen[rank][1] > SILENT_S:
@@ -110,7 +117,7 @@ class Heartbeat:
                     self._give_up(f"the store of the run is gone, and with it its rank or torchrun: {reason}")
 
     def _give_up(self, why: str) -> None:
-        """End this process at once: its main thread may wait in a collective that nothing can interrupt."""
+        """End this process immediately: its main thread may wait in a collective that nothing can interrupt."""
         if self._stop.is_set():
             return
         self._tell("ended", why)
@@ -118,4 +125,5 @@ class Heartbeat:
             f"ksim-rl: rank {group.rank()}: error: {why}; this rank ends too (it was {_place[0]})",
             to_stderr=True,
         )
+        # Not `sys.exit`, which ends this thread only.
         os._exit(FAILED)

@@ -32,11 +32,14 @@ def _count(
 ) -> None:
     """Count rows into moments, in place: all numbers are added in one order, in float64."""
     num_rows, dim = values_NL.shape
+    # Rows of a part, parts, and groups of parts, each rounded up.
     rows = max(LEAST_ROWS, -(-num_rows // MOST_PARTS))
     parts = -(-num_rows // rows)
     groups = -(-parts // GROUP)
     span = dim if count.device.type == "cpu" else 1  # of a row, for a thread that looks for faults
+    # Stage 0 sets the rows to 0 that do not count.
     counts_N = torch.ones(num_rows, dtype=torch.uint8, device=count.device)
+    # Mean and squares of each column, and one weight, for each part and group; the total at the end.
     moments = torch.empty((2 * dim + 1) * (parts + groups) + 1, dtype=torch.float64, device=count.device)
     at = [address(own) for own in (values_NL, valid_N, counts_N, moments, count, mean_L, squares_L)]
     for stage, size in enumerate(((num_rows, dim // span), (parts, dim), (groups, dim), (1, dim))):
@@ -47,10 +50,12 @@ def _count(
 def _count_in_torch(
     values_NL: Tensor, valid_N: Tensor | None, count: Tensor, mean_L: Tensor, squares_L: Tensor, until: int
 ) -> None:
-    """Do what the kernel does: the moments of the batch by two passes, and their union with all before."""
+    """Do the same as the kernel: the moments of the batch by two passes, merged with all earlier ones."""
+    # A row counts as a whole or not at all.
     counted_N = values_NL.isfinite().all(1)
     if valid_N is not None:
         counted_N &= valid_N.bool()
+    # The limit is of all ranks, which have counted about the same.
     if until >= 0:
         counted_N &= count * group.size() < until
     weight = counted_N.sum().double()
@@ -59,6 +64,7 @@ def _count_in_torch(
     error_NL = torch.where(counted_N[:, None], own_NL - own_mean_L, 0.0)
     total = count + weight
     share = weight / total.clamp_min(1.0)
+    # The update of Chan, Golub and LeVeque for two sets of rows.
     delta_L = own_mean_L - mean_L
     squares_L += error_NL.square().sum(0) + delta_L.square() * share * count
     mean_L += delta_L * share
@@ -139,6 +145,7 @@ class RunningMoments(nn.Module):
             valid_N = None
         else:
             valid_N = valid.reshape(-1).contiguous()
+        # -1 stands for no limit, as kernels take numbers only.
         until = -1 if self.until is None else self.until
         exact = self.count, self.exact_mean, self.exact_sum_of_squares
         if len(values_NL):
@@ -150,9 +157,11 @@ def publish(every: Sequence[RunningMoments]) -> None:
     """Set `mean` and `var` of each from all that was counted; all ranks have to call it, for one collective."""
     if not every:
         return
+    # All columns side by side, so that one collective serves all of them.
     dims = [own.dim for own in every]
     own_L = [(own.count.expand(own.dim), own.exact_mean, own.exact_sum_of_squares) for own in every]
     count_L, mean_L, squares_L = merged(*map(torch.cat, zip(*own_L, strict=True)))
+    # Before the first row the variance is 1, so that values pass unscaled.
     var_L = torch.where(count_L > 0, squares_L / count_L.clamp_min(1), 1.0)
     torch._foreach_copy_([own.mean for own in every], mean_L.split(dims))
     torch._foreach_copy_([own.var for own in every], var_L.split(dims))

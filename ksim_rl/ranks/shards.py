@@ -1,7 +1,7 @@
-"""A checkpoint of several ranks is gathered and dealt out here: each tensor once, or once per rank where they differ.
+"""Gathers and deals out the checkpoint of several ranks: each tensor once, or once per rank where they differ.
 
-The same number of ranks gets its own tensors back, bit for bit. Another number is dealt the same envs anew, by their
-place among those of all ranks: 1 to 2 to 1 is the run without a break.
+The same number of ranks gets its own tensors back, bit for bit. Another number shares the same envs, in the order of
+all ranks' envs: going from 1 rank to 2 and back to 1 continues the same run.
 """
 
 import zlib
@@ -18,7 +18,7 @@ from ksim_rl.device.group import rank, size
 Tensors = dict[str, Shaped[Tensor, "*?leaf"]]
 # Below it, `ReplayRing` keeps rows in the order of places and, in each place, of envs.
 _RING = "/replay/ring/"
-# What each rank counts of its own, and metrics add up.
+# Counters of each rank, which metrics add up.
 _COUNTERS = ("/non_finite_count", "/non_finite_env_states")
 # The parts of `RunningMoments`: of the observations that a rank has seen itself.
 _COUNT = "count"
@@ -27,27 +27,31 @@ _SQUARES = "exact_sum_of_squares"
 
 
 def gathered(own: Mapping[str, Shaped[Tensor, "*?leaf"]]) -> dict[str, Any]:
-    """Return the number of ranks and, by rank, the tensors of the others that differ from rank 0's: on rank 0.
+    """Return, on rank 0, the number of ranks and the tensors of other ranks that differ from those of rank 0.
 
     All ranks call it with tensors on the host, of the same names and shapes.
     """
+    # The same order on all ranks.
     names = sorted(own)
     digests_N = torch.tensor(
         [zlib.crc32(_bytes(own[name]).numpy().tobytes()) for name in names], dtype=torch.int64
     )
     parts = [torch.empty_like(digests_N) for _ in range(size())]
     dist.all_gather(parts, digests_N)
+    # Only digests travel so far; equal tensors, such as the networks, never do.
     differs_N = torch.stack(parts).ne(parts[0]).any(0).tolist()
     differing = [name for name, differs in zip(names, differs_N, strict=True) if differs]
     found: dict[str, Any] = {"size": size(), "parts": {}}
     if not differing:
         return found
+    # As bytes, so that one collective carries all dtypes.
     flat = torch.cat([_bytes(own[name]) for name in differing])
     if rank() == 0:
         flats = [torch.empty_like(flat) for _ in range(size())]
     else:
         flats = None
     dist.gather(flat, flats, dst=0)
+    # Rank 0's own are in the checkpoint anyway.
     for index, other in enumerate(flats or ()):
         if index:
             pieces = other.split([_bytes(own[name]).numel() for name in differing])
@@ -72,13 +76,14 @@ def dealt(
     parts = [dict(first)] + [
         {**first, **(saved or {})["parts"].get(str(index), {})} for index in range(1, before)
     ]
+    # The same number of ranks: no tensor is cut or merged.
     if before == size():
         return parts[rank()]
     return {name: _dealt_one(name, parts, live.get(name)) for name in first}
 
 
 def share_of(part: Any, field: str, ranks_before: int) -> int:
-    """Return what a config's `field`, which is per rank, is now for all ranks to have as many as `ranks_before` had.
+    """Return a config's `field`, which is per rank, such that all ranks have as many as `ranks_before` had.
 
     A ValueError says where that is no whole number.
     """
@@ -93,15 +98,18 @@ def share_of(part: Any, field: str, ranks_before: int) -> int:
 
 def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
     tensors = [part[name] for part in parts]
+    # Added up later by metrics, so one rank has the total and the others have nothing.
     if name.endswith(_COUNTERS):
         total = torch.stack(tensors).sum(0)
         return torch.zeros_like(total) if rank() else total
+    # A replay keeps [places * E, ...]: envs are joined and cut within each place.
     update, found, leaf = name.partition(_RING)
     if found and leaf.startswith(("available", "content/")):
         num_envs = len(parts[0][f"{update}{_RING}head"])
         rings_PE = torch.cat([rows.unflatten(0, (-1, num_envs)) for rows in tensors], 1)
         return rings_PE.chunk(size(), 1)[rank()].flatten(0, 1)
     shape = tensors[0].shape
+    # The dim in which the sizes differ is the dim of the envs.
     if live is not None and live.shape != shape:
         dim = next(
             (dim for dim in range(min(live.ndim, len(shape))) if live.shape[dim] != shape[dim]), len(shape)
@@ -112,6 +120,7 @@ def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
                 f"of {size()}: all ranks together must have as many envs as before"
             )
         return torch.cat(tensors, dim).narrow(dim, rank() * live.shape[dim], live.shape[dim]).clone()
+    # Running moments are merged, as each rank has counted other rows.
     room, _, leaf = name.rpartition("/")
     stem = leaf.rpartition(".")[0]
     prefix = f"{room}/{stem}." if stem else f"{room}/"

@@ -1,4 +1,4 @@
-"""A process joins the others of its run here, as torchrun's environment says, or is refused in one line."""
+"""Joins a process to the other ranks of its run by torchrun's environment, or refuses it in one line."""
 
 import json
 import os
@@ -34,7 +34,7 @@ def device(name: str) -> str:
 
 @contextmanager
 def joined(command: str) -> Iterator[None]:
-    """Join the other ranks for a command, and watch over them; nothing happens in a process that is alone.
+    """Join the other ranks for a command, and watch over them; does nothing in a single process.
 
     Raises ValueError where torchrun's environment is incomplete, ranks would share a GPU, or the command is for one
     process; RuntimeError where the others cannot be reached.
@@ -54,6 +54,7 @@ def joined(command: str) -> Iterator[None]:
     backend = _backend()
     rank = int(os.environ["RANK"])
     size = int(os.environ["WORLD_SIZE"])
+    # The store first: it tells this attempt from earlier ones, whose keys may still be there.
     _runs[:] = [store.of_run(store.connected(serves=store.is_served_by_rank()))]
     try:
         _attempts[:] = [store.attempt(_runs[0], rank=rank, size=size)]
@@ -62,14 +63,17 @@ def joined(command: str) -> Iterator[None]:
         )
     except RuntimeError as error:
         raise RuntimeError(f"the other ranks cannot be reached: {' '.join(str(error).split())}") from error
+    # Before the first collective on CUDA, which would run on GPU 0 otherwise.
     if backend != "gloo":
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     # A connection of its own: its thread must not wait for another's key.
     heart = heartbeat.Heartbeat(_of_attempt(store.of_run(store.connected())))
+    # Other versions may have other collectives, and would wait for each other.
     same = {"ksim_rl": _version(), "torch": torch.__version__, "Python": platform.python_version()}
     try:
         check_same(same, what="version")
         check_gpus(backend)
+        # Only in a run that can go on; a refusal above ends this rank, and `ended` tells the others.
         with heart:
             yield
             heart.done()
@@ -80,11 +84,12 @@ def joined(command: str) -> Iterator[None]:
 
 
 def check_same(values: Mapping[str, Any], *, what: str) -> None:
-    """Refuse, on all ranks, values that are not those of rank 0; the first that differs is named, by dotted path."""
+    """Refuse, on all ranks, values that differ from rank 0's; the first one is named, by dotted path."""
     if group.size() == 1:
         return
     own = _flat(values)
     parts: list[Any] = [None] * group.size()
+    # On the host, since GPUs may not have been checked yet.
     dist.all_gather_object(parts, own, group=_on_host())
     for rank, part in enumerate(parts):
         for name in {**parts[0], **part}:
@@ -98,7 +103,7 @@ def check_same(values: Mapping[str, Any], *, what: str) -> None:
 
 
 def by_first(function: Callable[[], str]) -> str:
-    """Return what a function returns on rank 0, which alone calls it; an OSError there is raised on all ranks."""
+    """Call a function on rank 0 only, and return its result on all ranks; an OSError is raised on all ranks, too."""
     if group.size() == 1:
         return function()
     texts = ["", ""]
@@ -107,6 +112,7 @@ def by_first(function: Callable[[], str]) -> str:
             texts[0] = function()
         except OSError as error:
             texts[1] = str(error) or type(error).__name__
+    # An error must reach all ranks: one that went on would wait for the others.
     dist.broadcast_object_list(texts, src=0, group=_on_host())
     if texts[1]:
         raise OSError(texts[1])
@@ -114,13 +120,14 @@ def by_first(function: Callable[[], str]) -> str:
 
 
 def run_folder(own: str) -> str:
-    """Return the folder of rank 0, or that of the attempt before, where torchrun has started the ranks again.
+    """Return the folder of rank 0, or of the attempt before, if torchrun has started the ranks again.
 
-    The own one is removed if it is another, and empty.
+    This rank's own folder is removed if it is another one, and empty.
     """
     if group.size() == 1:
         return own
 
+    # Rank 0 of the first attempt writes its folder, later attempts read it.
     def kept() -> str:
         if not _runs[0].check(["folder"]):
             _runs[0].set("folder", own)
@@ -166,6 +173,7 @@ def _backend() -> str:
         raise ValueError(
             "this torch has no NCCL, without which GPUs cannot train together: install a CUDA build"
         )
+    # Both: tensors of the host travel by gloo, those of GPUs by NCCL.
     return "cpu:gloo,cuda:nccl"
 
 
@@ -173,6 +181,7 @@ def check_gpus(backend: str) -> None:
     """Refuse two ranks on one GPU, which NCCL answers with an error that names neither."""
     if backend == "gloo":
         return
+    # The UUID tells GPUs apart also where CUDA_VISIBLE_DEVICES renumbers them.
     uuid = torch.cuda.get_device_properties(torch.cuda.current_device()).uuid
     places: list[Any] = [None] * group.size()
     dist.all_gather_object(places, f"{socket.gethostname()} {uuid}", group=_on_host())

@@ -1,7 +1,7 @@
-"""The ranks of a run share a key-value store, in which each attempt to run them has a place of its own.
+"""Connects the ranks of a run to a key-value store, in which each attempt to run them has its own keys.
 
-torchrun starts the ranks again under the same address and port, with the store as the attempt before has left it, so
-that the ranks would find keys of processes that are gone.
+torchrun restarts ranks under the same address and port, with the store as the attempt before has left it: without
+separate keys the ranks would find entries of processes that are gone.
 """
 
 import os
@@ -16,7 +16,7 @@ JOIN_S = 300.0
 
 
 def connected(*, serves: bool = False) -> dist.TCPStore:
-    """Return a connection of one's own to the store of all attempts, which rank 0 `serves` where torchrun does not.
+    """Return a new connection to the store of all attempts, which rank 0 `serves` where torchrun does not.
 
     Raises ValueError where the port is in use, RuntimeError where nobody answers.
     """
@@ -28,6 +28,7 @@ def connected(*, serves: bool = False) -> dist.TCPStore:
         )
     except (RuntimeError, OSError) as error:
         reason = " ".join(str(error).split())
+        # The user's mistake, which waiting does not mend.
         if "EADDRINUSE" in reason or "address already in use" in reason.lower():
             raise ValueError(f"MASTER_PORT={port} is in use on {host}: choose another one") from error
         raise RuntimeError(f"the other ranks cannot be reached at {host}:{port}: {reason}") from error
@@ -51,15 +52,18 @@ def attempt(run: dist.Store, *, rank: int, size: int) -> int:
     RuntimeError after `JOIN_S` seconds.
     """
     if rank:
+        # An answer under this name cannot be one for a process of an earlier attempt.
         name = uuid4().hex
         run.set(f"asks/{rank}", name)
         run.wait([f"answer/{name}"], timedelta(seconds=JOIN_S))
         number = int(run.get(f"answer/{name}"))
         run.set(f"heard/{number}/{rank}", "")
         return number
+    # Atomic, and only rank 0 counts.
     number = run.add("attempts", 1)
     waiting = set(range(1, size))
     until = time.monotonic() + JOIN_S
+    # Answered again and again: a rank may ask after its dead forerunner has asked.
     while waiting:
         for other in tuple(waiting):
             if run.check([f"asks/{other}"]):
@@ -68,5 +72,6 @@ def attempt(run: dist.Store, *, rank: int, size: int) -> int:
                 waiting.discard(other)
         if time.monotonic() > until:
             raise RuntimeError(f"rank {min(waiting)} did not start within {JOIN_S:.0f} s")
+        # s; short beside the seconds in which ranks start.
         time.sleep(0.02)
     return number

@@ -1,4 +1,4 @@
-"""Each rank times its rollouts, which wait for nobody, so that rank 0 can say which rank holds up the others."""
+"""Times each rank's rollouts, which wait for no other rank, so that rank 0 can name the slowest one."""
 
 import time
 
@@ -20,6 +20,7 @@ class Timing:
         """Begin to collect."""
         if size() == 1:
             return
+        # Each iteration is a new place, by which the others see that this rank moves.
         heartbeat.at(f"in iteration {iteration}")
         self._began = time.perf_counter()
         if self._device.type == "cuda":
@@ -43,9 +44,11 @@ class Timing:
         """
         if size() == 1:
             return {}
+        # Only events that have passed: asking for the others would wait for the device.
         while self._events and self._events[0][1].query():
             begin, end = self._events.pop(0)
             self._passed.append(begin.elapsed_time(end) / 1000.0)
+        # Only the last rollout is reported.
         del self._passed[:-1]
         heartbeat.took[rank()] = self._passed[-1]
         slowest = max(heartbeat.took, key=lambda index: heartbeat.took[index])

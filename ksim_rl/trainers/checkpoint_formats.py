@@ -1,4 +1,4 @@
-"""Each format of checkpoints is described here, with the way from an older one to the present one."""
+"""Describes each format of checkpoints, and migrates an older one to the present one."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -27,8 +27,10 @@ def _from_1(state: State, config: Config) -> tuple[State, Config]:
 
 
 def _in_order_of(group: Mapping[str, Any], columns: Mapping[str, Sequence[int]]) -> dict[str, Any]:
+    # By term its first column, which tells the order that the config of version 1 lost.
     starts = {column.rpartition("/")[2]: start for column, (start, _) in columns.items()}
     terms = group.get("terms", {})
+    # Columns of another kind: better the order as it is than a wrong one.
     if not terms.keys() <= starts.keys():
         return dict(group)
     return {**group, "terms": {name: terms[name] for name in sorted(terms, key=starts.__getitem__)}}
@@ -40,6 +42,7 @@ MIGRATIONS: dict[int, Callable[[State, Config], tuple[State, Config]]] = {1: _fr
 
 def refusal(version: Any) -> str | None:
     """Return why a version cannot be read, or None if it can."""
+    # JSON's true is an int in Python.
     if isinstance(version, bool) or not isinstance(version, int) or version < 1:
         return f"checkpoint format {version!r}: expected a whole number from 1 to {FORMAT_VERSION}"
     if version > FORMAT_VERSION:

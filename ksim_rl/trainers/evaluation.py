@@ -1,4 +1,4 @@
-"""An evaluation judges a policy by its deterministic actions in envs of their own, one whole episode in each."""
+"""Evaluates a policy by its deterministic actions in separate envs, one whole episode in each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from ksim_rl.envs.signal_keys import signal_keys
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Statistics over episodes. `unfinished` ones were cut at the step limit and count with what they had."""
+    """Statistics over episodes. `unfinished` ones were cut at the step limit, and count with their returns so far."""
 
     return_mean: float
     return_std: float
@@ -41,10 +41,12 @@ class Evaluator:
         self.seed = seed
         num_envs = env.batch_size[0]
         device = env.device or torch.device("cpu")
+        # float64: sums over many steps must not depend on their order.
         self._return_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
         self.length_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
         self._running_E = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._current_E: TensorDictBase | None = None
+        # One step is captured, and replayed for each step of an episode.
         self._step = Captured(self._count_one_step, device=device)
         self._followed = FollowedGraph(env, self._step, {"policy": policy})
 
@@ -57,6 +59,7 @@ class Evaluator:
                 if stop():
                     return None
                 self._step()
+        # Of all ranks, in one order, so that each rank computes the same figures.
         own = self._return_E, self.length_E, self._running_E.to(torch.float64)
         return_E, length_E, running_E = (torch.cat(ranks.gather(figure_E)) for figure_E in own)
         figures = torch.stack([*torch.std_mean(return_E, correction=0), length_E.mean(), running_E.sum()])
@@ -70,8 +73,10 @@ class Evaluator:
         )
 
     def _start(self) -> None:
+        # The same initial states at each evaluation, so that figures can be compared.
         self.env.set_seed(self.seed)
         first_E = self.env.reset()
+        # The first root makes the buffers, and later ones are copied into them.
         if self._current_E is None:
             self._current_E = first_E.clone()
         else:
@@ -87,8 +92,10 @@ class Evaluator:
             stepped_E, current_E = self.env.step_and_maybe_reset(acting_E)
         next_E = stepped_E.get("next")
         reward_E, done_E = (next_E.get(key).reshape(-1) for key in self._signals[:2])
+        # Only the first episode of each env counts: after its end the env goes on unseen.
         self._return_E.add_(torch.where(self._running_E, reward_E.to(torch.float64), 0.0))
         self.length_E.add_(self._running_E)
+        # After the sums, so that the last step of an episode counts.
         self._running_E.logical_and_(~done_E)
         self._keep(current_E)
 

@@ -1,4 +1,4 @@
-"""Gives the hooks of a resumed run the states that its checkpoint has kept for them."""
+"""Pairs the hooks of a resumed run with the states that its checkpoint has for them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -13,8 +13,10 @@ def paired(
 
     Hooks that keep nothing, such as a viewer's, may come and go between the sessions of a run; `keeps` knows others.
     """
+    # Numbers are texts in a checkpoint: "10" comes after "9".
     states = [saved[number] for number in sorted(saved, key=int)]
     own = list(hooks)
+    # Another number of hooks: leave out those that have no state on either side.
     if len(states) != len(own):
         states = [state for state in states if state]
         own = [hook for hook in own if keeps(hook)]

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM are turned into a request: the loop ends after the current iteration, with everything saved."""
+"""Turns SIGINT and SIGTERM into a request: the loop ends after the current iteration, with everything saved."""
 
 import os
 import signal
@@ -7,9 +7,9 @@ from types import FrameType
 
 
 class InterruptRequest:
-    """While entered, the first signal is remembered instead of raised; a second one interrupts at once.
+    """While entered, the first signal is remembered instead of raised; a second one interrupts immediately.
 
-    `said` tells then what follows. Outside the main thread, where Python allows no handlers, nothing is installed.
+    `said` is printed at the first one. Outside the main thread, where Python allows no handlers, nothing is installed.
     """
 
     def __init__(self, said: str = "the run ends after this iteration; once more ends it at once") -> None:
@@ -27,12 +27,14 @@ class InterruptRequest:
         return self
 
     def __exit__(self, *_: object) -> None:
+        # Back to the handlers of before, which may be those of an outer request.
         for number, handler in self._previous.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._previous.clear()
 
     def _remember(self, number: int, _frame: FrameType | None) -> None:
         if self.signal is not None:
+            # The user asks again: no more waiting for the end of the iteration.
             raise KeyboardInterrupt(number)
         self.signal = signal.Signals(number)
         # Not through sys.stderr, which the signal may have found in the middle of a line.

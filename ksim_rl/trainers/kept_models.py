@@ -1,4 +1,4 @@
-"""A run keeps the files of its models with their hashes, and who goes on with it is told where one has changed since.
+"""Keeps the model files of a run with their hashes, and tells a resumed run where a file has changed since.
 
 `models.json` of a run folder says of each robot and object whose model is a file: its path, the hash of all its files,
 and where in the folder `models` a copy lies. Models of the menagerie, and those that are too large, have a hash alone.
@@ -25,17 +25,17 @@ from ksim_rl.trainers.run_cfg import RunCfg
 FOLDER = "models"
 RECORD = "models.json"
 MOST_KEPT_BYTES = 64 * 2**20
-"""Of a model with its meshes and pictures, of which a run keeps a copy."""
+"""Size up to which a run keeps a copy of a model, with its meshes and textures."""
 KINDS = ("robots", "objects")
 
 
 class AbsolutePathError(ValueError):
-    """A model whose copy would still read files of another place."""
+    """Raised for a model whose copy would still read files of another place."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class KeptModel:
-    """What a run says of a model: the path it was read from, its hash, and its copy's path below `models`, if any."""
+    """A run's record of a model: the path it was read from, its hash, and its copy's path below `models`, if any."""
 
     source: str
     sha256: str
@@ -48,6 +48,7 @@ def keep_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None]) -
     record: dict[str, KeptModel] = {}
     for name, source in _sources(cfg):
         known = earlier.get(name)
+        # The record is of the run's beginning: a resumed run must not replace it by a changed file.
         if known is not None and (source == known.source or _is_copy(source, known)):
             record[name] = known
             continue
@@ -97,7 +98,7 @@ def with_kept_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], Non
 
 
 def read_record(run_folder: Path) -> dict[str, KeptModel]:
-    """Return what a run says of its models, nothing for a run that kept none; a ValueError where it is no such file."""
+    """Return a run's record of its models, empty for a run that kept none; a ValueError for a file of another kind."""
     path = run_folder / RECORD
     if not os.path.lexists(path):
         return {}
@@ -123,9 +124,11 @@ def _keep(
     place = name.replace("/", "_")
     try:
         with whole_folder(run_folder / FOLDER / place, below=run_folder) as unfinished:
+            # The same folders as in the source, since models name meshes by relative paths.
             for file in files.names:
                 (unfinished / file).parent.mkdir(parents=True, exist_ok=True)
                 write_whole(unfinished / file, files.contents(file))
+            # A copy with another hash still refers to files elsewhere.
             if not _is_whole(unfinished / files.main, kept):
                 raise AbsolutePathError(f"{source} names files by absolute paths")
     except AbsolutePathError as error:
@@ -144,7 +147,7 @@ def _is_whole(copy: Path, kept: KeptModel) -> bool:
 
 
 def _difference(source: str, kept: KeptModel) -> str:
-    """Return how the files of a model differ from those of when the run began; nothing if they do not."""
+    """Return how the files of a model differ from the start of the run; nothing if they do not."""
     try:
         files = files_of_model(source)
     except ValueError as error:
@@ -161,6 +164,7 @@ def _is_copy(source: str, kept: KeptModel) -> bool:
 
 def _checked_copy(name: str, kept: KeptModel, run_folder: Path) -> Path:
     """Return the path of a run's copy of a model; a ValueError refuses one that is damaged, or reaches outside."""
+    # A run folder may come from somebody else: links and ".." must not lead out of it.
     check_links(run_folder, below=(FOLDER,))
     inside = (run_folder / FOLDER).resolve()
     path = Path(os.path.abspath(run_folder / FOLDER / kept.copy))
@@ -171,6 +175,7 @@ def _checked_copy(name: str, kept: KeptModel, run_folder: Path) -> Path:
             raise ValueError(
                 f"{path}: the run's copy of {name} names {files.folder / file}, which lies outside of it"
             )
+    # Last, when all files are known to lie inside.
     if files.sha256() != kept.sha256:
         raise ValueError(
             f"{path}: damaged: not the model of {name} that the run began with, by its hash in {RECORD}"

@@ -1,4 +1,4 @@
-"""Metrics go to loggers. Any of TorchRL's fits: all that is called is `log_metrics` and `close`."""
+"""Opens the loggers of metrics. Any of TorchRL's fits: only `log_metrics` and `close` are called."""
 
 import importlib.util
 import os
@@ -49,6 +49,7 @@ class WandbCfg(Checked):
 def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> MetricLogger:
     """Begin the run with the config of a training run, or continue that of a resumed one."""
     path = run_folder / "wandb" / "run_id"
+    # The id stays in the folder, so that a resumed run goes on in the same place.
     if not path.exists():
         make_folder(path.parent, below=run_folder)
         write_whole(path, uuid.uuid4().hex)
@@ -69,6 +70,7 @@ def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> Me
 def kept_id(run_folder: Path, logger: str = "wandb") -> str:
     """Return the id that a run folder keeps of its run elsewhere, which becomes part of paths and addresses."""
     path = run_folder / logger / "run_id"
+    # Few bytes and plain letters, as the id becomes part of paths and addresses.
     text = read_bytes(path, limit=100).decode(errors="replace")
     if not re.fullmatch(r"[\w-]+", text, re.ASCII):
         raise ValueError(f"{path}: {text!r} is not the id of a run: letters, digits, _ and -")
@@ -111,6 +113,7 @@ def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> 
         os.environ["MLFLOW_RUN_ID"] = kept_id(run_folder, "mlflow")
     own = f"sqlite:///{(folder / 'mlflow.db').resolve()}"
     uri = cfg.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or own
+    # A database in the run folder keeps its artifacts there, too; a server has a place of its own.
     if uri == own:
         artifacts = (folder / "artifacts").resolve().as_uri()
     else:
@@ -120,6 +123,7 @@ def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> 
         write_whole(path, logger.experiment.info.run_id)
         mlflow.set_tag("mlflow.runName", cfg.name or run_folder.name)
         params = [(name, str(value)[:_MAX_LETTERS]) for name, value in plain_data.flat(config)]
+        # In pieces, as the server refuses longer requests.
         for first in range(0, len(params), _MAX_PARAMS):
             mlflow.log_params(dict(params[first : first + _MAX_PARAMS]))
     return logger
@@ -156,6 +160,7 @@ def make_loggers(
         "mlflow": (open_mlflow, "see to the server, or set logger.mlflow.tracking_uri"),
     }
     for name, (begin, fix) in services.items():
+        # Services last: they talk to a server, and may refuse.
         if (service := getattr(cfg, name)) is not None:
             try:
                 loggers.append(begin(service, run_folder, config or {}))

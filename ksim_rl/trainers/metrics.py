@@ -1,4 +1,4 @@
-"""Metrics are read from env and physics on the device, come to the host in one copy, and are explained there."""
+"""Reads metrics from env and physics on the device, copies them to the host together, and explains them there."""
 
 import itertools
 from collections.abc import Mapping
@@ -44,9 +44,11 @@ def start_copy(metrics: Mapping[str, Shaped[Tensor, ""]], *, device: torch.devic
     """
     if not metrics:
         return PendingMetrics((), torch.zeros(0, dtype=torch.float64))
+    # Grouped by dtype, so that each group is stacked and converted by one kernel.
     of_kind: dict[torch.dtype, dict[str, Tensor]] = {}
     for name, value in metrics.items():
         of_kind.setdefault(value.dtype, {})[name] = value.detach().reshape(())
+    # The order of the vector: by dtype, not the order of the argument.
     names = tuple(itertools.chain(*of_kind.values()))
     # float64 holds every count of env states exactly. One by one, a conversion each, took a kernel each.
     kinds = (torch.stack([*own.values()]).to(torch.float64) for own in of_kind.values())
@@ -55,13 +57,14 @@ def start_copy(metrics: Mapping[str, Shaped[Tensor, ""]], *, device: torch.devic
         return PendingMetrics(names, values_M)
     on_host_M = torch.empty(values_M.shape, dtype=values_M.dtype, pin_memory=True)
     on_host_M.copy_(values_M, non_blocking=True)
+    # Marks the end of the copy in the stream, for `read` to wait for.
     copied = torch.cuda.Event()
     copied.record(torch.cuda.current_stream(device))
     return PendingMetrics(names, on_host_M, copied)
 
 
 def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Num[Tensor, ""]]:
-    """Return what happened in this rollout, each a tensor [] on the device, and start the env's sums anew.
+    """Return the sums over this rollout, each a tensor [] on the device, and start the env's sums again at 0.
 
     Any env gives the mean reward per step; one with `EpisodeSums` also its sums over the episodes that ended, and one
     with `DifficultyLevels` those.
@@ -70,6 +73,7 @@ def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Num
     if (episodes := part(env, EpisodeSums)) is not None:
         # A copy, because the sums are cleared before they are read on the host.
         log = episodes.episode_log()
+        # One kernel for the copy of all sums.
         totals = torch.stack([*log.values()]).unbind()
         sums |= {f"sum/{name}": total for name, total in zip(log, totals, strict=True)}
         episodes.episode_log_reset_()
@@ -82,7 +86,7 @@ def read_episode_sums(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Num
 def episode_means(sums: Mapping[str, float], *, max_episode_length_s: float) -> dict[str, float]:
     """Turn sums over episodes into means per episode; without a finished episode those are left out.
 
-    What else is measured stays, but for the counts of `read_physics`.
+    Other metrics stay, except for the counts of `read_physics`.
 
     `episode/return`, `episode/length` (env steps) and `metric/<name>` are means. `termination/<name>` is a share of
     episodes. `reward/<term>` is the weighted sum over an episode, per second of the longest possible episode (or as it
@@ -94,6 +98,7 @@ def episode_means(sums: Mapping[str, float], *, max_episode_length_s: float) -> 
         return metrics
     metrics["episode/count"] = episodes
     metrics["episode/non_finite"] = sums.get("sum/termination/non_finite", 0.0)
+    # No episode has ended: means do not exist, and are left out rather than set to 0.
     if episodes == 0.0:
         return metrics
     metrics["episode/return"] = sums["sum/return_sum"] / episodes
@@ -109,7 +114,7 @@ def episode_means(sums: Mapping[str, float], *, max_episode_length_s: float) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsReport:
-    """What happened in the physics of one rollout."""
+    """Overflows and failures in the physics of one rollout."""
 
     metrics: dict[str, float]  # shares and counts to log, `physics/<name>`
     lost: tuple[str, ...] = ()  # one line for each kind of contacts or constraints that did not fit
@@ -117,7 +122,7 @@ class PhysicsReport:
 
 
 def read_physics(env: EnvBase) -> dict[str, Int64[Tensor, ""]]:
-    """Return the counts of this rollout, each a tensor [] on the device, and start anew; none without a world."""
+    """Return the counts of this rollout, each a tensor [] on the device, and clear them; none without a world."""
     simulated = part(env, SimulatedWorld)
     if simulated is None:
         return {}
@@ -127,11 +132,12 @@ def read_physics(env: EnvBase) -> dict[str, Int64[Tensor, ""]]:
 
 
 def explain_physics(env: EnvBase, counts: Mapping[str, float]) -> PhysicsReport:
-    """Say what the counts mean, which other metrics may stand beside; reads the device only if a world failed."""
+    """Explain the counts, among which may be other metrics; reads the device only if a world failed."""
     simulated = part(env, SimulatedWorld)
     if simulated is None:
         return PhysicsReport(metrics={})
     world = simulated.world
+    # In the order in which `read_physics` has numbered them.
     numbers = [int(value) for name, value in counts.items() if name.startswith(_OVERFLOW)]
     overflow = world.explain_overflow(numbers)
     return PhysicsReport(

@@ -1,4 +1,4 @@
-"""Says in which physics a trained policy is judged, and how that differs from its training."""
+"""Chooses and describes the physics in which a trained policy is judged, other than that of its training."""
 
 import dataclasses
 from collections.abc import Collection, Mapping

@@ -1,4 +1,4 @@
-"""The progress of a run is timed, and shown as one live panel on a terminal or as plain lines in a pipe."""
+"""Times the progress of a run, and shows it as one live panel on a terminal or as plain lines in a pipe."""
 
 import sys
 import threading
@@ -37,7 +37,7 @@ SILENCE_S = 15.0
 
 
 class _OwnConsole(Console):
-    """Goes on in silence where the pipe it writes to is closed; rich's own console would end the process."""
+    """A console that goes silent when its pipe is closed; rich's own console would end the process."""
 
     def on_broken_pipe(self) -> None:
         try:
@@ -62,6 +62,7 @@ class RunProgress:
         self.total = total
         self.done = done
         self.console = console or _OwnConsole(highlight=False)
+        # Other ranks show nothing, as all ranks are at the same iteration.
         self._enabled = enabled and ranks.rank() == 0
         self._status = ""
         self._metrics: dict[str, float] = {}
@@ -87,6 +88,7 @@ class RunProgress:
         if self._enabled and self.console.is_terminal:
             self._live = Live(self._panel(), console=self.console, refresh_per_second=4)
             self._live.start()
+        # For the whole run: in a pipe this starts the thread that breaks the silence.
         self._open.enter_context(self.busy(""))
         return self
 
@@ -101,6 +103,7 @@ class RunProgress:
         """Show the state after `iteration`."""
         self.done = iteration
         self._moved = time.monotonic()
+        # Metrics of evaluations stay in the panel between evaluations.
         self._metrics |= metrics
         self._status = ""
         if seconds_left is None:
@@ -115,7 +118,7 @@ class RunProgress:
             self.note(f"iteration {iteration}/{self.total}: {shown}, left {left}")
 
     def note(self, text: str) -> None:
-        """Print one line that stays; of several ranks only rank 0 says what is alike on all."""
+        """Print one line that stays; of several ranks only rank 0 prints, except for reports of the NaN guard."""
         if ranks.rank() and not text.startswith("NaN guard"):
             return
         self._spoken = time.monotonic()
@@ -133,11 +136,12 @@ class RunProgress:
 
     @contextmanager
     def busy(self, text: str) -> Iterator[None]:
-        """Show what a block does while it takes its time; without a text, that iterations go on."""
+        """Show the activity of a block that takes long; without a text, that iterations go on."""
         before = self._doing, self._since
         self._doing = text
         self._since = time.monotonic()
         with ExitStack() as shown:
+            # A running panel shows the text; before it a spinner does; in a pipe a thread prints lines.
             if self._live is not None and text:
                 self.status(text)
                 shown.callback(self.status, "")
@@ -151,10 +155,12 @@ class RunProgress:
     @contextmanager
     def _watch(self) -> Iterator[None]:
         """Break the silence of a pipe."""
+        # One thread for the outermost block; inner blocks only change what it says.
         done = threading.Event()
         self._watched = True
 
         def speak() -> None:
+            # Looks every second, so that a line is late by a second at most.
             while not done.wait(SILENCE_S / 15.0):
                 now = time.monotonic()
                 if now - self._spoken >= SILENCE_S:
@@ -180,6 +186,7 @@ class RunProgress:
     def _panel(self) -> Group:
         figures = self._figures(self._metrics)
         table = Table.grid(padding=(0, 2))
+        # Three columns keep the panel a few lines high.
         for start in range(0, len(figures), 3):
             table.add_row(*(f"[dim]{label}[/dim] {text}" for label, text in figures[start : start + 3]))
         return Group(self._bar, table, *([Text(printable(self._status))] if self._status else []))
@@ -202,6 +209,7 @@ class RunClock:
     def lap(self) -> float:
         """End an iteration, and return its seconds."""
         now = time.monotonic()
+        # Not zero, as throughput divides by it.
         seconds = max(now - (self._created if self._last is None else self._last), 1e-9)
         # The first iteration compiles kernels, so it says nothing about the rest.
         if self._last is not None:
@@ -212,12 +220,13 @@ class RunClock:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Leave what happens inside out of the iteration."""
+        """Count the time of this block in the total, but not in the iteration."""
         start = time.monotonic()
         yield
         elapsed = time.monotonic() - start
         self.total += elapsed
         if self._last is not None:
+            # Moves the start of the present iteration forward by the pause.
             self._last += elapsed
 
     def seconds_left(self, iterations: int) -> float | None:

@@ -1,4 +1,4 @@
-"""Puts parts of a checkpoint back, and says in one line what does not fit."""
+"""Restores parts of a checkpoint, and explains in one line what does not fit."""
 
 from collections.abc import Mapping
 from pathlib import Path

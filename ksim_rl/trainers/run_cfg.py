@@ -77,9 +77,9 @@ class TrainerCfg(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class ModulesCfg(Checked):
-    """The networks. Where there is a trunk, actor and critic both read its "features".
+    """Settings of the networks. Where there is a trunk, actor and critic both read its "features".
 
-    What they read beside those is theirs alone, as are the recurrent layers of each.
+    Their other inputs are separate, and so are the recurrent layers of each.
     """
 
     actor: ActorCfg | DeterministicActorCfg | SquashedActorCfg = field(default_factory=ActorCfg)
@@ -92,6 +92,7 @@ class ModulesCfg(Checked):
         """Refuse a trunk that a network does not read, and features that nothing writes."""
         super()._check_fields()
         for name, cfg in (("actor", self.actor), ("critic", self.critic)):
+            # Either both or neither: a network without features would leave the trunk untrained.
             if (FEATURES in self._read_by(name)) != (self.trunk is not None):
                 raise ValueError(
                     f"{name}.in_keys={self._read_by(name)!r}: {FEATURES!r} is what a trunk writes; name it with a "
@@ -113,12 +114,13 @@ class ModulesCfg(Checked):
         return type(self.actor), type(self.critic)
 
     def observation_keys(self, *names: str) -> list[ObservationKey]:
-        """Return what the networks read of an EnvState; given "actor" or "critic", what that one reads."""
+        """Return the keys of an EnvState that the networks read, or that the one named "actor" or "critic" reads."""
         if self.trunk is None:
             shared = ()
         else:
             shared = self.trunk.in_keys
         own = [key for name in names or ("actor", "critic") for key in self._read_by(name)]
+        # Each key once, in a fixed order, without features, which are no leaf of an EnvState.
         return [key for key in dict.fromkeys((*shared, *own)) if key != FEATURES]
 
     def _read_by(self, name: str) -> tuple[ObservationKey, ...]:
@@ -142,7 +144,7 @@ class BrowserCfg(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingCfg(Checked):
-    """What training needs to know beside the env: what a task recommends, and the larger part of a run's config."""
+    """Settings of training without the env: recommended by a task, and the larger part of a run's config."""
 
     num_envs: Count
     seed: WholeNumber = 1  # of all draws
@@ -156,13 +158,14 @@ class TrainingCfg(Checked):
         """Let the size of the data follow from `collector.rollout_length`, where that is given."""
         super()._check_fields()
         if self.collector.rollout_length is not None:
+            # The config is frozen, so the field is set past its own check of assignments.
             data = self.data.with_rollout_length(self.collector.rollout_length, self.num_envs)
             object.__setattr__(self, "data", data)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunCfg(TrainingCfg):
-    """A training run: what `TrainingCfg` holds, and where and of what it is."""
+    """A training run: the settings of `TrainingCfg`, with its task, device, loggers and viewer."""
 
     task_name: str  # the registered task that `task` began as; names the run and its threshold
     task: ManagerBasedRlEnvCfg  # the env; its number of envs and its seed are set to the run's
@@ -182,14 +185,17 @@ class RunCfg(TrainingCfg):
             raise ValueError(f"seed={self.seed}: expected at most {MOST_SEED}")
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"device={self.device!r}: expected 'auto', 'cpu', 'cuda' or 'cuda:<index>'")
+        # "auto" passes, as it falls back to the CPU.
         if self.device.startswith("cuda") and not torch.cuda.is_available():
             raise ValueError(f"device={self.device!r}: torch finds no CUDA device here; use device=cpu")
         if not self.task.actions:
             raise ValueError(
                 "task.actions is empty: a policy needs one at least, which says what it controls"
             )
+        # One source for the number of envs and the seed: the run's own.
         scene = replace(self.task.scene, num_envs=self.num_envs)
         object.__setattr__(self, "task", replace(self.task, scene=scene, seed=self.seed))
+        # Nested keys are no groups, but leaves such as commands.
         groups = {key for key in self.modules.observation_keys() if isinstance(key, str)}
         groups |= set(self.objective.observation_groups)
         missing = sorted(groups - set(self.task.observations))
@@ -198,6 +204,7 @@ class RunCfg(TrainingCfg):
                 f"task.observations has no group {missing[0]!r}, which modules.*.in_keys or objective.style_group "
                 f"name: {near(missing[0], self.task.observations)}"
             )
+        # Raises if the number of envs does not divide the size of the data.
         self.data.rollout_length(self.num_envs)
         self._check_sequences()
 
@@ -226,6 +233,7 @@ class RunCfg(TrainingCfg):
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> "RunCfg":
         """Build the config from plain data, also of an earlier version; a ValueError has the full path of a fault."""
+        # Plain data and known packages first: the tree may be of somebody else's run.
         check_plain(tree, "config")
         plugins.check_remembered(tree.get(PLUGINS) or ())
         tree = up_to_date({key: value for key, value in tree.items() if key != PLUGINS})
@@ -262,6 +270,7 @@ def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[st
 
     `given` are the fields, by dotted path, that the user sets himself.
     """
+    # A run folder may come from somebody else, so unknown fields are refused.
     known = {*(entry.name for entry in fields(RunCfg)), PLUGINS}
     for name in tree:
         if name not in known:
@@ -286,7 +295,9 @@ def reaching_outside(tree: Mapping[str, Any], *, given: Collection[str] = ()) ->
                 value = value.get(name)
             else:
                 value = None
+        # With dots at the ends, so that "viewer" covers "viewer.host" and not "viewers".
         own = any(f"{path}.".startswith(f"{field}.") for field in given)
+        # Unset fields and switches that are off reach nothing.
         reaches = value is not None and value is not False
         if reaches and not own and value != os.environ.get(VOUCHED_BY.get(path, "")):
             yield path, value
@@ -300,6 +311,7 @@ def without_env_size(tree: Mapping[str, Any]) -> dict[str, Any]:
     scene = dict(task["scene"])
     task = {**task, "scene": scene}
     for where, name, below in (("task.scene.num_envs", "num_envs", scene), ("task.seed", "seed", task)):
+        # Older trees repeat the run's numbers here; other numbers are a mistake.
         value = below.pop(name, None)
         if value is not None and value != tree.get(name):
             raise ValueError(

@@ -1,4 +1,4 @@
-"""A whole run lies in a folder: config, training, evaluation, learning curves, video."""
+"""Runs a training in a folder of its own: config, training, evaluation, learning curves, video."""
 
 import dataclasses
 import json
@@ -60,11 +60,12 @@ def run(
 ) -> Outcome:
     """Train, and leave in `run_folder` record, config, models, metrics, checkpoints, evaluation, curves and a video.
 
-    What cannot be drawn (no OpenGL) is said in one line of `progress`. `before` is called when all is built. Raises
-    ValueError when another process writes the folder, the checkpoint to resume or start from belongs to another
-    config, or memory does not suffice; OSError when the folder is deleted or moved meanwhile, or the end cannot be
-    saved.
+    A picture that cannot be drawn (no OpenGL) is noted in one line of `progress`. `before` is called when all parts are
+    built. Raises ValueError when another process writes the folder, the checkpoint to resume or start from belongs to
+    another config, or memory does not suffice; OSError when the folder is deleted or moved meanwhile, or the last
+    checkpoint cannot be saved.
     """
+    # Ranks with other settings would wait for each other in collectives of other sizes.
     ranks.check_same({**cfg.to_tree(), "device": cfg.resolved_device().type}, what="config")
     # The graphs that the first iterations record take memory as well. Several ranks cannot try on their own.
     if ranks.size() > 1:
@@ -79,6 +80,7 @@ def run(
         outcome = trainer.train(progress)
         _close(trainer)
         return outcome
+    # From here on rank 0 only: folder, lock, record and pictures.
     run_folder.mkdir(parents=True, exist_ok=True)
     try:
         with locked(run_folder, note=progress.note), threads_that_fail(progress.note), explained:
@@ -96,22 +98,28 @@ def _run_locked(
     make: Callable[[], Trainer],
     before: Callable[[Trainer], None] | None,
 ) -> Outcome:
+    # Tell now which classes a later command may not find, and not when the run is resumed.
     for note in loading_notes(cfg.to_tree()):
         progress.note(note)
+    # Under the lock nobody else writes here, so unfinished files are leftovers of a crash.
     for folder in (run_folder, run_folder / "checkpoint"):
         checkpoint.remove_leftovers(folder)
     with progress.busy("building envs and networks"):
         trainer = make()
+    # The engine that "auto" has chosen, so that config.yaml names it.
     cfg = with_engine(cfg, trained_with(trainer.config))
     if before is not None:
         before(trainer)
+    # Models and config are written before training, so that an interrupted run can be resumed.
     kept_models.keep_models(cfg, run_folder, note=progress.note)
     write_whole(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
+    # Ends the run when somebody deletes or moves its folder.
     trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
     with recorded(run_folder, note=progress.note) as ended:
         outcome = trainer.train(progress)
         ended("done" if outcome.interrupted_by is None else "interrupted", outcome.why)
     trainer.watch()
+    # The figures of the last evaluation, for tools and people.
     if outcome.evaluation is not None:
         figures = {
             "iteration": outcome.iteration,
@@ -121,8 +129,10 @@ def _run_locked(
         if trainer.solved_at is not None:
             figures["solved"] = outcome.solved
         write_whole(run_folder / EVALUATION, json.dumps(figures, indent=2) + "\n")
+    # Pictures come last: they may fail without harm to the run.
     with progress.busy("drawing learning curves and video"):
         _draw_curves(cfg, run_folder, solved_at=trainer.solved_at, note=progress.note)
+        # A run that was asked to stop does not begin to draw.
         if cfg.trainer.video and outcome.interrupted_by is None:
             path = run_folder / VIDEO
             record_video(cfg, trainer.update.actor, path, note=progress.note, status=progress.status)
@@ -155,9 +165,11 @@ def policy_of(saved: checkpoint.Checkpoint, *, device: str = "auto", cfg: RunCfg
     if cfg is None:
         cfg = RunCfg.from_tree({**saved.config, "device": device})
     cfg = without_nan_guard(kept_models.with_kept_models(cfg, saved.run_folder))
+    # One env is enough: the networks' shapes follow from its specs.
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
     actor = make_policy(cfg, env)
     with checkpoint.fitting(saved.path):
+        # Columns first: equal sizes with other terms would load in silence.
         checkpoint.check_columns(saved.state["observation_columns"], observation_columns(env))
         state_tree.copy_into(actor.state_dict(), saved.state["update"]["actor"], what="actor")
     env.close(raise_if_closed=False)
@@ -182,6 +194,7 @@ def record_video(
     seed: int = 0,
 ) -> Path | None:
     """Record the policy in one env; where that is impossible, say why and how to mend it, and return None."""
+    # Without noise, and with a camera.
     env = build_env(cfg, num_envs=1, seed=seed, render_mode="rgb_array")
     env.eval()
     clock = part(env, EpisodeClock)
@@ -204,6 +217,7 @@ def _draw_curves(
     cfg: RunCfg, run_folder: Path, *, solved_at: float | None, note: Callable[[str], None]
 ) -> None:
     table = run_folder / METRICS
+    # Say why, since an absent picture looks like a fault.
     if not table.exists():
         if cfg.logger.csv:
             reason = "which has no rows yet"

@@ -1,4 +1,4 @@
-"""Looks for the checkpoints, robots and targets that a run names, before anything is built."""
+"""Checks that the checkpoints, robots and targets that a run names exist, before anything is built."""
 
 from collections.abc import Iterable
 from dataclasses import fields
@@ -25,10 +25,12 @@ def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
     named = {"checkpoint": cfg.checkpoint}
     named |= {f"objective.{name}": getattr(cfg.objective, name) for name in cfg.objective.checkpoint_fields}
     for field, path in named.items():
+        # Read as a whole, hashes included: a damaged file must fail now and not after minutes.
         if path is not None and not resumes:
             with naming(f"{field}={path}", checkpoint.CheckpointError):
                 checkpoint.load_latest(Path(path))
     for kind, entities in (("robots", cfg.task.scene.robots), ("objects", cfg.task.scene.objects)):
+        # Reads the model's files, without compiling them.
         for name, entity in entities.items():
             with naming(f"task.scene.{kind}.{name}", ValueError, OSError):
                 entity.spec()
@@ -49,6 +51,7 @@ def check_targets(cfg: RunCfg, measured: Iterable[str] | None = None) -> None:
     known += [f"metric/{name}" for name in task.metrics]
     if cfg.trainer.eval_episodes:
         known += [f"evaluation/{entry.name}" for entry in fields(Evaluation)]
+    # Kinds whose names are all known here: another name of such a kind is a mistake.
     kinds = {name.partition("/")[0] for name in known} | {"evaluation", "metric", "reward"}
     for name in cfg.trainer.stop_at or {}:
         kind, slash, _ = name.partition("/")

@@ -1,4 +1,4 @@
-"""Names the iterations of a run that may have been made with Python that was frozen, and what is from before them."""
+"""Names the iterations of a run that may have used frozen Python, and the last checkpoint before them."""
 
 from pathlib import Path
 
@@ -13,6 +13,7 @@ def with_iterations(error: FrozenPythonError, *, iteration: int, folder: Path | 
     """
     if not error.rollouts:
         return error
+    # One rollout per iteration, so the suspects are the last iterations.
     first = iteration - error.rollouts + 1
     text = f"{error}. These are the iterations {first} to {iteration}"
     if folder is not None:

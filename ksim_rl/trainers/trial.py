@@ -34,10 +34,12 @@ def first_that_fits(cfg: RunCfg, numbers: Iterable[int], *, note: Callable[[str]
     """
     for num_envs in numbers:
         try:
+            # The device by its number: a child process must try the same GPU.
             fewer = dataclasses.replace(cfg, num_envs=num_envs, device=str(cfg.resolved_device()))
         except ValueError:
             continue
         note(f"memory does not suffice: trying num_envs={num_envs}")
+        # In a child, so that all its memory is released whatever happens.
         ended = run_python(["-c", PROGRAM], text=json.dumps(fewer.to_tree()))
         if ended.returncode == FITS:
             return num_envs
@@ -63,6 +65,7 @@ def main() -> int:
         soon = min(cfg.data.learning_starts, 3 * cfg.data.num_steps + 1)
         cfg = dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, learning_starts=soon))
     device = cfg.resolved_device()
+    # Before anything is built, for the share that must be left.
     free = free_bytes(device)
     try:
         trainer = build(cfg)
@@ -72,6 +75,7 @@ def main() -> int:
         print(" ".join(str(error).split()), flush=True)
         return DOES_NOT
     left = free_bytes(device)
+    # The first iterations may not show all that a run needs, so some memory must be left.
     if free and left is not None and left < SPARE * free:
         print(f"{left / 1e9:.2f} of {free / 1e9:.2f} GB are left, fewer than a tenth", flush=True)
         return DOES_NOT

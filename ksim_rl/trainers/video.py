@@ -1,4 +1,4 @@
-"""A video of a policy consists of the pictures that its env renders while it acts."""
+"""Records a video of a policy: the pictures that its env renders while it acts."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -46,6 +46,7 @@ def record(
     """
     if _failed:
         raise VideoUnavailableError(_failed[0])
+    # A whole number of env steps per picture; the file's rate follows from it, so that time runs right.
     every = max(1, round(1.0 / (fps * step_dt)))
     shown = 1.0 / (every * step_dt)
 
@@ -69,10 +70,12 @@ def record(
 
     frames = acting()
     try:
+        # The first picture opens OpenGL: if that fails, no file has been begun.
         first = next(frames)
     except VideoUnavailableError:
         raise
     except RuntimeError as error:
+        # Remembered for the life of the process; see above.
         _failed.append(str(error))
         raise VideoUnavailableError(str(error)) from error
     path.parent.mkdir(parents=True, exist_ok=True)
