@@ -131,10 +131,17 @@ def set_fixed_constants(warp_model: mjw.Model) -> None:
     mjw.set_const(warp_model, None, FIXED)  # pyright: ignore[reportArgumentType]
 
 
+def may_sleep(warp_model: mjw.Model) -> bool:
+    """Return whether trees may fall asleep."""
+    flags = warp_model.opt
+    # Islands fall asleep, so that nothing does where they are switched off.
+    has_islands = not flags.disableflags & mjw.DisableBit.ISLAND
+    return has_islands and bool(flags.enableflags & mjw.EnableBit.SLEEP)
+
+
 def wake_trees(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     """Wake the sleeping trees that something disturbs, as `forward` does first."""
-    flags = warp_model.opt
-    if flags.enableflags & mjw.EnableBit.SLEEP and not flags.disableflags & mjw.DisableBit.ISLAND:
+    if may_sleep(warp_model):
         wake(warp_model, warp_data_E)
         update_sleep(warp_model, warp_data_E)
 

@@ -126,6 +126,29 @@ def test_runge_kutta_leaves_the_forces_on_bodies_of_its_start() -> None:
     check(world, mj_data, names)
 
 
+WRAPPED = (
+    '<mujoco><option timestep="0.01" integrator="RK4">{flag}</option><worldbody>'
+    + HINGE
+    + '</worldbody><tendon><fixed name="t" damping="0.2"><joint joint="h" coef="0.3"/></fixed></tendon>'
+    "<actuator>{actuator}</actuator></mujoco>"
+)
+READ_BY_STAGES = {
+    "tendon": '<general tendon="t" dyntype="filter" dynprm="0.05" gainprm="2"/>',
+    "velocity": '<velocity joint="h" kv="0.3"/>',
+}
+
+
+@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize(
+    "flag", ("", '<flag sleep="enable"/>', '<flag sleep="enable" spring="disable" damper="disable"/>')
+)
+@pytest.mark.parametrize("actuator", READ_BY_STAGES)
+def test_runge_kutta_leaves_the_readings_of_its_last_stage(actuator: str, flag: str, kernels: str) -> None:
+    xml = WRAPPED.format(flag=flag, actuator=READ_BY_STAGES[actuator])
+    names = ("qpos", "qvel", "actuator_length", "actuator_velocity", "actuator_force", "qfrc_passive")
+    step_and_check(xml, KERNELS[kernels], names=names, substeps=2, speed=8.0)
+
+
 @pytest.mark.parametrize("flag", ("", '<flag spring="disable" damper="disable" actuation="disable"/>'))
 def test_time_passes_as_ever_where_sensors_are_delayed(flag: str) -> None:
     xml = (

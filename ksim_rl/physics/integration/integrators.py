@@ -22,15 +22,15 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from ksim_rl.physics import kernels
+from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.actuators.disabled_actuators import still_activations
 from ksim_rl.physics.integration.full_rows import full_rows_matter, implicit_with_full_rows
 from ksim_rl.physics.integration.runge_kutta import mended_runge_kutta
 
 _KINDS = mjw.IntegratorType
 _IMPLICIT = (_KINDS.IMPLICIT, _KINDS.IMPLICITFAST)
-# What is read of the last substep, and computed once more where trees may sleep, and by each stage of Runge-Kutta. C
-# shows the other readings of the last stage.
+# What is read of the last substep, and computed once more where trees may sleep, and by each stage of Runge-Kutta: that
+# keeps the other readings of its last stage itself.
 FORCES_OF_STAGES = ("cacc", "cfrc_int")
 READ_ONCE = ("actuator_velocity", "qfrc_passive", *FORCES_OF_STAGES)
 _DAMPING_FIELDS = (
@@ -55,12 +55,15 @@ def integrator(
         integrate = _implicit(mj_model, warp_model, warp_data_E)
     else:
         integrate = _explicit(warp_model, warp_data_E, mend)
+    if warp_model.opt.integrator == _KINDS.RK4:
+        kept = FORCES_OF_STAGES
+        if warp_model.na > 0 and warp_model.has_actuator_dcmotor:
+            # C integrates activations of such motors by velocities of the start, and leaves these.
+            kept = (*kept, "actuator_velocity")
+        integrate = _keeping_readings(integrate, warp_data_E, kept)
     # Where trees may sleep, MuJoCo Warp computes some readings once more after the step.
-    opt = warp_model.opt
-    if opt.enableflags & mjw.EnableBit.SLEEP and not opt.disableflags & mjw.DisableBit.ISLAND:
+    elif upstream.may_sleep(warp_model):
         integrate = _keeping_readings(integrate, warp_data_E, READ_ONCE)
-    elif opt.integrator == _KINDS.RK4:
-        integrate = _keeping_readings(integrate, warp_data_E, FORCES_OF_STAGES)
     # MuJoCo Warp moves activations of disabled actuators; C does not.
     columns = still_activations(mj_model)
     if columns.size == 0:

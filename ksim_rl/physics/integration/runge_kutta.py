@@ -7,11 +7,13 @@ from typing import Any
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.physics import kernels
+from ksim_rl.physics import kernels, upstream
 from ksim_rl.physics.actuators.disabled_actuators import SWITCHED_OFF
 
 # When the stages after the first are, in timesteps from the beginning of the step.
 STAGE_TIMES = (0.5, 0.5, 1.0)
+# Where trees may sleep, MuJoCo Warp computes these once more, of the state that it reached.
+READINGS = ("actuator_velocity", "qfrc_passive")
 
 
 def hook_after_rows(warp_model: mjw.Model) -> str:
@@ -33,8 +35,8 @@ def mended_runge_kutta(
     """Return a launcher of `mjw.rungekutta4`, and `mend` after the rows of each of its stages.
 
     Rows that tie bodies are made a second time, when the velocities belong to the stage and not to the one before.
-    It leaves the `act_dot` of the last stage, as C does, and not the mean of all four, and delayed controls are those
-    of the stage's own time.
+    It leaves the readings and the `act_dot` of the last stage, as C does, and not the mean of all four rates, and
+    delayed controls are those of the stage's own time.
     """
     d = warp_data_E
     # Whether actuation is on: a disabled one calls no callback of controls.
@@ -47,6 +49,10 @@ def mended_runge_kutta(
     hook = hook_after_rows(warp_model)
     if mends:
         hooks.setdefault(hook, []).extend(mends)
+    readings = _LastReadings(warp_data_E)
+    may_sleep = upstream.may_sleep(warp_model)
+    if may_sleep:
+        hooks.setdefault(hook, []).append(readings.take)
     keeps_rate = acts and warp_model.na > 0
     last_rate_E = wp.zeros_like(d.act_dot)
     if keeps_rate:
@@ -66,11 +72,14 @@ def mended_runge_kutta(
 
     def launch(substep_warp_model: mjw.Model) -> None:
         clock.start()
+        readings.start()
         # Hooks are set for this call alone, so that the program's own callbacks stay visible.
         callback = _with_hooks(substep_warp_model.callback, hooks)
         mjw.rungekutta4(dataclasses.replace(substep_warp_model, callback=callback, **changes), d)
         if keeps_rate:
             wp.copy(d.act_dot, last_rate_E)
+        if may_sleep:
+            readings.put_back()
         if not acts:
             # C does not compute it then.
             d.actuator_velocity.zero_()
@@ -93,6 +102,37 @@ def _idle_actuators(warp_model: mjw.Model) -> dict[str, Any]:
         "tendon_actfrclimited": wp.zeros_like(m.tendon_actfrclimited),
         "jnt_actgravcomp": wp.zeros_like(m.jnt_actgravcomp),
     }
+
+
+class _LastReadings:
+    """What the last stage of Runge-Kutta read of velocities and passive forces."""
+
+    def __init__(self, warp_data_E: mjw.Data) -> None:
+        self._arrays: list[wp.array] = []
+        self._kept: list[wp.array] = []
+        for name in READINGS:
+            array = vars(warp_data_E)[name]
+            self._arrays.append(array)
+            self._kept.append(wp.empty_like(array))
+        self._stage = 0
+
+    def start(self) -> None:
+        """Await the first stage."""
+        self._stage = 0
+
+    def take(self) -> None:
+        """Launch copies of the readings, while a stage goes on."""
+        self._stage += 1
+        # A fourth call follows, with the readings of the state that was reached.
+        if self._stage > len(STAGE_TIMES):
+            return
+        for array, kept in zip(self._arrays, self._kept, strict=True):
+            wp.copy(kept, array)
+
+    def put_back(self) -> None:
+        """Launch copies of what was taken last."""
+        for array, kept in zip(self._arrays, self._kept, strict=True):
+            wp.copy(array, kept)
 
 
 class _StageClock:
