@@ -12,7 +12,7 @@ from ksim_rl.transforms import upstream
 def side_by_side(values: Sequence[Shaped[Tensor, "*?leaf"]], num_rows: int) -> Shaped[Tensor, "E L"]:
     """Return values [E, ...] as the columns of one tensor [E, L], without a copy where they are that already.
 
-    So what one transform has split, the next one need not join. The result may share memory with the values.
+    So values that one transform has split, the next one need not join. The result may share memory with the values.
     """
     vectors = [
         value if value.ndim == 2 and value.shape[0] == num_rows else value.reshape(num_rows, -1)
@@ -28,16 +28,19 @@ def side_by_side(values: Sequence[Shaped[Tensor, "*?leaf"]], num_rows: int) -> S
 
 def _whole(vectors: list[Tensor]) -> Tensor | None:
     """Return the tensor whose columns, all of them and in this order, the vectors are; None if there is none."""
+    # Vectors that were split from one tensor are still columns of it.
     owner = upstream.base_of(vectors[0])
     if owner is None:
         return None
     width = vectors[0].stride(0)
+    # Each must begin where the one before it ends, in rows of the same width.
     offset = 0
     for vector in vectors:
         placed = upstream.base_of(vector) is owner and vector.storage_offset() == offset
         if not placed or vector.dtype != owner.dtype or vector.stride() != (width, 1):
             return None
         offset += vector.shape[1]
+    # All columns of the owner, and nothing else.
     if offset != width or owner.numel() != vectors[0].shape[0] * width or not owner.is_contiguous():
         return None
     return owner.view(-1, width)
@@ -49,6 +52,7 @@ def split(
     """Return views of the columns in the shapes of these values, which `side_by_side` has joined."""
     if len(likes) == 1:
         return [joined_EL if joined_EL.shape == likes[0].shape else joined_EL.reshape(likes[0].shape)]
+    # At least 1, as there may be no rows.
     sizes = [like.numel() // max(joined_EL.shape[0], 1) for like in likes]
     parts = joined_EL.split(sizes, dim=1)
     return [

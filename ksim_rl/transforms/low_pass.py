@@ -12,7 +12,7 @@ from ksim_rl.transforms.row_transform import Keys, RowTransform, checked_action
 
 
 def smoothing(cutoff_hz: float, step_s: float) -> float:
-    """Return alpha, what a filter of that cut-off takes of the way to a constant input in a step of `step_s`."""
+    """Return alpha, the share of the way to a constant input that such a filter goes in a step of `step_s`."""
     return 1.0 - math.exp(-2.0 * math.pi * cutoff_hz * step_s)
 
 
@@ -51,6 +51,7 @@ class ActionLowPass(RowTransform):
         return action_spec
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
+        # Only marked here: the first action is not known before the first step.
         self.fresh_E.logical_or_(mask_E)
         return tensordict_reset
 
@@ -61,12 +62,14 @@ class ActionLowPass(RowTransform):
             action = checked_action(tensordict, out_key, filtered_E.shape[1:], filtered_E.dtype)
             action_E = action.reshape(filtered_E.shape)
             fresh_E = self.fresh_E.reshape(-1, *[1] * (action_E.ndim - 1))
+            # A fresh filter that begins at the action lets it through unchanged.
             if self.initial is None:
                 before_E = action_E
             else:
                 before_E = self.initial
             filtered_E.copy_(torch.where(fresh_E, before_E, filtered_E)).lerp_(action_E, self.alpha)
-            # In memory of its own: the kept one changes in place.
+            # A copy: the kept one changes in place.
             tensordict.set(key, filtered_E.clone().reshape(action.shape))
+        # After all keys, which share the flags.
         self.fresh_E.zero_()
         return tensordict

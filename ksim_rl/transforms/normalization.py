@@ -1,4 +1,4 @@
-"""Observations are normalized by what has been observed so far by the transform of this module."""
+"""Observations are normalized by running statistics, by the transform of this module."""
 
 from copy import deepcopy
 from typing import Self
@@ -49,6 +49,7 @@ class ObservationNormalization(RowTransform):
         super().__init__(in_keys, out_keys)
         self.eps = eps
         self.until = until
+        # The host has to know whether ranks merge in this step, as all of them have to call a collective.
         self._wanted = self._collective = enabled
         self.moments = nn.ModuleList()
         self.register_buffer("updating", torch.tensor(enabled), persistent=False)
@@ -60,7 +61,7 @@ class ObservationNormalization(RowTransform):
         return self
 
     def train(self, mode: bool = True) -> Self:
-        """Follow the mode of the env: statistics are those of training."""
+        """Follow the mode of the env: statistics are taken in training only."""
         super().train(mode)
         if upstream.is_in_env(self):
             self._collective = self._wanted and mode
@@ -68,7 +69,7 @@ class ObservationNormalization(RowTransform):
         return self
 
     def clone(self) -> Self:
-        """Copy with statistics of its own."""
+        """Copy, statistics included."""
         copy = super().clone()
         copy._modules = {**self._modules, "moments": deepcopy(self.moments)}
         return copy
@@ -85,6 +86,7 @@ class ObservationNormalization(RowTransform):
         return observation_spec
 
     def _size_moments(self, sizes: list[int], device: Device) -> None:
+        # Statistics of the same sizes are kept: specs are made more than once.
         if [moments.dim for moments in self._each_moments()] != sizes:
             self.moments = nn.ModuleList(RunningMoments(n, until=self.until, device=device) for n in sizes)
 
@@ -93,6 +95,7 @@ class ObservationNormalization(RowTransform):
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         for values_EL, moments in self._flat(tensordict_reset, self.num_rows):
+            # Counted before they are normalized, so that the first observation has statistics, too.
             moments.count_rows(values_EL, mask_E & self.updating)
         # Ranks reset at different times, so they cannot merge here.
         if ranks.size() == 1:
@@ -124,6 +127,7 @@ class ObservationNormalization(RowTransform):
             self.out_keys, self.in_keys, self._flat(tensordict, num_rows), strict=True
         ):
             value = tensordict.get(key)
+            # Statistics are float64; the leaf keeps its dtype.
             normalized_EL = moments.normalized(values_EL, self.eps)
             tensordict.set(out_key, normalized_EL.reshape(value.shape).to(value.dtype))
         return tensordict

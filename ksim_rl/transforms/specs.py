@@ -41,6 +41,7 @@ def set_leaf_spec(observation_spec: Composite, key: NestedKey, spec: TensorSpec)
     path = path_of(key)
     parent = observation_spec
     for name in path[:-1]:
+        # Nested keys may be new: the nodes above them are made as they are needed.
         if name not in parent:
             parent[name] = Composite(shape=parent.shape, device=parent.device)  # pyright: ignore[reportArgumentType]
         parent = parent[name]
@@ -57,12 +58,14 @@ def drop_leaf(tree: Composite | TensorDictBase, key: NestedKey) -> None:
     del tree[key]
     if isinstance(key, tuple) and len(key) > 1:
         above = key[:-1] if len(key) > 2 else key[0]
+        # An empty node would be seen as an observation without leaves.
         if not list(tree[above].keys(True, True)):  # pyright: ignore[reportAttributeAccessIssue]
             drop_leaf(tree, above)
 
 
 def bounds(spec: TensorSpec) -> tuple[Num[Tensor, "*leaf"], Num[Tensor, "*leaf"]]:
     """Return (low, high) in the spec's shape; infinite where the spec has none."""
+    # Copies, since specs share the memory of their bounds.
     if isinstance(spec, Bounded):
         space: Any = spec.space
         return space.low.expand(spec.shape).clone(), space.high.expand(spec.shape).clone()
@@ -74,6 +77,7 @@ def bounded(
     low: Num[Tensor, "*leaf"], high: Num[Tensor, "*leaf"], *, dtype: torch.dtype, device: Device
 ) -> TensorSpec:
     """Return a `Bounded` spec, or `Unbounded` where no element has a bound."""
+    # Specs are made before the first step, where reading the device does no harm.
     if bool(torch.isinf(low).all()) and bool(torch.isinf(high).all()):
         return Unbounded(shape=low.shape, dtype=dtype, device=device)
     return Bounded(low=low.to(dtype), high=high.to(dtype), shape=low.shape, dtype=dtype, device=device)

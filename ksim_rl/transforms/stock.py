@@ -71,7 +71,7 @@ REFUSED = {name: reason for reason, names in _BY_REASON.items() for name in name
 
 
 def check(transform: type[Transform]) -> None:
-    """Refuse what is TorchRL's and not in `DATA`, with the reason."""
+    """Refuse transforms of TorchRL that are not in `DATA`, with the reason."""
     name = transform.__name__
     if transform.__module__.split(".")[0] == PACKAGE and name not in DATA:
         reason = REFUSED.get(name, "it is not in the list of those that are data")

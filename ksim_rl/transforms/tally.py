@@ -6,7 +6,7 @@ from torch import Tensor
 from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator
 
 _ARGUMENTS = arguments_of((int, "rows"), (ADDRESS, "mask reward total step total_out step_out"))
-# Parameters are what the CPU's compiler believes not to overlap, so that loops become vector instructions.
+# The CPU's compiler takes parameters not to overlap, so that loops become vector instructions.
 _quick_tally = QuickLaunch(
     _ARGUMENTS,
     r"""
@@ -42,6 +42,7 @@ def _tally(
     `step_E` (int64) and `total_E` (float32) are changed in place, one number per env; copies of both are returned.
     `reward_E`, float32, is None for a reset, and `mask_E`, bool [E], for a step.
     """
+    # The kernel reads rewards by address, one after the other.
     if reward_E is not None:
         reward_E = reward_E.contiguous()
     step_out_E = torch.empty_like(step_E)
@@ -63,7 +64,7 @@ def _tally(
 def _tally_in_torch(
     step_E: Tensor, total_E: Tensor, reward_E: Tensor | None, mask_E: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Do what the kernel does."""
+    """Do the work of the kernel in torch."""
     if mask_E is not None:
         step_E.masked_fill_(mask_E.view_as(step_E), 0)
         total_E.masked_fill_(mask_E.view_as(total_E), 0.0)

@@ -37,6 +37,7 @@ class TransformCfg(OwnTree):
             raise ValueError(f"{transform!r}: expected a class of transforms, with its arguments beside it")
         stock.check(transform)
         parameters = _parameters(transform)
+        # An unknown name is refused with the near ones.
         for name in arguments:
             _annotation(transform, name, name)
         missing = [
@@ -48,16 +49,18 @@ class TransformCfg(OwnTree):
         for name, value in arguments.items():
             _check_data(name, value)
         self.transform = transform
+        # Defaults included, so that a saved config does not change with the defaults of a later version.
         self.arguments = {
             name: _listed(arguments.get(name, default), annotation)
             for name, (annotation, default) in parameters.items()
         }
-        # Built once to try: what the class refuses shows before anything compiles.
+        # Built once to try: a refusal of the class shows before anything compiles.
         self.build()
 
     def build(self, name: str | None = None) -> Transform:
         """Return a new transform; with a name it draws from a stream of that name, unless its arguments give one."""
         arguments = self.arguments
+        # Named streams: two transforms of one class with the same keys draw differently.
         if name is not None and "stream" in arguments and arguments["stream"] is None:
             arguments = {**arguments, "stream": f"transforms.{name}"}
         with naming(self.transform.__name__, TypeError, KeyError, RuntimeError, ImportError):
@@ -71,7 +74,7 @@ class TransformCfg(OwnTree):
 
     @classmethod
     def from_tree(cls, tree: Any, path: str) -> Self:
-        """Build the description of a node; a ValueError names the full path of what is wrong."""
+        """Build the description of a node; a ValueError names the full path of the fault."""
         if isinstance(tree, cls):
             return tree
         if not isinstance(tree, Mapping) or TARGET not in tree:
@@ -112,7 +115,7 @@ def _is_transform(value: Any) -> bool:
 @functools.cache
 def _parameters(transform: type[Transform]) -> dict[str, tuple[Any, Any]]:
     """Return annotation and default of each argument that can be given by name."""
-    # Not that of the class, which for some of TorchRL's is that of `__new__`.
+    # Not the class's signature, which for some of TorchRL's classes comes from `__new__`.
     _self, *parameters = inspect.signature(transform.__init__).parameters.values()
     try:
         hints = typing.get_type_hints(transform.__init__)
@@ -133,7 +136,8 @@ def _annotation(transform: type[Transform], name: str, where: str) -> Any:
 
 
 def _as_data(annotation: Any) -> Any:
-    """Return what of an annotation a config can give: all of it but tensors, functions and the like; else `Any`."""
+    """Return the part of an annotation that a config can give: no tensors, functions and the like; else `Any`."""
+    # Both spellings of a union, `Union[A, B]` and `A | B`.
     is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     options = [
         option for option in (typing.get_args(annotation) if is_union else (annotation,)) if _is_data(option)
@@ -150,6 +154,7 @@ def _listed(value: Any, annotation: Any) -> Any:
         typing.get_origin(option) in (Sequence, list) and NestedKey in typing.get_args(option)
         for option in options
     )
+    # A tuple is one nested key, and must not be read as a list of several.
     if takes_keys and isinstance(value, tuple):
         return [value]
     return value
@@ -165,7 +170,7 @@ def _is_data(option: Any) -> bool:
 
 
 def _check_data(name: str, value: Any) -> None:
-    """Refuse what a config file could not hold."""
+    """Refuse values that a config file could not hold."""
     if isinstance(value, Mapping):
         for key, entry in value.items():
             if not isinstance(key, str):

@@ -17,7 +17,7 @@ from torchrl.envs.transforms import Transform
 
 
 def base_of(view: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*base"] | None:
-    """Return the tensor that a view shows, None for what is no view: values side by side need not be copied again."""
+    """Return the tensor that a view shows, None if it is no view: values side by side need not be copied again."""
     return view._base
 
 
@@ -65,7 +65,7 @@ class _SetSeed:
 def hear_seeds(env: EnvBase | None, seed_transforms: Callable[[TransformedEnv, int], None]) -> None:
     """Let `env.set_seed` seed the transforms of an env: `TransformedEnv.set_seed` passes seeds to the base env alone.
 
-    The method of that one env is covered; a class with a `set_seed` of its own keeps it.
+    The method of that one env is covered; a class that defines `set_seed` keeps it.
     """
     if isinstance(env, TransformedEnv) and type(env).set_seed is TransformedEnv.set_seed:
         vars(env).setdefault("set_seed", _SetSeed(env, seed_transforms))
@@ -76,7 +76,7 @@ _generator_of_worker = torch.Generator()
 
 
 def fresh_seed() -> int:
-    """Return a seed for what nobody has seeded: drawn from torch's default generator, and told apart by the process.
+    """Return a seed for transforms without one: drawn from torch's default generator, and told apart by the process.
 
     Forked workers share the state that their parent's generator had. Spawned ones know nothing of it, and torch begins
     anywhere there: unless they call `torch.manual_seed` themselves, they draw from a generator that begins at the same
@@ -85,8 +85,10 @@ def fresh_seed() -> int:
     """
     process = multiprocessing.current_process()
     given = vars(process).get("_kwargs", {})
+    # TorchRL's workers have different names for their number.
     told = [given[name] for name in ("worker_idx", "idx") if given.get(name) is not None]
     place = (*process._identity[:-1], *(told[:1] or process._identity[-1:]))
+    # Forked workers share the generator's state, and differ by their place only.
     is_forked = not place or type(process).__name__ == "ForkProcess"
     if is_forked or torch.initial_seed() != _SEED_AT_IMPORT:
         generator = None

@@ -63,7 +63,7 @@ class ObservationGroupCfg(Checked):
     """A vector made of terms, concatenated in order; or one image, which stays one.
 
     The env writes the clean reading to `("obs", name)`; `keep_terms` also writes each term, as it stands in the vector,
-    to `("<group>_terms", name)`. `delay` and `history` are for the terms that have none of their own; those share one
+    to `("<group>_terms", name)`. `delay` and `history` are for the terms that define none; these share one
     lag. A history with `flat=False` stacks the last vectors to [E, N, L]. `enable_noise=False` leaves out all noise.
     """
 
@@ -96,7 +96,7 @@ class ObservationGroupCfg(Checked):
 
 
 def history_cfg(history: int | HistoryCfg | None) -> HistoryCfg | None:
-    """Return what a history is in full, or None where it is the present frame alone."""
+    """Return the full config of a history, or None where it is the present frame only."""
     if history is None:
         return None
     try:
@@ -106,6 +106,7 @@ def history_cfg(history: int | HistoryCfg | None) -> HistoryCfg | None:
             cfg = HistoryCfg(length=history)
     except ValueError as error:
         raise ValueError(f"history.{error}") from None
+    # One flat frame is the observation itself.
     if cfg.length > 1 or not cfg.flat:
         return cfg
     return None
@@ -126,6 +127,7 @@ def compile_groups(
     images: list[Transform] = []
     drop: list[NestedKey] = []
     for group, cfg in groups.items():
+        # Per group: first the chains of single terms, then the vector of all of them.
         terms = {name: _completed(term, cfg) for name, term in cfg.terms.items()}
         chained = {name: term for name, term in terms.items() if _has_chain(term)}
         transforms += _chain(group, cfg, chained)
@@ -141,13 +143,16 @@ def compile_groups(
         keys: list[NestedKey] = [
             _term_key(group, name) if name in chained else ("obs", name) for name in terms
         ]
+        # Stacked histories are of whole vectors, so they come after all groups are made.
         frames = history_cfg(cfg.history)
         if frames is not None and not frames.flat:
             stacked.append(ObservationHistory([group], [group], **vars(frames)))
+        # An image is the group's only term, and only takes the group's name.
         if any(term.is_image for term in terms.values()):
             images.append(RenameTransform(keys, [group], create_copy=bool(plain) or cfg.keep_terms))
             continue
         vectors[group] = keys
+        # The steps of a chain are no observations of the env, unless they are asked for.
         if not cfg.keep_terms:
             drop += [_term_key(group, name) for name in chained]
     transforms += images
@@ -160,7 +165,7 @@ def compile_groups(
 
 
 def _completed(term: ObservationTermCfg, group: ObservationGroupCfg) -> ObservationTermCfg:
-    """Return the term with what the group decides for it."""
+    """Return the term with the settings that its group decides."""
     frames = history_cfg(group.history)
     return dataclasses.replace(
         term,
@@ -175,6 +180,7 @@ def _chain(group: str, cfg: ObservationGroupCfg, terms: Mapping[str, Observation
     transforms: list[Transform] = []
     current: dict[str, NestedKey] = {name: ("obs", name) for name in terms}
 
+    # Each stage reads a term where the last one has left it, and writes to the term's own key.
     def advance(names: list[str]) -> tuple[list[NestedKey], list[NestedKey]]:
         in_keys = [current[name] for name in names]
         current.update({name: _term_key(group, name) for name in names})
@@ -185,6 +191,7 @@ def _chain(group: str, cfg: ObservationGroupCfg, terms: Mapping[str, Observation
         transforms.append(ObservationNoise(*advance(list(noisy)), noise=list(noisy.values())))
     makers: dict[str, tuple[Any, Any]] = {"clip": (ObservationClip, None), "scale": (ObservationScale, 1.0)}
     for field, (make, neutral) in makers.items():
+        # Terms with the same stage share one transform, which saves launches.
         given = {name: value for name, term in terms.items() if (value := getattr(term, field)) != neutral}
         if given:
             in_keys, out_keys = advance(list(given))
@@ -192,11 +199,13 @@ def _chain(group: str, cfg: ObservationGroupCfg, terms: Mapping[str, Observation
             transforms.append(make(in_keys, out_keys, **{field: by_key}))
     for name, term in terms.items():
         if term.delay is not None and cfg.terms[name].delay is not None:
-            # One transform per term: each sensor has a lag of its own.
+            # One transform per term: each sensor has its own lag.
             transforms.append(ObservationDelay(*advance([name]), delay=term.delay))
+    # Terms without their own delay share one lag, as signals that come by one bus do.
     sharing = [name for name in terms if cfg.terms[name].delay is None]
     if cfg.delay is not None and sharing:
         transforms.append(ObservationDelay(*advance(sharing), delay=cfg.delay))
+    # Histories of the same length and stride share one ring.
     by_frames: dict[HistoryCfg, list[str]] = {}
     for name, term in terms.items():
         if (frames := history_cfg(term.history)) is not None:

@@ -30,6 +30,7 @@ class GroupSpec:
 
     def slice(self, term: NestedKey) -> slice:
         """Return the columns of `term`, given by its key or by the last part of it."""
+        # The whole key first: its last part may be the name of several terms.
         found = [i for i, key in enumerate(self.terms) if key == term] or [
             i for i, key in enumerate(self.terms) if last_name(key) == term
         ]
@@ -72,6 +73,7 @@ class ObservationGroups(CheckedKeys):
         for name, terms in self.groups.items():
             if not terms or len(set(terms)) != len(terms):
                 raise ValueError(f"groups[{name!r}]={terms}: expected one or more distinct terms")
+        # A term may be in several groups, but is read once.
         every = list(dict.fromkeys(term for terms in self.groups.values() for term in terms))
         super().__init__(every, list(self.groups), is_paired=False)
         if drop is True:
@@ -109,6 +111,7 @@ class ObservationGroups(CheckedKeys):
                 )
             specs = [leaf_spec(observation_spec, term, type(self).__name__) for term in terms]
             vectors[name] = self._vector_spec(specs, batch_size, observation_spec.device)
+            # Vectors can be concatenated as they are; other shapes are flattened in each step.
             if all(spec.ndim == len(batch_size) + 1 for spec in specs):
                 self._concatenable.add(name)
             else:
@@ -165,6 +168,7 @@ def group_specs(env: EnvBase) -> dict[NestedKey, GroupSpec]:
     assert env.output_spec is not None  # making the specs is what counts the columns
     found: dict[NestedKey, GroupSpec] = {}
     for groups in held_transforms(env, ObservationGroups):
+        # Transforms of outer envs come first, and hide groups of the same name inside.
         found = groups.group_specs | found
     return found
 

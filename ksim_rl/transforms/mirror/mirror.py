@@ -70,6 +70,7 @@ def image(
 
 @functools.lru_cache(maxsize=256)
 def _tensors(mirror: MirrorMap, device: Device) -> tuple[Tensor | None, Tensor]:
+    # Without a move the image is one product: a gather would copy the vector first.
     moves = mirror.source != tuple(range(mirror.size))
     if moves:
         source_L = torch.tensor(mirror.source, device=device)
@@ -136,7 +137,7 @@ class Mirror(KeyedTransform):
         self._register_rows("mirrored_E")
         self.maps = dict(maps)
         self.probability = probability
-        # Buffers rather than the maps' own tensors: compiled code would make those anew in each step.
+        # Buffers rather than the maps' own tensors: compiled code would make the latter again in each step.
         for index, key in enumerate([*keys, *keys_inv]):
             for name, tensor in zip(("source", "signs"), self.maps[key].tensors(None), strict=True):
                 held = None if tensor is None else tensor.clone()
@@ -151,6 +152,7 @@ class Mirror(KeyedTransform):
     def _widened(self, index: int, spec: TensorSpec) -> TensorSpec:
         plain = bounds(spec)
         other = self._image(self.in_keys[index], bounds(spec), self.batch_dims[index])
+        # The policy sees either, so that the bounds have to hold both.
         low = torch.minimum(plain[0], other[0])
         high = torch.maximum(plain[1], other[1])
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
@@ -163,6 +165,7 @@ class Mirror(KeyedTransform):
         key = self.in_keys_inv[index]
         plain = bounds(spec)
         other = self._image(key, bounds(spec), self.batch_dims_inv[index])
+        # An action has to be allowed as it is and in the mirror.
         low = torch.maximum(plain[0], other[0])
         high = torch.minimum(plain[1], other[1])
         if bool((low > high).any()):
@@ -176,9 +179,11 @@ class Mirror(KeyedTransform):
         if leaf[-1:] != (self.maps[key].size,):
             raise ValueError(f"the map of {key!r} has {self.maps[key].size} columns for shape {tuple(leaf)}")
         images = [self.maps[key](end) for end in ends]
+        # A sign of -1 turns low and high around.
         return torch.minimum(*images), torch.maximum(*images)
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
+        # Drawn for all rows, taken where an episode begins: no size depends on the mask.
         drawn_E = random.uniform(self._reset_keys("reset/mirrored"), 1)[:, 0] < self.probability
         self.mirrored_E.copy_(torch.where(mask_E, drawn_E, self.mirrored_E))
         return self._call(tensordict_reset)
@@ -193,11 +198,13 @@ class Mirror(KeyedTransform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
         pairs = zip(self.in_keys_inv, self.out_keys_inv, strict=True)
+        # Buffers of actions are numbered after those of observations.
         for index, (key, out_key) in enumerate(pairs, start=len(self.in_keys)):
             tensordict.set(key, self._seen(index, tensordict.get(out_key), tensordict.batch_size))
         return tensordict
 
     def _seen(self, index: int, value: Tensor, batch_size: torch.Size) -> Tensor:
+        # One flag per env, broadcast over the dims of the leaf.
         mirrored_E = self.mirrored_E.reshape(*batch_size, *[1] * (value.ndim - len(batch_size)))
         source_L = getattr(self, f"source_{index}")
         signs_L = getattr(self, f"signs_{index}")
@@ -215,6 +222,7 @@ def mirrored(tensordict: TensorDictBase, maps: Mapping[NestedKey, MirrorMap]) ->
     reflected = tensordict.clone(recurse=False)
     for key, mirror in maps.items():
         path = path_of(key)
+        # Observations after the step are mirrored like those before it.
         places = [place for place in (path, ("next", *path)) if tensordict.get(place, None) is not None]
         if not places:
             raise KeyError(f"maps: the batch has no {key!r}")

@@ -30,6 +30,7 @@ def mirror_name(name: str, names: Sequence[str]) -> str:
     capitals of which the second is L or R, where that gives another of `names`. Raises ValueError where a name has a
     side and `names` has no counterpart, or more than one.
     """
+    # Words that are no side stand for themselves; a side may have several counterparts.
     words = _WORDS.findall(name)
     images = [
         "".join(image) for image in itertools.product(*[_counterparts(word) or [word] for word in words])
@@ -53,6 +54,7 @@ def mirror_name(name: str, names: Sequence[str]) -> str:
 def _counterparts(word: str) -> list[str]:
     swapped = [b for a, b in _SIDES.items() if a == word.lower()]
     swapped += [a for a, b in _SIDES.items() if b == word.lower()]
+    # The counterpart is written in the same case.
     if word.isupper():
         return [other.upper() for other in swapped]
     if word[0].isupper():
@@ -68,6 +70,7 @@ def mirror_by_name(names: Sequence[str], each: MirrorMap | None = None) -> Mirro
     """
     if each is None:
         each = MirrorMap(source=(0,))
+    # Block i of the image is the block of the counterpart of name i.
     blocks = [list(names).index(mirror_name(name, names)) for name in names]
     return MirrorMap(
         source=tuple(block * each.size + column for block in blocks for column in each.source),
@@ -87,6 +90,7 @@ def mirror_joints(mj_model: "mujoco.MjModel", joints: Sequence[str] | None = Non
     import mujoco
 
     data = mujoco.MjData(mj_model)
+    # Axes and anchors are compared in the world frame, at the pose that the model is drawn in.
     data.qpos[:] = mj_model.qpos0
     mujoco.mj_kinematics(mj_model, data)
     hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -116,6 +120,7 @@ def _sign(mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: 
     else:
         handed = 1.0
     agreement = float(handed * reflection * data.xaxis[joint] @ data.xaxis[other])
+    # Anchors may differ by 2 percent of the robot's size, and axes by a thousandth.
     extent = max(float(mj_model.stat.extent), _TOLERANCE)
     differs = mj_model.jnt_type[joint] != mj_model.jnt_type[other] or abs(abs(agreement) - 1) > _TOLERANCE
     if differs or apart > 0.02 * extent:
@@ -127,7 +132,7 @@ def _sign(mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: 
 
 
 def mirror_group(group: GroupSpec, terms: Mapping[NestedKey, MirrorMap]) -> MirrorMap:
-    """Return the map of a group vector from those of its terms, by key of the term or by the last part of it.
+    """Return the map of a group vector from the maps of its terms, by key of the term or by the last part of it.
 
     A flat history repeats its term's. Raises ValueError where a term has no map, or one whose size does not divide it.
     """
@@ -142,5 +147,6 @@ def mirror_group(group: GroupSpec, terms: Mapping[NestedKey, MirrorMap]) -> Mirr
             raise ValueError(
                 f"term {key!r} has {size} columns, and its mirror map {mirror.size}: expected a multiple"
             )
+        # A flat history is as many copies of the term as it has frames.
         maps += [mirror] * (size // mirror.size)
     return concatenate(maps)

@@ -14,19 +14,19 @@ NonNegativePerDim = Annotated[PerDim, Within(low=0.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseCfg(Checked, ABC):
-    """What all noise has in common: a sample is offset + spread * draw, which is added or multiplies the observation.
+    """The base of all noise: a sample is offset + spread * draw, which is added or multiplies the observation.
 
     A reading goes through it in this order: bias, walk, the noise itself, resolution, dropout. With `by_level` the
     transform's level (see `FollowsLevel`) scales all of it: a sample s becomes level * s ("multiply": 1 + level *
     (s - 1)), and walk, resolution and dropout are multiplied by the level.
 
     Args:
-        bias: a further noise, drawn at each reset and held for the episode (an encoder's offset), with an operation of
-            its own; it has none of the fields below.
+        bias: a further noise, drawn at each reset and held for the episode (an encoder's offset), with a separate
+            operation; it has none of the fields below.
         walk_std: std of the steps of a random walk that is added (an IMU's drift), one per env step from 0 at a reset.
         resolution: the reading is rounded to a multiple of this; 0 does not round.
-        dropout: chance per env step that the reading is lost, all its elements at once; that of a reset never is.
-        lost: what stands in for a lost reading: "last" is the one of the step before, "zero" is 0.
+        dropout: chance per env step that the reading is lost, all its elements together; a reset's reading never is.
+        lost: replacement of a lost reading: "last" is the one of the step before, "zero" is 0.
     """
 
     is_gaussian: ClassVar[bool] = False
@@ -43,6 +43,7 @@ class NoiseCfg(Checked, ABC):
     def _check_fields(self) -> None:
         super()._check_fields()
         if self.bias is not None:
+            # A bias is one draw per episode: features that change from step to step have no meaning for it.
             for field in ("bias", "walk_std", "resolution", "dropout", "by_level"):
                 if getattr(self.bias, field) not in (None, 0.0):
                     raise ValueError(f"bias={self.bias!r}: a bias has no {field} of its own")
@@ -65,6 +66,7 @@ class UniformNoise(NoiseCfg):
         high = _numbers(self.high)
         if not low or not high or (len(low) != len(high) and 1 not in (len(low), len(high))):
             raise ValueError(f"low has {len(low)} numbers and high has {len(high)}: give as many, or one")
+        # One number stands for all elements: the shorter list repeats.
         width = max(len(low), len(high))
         if any(low[i % len(low)] > high[i % len(high)] for i in range(width)):
             raise ValueError(f"low={self.low!r} exceeds high={self.high!r}")

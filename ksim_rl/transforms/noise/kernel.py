@@ -1,6 +1,6 @@
 """Adds noise to all observations of a transform by one kernel, which is also a torch operator.
 
-Each column's draws are those of `ksim_rl.device.random` at (seed, stream, counter, row, column).
+Each column's draws come from `ksim_rl.device.random` at (seed, stream, counter, row, column).
 """
 
 import torch
@@ -12,11 +12,11 @@ from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments
 from ksim_rl.device.random import DRAWS
 
 GAUSSIAN, MULTIPLY, BIAS_GAUSSIAN, BIAS_MULTIPLY, BY_LEVEL, HOLD = (1 << bit for bit in range(6))
-"""What a column's flags say; the bits above them are the number of its observation."""
+"""The bits of a column's flags; the bits above them are the number of its observation."""
 KEY_SHIFT = 6
 
 HAS_BIAS, HAS_WALK, HAS_RESOLUTION, HAS_DROPOUT, HAS_GAUSSIAN = (1 << bit for bit in range(5))
-"""What any column of the transform has; the common combinations have loops of their own in the kernel."""
+"""Features that at least one column of the transform has; the common combinations have separate loops in the kernel."""
 
 OFFSET, SPREAD, BIAS_OFFSET, BIAS_SPREAD, WALK_STD, RESOLUTION, DROPOUT = range(7)
 """The rows of the table of parameters."""
@@ -70,7 +70,7 @@ def _launch(
 ) -> Tensor:
     """Return the noisy readings of E * L clean ones in any shape, drawn at the counts that the counter reaches.
 
-    A "step" adds 1 to the counter of each row [E], and changes what lasts from step to step: `bias_EL`, `walk_EL` and
+    A "step" adds 1 to the counter of each row [E], and changes the state between steps: `bias_EL`, `walk_EL` and
     `last_EL`, float32, None where no column has it. A "reset" begins the episodes of the masked rows, counts them, and
     returns the others' clean readings. In a "forward", readings are samples, which belong to no episode: the counter []
     stays, and there is no bias, drift or dropout.
@@ -78,11 +78,13 @@ def _launch(
     `table_PL` has the rows `OFFSET`, `SPREAD`, ..., float32; `flags_L` tells the kind of noise of each column, int32.
     `enabled` is bool [], `seed` int64 []; `level`, float32 [], is the strength of the columns with `BY_LEVEL`.
     """
+    # Samples belong to no episode, so that only noise without memory applies.
     if moment == "forward":
         features &= HAS_GAUSSIAN | HAS_RESOLUTION
     clean_EL = clean_EL.contiguous()
     out_EL = torch.empty_like(clean_EL)
     num_columns = flags_L.numel()
+    # At least 1: without columns there are no readings, and no rows.
     num_rows = clean_EL.numel() // max(num_columns, 1)
     device = clean_EL.device
     state = seed, counter, enabled, level, mask_E, table_PL, flags_L
@@ -116,6 +118,7 @@ def _noise_in_torch(
     x_EL = clean_EL.reshape(-1, num_columns)
     num_rows = len(x_EL)
     if mask_E is None:
+        # At a reset only masked rows are noisy; in a step all are.
         begins_E = torch.ones(num_rows, dtype=torch.bool, device=clean_EL.device)
     else:
         begins_E = mask_E.reshape(-1)
@@ -124,11 +127,13 @@ def _noise_in_torch(
     else:
         count = counter.reshape(-1) + 1
     keys = draws.keys_of(seed, stream, count, num_rows=num_rows, first_row=ranks.first_row(num_rows))
+    # Batches of samples are counted by the caller, since one counter serves all rows.
     if moment != "forward":
         counter += begins_E.view_as(counter)
     else:
         features &= HAS_GAUSSIAN | HAS_RESOLUTION
     column_L = torch.arange(num_columns, device=clean_EL.device)
+    # where noise is off; the level scales it for the columns that follow one.
     strength_L = enabled.float() * torch.where(flags_L & BY_LEVEL > 0, level, 1.0)
 
     def keep(state_EL: Tensor | None, new_EL: Tensor) -> None:
@@ -142,6 +147,7 @@ def _noise_in_torch(
         return table_PL[parameter] + table_PL[parameter + 1] * drawn_EL
 
     def applied(x_EL: Tensor, noise_EL: Tensor, multiplies_L: Tensor) -> Tensor:
+        # A multiplier fades to 1, an addition to 0.
         scaled_EL = x_EL * (strength_L * noise_EL + (1.0 - strength_L))
         return torch.where(multiplies_L, scaled_EL, x_EL + strength_L * noise_EL)
 
@@ -150,6 +156,7 @@ def _noise_in_torch(
             keep(bias_EL, sample(BIAS_INDEX, BIAS_OFFSET, flags_L & BIAS_GAUSSIAN > 0))
         x_EL = applied(x_EL, bias_EL.view(num_rows, num_columns), flags_L & BIAS_MULTIPLY > 0)
     if features & HAS_WALK and walk_EL is not None:
+        # A random walk begins at zero with each episode.
         drift_EL = torch.zeros_like(x_EL)
         if moment != "reset":
             steps_EL = draws.normal(draws.bits_of(keys, column_L + WALK_INDEX))
@@ -157,6 +164,7 @@ def _noise_in_torch(
         keep(walk_EL, drift_EL)
         x_EL = x_EL + strength_L * drift_EL
     x_EL = applied(x_EL, sample(0, OFFSET, flags_L & GAUSSIAN > 0), flags_L & MULTIPLY > 0)
+    # Rounded after all noise, as a sensor of that resolution reports it.
     if features & HAS_RESOLUTION:
         step_L = strength_L * table_PL[RESOLUTION]
         x_EL = torch.where(step_L > 0.0, (x_EL / step_L).round() * step_L, x_EL)

@@ -22,7 +22,7 @@ from ksim_rl.transforms.specs import Device, bounded, bounds, multiply_bounds
 class ObservationNoise(FollowsLevel, KeyedTransform):
     """Noise on floating-point observations, drawn once per env step, for the reset observation too.
 
-    Given other `out_keys`, the clean reading stays beside the noisy one (for an asymmetric critic). All keys of one
+    Given other `out_keys`, the clean reading stays as well as the noisy one (for an asymmetric critic). All keys of one
     transform share one kernel, so one transform with many keys is cheaper than many with one.
 
     `env.eval()` turns it off and `env.train()` on again, `enable_` does the same for one transform; both write a device
@@ -54,6 +54,7 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         super().__init__(in_keys, out_keys, seed=seed, stream=stream)
         self._register_rows("step_count_E", "bias_EL", "walk_EL", "last_EL")
         self.noise = _one_per_key(noise, self.in_keys)
+        # The wish of the user, which `train()` restores after an evaluation.
         self._wanted = enabled
         self._layout: tuple[int, list[torch.Size]] | None = None
         self.noise_columns: NoiseColumns | None = None
@@ -67,7 +68,7 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         return self
 
     def seed_(self, seed: int) -> Self:
-        """Set the seed and start the counters anew, in place."""
+        """Set the seed and start the counters again, in place."""
         if self._buffers["step_count_E"] is not None:
             self.step_count_E.zero_()
         return super().seed_(seed)
@@ -75,6 +76,7 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
     def train(self, mode: bool = True) -> Self:
         """Follow the mode of the env: noise is for training only."""
         super().train(mode)
+        # TorchRL calls `eval()` while it attaches a transform, which is no wish to turn noise off.
         if upstream.is_in_env(self):
             self.enabled.fill_(self._wanted and mode)
         return self
@@ -93,6 +95,7 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         return observation_spec
 
     def _size_columns(self, shapes: list[torch.Size], device: Device) -> None:
+        # Specs are made more than once: the state must survive that.
         if self._layout == (self.num_rows, shapes):
             return
         self._layout = (self.num_rows, shapes)
@@ -102,6 +105,7 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         if columns.has(HAS_BIAS):
             present = self._buffers["bias_EL"]
             if present is None or present.shape != shape:
+                # A bias begins neutral: 1 for a factor, 0 for a summand.
                 neutral_L = (columns.flags_L & noise_kernel.BIAS_MULTIPLY != 0).to(torch.float32)
                 self._buffers["bias_EL"] = neutral_L.expand(shape).clone()
         for name, feature in (("walk_EL", HAS_WALK), ("last_EL", HAS_DROPOUT)):
@@ -132,6 +136,7 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         self, tensordict: TensorDictBase, moment: str, counter: Tensor, mask_E: Tensor | None = None
     ) -> TensorDictBase:
         values = [tensordict.get(key) for key in self.in_keys]
+        # One observation needs no joining: the kernel takes it in its own shape.
         clean_EL = values[0]
         if len(values) > 1:
             clean_EL = side_by_side(values, tensordict.numel() if moment == "forward" else self.num_rows)
@@ -166,7 +171,7 @@ def _one_per_key(
 
 
 class NoiseColumns(nn.Module):
-    """Parameters of the noise, column by column, as `noise_kernel` reads them; `features` is what any column has.
+    """Parameters of the noise, column by column, as `noise_kernel` reads them; `features` is the union over columns.
 
     There are as many `cfgs`, `keys` (for errors) and `sizes` (numbers of columns) as observations.
     """
@@ -179,6 +184,7 @@ class NoiseColumns(nn.Module):
     ) -> None:
         super().__init__()
         self.size = sum(sizes)
+        # A row per parameter, a column per element of the observations side by side.
         table = torch.zeros(noise_kernel.NUM_PARAMETERS, self.size)
         flags = torch.zeros(self.size, dtype=torch.int32)
         start = 0
@@ -187,6 +193,7 @@ class NoiseColumns(nn.Module):
             table[:, columns] = torch.tensor(_parameters(cfg, key, size))
             flags[columns] = _flags(cfg) | index << noise_kernel.KEY_SHIFT
             start += size
+        # A feature that no column has is skipped by the kernel for all of them.
         found = {
             noise_kernel.HAS_GAUSSIAN: any(_is_gaussian(cfg) or _is_gaussian(cfg.bias) for cfg in cfgs),
             noise_kernel.HAS_BIAS: any(cfg.bias is not None for cfg in cfgs),
@@ -238,15 +245,19 @@ def widen(
     rows = [
         torch.tensor(row, device=low.device).reshape(shape) for row in _parameters(cfg, key, shape.numel())
     ]
+    # The stages of the reading, in the order of the kernel, each by its extremes.
     ends = low, high
     if cfg.bias is not None:
         ends = _noisy(cfg.bias, rows[noise_kernel.BIAS_OFFSET], rows[noise_kernel.BIAS_SPREAD], ends)
+    # A random walk has no bounds.
     drift = torch.where(rows[noise_kernel.WALK_STD] > 0, torch.inf, 0.0)
     ends = ends[0] - drift, ends[1] + drift
     ends = _noisy(cfg, rows[noise_kernel.OFFSET], rows[noise_kernel.SPREAD], ends)
+    # Rounding moves a reading by half a step at most.
     half = rows[noise_kernel.RESOLUTION] / 2
     lowest = torch.minimum(low, ends[0] - half)
     highest = torch.maximum(high, ends[1] + half)
+    # A lost reading is zero, which may lie outside.
     if cfg.dropout and cfg.lost == "zero":
         lowest = lowest.clamp(max=0.0)
         highest = highest.clamp(min=0.0)
@@ -259,6 +270,7 @@ def _noisy(
     """Return the bounds after a noise of any strength from none to full."""
     low, high = ends
     if cfg.is_gaussian:
+        # A gaussian reaches any number, unless its spread is zero.
         reach = torch.where(spread > 0, torch.inf, 0.0)
         noise = (offset - reach).expand(low.shape), (offset + reach).expand(low.shape)
     else:
