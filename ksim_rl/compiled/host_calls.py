@@ -1,6 +1,6 @@
-"""Finds the calls by which a step asks the host: its clocks, its random numbers, its files and its environment.
+"""Finds the calls by which a step reads the host: its clocks, random numbers, files and environment.
 
-Their answers would become constants of a recording. Code of libraries may ask for purposes of its own.
+Their answers would become constants of a recording. Code of libraries may read the host for its own purposes.
 """
 
 import datetime
@@ -50,7 +50,7 @@ ENVIRONMENT = "an environment variable"
 
 @dataclass(frozen=True, kw_only=True)
 class HostCall:
-    """A call of `name`, which asks for `what`, from the code at `place`, which ran as a part of the env (or none)."""
+    """A call of `name`, which asks for `what`, from the code at `place`, in a `part` of the env (or "")."""
 
     what: str
     name: str
@@ -58,7 +58,7 @@ class HostCall:
     part: str
 
     def __str__(self) -> str:
-        """Say who asks for what, and where."""
+        """Return a text that names the caller, the request and the place."""
         return f"{self.part or 'the step'} asks for {self.what}, by {self.name} at {self.place}"
 
 
@@ -66,9 +66,10 @@ class HostCall:
 def host_calls(parts: Mapping[str, Any]) -> Iterator[list[HostCall]]:
     """Collect the calls of this block; `parts` are the objects to which they are ascribed, by name.
 
-    Numbers of numpy's own generator are told by its state, since its functions are not seen when they are called.
+    Draws from NumPy's global generator are found by its state, since the profiler does not see calls of its functions.
     """
     tracer = _Tracer(parts)
+    # A profiler of the user, such as cProfile, is put back afterwards.
     before = sys.getprofile()
     sys.setprofile(tracer.notice)
     try:
@@ -84,12 +85,14 @@ class _Tracer:
         self._names = {id(part): name for name, part in parts.items()}
         self._packages = packages_of(parts.values())
         classes = {cls for part in parts.values() for cls in type(part).__mro__}
+        # Code of the parts' methods: cheap to look up at each call, so most calls cost little.
         self._entries = {
             function.__code__
             for cls in classes
             for function in vars(cls).values()
             if inspect.isfunction(function)
         }
+        # The parts that are running, innermost last; a call is ascribed to the last of them.
         self._running: list[tuple[types.FrameType, str]] = []
         self._numpy = _numpy_state()
 
@@ -100,6 +103,7 @@ class _Tracer:
             if asked is not None:
                 self._take(asked, _spelled(function), frame)
         elif event == "call":
+            # `os.environ` is Python code, which no event of C shows.
             if frame.f_code is _ENVIRONMENT:
                 self._take(ENVIRONMENT, "os.environ", frame)
             elif frame.f_code in self._entries:
@@ -114,6 +118,7 @@ class _Tracer:
     def _begin(self, frame: types.FrameType) -> None:
         code = frame.f_code
         if code.co_argcount:
+            # `self`: several parts may be objects of one class.
             owner = frame.f_locals.get(code.co_varnames[0])
         else:
             owner = None
@@ -145,11 +150,13 @@ class _Tracer:
 
     def _take(self, what: str, name: str, frame: types.FrameType | None) -> None:
         # Python's own modules ask for whoever calls them: `random.uniform`, `Path.read_text`.
+        # Up to the first frame outside of the standard library.
         while frame is not None and package_of(_module(frame)) in sys.stdlib_module_names:
             frame = frame.f_back
         if frame is None:
             return
         package = package_of(_module(frame))
+        # Our own code and libraries may look at a clock to measure themselves.
         is_users = package in self._packages or not is_library(package)
         if is_users and package != OURS:
             self._add(HostCall(what=what, name=name, place=_place(frame), part=self._part))
@@ -163,6 +170,7 @@ def _asked(function: Any) -> str | None:
     """Return what a function of C asks the host for, None if nothing."""
     name = getattr(function, "__name__", "")
     owner = getattr(function, "__self__", None)
+    # Functions of modules: `time.time`, `os.listdir`, `open`.
     if isinstance(owner, types.ModuleType):
         module = owner.__name__
         if module == "time" and name in CLOCKS:
@@ -172,6 +180,7 @@ def _asked(function: Any) -> str | None:
         if module == "builtins" and name == "input":
             return FILE
         return None
+    # Methods of classes: `datetime.now`.
     if isinstance(owner, type):
         if issubclass(owner, datetime.date) and name in _DATES:
             return CLOCK

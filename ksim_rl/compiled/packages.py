@@ -1,4 +1,4 @@
-"""Tells the packages of a user from those of libraries, whose code keeps nothing in Python that a step depends on."""
+"""Tells a user's packages from libraries, whose code keeps no Python values that a step depends on."""
 
 import functools
 import importlib.metadata
@@ -23,12 +23,14 @@ def is_library(package: str) -> bool:
 
     A package of the user may be installed as well: who looks has to except those that the user's parts come from.
     """
+    # The cheap tests first: this is asked for each class and function.
     if package == OURS or package in sys.stdlib_module_names:
         return True
     spec = getattr(sys.modules.get(package), "__spec__", None)
     places = [*(getattr(spec, "submodule_search_locations", None) or ()), getattr(spec, "origin", None) or ""]
     if any("site-packages" in place or "dist-packages" in place for place in places):
         return True
+    # Installed elsewhere, such as by `pip install --target`.
     return any(parent in _installed_into() for place in places for parent in Path(place).parents)
 
 
@@ -40,6 +42,7 @@ def _installed_into() -> frozenset[Path]:
     """
     folders: set[Path] = set()
     for distribution in importlib.metadata.distributions():
+        # Installers write this file; a project that is only on the path lacks it.
         if distribution.read_text("INSTALLER") is not None:
             folders.add(Path(str(distribution.locate_file(""))))
     return frozenset(folders)

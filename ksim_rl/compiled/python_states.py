@@ -1,4 +1,4 @@
-"""Tells by plain values where objects stand that change without being replaced: generators, iterators, arrays."""
+"""Describes by plain values the state of objects that change in place: generators, iterators, arrays."""
 
 import random
 import warnings
@@ -31,7 +31,7 @@ PLAIN = (
 
 
 def state_of(source: Any) -> int:
-    """Return a number that tells where a generator of random numbers of Python or numpy stands."""
+    """Return a number that identifies the state of a random generator of Python or NumPy."""
     if isinstance(source, random.Random):
         return hash(source.getstate())
     if isinstance(source, np.random.Generator):
@@ -49,12 +49,13 @@ def _hashable(tree: Any) -> Any:
 
 
 def checksum(array: np.ndarray) -> int:
-    """Return a number that tells what an array holds."""
+    """Return a number that changes with the content of an array."""
     return zlib.crc32(array.tobytes())
 
 
 def place_of(iterator: Any) -> str | None:
-    """Return where an iterator of Python's own stands, None where it does not tell."""
+    """Return the position of one of Python's own iterators, or None where it does not tell."""
+    # Copying iterators of itertools is deprecated since Python 3.12.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         try:
@@ -63,6 +64,7 @@ def place_of(iterator: Any) -> str | None:
             return None
     # What it goes through may be large, and is looked at elsewhere if it can change.
     plain = [argument for argument in arguments if issubclass(type(argument), PLAIN)]
+    # Chains and zips hold other iterators, which have places, too.
     nested = [item for part in arguments if isinstance(part, tuple) for item in part]
     within = [place_of(item) for item in nested if isinstance(item, Iterator)]
     return repr((plain, [item for item in nested if issubclass(type(item), PLAIN)], within))

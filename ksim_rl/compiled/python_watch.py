@@ -1,4 +1,4 @@
-"""Notices that Python values have changed which a recorded step was made from, and names them."""
+"""Notices when Python values change that a recorded step was made from, and names them."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ LONGEST = 60
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Change:
-    """A value that is another one than it was.
+    """A value that has changed.
 
-    `owner` has it under `key`; `names` say where it is, from each part that depends on it.
+    `owner` has it under `key`; `names` are its paths, one from each part that depends on it.
     """
 
     names: tuple[str, ...]
@@ -34,7 +34,7 @@ class Change:
         return isinstance(self.before, Tensor) and isinstance(self.now, Tensor)
 
     def __str__(self) -> str:
-        """Name it, with both values where they can be told apart by what they look like."""
+        """Return its name, with both values where their texts differ."""
         where = " and ".join(self.names[:3])
         if len(self.names) > 3:
             where += f" and {len(self.names) - 3} more"
@@ -49,8 +49,7 @@ class PythonWatch:
     """The Python values that some parts depend on, as they were when it last looked.
 
     Parts are objects by name: terms, transforms, networks. Looking for all values takes some milliseconds; asking
-    whether any of them has changed takes some tens of microseconds, since values that do not change are told by their
-    identity.
+    whether any of them has changed takes some tens of microseconds, since unchanged values are recognized by identity.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -70,6 +69,7 @@ class PythonWatch:
             held = remembered.held
             before = remembered.before
             now = held.read()
+            # Keys that are gone and keys that are new count as changes, too.
             for key in dict.fromkeys((*before, *now)):
                 old = before.get(key, ABSENT)
                 new = now.get(key, ABSENT)
@@ -82,7 +82,7 @@ class PythonWatch:
 
 @dataclass(frozen=True, eq=False)
 class _Remembered:
-    """Values in one place as they were: by key, and in order. `size` is that of the table that all of them are from."""
+    """Values in one place as they were: by key, and in order. `size` is the length of the table that they are from."""
 
     held: Held
     before: dict[Any, Any]
@@ -91,6 +91,7 @@ class _Remembered:
 
     @classmethod
     def of(cls, held: Held) -> "_Remembered":
+        # A copy, as `read` may return the live table.
         before = dict(held.read())
         if held.table is None:
             size = -1
@@ -106,10 +107,12 @@ class _Remembered:
             now = self.held.read()
             # Numbers that are worked out are other objects each time.
             return len(now) == len(self.values) and all(map(_is_same, now.values(), self.values))
+        # The whole table is watched, so its values are compared in order.
         if pick is None:
             return all(map(is_, table.values(), self.values))
         try:
             return all(map(is_, pick(table), self.values))
+        # A name was deleted and another one added.
         except KeyError:
             return False
 
@@ -130,8 +133,10 @@ def _is_same(old: Any, new: Any) -> bool:
     kind = type(old)
     if kind is not type(new):
         return False
+    # A tuple is made again at each reading; its items tell whether it has changed.
     if issubclass(kind, tuple):
         return len(old) == len(new) and all(map(_is_same, old, new))
+    # Only for types that never change: two equal lists may be two lists that change later.
     return issubclass(kind, PLAIN) and bool(old == new)
 
 

@@ -1,8 +1,8 @@
-"""Shows what rounding may do to a result: it moves what is computed by one unit in the last place.
+"""Shows the effect of rounding on a result: it moves computed numbers by one unit in the last place.
 
-A result may be far more sensitive than its size tells: 1 + cos(x) near pi keeps only the last bits of the cosine, which
-another library rounds otherwise. This is the random arithmetic of Vignes, "A stochastic arithmetic for reliable
-scientific computation" (1993), for torch's operators.
+A result may be far more sensitive than its size tells: 1 + cos(x) near pi keeps only the last bits of the cosine,
+which another library may round otherwise. This is the random arithmetic of Vignes, "A stochastic arithmetic for
+reliable scientific computation" (1993), for torch's operators.
 """
 
 from typing import Any
@@ -27,13 +27,14 @@ def nudged(value: Shaped[Tensor, "*shape"], generator: torch.Generator) -> Shape
     """Return a tensor, each floating-point number of which has moved by one unit in the last place, up or down."""
     if not value.is_floating_point():
         return value
+    # Drawn where the generator lives, on the CPU: the same directions for every device.
     is_up = torch.randint(2, value.shape, generator=generator, device=generator.device).to(value.device)
     towards = torch.where(is_up.bool(), torch.inf, -torch.inf).to(value.dtype)
     return torch.where(value.isfinite(), torch.nextafter(value, towards), value)
 
 
 class Nudging(TorchDispatchMode):
-    """Moves, within this context, each number that an operator of torch rounds; `generator` says which way."""
+    """Moves, within this context, each number that an operator of torch rounds; `generator` draws the directions."""
 
     def __init__(self, generator: torch.Generator) -> None:
         super().__init__()
@@ -42,9 +43,11 @@ class Nudging(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
         name = func.overloadpacket.__name__
+        # `add_` is rounded as `add` is; `_softmax` has its underscore in front.
         if name.rstrip("_") not in ROUNDED and name not in ROUNDED:
             return result
         if name.endswith("_"):
+            # In place: views of the tensor must see the moved numbers.
             args[0].copy_(nudged(args[0], self._generator))
             return result
         return tree_map_only(Tensor, lambda value: nudged(value, self._generator), result)

@@ -1,4 +1,4 @@
-"""Records CUDA graphs anew where Python values have changed that they were recorded from."""
+"""Records CUDA graphs again when Python values have changed that they were recorded from."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,11 +11,11 @@ from ksim_rl.compiled.python_watch import PythonWatch, listed
 from ksim_rl.device.capture import Captured
 
 MOST_RECORDINGS = 4
-"""Recordings after which Python runs at each call: what changes as often as that would be recorded for ever."""
+"""Recordings after which Python runs at each call: values that change as often would be recorded for ever."""
 
 
 class WatchedGraphs:
-    """Keeps graphs of the same work true to the Python values of their `parts`, by name: what is replayed runs none.
+    """Keeps graphs of the same work true to the Python values of their `parts`, by name: a replay runs no Python.
 
     `watched` is around each call of one of the graphs, a list that may grow.
     """
@@ -29,11 +29,13 @@ class WatchedGraphs:
     @contextmanager
     def watched(self) -> Iterator[None]:
         """Forget the graphs before a call if something has changed, and say so."""
+        # Before the first graph is ready, Python itself runs and nothing can be stale.
         if self._num_ready:
             changes = self._watch.changes()
             if changes:
                 self._forget(listed(changes))
         yield
+        # More graphs than before: one was captured in this call.
         num_ready = sum(graph.ready for graph in self._graphs)
         if num_ready != self._num_ready:
             # What a call does in Python, it has done now; from here on each change is somebody else's.

@@ -1,4 +1,4 @@
-"""Runs the checks that every env has to pass, ours and yours, and reports all findings at once."""
+"""Runs the checks that every env has to pass, ours and yours, and reports all findings together."""
 
 import gc
 from collections.abc import Callable, Collection
@@ -24,6 +24,7 @@ def check_syncs(env: EnvBase, num_steps: int) -> None:
     root = replays.start()
     # The first step may compile and fill caches.
     _, root = replays.step(root, 0)
+    # Steps with their masked resets only, as in a rollout.
     with count_syncs() as syncs:
         for index in range(1, num_steps):
             _, root = replays.step(root, index)
@@ -39,13 +40,16 @@ def check_memory(env: EnvBase, num_steps: int) -> None:
     replays = Replays(env, num_steps)
     root = replays.start()
     counts = []
+    # Two equal rounds: what the first one keeps may be a cache, what the second one adds is a leak.
     for _ in range(2):
         for index in range(_GROWTH_STEPS):
             _, root = replays.step(root, index % num_steps)
+        # Tensors in reference cycles are no leak.
         gc.collect()
         # `type`, because `isinstance` would ask proxies that warn when they are looked at.
         counts.append(sum(issubclass(type(thing), Tensor) for thing in gc.get_objects()))
     grown = counts[1] - counts[0]
+    # At least one tensor per step; fewer may come from elsewhere.
     if grown >= _GROWTH_STEPS:
         raise AssertionError(
             f"{_GROWTH_STEPS} steps leave {grown} tensors behind. Something keeps what each step makes: look for lists "
@@ -86,6 +90,7 @@ def check_env(env: EnvBase, *, num_steps: int = 4, skip: Collection[str] = ()) -
             raise unknown_name("check", name, CHECKS)
     findings = []
     for name, check in CHECKS.items():
+        # All checks run, whatever the earlier ones have found.
         if name in skip:
             continue
         try:

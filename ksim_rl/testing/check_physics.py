@@ -1,4 +1,4 @@
-"""Compares the physics of an env with MuJoCo's C engine, from states that random actions lead to."""
+"""Compares the physics of an env with MuJoCo's C engine, from states that random actions reach."""
 
 import copy
 
@@ -12,12 +12,12 @@ from ksim_rl.physics.fields import write_fields
 from ksim_rl.testing.replays import Replays
 
 SUBSTEPS = 20
-# Of the scale of a velocity, after these substeps: float32 and a solver that stops early stay far below; a field or an
-# option that one engine does not know of goes far beyond.
+# As a share of the scale of a velocity, after these substeps: float32 and a solver that stops early stay far below; a
+# field or an option that one engine does not know of goes far beyond.
 MEDIAN_TOLERANCE = 1e-3
 TOLERANCE = 1e-2
-# How far, relatively, states are moved to see what becomes of rounding and of contacts that just begin in the C engine
-# itself, and by how much more a row may differ.
+# Relative shift of states, which shows how much rounding and contacts that just begin change in the C engine itself,
+# and the factor by which a row may differ more than that.
 MOVED = 1e-5
 ALLOWANCE = 10.0
 # Iterations after which the C engine has solved a step: with those of a model it may be the one that stops early.
@@ -28,7 +28,7 @@ _INPUTS = "qpos qvel act ctrl qfrc_applied xfrc_applied mocap_pos mocap_quat qac
 
 
 def check_c_engine(env: EnvBase, num_steps: int) -> None:
-    """20 substeps from the states that random actions lead to agree with MuJoCo's C engine, in the worst row too.
+    """20 substeps from states that random actions reach agree with MuJoCo's C engine, in the worst row too.
 
     A row may also agree with a C engine that solves each step to the end instead, and may differ by more where the C
     engine itself does, from states moved by 1e-5.
@@ -38,18 +38,24 @@ def check_c_engine(env: EnvBase, num_steps: int) -> None:
         return
     replays = Replays(env, num_steps)
     root = replays.start()
+    # Random actions lead to states with contacts and moving joints.
     for index in range(num_steps):
         _, root = replays.step(root, index)
     world = simulated.world
     mj_model = world.mj_model
+    # The C engine first: stepping the worlds changes the state that it starts from.
     expected_EL, *moved = (_c_engine(world, moved=by) for by in (0.0, MOVED, -MOVED))
     solved_EL = _c_engine(world, iterations=SOLVED)
     world.step(SUBSTEPS)
     actual_EL = world.qvel_EL.cpu().numpy().astype(np.float64)
+    # The env's clocks and observations do not know of these substeps.
     env.reset()
     scale_E1 = 1.0 + np.abs(expected_EL).max(axis=-1, keepdims=True)
+    # [2, E, nv]: against the C engine as configured, and against one that solves to the end.
     errors_EL = np.stack([np.abs(actual_EL - each_EL) / scale_E1 for each_EL in (expected_EL, solved_EL)])
+    # For each row the engine that agrees better, by its worst joint.
     error_EL = errors_EL[errors_EL.max(axis=-1).argmin(axis=0), np.arange(len(actual_EL))]
+    # How chaotic each row is: the change by states that were moved a little.
     spread_E = np.max([np.abs(other_EL - expected_EL) / scale_E1 for other_EL in moved], axis=(0, -1))
     error_E = error_EL.max(axis=-1)
     allowed_E = TOLERANCE + ALLOWANCE * spread_E
@@ -69,10 +75,12 @@ def _c_engine(world: World, *, moved: float = 0.0, iterations: int = 0) -> np.nd
 
     Its solver makes at most as many `iterations` as the model says, or as are asked for where these are more.
     """
+    # Read once for all rows, as each read waits for the device.
     inputs = {name: world.view(name).cpu().numpy() for name in _INPUTS.split()}
     fields = {name: values_E.cpu().numpy() for name, values_E in world.per_world_fields().items()}
     reached = []
     for row in range(world.num_envs):
+        # A model for each row, with the fields that differ between worlds.
         mj_model = copy.copy(world.mj_model)
         write_fields(mj_model, {name: values[row] for name, values in fields.items()})
         is_field = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD
@@ -83,6 +91,7 @@ def _c_engine(world: World, *, moved: float = 0.0, iterations: int = 0) -> np.nd
             if name == "time":
                 mj_data.time = float(values[row])
             elif values[row].size:
+                # MuJoCo's arrays are views of its memory, so they are filled and not replaced.
                 target = getattr(mj_data, name)
                 target[:] = values[row].reshape(target.shape)
         mj_data.qpos *= 1.0 + moved

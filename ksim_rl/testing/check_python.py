@@ -12,6 +12,7 @@ def check_python(env: EnvBase, num_steps: int) -> None:
 
     An env on the CPU without a world of ours may do otherwise, since nothing of it is recorded.
     """
+    # There nothing is recorded, except where the world can be compiled.
     on_cpu = env.device is None or env.device.type == "cpu"
     is_compared = part(env, SimulatedWorld) is not None
     if on_cpu and not is_compared:
@@ -21,6 +22,7 @@ def check_python(env: EnvBase, num_steps: int) -> None:
     root = replays.start()
     index = 0
     try:
+        # As many steps as it takes to know: the first may fill caches, the second is judged.
         while not python.is_known:
             with python.calling():
                 _, root = replays.step(root, index % num_steps)

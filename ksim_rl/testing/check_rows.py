@@ -1,4 +1,4 @@
-"""Finds rows that do not repeat, that a reset of others changes, or whose last observation is lost."""
+"""Finds rows that do not repeat, that a reset of other rows changes, or whose last observation is lost."""
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -21,6 +21,7 @@ def check_determinism(env: EnvBase, num_steps: int) -> None:
         return
     replays = Replays(env, num_steps)
     rows = range(env.batch_size[0])
+    # Step by step, so that the first difference is the one that is reported.
     for step, (one, other) in enumerate(zip(replays.run(), replays.run(), strict=True)):
         _refuse(
             differing(one, other, rows),
@@ -37,6 +38,7 @@ def check_partial_reset(env: EnvBase, num_steps: int) -> None:
         raise AssertionError(
             f"the env has {num_envs} row: build it with at least 2, so that one can stay untouched"
         )
+    # Row 0 is reset, all others must not notice.
     others = range(1, num_envs)
     replays = Replays(env, num_steps)
     root = replays.start()
@@ -51,6 +53,7 @@ def check_partial_reset(env: EnvBase, num_steps: int) -> None:
     changed = [key for key, value in before.items() if _others_changed(value, after[key], num_envs)]
     advice = "Write through the mask only: `torch.where(mask, new, old)`, or `view.write_*(mask_E, ...)`"
     _refuse(changed, f"of the state change in rows that a reset of row 0 should leave alone. {advice}")
+    # Keys that only one of the two roots has are not compared.
     kept = root_before.select(*root.keys(True, True), strict=False)
     _refuse(
         differing(kept, root, others),
@@ -58,6 +61,7 @@ def check_partial_reset(env: EnvBase, num_steps: int) -> None:
     )
     if env.device is not None and env.device.type != "cpu":
         return
+    # Later steps, too: a shared generator or counter shows only there.
     undisturbed = replays.run()
     disturbed = replays.run(reset_at=num_steps // 2, rows=[0])
     for step, (one, other) in enumerate(zip(undisturbed, disturbed, strict=True)):
@@ -74,8 +78,10 @@ def check_episode_end(env: EnvBase, num_steps: int) -> None:
     root = replays.start()
     for index in range(num_steps):
         if index == num_steps // 2:
+            # Without it a short rollout may have no end at all.
             end_episodes_at_next_step(env)
         env_state_E, root = replays.step(root, index)
+        # Without rewards and flags, which differ between `next` and a root anyway.
         observed = set(env.full_observation_spec.keys(True, True))
         next_E = env_state_E.get("next")
         _check_end(next_E, root, [key for key in next_E.keys(True, True) if key in observed])
@@ -92,6 +98,7 @@ def _check_end(next_E: TensorDictBase, root: TensorDictBase, keys: list[NestedKe
         "differ between `next` and the next root in rows that go on. Compute each observation once per step: noise, "
         "delay and history must not advance again in `_reset`",
     )
+    # Equal in all keys means that the state reached was overwritten by the reset.
     for row in ended:
         if keys and len(differing(next_obs, root_obs, [row])) == 0:
             raise AssertionError(

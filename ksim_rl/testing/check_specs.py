@@ -40,6 +40,7 @@ def check_names(env: EnvBase, num_steps: int) -> None:
     for which in SPECS:
         _check_spec_names(getattr(env, which), which, env.batch_dims)
     root = env.reset()
+    # Each way in which an env returns data is looked at, as labels get lost in each on its own.
     assert_dims(root, dims.E)
     stepped = env.step(env.rand_action(root))
     assert_dims(stepped["next"], dims.E)
@@ -52,9 +53,11 @@ def check_values(env: EnvBase, num_steps: int) -> None:
     """Observations have the shapes and dtypes of their specs and are inside them; these, and rewards, are finite."""
     _check_values(env.reset(), env, "reset")
     rollout_ET = env.rollout(num_steps, break_when_any_done=False)
+    # Step by step, so that the error can say when.
     for step in range(num_steps):
         _check_values(rollout_ET[:, step]["next"], env, f"step {step}")
     base_env = part(env, ManagerBasedRlEnv)
+    # Terms first: the name of a term says more than the name of a group.
     if base_env is None:
         lines = []
     else:
@@ -74,6 +77,7 @@ def check_torchrl(env: EnvBase, num_steps: int) -> None:
 def check_actions(env: EnvBase, num_steps: int) -> None:
     """Actions of a wrong shape or dtype are refused."""
     action = env.rand_action(env.reset())[env.action_key]
+    # Each would broadcast or convert in silence.
     wrong = {
         "one element more": torch.cat((action, action[..., :1]), dim=-1),
         "no leaf dim": action[..., 0],
@@ -112,6 +116,7 @@ def _check_values(tensordict: TensorDictBase, env: EnvBase, when: str) -> None:
             continue
         if reason := misfit(value, spec[key]):
             raise AssertionError(f"observation {key!r}, {_written_by(env, key)}, {reason} (at {when})")
+        # Before the range, as NaN is outside of every range, too.
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             rows = (~torch.isfinite(value.reshape(value.shape[0], -1)).all(-1)).nonzero().flatten().tolist()
             where = f"at {when}, in the rows {rows}, {_written_by(env, key)}"
@@ -126,6 +131,7 @@ def _check_values(tensordict: TensorDictBase, env: EnvBase, when: str) -> None:
 def _written_by(env: EnvBase, key: NestedKey) -> str:
     """Return which transform wrote an observation last, or that the env did."""
     found = "written by the env"
+    # The outermost wrapper writes last.
     while isinstance(env, TransformedEnv):
         if isinstance(env.transform, Compose):
             transforms = env.transform

@@ -18,6 +18,7 @@ def check_terms(env: EnvBase, num_steps: int) -> None:
             root = replays.start()
             for index in range(num_steps):
                 if index == num_steps // 2:
+                    # Resets run events and curricula, which a short rollout might never reach.
                     end_episodes_at_next_step(env)
                 _, root = replays.step(root, index)
     except ValueError as refusal:

@@ -36,6 +36,7 @@ class CounterEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=batch)
         self.num_rows = max(1, len(lengths))
         length_E = torch.tensor(list(lengths) or [3])
+        # Buffers, so that `state_dict` has them and a copy to a device moves them.
         counters = {name: torch.zeros_like(length_E) for name in ("count_E", "episode_E")}
         counters |= {
             "length_E": length_E,
@@ -57,11 +58,13 @@ class CounterEnv(EnvBase):
             "done": {name: flag.clone() for name in ("done", "terminated", "truncated")},
         }
         for which, leaves in specs.items():
+            # All specs are made for one row, then expanded to the batch.
             spec = Composite(leaves).expand(batch).to(self.device)
             spec.names = [dims.E] * len(batch)
             setattr(self, f"full_{which}_spec", spec)
 
     def _observe(self) -> dict[str, Any]:
+        # Keyed by row and episode: a partial reset draws the same as a reset of all.
         keys = random.row_keys(self.seed_value, 1, self.episode_E, self.num_rows)
         count_E1 = self.count_E[:, None].float()
         batch = self.batch_size
@@ -84,6 +87,7 @@ class CounterEnv(EnvBase):
             )
         self.count_E.add_(1)
         ended_E = self.count_E >= self.length_E
+        # Both kinds of end occur, each in known rows.
         even_E = self.row_E % 2 == 0
         flags = {"done": ended_E, "terminated": ended_E & even_E, "truncated": ended_E & ~even_E}
         values = self._observe() | {k: v.reshape(*self.batch_size, 1) for k, v in flags.items()}
@@ -95,6 +99,7 @@ class CounterEnv(EnvBase):
             mask = None
         else:
             mask = tensordict.get("_reset", None)
+        # TorchRL's plain reset gives no mask.
         if mask is None:
             mask_E = torch.ones_like(self.count_E, dtype=torch.bool)
         else:

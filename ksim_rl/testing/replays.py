@@ -1,4 +1,4 @@
-"""Gives a check the same actions from the same start, as often as it needs them."""
+"""Replays the same actions from the same start, as often as a check needs them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,7 +18,7 @@ SEED = 11
 class Replays:
     """Remembers an env's state; each replay starts there, with the same seed and the same random actions.
 
-    What a curriculum has learned outlives a seed, so that a seed alone would not bring the start back.
+    The level of a curriculum outlives a seed, so a seed does not restore the start on its own.
     """
 
     def __init__(self, env: EnvBase, num_steps: int) -> None:
@@ -27,6 +27,7 @@ class Replays:
         # Some transforms' states begin with the first reset.
         env.reset()
         self._state = {key: copy_of(value) for key, value in env.state_dict().items()}
+        # `rand_action` draws from torch's global generator.
         torch.manual_seed(SEED)
         root = env.reset()
         self._actions = [env.rand_action(root)[env.action_key].clone() for _ in range(num_steps)]
@@ -34,6 +35,7 @@ class Replays:
     def start(self) -> TensorDictBase:
         """Return to the start, and return its root."""
         self.env.load_state_dict({key: copy_of(value) for key, value in self._state.items()})
+        # After the state, which has a seed of its own.
         self.env.set_seed(SEED)
         return self.env.reset()
 
@@ -49,12 +51,14 @@ class Replays:
             if index == reset_at:
                 root = reset_rows(self.env, root, rows)
             env_state_E, root = self.step(root, index)
+            # The env may write the next step into the same memory.
             env_states.append(env_state_E.clone())
         return env_states
 
 
 def reset_rows(env: EnvBase, root: TensorDictBase, rows: Sequence[int]) -> TensorDictBase:
     """Reset some rows only, by the mask that TorchRL knows."""
+    # In the shape of `done`, [E, 1].
     mask = torch.zeros_like(root.get("done"))
     mask[list(rows)] = True
     return env.reset(root.set("_reset", mask))
@@ -90,6 +94,7 @@ def same_bits(one: Shaped[Tensor, "*leaf"], other: Shaped[Tensor, "*leaf"]) -> b
 
 
 def _bits(value: Tensor) -> Tensor:
+    # As whole numbers, for which NaN equals NaN and 0 differs from -0.
     whole = {torch.float32: torch.int32, torch.float64: torch.int64}.get(value.dtype)
     if whole is None:
         return value

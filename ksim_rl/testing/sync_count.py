@@ -45,7 +45,7 @@ _INTERNAL = ("/torch/", "/contextlib.py", __file__)
 
 @dataclass(kw_only=True)
 class SyncCount:
-    """What `count_syncs` saw: one line per sync, with the place in the code."""
+    """The syncs that `count_syncs` saw: one line each, with the place in the code."""
 
     calls: list[str] = field(default_factory=list)
 
@@ -69,6 +69,7 @@ def count_syncs() -> Iterator[SyncCount]:
     `torch.cuda.set_sync_debug_mode("error")` is the last word. Inside compiled code it sees nothing.
     """
     count = SyncCount()
+    # Two modes: methods of Python, and operators of the dispatcher.
     with _Methods(count), _Operations(count):
         yield count
 
@@ -100,6 +101,7 @@ def _why_it_syncs(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> s
     name = func._schema.name
     if name in _ALWAYS:
         return _ALWAYS[name]
+    # The number of rows that a mask selects is known to the device only.
     if name in _INDEXING and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
         return "indexing by a mask"
     if (
@@ -111,6 +113,7 @@ def _why_it_syncs(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> s
     if name == "aten::_to_copy" and _differs(args[0].device, kwargs.get("device")):
         return "copy to another device"
     if name == "aten::copy_" and isinstance(args[1], Tensor) and _differs(args[0].device, args[1].device):
+        # `copy_(source, non_blocking=True)` into pinned memory returns before the copy is done.
         into_pinned = len(args) > 2 and args[2] and args[0].is_cpu and args[0].is_pinned()
         if into_pinned:
             return None
@@ -129,5 +132,6 @@ def _place() -> str:
         is_internal = any(part in frame.filename for part in _INTERNAL)
         if not is_internal:
             places.append(f"{frame.filename.rsplit('/', 1)[-1]}:{frame.lineno}")
+    # Enough to see the term and the line that called it.
     innermost = places[-3:]
     return " < ".join(reversed(innermost))
