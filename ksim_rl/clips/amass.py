@@ -42,6 +42,7 @@ _SKELETON: tuple[tuple[str, str, tuple[float, float, float]], ...] = (
     ("right_wrist", "right_elbow", (-0.146, 0.0, 0.0)),
 )
 JOINTS = tuple(name for name, _, _ in _SKELETON)
+# The spelling differs between parts of the data set.
 _RATES = ("mocap_framerate", "mocap_frame_rate")
 
 
@@ -50,8 +51,8 @@ def read_amass(
 ) -> Recording:
     """Return where the 22 joints of the body are, in an archive with `poses`, `trans` and `mocap_framerate`.
 
-    `poses` [F, 66 or more] are rotation vectors, rad, of which those of the hands are left out; `trans` [F, 3] is m, z
-    up, and the pelvis is there. `offsets` replaces those of joints from their parents, m: x left, y up, z ahead.
+    `poses` [F, 66 or more] are rotation vectors, rad, without the hands' rotations behind them; `trans` [F, 3] is m, z
+    up, and the pelvis is there. `offsets` replaces some offsets of joints from their parents, m: x left, y up, z ahead.
     """
     poses_FC, root_F3, fps = _read(path)
     parents = []
@@ -60,11 +61,13 @@ def read_amass(
         # The pelvis hangs from nothing.
         parents.append(JOINTS.index(parent) if parent else -1)
         own_offsets.append(offset)
+    # Offsets are in shares of height, given ones in m.
     offsets_N3 = height * np.array(own_offsets)
     for name, offset_3 in (offsets or {}).items():
         if name not in JOINTS:
             raise refused(path, f"offsets: no joint {name!r}", f"one of {', '.join(JOINTS)}")
         offsets_N3[JOINTS.index(name)] = offset_3
+    # Three numbers per joint; columns beyond the body's joints are the hands.
     turns_FN4 = from_rotation_vector(poses_FC[:, : 3 * len(JOINTS)].reshape(len(poses_FC), -1, 3))
     pos_FN3, quat_FN4 = chain(parents, offsets_N3, turns_FN4, root_F3)
     return Recording(fps=fps, names=JOINTS, pos_FN3=pos_FN3, quat_FN4=quat_FN4)
@@ -78,10 +81,12 @@ def _read(path: Path) -> tuple[Array, Array, float]:
     rate = next((name for name in _RATES if name in arrays), "")
     missing = [name for name in ("poses", "trans") if name not in arrays]
     if missing or not rate:
+        # The first missing array, or the rate under its usual name.
         lacks = (missing or [_RATES[0]])[0]
         raise refused(path, f"no array {lacks!r}", f"it has {', '.join(arrays) or 'none'}")
     poses_FC = arrays["poses"]
     root_F3 = arrays["trans"]
+    # Objects are refused before any arithmetic.
     if arrays[rate].size != 1 or any(
         array.dtype.kind not in "fiu" for array in (poses_FC, root_F3, arrays[rate])
     ):
@@ -91,10 +96,12 @@ def _read(path: Path) -> tuple[Array, Array, float]:
         raise refused(
             path, f"poses has shape {poses_FC.shape}", f"expected [F, {3 * len(JOINTS)} or more], F >= 2"
         )
+    # A place for each frame.
     if root_F3.shape != (len(poses_FC), 3):
         raise refused(path, f"trans has shape {root_F3.shape}", f"expected ({len(poses_FC)}, 3)")
     if not (np.isfinite(poses_FC).all() and np.isfinite(root_F3).all() and fps > 0.0):
         raise refused(
             path, "it holds numbers that are not finite, or a rate that is not positive", "repair it"
         )
+    # In float64: the chain of 22 joints adds up rounding errors.
     return poses_FC.astype(float), root_F3.astype(float), fps

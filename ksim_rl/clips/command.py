@@ -23,16 +23,19 @@ ROBOTS = {"g1": UnitreeG1, "t1": BoosterT1, "humanoid": Humanoid}
 def model_of(robot: str) -> mujoco.MjModel:
     """Return a robot of ours by name, or of a file, alone in its model."""
     if robot in ROBOTS:
+        # Without a scene: ground and sensors have no part in kinematics.
         return ROBOTS[robot]().spec().compile()
+    # Without a suffix or a folder it was meant as a name, and the near names help.
     if not Path(robot).suffix and "/" not in robot:
         raise ValueError(f"--robot {robot}: {near(robot, ROBOTS)}; or give the path of a model")
     return load_spec(robot).compile()
 
 
 def motion(arguments: Sequence[str]) -> int:
-    """Convert one file; a ValueError says what is wrong with it."""
+    """Convert one file; a ValueError names its fault."""
     options = _parser().parse_args(arguments)
     model = model_of(options.robot)
+    # A CSV holds the robot's own joints, so nothing has to be retargeted.
     if options.kind == "csv":
         if options.joints:
             joints = options.joints.split(",")
@@ -42,6 +45,7 @@ def motion(arguments: Sequence[str]) -> int:
             options.source, model, fps=options.source_fps, wanted_fps=options.fps, joints=joints
         )
     else:
+        # Both become recordings of points, which are then retargeted.
         if options.kind == "bvh":
             recording = read_bvh(options.source, scale=options.unit, y_up=not options.z_up)
         else:

@@ -38,7 +38,9 @@ class Recording(Checked):
 
 def between(count: int, fps: float, wanted_fps: float) -> tuple[Array, Float[Array, " F"]]:
     """Return for each frame at another rate the frame before it, and the part of the way to the next one."""
+    # The small number keeps the last frame where the division falls just short of it.
     times_F = np.arange(0, int((count - 1) / fps * wanted_fps + 1e-6) + 1) / wanted_fps
+    # At most the last but one, so that there is always a next frame.
     low_F = np.minimum((times_F * fps + 1e-9).astype(int), count - 2)
     return low_F, np.clip(times_F * fps - low_F, 0.0, 1.0)
 
@@ -48,15 +50,18 @@ def slerp(
 ) -> Float[Array, "*batch 4"]:
     """Return unit quaternions on the shorter arc between two, at an even speed."""
     cosine = (first * second).sum(-1, keepdims=True)
+    # q and -q are the same orientation: the nearer of the two gives the shorter arc.
     second = np.where(cosine < 0.0, -second, second)
     cosine = np.abs(cosine)
     angle = np.arccos(np.clip(cosine, 0.0, 1.0))
     sine = np.sin(angle)
+    # Nearly parallel: the sine would divide by zero, and a straight line is as good.
     is_small = sine < 1e-6
     safe = np.where(is_small, 1.0, sine)
     left = np.where(is_small, 1.0 - share, np.sin((1.0 - share) * angle) / safe)
     right = np.where(is_small, share, np.sin(share * angle) / safe)
     blend = left * first + right * second
+    # The linear case leaves the unit sphere a little.
     return blend / np.linalg.norm(blend, axis=-1, keepdims=True)
 
 
@@ -72,6 +77,7 @@ def multiply(a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"]) -> Float[
 
 def rotate(q: Float[Array, "*batch 4"], v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
     """Rotate vectors by quaternions."""
+    # v + 2 (w (u x v) + u x (u x v)) with u the vector part: cheaper than two products.
     across = np.cross(q[..., 1:], v)
     return v + 2.0 * (q[..., :1] * across + np.cross(q[..., 1:], across))
 
@@ -79,6 +85,7 @@ def rotate(q: Float[Array, "*batch 4"], v: Float[Array, "*batch 3"]) -> Float[Ar
 def from_rotation_vector(turn: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4"]:
     """Return the quaternions of rotation vectors, rad."""
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    # NumPy's sinc has a pi inside.
     half = 0.5 * np.sinc(angle / (2.0 * np.pi))  # sin(angle / 2) / angle, also at zero
     return np.concatenate((np.cos(0.5 * angle), half * turn), axis=-1)
 
@@ -95,6 +102,7 @@ def chain(
     """
     pos_FN3 = np.zeros((*turns_FN4.shape[:2], 3))
     quat_FN4 = turns_FN4.copy()
+    # Parents come first, so theirs are in the world already.
     for joint, parent in enumerate(parents):
         if parent < 0:
             pos_FN3[:, joint] = root_F3
@@ -113,6 +121,7 @@ def of_robot(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float)
     for qpos in qpos_FL:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(mj_model, data)
+        # Body 0 is the world.
         pos.append(data.xpos[1:].copy())
         quat.append(data.xquat[1:].copy())
     names = tuple(mj_model.body(i).name for i in range(1, mj_model.nbody))
@@ -120,5 +129,5 @@ def of_robot(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float)
 
 
 def refused(path: Path, wrong: str, fix: str) -> ValueError:
-    """Return the error for a file that cannot be read as a motion: what is wrong with it, and what to do."""
+    """Return the error for a file that cannot be read as a motion: the fault, and the way out."""
     return ValueError(f"motion {path}: {wrong}: {fix}")

@@ -23,8 +23,8 @@ class Pair(Checked):
     Attributes:
         point: its name in the recording.
         to: the site's or body's name.
-        weight: what 1 m of error costs.
-        turn_weight: what 1 rad of error costs; 0 leaves open how the part is turned.
+        weight: cost of 1 m of error.
+        turn_weight: cost of 1 rad of error; 0 leaves the part's orientation open.
         quat: the rotation (w, x, y, z) from the point's frame to the part's, where both do the same.
     """
 
@@ -41,8 +41,8 @@ class Retarget(Checked):
 
     Attributes:
         scale: m of the robot per m of the recording; its legs relative to the person's.
-        posture_weight: what 1 rad from the default pose costs, for joints that no pair asks for.
-        stride_weight: what 1 rad from the frame before costs: it keeps the motion continuous.
+        posture_weight: cost of 1 rad from the default pose, for joints that no pair asks for.
+        stride_weight: cost of 1 rad from the frame before: it keeps the motion continuous.
         soles: sites or bodies that touch the ground in the lowest frames: the motion is lowered or raised by a constant
             so that the fifth percentile of their lowest height is `sole_z` (m); () leaves heights as they are.
     """
@@ -71,11 +71,12 @@ def read_retarget(path: Path) -> Retarget:
 def retargeted(
     recording: Recording, mj_model: mujoco.MjModel, cfg: Retarget, *, fps: float = 50.0
 ) -> Float[Array, "F L"]:
-    """Return the qpos of a robot that does what a recording does, at `fps` frames per second.
+    """Return the qpos of a robot that moves as a recording does, at `fps` frames per second.
 
     The model has a free root. Each frame is searched for from the frame before, within the joints' ranges. A ValueError
     names the point, site or body that does not exist.
     """
+    # Names are checked before minutes of searching.
     for pair in cfg.pairs:
         if pair.point not in recording.names:
             raise ValueError(
@@ -83,9 +84,12 @@ def retargeted(
             )
     solver = InverseKinematics(mj_model)
     solver.check_names([*(pair.to for pair in cfg.pairs), *cfg.soles])
+    # At the robot's control rate first, so that no pose has to be interpolated between joints.
     played = recording.resampled(fps)
+    # The pose that no pair disagrees with, such as the keyframe "home".
     rest_L = (mj_model.key_qpos[0] if mj_model.nkey else mj_model.qpos0).copy()
     pull_M = np.full(mj_model.nv, cfg.posture_weight)
+    # The root goes wherever the pairs take it.
     pull_M[:6] = 0.0
     # Two pulls on one coordinate are one, to the weighted mean of where they pull to.
     both_M = np.hypot(pull_M, cfg.stride_weight)
@@ -95,14 +99,17 @@ def retargeted(
         goals = _goals(played, cfg, frame)
         if not found:
             # The first frame has none before it, and may be far from the default pose.
+            # Near to the person and turned as the person is: a search from afar may end in another pose.
             start_L = _facing(rest_L, goals[0])
             patient = InverseKinematics(mj_model, replace(solver.cfg, iterations=400))
             found.append(patient.solve(goals, start_L=start_L, posture_L=start_L, posture_weight_M=pull_M))
             continue
+        # Towards the default pose, as far as its weight against the stride's says.
         aim_L = _between(mj_model, found[-1], rest_L, share_M)
         found.append(solver.solve(goals, start_L=found[-1], posture_L=aim_L, posture_weight_M=both_M))
     qpos_FL = np.array(found)
     if cfg.soles:
+        # One constant for all frames: jumps stay jumps.
         qpos_FL[:, 2] += cfg.sole_z - _low_height(mj_model, qpos_FL, cfg.soles)
     return qpos_FL
 
@@ -112,6 +119,7 @@ def _goals(played: Recording, cfg: Retarget, frame: int) -> list[PoseGoal]:
     for pair in cfg.pairs:
         point = played.names.index(pair.point)
         if pair.turn_weight:
+            # The part's frame differs from the point's by a fixed rotation.
             quat_4 = multiply(played.quat_FN4[frame, point], np.array(pair.quat))
         else:
             quat_4 = None
@@ -133,6 +141,7 @@ def _facing(rest_L: Array, first: PoseGoal) -> Array:
     start_L[:3] = first.pos_3
     if first.quat_4 is not None:
         w, x, y, z = first.quat_4
+        # Yaw of the quaternion; roll and pitch are left out, so that the robot starts upright.
         heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         start_L[3:7] = multiply(np.array((np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2))), rest_L[3:7])
     return start_L
@@ -142,6 +151,7 @@ def _between(mj_model: mujoco.MjModel, from_L: Array, to_L: Array, share_M: Arra
     """Return the qpos that lies part of the way from one to another, by a share for each degree of freedom."""
     way_M = np.zeros(mj_model.nv)
     between_L = from_L.copy()
+    # In the tangent space, where a share of a rotation is well defined.
     mujoco.mj_differentiatePos(mj_model, way_M, 1.0, from_L, to_L)
     mujoco.mj_integratePos(mj_model, between_L, way_M * share_M, 1.0)
     return between_L
@@ -162,4 +172,5 @@ def _low_height(mj_model: mujoco.MjModel, qpos_FL: Array, soles: Sequence[str]) 
                 sole = data.body(name)
             heights.append(sole.xpos[2])
         lowest.append(min(heights))
+    # Not the minimum: a few frames of noise below the ground would lift the whole motion.
     return float(np.percentile(lowest, 5.0))

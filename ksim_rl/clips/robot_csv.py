@@ -33,6 +33,7 @@ def read_csv(
     joints that it leaves out stay as in the model's first keyframe. A ValueError says what is wrong in which line.
     """
     own = [mj_model.joint(i).name for i in scalar_joint_ids(mj_model)]
+    # Files of retargeted motions often have the joints of another version of the robot.
     joints = own if joints is None else list(joints)
     for joint in joints:
         if joint not in own:
@@ -40,6 +41,7 @@ def read_csv(
     if not mj_model.njnt or mj_model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         raise refused(path, "the model's first joint is not free", "give the model of a robot that can move")
     table_FC = _table(path, 7 + len(joints))
+    # Rounded files have quaternions that are nearly unit; anything else is another column order.
     norm_F = np.linalg.norm(table_FC[:, 3:7], axis=1)
     if (np.abs(norm_F - 1.0) > 0.05).any():
         line = int(np.abs(norm_F - 1.0).argmax()) + 1
@@ -52,12 +54,15 @@ def read_csv(
         rest_L = mj_model.key_qpos[0]
     else:
         rest_L = mj_model.qpos0
+    # Joints that the file leaves out stay as in this pose.
     qpos_FL = np.tile(rest_L, (len(table_FC), 1))
     qpos_FL[:, :3] = table_FC[:, :3]
+    # From (x, y, z, w) to MuJoCo's (w, x, y, z).
     qpos_FL[:, 3:7] = (table_FC[:, 3:7] / norm_F[:, None])[:, [3, 0, 1, 2]]
     qpos_FL[:, [int(mj_model.joint(joint).qposadr[0]) for joint in joints]] = table_FC[:, 7:]
     low_F, share_F = between(len(qpos_FL), fps, wanted_fps)
     share_F1 = share_F[:, None]
+    # Linear between frames, and the root's orientation along the arc.
     found_FL = (1.0 - share_F1) * qpos_FL[low_F] + share_F1 * qpos_FL[low_F + 1]
     found_FL[:, 3:7] = slerp(qpos_FL[low_F, 3:7], qpos_FL[low_F + 1, 3:7], share_F1)
     return found_FL
@@ -70,6 +75,7 @@ def _table(path: Path, columns: int) -> Array:
         raise refused(path, "it is no text", "give a CSV file") from None
     rows = []
     for number, line in enumerate(text.splitlines(), 1):
+        # Empty lines are common at the end of a file.
         if not line.strip():
             continue
         cells = line.split(",")
@@ -81,12 +87,14 @@ def _table(path: Path, columns: int) -> Array:
                 "of the file, if they are others",
             )
         try:
+            # No header: a row of names fails here and is told by its line.
             row = [float(cell) for cell in cells]
         except ValueError as error:
             raise refused(path, f"line {number}: {error}", "expected numbers only, and no header") from None
         if not np.isfinite(row).all():
             raise refused(path, f"line {number} holds a number that is not finite", "cut that part off")
         rows.append(row)
+    # Two frames at least, since velocities are differences.
     if len(rows) < 2:
         raise refused(path, f"it has {len(rows)} lines", "expected at least two frames")
     return np.array(rows)

@@ -34,10 +34,12 @@ def public_path(cls: type) -> str:
     """Return the shortest path that leads to a class, so that files which move inside a room change no config."""
     parts = cls.__module__.split(".")
     if parts[0] == OWN:
+        # From the room downwards: the first package that exports the class is the public one.
         for end in range(2, len(parts)):
             package = ".".join(parts[:end])
             if vars(sys.modules[package]).get(cls.__qualname__) is cls:
                 return f"{package}.{cls.__qualname__}"
+    # Other packages promise no exports: the module is the path.
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
@@ -57,24 +59,30 @@ def find(
     module_name, _, class_name = str(target).rpartition(".")
     where = f"{path}.{TARGET}={target!r}"
     package = module_name.split(".")[0]
+    # Importing runs code, so the package is checked before anything is imported.
     allowed = plugins.packages() | {OWN} | besides
     if package not in allowed:
         raise ValueError(
             f"{where}: only classes of these packages are built: {', '.join(sorted(allowed))}. {plugins.hint(package)}"
         )
     names: list[str] = []
+    # The path as written, then the packages that may export the class now.
     for candidate in _modules(module_name):
         try:
             module = importlib.import_module(candidate)
         except ModuleNotFoundError as error:
+            # A package of the path that is missing is tried elsewhere; a missing dependency is the real
+            # error.
             if not candidate.startswith(str(error.name)):
                 raise ValueError(
                     f"{where}: {candidate} needs {error.name!r}, which is not installed"
                 ) from error
             continue
+        # A re-exported class of a third package is not ours to build.
         found = vars(module).get(class_name)
         if isinstance(found, type) and accepts(found) and found.__module__.split(".")[0] in allowed:
             return found
+        # For the error: the names that would have been accepted.
         names += [name for name, value in vars(module).items() if isinstance(value, type) and accepts(value)]
     if not names:
         raise ValueError(f"{where}: no module {module_name!r} with a {kind}")
@@ -86,9 +94,11 @@ def _modules(name: str) -> list[str]:
     if name.split(".")[0] != OWN:
         return [name]
     moved = name
+    # In turn: a path may have moved twice.
     for old, new in MOVED.items():
         if f"{moved}.".startswith(f"{old}."):
             moved = moved.replace(old, new, 1)
+    # Longest first, so that a module counts before the packages above it.
     parts = moved.split(".")
     return list(dict.fromkeys([name, *(".".join(parts[:end]) for end in range(len(parts), 1, -1))]))
 
@@ -104,9 +114,11 @@ def foreign(tree: Any) -> Iterator[str]:
 def loading_notes(tree: Any) -> list[str]:
     """Return one line for each foreign package of a tree whose classes a later command does not find by itself."""
     notes: dict[str, str] = {}
+    # Plug-ins that are declared or named are found by any later command.
     known = plugins.declared_packages() | {name.split(".")[0] for name in plugins.named()}
     for target in foreign(tree):
         package = target.split(".")[0]
+        # Only this process knows its main module and its local classes.
         if package == "__main__" or "<locals>" in target:
             notes[target] = (
                 f"this run names {target}, which no other process can import: `ksim-rl` will not be able to load its "

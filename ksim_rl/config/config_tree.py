@@ -34,7 +34,7 @@ class OwnTree(ABC):
     @classmethod
     @abstractmethod
     def from_tree(cls, tree: Any, path: str) -> Self:
-        """Build the config that stands at `path`; a ValueError names the full path of what is wrong."""
+        """Build the config that stands at `path`; a ValueError names the full path of a wrong entry."""
 
 
 def to_tree(value: Any, annotation: Any = None) -> Any:
@@ -42,14 +42,17 @@ def to_tree(value: Any, annotation: Any = None) -> Any:
     if isinstance(value, OwnTree):
         return value.to_tree()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        # Resolved, since annotations may be texts.
         hints = typing.get_type_hints(type(value))
         tree: dict[str, Any] = {}
+        # The class is named only where the annotation does not say it: configs stay short.
         if type(value) is not _default_class(annotation):
             tree[TARGET] = class_paths.public_path(type(value))
         for field in dataclasses.fields(value):
             tree[field.name] = to_tree(getattr(value, field.name), hints[field.name])
         return tree
     if isinstance(value, Mapping):
+        # Values of a mapping are of its second type.
         item = next(iter(typing.get_args(annotation)[1:]), None)
         return {str(key): to_tree(entry, item) for key, entry in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
@@ -61,8 +64,10 @@ def default_tree(cls: type, annotation: Any = None) -> dict[str, Any]:
     """Return the plain tree of a dataclass's defaults, with Hydra's "???" for fields that have none."""
     hints = typing.get_type_hints(cls)
     tree = {}
+    # A group of Hydra has no annotation: its class is given by the group.
     if annotation is not None and cls is not _default_class(annotation):
         tree[TARGET] = class_paths.public_path(cls)
+    # Defaults without building the class: it may have fields that must be given.
     for field in dataclasses.fields(cls):
         default = field.default
         if field.default_factory is not dataclasses.MISSING:
@@ -78,9 +83,10 @@ def from_tree(annotation: type[Config], tree: Any, path: str = "") -> Config:
 
 
 def build_value(annotation: Any, value: Any, path: str) -> Any:
-    """Build what an annotation describes from a tree, as `from_tree` does; `Any` takes it as it is."""
+    """Build the value that an annotation describes from a tree, as `from_tree` does; `Any` takes it as it is."""
     if annotation is Any:
         return value
+    # The cases in order: null, trees that read themselves, dataclasses, then scalars and containers.
     alternatives = _alternatives(annotation)
     if value is None and type(None) in alternatives:
         return None
@@ -89,6 +95,7 @@ def build_value(annotation: Any, value: Any, path: str) -> Any:
     if len(classes) == 1 and issubclass(classes[0], OwnTree):
         return classes[0].from_tree(value, path)
     takes_mapping = any(typing.get_origin(option) in _MAPPINGS for option in alternatives)
+    # A mapping is a dataclass if it says so, or if nothing else takes mappings.
     if isinstance(value, Mapping) and (
         TARGET in value or not takes_mapping and any(dataclasses.is_dataclass(c) for c in classes)
     ):
@@ -97,11 +104,13 @@ def build_value(annotation: Any, value: Any, path: str) -> Any:
         built = _match(option, value, path)
         if built is not _NO_MATCH:
             return built
+    # Literal values are listed with the near ones.
     if len(alternatives) == 1 and typing.get_origin(alternatives[0]) is Literal:
         check_choice(path, value, typing.get_args(alternatives[0]))
     raise ValueError(f"{path}={value!r}: expected {_describe(annotation)}")
 
 
+# An object of its own, since None is a value.
 _NO_MATCH = object()
 _SCALARS = (bool, int, float, str, NestedKey)
 _MAPPINGS = (collections.abc.Mapping, dict)
@@ -115,9 +124,11 @@ def _match(option: Any, value: Any, path: str) -> Any:
     if origin in (tuple, collections.abc.Sequence, list):
         if not isinstance(value, (list, tuple)):
             return _NO_MATCH
+        # YAML has no tuples: a list of keys and one nested key look alike.
         if arguments[0] == NestedKey and origin is not tuple:
             # A tuple is one nested key, so several keys are a list.
             return [_build_nested_key(entry, f"{path}[{i}]") for i, entry in enumerate(value)]
+        # A fixed tuple has a type for each entry, the others one for all.
         kinds = arguments
         if origin is not tuple or arguments[1:] == (...,):
             kinds = arguments[:1] * len(value)
@@ -134,8 +145,10 @@ def _match(option: Any, value: Any, path: str) -> Any:
         }
     if option is NestedKey:
         return _build_nested_key(value, path)
+    # bool is a subclass of int: `true` is no number, and 1 no truth value.
     if option not in (bool, str, int, float) or isinstance(value, bool) and option is not bool:
         return _NO_MATCH
+    # YAML writes 1 for 1.0.
     if option is float:
         if isinstance(value, (int, float)):
             return float(value)
@@ -158,6 +171,7 @@ def _build_nested_key(value: Any, path: str) -> NestedKey:
 
 
 def _build_key(annotation: Any, key: object, path: str) -> Any:
+    # YAML and Hydra give keys as text or as numbers.
     if annotation is not int:
         return str(key)
     try:
@@ -168,8 +182,10 @@ def _build_key(annotation: Any, key: object, path: str) -> Any:
 
 def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> Any:
     cls: Any
+    # A class of a package that may be built, and of the kind that the field asks for.
     if TARGET in tree:
         cls = class_paths.find(tree[TARGET], path, kind="dataclass", accepts=dataclasses.is_dataclass)
+        # Protocols cannot be asked by `issubclass`.
         bases = [c for c in classes if not getattr(c, "_is_protocol", False)]
         if bases and not issubclass(cls, tuple(bases)):
             kinds = _describe(functools.reduce(operator.or_, bases))
@@ -179,21 +195,25 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
         if getattr(cls, "__abstractmethods__", None):
             raise ValueError(f"{path}: needs {TARGET}, the class of this {cls.__name__}")
     hints = typing.get_type_hints(cls)
+    # Fields that the class computes itself are not given.
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
     given = {}
     for key, entry in tree.items():
+        # Configs of earlier versions stay readable.
         if key == TARGET or (cls.__name__, key) in class_paths.GONE:
             continue
         where = _join(path, key)
         if key not in fields:
             raise ValueError(f"unknown field {where!r} of {cls.__name__}: {near(str(key), fields)}")
         given[key] = build_value(hints[key], entry, where)
+    # Told here, since the constructor would name the argument without its path.
     for name, field in fields.items():
         if name not in given and field.default is field.default_factory is dataclasses.MISSING:
             raise ValueError(f"{path}: {cls.__name__} needs the field {name!r}: {_describe(hints[name])}")
     try:
         return cls(**given)
     except ValueError as error:
+        # Its own checks name the field; the path is put in front.
         raise ValueError(_join(path, error)) from None
 
 

@@ -20,12 +20,12 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True, kw_only=True)
 class Demand:
-    """What each of F frames asks for.
+    """The demands of each of F frames on robot and ground.
 
     Attributes:
         zmp_F2: the zero-moment point on the ground, m: where the ground's pressure must have its centre.
         com_F3: the centre of mass, m.
-        force_F3: what the ground must push with, N.
+        force_F3: of the ground on the robot, N.
         torque_FM: of the joints, N m, one column per degree of freedom behind the six of the root.
     """
 
@@ -43,14 +43,16 @@ def demand(
     feet: Sequence[str],
     planted_FN: Bool[Array, "F N"],
 ) -> Demand:
-    """Return what a motion of a robot with a free root asks for.
+    """Return the demands of a motion of a robot with a free root.
 
     `feet` are sites at the middles of the soles, `planted_FN` which of them stand. The robot is alone in its model.
     """
     qvel_FM = velocities(mj_model, qpos_FL, fps)
+    # Differences of the motion: mj_inverse needs the acceleration of each frame.
     qacc_FM = np.gradient(qvel_FM, 1.0 / fps, axis=0)
     model = mj_model
     data = mujoco.MjData(mj_model)
+    # Without contacts and constraints the root's wrench is all that the ground has to give.
     flags = model.opt.disableflags
     model_flags = mujoco.mjtDisableBit
     model.opt.disableflags |= int(model_flags.mjDSBL_CONTACT) | int(model_flags.mjDSBL_CONSTRAINT)
@@ -63,6 +65,7 @@ def demand(
             data.qpos[:] = qpos
             data.qvel[:] = qvel
             data.qacc[:] = qacc
+            # Generalized forces that produce this acceleration, with the root's wrench.
             mujoco.mj_inverse(model, data)
             force_3, zmp_2, spin = _ground_wrench(data)
             zmp.append(zmp_2)
@@ -70,6 +73,7 @@ def demand(
             force.append(force_3)
             torque.append(_joint_torques(model, data, feet, planted, force_3, zmp_2, spin))
     finally:
+        # The model belongs to the caller.
         model.opt.disableflags = flags
     return Demand(
         zmp_F2=np.array(zmp), com_F3=np.array(com), force_F3=np.array(force), torque_FM=np.array(torque)
@@ -78,12 +82,15 @@ def demand(
 
 def _ground_wrench(data: mujoco.MjData) -> tuple[Array, Array, float]:
     """Return the ground's force, the point at z = 0 about which its moment is vertical, and that moment."""
+    # Force in world axes, moment in the root's own: a free joint's convention in MuJoCo.
     force_3 = data.qfrc_inverse[:3].copy()
     moment_3 = np.empty(3)
     mujoco.mju_rotVecQuat(moment_3, data.qfrc_inverse[3:6], data.qpos[3:7])
+    # Moved from the root to the origin of the world.
     about_origin_3 = moment_3 + np.cross(data.qpos[:3], force_3)
     # The root's wrench belongs to the ground: p x f with p on the ground has these horizontal moments.
     zmp_2 = np.array((-about_origin_3[1], about_origin_3[0])) / force_3[2]
+    # The moment about the vertical, which friction of the soles has to hold.
     return force_3, zmp_2, float(about_origin_3[2] - (zmp_2[0] * force_3[1] - zmp_2[1] * force_3[0]))
 
 
@@ -97,21 +104,26 @@ def _joint_torques(
     spin: float,
 ) -> Array:
     standing = [foot for foot, is_planted in zip(feet, planted_N, strict=True) if is_planted]
+    # In flight nothing pushes, so nothing has to be taken off.
     if not standing:
         return data.qfrc_inverse[6:].copy()
     places_N3 = np.stack([data.site(foot).xpos for foot in standing])
     shares = np.array([1.0])
+    # Two feet share the force as a lever does, by the place of the pressure on the line between them.
     if len(standing) == 2:
         line_2 = places_N3[1, :2] - places_N3[0, :2]
         second = np.clip((zmp_2 - places_N3[0, :2]) @ line_2 / (line_2 @ line_2), 0.0, 1.0)
         shares = np.array([1.0 - second, second])
+    # Pressure that is not on that line is beside both feet alike.
     beside_2 = zmp_2 - shares @ places_N3[:, :2]
     torque_M = data.qfrc_inverse.copy()
     jacobian_3M = np.zeros((3, mj_model.nv))
     turn_3M = np.zeros((3, mj_model.nv))
     for foot, place_3, share in zip(standing, places_N3, shares, strict=True):
+        # On the ground, z = 0, below the sole.
         point_3 = np.append(place_3[:2] + beside_2, 0.0)
         mujoco.mj_jac(mj_model, data, jacobian_3M, turn_3M, point_3, int(mj_model.site(foot).bodyid[0]))
+        # Take off the joint torques that the ground's push on this foot already gives.
         torque_M -= share * (jacobian_3M.T @ force_3 + turn_3M[2] * spin)
     return torque_M[6:]
 
@@ -122,9 +134,12 @@ def self_contacts(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"]) -> lis
     found = {}
     for frame, qpos in enumerate(qpos_FL):
         data.qpos[:] = qpos
+        # Positions alone find contacts.
         mujoco.mj_fwdPosition(mj_model, data)
         for contact in data.contact[: data.ncon]:
             names = [mj_model.geom(int(geom)).name for geom in contact.geom]
+            # Positive distances are within the margin, but do not touch.
             if contact.dist < 0.0:
+                # The first frame of each pair is kept.
                 found.setdefault(" and ".join(sorted(names)), frame)
     return [f"{pair} from frame {frame} on" for pair, frame in found.items()]

@@ -25,6 +25,7 @@ _MIDDLE = 0.0388
 FEET = ((_MIDDLE, _WIDTH, 0.0), (_MIDDLE, -_WIDTH, 0.0))
 _NARROW = ((_MIDDLE, 0.095, 0.0), (_MIDDLE, -0.095, 0.0))
 """Feet near enough to each other to stand on one without leaning far."""
+# Arms and waist keep their posture: else the search would balance with them.
 _ARMS = {name: 0.5 for name in JOINTS if "shoulder" in name or "elbow" in name or "wrist" in name}
 _WAIST = dict.fromkeys(("waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint"), 0.1)
 # The feet's sites lie 2 mm below the soles.
@@ -44,6 +45,7 @@ def model() -> mujoco.MjModel:
 
 def _swing(times: list[float], amplitude: float, *, first: float = 1.0) -> Keys:
     """Return keys that are zero at the first and last time, and `amplitude` with alternating signs between them."""
+    # The keys inside swing to one side and the other in turn.
     inner = [(time, first * amplitude * (-1.0) ** number) for number, time in enumerate(times[1:-1])]
     return ((times[0], 0.0), *inner, (times[-1], 0.0))
 
@@ -52,9 +54,11 @@ def _arm_swing(
     begin_s: float, step_s: float, count: int, *, shoulder: float, elbow: float
 ) -> dict[str, Keys]:
     """Return arms that swing in turn with so many steps, rad; a bent elbow follows its shoulder."""
+    # Late in each step, so that an arm is furthest out as its foot comes down.
     steps = (begin_s + (number + 0.9) * step_s for number in range(count))
     times = [begin_s - 0.3, *steps, begin_s + count * step_s + 0.6]
     keys: dict[str, Keys] = {}
+    # Left and right swing against each other.
     for side, sign in (("left", 1.0), ("right", -1.0)):
         keys[f"{side}_shoulder_pitch_joint"] = _swing(times, shoulder, first=sign)
         keys[f"{side}_elbow_joint"] = _swing(times, elbow, first=-sign)
@@ -77,6 +81,7 @@ def _arms_out(begin_s: float, end_s: float, by: float) -> dict[str, Keys]:
 
 def walk() -> Choreography:
     """Return twelve steps straight ahead."""
+    # Step time, of which both feet stand for a tenth of a second; stride in m.
     begin_s = 0.9
     step_s = 0.54
     both_s = 0.1
@@ -91,6 +96,7 @@ def walk() -> Choreography:
         length = 0.5 * stride if number == 0 else stride
         if last:
             length = 0.0
+        # From the foot that is ahead, so each step passes the other foot by a stride.
         at[foot] = max(at) + length
         start = begin_s + number * step_s
         swing_s = step_s - both_s
@@ -99,12 +105,14 @@ def walk() -> Choreography:
                 foot=foot,
                 begin_s=start,
                 end_s=start + swing_s,
+                # Foot 0 is the left one, whose side is positive y.
                 to=(at[foot], (1 - 2 * foot) * _WIDTH, 0.0),
                 lift=((0.5 * swing_s, 0.08),),
                 pitch=((0.4 * swing_s, 0.45),),
             )
         )
     end_s = begin_s + count * step_s
+    # Knees bend a little for the walk, and stretch again at the end.
     return Choreography(
         duration_s=end_s + 1.2,
         feet=FEET,
@@ -118,6 +126,7 @@ def walk() -> Choreography:
 def squat() -> Choreography:
     """Return four squats with the arms raised ahead at the bottom."""
     begin_s = 0.6
+    # One squat, s: down, a short rest and up.
     cycle_s = 1.85
     count = 4
     height = [(begin_s, STAND)]
@@ -127,6 +136,7 @@ def squat() -> Choreography:
     for number in range(count):
         down = begin_s + (number + 0.45) * cycle_s
         up = begin_s + (number + 1) * cycle_s
+        # Root height (m), and lean, arms and elbows (rad) at the bottom.
         for keys, low in ((height, 0.47), (lean, 0.35), (arms, -1.4), (elbows, 0.5)):
             rest = STAND if keys is height else 0.0
             keys += [(down, low), (down + 0.1 * cycle_s, low), (up, rest)]
@@ -149,14 +159,17 @@ def turn() -> Choreography:
     both_s = 0.12
     count = 14
     moves = []
+    # Two steps for each seventh of the turn: the left foot turns first, the right one follows.
     turn_by = 2.0 * math.pi / (count // 2)
     headings = [0.0, 0.0]
     for number in range(count):
         foot = number % 2
         other = headings[1 - foot]
+        # The left foot leads; the right foot comes to its heading.
         headings[foot] = other + turn_by if foot == 0 else other
         heading = headings[foot]
         side = (1 - 2 * foot) * _WIDTH
+        # The feet move on circles about the root.
         x = _MIDDLE * math.cos(heading) - side * math.sin(heading)
         y = _MIDDLE * math.sin(heading) + side * math.cos(heading)
         start = begin_s + number * step_s
@@ -178,6 +191,7 @@ def turn() -> Choreography:
         root_height=((0.2, STAND), (0.8, 0.7), (end_s, 0.7), (end_s + 0.7, STAND)),
         joints={
             **_arm_swing(begin_s, step_s, count, shoulder=0.45, elbow=0.4),
+            # Arms are held off the legs, which turn below them.
             **_arms_out(0.2, end_s + 0.8, 0.15),
         },
     )
@@ -188,10 +202,12 @@ def kick() -> Choreography:
     raise_s = 0.45
     kick_s = 0.42
     rest_s = 0.35
+    # Seconds on one leg: raise the foot, two kicks of out and back, then rest.
     alone_s = raise_s + 4 * kick_s + rest_s
     moves = []
     begin_s = 1.2
     arms: dict[str, list[tuple[float, float]]] = {name: [(0.6, 0.0)] for name in ("left", "right")}
+    # Right leg first, while the left one stands.
     for foot in (1, 0):
         # The foot is behind the hip at first, and is so again after each of two kicks.
         lift = [(raise_s, 0.22)]
@@ -199,6 +215,7 @@ def kick() -> Choreography:
         pitch = [(raise_s, 0.5)]
         swing = [(raise_s, 0.7)]
         for number in range(2):
+            # Out and back: two beats of `kick_s` for each kick.
             out_s = raise_s + (number + 0.5) * 2 * kick_s
             back_s = raise_s + (number + 1) * 2 * kick_s
             lift += [(out_s, 0.30), (back_s, 0.22)]
@@ -216,10 +233,12 @@ def kick() -> Choreography:
                 pitch=pitch,
             )
         )
+        # Arms swing against the leg that kicks.
         for side, sign in (("left", 1.0), ("right", -1.0)):
             toward = sign if foot == 1 else -sign
             arms[side] += [(begin_s + time, angle * toward) for time, angle in swing]
             arms[side].append((begin_s + alone_s, 0.0))
+        # A second on both feet between the two legs.
         begin_s += alone_s + 1.0
     joints = _arms_out(0.2, begin_s, 0.3)
     for side in arms:
@@ -260,6 +279,7 @@ def made(name: str) -> Float[np.ndarray, "F L"]:
 
 
 if __name__ == "__main__":
-    # Writes the files anew: python -m ksim_rl.tracking.g1_motions FOLDER
+    # The files of the package are made by this, not by hand.
+    # Writes the files again: python -m ksim_rl.tracking.g1_motions FOLDER
     for name in CLIPS:
         write_motion(Path(sys.argv[1]) / f"{name}.npz", model(), made(name), FPS)

@@ -29,7 +29,7 @@ class FootMove(Checked):
     Attributes:
         foot: 0 or 1, the place among `Figure.feet`.
         to: x, y (m) and heading (rad) of the middle of the sole.
-        lift, forward, pitch: what is added on the way: m up, m along the foot's heading, rad by which the toes point
+        lift, forward, pitch: added on the way: m up, m along the foot's heading, rad by which the toes point
             down; keys at seconds since `begin_s`, zero at both ends.
     """
 
@@ -44,13 +44,13 @@ class FootMove(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """Which parts of a robot the keyframes move.
+    """The parts of a robot that keyframes move.
 
     Attributes:
         feet: sites at the middles of the soles, x forward, z up.
         root, torso: bodies that are kept at their height, and upright.
         sole_z: where a sole's site is while the foot stands, m.
-        posture_weights: what straying from the posture costs by joint, rad^-1; others cost `loose`.
+        posture_weights: cost of straying from the posture by joint, rad^-1; others cost `loose`.
     """
 
     feet: tuple[str, str]
@@ -63,12 +63,12 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Choreography(Checked):
-    """What a figure does.
+    """The motion of a figure: footsteps, heights and joints over time.
 
     Attributes:
         feet: x, y (m) and heading (rad) of each foot at the start.
         root_height, lean: m, and rad by which the torso leans forward.
-        joints: what joints do beside the default pose: rad, added to it.
+        joints: offsets of joints from the default pose, rad.
     """
 
     duration_s: Positive
@@ -82,18 +82,23 @@ class Choreography(Checked):
 def eased(keys: Keys, time_F: Float[Array, " F"]) -> Float[Array, " F"]:
     """Return values between keys by the polynomial of fifth degree that rests at each key."""
     key_s, values = (np.array(column, float) for column in zip(*keys, strict=True))
+    # A single key holds its value at all times.
     if len(keys) == 1:
         return np.full_like(time_F, values[0])
+    # Index of the key before each frame, within the first and the last interval.
     index_F = np.clip(np.searchsorted(key_s, time_F, side="right") - 1, 0, len(keys) - 2)
     share_F = np.clip((time_F - key_s[index_F]) / np.diff(key_s)[index_F], 0.0, 1.0)
+    # 10 s^3 - 15 s^4 + 6 s^5: velocity and acceleration are zero at both ends.
     smooth_F = share_F**3 * (10.0 - 15.0 * share_F + 6.0 * share_F**2)
     return values[index_F] + smooth_F * np.diff(values)[index_F]
 
 
 def smoothed(value_FN: Float[Array, "F N"], frames: float) -> Float[Array, "F N"]:
     """Return the columns blurred by a bell of so many frames (its standard deviation), ends held."""
+    # Beyond four standard deviations the bell adds nothing.
     reach = int(np.ceil(4.0 * frames))
     bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
+    # The ends are repeated, so that a rest at the ends stays a rest.
     padded = np.pad(value_FN, ((reach, reach), (0, 0)), mode="edge")
     columns = [np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T]
     return np.stack(columns, axis=-1)
@@ -103,13 +108,17 @@ def foot_paths(
     plan: Choreography, time_F: Float[Array, " F"]
 ) -> tuple[Float[Array, "F N 5"], Bool[Array, "F N"]]:
     """Return x, y, height, heading and pitch of both feet, m and rad, and when they stand."""
+    # Last dim: x, y, height, heading, pitch.
     paths_FN5 = np.zeros((len(time_F), 2, 5))
     planted_FN = np.ones((len(time_F), 2), bool)
     for foot in (0, 1):
+        # Standing at the start until the first move.
         paths_FN5[:, foot, [0, 1, 3]] = plan.feet[foot]
+        # In the order of time, as each move starts where the one before has ended.
         for move in sorted((m for m in plan.moves if m.foot == foot), key=lambda m: m.begin_s):
             from_3 = paths_FN5[-1, foot, [0, 1, 3]]
             for column, start, end in zip((0, 1, 3), from_3, move.to, strict=True):
+                # Before the move the path so far; after it `eased` holds the place.
                 paths_FN5[:, foot, column] = np.where(
                     time_F < move.begin_s,
                     paths_FN5[:, foot, column],
@@ -118,17 +127,20 @@ def foot_paths(
             up_F, ahead_F, pitch_F = (
                 _on_the_way(keys, move, time_F) for keys in (move.lift, move.forward, move.pitch)
             )
+            # Forward is along the heading of each frame, which may turn on the way.
             heading_F = paths_FN5[:, foot, 3]
             paths_FN5[:, foot, 0] += ahead_F * np.cos(heading_F)
             paths_FN5[:, foot, 1] += ahead_F * np.sin(heading_F)
             paths_FN5[:, foot, 2] += up_F
             paths_FN5[:, foot, 4] += pitch_F
+            # Both edges count as standing: the foot is at rest there.
             planted_FN[:, foot] &= (time_F <= move.begin_s) | (time_F >= move.end_s)
     return paths_FN5, planted_FN
 
 
 def _on_the_way(keys: Keys, move: FootMove, time_F: Array) -> Array:
     inner = [(move.begin_s + second, value) for second, value in keys]
+    # Zero at both ends, whatever the keys between are.
     return eased([(move.begin_s, 0.0), *inner, (move.end_s, 0.0)], time_F)
 
 
@@ -142,15 +154,19 @@ def zmp_plan(
     """
     alone_F = planted_FN.sum(1) == 1
     middle_F2 = paths_FN5[:, :, :2].mean(1)
+    # The standing foot; where both stand, this is not used.
     on_foot_F2 = np.where(planted_FN[:, :1], paths_FN5[:, 0, :2], paths_FN5[:, 1, :2])
     keys: list[tuple[int, Array]] = [(0, middle_F2[0])]
+    # Changes between standing on one foot and on two; motions begin and end on two.
     edges = np.flatnonzero(np.diff(alone_F.astype(int)))
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         both = begin - keys[-1][0]
+        # With time enough the pressure rests in the middle, else it moves from foot to foot.
         if both > 2 * shift_frames:
             if keys[-1][0]:
                 keys.append((keys[-1][0] + shift_frames, middle_F2[begin]))
             keys.append((begin - shift_frames, middle_F2[begin]))
+        # From lift-off to landing the pressure stays on the standing foot.
         keys += [(begin, on_foot_F2[begin + 1]), (end + 1, on_foot_F2[end])]
     if len(keys) > 1:
         keys.append((min(keys[-1][0] + shift_frames, len(alone_F) - 1), middle_F2[-1]))
@@ -164,10 +180,14 @@ def pendulum(zmp_F2: Float[Array, "F 2"], height_F: Float[Array, " F"], fps: flo
 
     It solves x - z x'' / (g + z'') = p with x'' as the second difference of x.
     """
+    # Acceleration of the height adds to gravity, m/s^2.
     lift_F = np.gradient(np.gradient(height_F, 1.0 / fps), 1.0 / fps)
+    # z / g in units of frames^2, as x'' is a second difference of frames.
     ratio_F = height_F / (GRAVITY + lift_F) * fps**2
+    # No acceleration at the ends: the first and last row become x = p.
     ratio_F[[0, -1]] = 0.0
     count = len(ratio_F)
+    # Tridiagonal; a dense solve is quick enough for some hundred frames.
     system_FF = np.diag(1.0 + 2.0 * ratio_F) - np.diag(ratio_F[1:], -1) - np.diag(ratio_F[:-1], 1)
     assert system_FF.shape == (count, count)
     return np.linalg.solve(system_FF, zmp_F2)
@@ -182,27 +202,33 @@ def perform(
     rounds: int = 4,
     shift_s: float = 0.5,
 ) -> tuple[Float[Array, "F L"], Demand, Bool[Array, "F N"]]:
-    """Return the qpos of each frame, what it asks for, and which feet stand; `rounds` is how often balance is improved.
+    """Return the qpos of each frame, its demand, and the feet that stand; balance is improved `rounds` times.
 
     The robot is alone in its model, and the model's first keyframe is the pose that it returns to.
     """
+    # Both ends included.
     time_F = np.arange(round(plan.duration_s * fps) + 1) / fps
     paths_FN5, planted_FN = foot_paths(plan, time_F)
+    # Steps of the plan are blurred, as a jump of pressure asks for endless acceleration.
     zmp_F2 = smoothed(zmp_plan(paths_FN5, planted_FN, shift_frames=round(shift_s * fps)), 1.5)
     posture_FL, weight_M = _posture(mj_model, figure, plan, time_F)
     root_F = eased(plan.root_height, time_F)
     lean_F = eased(plan.lean, time_F)
+    # Between the headings of the feet, and blurred: the trunk does not turn with each step.
     heading_F = smoothed(paths_FN5[:, :, 3].mean(1, keepdims=True), 0.1 * fps)[:, 0]
     solver = InverseKinematics(mj_model)
+    # A first guess of the centre of mass: somewhat below the root. It is replaced by the true one.
     height_F = root_F - 0.09
     aim_F2 = zmp_F2.copy()
     qpos_FL = posture_FL
     asked = None
+    # The pendulum has no arms and legs: their swing shifts the zero-moment point, and the aim corrects it.
     for _ in range(rounds + 1):
         com_F2 = pendulum(aim_F2, height_F, fps)
         qpos_FL = _solved(solver, figure, paths_FN5, com_F2, root_F, lean_F, heading_F, posture_FL, weight_M)
         asked = demand(mj_model, qpos_FL, fps, feet=figure.feet, planted_FN=planted_FN)
         height_F = asked.com_F3[:, 2]
+        # Move the aim against the error, blurred as frames next to each other disagree.
         aim_F2 = aim_F2 + smoothed(zmp_F2 - asked.zmp_F2, 1.0)
     assert asked is not None
     return qpos_FL, asked, planted_FN
@@ -211,12 +237,14 @@ def perform(
 def _posture(
     mj_model: mujoco.MjModel, figure: Figure, plan: Choreography, time_F: Array
 ) -> tuple[Array, Array]:
-    """Return the pose that is kept where nothing else is asked for, by frame, and what straying from it costs."""
+    """Return the pose that is kept where nothing else is asked for, by frame, and the cost of straying from it."""
     posture_FL = np.tile(mj_model.key_qpos[0], (len(time_F), 1))
     weight_M = np.full(mj_model.nv, figure.loose)
+    # The root is placed by the goals alone.
     weight_M[:6] = 0.0
     for joint, weight in figure.posture_weights.items():
         weight_M[mj_model.joint(joint).dofadr[0]] = weight
+    # Offsets of the joints that the plan names, from the default pose.
     for joint, keys in plan.joints.items():
         posture_FL[:, mj_model.joint(joint).qposadr[0]] += eased(keys, time_F)
     return posture_FL, weight_M
@@ -233,22 +261,26 @@ def _solved(
     posture_FL: Array,
     weight_M: Array,
 ) -> Array:
+    # Each frame is searched for from the one before, so that the motion stays continuous.
     qpos_L = posture_FL[0].copy()
     found = []
     for frame, posture_L in enumerate(posture_FL):
         goals: list[PoseGoal | ComGoal] = [ComGoal(pos_N=com_F2[frame])]
         for foot, (x, y, z, heading, pitch) in zip(figure.feet, paths_FN5[frame], strict=True):
             place_3 = np.array((x, y, z + figure.sole_z))
+            # Feet weigh most: a sole that slides or tilts cannot be balanced away.
             goals.append(PoseGoal(name=foot, pos_3=place_3, quat_4=turned(heading, pitch), weight=3.0))
         height_3 = np.array((0.0, 0.0, root_F[frame]))
         level = turned(heading_F[frame], 0.0)
         goals += [
+            # Only the height of the root counts; x and y follow from the balance.
             PoseGoal(name=figure.root, pos_3=height_3, quat_4=level, weight=(0.0, 0.0, 1.0), turn_weight=0.1),
             PoseGoal(
                 name=figure.torso,
                 pos_3=height_3,
                 quat_4=turned(heading_F[frame], lean_F[frame]),
                 weight=0.0,
+                # A place for the torso is not asked for, only its orientation.
                 turn_weight=0.3,
             ),
         ]

@@ -50,15 +50,19 @@ class OfAlignedBodies(OfAnchor, OfMotionBodies):
 
     def aligned(self, view: EnvView) -> Poses:
         """Return where the bodies are in the aligned motion; position stage, computed once per state."""
+        # One computation for all terms that align the same bodies.
         key = f"motion/{self.file}.aligned {self.bodies} with {self.anchor}"
         if key not in view.cache:
             own = view.body(self.anchor)
             (pos_E3, quat_E4) = self.wanted(view)
+            # Yaw from the motion's anchor to the robot's: roll and pitch are to be tracked, so they stay.
             turn_E = quaternion.yaw(quaternion.multiply(own.quat_EL, quaternion.conjugate(quat_E4)))
             half_E1 = 0.5 * turn_E[:, None]
             zero_E2 = torch.zeros_like(quat_E4[:, :2])
+            # Quaternion (w, 0, 0, z) of a turn about the vertical.
             turn_EN4 = torch.cat((torch.cos(half_E1), zero_E2, torch.sin(half_E1)), dim=-1)[:, None]
             pos_EN3, quat_EN4 = motion_bodies(view, self.file, self.bodies)
+            # The robot's place on the ground and the motion's height: drift is forgiven, crouching is not.
             place_E3 = torch.cat((own.pos_EL[:, :2], pos_E3[:, 2:]), dim=-1)
             placed_EN3 = place_E3[:, None] + quaternion.rotate(turn_EN4, pos_EN3 - pos_E3[:, None])
             view.cache[key] = Poses(placed_EN3, quaternion.multiply(turn_EN4, quat_EN4))
@@ -70,12 +74,13 @@ def motion_velocities(
 ) -> tuple[Float[Tensor, "E N 3"], Float[Tensor, "E N 3"]]:
     """Return linear (m/s) and angular (rad/s) velocities that bodies have in the motion now, world frame.
 
-    Those of the origins of the body frames, from the motion's qpos and qvel; between frames linearly.
+    They are of the origins of the body frames, from the motion's qpos and qvel; between frames linearly.
     """
     key = f"motion/{file}.velocity of {bodies}"
     if key not in view.cache:
         motion = view.motion(file)
         table_FN6 = _velocity_table(view, file, bodies)
+        # The last pair of frames is interpolated up to its end.
         last = table_FN6.shape[0] - 1
         frame_E = (motion_time(view, file) * motion.fps).clamp(0.0, float(last))
         low_E = frame_E.floor().long().clamp(max=last - 1)
@@ -90,6 +95,7 @@ def _velocity_table(view: EnvView, file: str, bodies: Patterns) -> Tensor:
     if key not in tables:
         motion = view.motion(file)
         model = view.world.mj_model
+        # Once per view: the C engine steps through all frames on the host.
         qpos_FL = motion.qpos_FL.cpu().numpy()
         qvel_FM = motion.qvel_FL.cpu().numpy()
         found_FN6 = body_velocities(model, qpos_FL, qvel_FM, key[1])
@@ -112,10 +118,12 @@ def body_velocities(
     for frame, (qpos, qvel) in enumerate(zip(qpos_FL, qvel_FM, strict=True)):
         data.qpos[:] = qpos
         data.qvel[:] = qvel
+        # All that mj_objectVelocity reads.
         mujoco.mj_kinematics(mj_model, data)
         mujoco.mj_comPos(mj_model, data)
         mujoco.mj_comVel(mj_model, data)
         for place, body in enumerate(bodies):
             mujoco.mj_objectVelocity(mj_model, data, mujoco.mjtObj.mjOBJ_XBODY, body, turn_and_move, 0)
+            # From (angular, linear) to (linear, angular).
             found_FN6[frame, place] = np.roll(turn_and_move, 3)
     return found_FN6

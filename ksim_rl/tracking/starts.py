@@ -27,6 +27,7 @@ def part_weights(view: EnvView, file: str, parts: int) -> Float[Tensor, "E B"]:
 
 def parts_of(view: EnvView, file: str, part_s: float) -> int:
     """Return how many parts of about `part_s` seconds a motion has."""
+    # Rounded up: all parts are equally long, and none is longer than asked for.
     return max(1, math.ceil(view.motion(file).duration_s / part_s - 1e-6))
 
 
@@ -38,7 +39,7 @@ class StartInMotion(ResetToMotion):
     its weights instead.
 
     Attributes:
-        pose_range, velocity_range: what is added to the root: x, y, z (m, m/s), roll, pitch, yaw (rad, rad/s), world.
+        pose_range, velocity_range: errors of the root: x, y, z (m, m/s), roll, pitch, yaw (rad, rad/s), world.
         joint_range: rad added to each joint at most, either way; joints stay in their soft limits.
         part_s: length of the curriculum's parts, s; None: none runs.
     """
@@ -55,7 +56,9 @@ class StartInMotion(ResetToMotion):
         # Velocities are those in the world, as in the motion: they do not turn with the error of the root's pose.
         lin_vel_E3 = robot.root_lin_vel_w_EL
         ang_vel_E3 = robot.root_ang_vel_w_EL
+        # Read before the pose is written, since velocities in the world follow from it.
         moved_E6, kick_E6 = (draw_by_axis(view, ranges) for ranges in (self.pose_range, self.velocity_range))
+        # The error turns the robot about world axes.
         quat_E4 = quaternion.multiply(
             quaternion.from_euler_xyz(*moved_E6[:, 3:].unbind(-1)), robot.root_quat_EL
         )
@@ -63,10 +66,12 @@ class StartInMotion(ResetToMotion):
         robot.write_root_velocity(mask_E, lin_vel_E3 + kick_E6[:, :3], ang_vel_E3 + kick_E6[:, 3:])
         low_L, high_L = joints.soft_limits_L2.unbind(-1)
         off_EL = view.uniform(len(joints), -self.joint_range, self.joint_range)
+        # Within the soft limits, where the action can reach.
         joints.write_pos(mask_E, torch.clamp(joints.pos_EL + off_EL, low_L, high_L))
 
     def draw_share(self, view: EnvView) -> Float[Tensor, " E"]:
         """Draw it from the curriculum's weights where there are some, else from the range."""
+        # Two draws: one chooses the part, one the place in it.
         drawn_E2 = view.uniform(2)
         low, high = self.start_range
         plain_E = low + (high - low) * drawn_E2[:, 0]
@@ -74,8 +79,11 @@ class StartInMotion(ResetToMotion):
             return plain_E
         parts = parts_of(view, self.file, self.part_s)
         reach_EB = torch.cumsum(part_weights(view, self.file, parts), dim=-1)
+        # Not a probability yet: weights need not add up to 1.
         whole_E = reach_EB[:, -1]
+        # The first part whose cumulated weight exceeds the draw.
         part_E = (drawn_E2[:, :1] * whole_E[:, None] >= reach_EB).sum(-1).clamp(max=parts - 1)
+        # Zeros, before the curriculum has run, mean a start from the plain range.
         return torch.where(whole_E > 0.0, (part_E + drawn_E2[:, 1]) / parts, plain_E)
 
 
@@ -97,16 +105,23 @@ class FailedParts(OfMotion, CurriculumTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         parts = parts_of(view, self.file, self.part_s)
+        # Shared by all envs: one count for each part, 1 at first.
         failed_B = view.shared("failed_B", [1.0] * parts)
         weights_EB = part_weights(view, self.file, parts)
+        # The very first resets end no episode.
         lived_E = mask_E & (view.episode_step_E > 0)
         share_E = motion_time(view, self.file) / view.motion(self.file).duration_s
+        # Where the episode was when it ended: the clock is still the old one here.
         part_E = (share_E * parts).long().clamp(0, parts - 1)
         is_here_EB = part_E[:, None] == torch.arange(parts, device=view.device)
+        # Only failures count; motions that were finished say nothing about where it is hard.
         counts_B = (is_here_EB & (lived_E & view.terminated_E)[:, None]).sum(0).to(torch.float32)
+        # All ranks learn from all failures.
         ranks.sum_(counts_B)
+        # An exponential mean over resets; nothing is read back from the device.
         mixed_B = failed_B + (counts_B - failed_B) / self.memory
         failed_B.copy_(torch.where(ranks.any_of(lived_E), mixed_B, failed_B))
+        # A share is even over all parts, so that none is forgotten.
         chance_B = self.uniform / parts + (1.0 - self.uniform) * failed_B / failed_B.sum().clamp(min=1e-9)
         weights_EB.copy_(torch.where(mask_E[:, None], chance_B, weights_EB))
         return chance_B.max() / chance_B.sum()

@@ -59,9 +59,11 @@ ITERATIONS = 1_627
 
 def observations(file: str) -> dict[str, ObservationGroupCfg]:
     """Return the groups: a noisy "actor", and a clean "critic" that also sees where the bodies are."""
+    # Order of the robot, which observations and actions share.
     joints = ROBOT.joint_names
     reference = {"reference": ObservationTermCfg(term=mdp.MotionJoints(file=file, joints=joints))}
     last = {"actions": ObservationTermCfg(term=mdp.LastAction())}
+    # Term and reach of its uniform noise, in the term's units: what the robot's sensors can tell.
     reaches = {
         "anchor_pos": (terms.MotionAnchorPos(file=file, anchor=ANCHOR), 0.25),
         "anchor_axes": (terms.MotionAnchorAxes(file=file, anchor=ANCHOR), 0.05),
@@ -76,6 +78,7 @@ def observations(file: str) -> dict[str, ObservationGroupCfg]:
         )
         for part in ("positions", "axes")
     }
+    # The critic sees the same terms without noise.
     clean = {name: ObservationTermCfg(term=term) for name, (term, _) in reaches.items()}
     seen = {name: noisy(term, reach) for name, (term, reach) in reaches.items()}
     return {
@@ -85,11 +88,12 @@ def observations(file: str) -> dict[str, ObservationGroupCfg]:
 
 
 def rewards(file: str) -> dict[str, RewardTerm]:
-    """Return the rewards: how near anchor and bodies are to the motion, and what smooth and safe motion asks for."""
+    """Return the rewards: how near anchor and bodies are to the motion, and costs of rough and unsafe motion."""
     anchor = {"file": file, "anchor": ANCHOR}
     aligned = {**anchor, "bodies": BODIES}
     bodies = {"file": file, "bodies": BODIES}
     return {
+        # Weights and stds of mjlab.
         "anchor_pos": terms.TrackAnchorPos(weight=0.5, std=0.3, **anchor),
         "anchor_quat": terms.TrackAnchorQuat(weight=0.5, std=0.4, **anchor),
         "body_pos": terms.TrackAlignedPos(weight=1.0, std=0.3, **aligned),
@@ -103,8 +107,9 @@ def rewards(file: str) -> dict[str, RewardTerm]:
 
 
 def events(file: str) -> dict[str, EventTerm]:
-    """Return starts with errors, pushes, and what is drawn for each world: mass centre, default pose, friction."""
+    """Return starts with errors, pushes, and draws for each world: mass centre, default pose, friction."""
     return {
+        # Errors at the start in m and rad, so that the policy learns to recover.
         "start": StartInMotion(
             file=file,
             pose_range={
@@ -121,8 +126,10 @@ def events(file: str) -> dict[str, EventTerm]:
         "base_com": mdp.RandomizeBodyCom(
             bodies=ANCHOR,
             operation="add",
+            # Axes x, y and z of the torso, m.
             ranges={0: (-0.025, 0.025), 1: (-0.05, 0.05), 2: (-0.05, 0.05)},
         ),
+        # Joint encoders are off by a constant.
         "default_pose": mdp.RandomizeDefaultJointPos(ranges=(-0.01, 0.01)),
         "foot_friction": velocity.foot_friction(ROBOT, low=0.3, high=1.2),
     }
@@ -144,6 +151,7 @@ def track_cfg(file: str) -> ManagerBasedRlEnvCfg:
         rewards=rewards(file),
         events=events(file),
         terminations={
+            # The end of the motion is no failure; the others are, and the curriculum counts them.
             "finished": mdp.MotionFinished(file=file),
             "anchor_height": terms.OffHeight(file=file, bodies=ANCHOR, distance=HEIGHT_LIMIT),
             "anchor_upright": terms.OffUpright(file=file, anchor=ANCHOR, limit=UPRIGHT_LIMIT),

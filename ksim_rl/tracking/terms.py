@@ -25,8 +25,9 @@ from ksim_rl.tracking.reference import OfAlignedBodies, OfAnchor, motion_velocit
 
 
 def first_axes(quat_EN4: Float[Tensor, "E N 4"]) -> Float[Tensor, "E L"]:
-    """Return the x, then the y axis of orientations, which say all of a rotation without a jump anywhere; flat."""
+    """Return the x, then the y axis of orientations, which describe a rotation without jumps; flat."""
     axes_1123 = constant((1.0, 0.0, 0.0, 0.0, 1.0, 0.0), quat_EN4.device).view(1, 1, 2, 3)
+    # [E, N, 1, 4] on [1, 1, 2, 3]: both axes of each body.
     return quaternion.rotate(quat_EN4[:, :, None], axes_1123).flatten(start_dim=1)
 
 
@@ -40,6 +41,7 @@ class MotionAnchorPos(OfAnchor, ObservationTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         own = view.body(self.anchor)
         (pos_E3, _) = self.wanted(view)
+        # Relative to the robot, so that the policy needs no place in the world.
         return quaternion.rotate_inverse(own.quat_EL, pos_E3 - own.pos_EL)
 
 
@@ -50,6 +52,7 @@ class MotionAnchorAxes(OfAnchor, ObservationTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         own = view.body(self.anchor)
         (_, quat_E4) = self.wanted(view)
+        # The rotation from the robot's anchor to the motion's.
         return first_axes(quaternion.multiply(quaternion.conjugate(own.quat_EL), quat_E4)[:, None])
 
 
@@ -83,8 +86,10 @@ class JointPositionAroundMotion(OfMotion, JointAction):
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         joints = view.joints(self.joints)
+        # At the end of the step, when the target should be reached.
         time_E = motion_time(view, self.file) + view.step_dt
         pos_EK, _ = view.motion(self.file).sample_joints(time_E, joints.index)
+        # The error that this world's joints read with.
         wrong_EK = joints.default_pos_EL - view.default_qpos_L[joints.qpos]
         view.write_joint_pos_target(self.joints, pos_EK + wrong_EK + self.shaped(view, action_EK))
 
@@ -156,6 +161,7 @@ class OffHeight(OfMotionBodies, TerminationTerm):
     distance: Positive
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        # Only z of the offset: drift along the ground is no failure.
         return (self.offset(view)[..., 2].abs() > self.distance).any(-1)
 
 
@@ -175,6 +181,7 @@ class OffUpright(OfAnchor, TerminationTerm):
 
 
 def _upward(quat_E4: Tensor) -> Tensor:
+    # z of the body's z axis: the third diagonal entry of the rotation matrix.
     return 1.0 - 2.0 * quat_E4[:, 1:3].square().sum(-1)
 
 

@@ -49,6 +49,7 @@ class TrialRunner(Evaluator):
         self._base = base
         device = self.length_E.device
         num_envs = self.length_E.shape[0]
+        # float64 sums: thousands of steps lose digits in float32.
         self.ended_well_E = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.errors_EM = torch.zeros(num_envs, len(base.cfg.metrics), dtype=torch.float64, device=device)
 
@@ -58,10 +59,12 @@ class TrialRunner(Evaluator):
         self.errors_EM.zero_()
 
     def _count_one_step(self) -> None:
+        # Envs whose trial was running before this step.
         began_E = self._running_E.clone()
         super()._count_one_step()
         view = self._base.view
         metrics = self._base.cfg.metrics.values()
+        # Time ran out, and nothing else ended the trial: the motion was followed to its end.
         ended_well_E = view.truncated_E & ~view.terminated_E
         self.ended_well_E.logical_or_(began_E & ~self._running_E & ended_well_E)
         # Where a trial has just ended, the next one's start is there to be seen.
@@ -82,6 +85,7 @@ def trial_cfg(cfg: ManagerBasedRlEnvCfg, *, pushes: bool = False) -> ManagerBase
             "as g1_track_walk"
         )
     for name in starts:
+        # From the first frame, and not from the parts of the curriculum.
         events[name] = dataclasses.replace(events[name], start_range=(0.0, 0.0), part_s=None)
     if not pushes:
         events = {name: event for name, event in events.items() if not isinstance(event, PushByVelocity)}
@@ -108,13 +112,16 @@ def run_trials(
     base = part(env, ManagerBasedRlEnv)
     assert base is not None
     files = {event.file for event in (base.cfg.events or {}).values() if isinstance(event, StartInMotion)}
+    # The longest motion that any start may choose.
     duration_s = max(base.view.motion(file).duration_s for file in files)
+    # Rounded up, but not for a rounding error of the division.
     runner = TrialRunner(
         base, env=env, policy=actor, max_steps=math.ceil(duration_s / base.step_dt - 1e-6), seed=seed
     )
     runner()
     for text in losses_of(env):
         note(f"warning: {text}")
+    # Per step of all trials, so that a long trial counts more than a short one.
     steps = runner.length_E.sum()
     errors = (runner.errors_EM.sum(0) / steps).tolist()
     success = float(runner.ended_well_E.double().mean())
