@@ -1,4 +1,4 @@
-"""Joins the models of several entities into one, and checks that each is in there what it is alone."""
+"""Joins the models of several entities into one, and checks that none of them has changed by it."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ COUNTS = {
     "sensor": "nsensor",
     "pair": "npair",
 }
-# Places in other arrays, which a joined model has elsewhere, and what only pictures or users read.
+# Places in other arrays, which a joined model has elsewhere, and fields that only pictures or users read.
 PLACES = re.compile(r".*(id|adr|num|user|plugin|sameframe|simple|signature|geom1|geom2|rgba)")
 # Sums over a tree depend on the order of its bodies in the last digits.
 TOLERANCE = 1e-9
@@ -39,12 +39,13 @@ class _Part(NamedTuple):
 
 
 def joined(entities: Mapping[str, mujoco.MjSpec]) -> mujoco.MjSpec:
-    """Put entities into one spec, with one keyframe that holds what the first one of each holds.
+    """Put entities into one spec, with one keyframe that joins the first one of each.
 
-    A ValueError names the field in which an entity is not what it is alone.
+    A ValueError names the field in which an entity differs from its own model.
     """
     spec = mujoco.MjSpec()
     first = next(iter(entities.values()))
+    # A model has one set of options: the first entity's.
     spec.option = first.option
     parts: list[_Part] = []
     for name, entity in entities.items():
@@ -52,6 +53,7 @@ def joined(entities: Mapping[str, mujoco.MjSpec]) -> mujoco.MjSpec:
         # The joined model keeps all bodies and geoms: fusing and discarding change no motion.
         entity.compiler.fusestatic = False
         entity.compiler.discardvisual = False
+        # Alone, with the common options: the model that the joined one is compared with.
         parts.append(_Part(name, load_model(entity)))
         _keep_masses(entity, parts[-1].mj_model)
         # An attached keyframe would cover its own entity only.
@@ -60,8 +62,11 @@ def joined(entities: Mapping[str, mujoco.MjSpec]) -> mujoco.MjSpec:
         # The view knows whose a body is by the name of its outermost ancestor.
         for number, body in enumerate(entity.worldbody.bodies):
             body.name = body.name or f"body{number}"
+        # Prefixes keep apart elements of the same name; the frame holds the entity's world.
         spec.attach(entity, prefix=f"{name}/", frame=spec.worldbody.add_frame())
+    # After all have been attached, so that the numbers are in the joined order.
     add_joined(spec, "default", [default_data(part.mj_model) for part in parts])
+    # Warnings of the parts have been given already.
     with caught_warnings():
         _check(load_model(spec), parts)
     return spec
@@ -75,14 +80,17 @@ def _keep_masses(spec: mujoco.MjSpec, mj_model: mujoco.MjModel) -> None:
     ):
         return
     for number, body in enumerate(spec.bodies):
+        # Body 0 is the world.
         if number == 0 or mj_model.body_mass[number] == 0.0:
             continue
         body.explicitinertial = True
+        # A full inertia, if there is one, would win over the principal one: NaN means none.
         body.fullinertia = [np.nan, 0.0, 0.0, 0.0, 0.0, 0.0]
         body.mass = mj_model.body_mass[number]
         body.inertia = mj_model.body_inertia[number]
         body.ipos = mj_model.body_ipos[number]
         body.iquat = mj_model.body_iquat[number]
+    # The settings have done their work in the numbers above.
     compiler.settotalmass = -1.0
     # Explicit inertias would be ignored.
     compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
@@ -96,6 +104,7 @@ def _check(mj_model: mujoco.MjModel, parts: list[_Part]) -> None:
             name for name in dir(mj_model) if name.startswith(f"{kind}_") and not PLACES.fullmatch(name)
         ]
         for part, rows in zip(parts, rows_of, strict=True):
+            # An element that is missing or doubled would shift all rows after it.
             own = _own_rows(part.mj_model, kind)
             if len(own) != len(rows):
                 raise ValueError(
@@ -111,7 +120,9 @@ def _compare(part: _Part, field: str, own: list[int], joined_values: np.ndarray)
     same = np.isclose(alone, joined_values, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True)
     if same.all():
         return
+    # The first difference is enough for a message.
     place = int(np.argwhere(~same)[0][0])
+    # Users know joints by one name for both kinds of rows.
     if field.startswith(("jnt_", "dof_")):
         kind = "joint"
     else:
@@ -126,6 +137,7 @@ def _compare(part: _Part, field: str, own: list[int], joined_values: np.ndarray)
 def _own_rows(mj_model: mujoco.MjModel, kind: str) -> list[int]:
     """Return the rows of a part's elements; the world's body is everybody's."""
     count = getattr(mj_model, COUNTS[kind])
+    # The world's body is shared; all others belong to one part.
     return list(range(1 if kind == "body" else 0, count))
 
 
@@ -136,6 +148,7 @@ def _rows(mj_model: mujoco.MjModel, kind: str, parts: list[_Part]) -> Iterator[l
     if kind in ("geom", "site"):
         # A model lists what stands in the world itself first, of all parts.
         elsewhere = int(np.sum(getattr(mj_model, f"{kind}_bodyid") == 0))
+    # Body 0 is the world's own.
     elif kind == "body":
         elsewhere = 1
     for part in parts:

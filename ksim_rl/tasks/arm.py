@@ -33,10 +33,11 @@ def _cfg(
     events: Mapping[str, EventTerm],
     metric: MetricTerm,
 ) -> ManagerBasedRlEnvCfg:
-    """Put together what both tasks share; `prefix` stands before the names of the arm's elements."""
+    """Put together the parts that both tasks share; `prefix` stands before the names of the arm's elements."""
     joints = tuple(f"{prefix}{joint}" for joint in Arm.joints)
     terms = {
         "joint_pos": ObservationTermCfg(term=mdp.JointPosRel(joints=joints)),
+        # Divided by 5, since speeds reach several rad/s.
         "joint_vel": ObservationTermCfg(term=mdp.JointVel(joints=joints), scale=0.2),
         **observations,
         "last_action": ObservationTermCfg(term=mdp.LastAction()),
@@ -66,6 +67,7 @@ def arm_reach() -> ManagerBasedRlEnvCfg:
     """Return the config of bringing the tip to points in front of the arm, a new one every 3 to 5 s."""
     here: dict[str, Any] = {"command": COMMAND, "site": Arm.tip}
     return _cfg(
+        # A single entity keeps its plain names: no prefix.
         SceneCfg(robots={"arm": Arm()}, terrain=PlaneTerrain(), num_envs=2048),
         prefix="",
         observations={"to_target": ObservationTermCfg(term=mdp.OffsetToCommand(**here))},
@@ -74,6 +76,7 @@ def arm_reach() -> ManagerBasedRlEnvCfg:
             resampling_time_range_s=(3.0, 5.0),
         ),
         rewards={
+            # A wide and a narrow reward: the wide one leads there, the narrow one asks for precision.
             "coarse": mdp.TrackPosition(**here, std=0.25, weight=1.0),
             "fine": mdp.TrackPosition(**here, std=0.05, weight=1.0),
         },
@@ -84,6 +87,7 @@ def arm_reach() -> ManagerBasedRlEnvCfg:
 
 def arm_push() -> ManagerBasedRlEnvCfg:
     """Return the config of pushing a cube over the table to a place that stays for the episode."""
+    # Names of a joined scene have the entity's prefix.
     cube = "cube/box"
     here: dict[str, Any] = {"command": COMMAND, "body": cube}
     return _cfg(
@@ -103,19 +107,25 @@ def arm_push() -> ManagerBasedRlEnvCfg:
             "cube_lin_vel": ObservationTermCfg(term=mdp.RootLinVel(entity="cube", frame="world")),
         },
         command=mdp.CartesianCommand(
+            # The cube stays on the table: the target's height is half an edge.
             position={"x": (0.25, 0.45), "y": (-0.2, 0.2), "z": (CUBE_EDGE / 2, CUBE_EDGE / 2)},
+            # As long as an episode, so that the target stays.
             resampling_time_range_s=(8.0, 8.0),
         ),
         rewards={
+            # Leads the tip to the cube first, and is worth less than moving it.
             "near_cube": mdp.NearBody(site=f"arm/{Arm.tip}", body=cube, std=0.15, weight=0.5),
             "coarse": mdp.TrackPosition(**here, std=0.2, weight=1.0),
             "fine": mdp.TrackPosition(**here, std=0.05, weight=2.0),
         },
         events={
             "cube": mdp.ResetRootUniform(
-                entity="cube", pose_range={"x": (-0.07, 0.05), "y": (-0.12, 0.12), "yaw": (-3.14, 3.14)}
+                # About its placement, within the arm's reach.
+                entity="cube",
+                pose_range={"x": (-0.07, 0.05), "y": (-0.12, 0.12), "yaw": (-3.14, 3.14)},
             )
         },
+        # In the end only: the cube may pass the target earlier.
         metric=mdp.TargetReached(**here, tolerance=0.04, reduce="last"),
     )
 

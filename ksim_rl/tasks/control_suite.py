@@ -33,6 +33,7 @@ from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, Observation
 
 
 def _groups(**terms: ObservationTerm) -> dict[str, ObservationGroupCfg]:
+    # The state is fully observed: actor and critic see the same.
     cfgs = {name: ObservationTermCfg(term=term) for name, term in terms.items()}
     return dict.fromkeys(("actor", "critic"), ObservationGroupCfg(terms=cfgs))
 
@@ -59,6 +60,7 @@ class CartpolePosition(ObservationTerm):
     """Position of the cart, m, and cosine and sine of the pole's angle from upright, [E, 3]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
+        # Cosine and sine have no jump at half a turn.
         cart_E1 = view.joints("slider").pos_EL
         angle_E1 = view.joints("hinge").pos_EL
         return torch.cat((cart_E1, torch.cos(angle_E1), torch.sin(angle_E1)), dim=-1)
@@ -75,8 +77,10 @@ class CartpoleReward(RewardTerm):
         cart_E = view.joints("slider").pos_EL[:, 0]
         angle_E = view.joints("hinge").pos_EL[:, 0]
         velocity_E = view.joints("hinge").vel_EL[:, 0]
+        # 1 upright, 0 hanging.
         upright_E = (torch.cos(angle_E) + 1.0) / 2.0
         centered_E = (1.0 + tolerance(cart_E, low=0.0, high=0.0, margin=2.0)) / 2.0
+        # Control counts for a fifth at most, each of the others for half or all.
         small_control_E = (4.0 + (1.0 - view.action_EL[:, 0].clamp(-1.0, 1.0).square())) / 5.0
         small_velocity_E = (1.0 + tolerance(velocity_E, low=0.0, high=0.0, margin=5.0)) / 2.0
         return upright_E * centered_E * small_control_E * small_velocity_E
@@ -89,6 +93,7 @@ class PoleFallen(TerminationTerm):
     limit: Annotated[float, Within(low=0.0, high=math.pi, low_open=True)]
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        # Cosines, so that whole turns do not matter.
         return torch.cos(view.joints("hinge").pos_EL[:, 0]) < math.cos(self.limit)
 
 
@@ -105,6 +110,7 @@ class ResetCartpole(EventTerm):
     velocity_std: NonNegative = 0.01
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        # Both numbers from one draw, position and angle.
         spread_EL = view.uniform(2, -1.0, 1.0)
         cart_E1 = spread_EL[:, :1] * self.cart_range
         angle_E1 = self.angle + spread_EL[:, 1:] * self.angle_range
@@ -121,8 +127,10 @@ def _cartpole_cfg(reset: ResetCartpole, **terminations: TerminationTerm) -> Mana
         actions={"force": mdp.JointEffortAction(joints="slider")},
         events={"reset": reset},
         rewards={"balance": CartpoleReward()},
+        # A truncation, not a failure.
         terminations={"time_out": mdp.TimeOut(time_out=True), **terminations},
         episode_length_s=10.0,
+        # One reward per step, as in dm_control.
         scale_rewards_by_dt=False,
         viewer=ViewerCfg(body="cart", distance=4.0, elevation=-10.0, azimuth=90.0),
     )
@@ -183,6 +191,7 @@ class PendulumAngle(ObservationTerm):
     """Cosine and sine of the angle from upright, [E, 2]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 2"]:
+        # The pendulum's hinge is its only joint.
         return torch.cat((torch.cos(view.joint_pos_EL), torch.sin(view.joint_pos_EL)), dim=-1)
 
 
@@ -197,6 +206,7 @@ class PendulumReward(RewardTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         cosine_E = torch.cos(view.joint_pos_EL[:, 0])
         speed_E = view.joint_vel_EL[:, 0]
+        # Linear all the way down, so that there is a slope to climb from hanging.
         up_E = tolerance(cosine_E, low=UPRIGHT, margin=1.0 + UPRIGHT, value_at_margin=0.0, shape="linear")
         return up_E * (1.0 + 4.0 * tolerance(speed_E, low=0.0, high=0.0, margin=5.0)) / 5.0
 
@@ -285,12 +295,14 @@ class ReacherTarget(HeldCommand):
     def draw(self, view: EnvView) -> Float[Tensor, "E 2"]:
         share_E, angle_E = view.uniform(2).unbind(-1)
         inner, outer = self.radius
+        # The square root makes points uniform by area, not crowded at the hub.
         radius_E = torch.sqrt(inner**2 + share_E * (outer**2 - inner**2))
         angle_E = 2.0 * torch.pi * angle_E
         return radius_E[:, None] * torch.stack((torch.cos(angle_E), torch.sin(angle_E)), dim=-1)
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         x, y = self.held(view)[env_index].tolist()
+        # In the finger's plane.
         visualizer.sphere((x, y, Reacher.plane_height), radius=TARGET_RADIUS, rgba=(0.2, 0.6, 0.2, 0.8))
 
 
@@ -299,6 +311,7 @@ class ReacherPose(ObservationTerm):
     """Cosine and sine of the shoulder's angle, and the wrist's angle, rad, [E, 3]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
+        # The wrist has limits, and no whole turns.
         shoulder_E1, wrist_E1 = view.joint_pos_EL.split(1, dim=-1)
         return torch.cat((torch.cos(shoulder_E1), torch.sin(shoulder_E1), wrist_E1), dim=-1)
 
@@ -326,6 +339,7 @@ class ReacherReward(RewardTerm):
 
 def _offset(view: EnvView, command: str) -> Float[Tensor, "E 2"]:
     """Return target minus finger, x and y in the world frame, m, [E, 2]."""
+    # The command is in the world frame, as the site is.
     return view.command(command) - view.site("finger").pos_EL[:, :2]
 
 
@@ -338,8 +352,10 @@ def reacher() -> ManagerBasedRlEnvCfg:
         actions={"torque": mdp.JointEffortAction(joints=("shoulder", "wrist"))},
         events={
             "shoulder": mdp.ResetJoints(joints="shoulder", position_range=(-torch.pi, torch.pi)),
+            # The whole range of the wrist.
             "wrist": mdp.ResetJoints(joints="wrist", position_range=(-2.7, 2.7)),
         },
+        # As long as an episode: one target each.
         commands={"target": ReacherTarget(resampling_time_range_s=(20.0, 20.0))},
         rewards={"reach": ReacherReward()},
         terminations={"time_out": mdp.TimeOut(time_out=True)},

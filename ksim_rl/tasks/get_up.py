@@ -1,8 +1,8 @@
 """A legged robot that was dropped in any pose rises and then stands still; robots of our own, nothing to download.
 
 An episode starts with the robot in the air, turned and bent at random; within half a second it lies on the ground.
-The reward has no stages: height and uprightness lead up from any pose, and what a good stance adds on top is worth
-something only as far as the robot is up. Falling over ends nothing.
+The reward has no stages: height and uprightness lead up from any pose, and a good stance adds something on
+top only as far as the robot is up. Falling over ends nothing.
 """
 
 import dataclasses
@@ -60,8 +60,10 @@ class Standing(RewardTerm):
     speed_std: Positive = 2.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # Squared, so that lying on the belly at half height gives little.
         up_E = (upright(view) * risen(view, self.standing_height)).square()
         stray_E = view.joint_pos_rel_EL.square().mean(-1) / self.pose_std**2
+        # Both exponents add up: one exponential for pose and speed.
         motion_E = view.joint_vel_EL.square().mean(-1) / self.speed_std**2
         return up_E * torch.exp(-stray_E - motion_E)
 
@@ -76,6 +78,7 @@ class Stands(MetricTerm, reduce="last"):
     standing_height: float
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # Height alone would count a robot that stands on its head.
         is_high_E = root_height(view) > 0.85 * self.standing_height
         is_upright_E = -view.projected_gravity_EL[:, 2] > math.cos(0.35)
         return (is_high_E & is_upright_E).to(torch.float32)
@@ -83,6 +86,7 @@ class Stands(MetricTerm, reduce="last"):
 
 def risen(view: EnvView, standing_height: float) -> Float[Tensor, " E"]:
     """Return the root's height as a fraction of the standing one, within [0, 1], [E]; position stage."""
+    # A jump above the standing height gives no more.
     return (root_height(view) / standing_height).clamp(0.0, 1.0)
 
 
@@ -101,6 +105,7 @@ def get_up_cfg(
     """
     return ManagerBasedRlEnvCfg(
         decimation=4,
+        # `njmax` makes room for a whole body on the ground, where one is given.
         sim=dataclasses.replace(velocity.sim(), njmax=njmax),
         scene=velocity.on_plane(robot),
         observations=_observations(robot),
@@ -118,6 +123,7 @@ def get_up_cfg(
                 pose_range={
                     **dict.fromkeys(("x", "y"), (-0.5, 0.5)),
                     "z": drop_height,
+                    # Any orientation at all.
                     **dict.fromkeys(("roll", "pitch", "yaw"), (-math.pi, math.pi)),
                 }
             ),
@@ -125,6 +131,7 @@ def get_up_cfg(
             "encoder_bias": mdp.RandomizeEncoderBias(ranges=(-0.015, 0.015)),
             "foot_friction": velocity.foot_friction(robot, low=0.4, high=1.2),
         },
+        # No fall ends the episode: falling is where it begins.
         terminations={"time_out": mdp.TimeOut()},
         metrics={"stands": Stands(standing_height=standing_height)},
         episode_length_s=6.0,
@@ -133,12 +140,15 @@ def get_up_cfg(
 
 
 def _observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
-    """Return those of the velocity tasks without velocity, command and feet; the critic also sees its height."""
+    """Return the velocity tasks' observations without velocity, command and feet; the critic also sees its height."""
     groups = velocity.observations(robot)
+    # The actor has no linear velocity, which a robot cannot measure directly.
     own = ("base_ang_vel", "projected_gravity", "joint_pos_biased", "joint_vel", "actions")
+    # The critic's joint positions have no encoder bias.
     seen = ("base_lin_vel", *own[:2], "joint_pos", *own[3:])
     actor = {name: groups["actor"].terms[name] for name in own}
     critic = {name: groups["critic"].terms[name] for name in seen}
+    # Heights of the IMU and of the feet tell how far it has risen.
     height = ObservationTermCfg(term=mdp.FootHeight(sites=("imu", *robot.foot_sites)))
     return {
         "actor": ObservationGroupCfg(terms=actor),

@@ -1,6 +1,6 @@
 """Planar robots stand, walk, run and hop in the xz plane, rated by posture and speed, or as a recorded walk does.
 
-The tasks are those of dm_control's suite (Tassa et al., "DeepMind Control Suite", 2018) on robots of our own:
+The tasks are from dm_control's suite (Tassa et al., "DeepMind Control Suite", 2018) on robots of our own:
 rewards in [0, 1], 1000 steps per episode, no early end. Unlike there, episodes start standing; who falls has to get up.
 """
 
@@ -43,6 +43,7 @@ def height(view: EnvView) -> Float[Tensor, " E"]:
 
 def upright(view: EnvView) -> Float[Tensor, " E"]:
     """Return 1 where the torso is upright, 0 where it is upside down, linear in the cosine between, [E]."""
+    # Gravity's z in the torso's frame is -cos of the tilt.
     return (1.0 - view.projected_gravity_EL[:, 2]) / 2.0
 
 
@@ -53,6 +54,7 @@ def forward_speed(view: EnvView) -> Float[Tensor, " E"]:
 
 def small_effort(view: EnvView) -> Float[Tensor, " E"]:
     """Return 1 without any action, 0 where each is at or beyond its limit, [E]."""
+    # Raw actions may leave [-1, 1]; the motors clamp them there.
     return (1.0 - view.action_EL.clamp(-1.0, 1.0).square()).mean(-1)
 
 
@@ -71,9 +73,10 @@ class ForwardSpeed(MetricTerm):
 
 
 def _own_state(motors: str) -> dict[str, ObservationTermCfg]:
-    """Return what each planar robot sees of itself."""
+    """Return each planar robot's observations of itself."""
     return {
         "gravity": ObservationTermCfg(term=mdp.ProjectedGravity()),
+        # Without `root_x`: how far it has run must not matter.
         "joint_pos": ObservationTermCfg(term=mdp.JointPos(joints=("root_z", motors))),
         "joint_vel": ObservationTermCfg(term=mdp.JointVel()),
     }
@@ -84,6 +87,7 @@ def planar_cfg(
 ) -> ManagerBasedRlEnvCfg:
     """Put a planar task together; an env step lasts `step_dt`, s, and the camera's `distance` is in m."""
     motors = robot.joints
+    # Actor and critic see the same.
     seen = ObservationGroupCfg(terms=_own_state(motors))
     return ManagerBasedRlEnvCfg(
         decimation=decimation,
@@ -92,6 +96,7 @@ def planar_cfg(
         observations={"actor": seen, "critic": seen},
         actions={"torque": mdp.JointEffortAction(joints=motors)},
         events={
+            # A little above the ground, so that no foot starts inside of it.
             "height": mdp.ResetJoints(joints="root_z", position_range=(0.02, 0.08)),
             "pitch": mdp.ResetJoints(joints="root_y", position_range=(-0.1, 0.1)),
             "legs": mdp.ResetJoints(joints=motors, position_range=(-0.1, 0.1), velocity_range=(-0.1, 0.1)),
@@ -99,7 +104,9 @@ def planar_cfg(
         rewards={"task": reward},
         terminations={"time_out": mdp.TimeOut(time_out=True)},
         metrics={"forward_speed": ForwardSpeed()},
+        # Measured in steps, since the control rates differ.
         episode_length_s=STEPS_PER_EPISODE * step_dt,
+        # Rewards lie in [0, 1] per step, so that a perfect episode gives 1000.
         scale_rewards_by_dt=False,
         viewer=ViewerCfg(body="torso", distance=distance, elevation=-10.0, azimuth=90.0),
     )
@@ -142,6 +149,7 @@ class CheetahReward(RewardTerm):
     """Forward speed over `CHEETAH_SPEED`, clipped to [0, 1]; velocity stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # From a stand the reward rises in proportion to the speed.
         return _fast(view, CHEETAH_SPEED, margin=CHEETAH_SPEED)
 
 
@@ -170,6 +178,7 @@ class HopperReward(RewardTerm):
     speed: NonNegative = 0.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # Height above the foot, so that jumping alone gives nothing.
         foot_E = view.body("foot").pos_EL[:, 2]
         tall_E = tolerance(height(view) - foot_E, low=HOPPER_HEIGHT, margin=HOPPER_HEIGHT / 2)
         stand_E = tall_E * upright(view)
@@ -213,6 +222,7 @@ class WalkerReward(RewardTerm):
         stand_E = (3.0 * tall_E + upright(view)) / 4.0
         if self.speed == 0.0:
             return stand_E
+        # Half of "fast" is left at half the speed; the factor below keeps standing worth something.
         fast_E = _fast(view, self.speed, margin=self.speed / 2, value_at_margin=0.5)
         return stand_E * (5.0 * fast_E + 1.0) / 6.0
 
@@ -265,15 +275,17 @@ class PoseDistance(MetricTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         joints = view.joints(self.joints)
+        # All frames of the motion, in the order of the joints.
         poses_FL = view.motion(self.file).joint_pos_FL[:, joints.index]
         own_EL = joints.pos_EL
+        # Root mean square over joints, at the nearest frame.
         return torch.cdist(own_EL, poses_FL).amin(-1) / own_EL.shape[-1] ** 0.5
 
 
 def _motion_cfg(
     terms: Mapping[str, ObservationTermCfg], groups: Sequence[str] = ("actor", "critic"), **parts: Any
 ) -> ManagerBasedRlEnvCfg:
-    """Put together what both tasks share: the robot, what it observes of itself and `terms`, and its servos."""
+    """Put together the parts that both tasks share: the robot, its servos, and its observations with `terms`."""
     robot = Walker(actuators=WALKER_SERVOS)
     seen = {**_own_state(Walker.joints), **terms}
     return ManagerBasedRlEnvCfg(
@@ -292,6 +304,7 @@ def walker_amp() -> ManagerBasedRlEnvCfg:
     """Return the config of walking at the speed of the motion `walker_walk`."""
     return _motion_cfg(
         {},
+        # The group "style" is the one that AMP compares with the motion.
         ("actor", "critic", "style"),
         events={"reset": mdp.ResetToMotion(file=MOTION)},
         rewards={"walk": WalkAt(speed=SPEED)},
@@ -300,6 +313,7 @@ def walker_amp() -> ManagerBasedRlEnvCfg:
             "forward_speed": ForwardSpeed(),
             "pose_distance": PoseDistance(file=MOTION, joints=Walker.joints),
         },
+        # One per step at most, as in the other planar tasks.
         scale_rewards_by_dt=False,
     )
 
@@ -313,6 +327,7 @@ def walker_track() -> ManagerBasedRlEnvCfg:
     }
     return _motion_cfg(
         terms,
+        # The last tenth is left out, so that an episode has something to follow.
         events={"reset": mdp.ResetToMotion(file=MOTION, start_range=(0.0, 0.9))},
         rewards={
             "joint_pos": mdp.TrackMotionJointPos(file=MOTION, joints=Walker.joints, std=0.7, weight=0.65),
@@ -324,6 +339,7 @@ def walker_track() -> ManagerBasedRlEnvCfg:
         },
         terminations={
             "finished": mdp.MotionFinished(file=MOTION),
+            # Early termination: a robot that has strayed sees states that the motion never has.
             "strayed": mdp.FarFromMotion(file=MOTION, bodies="torso", distance=0.4),
         },
     )

@@ -1,6 +1,6 @@
 """The tasks in which legged robots follow a velocity command on flat ground, two of them on rough too.
 
-The figures of Go1 and G1 are those of mjlab 1.6.0's `Mjlab-Velocity-Flat-Unitree-Go1` and `-G1`. The quadruped and the
+The figures of Go1 and G1 are from mjlab 1.6.0's `Mjlab-Velocity-Flat-Unitree-Go1` and `-G1`. The quadruped and the
 humanoid are our own, with nothing to download; Go2's motors run PD control.
 """
 
@@ -51,6 +51,7 @@ def _task(
 # -- four legs ---------------------------------------------------------------------------------------------------
 
 
+# Hips stray less than knees, which do the lifting.
 def _four_legs_pose(hips: str, knees: str) -> velocity.PoseStd:
     moving = {hips: 0.3, knees: 0.6}
     return velocity.PoseStd(standing={hips: 0.05, knees: 0.1}, walking=moving, running=moving)
@@ -71,6 +72,7 @@ def go1_velocity_flat() -> ManagerBasedRlEnvCfg:
     return velocity.flat_cfg(
         GO1_ROBOT,
         UNITREE_POSE,
+        # An elliptic cone with a high impratio keeps feet from creeping while they stand.
         physics=velocity.sim(cone="elliptic", impratio=10.0),
         feet=ContactSensor(geoms=GO1_ROBOT.foot_geoms),
         friction=GO1_FRICTION,
@@ -102,6 +104,7 @@ def quadruped_velocity_flat() -> ManagerBasedRlEnvCfg:
 
 def quadruped_velocity_delayed() -> ManagerBasedRlEnvCfg:
     """Return the same with actions that arrive up to 40 ms late, as on a robot's bus: each env draws its own lags."""
+    # Up to two env steps of 20 ms.
     lag = TransformCfg(ActionDelay, delay=DelayCfg(min_lag=0, max_lag=2))
     return dataclasses.replace(quadruped_velocity_flat(), transforms={"lag": lag})
 
@@ -172,6 +175,7 @@ def g1_velocity_flat() -> ManagerBasedRlEnvCfg:
         G1_ROBOT,
         G1_POSE,
         is_biped=True,
+        # Each foot is seven capsules of one subtree: one element per foot, not per geom.
         feet=ContactSensor(subtrees=G1_ROBOT.foot_bodies),
         torso=torso,
         # A robot that lies on its arms needs 221 rows, more than the probe of the model finds.
@@ -186,6 +190,7 @@ def t1_velocity_flat() -> ManagerBasedRlEnvCfg:
         T1_ROBOT,
         T1_POSE,
         is_biped=True,
+        # Feet of several geoms count as one element each.
         feet=ContactSensor(subtrees=T1_ROBOT.foot_bodies),
         viewer=ViewerCfg(body=T1_ROBOT.root_body, distance=3.0, elevation=-10.0, azimuth=90.0),
     )

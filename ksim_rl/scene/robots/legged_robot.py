@@ -1,4 +1,4 @@
-"""Says what walking tasks need to know of a robot beyond its model; menagerie robots share how they are built."""
+"""Robots for walking tasks: the facts beyond their models, and how menagerie robots are built."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class LeggedRobot(Protocol):
     name: ClassVar[str]
     root_body: ClassVar[str]  # the body with the free joint
     joint_names: ClassVar[tuple[str, ...]]  # in policy order, as in actions and joint observations
-    foot_geoms: ClassVar[tuple[str, ...]]  # what treads on the ground; their friction is drawn
+    foot_geoms: ClassVar[tuple[str, ...]]  # they tread on the ground; their friction is drawn
     foot_sites: ClassVar[tuple[str, ...]]  # one per foot, near its sole
 
     @property
@@ -70,14 +70,18 @@ class MenagerieRobot(Checked):
         joints removed; bodies, passive joints and visual geoms stay.
         """
         spec = load_spec(self.model)
+        # Names and a free root come first, since the facts below refer to them.
         self._ready(spec)
         edit.reset_options(spec)
+        # Before the actuators: these may bring losses of their own.
         edit.clear_joint_losses(spec, self.actuators)
         set_actuators(spec, self.actuators)
         edit.replace_collision_geoms(spec, self.collision_geoms)
+        # Sites before the sensors that sit at them.
         edit.set_sites(spec, self.sites)
         edit.replace_sensors(spec, edit.root_sensors(imu=self.imu, root=self.root_body))
         pose = {"init_pos": self.init_pos, "init_quat": self.init_quat, "joint_pos": self.default_joint_pos}
+        # The keyframe needs the final joints and actuators.
         edit.set_keyframe(spec, "init_state", **pose)
         edit.exclude_contacts(spec, self.overlaps)
         return spec
@@ -88,7 +92,7 @@ class MenagerieRobot(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class ModelRobot(MenagerieRobot):
-    """The same with all facts as fields, such as `analyse` proposes them; `model` is what `load_spec` takes.
+    """The same with all facts as fields, such as `analyse` proposes them; `model` is a source for `load_spec`.
 
     Bodies and joints without a name are called by kind and place, such as "body3". `free_root` frees a base that the
     model fixes to the world, and `root_turn` (w, x, y, z) turns the frame of the root, see `turn_root`. The model's

@@ -16,11 +16,13 @@ def passive_joints(mj_model: mujoco.MjModel) -> list[int]:
     joints = scalar_joint_ids(mj_model)
     moving = np.flatnonzero(mj_model.actuator_trntype != mujoco.mjtTrn.mjTRN_BODY)  # adhesion moves nothing
     if not moving.size:
+        # Without actuators, as in files from CAD, only a spring tells a joint that is not meant to be driven.
         return [joint for joint in joints if mj_model.jnt_stiffness[joint] > 0.0]
     driven: set[int] = set()
     for actuator in moving:
         moved = _moved_by(mj_model, int(actuator))
         if moved is None:
+            # It cannot be told which joints move: all count as driven.
             return []
         driven.update(moved)
     return [joint for joint in joints if joint not in driven]
@@ -36,6 +38,7 @@ def _moved_by(mj_model: mujoco.MjModel, actuator: int) -> list[int] | None:
         return None
     first = int(mj_model.tendon_adr[target])
     count = int(mj_model.tendon_num[target])
+    # A spatial tendon pulls on all that it passes.
     if (mj_model.wrap_type[first : first + count] != mujoco.mjtWrap.mjWRAP_JOINT).any():
         return None
     return mj_model.wrap_objid[first : first + count].tolist()

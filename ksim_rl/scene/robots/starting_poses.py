@@ -30,7 +30,9 @@ def starting_poses(mj_model: mujoco.MjModel, wanted: str | None = None) -> list[
     """
     if not (mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
         raise ValueError(NO_FREE_JOINT)
+    # The model's own pose is tried last.
     poses = [StartingPose(name=OWN_POSE, qpos=_inside(mj_model, mj_model.qpos0))]
+    # Backwards, since each goes to the front.
     for number in reversed(range(mj_model.nkey)):
         name = mj_model.key(number).name or f"keyframe {number}"
         poses.insert(0, StartingPose(name=name, qpos=_inside(mj_model, mj_model.key_qpos[number])))
@@ -40,11 +42,14 @@ def starting_poses(mj_model: mujoco.MjModel, wanted: str | None = None) -> list[
             raise ValueError(
                 f"the model has no pose {wanted!r}: {near(wanted, [pose.name for pose in poses])}"
             )
+        # Two poses may have the same name; the first one is meant.
         return named[:1]
     heights = [_height(mj_model, pose.qpos) for pose in poses]
+    # The absolute value keeps the bound below the highest pose, whatever its sign.
     least = max(heights) - (1.0 - LEAST_HEIGHT) * abs(max(heights))
     upright = [pose for pose, height in zip(poses, heights, strict=True) if height >= least]
     different: list[StartingPose] = []
+    # Keyframes often repeat the own pose; each is tried once.
     for pose in upright:
         if not any(np.allclose(pose.qpos, other.qpos, atol=1e-3) for other in different):
             different.append(pose)
@@ -53,22 +58,26 @@ def starting_poses(mj_model: mujoco.MjModel, wanted: str | None = None) -> list[
 
 
 def _root_is_upright(mj_model: mujoco.MjModel, qpos: np.ndarray) -> bool:
+    # The free joint has the lowest joint type, 0.
     first = int(mj_model.jnt_qposadr[mj_model.jnt_type.argmin()])
     return turn_of_root(qpos[first + 3 : first + 7]) == UPRIGHT
 
 
 def _inside(mj_model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     """Return a pose with hinges and slides inside their ranges, and balls as the model has them."""
+    # A pose outside of a range would be pushed back in the first step.
     inside = qpos.copy()
     for joint in scalar_joint_ids(mj_model):
         if mj_model.jnt_limited[joint]:
             column = mj_model.jnt_qposadr[joint]
             inside[column] = np.clip(inside[column], *mj_model.jnt_range[joint])
+    # Balls keep the model's pose: the stance moves hinges and slides only.
     for joint in np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_BALL):
         first = mj_model.jnt_qposadr[joint]
         inside[first : first + 4] = mj_model.qpos0[first : first + 4]
     for joint in np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
         first = mj_model.jnt_qposadr[joint]
+        # A file's quaternion may have any length.
         mujoco.mju_normalize4(inside[first + 3 : first + 7])
     return inside
 

@@ -16,8 +16,10 @@ LEAST_UP = math.cos(math.radians(30.0))
 
 def name_all(spec: mujoco.MjSpec) -> list[str]:
     """Name the bodies and joints that have no name by their kind and place, and return these names."""
+    # A free joint needs no name.
     joints = [joint for joint in spec.joints if joint.type != FREE]
     given = []
+    # Without the world, which has its name.
     for kind, elements in (("body", list(spec.bodies)[1:]), ("joint", joints)):
         taken = {element.name for element in elements}
         for number, element in enumerate(elements, 1):
@@ -39,6 +41,7 @@ def free_root(spec: mujoco.MjSpec, root: str) -> None:
 
 def fixed_root(spec: mujoco.MjSpec) -> str | None:
     """Return the only body that stands in the world, if it has no joint there, else None."""
+    # With several bodies in the world it is not told which one is the robot.
     standing = list(spec.worldbody.bodies)
     if len(standing) != 1 or list(standing[0].joints):
         return None
@@ -49,10 +52,12 @@ def turn_of_root(quat: np.ndarray) -> Quaternion:
     """Return how the root's frame is to be turned so that its z axis points up in a pose where it has `quat`."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, quat)
+    # The lower right entry: the z component of the body's z axis.
     if matrix[8] >= LEAST_UP:
         return UPRIGHT
     inverse = np.zeros(4)
     mujoco.mju_negQuat(inverse, quat)
+    # Rounded, since it is written into code.
     w, x, y, z = (round(float(value), 6) for value in inverse)
     return w, x, y, z
 
@@ -63,9 +68,12 @@ def turn_root(spec: mujoco.MjSpec, root: str, quat: Quaternion) -> None:
     A body that stood upright at orientation `p` then does so at `p * quat`.
     """
     body = spec.body(root)
+    # Inertia first: it is read from the body as it still is.
     _turn_inertia(spec, body, quat)
     kinds = (body.frames, body.bodies, body.geoms, body.sites, body.cameras, body.lights)
+    # Elements in frames move along with these.
     loose = [element for kind in kinds for element in kind if element.frame is None]
+    # The contents turn back by as much as the body turns.
     back = np.zeros(4)
     mujoco.mju_negQuat(back, np.array(quat))
     frame = body.add_frame(quat=back)
@@ -75,6 +83,7 @@ def turn_root(spec: mujoco.MjSpec, root: str, quat: Quaternion) -> None:
 
 def _turn_inertia(spec: mujoco.MjSpec, body: mujoco.MjsBody, quat: Quaternion) -> None:
     """Write an explicit inertia down in the axes of the turned frame; one of the geoms follows these by itself."""
+    # Without it the compiler infers inertia from the geoms, which have been turned.
     if not body.explicitinertial:
         return
     back = np.zeros(4)
@@ -83,6 +92,7 @@ def _turn_inertia(spec: mujoco.MjSpec, body: mujoco.MjsBody, quat: Quaternion) -
     number = mj_model.body(body.name).id
     ipos = np.zeros(3)
     iquat = np.zeros(4)
+    # Both by the inverse turn, from the old axes into the new ones.
     mujoco.mju_rotVecQuat(ipos, mj_model.body_ipos[number], back)
     mujoco.mju_mulQuat(iquat, back, mj_model.body_iquat[number])
     write_inertia(body, mj_model, number, ipos=ipos, iquat=iquat)

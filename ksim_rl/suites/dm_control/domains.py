@@ -18,11 +18,11 @@ from ksim_rl.suites.dm_control.starts import DrawStart, StartFromBank
 
 @dataclass(frozen=True, kw_only=True)
 class Domain:
-    """What the tasks of one model share; `playground` has the fields that MuJoCo Playground has otherwise.
+    """The parts that the tasks of one model share; `playground` has the fields that MuJoCo Playground has otherwise.
 
     Attributes:
         decimation: physics substeps per control step.
-        sim: what is laid over the model's own options.
+        sim: options that replace the model's own.
         observations: as dm_control names and orders them; `Target`s add theirs by task.
         events: how episodes start; None is the default pose.
     """
@@ -36,6 +36,7 @@ class Domain:
 
 
 def _iterations(most: int, of_line_search: int, **options: Any) -> SimCfg:
+    # Playground limits the solver's and the line search's iterations.
     return SimCfg(iterations=most, ls_iterations=of_line_search, **options)
 
 
@@ -53,6 +54,7 @@ _OWN_RANGES = {"start": DrawStart(own_ranges=True)}
 _FISH_JOINTS = (
     "tail1", "tail_twist", "tail2", "finright_roll", "finright_pitch", "finleft_roll", "finleft_pitch",
 )  # fmt: skip
+# All bodies but the world's.
 _ALL_BODIES = "(?!world$).+"
 _WALKER_POSE = BodyAxes(bodies=_ALL_BODIES, entries=("xx", "xz"))
 
@@ -60,11 +62,13 @@ DOMAINS: Mapping[str, Domain] = {
     "acrobot": Domain(
         decimation=1,
         observations={
+            # By entry: both horizontals first, then both verticals, as dm_control has them.
             "orientations": BodyAxes(bodies=("upper_arm", "lower_arm"), entries=("xz", "zz"), by_entry=True),
             "velocity": _VELOCITY,
         },
         events=_OWN_RANGES,
         viewer=_side_view(7.0, 2.0),
+        # Playground's own options, for the same model.
         playground={"sim": _iterations(2, 4, integrator="euler")},
     ),
     "ball_in_cup": Domain(
@@ -94,6 +98,7 @@ DOMAINS: Mapping[str, Domain] = {
     "cheetah": Domain(
         decimation=1,
         observations={
+            # The cheetah's place along x must not matter.
             "position": mdp.JointPos(joints="(?!rootx$).+"),
             "velocity": _VELOCITY,
         },
@@ -108,6 +113,7 @@ DOMAINS: Mapping[str, Domain] = {
             "position": mdp.JointPos(joints=("proximal", "distal")),
             "tip": Offset(ends=("site:tip",), start="body:spinner", axes="xz"),
             "velocity": Readings(sensors=("proximal_velocity", "distal_velocity", "hinge_velocity")),
+            # Touch forces span orders of magnitude.
             "touch": Readings(sensors=("touchtop", "touchbottom"), log=True),
         },
         events={"start": StartFromBank(own_ranges=True, without_contacts=True)},
@@ -133,6 +139,7 @@ DOMAINS: Mapping[str, Domain] = {
     "hopper": Domain(
         decimation=4,
         observations={
+            # The hopper's place along x must not matter.
             "position": mdp.JointPos(joints="(?!rootx$).+"),
             "velocity": _VELOCITY,
             "touch": Readings(sensors=("touch_toe", "touch_heel"), log=True),
@@ -155,6 +162,7 @@ DOMAINS: Mapping[str, Domain] = {
             "com_velocity": Readings(sensors=("torso_subtreelinvel",)),
             "velocity": _VELOCITY,
         },
+        # The humanoid's joints are drawn until it touches nothing.
         events={"start": StartFromBank(own_ranges=True, root="positive", without_contacts=True)},
         viewer=_beside("torso", 4.0),
         playground={"sim": _iterations(4, 8), "events": None},
@@ -192,9 +200,11 @@ DOMAINS: Mapping[str, Domain] = {
         playground={"decimation": 4, "sim": _iterations(1, 6, timestep=0.005)},
     ),
     "swimmer": Domain(
+        # 15 substeps of 2 ms.
         decimation=15,
         observations={
             "joints": mdp.JointPos(joints="joint_.*"),
+            # In the head's frame, as seen from the swimmer.
             "to_target": Offset(ends=("command:target",), start="geom:nose", frame="body:head", axes="xy"),
             "body_velocities": Readings(
                 sensors=(

@@ -21,7 +21,7 @@ class DmControlModel(Checked):
     """A domain's model, such as "cheetah", as the package `dm_control` has it, or as MuJoCo Playground changes it.
 
     Both lose the flag "energy", which changes no motion and costs the one-kernel solver. A target that each episode
-    places anew is a command of the task, so that the model's own is hidden. `damping` replaces that of joints.
+    places again is a command of the task, so that the model's own is hidden. `damping` replaces the damping of joints.
 
     Raises:
         ValueError: where the package is missing, with the command that installs it.
@@ -37,9 +37,11 @@ class DmControlModel(Checked):
             "dm_control", of="the tasks of the DeepMind Control Suite", extra="dm_control"
         )
         spec = load_spec(folder / "suite" / f"{self.domain}.xml")
+        # All other flags stay as the file has them.
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
         if self.domain == "swimmer":
             _add_links(spec, NUM_SWIMMER_LINKS)
+        # The task's command draws its target itself.
         for element in (*spec.geoms, *spec.sites):
             if element.name == "target" and self.domain in ("finger", "fish", "reacher", "swimmer"):
                 element.group = HIDDEN_GROUP
@@ -47,7 +49,9 @@ class DmControlModel(Checked):
         for name, damping in self.damping.items():
             if name not in joints:
                 raise unknown_name("joint", name, joints)
+            # MuJoCo keeps three coefficients; only the linear one is set.
             joints[name].damping = [damping, 0.0, 0.0]
+        # Last, since it changes the finished model.
         if self.variant == "playground":
             _change(spec, self.domain)
         return spec
@@ -56,15 +60,18 @@ class DmControlModel(Checked):
 def _add_links(spec: mujoco.MjSpec, count: int) -> None:
     """Hang the links of a swimmer behind its head, each with a motor and with sensors of its velocities.
 
-    The file has the head alone; dm_control's `swimmer.py` makes the rest, and says what is in it.
+    The file has the head alone; dm_control's `swimmer.py` makes and describes the rest.
     """
     parent = spec.body("head")
     defaults = {name: spec.find_default(name) for name in ("swimmer", "visual", "inertial")}
+    # The head is the first of `count` links.
     for index in range(count - 1):
+        # Each link hangs 0.1 m from the one before it.
         parent = parent.add_body(name=f"segment_{index}", pos=[0.0, 0.1, 0.0])
         for kind in ("visual", "inertial"):
             parent.add_geom(defaults[kind], name=f"{kind}_{index}")
         site = parent.add_site(defaults["swimmer"], name=f"site_{index}")
+        # Together the joints can bend the chain into about a circle.
         limit = 2.0 * math.pi / count
         # Degrees, as in the file, which the compiler turns into radians.
         if spec.compiler.degree:
@@ -85,11 +92,14 @@ def _add_links(spec: mujoco.MjSpec, count: int) -> None:
 
 def _change(spec: mujoco.MjSpec, domain: str) -> None:
     """Change what MuJoCo Playground's own copies of the files have otherwise and no option of `SimCfg` says."""
+    # Playground's integrator treats damping explicitly.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     geoms = {geom.name: geom for geom in spec.geoms}
     if domain == "finger":
         for name in ("proximal_decoration", "spinner_decoration"):
+            # Decorations collide with nothing there.
             geoms[name].contype = geoms[name].conaffinity = 0
     if domain == "fish":
+        # A ball in place of the file's shape.
         geoms["torso_massive"].type = mujoco.mjtGeom.mjGEOM_SPHERE
         geoms["torso_massive"].size = [0.03, 0.0, 0.0]

@@ -28,6 +28,7 @@ class GeneralizedVelocity(ObservationTerm):
     """All of MuJoCo's qvel, [E, nv]: a free root has m/s in the world frame, then rad/s in its own; velocity stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        # A copy: the state changes in place.
         return view.world.qvel_EL.clone()
 
 
@@ -52,6 +53,7 @@ class Readings(ObservationTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         parts = []
         for entry in self.sensors:
+            # "name.xz" picks components, "name" takes all.
             name, _, axes = entry.partition(".")
             reading_EL = view.sensor(name)
             parts.append(reading_EL[:, _columns(view, axes)] if axes else reading_EL)
@@ -73,8 +75,9 @@ class BodyAxes(ObservationTerm):
     by_entry: bool = False
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
-        # Row b of `axes_EN33` is the axis b of the body, whose components are those of the world.
+        # Row b of `axes_EN33` is the axis b of the body, whose components are along the world's axes.
         axes_EN33 = view.bodies(self.bodies).axes_EN33
+        # Names are (component, axis), as in dm_control's matrices.
         values = [axes_EN33[..., AXES.index(axis), AXES.index(component)] for component, axis in self.entries]
         return torch.stack(values, dim=1 if self.by_entry else -1).flatten(start_dim=1)
 
@@ -95,16 +98,19 @@ class Offset(ObservationTerm):
     def _check_fields(self) -> None:
         super()._check_fields()
         for point in (*self.ends, *filter(None, (self.start, self.frame))):
+            # Names are looked up later, kinds can be refused now.
             if point.partition(":")[0] not in POINTS:
                 raise ValueError(
                     f"ends, start or frame {point!r}: expected a point such as 'body:torso'; kinds are {POINTS}"
                 )
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        # [E, N, 3] in the world frame.
         offset_EN3 = torch.stack([_point(view, end) for end in self.ends], dim=1)
         if self.start:
             offset_EN3 = offset_EN3 - _point(view, self.start)[:, None]
         if self.frame:
+            # Columns of the frame's matrix are its axes: components along these.
             offset_EN3 = torch.einsum("enw,ewf->enf", offset_EN3, _axes(view, self.frame))
         return offset_EN3[..., _columns(view, self.axes)].flatten(start_dim=1)
 
@@ -117,12 +123,14 @@ class Distance(ObservationTerm):
     radius: NonNegative = 0.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 1"]:
+        # Inside of the radius it is negative.
         return torch.linalg.vector_norm(self.of(view), dim=-1, keepdim=True) - self.radius
 
 
 def _point(view: EnvView, point: str) -> Float[Tensor, "E 3"]:
     """Return a point's position, world frame, m."""
     kind, _, name = point.partition(":")
+    # Commands are points in the world frame.
     if kind == "command":
         return view.command(name)
     if kind == "site":
@@ -130,6 +138,7 @@ def _point(view: EnvView, point: str) -> Float[Tensor, "E 3"]:
     if kind == "body":
         return view.body(name).pos_EL
     world = view.derived()
+    # The body's own centre of mass, without its children.
     if kind == "com":
         return world.xipos_EL[:, view.resolver.one("body", name)]
     return world.geom_xpos_EL[:, view.resolver.one("geom", name)]
@@ -139,6 +148,7 @@ def _axes(view: EnvView, frame: str) -> Float[Tensor, "E 3 3"]:
     """Return the matrix of a body's or geom's orientation: its columns are its axes in the world."""
     kind, _, name = frame.partition(":")
     if kind == "geom":
+        # MuJoCo's matrices have the axes as columns already.
         return view.derived().geom_xmat_EL[:, view.resolver.one("geom", name)]
     return view.body(name).axes_E33.transpose(-1, -2)
 
@@ -151,7 +161,7 @@ def _columns(view: EnvView, axes: str) -> Int[Tensor, " N"] | slice:
 class Factor(Checked):
     """How well a quantity lies in [low, high], in [floor, 1]: `tolerance`, the mean over the quantity's elements.
 
-    Its fields are those of `tolerance`, where None is no bound; the factor is floor + (1 - floor) * tolerance.
+    Its fields are as in `tolerance`, where None is no bound; the factor is floor + (1 - floor) * tolerance.
     """
 
     of: ObservationTerm
@@ -166,12 +176,14 @@ class Factor(Checked):
         """Return the factor of the current state, float32 [E]."""
         rated_EL = tolerance(
             self.of(view),
+            # None cannot stand in a comparison of tensors.
             low=-math.inf if self.low is None else self.low,
             high=math.inf if self.high is None else self.high,
             margin=self.margin,
             value_at_margin=self.value_at_margin,
             shape=self.shape,
         )
+        # The floor keeps a product from falling to 0 by this factor alone.
         return self.floor + (1.0 - self.floor) * rated_EL.mean(-1)
 
 

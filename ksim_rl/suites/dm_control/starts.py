@@ -48,16 +48,20 @@ class StartRule(EventTerm):
 
     def bounds(self, mj_model: mujoco.MjModel, default_L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest qpos, [nq] each, without the orientation of a free root."""
+        # Equal bounds leave a number at the default pose.
         low_L = default_L.copy()
         high_L = default_L.copy()
+        # Including free joints, whose names no pattern should match.
         names = [mj_model.joint(joint).name for joint in range(mj_model.njnt)]
         if self.own_ranges:
             for joint, address in enumerate(mj_model.jnt_qposadr):
                 if mj_model.jnt_limited[joint]:
                     low_L[address], high_L[address] = mj_model.jnt_range[joint]
+                # A hinge without limits takes all angles; slides without limits stay.
                 elif mj_model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
                     low_L[address] = -np.pi
                     high_L[address] = np.pi
+        # After the own ranges, which they replace.
         for pattern, (low, high) in self.ranges.items():
             for joint in match_names("joint", (pattern,), names):
                 low_L[mj_model.jnt_qposadr[joint]] = low
@@ -78,9 +82,11 @@ class DrawStart(StartRule):
         qpos_EL = torch.where(low_L == high_L, low_L, qpos_EL)
         if self.root != "default":
             if self.root == "uniform":
+                # A normal draw of four numbers is uniform in direction.
                 quat_E4 = view.normal(4)
             else:
                 quat_E4 = view.uniform(4)
+            # The root is the first joint: 3 of position, then its quaternion.
             qpos_EL[:, 3:7] = quat_E4 / torch.linalg.vector_norm(quat_E4, dim=-1, keepdim=True)
         view.write_qpos(mask_E, qpos_EL)
         qvel_EL = torch.zeros_like(view.world.qvel_EL)
@@ -89,6 +95,7 @@ class DrawStart(StartRule):
         view.write_qvel(mask_E, qvel_EL)
 
     def _device_bounds(self, view: EnvView) -> tuple[Float[Tensor, " L"], Float[Tensor, " L"]]:
+        # By world: each has its own default pose and device.
         known = _BANKS.setdefault(view.world, {})
         key = f"bounds of {self!r}"
         if key not in known:
@@ -108,7 +115,7 @@ class StartFromBank(StartRule):
         without_contacts: starts in which anything touches are drawn again.
         settle_steps: physics steps without controls, whose end is the start.
         size: starts in the bank.
-        bank_seed: of the bank; the env's seed is that of the choices from it.
+        bank_seed: of the bank; the env's own seed decides the choices from it.
     """
 
     without_contacts: bool = False
@@ -120,14 +127,17 @@ class StartFromBank(StartRule):
         known = _BANKS.setdefault(view.world, {})
         if repr(self) not in known:
             bank_NL = self._drawn_once(view.world.mj_model, view.default_qpos_L.double().cpu().numpy())
+            # Outside of inference mode: the tensor outlives the mode of the call that comes first.
             with torch.inference_mode(False):
                 known[repr(self)] = torch.tensor(bank_NL, dtype=torch.float32, device=view.device)
+        # A random row of the bank for each env.
         start_EL = known[repr(self)][view.integers(1, 0, self.size - 1)[:, 0]]
         nq = view.world.qpos_EL.shape[1]
         view.write_qpos(mask_E, start_EL[:, :nq])
         view.write_qvel(mask_E, start_EL[:, nq:])
 
     def _drawn_once(self, mj_model: mujoco.MjModel, default_L: np.ndarray) -> np.ndarray:
+        # The model's bytes: a bank depends on all that physics sees.
         content = np.empty(mujoco.mj_sizeModel(mj_model), np.uint8)
         mujoco.mj_saveModel(mj_model, None, content)
         key = repr(self), hashlib.sha256(content.tobytes()).digest()
@@ -141,6 +151,7 @@ class StartFromBank(StartRule):
         data = mujoco.MjData(mj_model)
         low_L, high_L = self.bounds(mj_model, default_L)
         bank_NL = np.zeros((self.size, mj_model.nq + mj_model.nv))
+        # Rows of the bank are filled in place.
         for row_L in bank_NL:
             for _ in range(MOST_DRAWS):
                 mujoco.mj_resetData(mj_model, data)
@@ -153,11 +164,13 @@ class StartFromBank(StartRule):
                     data.qpos[3:7] = quat / np.linalg.norm(quat)
                 if not self.without_contacts:
                     break
+                # Contacts need positions only.
                 mujoco.mj_fwdPosition(mj_model, data)
                 if data.ncon == 0:
                     break
             else:
                 raise ValueError(f"without_contacts=True: no start without contacts in {MOST_DRAWS} draws")
+            # Velocities stay 0.
             row_L[: mj_model.nq] = data.qpos
         if self.settle_steps:
             return _settled(mj_model, bank_NL, steps=self.settle_steps)
@@ -171,8 +184,10 @@ def _settled(mj_model: mujoco.MjModel, bank_NL: np.ndarray, *, steps: int) -> np
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
     assert mujoco.mj_stateSize(mj_model, kind) == 1 + mj_model.nq + mj_model.nv
     parts = []
+    # In parts, since all steps of a part are kept until it ends.
     for part_NL in np.array_split(bank_NL, max(1, len(bank_NL) // ROWS_AT_ONCE)):
         start_NL = np.concatenate((np.zeros((len(part_NL), 1)), part_NL), axis=1)
         states_NTL, _ = rollout.rollout(mj_model, datas, start_NL, nstep=steps)
+        # The last step, without its time.
         parts.append(states_NTL[:, -1, 1:])
     return np.concatenate(parts)

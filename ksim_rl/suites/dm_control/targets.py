@@ -1,4 +1,4 @@
-"""These commands are the targets that the DeepMind Control Suite places anew in each episode, world frame, m."""
+"""These commands are the targets that the DeepMind Control Suite draws in each episode, world frame, m."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -41,10 +41,13 @@ class BoxTarget(Target):
     near_scale: Point = (1.0, 1.0, 1.0)
 
     def draw(self, view: EnvView) -> Float[Tensor, "E 3"]:
+        # Uniform by volume.
         point_E3 = view.uniform(3, constant(self.low, view.device), constant(self.high, view.device))
+        # One draw less where no target is near.
         if not self.near_share:
             return point_E3
         is_near_E1 = view.uniform(1) < self.near_share
+        # The near box is about the origin, so that scaling the point is enough.
         return torch.where(is_near_E1, point_E3 * constant(self.near_scale, view.device), point_E3)
 
 
@@ -59,8 +62,10 @@ class RingTarget(Target):
     def draw(self, view: EnvView) -> Float[Tensor, "E 3"]:
         share_E, angle_E = view.uniform(2).unbind(-1)
         inner, outer = self.radius
+        # Uniform in distance, as dm_control has it, and not by area.
         radius_E = inner + share_E * (outer - inner)
         angle_E = 2.0 * torch.pi * angle_E
+        # The angle counts from the second axis of the plane.
         first_E = radius_E * torch.sin(angle_E)
         second_E = radius_E * torch.cos(angle_E)
         zero_E = torch.zeros_like(first_E)

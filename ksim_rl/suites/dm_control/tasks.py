@@ -45,7 +45,7 @@ CONTROL_S = {
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteTask:
-    """A task of a domain, with what it adds to the domain; its rewards are summed with their weights."""
+    """A task of a domain, with its additions to the domain; its rewards are summed with their weights."""
 
     description: str
     rewards: Mapping[str, ToleranceProduct]
@@ -59,6 +59,7 @@ class SuiteTask:
 
 
 def _product(weight: float = 1.0, /, **factors: Factor) -> ToleranceProduct:
+    # The factors' names are for logs and messages only.
     return ToleranceProduct(weight=weight, factors=factors)
 
 
@@ -67,6 +68,7 @@ def _reward(**factors: Factor) -> dict[str, ToleranceProduct]:
 
 
 def _speed(low: float, *, margin: float, value_at_margin: float, floor: float = 0.0) -> Factor:
+    # Along x, of the whole robot's centre of mass.
     speed = Readings(sensors=("torso_subtreelinvel.x",))
     return Factor(
         of=speed, low=low, margin=margin, value_at_margin=value_at_margin, shape="linear", floor=floor
@@ -76,7 +78,14 @@ def _speed(low: float, *, margin: float, value_at_margin: float, floor: float = 
 # -- factors that several tasks share ----------------------------------------------------------------------------
 
 _SMALL_CONTROL = Factor(
-    of=Control(), low=0.0, high=0.0, margin=1.0, value_at_margin=0.0, shape="quadratic", floor=0.8
+    # A floor of 0.8: control changes the reward by a fifth at most.
+    of=Control(),
+    low=0.0,
+    high=0.0,
+    margin=1.0,
+    value_at_margin=0.0,
+    shape="quadratic",
+    floor=0.8,
 )
 
 
@@ -90,6 +99,7 @@ def _upright(body: str, **tolerance: float) -> Factor:
 
 
 def _acrobot(margin: float) -> dict[str, ToleranceProduct]:
+    # 0.2 m is the target's radius.
     to_target = Distance(of=Offset(ends=("site:target",), start="site:tip"))
     return _reward(near=Factor(of=to_target, high=0.2, margin=margin))
 
@@ -102,6 +112,7 @@ _CARTPOLE = _reward(
     centered=Factor(of=_CART, low=0.0, high=0.0, margin=2.0, floor=0.5),
 )
 _CARTPOLE_SPARSE = _reward(
+    # Without a margin a factor is 1 inside its bounds and 0 outside: a sparse reward.
     centered=Factor(of=_CART, low=-0.25, high=0.25),
     upright=Factor(of=BodyAxes(bodies="pole_1", entries=("zz",)), low=0.995),
 )
@@ -116,10 +127,12 @@ _HANGING: Mapping[str, EventTerm] = {
 
 def _turn(radius: float) -> SuiteTask:
     target = Offset(ends=("command:target",), start="body:spinner", axes="xz")
+    # The radius is part of the distance, so that 0 is its surface.
     distance = Distance(of=Offset(ends=("command:target",), start="site:tip", axes="xz"), radius=radius)
     return SuiteTask(
         description=f"turn a free body to a target of {100 * radius:g} cm",
         rewards=_reward(inside=Factor(of=distance, high=0.0)),
+        # A circle about the spinner, where the tip can be brought by turning.
         target=RingTarget(center=(0.2, 0.0, 0.4), radius=(0.13, 0.13), plane="xz", size=radius),
         observations={"target_position": target, "dist_to_target": distance},
     )
@@ -143,6 +156,7 @@ _HUMANOID_STILL = Factor(of=_HUMANOID_VELOCITY, low=0.0, high=0.0, margin=2.0)
 
 def _humanoid_speed(low: float) -> Factor:
     speed = Distance(of=_HUMANOID_VELOCITY)
+    # The floor keeps standing worth a sixth, for a robot that does not move yet.
     return Factor(of=speed, low=low, margin=low, value_at_margin=0.0, shape="linear", floor=1.0 / 6.0)
 
 
@@ -150,6 +164,7 @@ def _reach(radius: float) -> SuiteTask:
     distance = Distance(of=Offset(ends=("command:target",), start="geom:finger", axes="xy"))
     return SuiteTask(
         description=f"a planar arm reaches a ball of {100 * radius:g} cm",
+        # 1 cm is the finger's radius.
         rewards=_reward(inside=Factor(of=distance, high=radius + 0.01)),
         target=RingTarget(center=(0.0, 0.0, 0.01), radius=(0.05, 0.2), size=radius),
         # Easy and hard came to 983 and 977 after 60 M env states; with 0.995 to 980 and 972 after 88 M.
@@ -160,10 +175,12 @@ def _reach(radius: float) -> SuiteTask:
 def _walker(*speeds: float) -> dict[str, ToleranceProduct]:
     standing = Factor(of=Offset(ends=("body:torso",), axes="z"), low=1.2, margin=0.6)
     factors = {
+        # Half the speed counts as half.
         f"move_{number}": _speed(low, margin=low / 2.0, value_at_margin=0.5, floor=1.0 / 6.0)
         for number, low in enumerate(speeds)
     }
     return {
+        # The sum (3 standing + upright) / 4 of dm_control, times the speed, as two weighted products.
         "standing": _product(0.75, standing=standing, **factors),
         "upright": _product(0.25, upright=_upright("torso"), **factors),
     }
@@ -294,6 +311,7 @@ SUITE_TASKS: Mapping[str, SuiteTask] = {
 
 def domain_of(name: str) -> str:
     """Return the domain of a task of `SUITE_TASKS`."""
+    # The first domain that fits: no domain's name begins another's.
     return next(domain for domain in DOMAINS if name.startswith(f"{domain}_"))
 
 
@@ -302,9 +320,11 @@ def make_cfg(name: str, variant: Variant) -> ManagerBasedRlEnvCfg:
     task = SUITE_TASKS[name]
     domain = DOMAINS[domain_of(name)]
     if variant == "playground":
+        # Playground changes some fields of a domain, and keeps the others.
         domain = dataclasses.replace(domain, **domain.playground)
     terms = {
         key: ObservationTermCfg(term=term)
+        # The domain's observations come first, in dm_control's order.
         for key, term in {**domain.observations, **task.observations}.items()
     }
     model = DmControlModel(domain=domain_of(name), variant=variant, damping=task.damping)
@@ -314,11 +334,14 @@ def make_cfg(name: str, variant: Variant) -> ManagerBasedRlEnvCfg:
         sim=domain.sim,
         observations=dict.fromkeys(("actor", "critic"), ObservationGroupCfg(terms=terms)),
         actions={"controls": mdp.ActuatorAction(actuators=".*")},
+        # Tasks with targets draw them at each reset.
         commands={} if task.target is None else {"target": task.target},
+        # Some tasks start elsewhere than their domain does.
         events=domain.events if task.events is None else task.events,
         rewards=task.rewards,
         terminations={"time_out": mdp.TimeOut(time_out=True)},
         episode_length_s=EPISODE_STEPS * CONTROL_S[domain_of(name)],
+        # Rewards lie in [0, 1] per step: a return is out of 1000.
         scale_rewards_by_dt=False,
         viewer=domain.viewer,
     )

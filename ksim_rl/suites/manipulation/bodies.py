@@ -55,7 +55,7 @@ class PlaygroundModel(Checked):
 class PlaceFreeBody(EventTerm):
     """Put a body with a free joint at its default place plus uniform offsets, m, world frame, at rest.
 
-    Its orientation is that of the default pose, or "uniform" over all.
+    Its orientation is the default pose's, or "uniform" over all.
     """
 
     body: str

@@ -46,7 +46,7 @@ class GoalOrientation(CommandTerm):
 
     When the object gets within `reached` (rad), the goal starts to turn about its own axes, at a velocity (rad/s) with
     each component from `turn`, which a factor of `decay` slows down in each env step. So it moves away and comes to
-    rest; what it was reached by is rewarded before it moves. A mocap body of the model shows it.
+    rest; the reaching itself is rewarded before it moves. A mocap body of the model shows it.
 
     Attributes:
         sensor: the MJCF sensor of the object's orientation, a quaternion.
@@ -62,8 +62,10 @@ class GoalOrientation(CommandTerm):
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw an orientation; its turn and its count of steps are zero in rows that reset."""
         goal_E4 = view.buffer("goal_E4", 4)
+        # A normalized normal draw is uniform over orientations.
         drawn_E4 = normalize(view.normal(4), dim=-1)
         goal_E4.copy_(torch.where(mask_E[:, None], drawn_E4, goal_E4))
+        # The mocap body follows right away, for the first picture.
         shown_E4 = self._shown(view)
         shown_E4.copy_(torch.where(mask_E[:, None], goal_E4, shown_E4))
 
@@ -74,15 +76,19 @@ class GoalOrientation(CommandTerm):
         steps_E = view.buffer("steps_E", dtype=torch.int64)
         # No env step has passed when a row has just been reset, so that its goal stays where it was drawn.
         moves_E1 = (steps_E != view.episode_step_E)[:, None]
+        # Against the goal from before this step, which the rewards have seen.
         is_reached_E1 = (quaternion.angle_between(view.sensor(self.sensor), goal_E4) <= self.reached)[:, None]
         next_E3 = torch.where(is_reached_E1, view.uniform(3, *self.turn), self.decay * turn_E3)
         turn_E3.copy_(torch.where(moves_E1, next_E3, turn_E3))
+        # Half the angle of this step, since quaternions turn by halves.
         half_E3 = 0.5 * view.step_dt * turn_E3
         angle_E1 = torch.linalg.vector_norm(half_E3, dim=-1, keepdim=True)
         # (cos a, sin(a) / a * v), with sinc(x) = sin(pi x) / (pi x), 1 at 0.
         step_E4 = torch.cat((torch.cos(angle_E1), torch.sinc(angle_E1 / math.pi) * half_E3), dim=-1)
+        # Normalized again: rounding adds up over 1000 steps.
         turned_E4 = normalize(quaternion.multiply(goal_E4, step_E4), dim=-1)
         goal_E4.copy_(torch.where(moves_E1, turned_E4, goal_E4))
+        # Now both counts agree until the next env step.
         steps_E.copy_(view.episode_step_E)
         self._shown(view).copy_(goal_E4)
         return goal_E4.clone()
@@ -116,8 +122,10 @@ class GoalTurn(OfGoal, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 6"]:
         goal_E4 = view.command(self.command)
+        # Object times the inverse of the goal: the turn from goal to object, world frame.
         turn_E4 = quaternion.multiply(view.sensor(self.sensor), quaternion.conjugate(goal_E4))
         axes_123 = array_constant(_LAST_AXES, view.device)
+        # Rows of the matrix are images of unit vectors under the inverse.
         return quaternion.rotate_inverse(turn_E4[:, None], axes_123).flatten(start_dim=1)
 
 
@@ -144,6 +152,7 @@ class ActuatorPower(RewardTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         force_EN = view.world.actuator_force_EL[:, view.resolver.index("actuator", self.actuators)]
+        # Absolute values: braking costs as much as driving.
         return (force_EN * view.joints(self.joints).vel_EL).abs().sum(-1)
 
 

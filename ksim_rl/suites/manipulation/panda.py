@@ -44,7 +44,7 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class TurnFromUpright(ObservationTerm):
-    """The first two rows of the unit matrix minus those of a body's orientation, [E, 6]; position stage."""
+    """The first two rows of the unit matrix minus a body's orientation matrix, [E, 6]; position stage."""
 
     body: str
 
@@ -61,6 +61,7 @@ class OneMinusTanh(RewardTerm):
     gain: Positive = 1.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        # 1 at the target, with a slope everywhere.
         return 1.0 - torch.tanh(self.gain * torch.linalg.vector_norm(self.of(view), dim=-1))
 
 
@@ -81,9 +82,11 @@ class CarryToTarget(RewardTerm):
         body_E3 = view.body(self.body).pos_EL
         gap_E = torch.linalg.vector_norm(body_E3 - view.site(self.site).pos_EL, dim=-1)
         was_there_E = view.buffer("was_there_E", dtype=torch.bool)
+        # It stays true for the rest of the episode; resets clear it.
         was_there_E.logical_or_(gap_E < self.reach)
         distance_E = torch.linalg.vector_norm(view.command(self.command)[:, :3] - body_E3, dim=-1)
         turn_E = torch.linalg.vector_norm(TurnFromUpright(body=self.body)(view), dim=-1)
+        # 5 * 0.9 and 5 * 0.1.
         return (1.0 - torch.tanh(4.5 * distance_E + 0.5 * turn_E)) * was_there_E
 
 
@@ -105,8 +108,10 @@ def panda_pick_cube() -> ManagerBasedRlEnvCfg:
         "target_error": JointTarget(joints=DRIVEN, relative=True),
     }
     group = ObservationGroupCfg(
+        # Actor and critic see the same.
         terms={name: ObservationTermCfg(term=term) for name, term in readings.items()}
     )
+    # 1 while the sensor finds no contact with the floor.
     off_floor = {
         geom: Factor(of=Readings(sensors=(f"{geom}_floor_found",)), high=0.0)
         for geom in ("left_finger_pad", "right_finger_pad", "hand_capsule")
@@ -116,6 +121,7 @@ def panda_pick_cube() -> ManagerBasedRlEnvCfg:
         scene=SceneCfg(robots={"panda": PlaygroundModel(scene="panda_cube")}, num_envs=2048),
         sim=SimCfg(njmax=128),
         observations={"actor": group, "critic": group},
+        # Targets move by at most 4 cm or 0.04 rad per unit action and step.
         actions={"joints": MoveTargets(joints=DRIVEN, scale=0.04)},
         events={
             "arm": mdp.ResetJoints(),
@@ -135,7 +141,7 @@ def panda_pick_cube() -> ManagerBasedRlEnvCfg:
                 body=BOX, low={"x": -1.0, "y": -1.0, "z": 0.0}, high={"x": 1.0, "y": 1.0, "z": 1.0}
             ),
         },
-        # Playground's task has no measure of success; 5 cm is that of its PandaPickCubeCartesian.
+        # Playground's task has no measure of success; 5 cm is taken from its PandaPickCubeCartesian.
         metrics={
             "at_target": mdp.TargetReached(
                 command=COMMAND, body=BOX, frame="world", tolerance=0.05, reduce="last"
