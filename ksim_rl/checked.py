@@ -29,7 +29,8 @@ class Within:
     ordered: bool = False
 
     def check(self, field: str, value: Any) -> None:
-        """Refuse what is outside, by a ValueError that names the field and the bounds; None passes."""
+        """Refuse a value outside, by a ValueError that names the field and the bounds; None passes."""
+        # Whether None is allowed is said by the union around.
         if value is None:
             return
         if self.ordered:
@@ -43,11 +44,12 @@ class Within:
 
 @dataclass(frozen=True)
 class Filled:
-    """Says that a text, a sequence or a mapping is not empty, with the `advice` of what to give."""
+    """Says that a text, a sequence or a mapping is not empty, with an `advice` for empty ones."""
 
     advice: str
 
 
+# The bounds that configs share, by name.
 Positive = Annotated[float, Within(low=0.0, low_open=True)]
 NonNegative = Annotated[float, Within(low=0.0)]
 Share = Annotated[float, Within(low=0.0, high=1.0)]
@@ -67,17 +69,19 @@ class Checked:
     def __init_subclass__(cls, **given: Any) -> None:
         """Take the constants and defaults of the class's statement, each declared by a base."""
         super().__init_subclass__()
+        # The base that is nearest wins, as in Python.
         bases = filter(is_dataclass, reversed(cls.__mro__[1:]))
         inherited = {field.name: field.type for base in bases for field in fields(base)}
         for name, value in given.items():
+            # A misspelt constant would be ignored in silence.
             if not any(name in inspect.get_annotations(base) for base in cls.__mro__):
                 raise TypeError(f"class {cls.__name__}: no base of it declares {name!r}")
-            if name in inherited:  # declared anew, so that `dataclass` takes the value as its default
+            if name in inherited:  # declared again, so that `dataclass` takes the value as its default
                 cls.__annotations__[name] = inherited[name]
             setattr(cls, name, value)
 
     def __post_init__(self) -> None:
-        """Check every field, and then what each class, the bases first, says of several."""
+        """Check every field, and then the rules about several fields of each class, bases first."""
         hints = _hints(type(self))
         for field in fields(typing.cast(Any, self)):
             check_value(field.name, getattr(self, field.name), hints[field.name])
@@ -88,17 +92,19 @@ class Checked:
 
 
 @cache
+# Resolving texts of annotations is slow, and classes do not change.
 def _hints(cls: type) -> dict[str, Any]:
     return typing.get_type_hints(cls, include_extras=True)
 
 
 def check_value(field: str, value: object, annotation: Any) -> None:
-    """Refuse a value that is not what an annotation says, as `checks` do; protocols, callables and `Any` take all."""
+    """Refuse a value that does not fit an annotation, as `checks` do; protocols, callables and `Any` take all."""
     origin = typing.get_origin(annotation)
     arguments = typing.get_args(annotation)
     if annotation is Any:  # a class since Python 3.11, but none to ask `isinstance` of
         return
     if origin is Annotated:
+        # Numbers have their bounds checked by one message, pairs and unions by theirs.
         for bound in (extra for extra in arguments[1:] if isinstance(extra, Within)):
             if arguments[0] is int and bound.high is None and bound.low is not None:
                 check_count(field, value, low=int(bound.low))
@@ -106,6 +112,7 @@ def check_value(field: str, value: object, annotation: Any) -> None:
                 check_in_range(field, value, low=bound.low, high=bound.high, low_open=bound.low_open)
             elif value is None or not bound.ordered:
                 check_value(field, value, arguments[0])
+            # Ranges and tuples of numbers.
             bound.check(field, value)
         check_value(field, value, arguments[0])
         for extra in arguments[1:]:
@@ -113,6 +120,7 @@ def check_value(field: str, value: object, annotation: Any) -> None:
                 raise ValueError(f"{field}={value!r}: {extra.advice}")
     elif origin in (typing.Union, types.UnionType):
         _check_union(field, value, arguments)
+    # The valid values are listed.
     elif origin is Literal:
         check_choice(field, value, arguments)
     elif origin is tuple or origin is Sequence:
@@ -123,13 +131,16 @@ def check_value(field: str, value: object, annotation: Any) -> None:
         for key, entry in value.items():
             check_value(f"{field} key {key!r}", key, arguments[0])
             check_value(f"{field}.{key}", entry, arguments[1])
+    # A whole number is a valid float, a truth value is not.
     elif annotation is float:
         check_in_range(field, value)
+    # Protocols would need all of their methods looked at; mistakes show when they are called.
     elif isinstance(annotation, type) and not getattr(annotation, "_is_protocol", False):
         _check_instance(field, value, annotation)
 
 
 def _check_instance(field: str, value: object, kind: type) -> None:
+    # bool is a subclass of int in Python.
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         expected = {int: "a whole number", str: "a text", bool: "true or false"}.get(
             kind, f"a {kind.__name__}"
@@ -138,6 +149,7 @@ def _check_instance(field: str, value: object, kind: type) -> None:
 
 
 def _check_union(field: str, value: object, options: Sequence[Any]) -> None:
+    # None is no error where the union names it.
     if value is None and type(None) in options:
         return
     errors = []
@@ -156,6 +168,7 @@ def _check_sequence(field: str, value: object, annotation: Any) -> None:
     arguments = typing.get_args(annotation)
     if not isinstance(value, (list, tuple)):
         raise ValueError(f"{field}={value!r}: expected a list")
+    # A homogeneous tuple or sequence of any length, or a tuple with a type for each place.
     if typing.get_origin(annotation) is Sequence or arguments[1:] == (...,):
         kinds: Sequence[Any] = [arguments[0]] * len(value)
     elif len(value) == len(arguments):

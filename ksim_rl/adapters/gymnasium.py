@@ -37,9 +37,11 @@ class GymnasiumVectorEnv(VectorEnv):
         self.num_envs = self._stepper.num_envs
         self.render_mode = self._stepper.render_mode
         clock = part(env, EpisodeClock)
+        # Tells wrappers that `obs` is of the new episode where one has ended.
         self.metadata = {
             "autoreset_mode": AutoresetMode.SAME_STEP,
             "render_modes": [mode for mode in (self.render_mode,) if mode],
+            # Pictures per second in real time; 1 where the env has no clock.
             "render_fps": round(1.0 / clock.step_dt) if clock else 1,
         }
         dims = self._stepper.batch_dims
@@ -60,6 +62,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """
         if options:
             raise ValueError(f"options={options!r}: this env has no reset options; use seed=")
+        # Gymnasium takes a seed per env; our env draws all rows from one.
         if not (seed is None or isinstance(seed, int)):
             seed = _one_seed(seed, self.num_envs)
         super().reset(seed=seed)
@@ -72,8 +75,10 @@ class GymnasiumVectorEnv(VectorEnv):
         step = self._stepper.step(self._stepper.as_action(actions_E))
         done_E = step.done_E
         infos: dict[str, Any] = {}
+        # Without asking the device whether an episode ended, since that would wait for it.
         if self.tensors:
             infos = {"final_obs": step.final_obs, "_final_obs": done_E}
+        # Only then are the last observations copied to the host.
         elif bool(done_E.any()):
             infos = _final_obs(to_numpy(step.final_obs), done_E.cpu().numpy())
         flags = (step.reward_E, step.terminated_E, step.truncated_E)
@@ -102,13 +107,16 @@ def _one_seed(seeds: Sequence[int | None], num_envs: int) -> int | None:
     if None in seeds:
         return None
     first = int(seeds[0] or 0)
+    # s, s + 1, ... is what Gymnasium makes of a single seed s.
     if all(seed == first + row for row, seed in enumerate(seeds)):
         return first
+    # Mixed into one seed; shifted to fit a signed integer.
     return int(np.random.SeedSequence([int(seed or 0) for seed in seeds]).generate_state(1)[0] >> 1)
 
 
 def _final_obs(obs: dict[str, np.ndarray], done_E: np.ndarray) -> dict[str, Any]:
     """Return the last observations in Gymnasium's layout: an object per env, and who has one."""
+    # Gymnasium's layout: None where no episode ended.
     final = np.full(done_E.shape, fill_value=None, dtype=object)
     for row in np.flatnonzero(done_E):
         final[row] = {name: value[row].copy() for name, value in obs.items()}

@@ -36,6 +36,7 @@ class SkrlWrapper(Wrapper):
         state_keys: tuple[NestedKey, ...] = (),
     ) -> None:
         super().__init__(env)
+        # Each leaf once, also where actor and critic read it both.
         self._stepper = Stepper(env, list(dict.fromkeys((*keys, *state_keys))))
         names = {key: name for name, key in self._stepper.keys.items()}
         self._observed = [names[key] for key in keys]
@@ -76,6 +77,7 @@ class SkrlWrapper(Wrapper):
 
     def reset(self) -> tuple[Float[Tensor, "E L"], dict[str, Any]]:
         """Return what the next actions answer to; the first call resets all envs."""
+        # skrl resets before each training; going on is what its wrappers of vector envs do.
         self._current = self._current or self._stepper.reset()
         return self._joined(self._current, self._observed), {}
 
@@ -85,8 +87,10 @@ class SkrlWrapper(Wrapper):
         """Step all envs."""
         step = self._stepper.step(self._stepper.as_action(actions))
         self._current = step.obs
+        # The states reached, since `obs` of an ended row is of its next episode.
         infos = {"final_obs": self._joined(step.final_obs, self._observed)}
         flags = (step.reward_E, step.terminated_E, step.truncated_E)
+        # skrl wants a column for each of them.
         reward_E1, terminated_E1, truncated_E1 = (flag.unsqueeze(-1) for flag in flags)
         return self._joined(step.obs, self._observed), reward_E1, terminated_E1, truncated_E1, infos
 
@@ -105,6 +109,7 @@ class SkrlWrapper(Wrapper):
         self._stepper.env.close()
 
     def _joined(self, leaves: Observations, names: list[str]) -> Tensor:
+        # float32 for all: masks and integers become numbers.
         return torch.cat([leaves[name].flatten(1).float() for name in names], -1)
 
     def _joined_space(self, names: list[str]) -> spaces.Box:

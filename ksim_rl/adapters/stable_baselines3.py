@@ -21,7 +21,7 @@ except ImportError as error:
     ) from error
 
 
-# What each row would have of its own, if it were a Gymnasium env.
+# Attributes that each row would have if it were a Gymnasium env.
 _OF_ROWS = ("render_mode", "observation_space", "action_space")
 
 
@@ -41,11 +41,13 @@ class StableBaselines3VecEnv(VecEnv):
         dims = self._stepper.batch_dims
         spec = env.full_observation_spec
         boxes = {name: space_of(spec[key], batch_dims=dims) for name, key in self._stepper.keys.items()}
+        # "MlpPolicy" takes a plain array, "MultiInputPolicy" a dict.
         if len(boxes) == 1:
             self._single = next(iter(boxes))
         else:
             self._single = None
         action = space_of(self._stepper.action_spec, batch_dims=dims)
+        # Infinite bounds cannot be rescaled, which some of its algorithms do.
         if isinstance(action, spaces.Box):
             low = np.where(np.isfinite(action.low), action.low, -action_limit)
             high = np.where(np.isfinite(action.high), action.high, action_limit)
@@ -59,11 +61,13 @@ class StableBaselines3VecEnv(VecEnv):
 
     def reset(self) -> np.ndarray | dict[str, np.ndarray]:
         """Reset all envs, with the seed that `seed` was given, if any."""
+        # The base class keeps a seed per row; our env has one for all rows.
         obs = self._stepper.reset(self._seeds[0])
         self._reset_seeds()
         self._reset_options()
         return self._out(obs)
 
+    # Two calls, as subprocess envs need; here the step is done in the second one.
     def step_async(self, actions_E: Shaped[np.ndarray, " E *leaf"]) -> None:
         """Take the actions of the next `step_wait`."""
         self._action = self._stepper.as_action(actions_E)
@@ -77,12 +81,14 @@ class StableBaselines3VecEnv(VecEnv):
         done_E = step.done_E.cpu().numpy()
         terminated_E = step.terminated_E.cpu().numpy()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        # The copy to the host is made only where an episode ended.
         if done_E.any():
             final = to_numpy(step.final_obs)
             for row in np.flatnonzero(done_E):
                 last = {name: value[row] for name, value in final.items()}
                 infos[row] = {
                     "terminal_observation": last if self._single is None else last[self._single],
+                    # stable-baselines3 bootstraps the value where this is true.
                     "TimeLimit.truncated": bool(not terminated_E[row]),
                 }
         return self._out(step.obs), step.reward_E.cpu().numpy(), done_E, infos
@@ -96,7 +102,7 @@ class StableBaselines3VecEnv(VecEnv):
         return [self._stepper.picture()]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the env, or what stable-baselines3 asks of an env, once per index: all are one env."""
+        """Return an attribute of the env, or one that stable-baselines3 asks for, once per index: all are one env."""
         value = getattr(self if attr_name in _OF_ROWS else self.env, attr_name)
         return [value for _ in self._get_indices(indices)]
 

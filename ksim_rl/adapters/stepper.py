@@ -63,7 +63,9 @@ class Stepper:
         self._signals = signal_keys(env)
         self.device = env.device or torch.device("cpu")
         self.keys = _named(env, keys)
+        # 1 for an env without a batch.
         self.num_envs = env.batch_size.numel()
+        # Other libraries know one reward per row only.
         if env.full_reward_spec[self._signals.reward].shape.numel() != self.num_envs:
             raise ValueError(
                 f"{self._signals.reward!r} has several numbers per row: adapters take one reward each"
@@ -76,7 +78,9 @@ class Stepper:
         self._root: TensorDictBase | None = None
         self._out: dict[str, TensorDictBase] = {}
         self.action_spec = env.full_action_spec[env.action_key]
+        # The buffer that the recorded step reads: actions are copied into it.
         self._action = self.action_spec.zero()
+        # Recorded where the device can, and replayed at each step.
         self._run = Captured(self._step, device=self.device)
         self._followed = FollowedGraph(env, self._run)
         self._steps = 0
@@ -92,6 +96,7 @@ class Stepper:
     @torch.no_grad()
     def reset(self, seed: int | None = None) -> Observations:
         """Reset all envs and return their observations."""
+        # Python that changed since the recording is noticed before it is used.
         self._followed.follow()
         if isinstance(self.env, MaskedReset):
             root_E = self.env.reset(seed=seed)
@@ -99,6 +104,7 @@ class Stepper:
             if seed is not None:
                 self.env.set_seed(seed)
             root_E = self.env.reset()
+        # In place after the first time, as the graph reads these very tensors.
         if self._root is None:
             self._root = root_E.clone()
         else:
@@ -106,10 +112,13 @@ class Stepper:
         return self.read(self._root)
 
     def as_action(self, values: Any) -> Shaped[Tensor, "*batch"]:
-        """Return what a foreign policy chose for E rows as an action of the env: numbers, or the index of a choice."""
+        """Return a foreign policy's choices for E rows as an action of the env: numbers, or the index of a choice."""
+        # NumPy arrays and tensors alike.
         action = torch.as_tensor(values, device=self.device)
+        # Other libraries choose by an index, our envs by one-hot rows.
         if isinstance(self.action_spec, OneHot):
             action = torch.nn.functional.one_hot(action.long().reshape(-1), self.action_spec.space.n)
+        # [E] and [E, 1] hold the same numbers where an action has one column.
         if action.shape != self._action.shape and action.numel() == self._action.numel() == self.num_envs:
             action = action.reshape(self._action.shape)
         return (action if self.batch_dims or action.shape == self._action.shape else action[0]).to(
@@ -125,6 +134,7 @@ class Stepper:
                 f"action is {action.dtype} of shape {tuple(action.shape)}: "
                 f"expected {wanted.dtype} of shape {tuple(wanted.shape)}"
             )
+        # Resets the env where nobody has.
         root = self.root
         self._action.copy_(action)
         # Looking takes a share of a step. So a change is noticed after at most as many steps as there were before it.
@@ -133,12 +143,15 @@ class Stepper:
         self._steps += 1
         self._run()
         next_E = self._out["next"]
+        # In place: the next replay reads from the same memory.
         root.update_(self._out["root"])
         if isinstance(self.env, MaskedReset):
             # The env's own reference points into the graph's memory, which the next replay overwrites.
             self.env.last_root = root
         keys = self._signals
+        # Copies, since the next replay overwrites its outputs.
         reward_E, done_E, terminated_E = (next_E.get(key).flatten().clone() for key in keys[:3])
+        # An env without truncation has only ends of the other kind.
         if keys.truncated is None:
             cut_E = done_E & ~terminated_E
         else:
@@ -160,6 +173,7 @@ class Stepper:
 
     def _step(self) -> None:
         assert self._root is not None
+        # A shallow copy: the env writes new entries, but the root's stay where they are.
         td = self._root.copy().set(self.env.action_key, self._action)
         with self._followed.calling():
             env_state_E, root_E = self.env.step_and_maybe_reset(td)
@@ -171,6 +185,7 @@ def _named(env: EnvBase, keys: Keys) -> dict[str, NestedKey]:
     spec = env.full_observation_spec
     present = list(spec.keys(True, True))
     if keys is None:
+        # Nested leaves are the clean terms of groups; policies read the groups.
         flat = [key for key in present if isinstance(key, str)]
         keys = flat or present
     if isinstance(keys, Mapping):

@@ -18,8 +18,10 @@ from ksim_rl.trainers import Algorithm, ModulesCfg, RunCfg, TrainingCfg
 from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg
 from ksim_rl.trainers.run_cfg import BrowserCfg
 
+# Annotations and defaults of a run, from which the groups are made.
 HINTS = get_type_hints(RunCfg)
 DEFAULTS = default_tree(RunCfg)
+# Groups that change with the algorithm; the others belong to the task or the machine.
 OF_AN_ALGORITHM = ("objective", "data", "modules")
 Tree = dict[str, Any]
 
@@ -53,19 +55,23 @@ CHOICES: dict[str, dict[str, Any]] = {
 
 
 def store_choices() -> None:
-    """Store what each group offers, in `objective` the algorithms, and `run`, the fields of no group."""
+    """Store the choices of each group, in `objective` the algorithms, and `run`, the fields of no group."""
+    # Fields of no group, at the top of the config.
     alone = ("task_name", "num_envs", "seed", "device", "checkpoint")
     ConfigStore.instance().store(name="run", node={name: DEFAULTS[name] for name in alone})
     upstream.store_config("collector", "rollout", lambda: DEFAULTS["collector"])
     upstream.store_config("trainer", "on_policy", lambda: DEFAULTS["trainer"])
+    # A copy: the algorithms add their own choices below.
     choices = {group: dict(own) for group, own in CHOICES.items()}
     for name in algorithms.names():
         algorithm = algorithms.algorithm(name)
         chosen = {}
         for group in ("data", "modules"):
             cfg = getattr(algorithm, group)
+            # An existing choice of the same content is used, so that names stay few.
             chosen[group] = next((choice for choice, own in CHOICES[group].items() if own == cfg), name)
             choices[group].setdefault(chosen[group], cfg)
+        # Made when Hydra loads it: building all trees takes longer than a command should.
         upstream.store_config("objective", name, partial(_objective, algorithm, chosen))
     for group, own in choices.items():
         for name, cfg in own.items():
@@ -73,12 +79,13 @@ def store_choices() -> None:
 
 
 def _objective(algorithm: Algorithm, chosen: Mapping[str, str]) -> dict[str, Any]:
+    # An algorithm chooses its data and networks, which the command line may override.
     overrides = [{f"override /{group}@_global_.{group}": name} for group, name in chosen.items()]
     return {"defaults": ["_self_", *overrides], **default_tree(algorithm.cfg, HINTS["objective"])}
 
 
 def training_defaults(name: str) -> Tree:
-    """Return what a task sets whatever the objective is, as a config tree."""
+    """Return a task's settings for any objective, as a config tree."""
     task = envs.task(name)
     # The env's own number of envs and seed follow the run's.
     tree = {
@@ -86,13 +93,14 @@ def training_defaults(name: str) -> Tree:
         "num_envs": task.cfg().scene.num_envs,
         "task": {"scene": {"num_envs": "${num_envs}"}, "seed": "${seed}"},
     }
+    # A task that is never trained has no settings.
     if task.training is None:
         return tree
     return tree | _changes(_of_all(_checked(task, task.training)), default_tree(TrainingCfg))
 
 
 def objective_defaults(name: str, objective: str) -> Tree:
-    """Return what a task sets for one algorithm, as a config tree.
+    """Return a task's settings for one algorithm, as a config tree.
 
     For an algorithm that it has no settings for, that is what fits of those in `training`: data and networks of the
     kinds that the algorithm has as well, and the settings that it inherits.
@@ -102,14 +110,17 @@ def objective_defaults(name: str, objective: str) -> Tree:
     if task.training is None:
         return {}
     base = _checked(task, task.training)
+    # Settings that were made for this algorithm come first.
     for other in task.other_trainings:
         own = _checked(task, other)
         if serving(type(own.objective)) is algorithm:
             return _own_changes(own, algorithm) | _changes(_of_all(own), _of_all(base))
+    # Else the settings of the main training, as far as they fit.
     source = serving(type(base.objective))
     changes = _own_changes(base, source)
     if source is algorithm:
         return changes
+    # A group fits where the algorithm's config has the same kind: its fields mean the same there.
     fits = {
         "objective": issubclass(algorithm.cfg, type(base.objective)),
         "data": type(algorithm.data) is type(base.data),
@@ -125,6 +136,7 @@ def _own_changes(training: TrainingCfg, algorithm: Algorithm) -> Tree:
         "modules": to_tree(algorithm.modules, HINTS["modules"]),
     }
     tree = to_tree(training, TrainingCfg)
+    # Only differences from the defaults: others may still be overridden by choices of groups.
     return _changes({group: tree[group] for group in OF_AN_ALGORITHM}, defaults)
 
 
@@ -139,6 +151,7 @@ def _changes(tree: Mapping[str, Any], base: Mapping[str, Any]) -> Tree:
     for key, value in tree.items():
         below: Any = base.get(key)
         are_trees = isinstance(value, dict) and isinstance(below, dict)
+        # The same class on both sides: go on inside, else the whole tree counts.
         if are_trees and value.get("_target_") == below.get("_target_"):
             if inner := _changes(value, below):
                 changes[key] = inner

@@ -23,7 +23,7 @@ from ksim_rl.trainers import RunCfg
 
 # A sweep over more combinations than this is checked in part here; each job checks its own config again.
 MAX_CHECKED_JOBS = 50
-# What follows from a rollout length that is given.
+# Fields that follow from a rollout length.
 SIZES = ("data.num_env_states_per_minibatch", "data.num_steps")
 
 
@@ -46,10 +46,12 @@ def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, value
     The primary config is `name`; sweeps such as `seed=1,2` need `multirun`. With `values` it returns the config, of
     each job of a sweep. The ValueError is one line that names what is wrong, and the near names or the valid values.
     """
+    # Hydra keeps one global state: an earlier call in this process would be found in the way.
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_module(MODULE, version_base="1.3"):
             loader = GlobalHydra.instance().config_loader()
+            # Parsed before anything is composed, for errors that name one override.
             overrides = [_parse(text, loader) for text in texts]
             sweeps = [str(override.input_line) for override in overrides if override.is_sweep_override()]
             if sweeps and not multirun:
@@ -57,7 +59,9 @@ def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, value
                     f"override {sweeps[0]!r} has several values: add --multirun to run one job for each"
                     f"{quoting(sweeps[0])}"
                 )
+            # Names before values: Hydra's own messages about them are long.
             _check_names(overrides, loader, name)
+            # Many jobs are checked in part; each of them checks itself when it starts.
             jobs = itertools.islice(_jobs(overrides), MAX_CHECKED_JOBS if values else 0)
             return [_compose(job, name) for job in jobs]
     except (HydraException, OmegaConfBaseException) as error:
@@ -66,6 +70,7 @@ def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, value
 
 def fields_of(overrides: Sequence[str]) -> list[str]:
     """Return the fields that overrides name: "task.sim.njmax" of "+task.sim.njmax=90"."""
+    # "+" adds and "~" deletes: the field behind is the same.
     return [text.lstrip("+~").partition("=")[0] for text in overrides]
 
 
@@ -76,9 +81,11 @@ def without_sweeps(texts: Sequence[str]) -> list[str]:
 
 
 def _compose(overrides: list[str], name: str) -> RunCfg:
+    # Interpolations are resolved here, as the run's config holds values only.
     plain = OmegaConf.to_container(hydra.compose(name, overrides=overrides), resolve=True)
     assert isinstance(plain, dict)
     cfg = RunCfg.from_tree({str(key): value for key, value in plain.items()})
+    # Data sizes follow from the rollout length, so only one of the two may be given.
     for override in overrides:
         if override.partition("=")[0] in SIZES and cfg.collector.rollout_length is not None:
             raise ValueError(
@@ -89,6 +96,7 @@ def _compose(overrides: list[str], name: str) -> RunCfg:
 
 
 def _parse(text: str, loader: ConfigLoader) -> Override:
+    # A flag among the overrides is a slip of habit: the right spelling is told.
     if text.startswith("-"):
         raise spelling.of_flag(text)
     if not text.isascii() and text.encode(errors="replace").decode() != text:
@@ -99,6 +107,7 @@ def _parse(text: str, loader: ConfigLoader) -> Override:
     try:
         return OverridesParser.create(config_loader=loader).parse_override(text)
     except HydraException as error:
+        # A single word may be a task or a folder, whose right use is told.
         if "=" not in text and (explained := spelling.of_word(text)) is not None:
             raise explained from error
         reason = " ".join(str(error).split())
@@ -112,11 +121,13 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
     choices = []
     fields = []
     for override in overrides:
+        # The name is a part of the task, and would not change the task.
         if override.key_or_group == "task_name":
             raise ValueError(
                 f"override {override.input_line!r}: the name comes with the task; choose that with task=name"
             )
         if override.key_or_group in groups:
+            # A run that is made again has one config, and no groups to choose from.
             if name == RUN_AGAIN:
                 raise ValueError(
                     f"override {override.input_line!r}: a run's config has no groups; override its fields, or compose "
@@ -128,10 +139,12 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
                     f"override {override.input_line!r}: a run needs each group; choose another with "
                     f"{override.key_or_group}=name: {', '.join(options)}"
                 )
+            # Each value of a sweep is a choice.
             for choice in _values(override):
                 check_known(override.key_or_group, choice, options)
             # A group that is not in the defaults list, such as another package's, is added with "+".
             added = "+" if override.is_add() else ""
+            # The first choice of a sweep stands for all: their fields are alike.
             choices.append(f"{added}{override.key_or_group}={_values(override)[0]}")
         elif not override.is_hydra_override():
             fields.append(override)
@@ -145,7 +158,8 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
 
 @cache
 def _names(name: str, choices: tuple[str, ...], sources: tuple[str, ...]) -> dict[str, Any]:
-    """Compose what overrides are checked against: choices of groups from these sources, which stay in a process."""
+    """Compose the tree that overrides are checked against: choices of groups from sources that stay in a process."""
+    # Without overrides of fields, which are checked against this tree.
     tree = OmegaConf.to_container(hydra.compose(name, overrides=list(choices)))
     assert isinstance(tree, dict)
     return {str(key): value for key, value in tree.items()}
@@ -168,9 +182,11 @@ def _groups(loader: ConfigLoader) -> list[str]:
 
 def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
     """Yield the overrides of each job, as Hydra's sweeper would."""
+    # One axis for each override; those without a sweep have a single value.
     axes = [
         [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
         if override.is_discrete_sweep()
+        # Sweeps by ranges of a sweeper plug-in are left to it.
         else [override.input_line or ""]
         for override in overrides
     ]

@@ -29,6 +29,7 @@ RUN_CONFIG = CONFIG
 CHOSEN_BY_TASK = TRAINING, OBJECTIVE_TRAINING = "task/training", "task/objective_training"
 WRITTEN_BY_LOGGERS = ("wandb", "mlflow")
 
+# Names of folders stay below the limit of file systems, with room for the number.
 MOST_LETTERS = 120
 # Hydra reads a group in Python, a letter in some 50 us.
 MOST_GROUP_BYTES = 2**16
@@ -37,7 +38,8 @@ MOST_REFERENCES = 16
 
 
 def job_folder(number: int, task: str, overrides: str) -> str:
-    """Return what the folder of a multirun's job is called: its number, and what jobs differ in."""
+    """Return the name of the folder of a multirun's job: its number, and the overrides that differ."""
+    # Signs of Hydra's grammar, such as brackets and quotes, have no place in a folder's name.
     name = re.sub(r"[^\w.+=,-]", "-", overrides or task)
     return f"{number}_{name[:MOST_LETTERS]}"
 
@@ -56,6 +58,7 @@ def register() -> None:
 
 @cache
 def _register(_named: tuple[str, ...]) -> None:
+    # Once: the same plug-ins register the same configs.
     Plugins.instance().register(DeclaredConfigs)
     envs.register_configs()
     store = partial(upstream.store_config, package="_global_")
@@ -65,6 +68,7 @@ def _register(_named: tuple[str, ...]) -> None:
         for objective in algorithms.names():
             make = partial(choices.objective_defaults, name, objective)
             store(OBJECTIVE_TRAINING, f"{name}_{objective}", make)
+    # After all is stored: lists of groups are then quick.
     upstream.quicken()
 
 
@@ -79,6 +83,7 @@ def register_run(folder: Path, given: Collection[str] = ()) -> None:
         raise ValueError(
             f"--config-dir {folder}: expected a run folder, whose {RUN_CONFIG} has a task and its name"
         )
+    # Loggers write YAML files of their own beside the run's config.
     for beside in config_files(folder):
         if beside.parts[0] not in (RUN_CONFIG, *WRITTEN_BY_LOGGERS):
             raise ValueError(f"{folder / beside}: a run folder has no configs but its {RUN_CONFIG}")
@@ -91,6 +96,7 @@ def store_run(tree: Mapping[str, Any], path: Path) -> None:
     task = tree.get("task")
     if not isinstance(task, dict) or not isinstance(task.get("scene"), dict):
         raise ValueError(f"{path}: task={task!r}: expected the config of an env, as a run writes it")
+    # The number of envs and the seed of the env follow the run's, as in a new config.
     plain = without_env_size(up_to_date(tree))
     ConfigStore.instance().store(name=RUN_AGAIN, node={**plain, "defaults": ["launch", "_self_"]})
 
@@ -121,6 +127,7 @@ def check_groups(folder: Path) -> None:
                 raise ValueError(
                     f"{os.path.join(root, name)}: a link, and what it leads to is no part of the folder"
                 )
+    # Counted over the whole folder: references multiply when they name each other.
     references = 0
     for path in found:
         text = read_bytes(folder / path, limit=MOST_GROUP_BYTES).decode(errors="replace")
@@ -136,6 +143,7 @@ def check_groups(folder: Path) -> None:
                 f"{folder / path}: the folder has more than {MOST_REFERENCES} references to other fields, such as "
                 "${num_envs}: give values"
             )
+        # A config at the top would be a primary config, and one that names Hydra could start programs.
         if len(path.parts) == 1 or "hydra" in f"{path} {text} {tree}".lower():
             raise ValueError(
                 f"{folder / path}: a folder of config groups holds choices of groups only, which do not name Hydra; "
@@ -154,7 +162,10 @@ def searched_folders(overrides: Sequence[str]) -> list[Path]:
             else:
                 places = [value]
             found += [
-                Path(str(place).removeprefix("file://")) for place in places if "pkg://" not in str(place)
+                # Packages come with what is installed, and so are trusted.
+                Path(str(place).removeprefix("file://"))
+                for place in places
+                if "pkg://" not in str(place)
             ]
     return found
 

@@ -17,6 +17,7 @@ def of_flag(flag: str, arguments: Sequence[str] = ()) -> ValueError:
     name, equals, value = flag.lstrip("-").partition("=")
     if not equals:
         if flag in arguments:
+            # `--task x`: the value is the argument behind it.
             after = list(arguments)[list(arguments).index(flag) + 1 :]
         else:
             after = []
@@ -24,24 +25,29 @@ def of_flag(flag: str, arguments: Sequence[str] = ()) -> ValueError:
             value = after[0]
         else:
             value = "VALUE"
+    # Flags are written with dashes, fields with underscores.
     name = name.replace("-", "_")
     known = [*GROUPS, *_fields(DEFAULTS)]
+    # The whole path, else all fields that end in the name.
     found = [field for field in known if field == name] or [
         field for field in known if field.endswith(f".{name}")
     ]
     if not found and name.partition(".")[0] not in known:
         return ValueError(f"{flag}: no such flag, and no field {name!r}: {near(name, known)}")
+    # Three are enough: a name such as `seed` stands in many places.
     options = " or ".join(f"{field}={value}" for field in (found or [name])[:3])
     return ValueError(f"{flag}: fields are set without dashes: {options}")
 
 
 def of_word(word: str) -> ValueError | None:
     """Build the error for an argument that is no `name=value`, if it names a task or a run."""
+    # A folder as an argument: the three things that one may want with a run.
     if (Path(word) / RUN_CONFIG).exists():
         return ValueError(
             f"{word!r}: expected name=value; make this run once more with --config-dir {word}, start from its weights "
             f"with checkpoint={word}, or continue it with: ksim-rl resume {word}"
         )
+    # A near task name is most likely what was meant.
     hint = near(word, envs.names())
     if not hint.startswith("did you mean"):
         return None

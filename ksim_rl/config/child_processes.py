@@ -29,10 +29,12 @@ def start_python(
 
     `environment` replaces variables of this process, and `streams` go to `subprocess.Popen`.
     """
+    # Plug-ins of this process by absolute paths, as the child starts elsewhere.
     own = plugins.environment()
     with suppress(OSError):  # the folder may be gone, and most children need none
         own[_PARENTS_FOLDER] = os.getcwd()
     return subprocess.Popen(
+        # -P: a file such as json.py in the working directory would change the child's imports.
         [sys.executable, "-P", *words],
         env={**os.environ, **own, **(environment or {})},
         cwd=START,
@@ -55,6 +57,7 @@ def run_python(
     with start_python(words, environment=environment, text=True, **pipes) as child:
         try:
             printed, complaints = child.communicate(text, timeout=seconds)
+        # Also for Ctrl-C: no child goes on without us.
         except BaseException:
             child.kill()
             raise
@@ -63,16 +66,18 @@ def run_python(
 
 def go_to_parents_folder() -> None:
     """Enter the working directory of the process that started this one, where relative paths of a config begin."""
+    # Taken out, so that children of the child do not follow it.
     folder = os.environ.pop(_PARENTS_FOLDER, None)
     if folder is not None:
         os.chdir(folder)
 
 
 def ask_git(folder: Path, *arguments: str) -> bytes | None:
-    """Return what git prints about a folder, or None where there is no git, or nothing of what was asked for."""
+    """Return git's output about a folder, or None where there is no git, or git has no answer."""
     # The folder may have settings that name programs; none of them is needed to list files and compare them.
     harmless = ("core.fsmonitor=false", "core.hooksPath=/dev/null", "core.quotePath=false")
     settings = [word for setting in harmless for word in ("-c", setting)]
+    # Variables of git may name another repository, such as in a hook.
     own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     command = ["git", *settings, "-C", str(folder.absolute()), *arguments]
     try:

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from ksim_rl.checks import near
 
-# What a value of one word may hold without quotes.
+# Letters that a value of one word may hold without quotes.
 UNQUOTED = frozenset(string.ascii_letters + string.digits + "_/.:+-%*@?")
 
 
@@ -29,35 +29,42 @@ def check_overrides(tree: Mapping[str, Any], overrides: Sequence[str]) -> None:
 
 
 def quoting(text: str) -> str:
-    """Return how to write an override whose value has signs of Hydra's grammar; nothing for one without a value.
+    """Return the right spelling of an override whose value has signs of Hydra's grammar; nothing without a value.
 
     Names of files have them: spaces with brackets, commas, `=`, `~` and letters beyond ASCII.
     """
+    # Quoted values and lists are left alone: their signs are meant.
     field, equals, value = text.partition("=")
     if not equals or value[:1] in "'\"[{" or set(value) <= UNQUOTED:
         return ""
+    # Inside of double quotes only these need an escape.
     escaped = value.replace('"', '\\"')
     return f"; a name or text with such signs is quoted, for the shell too: '{field}=\"{escaped}\"'"
 
 
 def check_parsed(tree: Mapping[str, Any], overrides: Iterable[Override]) -> None:
     """Do the same with overrides that are parsed: each sees what the ones before it have added and dropped."""
+    # A copy, since later overrides are checked against added and dropped fields.
     tree = copy.deepcopy(dict(tree))
     for override in overrides:
         key = override.key_or_group
+        # "+" makes a field, so that it may be set below.
         if override.is_add() or override.is_force_add():
             above = _node(tree, key.split(".")[:-1], make=True)
             above[key.split(".")[-1]] = None if override.is_sweep_override() else _plain(override)
             continue
+        # "~" and plain overrides need a field that is there.
         check_key(tree, key)
         if override.is_delete():
             above = _node(tree, key.split(".")[:-1])
             above.pop(key.split(".")[-1], None)
+        # A mapping adds its entries, as Hydra merges.
         elif not override.is_sweep_override() and isinstance(value := _plain(override), dict):
             _node(tree, key.split("."), make=True).update(value)
 
 
 def _plain(override: Override) -> Any:
+    # Through OmegaConf, which reads the value as it will later.
     tree: Any = OmegaConf.to_container(OmegaConf.create({"value": override.value()}))
     return tree["value"]
 
@@ -81,6 +88,7 @@ def check_key(tree: Mapping[str, Any], key: str) -> None:
     for depth, part in enumerate(parts):
         if isinstance(level, Mapping) and part in level:
             level = level[part]
+        # Entries of lists are named by number.
         elif isinstance(level, list | tuple) and part.isdigit() and int(part) < len(level):
             level = level[int(part)]
         else:
@@ -91,6 +99,7 @@ def check_key(tree: Mapping[str, Any], key: str) -> None:
                 where = f"{above} has no field {part!r}: "
             else:
                 where = ""
+            # The field exists one level down: most often a group was forgotten.
             inside = [top for top, below in tree.items() if isinstance(below, Mapping) and parts[0] in below]
             if above or not inside:
                 hint = near(part, choices)

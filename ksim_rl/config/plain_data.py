@@ -12,11 +12,13 @@ from ksim_rl.config.upstream import yaml_resolvers
 from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
 from ksim_rl.files.writing import check_name, check_own
 
+# Deeper trees would exhaust Python's stack.
 MOST_DEPTH = 50
 # In C where PyYAML was built with it: a hundred times as fast.
 _FastLoader: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader
 
 
+# The name of a field between braces, and nothing else.
 _REFERENCE = re.compile(r"\$\{[A-Za-z_.][\w.]*\}", re.ASCII)
 
 
@@ -27,6 +29,7 @@ class _Loader(_FastLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse keys that are there twice, of which one would win in silence."""
+        # By their written form, as 1 and "1" are different keys.
         seen: set[str] = set()
         for key, _ in node.value:
             text = repr(self.construct_object(key, deep=True))
@@ -42,10 +45,12 @@ def read_yaml(path: Path) -> Any:
     """Return the tree of a YAML file that holds scalars, lists and mappings, and no anchors, tags or interpolations."""
     try:
         text = read_bytes(path, limit=MOST_CONFIG_BYTES).decode()
+        # On the events, before any object is made of them.
         check_events(path, text)
         tree: Any = yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+    # An empty file is an empty config.
     tree = {} if tree is None else tree
     check_plain(tree, str(path))
     return tree
@@ -54,6 +59,7 @@ def read_yaml(path: Path) -> Any:
 def check_events(path: Path, text: str) -> None:
     """Refuse a YAML text that names classes by tags, repeats parts by anchors, or is nested without end."""
     depth = 0
+    # Anchors may expand to gigabytes, and tags may name classes.
     for event in yaml.parse(text, Loader=_FastLoader):
         found = None
         if isinstance(event, yaml.NodeEvent) and event.anchor is not None:
@@ -73,16 +79,19 @@ def check_plain(tree: Any, where: str) -> None:
     if isinstance(tree, Mapping):
         for key, entry in tree.items():
             check_plain(key, where)
+            # The path so far; the first part is the file.
             check_plain(entry, f"{where}: {key}" if ": " not in where else f"{where}.{key}")
     elif isinstance(tree, (list, tuple)):
         for index, entry in enumerate(tree):
             check_plain(entry, f"{where}[{index}]")
+    # Resolvers may read the environment, or run code of a plug-in.
     elif isinstance(tree, str) and "${" in tree:
         raise ValueError(f"{where}={tree[:80]!r}: an interpolation, and a run's config holds values only")
 
 
 def check_references(tree: Any, where: str) -> None:
     """Refuse interpolations that do more than name another field of the config, such as `${num_envs}`."""
+    # What is left after taking off plain references must be plain.
     check_plain(_without_references(tree), where)
 
 
@@ -98,8 +107,9 @@ def _without_references(tree: Any) -> Any:
 
 
 def flat(tree: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield what is in a tree by dotted path, mappings that have entries by these."""
+    """Yield the values of a tree by dotted path; of mappings with entries the entries."""
     for key, value in tree.items():
+        # An empty mapping is a value, too.
         if isinstance(value, Mapping) and value:
             yield from flat(value, f"{path}{key}.")
         else:
@@ -109,10 +119,11 @@ def flat(tree: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 def check_links(folder: Path, *, below: Sequence[str]) -> None:
     """Refuse a folder in which something, at its top or in the folders `below`, leads out: a run writes there.
 
-    That are links to other folders, files with other names (hard links), pipes and devices.
+    These are links to other folders, files with other names (hard links), pipes and devices.
     """
     check_name(folder)
     inside = folder.resolve()
+    # Only folders that a run writes into; others, such as a user's data, may hold anything.
     walked = (
         os.path.join(root, name)
         for own in below
@@ -120,9 +131,11 @@ def check_links(folder: Path, *, below: Sequence[str]) -> None:
         for name in sum(names, [])
     )
     for path in map(Path, (*folder.iterdir(), *walked)):
+        # Links inside of the folder are harmless.
         if path.is_symlink() and not path.resolve().is_relative_to(inside):
             raise ValueError(
                 f"{path}: a link that leads out of the run folder, and a run writes only into its own"
             )
+        # Hard links, pipes and devices in the place of files.
         if not path.is_symlink() and not path.is_dir():
             check_own(path)

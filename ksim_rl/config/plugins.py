@@ -37,6 +37,7 @@ ALGORITHMS = "ksim_rl.algorithms"
 VARIABLE = "KSIM_RL_PLUGINS"
 PATH_VARIABLE = "KSIM_RL_PLUGIN_PATH"
 
+# Plug-ins that were named, in that order, and packages that were only allowed.
 _named: list[str] = []
 _allowed: set[str] = set()
 
@@ -44,6 +45,7 @@ _allowed: set[str] = set()
 @cache
 def declared(group: str) -> tuple[EntryPoint, ...]:
     """Return the entry points of a group, by name."""
+    # Sorted, since the order of installed packages is the file system's.
     return tuple(sorted(entry_points(group=group), key=lambda point: (point.name, point.value)))
 
 
@@ -61,10 +63,12 @@ def load_from_here(names: Sequence[str], *, note: Callable[[str], None]) -> None
     _extend_path()
     for name in names:
         package = name.strip().partition(".")[0]
+        # Found elsewhere: the working directory must not take its place.
         if package in sys.modules or find_spec(package) is not None:
             continue
         if PathFinder.find_spec(package, [here]) is not None:
             note(f"--plugin {name}: taken from {here}, where Python finds modules from now on")
+            # For child processes too, whose working directory is another.
             os.environ[PATH_VARIABLE] = os.pathsep.join([*_folders(), here])
             break
     load(names)
@@ -77,14 +81,17 @@ def load(names: Sequence[str]) -> None:
     names one that cannot be imported.
     """
     _extend_path()
+    # Those of the environment first: a command adds to them.
     wanted = [*os.environ.get(VARIABLE, "").split(","), *names]
     for name in dict.fromkeys(name.strip() for name in wanted if name.strip()):
         if name in _named:
             continue
+        # Told with the error, as a missing folder is the usual reason.
         fix = f"correct the name, install the package, or put its folder into {PATH_VARIABLE}"
         _import(f"plug-in {name!r}", name, fix)
         _named.append(name)
     if _named:
+        # Children load the same plug-ins by this.
         os.environ[VARIABLE] = ",".join(_named)
 
 
@@ -110,6 +117,7 @@ def _folders() -> list[str]:
 
 
 def _extend_path() -> None:
+    # Behind everything else, so that no plug-in hides an installed package.
     sys.path += [folder for folder in _folders() if folder not in sys.path]
 
 
@@ -120,6 +128,7 @@ def named() -> tuple[str, ...]:
 
 def declared_packages() -> frozenset[str]:
     """Return the top-level packages that declare an entry point of ours; nothing is imported."""
+    # Names of entry points alone: importing would run their code.
     points = (point.module for group in (TASKS, CONF, ALGORITHMS) for point in declared(group))
     return frozenset(name.split(".")[0] for name in points)
 
@@ -152,6 +161,7 @@ def modules(group: str) -> Iterator[tuple[str, ModuleType]]:
         else:
             owner = point.dist.name
         origin = f"entry point {point.name} = {point.value!r} of {owner}"
+        # Importing registers the tasks and algorithms at a module's top level.
         for module in _import(origin, point.module, "mend or uninstall that package"):
             yield origin, module
     for name in _named:
@@ -164,6 +174,7 @@ def conf_packages() -> Iterator[tuple[str, str]]:
     for point in declared(CONF):
         yield point.name, point.module
     for name in _named:
+        # A plug-in of one file has no folder for configs.
         if "__path__" in vars(sys.modules[name]) and find_spec(f"{name}.conf") is not None:
             yield name, f"{name}.conf"
 
@@ -173,6 +184,7 @@ def _import(origin: str, name: str, fix: str) -> list[ModuleType]:
     try:
         module = importlib.import_module(name)
         inside = vars(module).get("__path__", ())
+        # `__main__` would run the plug-in's program.
         found = (info.name for info in pkgutil.iter_modules(inside) if info.name != "__main__")
         return [module, *(importlib.import_module(f"{name}.{child}") for child in found)]
     except Exception as error:

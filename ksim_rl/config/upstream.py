@@ -18,6 +18,7 @@ from omegaconf._utils import get_yaml_loader
 class _Kept(ConfigNode):
     """A stored config that stays the same object in a copy of the store."""
 
+    # Hydra copies the store for lookups, which is slow with hundreds of configs.
     def __deepcopy__(self, _memo: dict[int, Any]) -> "_Kept":
         return self
 
@@ -34,6 +35,7 @@ class _Made(_Kept):
         self.package = package
         self.provider = None
 
+    # Built on first use: a command needs a few of the configs.
     @cached_property
     def node(self) -> DictConfig:
         return _made(self.make)
@@ -49,6 +51,7 @@ def store_config(
     group: str, name: str, make: Callable[[], dict[str, Any]], *, package: str | None = None
 ) -> None:
     """Store a config in a group; `make` is called for its tree when Hydra first loads it."""
+    # Written into the store's folders, since its own method wants the finished tree.
     folder = ConfigStore.instance().repo
     for part in group.split("/"):
         folder = folder.setdefault(part, {})
@@ -56,16 +59,17 @@ def store_config(
 
 
 def quicken(folder: dict[str, Any] | None = None) -> None:
-    """Let what others stored so far be listed without copies of it."""
+    """Let the configs that others stored so far be listed without copies of them."""
     if folder is None:
         folder = ConfigStore.instance().repo
     for name, entry in folder.items():
         if isinstance(entry, dict):
             quicken(entry)
+        # Exactly this class: ours are kept already.
         elif type(entry) is ConfigNode:
             folder[name] = _Kept(**vars(entry))
 
 
 def yaml_resolvers() -> dict[str, Any]:
-    """Return what OmegaConf takes for which kind of scalar: 1e-3 is a number, and a date is text."""
+    """Return OmegaConf's rules for kinds of scalars: 1e-3 is a number, and a date is text."""
     return dict(get_yaml_loader().yaml_implicit_resolvers)

@@ -25,6 +25,7 @@ from ksim_rl.runs import record
 from ksim_rl.scene.rendering import rendering
 from ksim_rl.terminal import show
 
+# The driver's own word: it is there also where torch finds no GPU.
 NVIDIA = Path("/proc/driver/nvidia/version")
 _DRAWS = """
 import mujoco
@@ -35,18 +36,20 @@ renderer = mujoco.Renderer(model, 16, 16)
 renderer.update_scene(data)
 assert renderer.render().any()
 """
+# Software drawing may take seconds to start; a broken driver may never answer.
 _DRAW_SECONDS = 60
 
 
 @dataclass
 class Report:
-    """Lines about the machine, and what is wrong with it."""
+    """Lines about the machine, and its faults."""
 
     lines: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
 
     def say(self, subject: str, text: str, *, wrong: bool = False) -> None:
         """Add a line, and a fault where it is one."""
+        # Reports are pasted into issues: the user's name is taken out of paths.
         self.lines.append(f"{subject}: {_without_user(text)}")
         if wrong:
             self.faults.append(self.lines[-1])
@@ -62,8 +65,10 @@ def examine(*, test_devices: bool = True) -> Report:
     report = Report()
     report.say("versions", ", ".join(f"{name} {version}" for name, version in record.versions().items()))
     hardware = record.hardware()
+    # A bug report needs no name of a machine.
     hardware.pop("host", None)
     report.say("machine", ", ".join(f"{name} {value}" for name, value in hardware.items()))
+    # Without Warp nothing below can run, but pictures can still be looked at.
     warp_starts = _look_at_caches(report)
     if warp_starts:
         _look_at_gpus(report)
@@ -87,11 +92,12 @@ def command(arguments: Sequence[str]) -> int:
 
 
 def _look_at_caches(report: Report) -> bool:
-    """Report the caches, and return whether Warp starts, which makes its own at once."""
+    """Report the caches, and return whether Warp starts, which makes its own cache as it starts."""
     home = os.environ.get("HOME")
     if not home or not os.access(home, os.W_OK):
         if not home:
             stands = "is not set"
+        # Caches go below HOME where nothing else says so.
         else:
             stands = f"is {home}, where nothing can be written"
         report.say("HOME", f"{stands}: set it to a folder of yours, where caches are kept", wrong=True)
@@ -101,6 +107,7 @@ def _look_at_caches(report: Report) -> bool:
     except Exception as error:  # Warp raises whatever the file system does
         wrong = f"{type(error).__name__}: {error}"
         report.say("Warp", f"does not start: {wrong}", wrong=True)
+    # The caches of the compilers that a training uses, each with the variable that moves it.
     for name, variable, folder in _caches(warp_starts=wrong is None):
         refusal = _refusal(folder)
         if refusal is None:
@@ -113,14 +120,17 @@ def _look_at_caches(report: Report) -> bool:
 
 
 def _caches(*, warp_starts: bool) -> Iterator[tuple[str, str, Path]]:
+    # Warp names its folder only after it has started.
     if warp_starts:
         yield "Warp", "WARP_CACHE_PATH", Path(wp.config.kernel_cache_dir or "")
+    # The default of torch, which makes it in the temporary folder by user.
     default = Path(tempfile.gettempdir()) / f"torchinductor_{_user()}"
     yield (
         "torch.compile",
         "TORCHINDUCTOR_CACHE_DIR",
         Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or default),
     )
+    # Triton compiles for GPUs only.
     if torch.cuda.is_available():
         default = Path(os.path.expanduser("~")) / ".triton" / "cache"
         yield "Triton", "TRITON_CACHE_DIR", Path(os.environ.get("TRITON_CACHE_DIR") or default)
@@ -138,6 +148,7 @@ def _refusal(folder: Path) -> str | None:
     """Return why nothing can be written into a folder, which is made, or None."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        # Tried, as permissions alone do not tell of full or read-only disks.
         with tempfile.NamedTemporaryFile(dir=folder):
             return None
     except OSError as error:
@@ -150,6 +161,7 @@ def _devices() -> list[torch.device]:
 
 def _look_at_gpus(report: Report) -> None:
     gpus = [device for device in _devices() if device.type == "cuda"]
+    # A driver without GPUs in torch is a fault; no driver is a machine without GPUs.
     if not gpus:
         if NVIDIA.exists():
             driver = " ".join(NVIDIA.read_text().splitlines()[0].split())
@@ -169,12 +181,14 @@ def _look_at_gpus(report: Report) -> None:
             f"{about.name}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free, driver for CUDA {driver}, torch "
             f"for CUDA {torch.version.cuda}",
         )
+        # Warp's memory pool is what lets graphs allocate; without it each kernel is launched by itself.
         pool = wp.is_mempool_enabled(warp_device(device))
         if pool:
             text = "available"
         else:
             text = "unavailable, and training about 13 times slower: Warp's memory pool is off"
         report.say(f"graphs on GPU {device.index}", text, wrong=not pool)
+        # Loops inside a graph let the solver stop early.
         loops = wp.is_conditional_graph_supported()
         if loops:
             text = "available"
@@ -184,17 +198,20 @@ def _look_at_gpus(report: Report) -> None:
 
 
 def _look_at_opengl(report: Report) -> None:
-    """Report whether pictures can be drawn off screen, tried in a process of its own, since MuJoCo may abort it."""
+    """Report whether pictures can be drawn off screen, tried in a separate process, since MuJoCo may abort it."""
+    # The same choice as for videos.
     try:
         platform = rendering.choose_gl_platform()
     except RuntimeError as error:
         report.say("OpenGL", str(error), wrong=True)
         return
+    # In a child: a broken OpenGL aborts the whole process.
     try:
         tried = run_python(["-c", _DRAWS], environment={"MUJOCO_GL": platform}, seconds=_DRAW_SECONDS)
         if tried.returncode == 0:
             said = ""
         else:
+            # The last line of a traceback has the reason.
             said = (tried.stderr.strip().splitlines() or ["failed"])[-1]
     except TimeoutExpired:
         said = f"no answer in {_DRAW_SECONDS} s"
@@ -209,6 +226,7 @@ def _look_at_opengl(report: Report) -> None:
 
 def _try_device(report: Report, device: torch.device) -> None:
     say: Callable[[str], None] = lambda text: show(f"{text} ...", to_stderr=True)  # noqa: E731
+    # Compiling is part of the time that is told.
     began = time.monotonic()
     with compile_notice(say):
         done = try_device(device)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from ksim_rl.diagnosis.curves import Curves
 from ksim_rl.modules.actor import MIN_STD
 
+# A function of the curves that returns the evidence, or None where the fault is not seen.
 Fault = Callable[[Curves], str | None]
 
 
@@ -21,6 +22,7 @@ def std_at_floor(curves: Curves) -> str | None:
     reward that punishes every action.
     """
     std = curves.late("policy/std")
+    # The library's bound, or the config's where that is higher.
     floor = max(MIN_STD, math.exp(curves.setting("modules.actor.log_std_min", -math.inf)))
     # Three times the bound, since it is a mean over actions, some of which may lie above.
     if _below(std, 3.0 * floor):
@@ -29,15 +31,16 @@ def std_at_floor(curves: Curves) -> str | None:
 
 
 def entropy_collapsed(curves: Curves) -> str | None:
-    """The policy stopped exploring: its actions scatter by a tenth of what they did at first, or less.
+    """The policy stopped exploring: its actions scatter by a tenth of their first spread, or less.
 
     Raise objective.entropy_coeff, or lower objective.learning_rate or objective.desired_kl.
     """
-    # The entropy of densities has no zero to compare with, but their std has; that of choices is never negative.
+    # The entropy of densities has no zero to compare with, but their std has; entropies of choices are never negative.
     if curves.values("policy/std"):
         name = "policy/std"
     else:
         name = "loss/entropy"
+    # A tenth of what it was: learning narrows it too, but not that far.
     first = curves.early(name)
     last = curves.late(name)
     if first is None or last is None or first <= 0.0 or not 0.0 <= last <= 0.1 * first:
@@ -60,7 +63,9 @@ def value_error_exploding(curves: Curves) -> str | None:
     # The return of the largest mean reward, discounted or up to the end of an episode; a loss is a squared error.
     steps = 1.0 / max(1.0 - curves.setting("objective.gamma", 0.99), 1e-3)
     largest = max(rewards) * min(steps, max(curves.values("episode/length"), default=steps))
+    # Over the first values, since the error also falls as the critic learns.
     first = statistics.median(errors[: max(3, len(errors) // 5)])
+    # Both: grown tenfold, and larger than the square of any return could be.
     if last > 10.0 * first and last > (2.0 * largest) ** 2:
         return f"loss/value rose to {last:.3g}, where returns are at most about {largest:.2g}"
     return None
@@ -69,10 +74,11 @@ def value_error_exploding(curves: Curves) -> str | None:
 def negative_explained_variance(curves: Curves) -> str | None:
     """The critic predicts returns worse than their mean would: advantages are noise.
 
-    Raise objective.critic_coeff, give the critic what it needs to see (its observation group), lower
+    Raise objective.critic_coeff, let the critic see more (its observation group), lower
     modules.critic.output_gain, or lower objective.gamma.
     """
     share = curves.late("update/explained_variance")
+    # A critic that predicts the mean has 0; a little below is noise.
     if _below(share, -0.2):
         return f"update/explained_variance is {share:.2g}"
     return None
@@ -108,8 +114,10 @@ def episodes_end_at_once(curves: Curves) -> str | None:
     Loosen the termination that is named, or start where it does not hold (events of mode reset).
     """
     length = curves.late("episode/length")
+    # Fewer steps than any task needs to show a difference.
     if not _below(length, 5.0):
         return None
+    # The share of each termination tells which of them to loosen.
     ends = {name: curves.late(name) or 0.0 for name in curves.names("termination")}
     worst = max(ends, key=lambda name: ends[name], default=None)
     if worst is None:
@@ -120,12 +128,13 @@ def episodes_end_at_once(curves: Curves) -> str | None:
 
 
 def penalty_outweighs(curves: Curves) -> str | None:
-    """One penalty is ten times as large as all rewards together: what pays is to do nothing, or to end the episode.
+    """One penalty is ten times as large as all rewards together: it pays to do nothing, or to end the episode.
 
     Lower the weight of that reward, task.rewards.<name>.weight, or let a curriculum raise it later.
     """
     terms = {name: curves.late(name) or 0.0 for name in curves.names("reward")}
     earned = sum(max(value, 0.0) for value in terms.values())
+    # The lowest term; there may be no penalty at all.
     worst = min(terms, key=lambda name: terms[name], default=None)
     if worst is None or not earned or -terms[worst] < 10.0 * earned:
         return None
@@ -162,6 +171,7 @@ def stale_normalizer(curves: Curves) -> str | None:
     Let the normalizers go on learning, look for an observation that jumps or grows without bound, and do not begin from
     the checkpoint of a task with other observations.
     """
+    # 1 is the aim; a factor of a few is no harm.
     size = curves.last("policy/observation_rms")
     off = size is not None and not 0.2 < size < 4.0
     if off:
@@ -169,6 +179,7 @@ def stale_normalizer(curves: Curves) -> str | None:
     return None
 
 
+# Order of the report: a cause stands before the faults that follow from it.
 FAULTS: tuple[Fault, ...] = (
     episodes_end_at_once,
     stale_normalizer,
@@ -200,7 +211,7 @@ EXPLAINS: Mapping[Fault, tuple[Fault, ...]] = {
     ),
     stale_normalizer: (dead_units, kl_far_off, most_ratios_clipped, negative_explained_variance),
 }
-"""What follows from a fault, and is not said beside it."""
+"""Faults that follow from a fault, and are not told when it is."""
 
 
 def _above(value: float | None, limit: float) -> bool:

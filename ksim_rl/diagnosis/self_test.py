@@ -1,4 +1,4 @@
-"""Tries on each device what every run needs: physics as in MuJoCo's C engine, graphs, and an update."""
+"""Tries the needs of every run on each device: physics as in MuJoCo's C engine, graphs, and an update."""
 
 from collections.abc import Callable
 from importlib.resources import files
@@ -14,6 +14,7 @@ from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import PPOCfg, StepGuard, make_loss, make_optimizer, ppo_step
 from ksim_rl.physics import World
 
+# A few envs are enough: the kernels are the same for thousands.
 NUM_ENVS = 4
 NUM_STEPS = 50
 # float32 against float64 over half a second of a pole that swings.
@@ -21,7 +22,8 @@ MOST_DIFFERENCE = 1e-4
 
 
 def try_device(device: torch.device) -> list[tuple[str, str | None]]:
-    """Return what was tried on a device and how it went, with what is wrong, or None."""
+    """Return the names of the trials on a device, each with its fault, or None."""
+    # The smallest robot of the package: it compiles soonest.
     mj_model = mujoco.MjModel.from_xml_string(
         files("ksim_rl.scene.robots").joinpath("cartpole.xml").read_text()
     )
@@ -40,6 +42,7 @@ def try_device(device: torch.device) -> list[tuple[str, str | None]]:
     return done
 
 
+# MuJoCo's C engine in float64 is the reference.
 def _physics(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
     world = _pushed(mj_model, device)
     data = mujoco.MjData(mj_model)
@@ -55,6 +58,7 @@ def _physics(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
 
 
 def _graphs(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
+    # Two worlds of the same state: one is stepped by a graph, one kernel by kernel.
     graphed, live = (_pushed(mj_model, device) for _ in range(2))
     total = torch.zeros((), device=device)
 
@@ -62,8 +66,10 @@ def _graphs(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
         graphed.step(1)
         total.add_(graphed.qpos_EL.sum())
 
+    # On a GPU a failed capture is the fault that is looked for; the CPU goes on without.
     captured = Captured(step, device=device, require_graphs=device.type == "cuda")
     expected = torch.zeros_like(total)
+    # The first calls warm up and record, the later ones replay.
     for _ in range(5):
         captured()
         with live_launches():
@@ -78,6 +84,7 @@ def _graphs(mj_model: mujoco.MjModel, device: torch.device) -> str | None:
 
 
 def _update(device: torch.device) -> str | None:
+    # Seeded on the CPU, so that all devices get the same numbers.
     generator = torch.Generator().manual_seed(0)
 
     def draw(size: int) -> torch.Tensor:
@@ -88,6 +95,7 @@ def _update(device: torch.device) -> str | None:
     actor = make_actor(ActorCfg(hidden_dims=(16,)), obs_dim=3, action_dim=2, action_spec=spec, device=device)
     critic = make_critic(CriticCfg(hidden_dims=(16,)), obs_dim=3, device=device)
     minibatch_B = actor(
+        # As a rollout would hold it: observations, action and its log-probability, without gradients.
         TensorDict({"actor": draw(3), "critic": draw(3)}, batch_size=[64], device=device)
     ).detach()
     minibatch_B.update({"advantage": draw(1), "value_target": draw(1), "state_value": draw(1)})
@@ -95,6 +103,7 @@ def _update(device: torch.device) -> str | None:
     optimizer = make_optimizer(cfg, actor, critic)
     guard = StepGuard(device=device)
     ppo_step(make_loss(cfg, actor, critic), optimizer, minibatch_B, cfg=cfg, guard=guard)
+    # Parameters have to move, and the guard has to see finite gradients.
     moved = any(not torch.equal(old, new) for old, new in zip(before, actor.parameters(), strict=True))
     if moved and not int(guard.skipped):
         return None

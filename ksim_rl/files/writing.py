@@ -15,12 +15,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-# What a name begins with until its file is whole; who writes there next deletes what a crash left.
+# A name begins with this until its file is whole; who writes there next deletes leftovers of a crash.
 WRITING = ".writing-"
 
 
 def check_own(path: Path) -> None:
-    """Refuse a path at which something lies that is more than a file of this folder alone."""
+    """Refuse a path at which something else lies than a file of this folder alone."""
     check_name(path)
     with suppress(FileNotFoundError):
         _check_status(path, os.lstat(path))
@@ -28,6 +28,7 @@ def check_own(path: Path) -> None:
 
 def check_name(path: Path) -> None:
     """Refuse a path with bytes that are no UTF-8: libraries that write files abort there, or write elsewhere."""
+    # Surrogate escapes stand for bytes that are no UTF-8.
     if os.fsencode(path) != str(path).encode(errors="replace"):
         raise ValueError(
             f"{path.absolute()}: bytes that are no UTF-8, with which nothing is written: rename the folder"
@@ -36,6 +37,7 @@ def check_name(path: Path) -> None:
 
 def check_folder(folder: Path, *, below: Path) -> None:
     """Refuse a folder of a user's folder `below` that is reached by a link; `below` itself may be one."""
+    # `below` may be a link of the user's own, such as to a larger disk; nothing under it may.
     check_name(folder)
     reached = below
     for name in folder.relative_to(below).parts:
@@ -59,11 +61,14 @@ def whole_file(path: Path) -> Iterator[Path]:
     A ValueError refuses a `path` that leads elsewhere, see `check_own`.
     """
     check_own(path)
+    # In the same folder: only within one file system does a file replace another at one moment.
     temporary = path.with_name(f"{WRITING}{secrets.token_hex(4)}-{path.name}")  # another writer has another
     try:
         with _named(path):
             yield temporary
+            # Readers see the old file or the new one, never a part.
             os.replace(temporary, path)
+    # Also for Ctrl-C.
     except BaseException:
         with suppress(OSError):
             temporary.unlink()
@@ -91,8 +96,10 @@ def whole_folder(folder: Path, *, below: Path) -> Iterator[Path]:
     try:
         with unfinished_folder(folder) as temporary:
             yield temporary
+            # Files of subfolders too.
             files = [path for path in sorted(temporary.rglob("*")) if path.is_file()]
             targets = [folder / path.relative_to(temporary) for path in files]
+            # All places are checked before the first file moves.
             for target in targets:
                 check_folder(target.parent, below=below)
                 check_own(target)
@@ -107,6 +114,7 @@ def whole_folder(folder: Path, *, below: Path) -> Iterator[Path]:
 @contextmanager
 def unfinished_folder(folder: Path) -> Iterator[Path]:
     """Give a new folder in `folder`, which is deleted at the end, and after a kill by who comes here next."""
+    # Whoever writes here next cleans up after a crash.
     _remove_abandoned(folder)
     temporary = folder / f"{WRITING}{secrets.token_hex(4)}"
     temporary.mkdir()
@@ -121,11 +129,13 @@ def open_own(path: Path) -> IO[str]:
     """Open a file to read and write, which is made where there is none, and is refused as `check_own` refuses it."""
     check_name(path)
     try:
+        # Not through a link, and without waiting for the reader of a pipe.
         number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
     except OSError:
         check_own(path)  # which names a link
         raise
     try:
+        # The open file is asked, so that nothing can be put in its place in between.
         _check_status(path, os.fstat(number))
         return os.fdopen(number, "r+")
     except BaseException:
@@ -138,6 +148,7 @@ def _check_status(path: Path, about: os.stat_result) -> None:
         what = "a link"
     elif not stat.S_ISREG(about.st_mode):
         what = "no regular file"
+    # A hard link would change a file of another folder, too.
     elif about.st_nlink > 1:
         what = f"a file with {about.st_nlink} names (hard links)"
     else:
@@ -149,10 +160,11 @@ def _check_status(path: Path, about: os.stat_result) -> None:
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Say what could not be written where an error does not: a full disk answers a write without any name."""
+    """Name the path in errors that name none: a full disk answers a write without any name."""
     try:
         yield
     except OSError as error:
+        # An error that names its file needs no help.
         if error.errno is None or error.filename is not None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
@@ -161,6 +173,7 @@ def _named(path: Path) -> Iterator[None]:
 @contextmanager
 def _held(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder that is being filled, so that others see that its process lives."""
+    # A folder can be locked like a file.
     number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         with suppress(OSError):  # some file systems have no locks
@@ -171,13 +184,15 @@ def _held(folder: Path) -> Iterator[None]:
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Delete what processes left here that were killed while they filled a folder."""
+    """Delete the leftovers of processes that were killed while they filled a folder."""
     for entry in folder.glob(f"{WRITING}*"):
+        # A link is not followed, and not deleted either: it is none of ours.
         if entry.is_symlink() or not entry.is_dir():
             continue
         with suppress(OSError):
             number = os.open(entry, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             try:
+                # Fails where the process that fills the folder lives: then the folder stays.
                 fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(entry, ignore_errors=True)
             finally:

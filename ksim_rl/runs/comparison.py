@@ -13,7 +13,7 @@ from ksim_rl.runs.listing import CONFIG, HEADS, METRICS, line, metric_rows, numb
 from ksim_rl.terminal import printable
 
 RETURN = ("evaluation/return_mean", "episode/return")
-# Title, the metrics of which the first that all runs have a curve of is drawn, and over what.
+# Title, metrics (the first of which all runs have a curve is drawn), and the horizontal axis.
 PANELS = (
     ("Return", RETURN, STEP),
     ("Return", RETURN, "seconds"),
@@ -24,9 +24,11 @@ MOST_FIELDS = 60
 MOST_LETTERS = 60
 
 
+# Titles and legends have room for short names only.
 def names(folders: Sequence[Path]) -> list[str]:
     """Return short names of run folders: the last parts of their paths that tell them apart."""
     parts = [folder.resolve().parts for folder in folders]
+    # From the last part on, until all are different.
     for length in range(1, max(map(len, parts)) + 1):
         short = ["/".join(own[-length:]) for own in parts]
         if len(set(short)) == len(short):
@@ -43,6 +45,7 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
     lines = [line(summarize(folder), name=name) for folder, name in zip(folders, names(folders), strict=True)]
     rows = [[head, *cells] for head, *cells in zip(HEADS, *lines, strict=True)]
     returns = [
+        # Evaluations where there are any, else training episodes.
         next(filter(None, (numbers(metric_rows(folder), metric) for metric in RETURN)), [])
         for folder in folders
     ]
@@ -51,6 +54,7 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
     differing = []
     for name in fields:
         values = [config.get(name, "-") for config in configs]
+        # Fields that are equal in all runs say nothing.
         if len(set(values)) > 1:
             differing.append([name, *values])
     rows += differing[:MOST_FIELDS]
@@ -75,11 +79,13 @@ def draw(folders: Sequence[Path], picture: Path) -> None:
                 metric = candidate
                 break
         for name, rows in zip(names(folders), tables, strict=True):
+            # Rows that have both, so that the two lists fit.
             points = [row for row in rows if numbers([row], over) and numbers([row], metric)]
             axes.plot(numbers(points, over), numbers(points, metric), label=printable(name), linewidth=1.6)
         if title == PANELS[-1][0]:
             # Where iterations overlap, one that waited for a graph to be recorded makes the next one look short.
             speeds = sorted(speed for rows in tables for speed in numbers(rows, metric)) or [1.0]
+            # The 97th percentile: single rows may have any speed.
             axes.set_ylim(0.0, 1.2 * speeds[int(0.97 * (len(speeds) - 1))])
         title += f": {metric}" if len(metrics) > 1 else ""
         curves.dress(axes, title, over="time (s)" if over == "seconds" else "env states")

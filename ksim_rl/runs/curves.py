@@ -30,13 +30,16 @@ _COLORS = ("#3465a4", "#cc5500")
 def draw(table: Path, picture: Path, *, title: str, solved_at: float | None = None) -> None:
     """Draw the learning curves of a `metrics.csv` into a PNG, with a line at `solved_at`; ValueError without rows."""
     _, rows = read_table(table)
+    # Only panels with data: algorithms log different metrics.
     present = [
         (name, series) for name, series in PANELS if any(row.get(key) for row in rows for key, _ in series)
     ]
     if not present:
         raise ValueError(f"{table}: no rows to draw")
     columns = min(3, len(present))
+    # Rounded up.
     lines = -(-len(present) // columns)
+    # Inches, with room for the title.
     figure = Figure(figsize=(4.6 * columns, 2.9 * lines + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13)
@@ -57,9 +60,11 @@ def _draw_panel(
     for (key, label), color in zip(series, _COLORS, strict=False):
         points = [(float(row[STEP]), float(row[key])) for row in rows if row.get(key)]
         if points:
+            # Few points are evaluations: they are marked, as a line between them says little.
             marker = "o" if len(points) < 25 else None
             style = {"marker": marker, "markersize": 3, "linewidth": 1.6}
             axes.plot(*zip(*points, strict=True), color=color, label=label, **style)
+    # Only in the panel of returns.
     if solved_at is not None:
         axes.axhline(
             solved_at, color="#4e9a06", linestyle="--", linewidth=1.2, label=f"solved at {solved_at:g}"

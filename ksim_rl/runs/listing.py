@@ -16,6 +16,7 @@ from ksim_rl.terminal import printable
 
 CONFIG = "config.yaml"
 METRICS = "metrics.csv"
+# Read without YAML: a list of hundreds of runs should take no time.
 _TASK = re.compile(r"^task_name: *['\"]?([\w.+-]+)", re.MULTILINE)
 # Rows of metrics that the speed is the median of: the first ones compile.
 LATEST = 50
@@ -25,7 +26,7 @@ LATEST = 50
 class Summary:
     """How a run stands; None where it has no such figure yet.
 
-    `evaluation` is the mean return of the last evaluation, `episodes` that of the last training episodes; `speed` is in
+    `evaluation` is the mean return of the last evaluation, `episodes` of the last training episodes; `speed` is in
     env states per second, without evaluations and checkpoints.
     """
 
@@ -65,14 +66,16 @@ def find(folder: Path) -> list[Path]:
 
 def _walk(folder: Path) -> Iterator[Path]:
     for root, folders, files in os.walk(folder):
+        # The config alone is not enough: a folder of configs has one, too.
         if CONFIG in files and ("checkpoint" in folders or record.RECORD in files or METRICS in files):
             folders.clear()  # a run holds no other
             yield Path(root)
 
 
 def summarize(folder: Path) -> Summary:
-    """Sum up a run; what of its files cannot be read is said in `why`."""
+    """Sum up a run; files that cannot be read are named in `why`."""
     status, why = record.status(folder)
+    # A run with damaged files is still listed, with the reason.
     faults = [why] if why else []
     rows: list[dict[str, str]] = []
     task = began = "?"
@@ -87,6 +90,7 @@ def summarize(folder: Path) -> Summary:
         rows = metric_rows(folder)
     except (ValueError, csv.Error) as error:
         faults.append(printable(str(error)))
+    # The median, as evaluations and other programs slow single rows down.
     speeds = numbers(rows[-LATEST:], "throughput/env_states_per_s")
     iteration = last(rows, "iteration")
     env_states = last(rows, STEP)
@@ -94,6 +98,7 @@ def summarize(folder: Path) -> Summary:
         folder=folder,
         task=task,
         status=status,
+        # The same fault may be found by the record and by the list.
         why="; ".join(dict.fromkeys(faults)),
         began=began,
         iteration=None if iteration is None else int(iteration),
@@ -114,11 +119,13 @@ def metric_rows(folder: Path) -> list[dict[str, str]]:
 
 def numbers(rows: Sequence[dict[str, str]], name: str) -> list[float]:
     """Return a metric's finite values, oldest first."""
+    # A cell may be empty or not finite.
     return [value for row in rows if math.isfinite(value := _number(row.get(name)))]
 
 
 def last(rows: Sequence[dict[str, str]], name: str) -> float | None:
     """Return a metric's last finite value, or None."""
+    # Only the newest row that has the metric is looked at.
     return next(iter(numbers([row for row in rows[::-1] if row.get(name)][:1], name)), None)
 
 
@@ -131,6 +138,7 @@ def _number(text: str | None) -> float:
 
 def line(summary: Summary, *, name: str) -> list[str]:
     """Return a run as the cells of a table with the columns `HEADS`."""
+    # Of a run that is done there is nothing to explain.
     if summary.why and summary.status != "done":
         status = f"{summary.status} ({summary.why})"
     else:

@@ -30,6 +30,7 @@ from ksim_rl.terminal import printable
 
 RECORD = "run.json"
 Status = Literal["running", "done", "interrupted", "failed"]
+# The packages that numbers depend on; their versions are compared when runs differ.
 PACKAGES = [
     "ksim_rl",
     "torch",
@@ -43,13 +44,14 @@ PACKAGES = [
     "hydra-core",
     "omegaconf",
 ]
+# A file that a stranger or a loop of restarts has filled stays small.
 MOST_SESSIONS = 1000
 MOST_DIFF_BYTES = MOST_RECORD_BYTES = 4 * 2**20
 
 
 @dataclass(frozen=True, kw_only=True)
 class Session(Checked):
-    """One time that a run was started or resumed; `code` has the commit of each package and what was changed in it."""
+    """One time that a run was started or resumed; `code` has the commit of each package and its changes since."""
 
     began: str
     command: str
@@ -67,9 +69,10 @@ def recorded(
 ) -> Iterator[Callable[[Status, str], None]]:
     """Add a session to the record of a folder while this process writes there, with "failed" where the block raises.
 
-    The block is given a function that says how it ended and why. The command is by default that of this process.
+    The block is given a function that says how it ended and why. The command is by default this process's own.
     """
     began = f"{datetime.now():%Y-%m-%d %H:%M:%S}"
+    # A damaged record must not keep a run from starting.
     try:
         earlier = read(folder)[-MOST_SESSIONS + 1 :]
     except ValueError as error:
@@ -77,12 +80,14 @@ def recorded(
         earlier = []
     session = Session(
         began=began,
+        # Quoted, so that it can be pasted into a shell.
         command=shlex.join(sys.argv if command is None else command),
         code=_code(folder, len(earlier) + 1),
         versions=versions(),
         hardware=hardware(),
     )
 
+    # The whole file each time: it is small, and never half written.
     def ended(status: Status, why: str) -> None:
         now = f"{datetime.now():%Y-%m-%d %H:%M:%S}"
         _write(folder, [*earlier, dataclasses.replace(session, status=status, why=why, ended=now)])
@@ -100,10 +105,12 @@ def recorded(
 def read(folder: Path) -> list[Session]:
     """Return the sessions of a run, none where nothing was recorded; a ValueError where the file holds other things."""
     path = folder / RECORD
+    # Also a broken link counts as there, and is refused below.
     if not os.path.lexists(path):
         return []
     try:
         entries = json.loads(read_bytes(path, limit=MOST_RECORD_BYTES))["sessions"]
+        # Fields are checked as in configs; unknown ones raise TypeError.
         sessions = [Session(**_text(entry)) for entry in entries[:MOST_SESSIONS]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path}: no record of a run: {printable(str(error))}") from error
@@ -112,6 +119,7 @@ def read(folder: Path) -> list[Session]:
 
 def status(folder: Path) -> tuple[str, str]:
     """Return how a run stands, a `Status` or "unknown", and why; a process that was killed has failed."""
+    # The lock tells of a living process, which the record cannot.
     if is_locked(folder):
         return "running", ""
     try:
@@ -121,12 +129,14 @@ def status(folder: Path) -> tuple[str, str]:
     if not sessions:
         return "unknown", "of an earlier version"
     last = sessions[-1]
+    # Nobody wrote an end, and nobody holds the lock.
     if last.status == "running":
         return "failed", "its process ended without a word: killed, or the machine went down"
     return last.status, last.why
 
 
 def _text(value: Any) -> Any:
+    # Control characters of a stranger's file must not reach the terminal.
     if isinstance(value, dict):
         return {printable(str(name)): _text(entry) for name, entry in value.items()}
     if isinstance(value, str):
@@ -140,11 +150,12 @@ def _write(folder: Path, sessions: Sequence[Session]) -> None:
 
 
 def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
-    """Return the commits of this package, the plug-ins and the program, and write what was changed since beside them.
+    """Return the commits of this package, the plug-ins and the program, and write the changes since then beside them.
 
     Only these are asked: a repository somewhere around the working directory may be anybody's.
     """
     found: dict[str, dict[str, str]] = {}
+    # Packages of one repository are listed once.
     seen = set()
     for name in ("ksim_rl", *sorted(plugins.packages()), "__main__"):
         file = getattr(sys.modules.get(name), "__file__", None)
@@ -153,14 +164,18 @@ def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
         commit, top = repository
         seen.add(top)
         found[name] = {"commit": commit}
+        # No programs of the repository's settings run: neither diff tools nor converters of text.
         if changes := ask_git(top, "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD"):
+            # Each session keeps its own changes: the code may have changed in between.
             if session == 1:
                 kept = f"{name}.diff"
             else:
                 kept = f"{name}.{session}.diff"
+            # A large diff is most often data; the commit alone is kept then.
             if len(changes) <= MOST_DIFF_BYTES:
                 write_whole(folder / kept, changes)
             found[name]["changed"] = kept if len(changes) <= MOST_DIFF_BYTES else "too much to keep"
+        # Files that git does not know are named, not copied.
         if new := ask_git(top, "ls-files", "--others", "--exclude-standard", "--exclude=__pycache__"):
             found[name]["not in git"] = ", ".join(new.decode(errors="replace").splitlines()[:20])
     return found
@@ -168,6 +183,7 @@ def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
 
 def _repository(file: Path) -> tuple[str, Path] | None:
     """Return the commit and the top folder of the repository that has a file, and not only lies around it."""
+    # A site-packages folder inside of some repository is no part of it.
     if ask_git(file.parent, "ls-files", "--error-unmatch", "--", file.name) is None:
         return None
     answer = ask_git(file.parent, "rev-parse", "HEAD", "--show-toplevel")
@@ -189,9 +205,11 @@ def versions() -> dict[str, str]:
 
 
 def hardware() -> dict[str, str]:
-    """Return what this machine is: host, system, cores, memory, processor, GPUs."""
+    """Return facts about this machine: host, system, cores, memory, processor, GPUs."""
     found = {"host": platform.node(), "system": platform.platform(), "cores": str(os.cpu_count())}
+    # Bytes of all pages.
     found["memory"] = f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
+    # Linux only; elsewhere the kind of processor is left out.
     processors = Path("/proc/cpuinfo")
     if processors.exists():
         models = (

@@ -30,12 +30,13 @@ from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
 from ksim_rl.trainers.run_cfg import reaching_outside
 
+# Points of a curve: enough to draw it, few enough for a file in the repository.
 KEPT_POINTS = 60
 # One evaluation, at the end, of the final policy.
 FIXED = "trainer.eval_interval=0 trainer.checkpoint_interval=0 trainer.stop_when_solved=false logger=local"
 # Two iterations and a few short episodes say whether all parts of a row work, and nothing about how well it learns.
 SMOKE = "num_envs=8 data.num_env_states_per_minibatch=32 data.num_minibatches=2 task.episode_length_s=0.4"
-# Fields that came after the first tables, with values that change nothing, as the text of a fingerprint has them.
+# Fields that came after the first tables, with values that change nothing, as a fingerprint's text has them.
 LATER = re.compile(
     '"min_advantage_std": 0.0001, |"min_std": 0.001, |"engine": "auto", |"eager": false, '
     r'|"free_root": false, |"root_turn": \[1.0, 0.0, 0.0, 0.0\], '
@@ -47,9 +48,11 @@ def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -
 
     A table is data: a field by which a run writes or listens outside of its folder is refused.
     """
+    # The same words as on a command line, so that a row can be repeated by hand.
     words = [f"task={row.task}", f"objective={row.objective}", f"seed={seed}", f"device={device}"]
     words += [*FIXED.split(), *row.overrides, f"trainer.eval_episodes={8 if smoke else row.episodes}"]
     cfg = conf.compose([*words, *(SMOKE.split() if smoke else ())])
+    # A table may be a stranger's file.
     for path, value in reaching_outside(cfg.to_tree()):
         raise ValueError(
             f"overrides: {path}={value!r} reaches outside of the run folder, which a table may not: leave it out, or "
@@ -59,26 +62,31 @@ def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -
     if smoke:
         num_iterations = 2
     else:
+        # As many whole iterations as fit into the row's env states.
         num_iterations = max(1, int(row.env_states // per_iteration))
+    # Compiling would take longer than the two iterations.
     if smoke and hasattr(cfg.objective, "compile"):
         quick = {"compile": False}
     else:
         quick = {}
+    # Compiled before the clock starts, since compiling is no part of learning.
     compiles = getattr(cfg.objective, "compile", False) and not smoke
     trainer = replace(cfg.trainer, num_iterations=num_iterations, video=False, warm_up=compiles)
     return replace(cfg, trainer=trainer, objective=replace(cfg.objective, **quick))
 
 
 def settings(row: Row, cfg: RunCfg) -> str:
-    """Return a fingerprint of all that makes a row, its seed apart: seeds of different settings are never mixed."""
+    """Return a fingerprint of all that makes a row except its seed: seeds of different settings are never mixed."""
+    # The seed tells rows of one setting apart; the device is recorded in the result.
     tree = {key: value for key, value in cfg.to_tree().items() if key not in ("seed", "device")}
     tree["row"] = {"levels": dict(row.levels), "episodes": row.episodes, "measure": row.measure}
+    # Later fields with values that change nothing must not make older results invalid.
     text = LATER.sub("", json.dumps(tree, sort_keys=True, default=str))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class _Judge(Hook):
-    """Keeps what is known when training has ended: the evaluation comes before this hook."""
+    """Keeps the figures of the end of training: the evaluation comes before this hook."""
 
     interval = 0
 
@@ -93,9 +101,11 @@ class _Judge(Hook):
         self.ended = 0.0
 
     def at_end(self, trainer: Trainer) -> None:
+        # Before the trials below, which take their own time.
         self.ended = time.monotonic()
         self.seconds_in_all = trainer.clock.total
         assert (evaluator := trainer.evaluator) is not None
+        # Ends before the time limit are falls.
         too_early_E = evaluator.length_E < evaluator.max_steps
         self.found["falls"] = round(float(too_early_E.double().mean()), 5)
         if episodes := part(evaluator.env, EpisodeSums):
@@ -104,6 +114,7 @@ class _Judge(Hook):
             sums = {}
         metrics = {name: float(sums[name] / sums["episodes"]) for name in sums if name.startswith("metric/")}
         self.found["means"] = {f"evaluation/{name}": round(mean, 4) for name, mean in metrics.items()}
+        # Trials are run by the trained policy, in envs of their own.
         if self._trials:
             how = {"trials": self._trials, "note": trainer.progress.note}
             self.found["trials"] = asdict(run_trials(self._cfg, trainer.update.actor, **how))
@@ -117,6 +128,7 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
     began = time.monotonic()
     with compile_notice(progress.status):
         outcome = run(cfg, run_folder, progress=progress, hooks=[judge])
+    # Half a run says nothing.
     if outcome.interrupted_by is not None or outcome.evaluation is None:
         raise KeyboardInterrupt
     names = ("env_states", "seconds", "episode/return", "episode/length", *row.levels)
@@ -126,11 +138,14 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
         if line.get("seconds"):
             points.append({name: float(line[name]) for name in names if line.get(name)})
     if row.levels:
+        # The first point from which on the levels hold.
         end = reached(points, row.levels)
     else:
         end = None
+    # The last env states of training, in which levels should hold.
     last = [point for point in points if point["env_states"] >= points[-1]["env_states"] - HELD_STATES]
     session = record.read(run_folder)[-1]
+    # Where the package is installed without git, the environment may name the commit.
     code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})
     return {
         "settings": settings(row, cfg),
@@ -155,6 +170,7 @@ def main(name: str, row: str, seed: str, result: str, run_folder: str, device: s
     """Measure and write; the result appears whole or not at all."""
     go_to_parents_folder()  # the table, and the paths of the command, are as they were given there
     plugins.load([])  # those of KSIM_RL_PLUGINS, where `ksim-rl --plugin` has put its own
+    # The child composes the row itself: it gets names only.
     found = measure(load(name).rows[row], int(seed), Path(run_folder), device=device, smoke=bool(smoke))
     path = Path(result)
     path.parent.mkdir(parents=True, exist_ok=True)

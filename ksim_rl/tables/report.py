@@ -22,14 +22,16 @@ PROTOCOL = (
 def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
     """Return flat figures: `<table>/<row>`, with `/seconds` and `/falls`, or `/success` for these measures; means.
 
-    What is infinite has no figure, and neither has a mean over a group that lacks a row.
+    An infinite value has no figure, and neither has a mean over a group that lacks a row.
     """
     figures = {}
     for name, results in rows.items():
         value = value_of(table.rows[name], results)
         key = f"{table.name}/{name}"
+        # The worst seed counts: a gait that falls with one seed is no success.
         if table.rows[name].measure == "seconds":
             figures[f"{key}/falls"] = max(result["falls"] for result in results)
+        # The return has the plain name, as most rows measure it.
         key += {"return": ""}.get(table.rows[name].measure, f"/{table.rows[name].measure}")
         if value is not None:
             figures[key] = round(value, 4 if key.endswith("/success") else 2)
@@ -37,10 +39,12 @@ def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
         found = {}
         for group, names in table.groups().items():
             keys = [f"{table.name}/{name}" for name in names if name.rpartition("/")[2] not in mean.without]
+            # Only over whole groups: means over different rows cannot be compared.
             if all(key in figures for key in keys):
                 found[group] = round(statistics.fmean(figures[key] for key in keys), 2)
         figures |= {f"{table.name}/{group}/{mean_name}": value for group, value in found.items()}
         if found:
+            # The best group shows what the library can do, whatever the algorithm.
             figures[f"{table.name}/best/{mean_name}"] = max(found.values())
     return figures
 
@@ -48,6 +52,7 @@ def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
 def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Sequence[int]) -> Path:
     """Write `<folder>/<table>.json`, `.md` and, where a row is complete, `.png`; return the path of the first."""
     counted = [result for row in rows.values() for result in row]
+    # Commit and versions of the newest result stand for the table; all commits are listed.
     newest = max(counted, key=lambda result: result["date"], default={})
     tree = {
         **{key: newest.get(key, "") for key in ("commit", "date", "device", "versions")},
@@ -61,6 +66,7 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
                 "reached": is_reached(table.rows[name], results),
                 "value": value_of(table.rows[name], results),
                 "goal": table.rows[name].goal,
+                # Curves are for the picture only.
                 "runs": [{k: v for k, v in r.items() if k not in ("curve", "versions")} for r in results],
             }
             for name, results in rows.items()
@@ -68,6 +74,7 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
     }
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{table.name}.json"
+    # JSON for programs, Markdown for readers.
     write_whole(path, json.dumps(tree, indent=2) + "\n")
     write_whole(path.with_suffix(".md"), _markdown(table, rows, tree))
     if rows:
@@ -81,6 +88,7 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
 def _markdown(table: Table, rows: Mapping[str, Results], tree: Mapping[str, Any]) -> str:
     lines = [f"# {table.title}", ""]
     for group, names in table.groups().items():
+        # One column for each publication that any row of the group has.
         others = list(dict.fromkeys(key for name in names for key in table.rows[name].published))
         head = [group or table.name, *others, "ours", "seeds", "env states", "seconds + before", "reached"]
         lines += [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
@@ -104,6 +112,7 @@ def _cells(row: Row, results: Results) -> list[str]:
     if not results:
         return ["", "0", "", "", "not run"]
     value = value_of(row, results)
+    # The spread over seeds, of the same evaluations as the value.
     returns = [r["evaluation"]["return_mean"] for r in results]
     if len(returns) > 1:
         spread = f" ± {statistics.stdev(returns):.0f}"
@@ -113,6 +122,7 @@ def _cells(row: Row, results: Results) -> list[str]:
         ours = ""
     else:
         ours = f"{value:.0f}{spread}"
+    # With returns the levels are a second condition, whose worst seed is shown.
     for level in row.levels if row.measure == "return" else ():
         worst = min(r["means"].get(level, float("-inf")) for r in results)
         ours += f", {level.rpartition('/')[2]} {worst:.2f}"

@@ -1,4 +1,4 @@
-"""`ksim-rl reproduce TABLE` runs what a table lacks, and writes it as JSON, Markdown and a picture."""
+"""`ksim-rl reproduce TABLE` runs the missing jobs of a table, and writes it as JSON, Markdown and a picture."""
 
 import math
 import re
@@ -25,11 +25,13 @@ def reproduce(arguments: Sequence[str]) -> int:
     table = load(options.table)
     seeds = [int(word) for word in options.seeds.split(",") if word]
     rows = {name: row for name, row in table.rows.items() if re.fullmatch(options.rows, name)}
+    # Seeds of the table only: others would be chosen by their results.
     known = sorted({seed for row in rows.values() for seed in row.seeds})
     if not rows:
         raise ValueError(f"--rows {options.rows}: {table.name} has no such: {near(options.rows, table.rows)}")
     if strangers := set(seeds) - set(known):
         raise ValueError(f"--seeds: {strangers} are none of {known}; try other seeds with ksim-rl train")
+    # Times are measured: another run on the GPU would lengthen them.
     timed = [name for name, row in rows.items() if row.measure == "seconds"]
     check_in_range("--per-gpu", options.per_gpu, low=1)
     if options.per_gpu > 1 and timed:
@@ -37,12 +39,14 @@ def reproduce(arguments: Sequence[str]) -> int:
             f"--per-gpu {options.per_gpu}: runs that share a GPU wait for each other, and {timed[0]} measures seconds; "
             "leave it out, or choose other --rows"
         )
+    # In a checkout the results belong to the repository.
     if Path("benchmarks/results").is_dir():
         default = "benchmarks/results/tables"
     else:
         default = "tables"
     output = (options.output or Path(default)) / ("smoke" if smoke else "")
     run_folder = options.runs / ("smoke" if smoke else "") / table.name
+    # A machine without a GPU does what it can.
     if torch.cuda.is_available():
         device = options.device
     else:
@@ -50,17 +54,20 @@ def reproduce(arguments: Sequence[str]) -> int:
     runs = Runs(table, output / table.name, run_folder, smoke=smoke)
 
     def write(said: str) -> None:
+        # After each job, so that a stop leaves the table of all that is done.
         report.write(table, runs.complete(seeds), output, seeds=seeds)
         show(said)
 
+    # A smoke test always runs, since its results say nothing.
     present = {} if smoke else runs.results()
-    # Seed by seed, so that what is cut off has some seeds of all rows; the longest first, so that all end together.
+    # Seed by seed, so that a table that is cut off has some seeds of all rows; the longest first, to end together.
     jobs = [
         (name, seed)
         for seed in seeds or known
         for name, row in sorted(rows.items(), key=lambda item: -item[1].env_states)
         if seed in row.seeds and seed not in present.get(name, {})
     ]
+    # One seed is enough to check a row's config.
     for name in {name for name, _ in jobs}:
         run_cfg(rows[name], 1, device="cpu", smoke=smoke)  # what is wrong is said before anything runs
     gpus = gpus_for(device, per_gpu=options.per_gpu)

@@ -18,6 +18,7 @@ from ksim_rl.runs import run_lock
 from ksim_rl.tables.measure import run_cfg, settings
 from ksim_rl.tables.table import Table
 
+# Polling is enough: runs take minutes.
 POLL_S = 0.2
 MOST_RESULT_BYTES = 4 * 2**20
 Job = tuple[str, int]  # a row and a seed
@@ -31,6 +32,7 @@ class Runs:
         self.folder = folder
         self.run_folder = run_folder
         self.smoke = smoke
+        # Composing a config takes a second, and each row is asked for many times.
         self._of = cache(lambda name: run_cfg(table.rows[name], 1, smoke=smoke))
 
     def results(self) -> dict[str, dict[int, dict[str, Any]]]:
@@ -40,9 +42,11 @@ class Runs:
             paths = {seed: self.folder / name / f"seed_{seed}.json" for seed in row.seeds}
             present = {seed: _result(path) for seed, path in paths.items() if path.exists()}
             if present:
+                # Composed only where there is a result to compare with.
                 own = settings(row, self._of(name))
             else:
                 own = ""
+            # A result of other settings is no result of this row.
             found[name] = {seed: result for seed, result in present.items() if result["settings"] == own}
         return found
 
@@ -51,6 +55,7 @@ class Runs:
         rows = self.table.rows
         found = {}
         for name, results in self.results().items():
+            # Without `seeds` each seed of the row has to be there.
             wanted = [seed for seed in rows[name].seeds if not seeds or seed in seeds]
             if wanted and set(wanted) <= results.keys():
                 found[name] = [results[seed] for seed in wanted]
@@ -66,15 +71,18 @@ class Runs:
         waiting = list(jobs)
         left = 0
         running: dict[int, tuple[Job, Popen[bytes]]] = {}
+        # Jobs that another process had when we looked: their results may appear meanwhile.
         elsewhere: set[Job] = set()
         try:
             while waiting or running:
                 is_over = time.monotonic() > until
+                # Time is up: nothing starts any more, and what runs is ended.
                 if is_over:
                     left = left + len(waiting)
                     waiting = []
                     for _, process in running.values():
                         process.kill()
+                # One job on each slot; a slot is free as soon as its process has ended.
                 for slot, gpu in enumerate(gpus):
                     if slot not in running:
                         taken = self._next(waiting, elsewhere, note)
@@ -84,9 +92,11 @@ class Runs:
                 for slot, (job, process) in list(running.items()):
                     if (code := process.poll()) is not None:
                         del running[slot]
+                        # It lost the race for the run folder: try again when the other has ended.
                         if code and not is_over and run_lock.is_locked(self._run(job)):
                             waiting.append(job)  # the other was faster
                             continue
+                        # The last line of a Python program that failed is its error.
                         last = "".join(self._said(job).splitlines()[-1:])
                         if is_over:
                             why = "no time left"
@@ -96,6 +106,7 @@ class Runs:
                         left += bool(code)
                 time.sleep(POLL_S)
         finally:
+            # After Ctrl-C: no process is left on a GPU.
             for _, process in running.values():
                 process.kill()
                 process.wait()
@@ -105,6 +116,7 @@ class Runs:
         self, waiting: list[Job], elsewhere: set[Job], note: Callable[[str], None]
     ) -> tuple[Job, IO[str]] | None:
         """Take a job that no other process does now, with its log, or None; what another has done is not done again."""
+        # A copy, since jobs are taken out of it.
         for job in list(waiting):
             log = self._claimed(job)
             if log is None:
@@ -125,14 +137,17 @@ class Runs:
         The job's process inherits the lock with its output, and holds it until it ends, whatever becomes of this one.
         Its run folder is locked later, once it has imported all, so that two processes would begin the same job.
         """
+        # A run that was started by hand holds this lock, too.
         if run_lock.is_locked(self._run(job)):
             return None
         path = self._log(job)
         make_folder(path.parent, below=self.run_folder.parent)
         log = open_own(path)
         try:
+            # The lock goes to the child with its output.
             if run_lock.try_lock(log):
                 return log
+        # Without locks there is only one process to expect.
         except OSError as error:
             if error.errno in run_lock.WITHOUT_LOCKS:
                 return log
@@ -146,12 +161,15 @@ class Runs:
         words = [self.table.source, name, seed, result, self._run(job), "cuda" if gpu else "cpu"]
         command = ["-m", "ksim_rl.tables.measure", *map(str, words), "smoke" * self.smoke]
         make_folder(result.parent, below=self.folder.parent)
+        # An old result must not be taken for the one of this run.
         result.unlink(missing_ok=True)
         if gpu:
+            # The child sees one GPU, as its first.
             environment = {"CUDA_VISIBLE_DEVICES": gpu}
         else:
             environment = {}
         with log:
+            # Only now: the log of an earlier attempt is kept until the job is ours.
             log.truncate()
             return start_python(command, environment=environment, stdout=log, stderr=STDOUT)
 
@@ -172,6 +190,7 @@ def _result(path: Path) -> dict[str, Any]:
 def gpus_for(device: str, *, per_gpu: int) -> list[str]:
     """Return the GPUs of jobs, as `CUDA_VISIBLE_DEVICES` names them, each `per_gpu` times; [""] on the CPU."""
     every = ",".join(str(index) for index in range(torch.cuda.device_count()))
+    # "" is the CPU, of which there is one.
     if device == "cpu":
         named = [""]
     else:

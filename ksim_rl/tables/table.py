@@ -26,7 +26,7 @@ class Row(Checked):
     Attributes:
         overrides: of `ksim-rl train`, beside task, objective and seed.
         env_states: that training collects at most: as many iterations as fit.
-        seeds: those that count. They are for nothing else: settings are chosen with other ones.
+        seeds: the seeds that count. They are for nothing else: settings are chosen with other ones.
         measure: "return" of the final evaluation, the mean over the seeds; or "seconds" of training until `levels` of
             training metrics hold, the median over the seeds, one that does not get there counting as infinite; or
             "success" of the final policy in `episodes` trials of a tracking task, the lowest over the seeds.
@@ -36,7 +36,7 @@ class Row(Checked):
         within_s: seconds in which the levels should be reached.
         at_least: share of trials that should succeed.
         most_falls: share of these episodes that may end before their time; the worst seed counts.
-        published: what others report, by who; `against` says which of them a return should reach, "" none.
+        published: returns that others report, by who; `against` names the one to reach, "" none.
     """
 
     task: str
@@ -55,18 +55,21 @@ class Row(Checked):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # A seed that is there twice would count twice.
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds={self.seeds!r}: expected at least one, and each once")
         if self.measure == "seconds" and not self.levels:
             raise ValueError("levels={}: measure=seconds waits until metrics reach some; give one at least")
         check_name("task", self.task)
         check_name("objective", self.objective)
+        # Names and words go into paths and command lines: signs with a meaning there are refused.
         for word in self.overrides:
             check_override(word)
 
     @property
     def goal(self) -> float | None:
         """What the measure should reach: a return or share at least, seconds at most; None where nothing is asked."""
+        # What counts depends on the measure: a return is compared with a publication.
         goals = {"success": self.at_least, "seconds": self.within_s}
         return goals.get(self.measure, self.published.get(self.against))
 
@@ -104,20 +107,23 @@ def shipped() -> list[str]:
 
 
 def load(name: str) -> Table:
-    """Read a table of the package by name, or a file of yours by path; a ValueError says what is wrong."""
+    """Read a table of the package by name, or a file of yours by path; a ValueError names the fault."""
     if name.endswith(SUFFIX):
         path = Path(name)
     else:
         path = FOLDER / f"{name}{SUFFIX}"
+    # A name without a file: the near names help.
     if path.parent == FOLDER and path.stem not in shipped():
         raise unknown_name("table", name, shipped())
     tree = plain_data.read_yaml(path)
     if isinstance(tree, dict):
+        # Rows stand in groups in the file, and side by side in a table.
         groups = tree.pop("groups", None)
     else:
         groups = None
     with naming(str(path)):
         rows = _rows(groups)
+    # A name in the tree wins over the file's name; rows and source are always ours.
     table = from_tree(Table, {"name": path.stem, **tree, "source": name, "rows": rows}, str(path))
     with naming(str(path)):
         check_name("name", table.name)
@@ -125,7 +131,7 @@ def load(name: str) -> Table:
 
 
 def _rows(groups: Any) -> dict[str, Any]:
-    """Return the fields of each row by `<group>/<name>`, with those of its group."""
+    """Return the fields of each row by `<group>/<name>`, with the fields of its group."""
     if isinstance(groups, dict):
         found = groups
     else:
@@ -134,8 +140,10 @@ def _rows(groups: Any) -> dict[str, Any]:
     for group, fields in found.items():
         if not isinstance(fields, dict) or not isinstance(fields.get("rows"), dict):
             raise ValueError("expected a mapping with a title, and groups that have rows")
+        # The group "" is for tables without groups.
         if group != "":
             check_name("group", group)
+        # Fields of a group hold for all its rows, which may replace them.
         shared = {key: value for key, value in fields.items() if key != "rows"}
         for row, own in fields["rows"].items():
             check_name("row", row)

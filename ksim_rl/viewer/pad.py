@@ -1,4 +1,4 @@
-"""A small page of ours reads keyboard and gamepad, which viser does not, and sends what they ask for."""
+"""A small page of ours reads keyboard and gamepad, which viser does not, and sends their requests."""
 
 import json
 import threading
@@ -22,12 +22,13 @@ from ksim_rl.viewer.session import Session
 PAGE = Path(__file__).with_name("pad.html")
 # Bytes of a message; a page sends a few dozen.
 MOST_BYTES = 1024
+# Axes by number, as the page sends them; the panel knows which field each drives.
 AXES = ("0", "1", "2")
 DOES = ("pause", "step", "reset", "push")
 
 
 class Pad:
-    """Serves the page on `host`:`port`, or the next port that is free, and does what it says.
+    """Serves the page on `host`:`port`, or the next free port, and obeys its messages.
 
     A message is JSON: `{"axes": {"0": 0.5}}` drives (see `Panel.drive`), `{"do": "pause" | "step" | "reset" | "push"}`.
     All others are ignored and counted by the gate, which also refuses pages of other sites.
@@ -39,11 +40,13 @@ class Pad:
         self._panel = panel
         self._session = session
         self._gate = gate
+        # Few at a time: each open page has a thread.
         self._places = threading.BoundedSemaphore(MOST_CLIENTS)
         self._page = PAGE.read_text().replace("VIEWER_PORT", str(viewer_port)).encode()
         self._server = self._bind(host, port)
         self.port = int(self._server.socket.getsockname()[1])
         self.address = gate.address(self.port)
+        # A daemon: it must not keep the program from ending.
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def close(self) -> None:
@@ -51,6 +54,7 @@ class Pad:
         self._server.shutdown()
 
     def _bind(self, host: str, port: int) -> Server:
+        # The next free port, as viser does.
         for candidate in range(port, port + 100):
             try:
                 return serve(self._listen, host, candidate, process_request=self._answer, max_size=MOST_BYTES)
@@ -59,9 +63,11 @@ class Pad:
         raise OSError(f"ports {port} to {port + 99} of {host} are all taken: choose another with --port")
 
     def _answer(self, _: ServerConnection, request: Request) -> Response | None:
+        # The same check for the page and for its connection.
         refusal = self._gate.refusal(request)
         if refusal is not None:
             return refusal
+        # None lets the library go on with the handshake.
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return None
         headers = Headers(
@@ -70,6 +76,7 @@ class Pad:
         return Response(HTTPStatus.OK, "OK", headers, self._page)
 
     def _listen(self, connection: ServerConnection) -> None:
+        # Refused immediately, not kept waiting.
         if not self._places.acquire(blocking=False):
             connection.close(1013, f"{MOST_CLIENTS} pages are open already")
             return
@@ -79,6 +86,7 @@ class Pad:
                 if asked is None:
                     self._gate.ignore()
                 else:
+                    # Requests run in the thread of the session, as all that touches the env does.
                     self._session.ask(partial(self._obey, asked))
                 # What is not read stays with the client, whose own queue then fills.
                 time.sleep(1.0 / MESSAGES_PER_S)
@@ -102,11 +110,13 @@ class Pad:
 
 
 def parsed(message: str | bytes) -> dict[str, Any] | None:
-    """Return what a message of the page asks for, shares by axis clamped to [-1, 1], or None for any other message."""
+    """Return the request in a message of the page, shares by axis clamped to [-1, 1], or None for any other message."""
     try:
+        # NaN and infinity are no JSON, but Python's parser takes them.
         asked = json.loads(message, parse_constant=_refuse)
     except (ValueError, RecursionError):
         return None
+    # Unknown fields are refused: the page sends none.
     if not isinstance(asked, dict) or not asked or not asked.keys() <= {"axes", "do"}:
         return None
     found: dict[str, Any] = {}
@@ -118,6 +128,7 @@ def parsed(message: str | bytes) -> dict[str, Any] | None:
             or not all(map(is_number, axes.values()))
         ):
             return None
+        # Shares beyond the range would drive beyond the command's range.
         found["axes"] = {int(number): clamped(float(share), -1.0, 1.0) for number, share in axes.items()}
     if "do" in asked:
         if asked["do"] not in DOES:

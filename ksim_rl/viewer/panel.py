@@ -13,12 +13,12 @@ _SPEED_NAMES = {("1/8", "1/4", "1/2", "1", "2", "4", "8")[i]: speed for i, speed
 
 
 class Panel:
-    """Shows how a session goes, and asks it for what is clicked.
+    """Shows how a session goes, and turns clicks into its requests.
 
     Attributes:
         follows: whether the camera follows the robot.
         contacts: whether contact points are drawn.
-        drawn: the names of what is drawn for debugging.
+        drawn: the names of the drawings for debugging.
         push_speed: how hard a push is, m/s.
     """
 
@@ -32,11 +32,13 @@ class Panel:
         self._status = gui.add_html("")
         self._error = gui.add_html("", visible=False)
         self._play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+        # Widgets are called in threads of the server, so all that touches the env goes through `ask`.
         self._play.on_click(lambda _: session.ask(session.toggle))
         runs = gui.add_button_group("Run", ("Step", "Reset"))
         calls = {"Step": session.step_once, "Reset": session.reset}
         runs.on_click(lambda event: session.ask(calls[str(_value(event))]))
         self._speed = gui.add_button_group("Speed", tuple(_SPEED_NAMES))
+        # A plain number, read between steps: no request is needed.
         self._speed.on_click(lambda event: setattr(session, "speed", _SPEED_NAMES[str(_value(event))]))
         self._env = gui.add_number("Env", 0, min=0, max=session.ours.num_envs - 1, step=1)
         self._env.on_update(lambda _: session.ask(partial(session.choose, int(self._env.value))))
@@ -45,10 +47,12 @@ class Panel:
         self.push_speed = gui.add_slider("Push (m/s)", 0.1, 3.0, 0.1, 1.0)
         push = gui.add_button("Push", icon=viser.Icon.HAND_MOVE)
         push.on_click(lambda _: session.ask(partial(session.push, float(self.push_speed.value))))
+        # Commands without ranges cannot be set by hand.
         steerable = {name: term for name, term in session.ours.cfg.commands.items() if term.ranges}
         if steerable:
             with gui.add_folder("Commands"):
                 for name, term in steerable.items():
+                    # Names of commands only where there are several.
                     self._add_command(name, term.ranges, prefix=f"{name}." if len(steerable) > 1 else "")
         with gui.add_folder("Conditions", expand_by_default=False):
             for field in dataclasses.fields(Conditions):
@@ -68,6 +72,7 @@ class Panel:
         else:
             label = "Play"
             icon = viser.Icon.PLAYER_PLAY
+        # Only where it changed, since each set is a message.
         if self._play.label != label:
             self._play.label = label
             self._play.icon = icon
@@ -81,12 +86,14 @@ class Panel:
 
         Rest is 0 where the range holds it, else its middle. From any thread.
         """
+        # Only the first command: the loop returns in its first pass.
         for command, (by_hand, sliders) in self._steering.items():
             for number, share in shares.items():
                 if number >= len(sliders):
                     continue
                 slider = list(sliders.values())[number]
                 slider.value = _at_share(share, float(slider.min), float(slider.max))
+            # Otherwise the command would be drawn again over the hand's values.
             by_hand.value = True
             self._session.ask(partial(self._steer, command))
             return
@@ -117,6 +124,7 @@ class Panel:
         by_hand.on_update(lambda _: self._session.ask(partial(self._steer, name)))
         sliders = {}
         for field, (low, high) in ranges.items():
+            # viser refuses a slider whose ends are equal.
             step = max((high - low) / 100, 1e-3)
             rest = _at_share(0.0, low, high)
             sliders[field] = gui.add_slider(prefix + field, low, max(high, low + step), step, rest)
@@ -132,6 +140,7 @@ class Panel:
     def _steer(self, name: str) -> None:
         by_hand, sliders = self._steering[name]
         values = {field: float(slider.value) for field, slider in sliders.items()}
+        # Without the tick the command is drawn again.
         self._session.steer(name, values if by_hand.value else None)
 
     def _add_condition(self, name: str) -> None:
@@ -154,6 +163,7 @@ def _at_share(share: float, low: float, high: float) -> float:
         rest = 0.0
     else:
         rest = (low + high) / 2
+    # Each side of rest has its own scale, as ranges need not be symmetric.
     return rest + share * (high - rest if share > 0 else rest - low)
 
 

@@ -21,20 +21,23 @@ MOST_CURVES = 16
 
 
 class Curves:
-    """A chart of named values over the last seconds of simulated time, with a table of what they are now."""
+    """A chart of named values over the last seconds of simulated time, with a table of their present values."""
 
     def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, *, points: int) -> None:
         self._gui = gui
         self._folder = folder
+        # The oldest points fall out as new ones come.
         self._rows: deque[tuple[float, list[float]]] = deque(maxlen=points)
         self._names: tuple[str, ...] = ()
         self._chart: viser.GuiUplotHandle | None = None
         self._table = gui.add_html("")
+        # The chart is made later, and has to stand above the table.
         self._order = self._table.order
 
     def add(self, seconds: float, values: Mapping[str, float]) -> None:
-        """Take in the values of one env step; other names than before start anew."""
+        """Take in the values of one env step; other names than before start a new chart."""
         names = tuple(values)
+        # Time that runs backwards is a new session.
         if names != self._names or (self._rows and seconds <= self._rows[-1][0]):
             self._rows.clear()
         if names != self._names:
@@ -45,12 +48,14 @@ class Curves:
         self._rows.append((seconds, list(values.values())))
 
     def show(self) -> None:
-        """Send what there is."""
+        """Send the chart and the table."""
+        # One point is no curve.
         if len(self._rows) < 2 or not self._names:
             return
         shown = self._names[:MOST_CURVES]
         x = np.array([seconds for seconds, _ in self._rows])
         y = np.array([values for _, values in self._rows])
+        # Copies: viser wants each series contiguous.
         data = (x, *(y[:, column].copy() for column in range(len(shown))))
         if self._chart is None:
             series = [uplot.Series(label="s")]
@@ -68,6 +73,7 @@ class Curves:
         else:
             self._chart.data = data
         rows = []
+        # Values beyond the curves are listed without a colour.
         for column, name in enumerate(self._names):
             if column < MOST_CURVES:
                 color = COLORS[column % len(COLORS)]
@@ -94,6 +100,7 @@ class Plots:
 
     def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, session: Session) -> None:
         self._session = session
+        # As many points as steps in the shown time.
         points = max(2, round(SECONDS / session.ours.step_dt))
         self._seconds = 0.0
         self._seen = session.steps
@@ -109,6 +116,7 @@ class Plots:
         session = self._session
         if session.steps == self._seen or not session.rewards:
             return
+        # Simulated time since the last step that was taken in.
         self._seconds += (session.steps - self._seen) * session.ours.step_dt
         self._seen = session.steps
         self._rewards.add(self._seconds, session.rewards)
@@ -119,6 +127,7 @@ class Plots:
 
     def show(self) -> None:
         """Send the curves, a few times per second while it plays."""
+        # Charts are large messages; a paused session is shown as it is.
         if time.monotonic() - self._shown_at >= PERIOD_S or not self._session.playing:
             self._shown_at = time.monotonic()
             self._rewards.show()

@@ -24,7 +24,7 @@ RETURN = "episode/return"
 def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> Card:
     """Make an entry out of a run folder, with `episodes` compared with MuJoCo's C engine, and return its card.
 
-    Matrices are rounded to float16, and what is compared is the rounded policy. Raises ValueError for a wrong name, a
+    Matrices are rounded to float16, and the rounded policy is compared. Raises ValueError for a wrong name, a
     run of code that is not in one commit, rewards that cannot be compared, and more than 200 kB.
     """
     if not NAME.fullmatch(name):
@@ -35,22 +35,28 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
     check_run_tree(saved.config, saved.path)
     card = _of_run(saved, name=name)
     folder.mkdir(parents=True, exist_ok=True)
+    # In a folder beside: the entry appears once it is whole and its figures are there.
     with unfinished_folder(folder) as temporary:
         entry = temporary / name
         exported = temporary / "export"
+        # The actor is all that playing needs, and matrices in half precision halve its size.
         with checkpoint.fitting(saved.path):
             actor = dict(saved.state["update"]["actor"])
             actor |= {key: x.half() for key, x in actor.items() if x.is_floating_point() and x.ndim > 1}
             state = {"observation_columns": saved.state["observation_columns"], "update": {"actor": actor}}
         entry.mkdir()
         checkpoint.save(entry / CHECKPOINT, state, iteration=saved.iteration, config=saved.config)
+        # Of the training, not of this command.
         made = {"commit": card.commit, "versions": dict(record.read(run)[-1].versions)}
         export(entry, exported, episodes=episodes, note=show, trained_with=made)
+        # The rounded policy is compared, as that is what users get.
         report = sim2sim(exported, episodes=episodes, note=show)
         if not math.isfinite(report.return_ratio):
             raise ValueError(f"{run}: of its rewards none has a description; see docs/deploy.md")
+        # The network in ONNX is the one that was compared.
         shutil.copyfile(exported / ONNX, entry / ONNX)
         ratio = {"return_ratio": report.return_ratio, "standard_error": report.standard_error}
+        # Hashes of all files but the card, which holds them.
         card = replace(card, sim2sim={**ratio, "episodes": float(episodes)}, files=hashes(entry))
         (entry / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n")
         if (size := sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())) > MOST_BYTES:
@@ -64,12 +70,15 @@ def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
     run = saved.run_folder
     summary = listing.summarize(saved.run_folder)
     codes = [session.code.get("ksim_rl", {}) for session in record.read(run)] or [{}]
+    # A run that was resumed may have been made by several commits.
     made = {code.get("commit", "no commit") + " with changes" * ("changed" in code) for code in codes}
     commit = " and ".join(sorted(made))
+    # Only a clean commit can be repeated.
     if not re.fullmatch("[0-9a-f]{40}", commit):
         raise ValueError(f"{run}: made of {commit}: train in a clean clone of one commit, and add that run")
     rows = listing.metric_rows(run)
     earned = [(int(row[STEP]), value) for row in rows for value in listing.numbers([row], RETURN)]
+    # Every so many points, so that the card stays small.
     earned = earned[:: max(1, len(earned) // CURVE_POINTS)]
     return Card(
         name=name,

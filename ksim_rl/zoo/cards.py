@@ -20,12 +20,13 @@ FOLDER = Path(__file__).parent / "policies"
 CARD = "card.json"
 ONNX = "policy.onnx"
 CHECKPOINT = "checkpoint"
+# Of one entry: the whole zoo is a part of the package.
 MOST_BYTES = 200_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Card(Checked):
-    """What is known of a policy: how it was trained, what it earns, and the SHA-256 of its files.
+    """The record of a policy: its training, its return, and the SHA-256 of its files.
 
     `curve` has pairs of env states and mean return of training episodes; `sim2sim` what MuJoCo's C engine earned of
     the recorded return (`return_ratio`), its standard error and the episodes.
@@ -54,16 +55,19 @@ def _names(folder: Path) -> list[str]:
 
 
 def read_card(name: str, folder: Path = FOLDER) -> Card:
-    """Return an entry's card, after its files were compared with it; a ValueError names what is missing or differs."""
+    """Return an entry's card, after its files were compared with it; a ValueError names a missing or different file."""
     if name not in (known := _names(folder)):
         raise ValueError(f"zoo:{name}: no such policy: {near(name, known)}")
     path = folder / name / CARD
     try:
+        # Read as a stranger's file, as `--folder` may name any.
         tree = json.loads(read_bytes(path, limit=MOST_BYTES))
+        # Texts are shown on a terminal.
         plain: Any = {key: printable(v) if isinstance(v, str) else v for key, v in tree.items()}
         card = Card(**plain)
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path}: no card: {printable(str(error))}") from error
+    # A changed or missing file would be another policy under the same name.
     if card.name != name or hashes(path.parent) != dict(card.files):
         raise ValueError(f"{path.parent}: its files are not those of its card: install the package once more")
     return card
@@ -71,6 +75,7 @@ def read_card(name: str, folder: Path = FOLDER) -> Card:
 
 def hashes(entry: Path) -> dict[str, str]:
     """Return the SHA-256 of each file but the card; a ValueError refuses links and large files."""
+    # Links are kept in the list, so that reading refuses them.
     paths = [path for path in sorted(entry.rglob("*")) if path.is_symlink() or not path.is_dir()]
     files = {str(path.relative_to(entry)): read_bytes(path, limit=MOST_BYTES) for path in paths}
     files.pop(CARD, None)

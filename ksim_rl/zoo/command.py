@@ -26,6 +26,7 @@ def zoo(arguments: Sequence[str]) -> int:
     )
     options: Any = parser.parse_args(arguments)
     match options.words:
+        # Without words: the list.
         case []:
             show(ROW.format("name", "task", "env states", "return", "C engine", "commit"))
             for card in cards(options.folder):
@@ -34,6 +35,7 @@ def zoo(arguments: Sequence[str]) -> int:
                 else:
                     earned = f"{card.return_mean:.4g}"
                 ratio = f"x {card.sim2sim.get('return_ratio', float('nan')):.3f}"
+                # Seven letters of a commit are enough to find it.
                 row = (card.name, card.task, f"{card.env_states:,}", earned, ratio, card.commit[:7])
                 show(ROW.format(*row))
             return 0

@@ -13,9 +13,10 @@ from ksim_rl.zoo.cards import CHECKPOINT, FOLDER, read_card
 def locate(text: str | Path, *, note: Callable[[str], None] = show) -> Path:
     """Return a run folder: `zoo:NAME` and `wandb:ENTITY/PROJECT/RUN` are copied into `runs/zoo` and `runs/wandb`.
 
-    Any other text is a path. What is copied is data, checked by hash; a ValueError says what is wrong with it.
+    Any other text is a path. The copy is data, checked by hash; a ValueError names its fault.
     """
     kind, colon, name = str(text).partition(":")
+    # A path with a colon in it is still a path.
     if not colon or kind not in ("zoo", "wandb"):
         return Path(text)
     if kind == "wandb":
@@ -24,6 +25,7 @@ def locate(text: str | Path, *, note: Callable[[str], None] = show) -> Path:
     copy = Path("runs/zoo") / name
     runs = Path("runs")  # which may be a link of the user's, to a larger disk
     check_folder(copy / CHECKPOINT, below=runs)
+    # The checkpoint of an older package must not stay beside the new one.
     shutil.rmtree(copy / CHECKPOINT, ignore_errors=True)
     with whole_folder(copy, below=runs) as unfinished:
         shutil.copytree(FOLDER / name, unfinished, dirs_exist_ok=True)
