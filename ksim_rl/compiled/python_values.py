@@ -1,6 +1,6 @@
-"""Finds the Python values that objects depend on: attributes, containers, closures, and globals that their code reads.
+"""Finds the Python values that objects depend on: attributes, containers, closures, and globals in their code.
 
-What lies in a tensor is no such value: a recording reads it anew each time. That a tensor is replaced by another is.
+Numbers in a tensor are no such value, as a recording reads them again each time; replacing the tensor is a change.
 """
 
 import functools
@@ -22,7 +22,7 @@ from ksim_rl.compiled.packages import OURS, is_library, package_of, packages_of
 from ksim_rl.compiled.python_states import PLAIN, checksum, place_of, state_of
 
 MOST_ITEMS = 10_000
-"""Of a larger container only the length is looked at."""
+"""Only the length of a larger container is watched."""
 ABSENT = "(absent)"
 _MODULE_PARTS = ("_modules", "_buffers", "_parameters")
 # A reference to what the last step returned.
@@ -34,9 +34,9 @@ Values = Mapping[Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Listed:
-    """Stands for the object `of` as a part that depends on what `read` gives by name, and on nothing else of it.
+    """Stands for the object `of` as a part that depends only on the values that `read` returns by name.
 
-    With `reads_code` also on what the code of these values reads.
+    With `reads_code` it also depends on the globals and closures that the code of these values reads.
     """
 
     of: Any
@@ -46,10 +46,10 @@ class Listed:
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Values in one place, which `read` gives by key; `spell` makes a name of a path and a key.
+    """Values in one place, which `read` returns by key; `spell` makes a name of a path and a key.
 
-    `paths` say from which parts it is reached; `owner` is the object that has the values. Where all of them are entries
-    of one `table`, they can be had in less time: by `pick` from it, or, without that, all that it has.
+    `paths` say from which parts it is reached; `owner` is the object that has the values. If all of them are entries of
+    one `table`, they are read faster: by `pick` from the table, or without `pick` all of its entries.
     """
 
     owner: Any
@@ -92,11 +92,13 @@ class _Search:
         self._alive: list[Any] = []
 
     def of_part(self, name: str, part: Any) -> None:
+        # By part, so that a shared object gets a path from each part that reaches it.
         self._seen = set()
         self._reads_code = not isinstance(part, Listed) or part.reads_code
         self._look_at(part, name)
         while self._ahead:
             value, path = self._ahead.popleft()
+            # Another part is listed on its own; plain values have nothing inside.
             is_other_part = id(value) in self._parts
             if is_other_part or issubclass(type(value), PLAIN) or id(value) in self._seen:
                 continue
@@ -105,6 +107,7 @@ class _Search:
             self._look_at(value, path)
 
     def _look_at(self, value: Any, path: str) -> None:
+        # The first kind that fits counts; an object of none of these is looked at as an instance of its class.
         looks: tuple[tuple[Any, Callable[[Any, str], None]], ...] = (
             (Listed, self._at_listed),
             (Tensor, self._at_tensor),
@@ -155,6 +158,7 @@ class _Search:
     ) -> None:
         """Take note of the values in a place, and go on to each of them."""
         values = read()
+        # One place is held once, with a path from each part.
         if (id(owner), what) not in self.found:
             # What reads all of a table gives the table itself.
             if values is table:
@@ -222,11 +226,13 @@ class _Search:
 
     def _at_instance(self, value: Any, path: str) -> None:
         cls = type(value)
+        # Objects of libraries are not entered; our own settings are, as users set their fields.
         is_settings = package_of(cls.__module__) == OURS and is_dataclass(cls)
         if self._is_library(cls.__module__) and not is_settings:
             return
         if _own_attributes(value):
             self._hold(value, path, lambda: vars(value), _attribute, table=vars(value))
+        # Slots lie outside of the object's table.
         names = [name for base in cls.__mro__ for name in _slots(base)]
         if names:
             self._hold(
@@ -238,6 +244,7 @@ class _Search:
         """Look at a transform, an env or a network: all but what its base in a library keeps for itself."""
         own = lambda: attributes_of(module)  # noqa: E731
         self._hold(module, path, own, _attribute, table=vars(module))
+        # Submodules, buffers and parameters: that one is replaced by another is a change.
         for part in _MODULE_PARTS:
             entries = vars(module)[part]
             self._hold(entries, path, lambda entries=entries: entries, _attribute, table=entries)
@@ -280,6 +287,7 @@ class _Search:
         self._ahead.append((function.__kwdefaults__, f"{path}: defaults of {function.__qualname__}"))
         own = f"{path}: {function.__qualname__}"
         self._hold(vars(function), own, lambda: vars(function), _attribute, table=vars(function))
+        # Names in the code may be globals or attributes; those that exist as globals are watched.
         names = _names_in(function.__code__)
         scope = function.__globals__
         known = [name for name in names if name in scope]
@@ -310,7 +318,7 @@ class _Search:
         self._hold(function, path, read, spell, what="closure")
 
     def _at_names_of_module(self, module: types.ModuleType, names: Collection[str], path: str) -> None:
-        """Look at those attributes of a module that some code may read: it names them."""
+        """Look at those attributes of a module that some code names, and so may read."""
         own = [name for name in names if name in vars(module)]
 
         def spell(path: str, name: str) -> str:
@@ -349,7 +357,7 @@ def attributes_of(module: nn.Module) -> dict[str, Any]:
 
 
 def _own_attributes(value: Any) -> Mapping[str, Any]:
-    """Return what an object keeps by name; nothing where it has no such table."""
+    """Return the attributes in an object's `__dict__`; nothing where it has none."""
     try:
         return object.__getattribute__(value, "__dict__")
     except AttributeError:
@@ -357,7 +365,7 @@ def _own_attributes(value: Any) -> Mapping[str, Any]:
 
 
 def _picking(keys: tuple[Any, ...]) -> Callable[[Values], tuple[Any, ...]]:
-    """Return what takes the values of some keys from a table, faster than a loop; a KeyError where one is gone."""
+    """Return a function that takes the values of some keys from a table, faster than a loop; it may raise KeyError."""
     if not keys:
         return lambda _table: ()
     if len(keys) == 1:
@@ -384,6 +392,7 @@ def _names_in(code: types.CodeType) -> tuple[str, ...]:
     """Return the names of globals and attributes that code uses, functions within it included."""
     names = dict.fromkeys(code.co_names)
     for constant in code.co_consts:
+        # Code of inner functions and comprehensions lies among the constants.
         if inspect.iscode(constant):
             names |= dict.fromkeys(_names_in(constant))
     return tuple(names)
@@ -400,7 +409,7 @@ def _texts_in(code: types.CodeType) -> Iterator[str]:
 
 @functools.cache
 def _names_of_bases(cls: type) -> frozenset[str]:
-    """Return the private names that the bases of a class use which are of libraries or ours: they keep these."""
+    """Return the private names that bases from libraries, or from this package, use for themselves."""
     names: set[str] = set()
     for base in cls.__mro__:
         if not is_library(package_of(base.__module__)):

@@ -137,11 +137,11 @@ def write(operation: Operation, cells: Cells) -> None:
     kwargs = operation.kwargs
     outs = [*operation.made, *operation.written]
     name = operation.name
-    if name.endswith("_") and not name.startswith("_"):
+    if name.endswith("_") and not name.startswith("_"):  # `add_` writes what `add` returns
         name = name.removesuffix("_")
     if name in _SPECIAL:
         return _SPECIAL[name](args, kwargs, outs[0], cells)
-    if len(outs) > 1:
+    if len(outs) > 1:  # no function below writes two tensors
         raise NotARowError("several results")
     if name in _FILLS:
         return _fill(outs[0], _FILLS[name], cells)
@@ -179,7 +179,7 @@ def _pointwise(
         raise NotARowError("division that rounds")
     operands = list(args)
     if name in ("_to_copy", "clone", "nan_to_num", "_unsafe_view", "round"):
-        operands = operands[:1]
+        operands = operands[:1]  # the rest are options
     if name in ("where", "masked_fill"):
         masks = [operands.pop({"where": 0, "masked_fill": 1}[name])]
     else:
@@ -192,9 +192,9 @@ def _pointwise(
     shape = _inner(out, cells)
     place = names_of(len(shape))
     tensors = [x for x in operands if isinstance(x, Tensor)]
-    computed = out.dtype
+    computed = out.dtype  # torch computes in the type of the result
     if name in _TESTS:
-        computed = tensors[0].dtype
+        computed = tensors[0].dtype  # tests give bools, and compare in the operands' type
         for operand in operands[1:]:
             if isinstance(operand, Tensor):
                 other = operand.dtype
@@ -209,7 +209,7 @@ def _pointwise(
         expression = "!a"
     body = []
     for letter, operand in zip("abc", operands, strict=False):
-        if operand is None:
+        if operand is None:  # a clamp without this bound
             continue
         if isinstance(operand, Tensor):
             value = cells.at(operand, place)
@@ -275,7 +275,7 @@ def _reduce(
     kept = [k for k in range(first, source.ndim) if k not in dims]
     names = dict(zip(kept, names_of(len(kept)), strict=True))
     # Where the result is: dims that are reduced have length 1 there, or are gone.
-    place = []
+    place = []  # indices of the result
     for k in range(first, source.ndim):
         if k in kept:
             place.append(names[k])
@@ -287,7 +287,7 @@ def _reduce(
         ctype = "bool"
     else:
         ctype = CTYPES[out.dtype]
-    count = math.prod(source.shape[k] for k in dims)
+    count = math.prod(source.shape[k] for k in dims)  # elements of each sum
     inner = f"const {ctype} e = ({ctype}){cells.at(source, list(names.values()))}; {step};"
     over = " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in dims)
     end = end.replace("count", literal(count, ctype))
@@ -301,7 +301,7 @@ def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, c
     first = int(bool(cells.rows))
     if dim < first:
         raise NotARowError("rows are joined")
-    offset = 0
+    offset = 0  # of the present tensor in the result, along `dim`
     for number, tensor in enumerate(tensors):
         shape = list(tensor.shape[first:])
         names = names_of(len(shape))
@@ -375,7 +375,7 @@ def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cel
         raise NotARowError("rows are gathered")
     names = names_of(out.ndim - first)
     place = [*names]
-    place[dim - first] = f"(int){cells.at(index, names)}"
+    place[dim - first] = f"(int){cells.at(index, names)}"  # gather takes no negative numbers
     cells.loop(_inner(out, cells), [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
 
@@ -395,7 +395,7 @@ def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
     ]
     pairs = ((1, 2), (2, 0), (0, 1))
     body += [f"{at(out, k)} = x{i} * y{j} - x{j} * y{i};" for k, (i, j) in enumerate(pairs)]
-    shape[dim] = 1
+    shape[dim] = 1  # one place writes all three components
     cells.loop(shape, body)
 
 
@@ -412,7 +412,7 @@ def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
     seed, stream, counter, _, first_row, n, kind, low, high, start, span = args
     plain = cells.uniform
     if counter.ndim:
-        count = cells.at(counter, [])
+        count = cells.at(counter, [])  # each row has a counter of its own
     else:
         count = plain.at(counter, [])
     low_ = literal(low, "float")

@@ -87,7 +87,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             fields += cfg.scene.terrain.per_world_fields
         spec = build_spec(cfg.scene)
         cfg.sim.apply_to(spec)
-        prepare_spec(spec, fields)
+        prepare_spec(spec, fields)  # before compilation, which may specialize these fields
         model = load_model(spec)
         self._renderer = (
             OffscreenRenderer(model, cfg.viewer, spacing=cfg.scene.spacing) if render_mode else None
@@ -103,11 +103,11 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             soft_joint_pos_limit_factor=cfg.scene.soft_joint_pos_limit_factor,
             entities=tuple(cfg.scene.entities),
         )
-        self.world.refresh()
+        self.world.refresh()  # managers read derived quantities
         self._events_cfg: Mapping[str, Any] = events
         self.view = self.driver.view
         self.load_managers()
-        self.driver.freeze()
+        self.driver.freeze()  # no buffer may be made in a captured step
         readings = {"obs": self.observation_manager.examples, "command": self.command_manager.values}
         size, bounds_L2 = self.action_manager.size, self.action_manager.bounds_L2
         self.observation_spec, self.full_action_spec, self.full_reward_spec, self.full_done_spec = make_specs(
@@ -135,7 +135,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         """
         cfg, driver, view = self.cfg, self.driver, self.driver.view
         if cfg.scene.terrain is not None:
-            driver.ground = cfg.scene.terrain.ground(view)
+            driver.ground = cfg.scene.terrain.ground(view)  # events and sensors read it
         driver.add_sensors(cfg.scene.sensors)
         actuators = {
             view.entity(name).prefix: getattr(robot, "actuators", ())
@@ -209,7 +209,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         driver.forget()
         driver.step_count.add_(1)
         self.event_manager.step()
-        finite_E = self.action_manager.apply(action_EL)
+        finite_E = self.action_manager.apply(action_EL)  # [E], False ends the row's episode
 
         world.step(
             self.cfg.decimation,
@@ -225,12 +225,12 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         driver.refreshed()
 
         driver.episode_step_E.add_(1)
-        driver.update_sensors()
+        driver.update_sensors()  # after resets of failed worlds, before terms read
         terminated_E, truncated_E = self.termination_manager.step(finite_E)
         done_E = terminated_E | truncated_E
-        reward_E = self.reward_manager.step(finite_E)
+        reward_E = self.reward_manager.step(finite_E)  # may read terminations
         self.metric_manager.step(finite_E)
-        self._log.step(done_E)
+        self._log.step(done_E)  # the sums of this step included
         # Last, so that rewards and terminations see the command that the policy saw.
         self.command_manager.step(~done_E)
         return self._env_state(
@@ -247,23 +247,23 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         else:
             mask_E = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         driver.forget()
-        driver.reset_count_E.add_(mask_E)
+        driver.reset_count_E.add_(mask_E)  # keys the draws of this reset, row by row
         # Curricula first: they judge the episode that ended, and what they change holds for the next one.
         self.curriculum_manager.reset(mask_E)
         self.world.reset(mask_E)
         self.view.restore_default(mask_E)
-        driver.buffers.clear(mask_E)
+        driver.buffers.clear(mask_E)  # memory of terms, but what they keep
         self.view.targets.reset(mask_E)
-        self.joint_drives.reset(mask_E)
+        self.joint_drives.reset(mask_E)  # draws the lags of the new episode
         driver.episode_step_E.masked_fill_(mask_E, 0)
         driver.changed()
         # Events write the state; poses and sensors derived from it are refreshed once, after all of them.
         self.event_manager.reset(mask_E)
         self.view.default_state.follow_pose(mask_E)
-        self.command_manager.resample(mask_E)
+        self.command_manager.resample(mask_E)  # clocks and targets of the new episode
         self.world.refresh(mask_E)
         driver.refreshed()
-        self.command_manager.refresh(mask_E)
+        self.command_manager.refresh(mask_E)  # vectors need refreshed poses
         no_E1 = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         flags = {"done": no_E1, "terminated": no_E1.clone(), "truncated": no_E1.clone()}
         return self._env_state(reset_E=mask_E, **flags)
@@ -295,7 +295,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.driver.seed.fill_(seed)
         self.driver.step_count.zero_()
         self.driver.reset_count_E.zero_()
-        self.event_manager.startup()
+        self.event_manager.startup()  # its draws depend on the seed
 
     def stagger_episodes_(self) -> None:
         """Let the running episodes time out at random steps; later episodes have their full length.
@@ -371,7 +371,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             given = {name: given.get(name, buffer) for name, buffer in own.items()}
         copy_into(own, given, what="state of an env (of the same config and num_envs)")
         self.world.load_state_dict(of_world)
-        self.driver.refreshed()
+        self.driver.refreshed()  # cached quantities are of the old state
         self.cfg = dataclasses.replace(self.cfg, seed=int(self.view.seed))
 
     def _buffers_to_save(self) -> dict[str, Tensor]:

@@ -91,7 +91,7 @@ class EvaluationHook(Hook):
         episodes = self.evaluator.env.batch_size[0] * ranks.size()
         with trainer.clock.paused(), trainer.progress.busy(f"evaluating over {episodes} episodes"):
             evaluation = self.evaluator(stop=lambda: ranks.size() == 1 and bool(trainer.interrupt))
-        if evaluation is None:
+        if evaluation is None:  # it was asked to stop
             return
         for text in losses_of(self.evaluator.env):
             trainer.progress.note(f"warning: evaluation at iteration {trainer.iteration}: {text}")
@@ -114,7 +114,7 @@ class CheckpointHook(Hook):
 
     def __call__(self, trainer: "Trainer") -> None:
         """Save, or say why not."""
-        if trainer.folder is None:
+        if trainer.folder is None:  # a run that saves nothing
             return
         try:
             trainer.save()
@@ -185,13 +185,13 @@ class Trainer:
             # Judged first, so that a checkpoint of the same iteration has the evaluation.
             self._hooks.insert(0, EvaluationHook(evaluator, interval=cfg.eval_interval))
         if cfg.overlap is None:
-            self._overlaps = update.device.type == "cuda"
+            self._overlaps = update.device.type == "cuda"  # on the CPU nothing runs meanwhile
         else:
             self._overlaps = cfg.overlap
-        self._unread: list[tuple[int, PendingMetrics]] = []
+        self._unread: list[tuple[int, PendingMetrics]] = []  # oldest first
         self.collecting = ranks.Timing(update.device)
         self._target_met = False
-        self._warned: set[str] = set()
+        self._warned: set[str] = set()  # kinds of warnings, each said once
         self._non_finite_terms = 0.0
         self._told_to_end = False  # by any rank
 
@@ -227,11 +227,11 @@ class Trainer:
         self.progress = progress or self.progress
         with self.interrupt, self.progress:
             notes = (*self._notes, *notes_of(self.update, warm_up=self.cfg.warm_up))
-            for text in (*missing_parts(self.collector.env), *notes):
+            for text in (*missing_parts(self.collector.env), *notes):  # what this env cannot do
                 self.progress.note(text)
             if self.warm_up_s:
                 self.progress.note(f"compiled and captured in {self.warm_up_s:.1f} s, before training")
-            self.clock.begin()
+            self.clock.begin()  # compiling before this does not count
             try:
                 while not self._is_over():
                     self.iterate()
@@ -322,13 +322,13 @@ class Trainer:
             self._told_to_end = True
             self.interrupt.signal = self.interrupt.signal or signal.SIGTERM
         clock = part(env, EpisodeClock)
-        physics = explain_physics(env, read)
+        physics = explain_physics(env, read)  # waits for the device only after a failure
         for text in physics.saved:
             self.progress.note(f"NaN guard: {text}")
         self._warn(physics.lost, read, iteration)
-        self.update.check(read)
+        self.update.check(read)  # may end the run: warnings come first
         if clock is None:
-            longest_s = 0.0
+            longest_s = 0.0  # rewards are then per episode, not per second
         else:
             longest_s = clock.max_episode_length_s
         self.metrics = episode_means(read, max_episode_length_s=longest_s)
@@ -403,7 +403,7 @@ class Trainer:
                 keep=self.cfg.keep_checkpoints,
                 trusted=self.iteration - self.collector.unchecked_rollouts,
             )
-        self.saved_at = self.iteration
+        self.saved_at = self.iteration  # so that the end is not saved twice
         return path
 
     def load(self, path: Path) -> None:
@@ -435,7 +435,7 @@ class Trainer:
         hooks = paired(self._own_hooks, state["hooks"], keeps=_keeps)
         # A first reset allocates what the collector and the transforms keep, before the saved values go in.
         self.collector.reset()
-        state = checkpoint.own_part(state, self.state_dict)
+        state = checkpoint.own_part(state, self.state_dict)  # of this rank
         self.update.load_state_dict(state["update"])
         load_env_state(self.collector.env, state["env"])
         self.collector.load_state_dict(state["collector"])
@@ -443,7 +443,7 @@ class Trainer:
             hook.load_state_dict(own)
         self.iteration = self.saved_at = int(state["iteration"])
         self.clock.total = float(state["seconds"])
-        load_random_state(state["random"], self.update.device)
+        load_random_state(state["random"], self.update.device)  # last: the steps above may draw
 
 
 def _keeps(hook: Hook) -> bool:

@@ -103,6 +103,7 @@ class TermMemory:
         """Return the quantities that are computed now and are no windows onto lasting memory."""
         pieces = self.lasting()
         found: list[Tensor] = []
+        # Windows onto lasting memory are compared there already.
         for cache in self._simulation.caches():
             for value in cache.values():
                 for _, tensor in _leaves("", value):
@@ -119,6 +120,7 @@ class TermMemory:
         lasting = self._at(self.lasting(), start, end)
         if lasting is not None:
             return lasting
+        # No lasting piece: any overlap with a quantity counts.
         for quantity in self._named_quantities():
             if quantity.start < end and start < quantity.end:
                 return quantity
@@ -149,6 +151,7 @@ class TermMemory:
         """Return the number of entries of each kind that still grows while an env is constructed."""
         simulation = self._simulation
         readings = self._readings
+        # Caches are left out, as quantities are looked up anew each time.
         growing = (
             simulation.buffers.by_name(),
             simulation.shared_values.by_name(),
@@ -204,6 +207,7 @@ class TermMemory:
                 yield _piece(f"view.field({name!r})", FIELD, field, has_rows=True)
         # Arrays of Warp by the ways in which a term can reach them.
         shown = {name: f"view.world.view({name!r})" for name in views.READABLE}
+        # "qpos_EL" is the view of the array "qpos".
         for attribute in views.DataViews.__annotations__:
             shown[attribute.rpartition("_")[0]] = f"view.world.{attribute}"
         for called, tensor, start, end in world.memory():
@@ -217,6 +221,7 @@ class TermMemory:
                 spelled = called
             else:
                 spelled = shown.get(name, called)
+            # Arrays without a view are known by their addresses only.
             if tensor is None:
                 yield Piece(name=spelled, owner=owner, start=start, end=end)
             else:
@@ -228,6 +233,7 @@ class TermMemory:
         for spelled, part in self._view.parts().items():
             for name, tensor in _tensors_of(part):
                 yield _piece(f"{spelled}.{name}", TABLE, tensor)
+        # Shared by all terms of the process, so nobody may write them.
         for tensor in constants():
             if tensor.numel():
                 start, end = extent(tensor)
@@ -235,6 +241,7 @@ class TermMemory:
 
     def _named_quantities(self) -> Iterator[Piece]:
         """List all quantities, windows too, as terms call them."""
+        # The part of the view whose cache has the quantity, as in `view.robot.`.
         owners = {id(vars(part).get("cache")): spelled for spelled, part in self._view.parts().items()}
         for cache in self._simulation.caches():
             for key, value in cache.items():
