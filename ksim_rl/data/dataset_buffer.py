@@ -43,6 +43,7 @@ class DatasetCfg(Checked):
     def rollout_length(self, num_envs: int) -> int:
         """Return T for so many parallel environments; see `rollout_length`. Envs and minibatches have equal shards."""
         size = self.num_env_states_per_minibatch
+        # Each shard has as many envs, and as many env states in each minibatch.
         if num_envs % self.shards or size % self.shards:
             raise ValueError(
                 f"shards={self.shards} does not divide num_envs={num_envs} and num_env_states_per_minibatch={size}: "
@@ -166,6 +167,7 @@ class DatasetBuffer(ReplayBuffer):
 
         With a `SequenceSampler` it is `["B","T"]`: whole sequences, which begin with their burn-in if there is one.
         """
+        # The info has the burn-in flags, whether the caller wants it or not.
         data, info = super().sample(batch_size, return_info=True)
         data = _labelled(data, info)
         return (data, info) if return_info else data

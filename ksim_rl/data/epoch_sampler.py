@@ -78,7 +78,9 @@ class EpochSampler(Sampler):
                 f"batch_size={batch_size} exceeds the {size} stored elements and drop_last=True: "
                 "nothing could be sampled; use a smaller batch_size or drop_last=False"
             )
+        # A slice of the order, which is on the device of the storage already.
         index = self._next_part(size, batch_size, torch.device(getattr(storage, "device", None) or "cpu"))
+        # TorchRL indexes storages of several dims by a tuple.
         if storage.ndim > 1:
             index = torch.unravel_index(index, storage.shape)
         return index, {}
@@ -150,6 +152,7 @@ class EpochSampler(Sampler):
             device = self._epoch.device
         if self._epoch is not None:
             self._epoch.fill_(self._first_epoch)
+        # In the middle of an epoch the rest of its order is needed again.
         if self._position > 0:
             # The counter is one ahead of the epoch whose order is in use.
             previous = torch.full((1,), self._first_epoch - 1, dtype=torch.int64, device=device)

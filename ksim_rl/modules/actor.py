@@ -69,6 +69,7 @@ class ActorCfg(OnPolicyNetworkCfg):
                 f"action_bound={self.action_bound!r} does nothing with distribution={self.distribution!r}: "
                 "use 'tanh_gaussian' or 'truncated_gaussian', or leave it out"
             )
+        # The floor would decide the first policy, whatever `init_std` says.
         if self.min_std > self.init_std:
             raise ValueError(
                 f"min_std={self.min_std!r} exceeds init_std={self.init_std!r}: lower it, or begin there"
@@ -114,6 +115,7 @@ class GaussianHead(nn.Module):
         self, features: Float[Tensor, "*batch L"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
         """Return `loc`, and `scale` of at least `cfg.min_std`; autocast, which would move narrow policies, is off."""
+        # The context is entered only under autocast, since it costs time in every call.
         kind = features.device.type
         with torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext():
             features = features.to(self.loc.weight.dtype)
@@ -122,6 +124,7 @@ class GaussianHead(nn.Module):
 
     def scale(self, features: Float[Tensor, "*batch L"] | None = None) -> Float[Tensor, "*own action_dim"]:
         """Return the `scale`, [action_dim] where it does not depend on the state, whose features are not read then."""
+        # One standard deviation per action for all states, or a second layer's output for each.
         if self.std_layer is None:
             assert self.std is not None
             if self.std_type == "log":
@@ -129,6 +132,7 @@ class GaussianHead(nn.Module):
             else:
                 scale = self.std
         else:
+            # The softplus keeps the output of a "scalar" layer positive.
             raw = self.std_layer(features)
             if self.std_type == "log":
                 scale = raw.exp()
@@ -236,6 +240,7 @@ class MixedHead(nn.Module):
 
     def distribution(self, params: TensorDictBase) -> CompositeDistribution:
         """Return the distribution of all actions; `params` is the entry at "params"."""
+        # Each head makes its own distribution from its part of the parameters.
         parts: dict[Any, Any] = {}
         for key, head in zip(self.action_keys, self.heads, strict=True):
             parameters = {name: params.get((*path_of(key), name)) for name in head.parameter_names}  # type: ignore[union-attr]
@@ -251,6 +256,7 @@ def action_range(
     Off-policy methods need bounded actions: their critics are asked about whatever the policy proposes, and there is no
     trust region that keeps it near tried actions. `bound` is in the units of the action, before its term's own scale.
     """
+    # Discrete specs have a space without these two, and unbounded ones may have no space.
     low, high = (getattr(getattr(spec, "space", None), name, None) for name in ("low", "high"))
     shape = spec.shape[-1:]
     lowest = torch.full(shape, -bound, device=device)
@@ -279,7 +285,9 @@ def make_head(
     `full_action_spec`, with its batch dims as shape. Raises ValueError, naming the action, where it does not go with
     `cfg.distribution`.
     """
+    # One head per action; several are joined in a `MixedHead`.
     leaves = _leaves(action_spec)
+    # Discrete actions need no setting next to continuous ones, but a gaussian for them only is a mistake.
     if cfg.distribution != "categorical" and all(isinstance(leaf, DISCRETE) for leaf, _ in leaves.values()):
         names = " and ".join(f"the action {key!r}" for key in leaves)
         raise ValueError(f"distribution={cfg.distribution!r}, but {names} is discrete: use 'categorical'")
@@ -311,6 +319,7 @@ def _choosing(
     cfg: ActorCfg, key: NestedKey, leaf: Any, shape: tuple[int, ...], **layer: Any
 ) -> CategoricalHead:
     one_hot = isinstance(leaf, specs.OneHot)
+    # How many options each choice has; None for a single choice.
     if isinstance(leaf, specs.MultiOneHot):
         sizes = tuple(int(size) for size in leaf.nvec)
     elif isinstance(leaf, specs.MultiCategorical):
@@ -333,6 +342,7 @@ def _choosing(
 def _continuous(
     cfg: ActorCfg, key: NestedKey, leaf: TensorSpec, shape: tuple[int, ...], **layer: Any
 ) -> GaussianHead:
+    # A gaussian needs numbers that it can shift and scale.
     if cfg.distribution == "categorical" or not leaf.dtype.is_floating_point:
         kind = f"{type(leaf).__name__} of {leaf.dtype}".replace("torch.", "")
         raise ValueError(
@@ -345,6 +355,7 @@ def _continuous(
         return GaussianHead(cfg, action_dim=shape[0], **layer)
     # Without `action_bound` a spec without bounds gives infinite ones, which are refused below.
     low_L, high_L = action_range(leaf, math.inf if cfg.action_bound is None else cfg.action_bound)
+    # Read on the host, once, as the network is built.
     if not bool((low_L.isfinite() & high_L.isfinite()).all()):
         raise ValueError(
             f"distribution={cfg.distribution!r} needs bounds, but the action {key!r} has no finite ones in the env's "
@@ -387,6 +398,7 @@ def make_actor(
         if action_dim is None:
             raise ValueError("make_actor needs action_spec, or action_dim")
         action_spec = Unbounded(action_dim)
+    # Without hidden layers the head reads the observations themselves.
     if cfg.hidden_dims:
         feature_dim = cfg.hidden_dims[-1]
     else:
@@ -403,6 +415,7 @@ def make_probabilistic(
     """Wrap a network with a `head` from `make_head` as TorchRL's `ProbabilisticActor`."""
     head = network.head
     mixed = isinstance(head, MixedHead)
+    # A single action has its parameters at the root, several have them nested under "params".
     parameter_keys = head.parameter_keys if mixed else list(head.parameter_names)  # type: ignore[union-attr,arg-type]
     return ProbabilisticActor(
         TensorModule(network, in_keys=in_keys, out_keys=parameter_keys),

@@ -95,6 +95,7 @@ class SquashedPolicy(BoundedActor):
         self, obs: Float[Tensor, "*batch L"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
         """Return `(loc, scale)`."""
+        # The first half of the outputs are means, the second one become standard deviations.
         loc, raw = self.output(obs).chunk(2, dim=-1)
         # A tanh instead of a clamp: the gradient never vanishes wholly at a bound.
         low = self.cfg.log_std_min
@@ -120,6 +121,7 @@ def make_squashed_actor(cfg: SquashedActorCfg, **network: Any) -> ProbabilisticA
         in_keys=["loc", "scale"],
         out_keys=["action"],
         distribution_class=TanhGaussian,
+        # The buffers themselves: a state dict that is loaded in place shows in them.
         distribution_kwargs={"low": policy.low, "high": policy.high},
         default_interaction_type=ExplorationType.RANDOM,
     )

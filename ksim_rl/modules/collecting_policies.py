@@ -51,6 +51,7 @@ class ExploringPolicy(TensorDictModuleBase):
         """Write "action" [E, action_dim]."""
         acting = self.actor(tensordict.select(*self.in_keys))
         action = acting.get("action")
+        # Policies that draw their own actions, as SAC's, add no noise here.
         if self.noise_max > 0.0:
             half_range = (self._high_L - self._low_L) / 2
             noise = ranks.randn(action.shape, device=action.device) * self.noise_scale_E1 * half_range

@@ -63,6 +63,7 @@ class QNetworkCfg(OffPolicyNetworkCfg):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # Checked without atoms as well, where the range is not used yet.
         if self.v_min >= self.v_max:
             raise ValueError(f"v_min={self.v_min!r} is not below v_max={self.v_max!r}")
 
@@ -104,6 +105,7 @@ def make_q_network(
     It writes "state_action_value" [..., N], or with atoms "state_action_logits" [..., N, A].
     """
     network = QNetwork(cfg, obs_dim=obs_dim, action_dim=action_dim, device=device)
+    # The key tells the losses what the numbers are: values, or logits of the atoms.
     if cfg.num_atoms == 1:
         out_key = "state_action_value"
     else:

@@ -97,6 +97,7 @@ class DiagonalGaussian(VectorDistribution):
 
     def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
         """Draw by reparametrization: gradients reach `loc` and `scale`."""
+        # Ranks draw for their own rows, so that a run does not depend on how envs are spread.
         shape = torch.Size(sample_shape) + self.loc.shape
         noise = ranks.randn(shape, dim=len(sample_shape), dtype=self.loc.dtype, device=self.loc.device)
         return self.loc + self.scale * noise
@@ -156,6 +157,7 @@ class TanhGaussian(BoundedDistribution):
         self, sample_shape: Any = ()
     ) -> tuple[Float[Tensor, "*shape L"], Float[Tensor, "*shape"]]:
         """Draw as `rsample`, and return the log density without inverting the squashing."""
+        # The density is computed from u: inverting the tanh would lose digits near the bounds.
         latent = self.base.rsample(sample_shape)
         return self._squash(latent), self._log_density(latent)
 
@@ -381,6 +383,7 @@ class Categorical(Distribution):
             for log_probs in self._log_probs:
                 shape = torch.Size(sample_shape) + log_probs.shape
                 like = {"dtype": log_probs.dtype, "device": log_probs.device}
+                # The Gumbel noise is minus the logarithm of a draw from the exponential distribution.
                 waiting = ranks.exponential(shape, dim=len(sample_shape), **like)
                 chosen.append((log_probs - waiting.log()).argmax(-1))
         return self._as_value(chosen)

@@ -51,6 +51,7 @@ class ObservationNormalizer(RunningMoments):
     def __init__(
         self, dim: int, *, eps: float = 1e-4, until: int | None = None, device: Device = None
     ) -> None:
+        # Zero would divide a component that never moves by zero.
         check_in_range("eps", eps, low=0.0, low_open=True)
         super().__init__(dim, until=until, device=device)
         self.eps = eps
@@ -73,6 +74,7 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None
     seen: dict[int, ObservationNormalizer] = {}
     for network in networks:
         for module in network.modules():
+            # A TensorDict module holds the network as its `module`: only it knows the keys of the observations.
             normalizer = getattr(getattr(module, "module", None), "normalizer", None)
             if not isinstance(module, TensorDictModule) or not isinstance(normalizer, ObservationNormalizer):
                 continue
@@ -104,6 +106,7 @@ class NetworkCfg(Checked):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # The class is frozen; a config file gives a list.
         object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
         check_choice("activation", self.activation, ACTIVATIONS)
 
@@ -112,6 +115,7 @@ def _hashable(key: str | Sequence[str]) -> str | tuple[str, ...]:
     """Return a key as a TensorDict has it: a text, or a tuple of two or more."""
     if isinstance(key, str):
         return key
+    # A list of one name is that name, as TensorDict would have it.
     parts = tuple(key)
     return parts[0] if len(parts) == 1 else parts
 
@@ -151,6 +155,7 @@ class ObservingNetwork(nn.Module):
     def __init__(self, cfg: NetworkCfg, *, obs_dim: int, device: Device = None) -> None:
         super().__init__()
         self.obs_dim = obs_dim
+        # The normalizer is part of the network, so that checkpoints and exports have it without further work.
         if cfg.obs_normalization:
             self.normalizer = ObservationNormalizer(obs_dim, device=device)
         else:

@@ -42,6 +42,7 @@ class RecurrentStatePrimer(TensorDictPrimer):
             mask = None
         else:
             mask = tensordict.get(self.reset_key, None)
+        # Each episode begins with zeros; rows that go on keep the state that the last step wrote.
         for key in self.state_keys:
             zero = self.primers[key].zero()  # pyright: ignore[reportOptionalSubscript]
             if tensordict is None:
@@ -214,6 +215,7 @@ class RecurrentModule(TensorDictModule):
         self, obs: Tensor, reset: Tensor | None, state: list[Tensor], batch_size: torch.Size
     ) -> tuple[Tensor, ...]:
         # One row per step: a sequence of length 1.
+        # [1, B, L] with all batch dims flattened into B.
         obs_1B = obs.reshape(1, -1, obs.shape[-1])
         if reset is None:
             reset_1B1 = None
@@ -233,6 +235,7 @@ class RecurrentModule(TensorDictModule):
                 f"recurrent mode {self.name!r} reads sequences [B, T] with {RESET_KEY!r}, which TorchRL's InitTracker "
                 "writes"
             )
+        # The network is time first; of the stored states only the first step's is read.
         features_TBH, states_TB = self.module(
             obs.transpose(0, 1), tuple(part[:, 0] for part in state), reset.transpose(0, 1)
         )
@@ -266,6 +269,7 @@ def behind(recurrent: RecurrentModule, network: AnyModule) -> AnyModule:
 
 def recurrent_modules(*networks: nn.Module) -> list[Any]:
     """Return the recurrent TensorDict modules inside networks, each once: ours, TorchRL's, or any other."""
+    # Any module that reads a key and writes it under "next" carries a state.
     found = [module for network in networks for module in network.modules() if carried_keys(module)]
     # A sequence of modules carries the states of those that it holds.
     holders = {
@@ -407,6 +411,7 @@ def burnt_in(
     # Sequences at the start of a rollout have no steps before them, and keep the stored state.
     renewed_B1 = before_BT.get(key)[:, -1]
     for module in recurrent_modules(*networks):
+        # The steps of the burn-in run as a sequence, from the stored state.
         with set_recurrent_mode(True):
             unrolled_BT = module(before_BT.select(*module.in_keys))
         for state_key in carried_keys(module):

@@ -112,6 +112,7 @@ class RolloutEstimator(ValueEstimatorBase):
         `params` and `target_params` are of a functional critic, at the root and under "next". Raises ValueError where a
         value, the reward or a flag is missing, or their shapes differ.
         """
+        # Values first, then the recursion over time, then the standardization of finite advantages.
         signals = self._signals(tensordict, params, target_params, self._resolved(time_dim, tensordict))
         adv_ET, target_ET, finite_ET = self._estimate(signals, tensordict)
         if self.normalize_advantage:
@@ -123,6 +124,7 @@ class RolloutEstimator(ValueEstimatorBase):
         return tensordict
 
     def _resolved(self, time_dim: int | None, tensordict: TensorDictBase) -> int:
+        # The argument of a call goes before the dim given at construction.
         if time_dim is None:
             assert self.time_dim is not None
             time_dim = self.time_dim
@@ -144,6 +146,7 @@ class RolloutEstimator(ValueEstimatorBase):
         following: TensorDictBase = tensordict.get("next")
         critic: Any = self.value_network
         if critic is not None:
+            # Values after a step come from the target critic, where TorchRL passes one.
             if target_params is None:
                 next_params = params
             else:
@@ -245,6 +248,7 @@ def discounted_sum(
     term_ET: Float[Tensor, "*batch 1"], discount_ET: Float[Tensor, "*batch 1"], *, time_dim: int
 ) -> Float[Tensor, "*batch 1"]:
     """Return x with x_t = term_t + discount_t x_{t+1}; x after the last step is zero."""
+    # Time first, and split into its steps: a loop over T small tensors, [*batch, 1] each.
     terms, discounts = (leaf.movedim(time_dim, 0).unbind(0) for leaf in (term_ET, discount_ET))
     total = torch.zeros_like(terms[0])
     totals = []

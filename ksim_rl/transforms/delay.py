@@ -102,6 +102,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
 
     def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
         """Return which rows reset, bool [E], and draw their lags where the rings do not."""
+        # The ring draws and counts these resets itself, in the launch that begins the rows.
         if self._draws_in_ring:
             return RowTransform._rows_that_reset(self, tensordict, tensordict_reset)
         mask_E = super()._rows_that_reset(tensordict, tensordict_reset)

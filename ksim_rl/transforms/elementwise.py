@@ -106,6 +106,7 @@ class ObservationClip(_Clip, ObservationMap):
         self, in_keys: Keys, out_keys: Keys | None = None, *, clip: Range | Mapping[NestedKey, Range]
     ) -> None:
         super().__init__(in_keys, out_keys)
+        # One range per key, so that units may differ from key to key.
         self.ranges = one_per_key("clip", clip, self.in_keys)
         for key, ends in zip(self.in_keys, self.ranges, strict=True):
             check_clip(f"clip of {key!r}", ends)
@@ -175,6 +176,7 @@ class ObservationScale(ObservationMap):
 
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
         factor: Tensor = getattr(self, f"factor_{index}").to(spec.device)
+        # A factor per element has to fit the last dim of the leaf.
         if factor.ndim:
             leaf = spec.shape[self.batch_dims[index] :]
             _check_per_dim(f"scale of {self.in_keys[index]!r}", factor.shape[0], "observation", leaf)
@@ -207,6 +209,7 @@ class RewardScale(FollowsLevel, RewardMap):
         first_scale: float | None = None,
     ) -> None:
         super().__init__(in_keys, out_keys)
+        # `first_scale` is only there where a curriculum changes the scale.
         for name, value in (("scale", scale), ("offset", offset), ("first_scale", first_scale)):
             if value is not None:
                 checks.check_in_range(name, value)
@@ -228,6 +231,7 @@ class RewardScale(FollowsLevel, RewardMap):
             scale = self.scale
         else:
             scale = by_level(self.first_scale, self.scale, self.level)
+        # Most rewards have none, and an addition would be one more kernel.
         if self.offset:
             return value * scale + self.offset
         return value * scale
@@ -255,17 +259,20 @@ class ActionScale(ActionMap):
             raise ValueError(f"offset={offset!r} without scale: the bounds of the env give both")
         if scale is not None:
             check_scale("scale", scale)
+            # The policy's bounds come from dividing by the scale.
             if 0 in (scale if isinstance(scale, Sequence) else [scale]):
                 raise ValueError(f"scale={scale!r}: expected numbers other than 0")
         check_scale("offset", offset)
         self.scale = scale
         self.offset = offset
         for index in range(len(self.in_keys_inv)):
+            # Made with the specs, from which the dtype and perhaps the bounds come.
             self.register_buffer(f"scale_{index}", None, persistent=False)
             self.register_buffer(f"offset_{index}", None, persistent=False)
 
     def new_spec(self, index: int, spec: TensorSpec) -> TensorSpec:
         scale, offset = self._affine(index, spec)
+        # Set once: a captured step keeps its addresses.
         if self._buffers[f"scale_{index}"] is None:
             self._buffers[f"scale_{index}"] = scale
             self._buffers[f"offset_{index}"] = offset

@@ -85,6 +85,7 @@ class RingTransform(RowTransform):
         buffers: dict[str, Any] = self._buffers
         ring_EM = buffers[f"ring_{index}"]
         age_E = buffers["age_E"]
+        # Envs with nested batch dims are flattened to one row per env.
         if value.ndim == ring_EM.ndim - 1:
             value_E = value
         else:
@@ -149,6 +150,7 @@ class ObservationHistory(RingTransform):
     def _repeated(self, spec: TensorSpec, batch_dims: int) -> TensorSpec:
         batch = spec.shape[:batch_dims]
         leaf = spec.shape[batch_dims:]
+        # A frame dim behind the batch dims of the observation.
         stacked = spec.unsqueeze(batch_dims).expand(*batch, self.num_frames, *leaf)
         if not self.flat:
             return stacked.clone()

@@ -63,6 +63,7 @@ class ObservationNormalization(RowTransform):
     def train(self, mode: bool = True) -> Self:
         """Follow the mode of the env: statistics are taken in training only."""
         super().train(mode)
+        # TorchRL calls `eval()` while it attaches a transform, which is no wish to freeze.
         if upstream.is_in_env(self):
             self._collective = self._wanted and mode
             self.updating.fill_(self._collective)
@@ -81,6 +82,7 @@ class ObservationNormalization(RowTransform):
             is_floating=True,
         )
         self._size_rows(observation_spec)
+        # Statistics are per element, whatever the shape of the leaf.
         sizes = [leaf.shape[observation_spec.ndim :].numel() for leaf in leaves]
         self._size_moments(sizes, observation_spec.device)
         return observation_spec

@@ -58,6 +58,7 @@ class CheckedKeys(Transform):
         for key in self.in_keys:
             value = tensordict.get(key, None)
             if value is None:
+                # A key that is missing is often misspelt: the error names those like it.
                 near = checks.near(spell(key), map(spell, tensordict.keys(True, True)))
                 raise KeyError(f"{type(self).__name__}: the samples have no {key!r}: {near}")
             if is_floating:
@@ -142,6 +143,7 @@ class RowTransform(CheckedKeys, ABC):
         """Make a zero buffer [E, *leaf], unless there is one of that shape and dtype already."""
         present = self._buffers[name]
         shape = (self.num_rows, *leaf)
+        # Kept where it fits: episodes go on when TorchRL asks for the specs again.
         if present is None or present.shape != shape or present.dtype != dtype:
             self._buffers[name] = torch.zeros(shape, dtype=dtype, device=self._row_device)
 
@@ -181,6 +183,7 @@ class RowTransform(CheckedKeys, ABC):
         # Nearly every reset has one mask and nothing else: a look-up spares a walk through the keys.
         if len(tensordict.keys()) == 1 and (only := tensordict.get("_reset", None)) is not None:
             return _per_row(only, self.num_rows)
+        # Nested envs have several masks; a row resets where any of them says so.
         masks = [
             _per_row(mask, self.num_rows)
             for key, mask in tensordict.items(True, True)
@@ -195,6 +198,7 @@ class RowTransform(CheckedKeys, ABC):
         self._refuse_samples()
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        # A replay buffer calls the inverse on its samples, which have no episode to keep state of.
         if self._is_for_samples and type(self).forward is RowTransform.forward:
             self._refuse_samples()
         return tensordict
@@ -271,6 +275,7 @@ class KeyedTransform(RowTransform):
         self._is_seeded = True
         self.seed_value.fill_(seed)
         self.step_count.zero_()
+        # A transform may be seeded before an env has sized its buffers.
         if self._buffers["reset_count_E"] is not None:
             self.reset_count_E.zero_()
         return self
@@ -349,6 +354,7 @@ class FollowsLevel(Transform):
             # The tensor itself, so that a curriculum that changes it in place needs no call.
             self._buffers["level"] = level
         else:
+            # A number is checked; a tensor's values would have to be read on the host.
             checks.check_in_range("level", level, low=0.0, high=1.0)
             self.level.fill_(level)
         return self

@@ -67,6 +67,7 @@ class EpisodeTracker(_Tracker):
         in_keys = as_keys(in_keys)
         returns = as_keys(out_keys)
         checked_out_keys(in_keys, returns)
+        # The returns first, one per reward, then the length: the order of `_kept`.
         if length_key is None:
             lengths: list[NestedKey] = []
         else:
@@ -81,12 +82,14 @@ class EpisodeTracker(_Tracker):
         rewards = output_spec["full_reward_spec"]
         observations = output_spec["full_observation_spec"]
         leaves = [leaf_spec(rewards, key, type(self).__name__) for key in self.in_keys]
+        # A sum of flags would be a flag.
         for key, spec in zip(self.in_keys, leaves, strict=True):
             if spec.dtype == torch.bool:
                 raise ValueError(f"EpisodeTracker: {key!r} is {spec.dtype}: expected numbers")
         for key, spec in zip(self.out_keys, leaves, strict=False):
             set_leaf_spec(observations, key, Unbounded(spec.shape, dtype=spec.dtype, device=spec.device))
         if self.length_key is not None:
+            # int64, as episodes have no longest length.
             shape = torch.Size([*observations.shape, 1])
             spec = Unbounded(shape, dtype=torch.int64, device=observations.device)
             set_leaf_spec(observations, self.length_key, spec)
@@ -95,6 +98,7 @@ class EpisodeTracker(_Tracker):
         self._size_leaves("return", observations, leaves)
         # Nearly every env has one float32 reward: it is counted in one launch.
         one = [spec.dtype for spec in leaves] == [torch.float32]
+        # A nested reward may have several numbers per env, for which the launch is not made.
         self._is_usual = one and self.return_0.numel() == self.num_rows
         return output_spec
 
@@ -227,6 +231,7 @@ class TimeAwareObservation(_Tracker):
             if self.container is None:
                 raise ValueError("horizon=None asks the env for its horizon: use the transform in an env")
             env = innermost(self.container)
+            # Ours say it themselves; Gymnasium keeps it in the spec of its env.
             if isinstance(env, EpisodeLimit):
                 found = env.max_episode_length
             else:
@@ -245,6 +250,7 @@ class TimeAwareObservation(_Tracker):
 
     def _write(self, tensordict: TensorDictBase, copies: Sequence[Tensor] | None = None) -> TensorDictBase:
         horizon = self._horizon()
+        # The remaining time is made from the count, so that only the count is kept.
         left_E1 = time_left(horizon, self.step_E).unsqueeze(1)
         return super()._write(tensordict, [left_E1 / horizon if self.normalize else left_E1])
 

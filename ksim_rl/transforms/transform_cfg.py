@@ -77,6 +77,7 @@ class TransformCfg(OwnTree):
         """Build the description of a node; a ValueError names the full path of the fault."""
         if isinstance(tree, cls):
             return tree
+        # Without a class there is nothing to check the arguments by.
         if not isinstance(tree, Mapping) or TARGET not in tree:
             raise ValueError(f"{path}: needs {TARGET}, the class of this transform, and its arguments")
         transform = class_paths.find(
@@ -85,6 +86,7 @@ class TransformCfg(OwnTree):
         with naming(f"{path}.{TARGET}"):
             stock.check(transform)
         arguments = {}
+        # Arguments are built by the annotations of the class, so that nested configs become their classes.
         for name, value in tree.items():
             if name != TARGET:
                 where = f"{path}.{name}"

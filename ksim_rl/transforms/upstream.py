@@ -23,6 +23,7 @@ def base_of(view: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*base"] | None:
 
 def env_of(transform: Transform) -> EnvBase | None:
     """Return the env that holds a transform, or None: the property `container` raises in a chain that no env holds."""
+    # Up the chain of containers, without the property that raises.
     inside: Any = transform
     while isinstance(inside, Transform):
         reference = inside.__dict__.get("_container")

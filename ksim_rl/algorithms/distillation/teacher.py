@@ -65,11 +65,13 @@ def restored_teacher(state: Mapping[str, Any], env: EnvBase, *, cfg: RunCfg) -> 
                 f"the teacher reads {key!r}, and this env shows {', '.join(map(repr, ours))}: add it to "
                 "task.observations as the teacher's run has it"
             )
+    # Only groups of the vector kind have columns; nested keys are single observations.
     groups = [key for key in read if isinstance(key, str)]
     checkpoint.check_columns(
         *({group: columns[group] for group in groups if group in columns} for columns in (theirs, ours))
     )
     policy = make_policy(teacher_cfg, env)
+    # Labels are made for single env states, from which no recurrent state can be known.
     if recurrent_modules(policy):
         raise ValueError("the teacher is recurrent, and has to label single env states: take one without")
     state_tree.copy_into(policy.state_dict(), state["actor"], what="teacher")

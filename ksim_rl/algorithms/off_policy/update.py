@@ -94,6 +94,7 @@ class OffPolicyUpdate(RolloutUpdate):
         self.replay = ReplayRing(
             data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
         )
+        # The optimizer of the critics moves the targets in the same step.
         target = loss.target_critic_network.parameters()
         rate = cfg.critic_learning_rate
         self.optimizers = {

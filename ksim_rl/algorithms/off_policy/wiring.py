@@ -78,6 +78,7 @@ def make_off_policy_update(
 def make_off_policy_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
     """Build the policy of a run: with SAC's settings one that draws its actions, with TD3's one that does not."""
     spec: Any = env.observation_spec
+    # The settings of the algorithm decide the kind of policy, which the config of the networks has to match.
     draws = isinstance(cfg.objective, SACCfg)
     if draws:
         make: Any = make_squashed_actor

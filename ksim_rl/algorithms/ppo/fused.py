@@ -48,6 +48,7 @@ def make_fused_ppo(
     sizes: Any = {name: getattr(data, name) for name in ("num_env_states_per_minibatch", "num_minibatches")}
     if isinstance(networks, NotFused):
         return networks
+    # The description of the networks is there: now config, sizes and precision.
     reason = why_not_fused(cfg, networks, **sizes)
     if reason is not None:
         return NotFused(reason)

@@ -32,6 +32,7 @@ def make_ppo_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> PPOUpd
     """Build the PPO update of a run; one that is resumed is built like a new one."""
     assert isinstance(cfg.objective, PPOCfg)
     actor, critic = build_networks(cfg, env)
+    # Only observations that a network reads need a mirror image.
     read = list(dict.fromkeys((*observation_keys(actor), *critic.in_keys)))
     return PPOUpdate(
         cfg.objective,
@@ -68,6 +69,7 @@ def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSe
         )
 
     def width(keys: tuple[ObservationKey, ...]) -> int:
+        # The trunk's features are no observation of the env, and have their own width.
         return observation_dim(spec, [key for key in keys if key != FEATURES]) + shared
 
     # Behind a recurrent module, where there is one.

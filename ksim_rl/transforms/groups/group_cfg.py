@@ -47,6 +47,7 @@ class ObservationTermCfg(Checked):
             check_clip("clip", self.clip)
         check_scale("scale", self.scale)
         frames = history_cfg(self.history)
+        # Stacked frames are no columns of a vector.
         if frames is not None and not frames.flat:
             raise ValueError(
                 "history.flat=False: frames in a vector are flat; stack those of the whole group"
@@ -76,6 +77,7 @@ class ObservationGroupCfg(Checked):
     def _check_fields(self) -> None:
         super()._check_fields()
         history_cfg(self.history)
+        # An image has no place in a vector.
         images = [name for name, cfg in self.terms.items() if cfg.is_image]
         if images and len(self.terms) > 1:
             other = next(name for name in self.terms if name != images[0])
@@ -131,6 +133,7 @@ def compile_groups(
         terms = {name: _completed(term, cfg) for name, term in cfg.terms.items()}
         chained = {name: term for name, term in terms.items() if _has_chain(term)}
         transforms += _chain(group, cfg, chained)
+        # Terms without a chain go into the vector straight from the env.
         plain = [name for name in terms if name not in chained]
         if cfg.keep_terms and plain:
             transforms.append(

@@ -76,6 +76,7 @@ class ObservationGroups(CheckedKeys):
         # A term may be in several groups, but is read once.
         every = list(dict.fromkeys(term for terms in self.groups.values() for term in terms))
         super().__init__(every, list(self.groups), is_paired=False)
+        # Terms of several groups are removed once.
         if drop is True:
             self.drop = every
         elif drop is False:
@@ -125,6 +126,7 @@ class ObservationGroups(CheckedKeys):
         return observation_spec
 
     def _vector_spec(self, specs: list[TensorSpec], batch_size: torch.Size, device: Device) -> TensorSpec:
+        # The vector takes the dtype to which `torch.cat` promotes its terms.
         dtype = specs[0].dtype
         for spec in specs[1:]:
             dtype = torch.promote_types(dtype, spec.dtype)

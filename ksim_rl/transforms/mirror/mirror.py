@@ -31,12 +31,14 @@ class MirrorMap:
     def __post_init__(self) -> None:
         object.__setattr__(self, "source", tuple(self.source))
         object.__setattr__(self, "signs", tuple(float(s) for s in self.signs) or (1.0,) * len(self.source))
+        # A permutation: each column comes from exactly one other.
         if sorted(self.source) != list(range(len(self.source))):
             raise ValueError(f"source={self.source}: expected each of 0 to {len(self.source) - 1} once")
         if len(self.signs) != len(self.source):
             raise ValueError(f"signs has {len(self.signs)} numbers for the {len(self.source)} of source")
         for index, (source, sign) in enumerate(zip(self.source, self.signs, strict=True)):
             checks.check_choice(f"signs[{index}]", sign, (1.0, -1.0))
+            # Twice in the mirror is the vector itself.
             if self.source[source] != index or self.signs[source] != sign:
                 raise ValueError(
                     f"columns {index} and {source} are no mirror images of each other: "

@@ -95,12 +95,14 @@ class ConstantNoise(NoiseCfg):
     value: PerDim = 0.0
 
     def affine(self, size: int) -> tuple[list[float], list[float]]:
+        # A spread of zero: nothing is drawn that counts.
         return per_dim("value", self.value, size), [0.0] * size
 
 
 def per_dim(field: str, value: PerDim, size: int) -> list[float]:
     """Return one number for each of `size` elements; a ValueError refuses other lengths than 1 and `size`."""
     numbers = [float(number) for number in _numbers(value)]
+    # A single number stands for all elements.
     if len(numbers) not in (1, size):
         raise ValueError(
             f"{field} has {len(numbers)} numbers, but the observation has {size} per env: give 1 or {size}"

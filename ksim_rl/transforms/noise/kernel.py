@@ -81,6 +81,7 @@ def _launch(
     # Samples belong to no episode, so that only noise without memory applies.
     if moment == "forward":
         features &= HAS_GAUSSIAN | HAS_RESOLUTION
+    # The kernel reads rows by address.
     clean_EL = clean_EL.contiguous()
     out_EL = torch.empty_like(clean_EL)
     num_columns = flags_L.numel()
@@ -89,6 +90,7 @@ def _launch(
     device = clean_EL.device
     state = seed, counter, enabled, level, mask_E, table_PL, flags_L
     tensors = *state, clean_EL, bias_EL, walk_EL, last_EL, out_EL
+    # A warp per row on the GPU, one thread per row on the CPU.
     dim = (num_rows, 1 if device.type == "cpu" else _LANES)
     layout = num_columns, _MODES[moment], features, ranks.first_row(num_rows), stream
     _quick(device, dim, *layout, *map(address, tensors))
@@ -176,6 +178,7 @@ def _noise_in_torch(
             held_EL = torch.where(flags_L & HOLD > 0, last_EL.view(num_rows, num_columns), 0.0)
             x_EL = torch.where(lost_EL, held_EL, x_EL)
         keep(last_EL, x_EL)
+    # At a reset the other rows keep their clean readings.
     noisy_EL = torch.where(begins_E[:, None], x_EL, clean_EL.reshape(-1, num_columns))
     return noisy_EL.view(clean_EL.shape)
 

@@ -140,6 +140,7 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         clean_EL = values[0]
         if len(values) > 1:
             clean_EL = side_by_side(values, tensordict.numel() if moment == "forward" else self.num_rows)
+        # The kernel computes in float32; the results go back to the dtype of the leaf below.
         if clean_EL.dtype != torch.float32:
             clean_EL = clean_EL.float()
         # Look-ups by attribute go through `nn.Module` and would take a fifth of the step.
@@ -189,6 +190,7 @@ class NoiseColumns(nn.Module):
         flags = torch.zeros(self.size, dtype=torch.int32)
         start = 0
         for index, (cfg, key, size) in enumerate(zip(cfgs, keys, sizes, strict=True)):
+            # Each observation fills its own columns of the table.
             columns = slice(start, start + size)
             table[:, columns] = torch.tensor(_parameters(cfg, key, size))
             flags[columns] = _flags(cfg) | index << noise_kernel.KEY_SHIFT
@@ -275,6 +277,7 @@ def _noisy(
         noise = (offset - reach).expand(low.shape), (offset + reach).expand(low.shape)
     else:
         noise = offset.expand(low.shape), (offset + spread).expand(low.shape)
+    # The clean bounds count as well: noise may be off, or of less than full strength.
     noisy_low = low + noise[0]
     noisy_high = high + noise[1]
     if cfg.operation == "multiply":
