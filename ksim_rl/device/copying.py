@@ -25,12 +25,14 @@ def copy_rows(
     layouts: list[tuple[int, int, int, int]] = []
     for own, new in zip(to, given, strict=True):
         assert own.shape == new.shape and own.dtype == new.dtype, "a copy of rows changes nothing"
+        # The kernel is for GPUs, and for rows that lie in one piece.
         if own.device.type == "cpu" or not new[:1].is_contiguous():
             own.copy_(new)
         elif own.numel():
             size = own.element_size()
             sizes = own[0].nbytes, own.stride(0) * size, new.stride(0) * size
             pair = own.data_ptr(), new.data_ptr()
+            # Copied as ints where all sizes and addresses allow it, or else byte by byte.
             if any(number % 4 for number in (*sizes, *pair)):
                 unit = 1
             else:
@@ -46,6 +48,7 @@ def copy_rows(
 def _launcher(layouts: tuple[tuple[int, int, int, int], ...]) -> QuickLaunch:
     """Return the copy of tensors, each in units of so many bytes: of a row, and from row to row in both."""
     lines = [f"constexpr int LANES = {LANES};", _COPY]
+    # Sizes are compiled in, so that the kernel needs addresses only.
     for place, (unit, *sizes) in enumerate(layouts):
         kind = "int" if unit == 4 else "char"
         numbers = ", ".join(map(str, sizes))

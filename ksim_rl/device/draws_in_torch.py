@@ -23,6 +23,7 @@ class Keys(NamedTuple):
 
 def mix(x: Int64[Tensor, "*shape"]) -> Int64[Tensor, "*shape"]:
     """Mix 32 bits, as `draws.cpp` does."""
+    # Constants of Wellons' hash: the product is cut to 32 bits after each step.
     x = ((x ^ (x >> 16)) * 0x21F0AAAD) & MASK
     x = ((x ^ (x >> 15)) * 0xD35A2D97) & MASK
     return x ^ (x >> 15)
@@ -33,6 +34,7 @@ def keys_of(
 ) -> Keys:
     """Return the keys of `num_rows` rows at a common count [], or at a count each, [E]."""
     row_E = torch.arange(first_row, first_row + num_rows, device=seed.device)
+    # Counts and seeds have 64 bits, which are mixed as two halves.
     low = count & MASK
     high = (count >> 32) & MASK
     base = mix(((seed ^ (seed >> 32)) & MASK) ^ stream)
@@ -69,14 +71,17 @@ def permuted(keys: Keys, n: int, bits: int, rounds: int) -> Int64[Tensor, "E n"]
     """Return an order of 0 to n - 1 for each row, by a Feistel network on numbers of so many bits."""
     device = keys.first_E.device
     low_bits = bits // 2
+    # The network works on two halves of the bits, which differ by one bit at most.
     low_mask = (1 << low_bits) - 1
     high_mask = (1 << (bits - low_bits)) - 1
+    # One key of 32 bits for each round and row.
     round_keys = bits_of(keys, torch.arange(rounds, device=device)).unsqueeze(1).unbind(-1)
 
     def through(number: Tensor) -> Tensor:
         low = number & low_mask
         high = number >> low_bits
         for place in range(0, rounds, 2):
+            # Each round changes one half by a mix of the other, so that it can be undone: no number comes twice.
             low = low ^ (mix(high ^ round_keys[place]) & low_mask)
             high = high ^ (mix(low ^ round_keys[place + 1]) & high_mask)
         return (high << low_bits) | low

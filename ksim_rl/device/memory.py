@@ -31,17 +31,21 @@ def memory_for(
 
     `first_that_fits` tries numbers of envs, half of `num_envs` and so on, after what the block built is given back.
     """
+    # Measured before anything is built, to know later what this block took.
     free = free_bytes(device)
     try:
         yield
     except (RuntimeError, ValueError) as error:
+        # Another error may wrap the refusal.
         asked = refused_bytes(error) or refused_bytes(error.__cause__)
         if asked is None:
             raise
+        # A CPU does not tell how much memory is free for one program.
         if free is None:
             taken = 0
         else:
             taken = max(0, free - (free_bytes(device) or 0))
+        # A lower bound: the block might have asked for more after this.
         per_env = max(1, (taken + asked) // num_envs)
         if isinstance(error, TooManyEnvsError):  # raised nearer to it, before anything was given back
             per_env = max(per_env, error.per_env)
@@ -50,6 +54,7 @@ def memory_for(
         if free is not None:
             most = free // per_env
             fits = f" of {free / 1e9:.1f} GB that were free: at most {most} fit"
+        # Before other numbers are tried, which need the same memory.
         _give_back(error, device)
         halves = [num_envs >> times for times in range(1, num_envs.bit_length())]
         if first_that_fits:
@@ -67,6 +72,7 @@ def memory_for(
 
 def _give_back(error: BaseException, device: torch.device) -> None:
     """Free what was built where `error` and its causes came from: their frames hold it."""
+    # A list that grows in the loop: causes have causes.
     causes: list[BaseException | None] = [error]
     for cause in causes:
         if cause is not None:

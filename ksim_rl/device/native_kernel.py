@@ -28,6 +28,7 @@ class NativeKernel:
         types = {name: _type_of(kind) for name, kind in fields.items()}
         arguments: Any = wp.struct(type("Arguments", (), {"__annotations__": types}))
 
+        # The C++ sees the thread's place under the names that its author chose.
         @wp.func_native(f"const int {indices[0]} = index_0, {indices[1]} = index_1;\n{source}")
         def run(index_0: int, index_1: int, a: arguments): ...  # type: ignore[valid-type]
 
@@ -54,11 +55,13 @@ class NativeKernel:
             lock = self._lock
             stream = current_warp_stream(device)
         with lock:
+            # The first launch of a device and size is recorded; the others write their bytes into that record.
             launch, packed = self._recorded.get((device, dim)) or self._record(device, dim)
             self._packer.pack_into(packed, 0, *values)
             launch.launch(stream)
 
     def _record(self, device: torch.device, dim: tuple[int, int]) -> tuple[wp.Launch, ctypes.Structure]:
+        # Sizes that come only once, such as a last batch, would pile up.
         if len(self._recorded) >= MAX_RECORDED:
             self._recorded.clear()
         with warp_scope(device):
@@ -71,6 +74,7 @@ class NativeKernel:
                 block_dim=self._block_dim,
             )
         packed: Any = upstream.recorded_arguments(launch)
+        # The layout of the struct's bytes, with C's alignment.
         self._packer = struct.Struct("@" + "".join(kind._type_ for _, kind in packed._fields_))
         self._recorded[device, dim] = launch, packed
         return launch, packed

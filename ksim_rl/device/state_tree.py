@@ -19,10 +19,12 @@ def split(state: Mapping[str, Any]) -> tuple[dict[str, Shaped[Tensor, "*?leaf"]]
     values: dict[str, Any] = {}
 
     def visit(path: str, node: Any) -> None:
+        # Keys may contain the separator.
         if isinstance(node, Mapping) and node:
             for key, child in node.items():
                 escaped = str(key).replace("~", "~0").replace("/", "~1")
                 visit(f"{path}/{escaped}", child)
+        # An empty mapping has no leaf, and would be lost.
         elif isinstance(node, Mapping):
             values[path] = {}
         elif isinstance(node, Tensor):
@@ -41,6 +43,7 @@ def split(state: Mapping[str, Any]) -> tuple[dict[str, Shaped[Tensor, "*?leaf"]]
 
 def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, Any]) -> State:
     """Undo `split`."""
+    # A state that is itself empty has the empty path.
     if list(values) == [""] and not tensors:
         return {}
     state: State = {}
@@ -57,6 +60,7 @@ def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, A
 
 def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: Mapping[str, Any], *, what: str) -> None:
     """Copy saved tensors into live ones, whose addresses stay for captured graphs; a ValueError names the misfit."""
+    # Names are compared in both directions, then shapes, before anything is written.
     for name in live:
         if name not in saved:
             raise ValueError(f"{what}: the checkpoint has no {name!r}")

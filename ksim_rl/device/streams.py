@@ -31,6 +31,7 @@ def start_warp() -> None:
     A run on the CPU is no fault, and who asks for CUDA there is refused by name. The complaint is written by native
     code, so it can be told from other messages only on the file descriptor.
     """
+    # Python's own buffer goes out first, so that it is not caught.
     sys.stderr.flush()
     stderr = os.dup(2)
     try:
@@ -68,6 +69,7 @@ def checked_device(device: str | torch.device) -> torch.device:
             f"device={device!r}: no CUDA device is available to torch and Warp; use device='cpu', or install an "
             "NVIDIA driver and a CUDA build of torch"
         )
+    # "cuda" alone means the current device; later comparisons need its index.
     if checked.index is None:
         index = torch.cuda.current_device()
     else:
@@ -116,6 +118,7 @@ def waiting_allowed(device: torch.device) -> Iterator[None]:
     if device.type != "cuda":
         yield
         return
+    # The program's own mode is put back afterwards.
     mode = torch.cuda.get_sync_debug_mode()
     torch.cuda.set_sync_debug_mode("default")
     try:
@@ -132,6 +135,7 @@ def beside(aside: wp.Stream | None, *launches: Callable[[], None]) -> Iterator[N
     reads or writes, or free what the other allocates: memory is given back in the order of one stream.
     """
     if aside is not None:
+        # The side stream starts after the work that precedes the block.
         aside.wait_stream(aside.device.stream)
         with wp.ScopedStream(aside, sync_enter=False), torch.cuda.stream(wp.stream_to_torch(aside)):
             for launch in launches:

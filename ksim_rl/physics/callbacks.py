@@ -14,6 +14,7 @@ class Callbacks:
 
     def __init__(self, warp_model: mjw.Model) -> None:
         self._callback = warp_model.callback
+        # A copy of the names and functions that are set now.
         self._own = dict(vars(self._callback))
         self._ours_first: dict[str, Callable[..., None]] = {}
 
@@ -29,10 +30,12 @@ class Callbacks:
         """
         for name, own in self._own.items():
             present = vars(self._callback)[name]
+            # Nothing changed since the last substep: ours alone, or ours before the program's.
             if own is None or present is own or present is self._ours_first.get(name):
                 continue
             if present is not None:
                 self._ours_first[name] = _in_turn(own, present)
+            # A program that took a callback away gets ours back.
             setattr(self._callback, name, own if present is None else self._ours_first[name])
 
 

@@ -23,6 +23,7 @@ def choose_engine(
     warp_alone: Sequence[str] = (),
 ) -> tuple[str, str]:
     """Return the engine, "warp" or "c", and why; `warp_alone` names features that are asked for and C does not have."""
+    # A setting comes first, then features that only one engine has, and size at last.
     if sim.engine != "auto":
         return sim.engine, f"task.sim.engine={sim.engine}"
     if device.type != "cpu":

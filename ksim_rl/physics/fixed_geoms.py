@@ -19,10 +19,11 @@ FIELDS = frozenset(("body_pos", "body_quat", "geom_pos", "geom_quat"))
 
 
 def fixed_geoms(warp_model: mjw.Model) -> np.ndarray:
-    """Return which geoms are of the world or of what is welded to it, bool [ngeom]; mocap bodies move."""
+    """Return which geoms are of the world or of bodies welded to it, bool [ngeom]; mocap bodies move."""
     m = warp_model
     body = m.geom_bodyid.numpy()
     is_fixed = m.body_weldid.numpy() == 0
+    # A mocap body is welded to the world in the tree, but is moved.
     is_fixed &= m.body_mocapid.numpy()[m.body_rootid.numpy()] == -1
     return is_fixed[body]
 
@@ -30,7 +31,7 @@ def fixed_geoms(warp_model: mjw.Model) -> np.ndarray:
 def placing_of_fixed_geoms(
     warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
-    """Return a launcher of it, with arrays in their final place; None where no field of `expanded` moves any."""
+    """Return a launcher of the placing, with arrays in their final place; None where no `expanded` field moves any."""
     m = warp_model
     d = warp_data_E
     ids = np.flatnonzero(fixed_geoms(m))
@@ -64,6 +65,7 @@ def place_fixed_geoms(
     pos = geom_pos[world % geom_pos.shape[0], geom]
     quat = geom_quat[world % geom_quat.shape[0], geom]
     body = geom_bodyid[geom]
+    # From the geom's body up to the world.
     while body > 0:
         # As kinematics has it, which makes the quaternion of each body one of unit length.
         turn = wp.normalize(body_quat[world % body_quat.shape[0], body])

@@ -100,6 +100,7 @@ class OverflowRecord:
 
     def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
         self._warp_data_E = warp_data_E
+        # One thread for each world.
         if warp_data_E.qpos.device.is_cuda:
             threads = 128
         else:
@@ -118,6 +119,7 @@ class OverflowRecord:
 
     def clear(self) -> None:
         """Start the next period. Bits that MuJoCo Warp keeps until a world resets are of the last one, too."""
+        # The maxima are zeroed in place: graphs keep their addresses.
         of_worlds_E = wp.to_torch(self._warp_data_E.overflow)
         for tensor in (self.sticky_E, self.most_nefc_E, self.most_pool, of_worlds_E):
             tensor.zero_()
@@ -125,6 +127,7 @@ class OverflowRecord:
     def counts(self) -> Int[Tensor, " N"]:
         """Return the period in whole numbers on the device: worlds by bit, most rows, most contacts and pairs."""
         bits = torch.arange(len(BIT_NAMES), device=self.sticky_E.device, dtype=torch.int32)
+        # A column for each bit, [E, bits], summed over worlds.
         worlds = ((self.sticky_E[:, None] >> bits) & 1).sum(0)
         return torch.cat([worlds, self.most_nefc_E.max().view(1), self.most_pool])
 
@@ -133,6 +136,7 @@ class OverflowRecord:
         d = self._warp_data_E
         worlds = dict(zip(BIT_NAMES, numbers, strict=False))
         nefc = numbers[len(BIT_NAMES)]
+        # Contacts and candidate pairs share the pool: the larger number is what it needed.
         ncon = max(numbers[len(BIT_NAMES) + 1 :])
         return OverflowReport(
             worlds=worlds, nefc=nefc, njmax=d.njmax, ncon=ncon, naconmax=d.naconmax, num_envs=d.nworld

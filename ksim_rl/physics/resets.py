@@ -33,11 +33,13 @@ def fill_rows(
     world, lane = wp.tid()
     if not mask[world]:
         return
+    # Arrays are given by address, so that one launch fills all of them, whatever their number.
     for k in range(places.shape[0]):
         rows = wp.array(ptr=places[k], shape=(mask.shape[0], widths[k]), dtype=float)
         for i in range(lane, widths[k], LANES):
             rows[world, i] = 0.0
     for i in range(lane, qpos.shape[1], LANES):
+        # Worlds may have a pose of their own to reset to.
         qpos[world, i] = qpos0[world % qpos0.shape[0], i]
 
 
@@ -52,6 +54,7 @@ def empty_contacts(
 ):
     """Zero the contacts of the worlds that `mask` names, in arrays [contacts, width]; none has a row."""
     contact = wp.tid()
+    # A contact whose world is -1 belongs to nobody, and is emptied, too.
     if contact >= nacon[0] or (world_of[contact] >= 0 and not mask[world_of[contact]]):
         return
     for k in range(places.shape[0]):
@@ -71,11 +74,14 @@ def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Call
     m = warp_model
     d = warp_data_E
     contact = warp_data_E.contact
+    # These two have other values than 0 after a reset.
     names = {field.name for field in dataclasses.fields(contact)} - {"worldid", "efc_address"}
     device = d.qpos.device
 
     def table(arrays: list[wp.array], rows: int) -> tuple[wp.array, wp.array]:
+        # Empty arrays have no address.
         used = [array for array in arrays if array.size]
+        # Widths count floats: every type here has 4 bytes for each number.
         widths = [array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // rows for array in used]
         places = wp.array([array.ptr for array in used], dtype=wp.uint64, device=device)
         return places, wp.array(widths, dtype=int, device=device)
@@ -90,6 +96,7 @@ def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Call
     has_more = any(getattr(m, name) for name in HAS_MORE) or bool(m.opt.enableflags & mjw.EnableBit.SLEEP)
 
     def launch() -> None:
+        # Models with more state need MuJoCo Warp's own reset; ours then zeroes the arrays that it leaves.
         if has_more:
             mjw.reset_data(m, d, reset=mask)
         else:

@@ -57,12 +57,14 @@ def substep_plan(
     warp_model: mjw.Model, warp_data_E: mjw.Data, sim: SimCfg, *, solver_unavailable: str | None
 ) -> SubstepPlan:
     """Return the plan of a world whose model and data are in their final place, without callbacks of a program."""
+    # Each stage needs the one before: the reasons follow from each other.
     dynamics = stages.one_kernel_dynamics_unavailable(warp_model, sim, solver_unavailable=solver_unavailable)
     rows = one_kernel_rows_unavailable(warp_model, dynamics_unavailable=dynamics)
     broad_phase = broad_phase_unavailable(warp_model, warp_data_E, rows_unavailable=rows)
     return SubstepPlan(
         dynamics=dynamics,
         broad_phase=broad_phase,
+        # Contacts may be found by both: our broad phase, and MuJoCo Warp's narrow phase for some types.
         collisions=broad_phase or pairs_left(warp_model),
         rows=rows,
         solver=solver_unavailable,
@@ -76,6 +78,7 @@ def with_callbacks(plan: SubstepPlan, names: Sequence[str]) -> SubstepPlan:
     One that has a part in the forces stands between the stages of our kernel of the dynamics. Then MuJoCo Warp computes
     these, and the contacts and rows that follow from them.
     """
+    # Other callbacks, such as of sensors, run between the same launches.
     forces = [name for name in names if name in stages.FORCE_CALLBACKS]
     if not forces:
         return dataclasses.replace(plan, callbacks=tuple(names))

@@ -2,8 +2,8 @@
 
 Such an actuator pulls along the mean of the normals of a body's contacts. MuJoCo Warp counts the pairs of geoms whose
 distance a sensor reads among the contacts, and upper corners of boxes on planes, so that the pull is weaker than C's:
-here they are hidden from it. And no
-refresh looks for contacts, so that these moments stay as the last substep left them; rows that reset read zero.
+here they are hidden from it. And no refresh looks for contacts, so that these moments stay as the last substep left
+them; rows that reset read zero.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
@@ -29,6 +29,7 @@ def miscounts_contacts(warp_model: mjw.Model) -> bool:
 def transmissions_of_contacts(warp_model: mjw.Model, warp_data_E: mjw.Data) -> Callable[[], None]:
     """Return a launcher of MuJoCo Warp's `transmission` with contacts alone, once there are constraint rows."""
     contact = warp_data_E.contact
+    # A copy of the geoms, so that other readers see all contacts.
     geom = wp.empty_like(contact.geom)
     hiding = dataclasses.replace(warp_data_E, contact=dataclasses.replace(contact, geom=geom))
     d = warp_data_E
@@ -50,6 +51,7 @@ def transmissions_of_refresh(warp_model: mjw.Model, warp_data_E: mjw.Data) -> Ca
     d = warp_data_E
     if m.nacttrnbody == 0:
         return lambda: mjw.transmission(m, d)
+    # All actuators but those that adhere: their moments would be computed from contacts, which a refresh does not find.
     without_contacts = dataclasses.replace(m, nacttrnbody=0)
     shape = (d.nworld, m.nacttrnbody, m.nv)
     kept = wp.empty(shape, dtype=float)
@@ -90,6 +92,7 @@ def _hide_rowless(
     contact = wp.tid()
     if contact >= nacon[0]:
         return
+    # Contacts with rows are the ones that C counts.
     if kind[contact] & CONSTRAINT:
         shown[contact] = geom[contact]
     else:

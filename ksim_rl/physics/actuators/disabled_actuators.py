@@ -32,6 +32,7 @@ def still_activations(mj_model: mujoco.MjModel) -> np.ndarray:
         # MuJoCo Warp would put them into their range.
         return np.arange(mj_model.na, dtype=np.int32)
     columns: list[int] = []
+    # An actuator may have several activations, or none.
     for actuator in np.flatnonzero(_is_disabled(mj_model)):
         first = mj_model.actuator_actadr[actuator]
         columns += range(first, first + mj_model.actuator_actnum[actuator])
@@ -41,6 +42,7 @@ def still_activations(mj_model: mujoco.MjModel) -> np.ndarray:
 def _is_disabled(mj_model: mujoco.MjModel) -> np.ndarray:
     """Return which actuators the option disables, bool [nactuator]."""
     group = mj_model.actuator_group
+    # A shift by 31 or more, or by a negative number, would be undefined.
     has_bit = (group >= 0) & (group < MOST_GROUPS)
     bits = np.left_shift(1, np.where(has_bit, group, 0))
     return has_bit & ((mj_model.opt.disableactuator & bits) != 0)

@@ -24,6 +24,7 @@ _FUNCTIONS = {FORCES_OF_BODIES: mujoco.mj_rnePostConstraint, SUBTREE_VELOCITIES:
 
 def left_out(mj_model: mujoco.MjModel) -> frozenset[str]:
     """Return the names of the arrays that no sensor of the model makes C compute."""
+    # Without sensors C computes neither group.
     if mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return FORCES_OF_BODIES | SUBTREE_VELOCITIES
     missing: set[str] = set()
@@ -51,6 +52,7 @@ class ByWorld:
 
     def array(self, name: str) -> np.ndarray:
         """Return the array of that name, zeros at first, which `fill` fills from then on."""
+        # C's function fills all arrays of a group in one call.
         if name in FORCES_OF_BODIES:
             together = FORCES_OF_BODIES
         else:

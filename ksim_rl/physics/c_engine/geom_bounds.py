@@ -17,8 +17,10 @@ _SIZED = (
 def half_sizes(mj_model: mujoco.MjModel, size_EN3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the half sizes of the box around each geom, [E, N, 3] m, and which geoms have one, bool [N]."""
     kind = mj_model.geom_type
+    # MuJoCo's sizes: a radius, then half a length, or three half sizes.
     radius = size_EN3[..., :1]
     length = size_EN3[..., 1:2]
+    # Right for boxes and ellipsoids as it is.
     half = size_EN3.copy()
     sphere = kind == _GEOMS.mjGEOM_SPHERE
     half[:, sphere] = np.broadcast_to(radius, half.shape)[:, sphere]

@@ -40,6 +40,7 @@ class MaskedConstants:
         self._warp_model = warp_model
         self._moves = KINEMATIC & set(expanded)
         self._resizes = "geom_size" in expanded
+        # Weights of tendons, flexes and other transmissions are not computed by the kernel.
         self._inert = not mj_model.ntendon and not mj_model.nflex and _drives_scalar_joints(mj_model)
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any()) or mj_model.ntendon > 0
         has_armature = "actuator_armature" in expanded or np.any(mj_model.actuator_armature)
@@ -54,10 +55,12 @@ class MaskedConstants:
         # Frames at qpos0 are shared unless a field that moves them differs between worlds.
         num_frames = num_envs if self._moves else 1
         self._mask = mask
+        # The mask of `place_frames`, which runs for all frames.
         self._everywhere = wp.full(num_frames, True, dtype=bool)
         own = {
             "mask": mask,
             "sums_masses": "body_subtreemass" in expanded,
+            # Without armature, actuators add nothing to the inertia matrix.
             "num_actuators": mj_model.nu if has_armature else 0,
             "dof_rotates": wp.array(_rotates(mj_model), dtype=float),
             "group_start": wp.array(starts, dtype=int),
@@ -71,6 +74,7 @@ class MaskedConstants:
             "axis": wp.zeros((num_frames, nv), dtype=wp.vec3),
             "xipos": wp.zeros((num_envs, nbody), dtype=wp.vec3),
             "inertia": wp.zeros((num_envs, nbody), dtype=wp.mat33),
+            # One row where shared memory holds it, since a kernel takes an array in any case.
             "scratch": wp.zeros((1 if on_chip else num_envs, floats), dtype=float),
         }
         self._constants = filled(kernels.Constants, own, warp_model)
@@ -90,6 +94,7 @@ class MaskedConstants:
         """Return whether the constants that follow from `fields` can be recomputed here, as `World.set_const` says."""
         fields = set(fields)
         groups = const_groups(fields, self._mj_model)
+        # Anchors of ties, and lengths of tendons, follow from frames.
         moves = bool(fields & (KINEMATIC | {"eq_data"}))
         return (self._inert or not groups & INERT0) and not (moves and self._ties_bodies)
 
@@ -100,6 +105,7 @@ class MaskedConstants:
             set_fixed_constants(self._warp_model)
         if not groups & (KIN0 | INERT0):
             return
+        # Frames that all worlds share stay as `place_frames` left them.
         if self._moves:
             wp.launch(kernels.frames, dim=self._num_envs, inputs=[self._constants])
         dim = (self._num_envs, self._lanes)
@@ -113,6 +119,7 @@ def _drives_scalar_joints(mj_model: mujoco.MjModel) -> bool:
 
 
 def _driven_dofs(mj_model: mujoco.MjModel) -> np.ndarray:
+    # MuJoCo Warp computes these models' constants; no table is needed.
     if not _drives_scalar_joints(mj_model):
         return np.zeros(0, dtype=int)
     return mj_model.jnt_dofadr[mj_model.actuator_trnid[:, 0]]
@@ -135,6 +142,7 @@ def _joint_groups(mj_model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return for each dof the first one, and the number, of those whose inverse weights are averaged."""
     kind = mj_model.jnt_type[mj_model.dof_jntid]
     triple = np.isin(kind, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL))
+    # The rotations of a free joint, whose translations are averaged apart from them.
     second = _free_offset(mj_model) // 3 == 1
     start = np.where(triple, mj_model.jnt_dofadr[mj_model.dof_jntid] + 3 * second, np.arange(mj_model.nv))
     return start, np.where(triple, 3, 1)
@@ -145,6 +153,7 @@ def _last_dofs(mj_model: mujoco.MjModel) -> np.ndarray:
     last = np.full(mj_model.nbody, -1)
     for body in range(1, mj_model.nbody):
         count = mj_model.body_dofnum[body]
+        # A body without joints moves as its parent does.
         own = mj_model.body_dofadr[body] + count - 1
         last[body] = own if count else last[mj_model.body_parentid[body]]
     return last

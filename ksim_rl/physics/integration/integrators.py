@@ -84,7 +84,7 @@ def integrator(
 def _keeping_readings(
     integrate: Callable[[mjw.Model], None], warp_data_E: mjw.Data, names: Sequence[str]
 ) -> Callable[[mjw.Model], None]:
-    """Return a launcher of an integrator and puts back arrays that the substep read before it."""
+    """Return a launcher of an integrator that puts back arrays which the substep read before it."""
     arrays = [getattr(warp_data_E, name) for name in names]
     kept = [wp.empty_like(array) for array in arrays]
 

@@ -52,8 +52,10 @@ def files_of_model(source: str | Path) -> ModelFiles | None:
     if is_urdf(text):
         packages = packages_of(text, read.folder)
         text = ready_urdf(text, read.folder)
+    # Absolute, without resolving links: names in the texts are relative to the path as it is called.
     main = Path(os.path.abspath(path))
     paths = sorted({main, *files_named(text, read.folder, read.label)})
+    # One folder higher, since packages of ROS are found by the names of folders above the file.
     folder = Path(os.path.commonpath([*(file.parent for file in paths), *packages])).parent
     return ModelFiles(
         folder=folder,

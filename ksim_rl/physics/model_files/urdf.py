@@ -37,11 +37,13 @@ def ready_urdf(text: str, folder: Path) -> str:
             discards = "true"
         else:
             discards = "false"
+        # Paths of meshes stay whole, and links that are fixed stay bodies.
         compiler = f'<compiler strippath="false" fusestatic="false" discardvisual="{discards}"/>'
         text = _ROBOT.sub(lambda found: f"{found[0]}<mujoco>{compiler}</mujoco>", text, count=1)
     folder = Path(os.path.abspath(folder))  # as it is called, since links may be what holds packages together
 
     def found_mesh(match: re.Match[str]) -> str:
+        # XML may escape characters of a path.
         path = _mesh_path(html.unescape(match["name"].strip()), folder)
         return f"{match['start']}{match['quote']}{html.escape(path)}{match['quote']}"
 
@@ -64,6 +66,7 @@ def packages_of(text: str, folder: Path) -> list[Path]:
 
 def _folders_of(package: str, folder: Path) -> Iterator[Path]:
     """Yield the folders that may be a package's, from a file's own folder upwards."""
+    # The package is a folder beside one above the file, or is itself above it.
     for above in (folder, *folder.parents):
         yield above / package
         if above.name == package:

@@ -48,12 +48,14 @@ def write(path: Path, failure: Failure) -> None:
     tensors = {_MODEL: model_bytes(failure.mj_model)}
     for prefix, arrays in ((_STATE, failure.states), (_REACHED, failure.reached), (_FIELD, failure.fields)):
         tensors |= {f"{prefix}{name}": np.ascontiguousarray(array) for name, array in arrays.items()}
+    # Counters and versions travel as JSON in the header of the file.
     about = {"format": FORMAT, "mujoco": mujoco.__version__}
     about |= {"world": failure.world, "substep": failure.substep, "sha256": _sha256(tensors)}
     data = safetensors.numpy.save(tensors, metadata={"about": json.dumps(about)})
     with whole_file(path) as temporary, open(temporary, "wb") as file:
         file.write(data)
         file.flush()
+        # On the disk before the file gets its name, so that a crash leaves no half of it.
         os.fsync(file.fileno())
 
 
@@ -63,6 +65,7 @@ def read(path: Path) -> Failure:
     Raises ValueError where the file is none of ours, is damaged, holds other counters, names, shapes or dtypes than the
     guard writes, or was written with another MuJoCo.
     """
+    # Before reading: a pipe would never end, and a huge file fill the memory.
     check_regular(path, limit=MOST_DATA_BYTES)
     try:
         # It compares all sizes with the file's before any memory is taken.
@@ -73,8 +76,10 @@ def read(path: Path) -> Failure:
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, json.JSONDecodeError, OSError) as error:
         raise ValueError(f"{path}: damaged, or not a file of the NaN guard: {error}") from None
+    # Before MuJoCo parses the model, whose binary format it trusts.
     if about.get("sha256") != _sha256(tensors):
         raise ValueError(f"{path}: damaged: its numbers are not those that were written")
+    # The binary format of models differs from version to version.
     if about.get("mujoco") != mujoco.__version__:
         raise ValueError(f"{path}: written with MuJoCo {about.get('mujoco')}; this is {mujoco.__version__}")
 
@@ -101,6 +106,7 @@ def read(path: Path) -> Failure:
 
 def _sha256(tensors: Mapping[str, np.ndarray]) -> str:
     found = hashlib.sha256()
+    # Sorted, so that the hash does not depend on the order of the file.
     for name in sorted(tensors):
         found.update(name.encode() + tensors[name].tobytes())
     return found.hexdigest()
@@ -110,10 +116,12 @@ def _check(failure: Failure) -> None:
     """Refuse counters, names, shapes and dtypes that no failure of this model has; its numbers may be non-finite."""
     for name, least in (("world", 0), ("substep", 1)):
         value = getattr(failure, name)
+        # JSON has booleans, which Python counts as integers: hence the exact type.
         if type(value) is not int or not least <= value < 2**31:
             raise ValueError(f"{name}={value!r}: expected a number from {least} on")
     data = mujoco.MjData(failure.mj_model)
     kept = len(failure.states["qpos"])
+    # The sizes that the model's own data have.
     width = {name: np.size(getattr(data, name)) for name in SUBSTEP_INPUTS}
     expected = {f"{_STATE}{name}": (kept, size) for name, size in width.items() if size}
     expected |= {f"{_REACHED}{name}": (width[name],) for name in ("qpos", "qvel")}

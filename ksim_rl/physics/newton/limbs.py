@@ -31,12 +31,15 @@ class Limbs:
 
 def limbs_of(parents: Sequence[int]) -> Limbs:
     """Return the limbs of a tree, or nothing where there is one limb, a part is too large, or no row gets narrower."""
+    # The leaves at or below each degree of freedom: with more than one, it belongs to the trunk.
     leaves = [0] * len(parents)
     chains = dict[int, list[int]]()
+    # Children come after their parents, so that the reverse order meets them first.
     for dof in reversed(range(len(parents))):
         leaves[dof] = max(leaves[dof], 1)
         if parents[dof] >= 0:
             leaves[parents[dof]] += leaves[dof]
+    # A chain is taken over by its next degree of freedom, until it ends in a leaf.
     for dof, parent in enumerate(parents):
         if leaves[dof] == 1:
             chains[dof] = [*chains.pop(parent, []), dof]

@@ -57,7 +57,9 @@ def constraint_rows(
     d = warp_data_E
     bits = mjw.DisableBit
     flags = int(warp_model.opt.disableflags)
+    # Sorted below by number: MuJoCo Warp lists balls apart from hinges and slides.
     limited = np.concatenate([m.jnt_limited_ball_adr.numpy(), m.jnt_limited_slide_hinge_adr.numpy()])
+    # For each geom, 64 bits say which degrees of freedom move it: a contact's row needs no search.
     moves = m.body_isdofancestor.numpy()[m.body_weldid.numpy()[m.geom_bodyid.numpy()], : m.nv] != 0
     masks = (moves * (np.uint64(1) << np.arange(m.nv, dtype=np.uint64))).sum(-1, dtype=np.uint64)
     device = d.qpos.device
@@ -69,6 +71,7 @@ def constraint_rows(
         "efc_J_colind": d.efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": d.efc.J.reshape((d.nworld, -1)),
     }
+    # Disabled kinds of rows are compiled out.
     on = {bit: not flags & (bits.CONSTRAINT | bit) for bit in bits}
     sizes = {"num_dofs": m.nv, "njmax": d.njmax, "most_nonzeros": d.njmax_nnz}
     constants = {
@@ -81,15 +84,18 @@ def constraint_rows(
         "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
         "refsafe": not flags & bits.REFSAFE,
     }
+    # The CPU always has one lane.
     if not (lanes and device.is_cuda):
         lanes = lists.lanes
     threads = lists.threads
+    # Fewer registers pay only where not all threads are on the GPU at the same time.
     waits = device.is_cuda and d.nworld * lanes > THREADS_AT_ONCE * device.sm_count
     most = REGISTERS if waits else None
     source = native.source_of("rows", PARTS)
     launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)
 
     def make_rows() -> None:
+        # First, since rows of contacts follow the order of the lists.
         lists.append()
         launch()
 

@@ -35,6 +35,7 @@ class ContactLists:
         self.room = room or max(1, d.njmax + (d.naconmax // d.nworld if gaps else 0))
         self.count, self.appended = (wp.zeros(d.nworld, dtype=int, device=device) for _ in range(2))
         self.ids, self.found = (wp.zeros((d.nworld, self.room), dtype=int, device=device) for _ in range(2))
+        # Contacts are sorted by these 64 bits, in C's order.
         self.keys = wp.empty((d.nworld, self.room), dtype=wp.uint64, device=device)
         # For the kernels that read them, too.
         self.constants = {
@@ -50,6 +51,7 @@ class ContactLists:
         else:
             self.lanes = 1
             self.threads = 1
+        # The first half appends, the second one sorts.
         sources = [native.source_of("rows", parts) for parts in (("append",), ("layout", "order"))]
         self._append, self.order = (
             native.launcher(source, self.constants, vars(self), m, d, lanes=self.lanes, threads=self.threads)
@@ -60,5 +62,6 @@ class ContactLists:
     def append(self) -> None:
         """Launch the first half, after a collision pass that has not: the lists in any order."""
         if not self.are_appended:
+            # Counters of the last substep.
             self.appended.zero_()
             self._append()

@@ -32,8 +32,10 @@ def kinds_of_ties(mj_model: mujoco.MjModel) -> np.ndarray:
     for equality, bodies in enumerate(tied_bodies(mj_model)):
         if bodies[0] < 0:
             continue
+        # Weights [2] of translation and rotation, of both bodies together.
         weights = mj_model.body_invweight0[bodies].sum(0)
         if mj_model.eq_type[equality] == mujoco.mjtEq.mjEQ_WELD:
+            # A weld ties rotation, too; connect ties a point only.
             parts = 2
         else:
             parts = 1
@@ -46,6 +48,7 @@ def kinds_of_ties(mj_model: mujoco.MjModel) -> np.ndarray:
 
 def _moves(mj_model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
     """Return whether a joint moves each body: those that none does are welded to the world, or to a mocap body."""
+    # A body without joints moves as the body that it is welded to.
     rigid = mj_model.body_weldid[bodies]
     return mj_model.body_dofnum[rigid] > 0
 
@@ -53,7 +56,7 @@ def _moves(mj_model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
 def stilling_of_ties(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
 ) -> Callable[[], None] | None:
-    """Return a launcher of it after MuJoCo Warp's rows, with arrays in their final place; None where none is idle."""
+    """Return a launcher for after MuJoCo Warp's rows, with arrays in their final place; None where none is idle."""
     m = warp_model
     d = warp_data_E
     kinds = kinds_of_ties(mj_model)
@@ -61,6 +64,7 @@ def stilling_of_ties(
         return None
     efc = d.efc
     table = wp.array(kinds, dtype=int, device=d.qpos.device)
+    # The Jacobian is one row of entries per world, or rows of all degrees of freedom.
     columns = [bool(m.is_sparse), m.nv, efc.J_rownnz, efc.J_rowadr, efc.J]
     inputs = [table, d.ne, efc.type, efc.id, efc.pos, *columns]
 
@@ -91,6 +95,7 @@ def still_ties(
     kind = kinds[efc_id[world, row]]
     if kind == NOT_A_TIE:
         return
+    # The largest entry of the row's Jacobian: 0 where no joint moves what the row ties.
     largest = float(0.0)  # noqa: UP018 (Warp: a variable that changes in a loop)
     if is_sparse:
         start = J_rowadr[world, row]
@@ -99,5 +104,6 @@ def still_ties(
     else:
         for dof in range(nv):
             largest = wp.max(largest, wp.abs(J[world, row, dof]))
+    # A stiffness of 0 makes the row exert nothing.
     if largest == 0.0 and (kind == FIXED_TIE or wp.abs(efc_pos[world, row]) < ROUNDING):
         efc_D[world, row] = 0.0

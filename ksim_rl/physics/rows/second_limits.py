@@ -91,7 +91,7 @@ def room_for_nonzeros(warp_model: mjw.Model, expanded: Collection[str], *, njmax
 def adding_of_second_limits(
     warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
-    """Return a launcher of it after MuJoCo Warp's rows, with arrays in their final place; None if no row lacks."""
+    """Return a launcher for after MuJoCo Warp's rows, with arrays in their final place; None if no row lacks."""
     m = warp_model
     d = warp_data_E
     bits = mjw.DisableBit

@@ -23,6 +23,7 @@ BODY_EQUALITIES = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 def tied_bodies(mj_model: mujoco.MjModel) -> np.ndarray:
     """Return the two bodies that each equality constraint ties, -1 for one that ties others, [neq, 2]."""
     bodies = np.stack([mj_model.eq_obj1id, mj_model.eq_obj2id], axis=-1)
+    # Ties between sites tie the bodies that carry them.
     of_sites = mj_model.eq_objtype == mujoco.mjtObj.mjOBJ_SITE
     bodies[of_sites] = mj_model.site_bodyid[bodies[of_sites]]
     bodies[~np.isin(mj_model.eq_type, BODY_EQUALITIES)] = -1
@@ -32,10 +33,11 @@ def tied_bodies(mj_model: mujoco.MjModel) -> np.ndarray:
 def weighing_of_ties(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
 ) -> Callable[[], None] | None:
-    """Return a launcher of it after MuJoCo Warp's rows, with arrays in their final place; None where they are right."""
+    """Return a launcher for after MuJoCo Warp's rows, with arrays in their final place; None where they are right."""
     m = warp_model
     d = warp_data_E
     bodies = tied_bodies(mj_model)
+    # Rows between bodies that carry joints themselves are right already.
     carriers = np.where(bodies < 0, -1, mj_model.body_weldid[bodies])
     bodies[(bodies == carriers).all(-1)] = -1
     if not m.is_sparse or (bodies < 0).all():
@@ -63,6 +65,7 @@ def weigh_ties(
     world, row = wp.tid()
     if row >= ne[world] or efc_type[world, row] != EQUALITY:
         return
+    # Ties whose weights are right have -1 in `bodies`.
     equality = efc_id[world, row]
     if bodies[equality][0] < 0:
         return
@@ -76,5 +79,6 @@ def weigh_ties(
     for side in range(2):
         present += body_invweight0[of_world, carriers[equality][side]][part]
         wanted += body_invweight0[of_world, bodies[equality][side]][part]
+    # Bodies that nothing moves have no weight to scale.
     if present > 0.0:
         efc_D[world, row] = 1.0 / wp.max(wanted / (present * efc_D[world, row]), MINVAL)

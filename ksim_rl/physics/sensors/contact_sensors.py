@@ -36,8 +36,10 @@ def read_by_us(mj_model: mujoco.MjModel) -> tuple[list[int], list[int]]:
     objects = list(MATCHED.values())
     if m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return [], []
+    # The kernel writes plain readings: delays and cutoffs are left to MuJoCo Warp.
     plain = ~m.sensor_history.any(-1) & (m.sensor_cutoff == 0.0)
     known = (m.sensor_intprm[:, None, :3] == (NET, STRONGEST)).all(-1).any(-1)
+    # A first object must be named; the second may be anything.
     known &= np.isin(m.sensor_objtype, objects[1:]) & np.isin(m.sensor_reftype, objects)
     of_contacts = plain & known & (m.sensor_type == kinds.mjSENS_CONTACT)
     accelerometers = plain & (m.sensor_type == kinds.mjSENS_ACCELEROMETER)
@@ -57,6 +59,7 @@ class ContactReadings:
         m = warp_model
         d = warp_data_E
         of_contacts, accelerometers = read_by_us(mj_model)
+        # The order of the kernel's outputs: contact sensors, then accelerometers.
         self.sensors = of_contacts + accelerometers
         own = {
             **vars(lists),
@@ -92,6 +95,7 @@ class ContactReadings:
 
     def list(self) -> None:
         """List each world's contacts, where no kernel of constraint rows has."""
+        # The collision pass was MuJoCo Warp's, which appends nothing.
         self._lists.are_appended = False
         self._lists.append()
         self._lists.order()
@@ -103,5 +107,6 @@ class ContactReadings:
 
     def rne_postconstraint(self, warp_model: mjw.Model) -> None:
         """Do the work of MuJoCo Warp's function of that name; only forces of equalities and tendons have no order."""
+        # Forces of contacts are summed in a fixed order, then passed on as applied forces.
         self._sum_forces()
         mjw.rne_postconstraint(warp_model, self._without_pool)

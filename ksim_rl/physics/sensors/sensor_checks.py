@@ -24,6 +24,7 @@ def check_sensors(mj_model: mujoco.MjModel) -> None:
     check_sites_of_meshes(mj_model)
     flags = mj_model.opt.disableflags
     bits = mujoco.mjtDisableBit
+    # Distances are measured in the collision pass.
     for sensor in np.flatnonzero(np.isin(mj_model.sensor_type, DISTANCES)):
         if flags & bits.mjDSBL_CONSTRAINT:
             raise ValueError(
@@ -91,6 +92,7 @@ def check_touched_sites(mj_model: mujoco.MjModel) -> None:
 def check_signed_distance_fields(mj_model: mujoco.MjModel) -> None:
     """Refuse signed distance fields of plugins that collide, and sensors of distances or contacts of any."""
     fields = np.flatnonzero(mj_model.geom_type == SDF)
+    # Geoms of a <pair> collide whatever their contype is.
     collides = (mj_model.geom_contype | mj_model.geom_conaffinity) != 0
     collides[mj_model.pair_geom1] = True
     collides[mj_model.pair_geom2] = True
@@ -132,6 +134,7 @@ def geoms_of(mj_model: mujoco.MjModel, kind: int, element: int) -> np.ndarray:
 
 
 def _is_below(mj_model: mujoco.MjModel, body: int, ancestor: int) -> bool:
+    # Children have higher numbers than their parents.
     while body > ancestor:
         body = int(mj_model.body_parentid[body])
     return body == ancestor

@@ -39,6 +39,7 @@ def contact_sensors_left(mj_model: mujoco.MjModel, read: list[int]) -> list[int]
     m = mj_model
     left = (m.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT) & ~m.sensor_history.any(-1)
     left[read] = False
+    # Contacts of flexes are in no list, so that MuJoCo Warp reads all of them.
     if m.nflex:
         return []
     return np.flatnonzero(left).tolist()
@@ -70,6 +71,7 @@ def mend_sensors(
         hooks.append(_bounding_of(bounded, warp_model, warp_data_E))
 
     def after_sensors(warp_model: mjw.Model, warp_data_E: mjw.Data, stage: int) -> None:
+        # Called after each stage; forces are known after the last.
         if stage == upstream.Stage.ACC:
             for hook in hooks:
                 hook()
@@ -92,6 +94,7 @@ def _reading_of(
 ) -> Callable[[], None]:
     m = warp_model
     d = warp_data_E
+    # With our own rows the lists exist already, and are in order.
     if lists is None:
         of_contacts = ContactLists(m, d)
     else:
