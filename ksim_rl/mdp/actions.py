@@ -60,7 +60,7 @@ class JointAction(ActionTerm):
         self, view: EnvView, action_EK: Float[Tensor, "E K"], field: str, scale: PerJoint
     ) -> Float[Tensor, "E K"]:
         """Return the action after clip, tanh, a scale (the field of that name) and the filter."""
-        # The clip comes first: it bounds what the policy gives, not the target.
+        # The clip comes first: it bounds the policy's output, not the target.
         if self.clip is not None:
             action_EK = clipped(action_EK, self.clip)
         if self.tanh:
@@ -181,6 +181,6 @@ class ActuatorAction(ActionTerm):
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         index = view.resolver.index("actuator", self.actuators)
         limits_K2 = view.ctrl_limits_L2[index]
-        # Clamped here, so that `ctrl` reads as what the actuator takes.
+        # Clamped here, so that `ctrl` reads as the control in force.
         ctrl_EK = torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1])
         view.world.ctrl_EL[:, index] = ctrl_EK

@@ -1,4 +1,4 @@
-"""These commands steer what walks, set the rhythm of a gait, and ask for poses of a root, joints, a body or site."""
+"""These commands steer robots, set the rhythm of a gait, and ask for poses of a root, joints, a body or site."""
 
 import math
 from abc import abstractmethod
@@ -27,7 +27,7 @@ class OfTarget(InFrame):
 
     Attributes:
         command: a position, with an orientation or not, such as `CartesianCommand` or `StartPoseCommand`, in `frame`.
-        body, site: what should be there; name one of the two.
+        body, site: the element that should be there; name one of the two.
     """
 
     command: str

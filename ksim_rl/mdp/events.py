@@ -126,7 +126,7 @@ class ResetHeading(OfEntity, EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         body = view.entity(self.entity)
-        # The default heading does not matter: only what is missing from the present one to the drawn one is
+        # The default heading does not matter: only the difference from the present one to the drawn one is
         # turned.
         turn_E = view.uniform(1, *self.heading_range)[:, 0] - body.heading_E
         nothing_E = torch.zeros_like(turn_E)

@@ -152,7 +152,7 @@ def distance_from_origin(view: EnvView, entity: str) -> Float[Tensor, " E"]:
 
 def mechanical_power(view: EnvView, joints: Patterns) -> Float[Tensor, " E"]:
     """Return the sum over joints of |effort (acceleration stage) * velocity|, W: braking costs as much as driving."""
-    # Without the absolute value, braking would pay back what driving has cost.
+    # Without the absolute value, braking would pay back the cost of driving.
     driven = view.joints(joints)
     return (driven.effort_EL * driven.vel_EL).abs().sum(-1)
 

@@ -1,4 +1,4 @@
-"""These metrics say how well and how smoothly commands are followed, what moving costs, and who succeeds.
+"""These metrics say how well and how smoothly commands are followed, the cost of moving, and who succeeds.
 
 Poses and velocities are of the current state, contacts and forces of the last physics substep (acceleration stage).
 """

@@ -1,4 +1,4 @@
-"""The left-right mirror image of what a policy reads and does is found here from the env's own terms."""
+"""The left-right mirror image of a policy's observations and actions is found here from the env's own terms."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""A reference motion is turned here into what an env would observe if the motion were played in it."""
+"""A reference motion is turned here into the observations of an env in which it is played."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class PlayMotion(OfMotion, EventTerm):
 def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L"]:
     """Return an observation group along a reference motion, one row per env step, on the env's device.
 
-    Envs of their own, on a plane, are put into the motion's states, and the group's terms and transforms compute what
+    Envs of their own, on a plane, are put into the motion's states, and the group's terms and transforms compute as
     they always do; noise is off. Terms that read more than positions and velocities (commands, actions, contacts,
     forces) read their values after a reset. The given env, around a `ManagerBasedRlEnv`, stays as it is; `file` is a
     motion as `view.motion` reads it, at least as long as an env step.

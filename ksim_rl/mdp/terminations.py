@@ -139,7 +139,7 @@ class NonFiniteState(TerminationTerm):
     """A joint acceleration, an actuator's force or a sensor's reading is not finite; acceleration stage.
 
     A world whose positions or velocities are not finite ends without this term, as `non_finite`; this one also catches
-    what has not reached them, such as a sensor that divides by zero.
+    faults that have not reached them, such as a sensor that divides by zero.
     """
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:

@@ -146,7 +146,7 @@ def _rows(mj_model: mujoco.MjModel, kind: str, parts: list[_Part]) -> Iterator[l
     in_world = 0
     elsewhere = 0
     if kind in ("geom", "site"):
-        # A model lists what stands in the world itself first, of all parts.
+        # A model lists elements of the world itself first, of all parts.
         elsewhere = int(np.sum(getattr(mj_model, f"{kind}_bodyid") == 0))
     # Body 0 is the world's own.
     elif kind == "body":

@@ -1,4 +1,4 @@
-"""Edits the keyframes of specs: what a file leaves out of them, where entities are placed, and joining."""
+"""Edits the keyframes of specs: completes them, moves them with placed entities, and joins them."""
 
 from collections.abc import Collection, Sequence
 
@@ -44,7 +44,7 @@ def complete_keyframes(spec: mujoco.MjSpec) -> None:
 
 
 def compile_keyframes(spec: mujoco.MjSpec) -> None:
-    """Compile a spec, so that its keyframes lose what belongs to elements that are deleted from it, and nothing else.
+    """Compile a spec, so that its keyframes lose the numbers of elements that are deleted from it, and no others.
 
     Only of a spec that was compiled MuJoCo knows which number of a keyframe is whose.
     """
@@ -70,7 +70,7 @@ def let_new_servos_hold(spec: mujoco.MjSpec, new: Collection[str]) -> None:
 def move_keyframe(
     key: mujoco.MjsKey, mj_model: mujoco.MjModel, pos_3: Sequence[float], quat_4: Sequence[float]
 ) -> None:
-    """Move what a keyframe says of free joints and mocap bodies by a rigid transform: m, and a unit quaternion.
+    """Move a keyframe's poses of free joints and mocap bodies by a rigid transform: m, and a unit quaternion.
 
     What it leaves out follows from the bodies, which have moved.
     """

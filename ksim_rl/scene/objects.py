@@ -23,11 +23,13 @@ class Box(Checked):
         """Return a new spec of the model."""
         spec = mujoco.MjSpec()
         spec.modelname = "box"
+        # Half an edge up, so that it rests on the plane.
         body = spec.worldbody.add_body(name="box", pos=[0.0, 0.0, self.size[2] / 2])
         body.add_freejoint(name="box")
         body.add_geom(
             name="box",
             type=mujoco.mjtGeom.mjGEOM_BOX,
+            # MuJoCo takes half edges.
             size=[edge / 2 for edge in self.size],
             mass=self.mass,
             friction=list(self.friction),

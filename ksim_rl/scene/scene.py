@@ -64,7 +64,7 @@ class Robot(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class MjcfRobot(Checked):
-    """A robot, or a whole scene, from what `physics.load_spec` takes: an MJCF file, an XML string or a menagerie name.
+    """A robot or a whole scene from a source for `physics.load_spec`: an MJCF file, an XML string or a menagerie name.
 
     `actuators` drive joints in place of the model's own actuators of these joints.
     """

@@ -18,7 +18,7 @@ class ViewerCfg(Checked):
 
     body: str | None = None
     lookat: tuple[float, float, float] = (0.0, 0.0, 0.5)
-    distance: Positive = 3.0  # m from what it looks at
+    distance: Positive = 3.0  # m from the body or point that it looks at
     elevation: Annotated[float, Within(low=-90.0, high=90.0)] = -20.0  # degrees, as in MuJoCo's free camera
     azimuth: Annotated[float, Within(low=-360.0, high=360.0)] = 120.0
     width: Count = 640  # pixels
@@ -29,6 +29,7 @@ class ViewerCfg(Checked):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        # Refused here, where the field can be named, and not at the first picture.
         for index, pattern in enumerate(self.draw):
             with naming(f"draw[{index}]={pattern!r}: no regular expression", re.error):
                 re.compile(pattern)

@@ -1,4 +1,4 @@
-"""The models of suites come from packages of others: where those lie, and what of their models is not drawn."""
+"""The models of suites come from packages of others: where those lie, and which of their elements are not drawn."""
 
 from importlib.util import find_spec
 from pathlib import Path

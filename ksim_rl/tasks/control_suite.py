@@ -200,7 +200,7 @@ class PendulumReward(RewardTerm):
     """up * (1 + 4 slow) / 5, in [0, 1]; position and velocity stage.
 
     "up" grows linearly with the cosine, to 1 at 8 degrees from upright; "slow" is 1 at rest and 0.1 at 5 rad/s, so that
-    turning round and round gives less than half of what swinging does.
+    turning round and round gives less than half as much as swinging does.
     """
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

@@ -1,6 +1,6 @@
 """All velocity tasks share this module: a legged robot follows a planar velocity command.
 
-A task's module holds the figures of its robot and puts the parts together. Weights, noise and pushes are those of mjlab
+A task's module holds the figures of its robot and puts the parts together. Weights, noise and pushes are from mjlab
 1.6.0's velocity tasks, so that both can be compared on the same work, and so are the training settings but for two (see
 `training`). Two more things are ours: the actor's joint positions are a term of their own (`joint_pos_biased`), because
 groups share terms by name; and the encoders' bias reaches that observation only, not the servo targets.
@@ -410,9 +410,9 @@ def fast_sac_training(*, symmetry: Literal["none", "augment"] = "augment") -> Tr
     """Return the training settings of FastSAC: 4 steps of 4096 envs and 48 gradient steps in turn.
 
     Rewards reach 0.12 per step, so that returns lie within the atoms: 0.12 / (1 - 0.97) = 4. Actions reach twice the
-    scale of the action term (0.75 rad on Go1), which is about what policies of PPO use. The target entropy is that of a
+    scale of the action term (0.75 rad on Go1), which is about as much as policies of PPO use. The target entropy fits a
     standard deviation of 0.09 of them: with the paper's 0 (arXiv 2512.01996), one of 0.24, the noise alone costs Go1
-    half of what it can get for its turning rate, and G1 nearly all. Critics have two thirds of the paper's width and
+    half of its reward for the turning rate, and G1 nearly all. Critics have two thirds of the paper's width and
     half its atoms; with such an actor one seed of five never walked.
     """
     objective = FastSACCfg(
@@ -424,12 +424,12 @@ def fast_sac_training(*, symmetry: Literal["none", "augment"] = "augment") -> Tr
 
 
 def fast_td3_training() -> TrainingCfg:
-    """Return the training settings of FastTD3, with noise near that of the paper for quadrupeds (arXiv 2505.22642)."""
+    """Return the training settings of FastTD3, with noise near the paper's for quadrupeds (arXiv 2505.22642)."""
     objective = FastTD3Cfg(target_noise=0.1, autocast=True)
     return _off_policy(objective=objective, data=_REPLAY, actor=fast_td3.ACTOR, critic=fast_td3.CRITIC)
 
 
-# 2.2 GB for Go1; without it a resumed run fills the replay anew.
+# 2.2 GB for Go1; without it a resumed run fills the replay again.
 _REPLAY = dataclasses.replace(MANY_ENVS, save_replay=False)
 
 

@@ -118,7 +118,7 @@ class Contact(OfContacts, ObservationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class ContactForce(OfSensor, FramedObservation, frame="world"):
-    """Net contact forces, N, [E, 3N]; acceleration stage. MuJoCo's sign: what weighs on the ground reads negative z."""
+    """Net contact forces, N, [E, 3N]; acceleration stage. MuJoCo's sign: weight on the ground reads negative z."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.contact(self.sensor).force_EN3)

@@ -29,8 +29,8 @@ class EncodedJoints(OfJoints, ObservationTerm):
     biased: bool = False
 
     def read(self, view: EnvView, pos_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
-        """Return what encoders read at these positions of the joints."""
-        # Biased readings are what the real robot's encoders would give.
+        """Return the encoders' readings at these positions of the joints."""
+        # A real robot's policy sees its encoders' readings, with their bias.
         if self.biased:
             return pos_EL + view.joints(self.joints).encoder_bias_EL
         return pos_EL
@@ -282,7 +282,7 @@ class HeightScan(OfEntity, ObservationTerm):
 
     The grid is centred on the root and turns with its yaw only. Points run along x (forward) first, from back to front,
     and these rows along y, from right to left. Heights are of the terrain itself, exactly and without casting
-    rays: of what else stands there nothing is seen (`scene.sensors` with a `RayCaster` does). Ground that is higher
+    rays: nothing else that stands there is seen (`scene.sensors` with a `RayCaster` does). Ground that is higher
     reads lower; on flat ground all points read root height - offset. `size` has the grid's edges along x and y, m.
     """
 

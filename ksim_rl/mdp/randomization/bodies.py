@@ -104,7 +104,7 @@ class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shi
 
     The body's mass distribution is deformed: J = U J0 U^T for its pseudo-inertia matrix J0 [4, 4] in the frame of
     its principal axes, with U = exp(alpha) [[exp(d1), s12, s13, t1], [0, exp(d2), s23, t2], [0, 0, exp(d3), t3],
-    [0, 0, 0, 1]]. J stays positive definite for any parameters, which is what makes an inertia physical (Rucker and
+    [0, 0, 0, 1]]. J stays positive definite for any parameters, which makes an inertia physical (Rucker and
     Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE RA-L 7(2), 2022). All zero changes nothing.
     """
 

@@ -1,4 +1,4 @@
-"""These events draw what joints, tendons and actuators are made of, where joints stand, and how they are read."""
+"""These events draw properties of joints, tendons and actuators, where joints stand, and how they are read."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -118,7 +118,7 @@ class RandomizeTendonArmature(RandomizeTendonField, field="tendon_armature"):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeDefaultJointPos(OfJoints, RandomizeNumber, operation="add"):
-    """The default pose, rad or m: what resets, position actions and relative joint positions start from.
+    """The default pose, rad or m, from which resets, position actions and relative joint positions start.
 
     The model's own value is from its first keyframe or, without one, `qpos0`. In mode "reset" let it run before the
     event that resets the joints.
@@ -222,7 +222,7 @@ class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
         # Back to before the gear.
         value_EN = _times(value_EN, 1.0 / (gear * gear))
         write_entries(view.field("actuator_biasprm"), servos, (column,), mask_E, -value_EN[..., None])
-        # The gain and the constant of what holds a position, or a velocity alone, are in proportion to it.
+        # The gain and the constant of a position servo, or of a velocity servo, are in proportion to it.
         leads = [i for i, servo in enumerate(servos) if _leading_column(model, servo) == column]
         if not leads:
             return
@@ -240,14 +240,14 @@ class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
 class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
     """Largest effort of the actuators of joints, N m or N behind the gear: one draw for both directions.
 
-    It changes what holds the effort: the actuator's force range, the joint's, both, or an explicit actuator's
+    It changes all that limits the effort: the actuator's force range, the joint's, both, or an explicit actuator's
     `effort_limit`, which stays at 0 or above.
     """
 
     per_world_fields: ClassVar[tuple[str, ...]] = ("actuator_forcerange", "jnt_actfrcrange")
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        # A factor or an offset cannot limit what has no limit: there, the limit of the joint itself may be meant.
+        # A factor or an offset cannot limit a joint without a limit: there, the limit of the joint itself may be meant.
         finite = self.operation != "abs"
         drawn_EN, builtin = self._draw_explicit(view, mask_E, "effort_limit", self.ranges, finite)
         model = view.world.mj_model
@@ -317,7 +317,7 @@ def _leading_column(mj_model: mujoco.MjModel, actuator: int) -> int:
 
 
 def _times(value_EN: Float[Tensor, "E N"], factor_N: np.ndarray) -> Float[Tensor, "E N"]:
-    """Return the products; factors of 1, those of plain servos, cost nothing."""
+    """Return the products; factors of 1, as of plain servos, cost nothing."""
     if np.all(factor_N == 1.0):
         return value_EN
     return value_EN * array_constant(factor_N, value_EN.device)

@@ -1,4 +1,4 @@
-"""These events draw what cameras see: their lenses, lights, and colours of materials and geoms."""
+"""These events draw the looks of a scene: lenses of cameras, lights, and colours of materials and geoms."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""These rewards rate what joints, actuators and actions do, left-right symmetry, and whether an episode goes on."""
+"""These rewards rate joints, actuators and actions, left-right symmetry, and whether an episode goes on."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -200,5 +200,5 @@ class ExplicitActuator(JointActuator, is_explicit=True):
         """Make a motor whose control is its effort; the law holds the limit, which may differ between worlds."""
         super().configure(actuator, joint)
         actuator.set_to_motor()
-        # The law clamps by a buffer; a fixed range in the model would hide what it allows.
+        # The law clamps by a buffer; a fixed range in the model would cut it once more.
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE

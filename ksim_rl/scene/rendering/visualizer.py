@@ -1,4 +1,4 @@
-"""Draws what terms show for debugging into a MuJoCo scene."""
+"""Draws the debug marks of terms into a MuJoCo scene."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ Rgba = tuple[float, float, float, float]
 class DebugVisualizer:
     """What commands, rewards and sensors draw with: m, world frame; colors in [0, 1].
 
-    It draws into a `mujoco.MjvScene`; what exceeds the scene's capacity is refused, not dropped.
+    It draws into a `mujoco.MjvScene`; marks beyond the scene's capacity are refused, not dropped.
     """
 
     def __init__(

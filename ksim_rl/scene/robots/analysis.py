@@ -179,14 +179,14 @@ TASK = velocity.VelocityTask.for_robot({name})
 
 
 def analyse(source: Source, *, pose: str | None = None) -> RobotAnalysis:
-    """Analyse a legged robot from what `physics.load_spec` takes: a file, a menagerie name, XML or a spec.
+    """Analyse a legged robot from a source for `physics.load_spec`: a file, a menagerie name, XML or a spec.
 
     Keyframes and the model's own pose, "qpos0", are tried in this order, but for those in which the robot lies; the
     first from which it stands is taken, or else that from which it stands longest. `pose` names the one to take.
 
     Gains follow from armature and `FREQUENCY`, for motors and position servos alike: a `PositionActuator` is a torque
-    motor under PD control. They are raised where the load would bend a joint by more than `MOST_SAG`, to twice what
-    keeps all that a joint carries from toppling over it, and in the legs until the robot stands.
+    motor under PD control. They are raised where the load would bend a joint by more than `MOST_SAG`, to twice the
+    stiffness that keeps a joint's load from toppling over it, and in the legs until the robot stands.
     """
     model = read_model(source)
     found: list[RobotAnalysis] = []
@@ -346,7 +346,7 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
 def _robot(
     model: StrangersModel, data: mujoco.MjData, anatomy: Anatomy, servos: dict[int, dict[str, float]]
 ) -> ModelRobot:
-    """Return the robot in the pose of `data` with servos by joint; what their hulls touch there is left to pass."""
+    """Return the robot in the pose of `data` with servos by joint; bodies whose hulls touch there may pass."""
     mj_model = data.model
     every_joint = scalar_joint_ids(mj_model)
     root_at = int(mj_model.jnt_qposadr[mj_model.jnt_type.argmin()])
@@ -410,7 +410,7 @@ def _robot(
 def _drive(
     mj_model: mujoco.MjModel, joint: int, *, most: float
 ) -> tuple[str, tuple[float, float], float | None]:
-    """Return what drives a joint in the model, its stiffness and damping, and the least of all limits of its effort.
+    """Return a joint's kind of drive in the model, stiffness and damping, and the least of all limits of its effort.
 
     A limit above `most` is no limit.
     """

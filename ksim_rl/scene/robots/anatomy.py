@@ -335,7 +335,7 @@ def _about(axis: int, angle: float) -> np.ndarray:
 
 
 def _sole(points_N3: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the centres and the radius, m, of what treads in place of a sole with these lowest points, world frame."""
+    """Return centres and radius, m, of the balls in place of a sole with these lowest points, world frame."""
     x0, y0, z = points_N3.min(0)
     x1, y1, _ = points_N3.max(0)
     length = x1 - x0

@@ -13,6 +13,7 @@ from ksim_rl.scene.actuators import Actuator, PositionActuator
 from ksim_rl.scene.robots.edit import CollisionGeom, Site, capsule, sphere, spread
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 
+# The model's order: head, arms, waist, legs, left before right.
 SIDES = ("Left", "Right")
 _LEG = ("Hip_Pitch", "Hip_Roll", "Hip_Yaw", "Knee_Pitch", "Ankle_Pitch", "Ankle_Roll")
 _ARM = ("Shoulder_Pitch", "Shoulder_Roll", "Elbow_Pitch", "Elbow_Yaw")
@@ -25,6 +26,7 @@ JOINTS = (
 )
 
 
+# One armature for all motors, kg m^2.
 def _servo(joints: tuple[str, ...], limit: float, *, kp: float, kd: float) -> PositionActuator:
     return PositionActuator(joints=joints, effort_limit=limit, armature=0.005, stiffness=kp, damping=kd)
 
@@ -54,8 +56,10 @@ _SMOOTH: dict[str, Any] = {"condim": 1, "priority": 1}
 
 
 def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
+    # The y axis points left, so that offsets to the side change sign with it.
     y = 1.0 if side == "Left" else -1.0
     low = side.lower()
+    # The arm's third link bears the upper arm.
     upper_arm = f"A{side[0]}3"
     shank = f"Shank_{side}"
     soles = tuple(
@@ -102,6 +106,7 @@ class BoosterT1(MenagerieRobot, name="t1", root_body="Trunk", joint_names=JOINTS
         sphere("head_collision", "H2", 0.08, (0.01, 0.0, 0.11), **_SMOOTH),
         *(geom for side in SIDES for geom in _side_geoms(side)),
     )
+    # At the origin of the trunk's frame.
     sites: ClassVar[tuple[Site, ...]] = (
         Site(name="imu", body="Trunk"),
         *(

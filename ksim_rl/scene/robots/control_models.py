@@ -22,6 +22,7 @@ class ShippedModel(Checked):
 
     def spec(self) -> mujoco.MjSpec:
         """Return a new spec of the model."""
+        # As text: the package may lie in an archive, where a model has no path.
         return load_spec(files("ksim_rl.scene.robots").joinpath(f"{self.name}.xml").read_text())
 
 
@@ -84,6 +85,7 @@ class Walker(ShippedModel, name="walker"):
     def spec(self) -> mujoco.MjSpec:
         """Return a new spec of the model."""
         spec = super().spec()
+        # Without actuators this changes nothing.
         set_actuators(spec, self.actuators)
         return spec
 

@@ -11,6 +11,7 @@ from typing import ClassVar
 from ksim_rl.checked import Share
 from ksim_rl.scene.robots.control_models import ShippedModel
 
+# Order of the joints in policies: front before rear, left before right.
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 SIDES = ("left", "right")
 _ARM = ("shoulder_pitch", "shoulder_roll", "elbow")
@@ -29,6 +30,7 @@ class Quadruped(ShippedModel, name="quadruped"):
         f"{leg}_{kind}" for leg in LEGS for kind in ("roll", "hip", "knee")
     )
     foot_geoms: ClassVar[tuple[str, ...]] = tuple(f"{leg}_foot" for leg in LEGS)
+    # Geom and site of a foot have the same name.
     foot_sites: ClassVar[tuple[str, ...]] = foot_geoms
 
 
@@ -47,6 +49,7 @@ class Humanoid(ShippedModel, name="humanoid"):
         *(f"{side}_{kind}" for side in SIDES for kind in _LEG),
     )
     foot_bodies: ClassVar[tuple[str, ...]] = tuple(f"{side}_foot" for side in SIDES)
+    # Two geoms per foot, along its edges.
     foot_geoms: ClassVar[tuple[str, ...]] = tuple(
         f"{side}_foot_{edge}" for side in SIDES for edge in ("inner", "outer")
     )

@@ -47,14 +47,18 @@ GO1_SERVOS = (
     ),
 )
 # A unit action moves the target by a quarter of the deflection at which the servo saturates (effort_limit / kp).
+# Keys match all four legs.
 GO1_ACTION_SCALE = {".*_(hip|thigh)_joint": 0.37275, ".*_calf_joint": 0.2485}
+# Six dimensions: feet also resist spinning and rolling; their priority decides on any ground.
 _GO1_FOOT: Any = {"condim": 6, "solref": (0.01, 1.0), "priority": 1, "friction": (1.0, 0.005, 0.0005)}
 
 
 def _go1_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
+    # The y axis points left, so that offsets to the side change sign with it.
     y = 1.0 if leg.endswith("L") else -1.0
     thigh = f"{leg}_thigh"
     calf = f"{leg}_calf"
+    # The thigh bends backwards: three capsules follow its shape.
     return (
         capsule(f"{leg}_hip_collision", f"{leg}_hip", 0.05, (0, 0.02 * y, 0, 0, 0.04 * y, 0), **_GO1_SMOOTH),
         capsule(f"{thigh}_collision1", thigh, 0.015, (-0.02, 0, 0, -0.02, 0, -0.16), **_GO1_SMOOTH),
@@ -84,6 +88,7 @@ class UnitreeGo1(UnitreeQuadruped, name="go1", root_body="trunk", model="unitree
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh, editable model of the robot alone, whose free joint has a name."""
         spec = super().spec()
+        # The menagerie leaves the free joint without a name, by which terms would look it up.
         for joint in spec.joints:
             if joint.type == mujoco.mjtJoint.mjJNT_FREE:
                 joint.name = "floating_base_joint"
@@ -128,5 +133,6 @@ class UnitreeGo2(UnitreeQuadruped, name="go2", root_body="base", model="unitree_
     )
     sites: ClassVar[tuple[Site, ...]] = (
         Site(name="imu", body="base", pos=(-0.02557, 0.0, 0.04232)),
+        # Foot sites are the centres of the feet's balls.
         *(Site(name=leg, body=f"{leg}_calf", pos=_GO2_FOOT) for leg in LEGS),
     )

@@ -1,4 +1,4 @@
-"""Senses contact: what geoms, bodies or whole limbs touch, how hard, and since when."""
+"""Senses the contacts of geoms, bodies or whole limbs: whether they touch, how hard, and since when."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -46,7 +46,7 @@ class Sensor(Checked, ABC):
 
     @abstractmethod
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
-        """Add the sensor's elements to the scene's spec; a ValueError if the model lacks what the sensor names."""
+        """Add the sensor's elements to the scene's spec; a ValueError if the model lacks an element that it names."""
 
     @abstractmethod
     def track(self, name: str, view: WorldView) -> SensorTracker:

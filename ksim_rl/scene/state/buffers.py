@@ -108,10 +108,10 @@ class Buffers:
     ) -> Shaped[Tensor, " E *shape"]:
         """Return the buffer `name`; the first call makes it, later ones must agree in shape and dtype.
 
-        `keep` leaves it alone when rows reset; `initial` (read each time, so it may change) is what it holds at first
+        `keep` leaves it alone when rows reset; `initial` (read each time, so it may change) is its value at first
         and after a reset, else zeros. `owner` is the scope of the one part that writes it, `ENV` for a manager, and
-        empty for what events and actions write for all to read. A ValueError where it differs from what exists, or is
-        new after construction.
+        empty for buffers that events and actions write for all to read. A ValueError where it differs from the existing
+        one, or is new after construction.
         """
         buffer = self._buffers.get(name)
         # The first call makes it, while the env is constructed.
@@ -195,7 +195,7 @@ class SharedValues:
     ) -> Float[Tensor, "*shape"]:
         """Return the tensor `name`, always the same, which starts at `initial`; a ValueError if it is new too late.
 
-        `owner` is the scope of the one part that writes it; empty for what curricula write.
+        `owner` is the scope of the one part that writes it; empty for values that curricula write.
         """
         tensor = self._tensors.get(name)
         if tensor is None:

@@ -1,4 +1,4 @@
-"""Says in what state rows start before events draw: all that a model's first keyframe holds."""
+"""Says in which state rows start before events draw: all that a model's first keyframe holds."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ class Held(NamedTuple):
 
 
 def held(mj_model: mujoco.MjModel, qpos_L: np.ndarray) -> Held:
-    """Return what holds a pose: controls of the servos of joints, and the activations of all servos; other zeros."""
+    """Return controls of the servos of joints, and activations of all servos, that hold a pose; other zeros."""
     data = mujoco.MjData(mj_model)
     data.qpos[:] = qpos_L
     # Lengths of actuators at the pose need positions only, no velocities or forces.

@@ -1,4 +1,4 @@
-"""Says what the control of a joint's actuator means: the target at the joint that it stands for.
+"""Tells the meaning of the control of a joint's actuator: the target at the joint that it stands for.
 
 MuJoCo's actuator on a hinge or slide with gear r has length r q, and exerts the effort r (g u + b0 + b1 r q + b2 r q')
 on the joint, with its gain g, its bias (b0, b1, b2), and its control u (behind dynamics: its activation). The control
@@ -44,7 +44,7 @@ class JointControl(NamedTuple):
 
 
 def joint_control(mj_model: mujoco.MjModel, actuator: int) -> JointControl:
-    """Return what the control of an actuator of a hinge or slide means."""
+    """Return the meaning of the control of an actuator of a hinge or slide."""
     return _control(
         gear=float(mj_model.actuator_gear[actuator, 0]),
         gain=(int(mj_model.actuator_gaintype[actuator]), mj_model.actuator_gainprm[actuator]),
@@ -54,7 +54,7 @@ def joint_control(mj_model: mujoco.MjModel, actuator: int) -> JointControl:
 
 
 def control_of_spec(actuator: mujoco.MjsActuator) -> JointControl:
-    """Return what the control of an actuator means that is not compiled yet."""
+    """Return the meaning of the control of an actuator that is not compiled yet."""
     return _control(
         gear=float(actuator.gear[0]),
         gain=(int(actuator.gaintype), np.asarray(actuator.gainprm)),
@@ -66,7 +66,7 @@ def control_of_spec(actuator: mujoco.MjsActuator) -> JointControl:
 def _control(
     *, gear: float, gain: tuple[int, np.ndarray], bias: tuple[int, np.ndarray], dyntype: int
 ) -> JointControl:
-    """Return what a control means; a bias against the position makes a position servo, one against the velocity alone
+    """Return the meaning of a control; a bias against the position makes a position servo, against the velocity alone
     a velocity servo, and an integrator before a position servo makes its control a velocity.
     """
     gaintype, gainprm = gain

@@ -77,7 +77,7 @@ class _Route(NamedTuple):
 
 
 class JointTargets:
-    """Targets of all hinges and slides, in the model's order; rows that reset are asked for what the keyframe asks for.
+    """Targets of all hinges and slides, in the model's order; rows that reset take the targets of the keyframe.
 
     A target of a built-in actuator becomes its control (`JointControl`); a motor model reads it before each substep.
     An actuator takes the kind of target that its gains make of its control, so that a position never ends up as the
@@ -163,12 +163,12 @@ class JointTargets:
             value_EK = torch.clamp(value_EK, route.limits_K2[:, 0], route.limits_K2[:, 1])
         # All joints keep their targets here, also for laws that read them before each substep.
         self._buffers[kind][:, route.joints] = value_EK
-        # Built-in actuators have their controls written at once, in their own columns.
+        # Built-in actuators have their controls written here, in their own columns.
         if route.ctrl is not None:
             self._world.ctrl_EL[:, route.ctrl] = route.line.of(value_EK[:, route.columns])
 
     def limits(self, kind: TargetKind, patterns: Patterns) -> Float[Tensor, "K 2"] | None:
-        """Return what targets of joints are clamped to, (low, high); None if nothing limits them."""
+        """Return the limits that targets of joints are clamped to, (low, high); None if nothing limits them."""
         return self._route_of(kind, patterns).limits_K2
 
     def check_no_law(self, actuators: Sequence[int]) -> None:

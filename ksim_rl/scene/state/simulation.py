@@ -1,4 +1,4 @@
-"""Drives the worlds of an env: it knows when the state changes, whose turn it is, and what is kept."""
+"""Drives the worlds of an env: it knows when the state changes, whose turn it is, and which tensors are kept."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -21,8 +21,8 @@ UNWATCHED: AbstractContextManager[Mapping[str, Kept]] = nullcontext({})
 class Simulation:
     """The worlds with their clocks, buffers and draws, for whoever drives them; terms read a `WorldView` of it.
 
-    A moment has two phases: state is written through masks (`changed`), then the world refreshes what derives from it
-    (`refreshed`); what derives cannot be read in between. A term runs inside `scope`, which names its buffers.
+    A moment has two phases: state is written through masks (`changed`), then the world refreshes derived
+    quantities (`refreshed`), which cannot be read in between. A term runs inside `scope`, which names its buffers.
 
     Attributes:
         ground: the ground that heights are measured from.
@@ -79,7 +79,7 @@ class Simulation:
         return self._caches[-1]
 
     def derived(self) -> World:
-        """Return the world for reading what derives from the state; a RuntimeError if a write has made that stale."""
+        """Return the world for reading derived quantities; a RuntimeError if a write has made them stale."""
         # A stale quantity would be wrong in silence, and only in the rows that were written.
         if self._is_stale:
             raise RuntimeError(
@@ -89,17 +89,17 @@ class Simulation:
         return self.world
 
     def forget(self) -> None:
-        """Forget computed quantities, whether or not what derives from the state is current."""
+        """Forget computed quantities, whether or not derived ones of the world are current."""
         for cache in self._caches:
             cache.clear()
 
     def refreshed(self) -> None:
-        """Forget computed quantities: the state has changed, and the world has refreshed what derives from it."""
+        """Forget computed quantities: the state has changed, and the world has refreshed its derived quantities."""
         self.forget()
         self._is_stale = False
 
     def changed(self) -> None:
-        """Forget computed quantities: the state has changed, and what derives from it has not followed yet."""
+        """Forget computed quantities: the state has changed, and derived quantities have not followed yet."""
         self.forget()
         self._is_stale = True
 
@@ -154,8 +154,8 @@ class Simulation:
         """Run a term under a name, which separates its buffers and draws from others' and stands before its errors.
 
         `counter` keys the draws (the step count unless given), and `draws` tells apart the moments of one term whose
-        counters may coincide. `part` is what runs, if what it writes is to be watched, and `mask_E` the rows that it
-        may write. Gives the tensors that the part has written of its own, by name, where it was watched (see `watch`).
+        counters may coincide. `part` is the running term, if its writes are to be watched, and `mask_E` the rows it may
+        write. Gives the tensors that the part has written of its own, by name, where it was watched (see `watch`).
         """
         # Buffers are named by the term, draws by the term and the moment.
         self._scope = name
@@ -186,7 +186,7 @@ class Simulation:
     def watch(
         self, part: object, mask_E: Bool[Tensor, " E"] | None
     ) -> AbstractContextManager[Mapping[str, Kept]]:
-        """Watch what a part writes while it runs under `reader`; whoever drives terms may refuse some of it.
+        """Watch a part's writes while it runs under `reader`; whoever drives terms may refuse some of it.
 
         Here nothing is watched.
         """

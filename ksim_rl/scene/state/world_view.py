@@ -228,7 +228,7 @@ class WorldView:
         return parts
 
     def derived(self) -> World:
-        """Return the world for reading what derives from the state: `Simulation.derived`."""
+        """Return the world for reading derived quantities: `Simulation.derived`."""
         return self._simulation.derived()
 
     def motion(self, file: str) -> ReferenceMotion:

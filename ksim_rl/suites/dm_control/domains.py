@@ -1,6 +1,6 @@
 """The domains of the DeepMind Control Suite: their time steps, observations, starts and targets.
 
-Tassa et al., "DeepMind Control Suite" (2018), and the package `dm_control`; what MuJoCo Playground changes stands in
+Tassa et al., "DeepMind Control Suite" (2018), and the package `dm_control`; changes by MuJoCo Playground stand in
 `playground` of each domain, and in docs/suites.md.
 """
 

@@ -91,7 +91,7 @@ def _add_links(spec: mujoco.MjSpec, count: int) -> None:
 
 
 def _change(spec: mujoco.MjSpec, domain: str) -> None:
-    """Change what MuJoCo Playground's own copies of the files have otherwise and no option of `SimCfg` says."""
+    """Make the changes of MuJoCo Playground's copies of the files that no option of `SimCfg` makes."""
     # Playground's integrator treats damping explicitly.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     geoms = {geom.name: geom for geom in spec.geoms}

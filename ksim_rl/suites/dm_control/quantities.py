@@ -1,4 +1,4 @@
-"""These terms read what the DeepMind Control Suite observes and rewards; its rewards are products of tolerances.
+"""These terms are the observations and rewards of the DeepMind Control Suite; its rewards are products of tolerances.
 
 Directions are named as in dm_control: the axes "xz" of a matrix are the x component of a body's z axis.
 """

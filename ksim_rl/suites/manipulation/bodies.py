@@ -64,14 +64,17 @@ class PlaceFreeBody(EventTerm):
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         model = view.world.mj_model
+        # Where the body's free joint starts in qpos: position, then quaternion.
         start = int(model.jnt_qposadr[model.body_jntadr[view.resolver.one("body", self.body)]])
         low, high = zip(*(self.offset.get(axis, (0.0, 0.0)) for axis in AXES), strict=True)
         default_7 = view.default_qpos_L[start : start + 7]
+        # About its default place, in the world's axes.
         pos_E3 = default_7[:3] + view.uniform(3, constant(low, view.device), constant(high, view.device))
         quat_E4 = default_7[3:].expand(len(pos_E3), 4)
         if self.orientation == "uniform":
             # Independent normals favour no direction.
             quat_E4 = torch.nn.functional.normalize(view.normal(4), dim=-1)
+        # The state is written as a whole: all other columns keep their values.
         before_EL = view.world.qpos_EL[:, :start]
         after_EL = view.world.qpos_EL[:, start + 7 :]
         view.write_qpos(mask_E, torch.cat((before_EL, pos_E3, quat_E4, after_EL), dim=-1))
@@ -87,6 +90,7 @@ class LeavesBox(TerminationTerm):
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         pos_E3 = view.body(self.body).pos_EL
+        # Axes that are left out have no bound.
         low_3 = constant([self.low.get(axis, -torch.inf) for axis in AXES], view.device)
         high_3 = constant([self.high.get(axis, torch.inf) for axis in AXES], view.device)
         return ((pos_E3 < low_3) | (pos_E3 > high_3)).any(-1)

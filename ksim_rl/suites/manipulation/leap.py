@@ -157,7 +157,7 @@ class ActuatorPower(RewardTerm):
 
 
 def leap_cube_reorient() -> ManagerBasedRlEnvCfg:
-    """Return the config: 20 Hz control, episodes of 1000 steps, rewards per second but for that of reaching a goal."""
+    """Return the config: 20 Hz control, episodes of 1000 steps, rewards per second but for reaching a goal."""
     pos = mdp.JointPos(joints=HAND)
     offset = Offset(ends=("site:grasp_site",), start=f"com:{CUBE}")
     turn = GoalTurn()
