@@ -27,7 +27,7 @@ class TooManyEnvsError(ValueError):
 def memory_for(
     num_envs: int, device: torch.device, first_that_fits: Callable[[Iterable[int]], int | None] | None = None
 ) -> Iterator[None]:
-    """Turn an allocation that fails in this block into a TooManyEnvsError: what an env takes, and how many may fit.
+    """Turn an allocation that fails in this block into a TooManyEnvsError: memory of an env, and how many may fit.
 
     `first_that_fits` tries numbers of envs, half of `num_envs` and so on, after what the block built is given back.
     """
@@ -71,7 +71,7 @@ def memory_for(
 
 
 def _give_back(error: BaseException, device: torch.device) -> None:
-    """Free what was built where `error` and its causes came from: their frames hold it."""
+    """Free objects that the frames of `error` and its causes hold."""
     # A list that grows in the loop: causes have causes.
     causes: list[BaseException | None] = [error]
     for cause in causes:

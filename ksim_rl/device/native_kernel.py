@@ -64,6 +64,7 @@ class NativeKernel:
         # Sizes that come only once, such as a last batch, would pile up.
         if len(self._recorded) >= MAX_RECORDED:
             self._recorded.clear()
+        # Recorded without running: the arguments are still empty.
         with warp_scope(device):
             launch = wp.launch(
                 self._kernel,

@@ -32,6 +32,7 @@ def arguments_of(*fields: tuple[type | str, str]) -> dict[str, type | str]:
 
     A type is `int`, `float` or the name of one of Warp's.
     """
+    # The order of the struct's fields is the order of these names.
     return {name: kind for kind, names in fields for name in names.split()}
 
 

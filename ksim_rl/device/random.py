@@ -42,6 +42,7 @@ class RowKeys(NamedTuple):
 
 def stream_id(name: str) -> int:
     """Return a stable 31-bit id for a named stream of draws (the same in every process)."""
+    # Python's own hash of a string differs from process to process.
     return zlib.crc32(name.encode()) & 0x7FFFFFFF
 
 
@@ -191,6 +192,7 @@ def _draw_in_torch(
             orders.append(first_number_E + in_torch.permuted(keys, n, start, span))
         return torch.cat(orders)
     keys = in_torch.keys_of(seed, stream, counter, num_rows=num_rows, first_row=first_row)
+    # Each column is hashed on its own, as in the kernel.
     bits_EL = in_torch.bits_of(keys, torch.arange(n, device=seed.device))
     if kind == _UNIFORM:
         return low + in_torch.unit(bits_EL) * (high - low)

@@ -64,7 +64,7 @@ class Operation:
 
     @property
     def name(self) -> str:
-        """What the operator is called, whatever its arguments are."""
+        """The name of the operator, whatever its arguments are."""
         return self.function.overloadpacket.__name__
 
     def read(self) -> list[Shaped[Tensor, "*?shape"]]:

@@ -29,6 +29,7 @@ def split(state: Mapping[str, Any]) -> tuple[dict[str, Shaped[Tensor, "*?leaf"]]
             values[path] = {}
         elif isinstance(node, Tensor):
             tensors[path] = node.detach().to("cpu", copy=True).contiguous()
+        # JSON knows no tuples.
         elif _is_plain(node):
             values[path] = list(node) if isinstance(node, tuple) else node
         else:
@@ -51,6 +52,7 @@ def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, A
         *parents, last = [key.replace("~1", "/").replace("~0", "~") for key in path.split("/")[1:]]
         node = state
         for key in parents:
+            # Parents are made on the way; one that is a leaf already is a fault of the file.
             node = node.setdefault(key, {})
             if not isinstance(node, dict):
                 raise ValueError(f"state {path} lies below a leaf")
@@ -73,6 +75,7 @@ def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: Mapping[str, 
         # The zoo keeps matrices as float16, and each of these numbers is one of float32.
         if have not in (want, want.replace("float32", "float16")):
             raise ValueError(f"{what}: {name!r} is {have} in the checkpoint and {want} in this run")
+    # Parameters that require gradients refuse to be written otherwise.
     with torch.no_grad():
         for name, tensor in live.items():
             tensor.copy_(saved[name])

@@ -35,6 +35,7 @@ def start_warp() -> None:
     sys.stderr.flush()
     stderr = os.dup(2)
     try:
+        # Native code writes to the file descriptor itself, past `sys.stderr`.
         with tempfile.TemporaryFile() as caught:
             os.dup2(caught.fileno(), 2)
             try:
@@ -60,6 +61,7 @@ def checked_device(device: str | torch.device) -> torch.device:
         checked = torch.device(device)
     except (RuntimeError, TypeError) as error:
         raise ValueError(f"device={device!r}: expected 'cpu', 'cuda' or 'cuda:<index>'") from error
+    # The CPU has no index: "cpu:0" is the same device.
     if checked.type == "cpu":
         return torch.device("cpu")
     if checked.type != "cuda":
@@ -104,10 +106,12 @@ def warp_scope(device: torch.device) -> Iterator[None]:
     """Send the Warp work of this block to `device`, ordered with torch's current stream there."""
     if device.type == "cpu":
         start_warp()
+        # The lock is reentrant, since such blocks nest.
         with CPU_LOCK, wp.ScopedDevice("cpu"):
             yield
     else:
         stream = warp_stream(torch.cuda.current_stream(device))
+        # One stream for both libraries needs no wait in between.
         with wp.ScopedStream(stream, sync_enter=False, sync_exit=False):
             yield
 
@@ -129,7 +133,7 @@ def waiting_allowed(device: torch.device) -> Iterator[None]:
 
 @contextmanager
 def beside(aside: wp.Stream | None, *launches: Callable[[], None]) -> Iterator[None]:
-    """Let a GPU do what `launches` launch together with the work of this block; without a stream, after it.
+    """Run `launches` in parallel with the work of this block on a side stream; without a stream, after it.
 
     Both follow what precedes the block and precede what follows it, in a graph too. Neither may write what the other
     reads or writes, or free what the other allocates: memory is given back in the order of one stream.

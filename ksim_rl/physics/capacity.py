@@ -147,7 +147,7 @@ def _round_up(needed: float) -> int:
 
 
 def _most_limits(mj_model: mujoco.MjModel) -> int:
-    """Return how many limits may have a row at once: both of one joint where its range is within its margins."""
+    """Return how many limits may have a row in one state: both of one joint where its range is within its margins."""
     joints = mj_model.jnt_limited.astype(bool)
     margin = mj_model.jnt_margin
     # Within twice the margin, a joint may violate both limits together.
@@ -260,7 +260,7 @@ def _put_to_key(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, key: int) -> N
 class CandidatePairs:
     """Counts the geom pairs whose bounding spheres touch: Warp keeps a place in the contact pool for each of them.
 
-    The pairs that may collide at all are those of MuJoCo's filters: contype and conaffinity, not the same rigid body,
+    MuJoCo's filters leave the pairs that may collide at all: contype and conaffinity, not the same rigid body,
     not parent and child, not excluded.
     """
 

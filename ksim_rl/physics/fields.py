@@ -76,7 +76,7 @@ def prepare_spec(spec: mujoco.MjSpec, per_world_fields: Iterable[str]) -> None:
 
 
 def write_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> None:
-    """Write one row of `World.per_world_fields` into a model of the C engine, in place, and what C derives from it."""
+    """Write one row of `World.per_world_fields` into a model of the C engine, in place, and the constants of it."""
     _copy_fields(mj_model, fields)
     # Constants do not follow from how things look, nor from gravity.
     shown = ("mat_", "light_", "cam_fovy", "cam_intrinsic", "geom_matid", "geom_rgba", GRAVITY)

@@ -55,7 +55,7 @@ def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
 
 
 def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
-    """Refuse what MuJoCo takes and nobody means: a time step out of (0, 0.1] s, counts and losses below zero."""
+    """Refuse numbers that MuJoCo takes but nobody means: a time step out of (0, 0.1] s, negative counts and losses."""
     step = float(mj_model.opt.timestep)
     if not 0.0 < step <= MOST_TIMESTEP:
         raise ValueError(

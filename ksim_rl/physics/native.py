@@ -46,9 +46,11 @@ def launcher(
     capitals, with LANES and THREADS. Its `problem.x` is x of `own`, or else of the model, its options or its
     worlds; see `values_of`. A launch may change scalars of `own`, by name.
     """
+    # The C++ itself says which arrays it reads, so that no list of them can go out of date.
     names = dict.fromkeys(re.findall(r"\bproblem\.(\w+)", source))
     owners = own, warp_model, warp_model.opt, warp_data_E
     types = tuple((name, _type_of(value)) for name, value in values_of(names, *owners).items())
+    # Constants are whole numbers, so that kernels of equal sizes are one in the cache.
     values = {name.upper(): int(value) for name, value in constants.items()}
     values |= {"LANES": lanes, "THREADS": threads}
     kernel, struct = _kernel(source, tuple(values.items()), types, threads, fast_math, max_registers)
@@ -56,6 +58,7 @@ def launcher(
     dim = (warp_data_E.nworld, lanes)
     device = warp_data_E.qpos.device
 
+    # The struct is filled once: only scalars change from launch to launch.
     def launch(**changes: Any) -> None:
         for name, value in changes.items():
             setattr(problem, name, value)
@@ -81,10 +84,12 @@ def _kernel(
 ) -> tuple[wp.Kernel, Any]:
     """Return the kernel, and the struct that it takes."""
 
+    # A struct of the arrays that this source reads.
     class Problem: ...
 
     Problem.__annotations__ = dict(types)
     struct = wp.struct(Problem)
+    # Constants of C++, not arguments: loops over them are unrolled.
     named = "".join(f"constexpr int {name} = {value};\n" for name, value in constants)
     named += "__builtin_assume(lane >= 0 && lane < LANES);\n"  # or else loops over nothing are compiled
 

@@ -66,7 +66,7 @@ def scatter(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Gen
 
 
 def put_in_ground(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, *, depth: float) -> None:
-    """Move each free body, with what hangs on it, so that one of its geoms is `depth` (m) deep in the ground.
+    """Move each free body, with its subtree, so that one of its geoms is `depth` (m) deep in the ground.
 
     That is the highest plane, the highest of the height field below a geom, and what else is fixed to the world (boxes,
     meshes) below the body's origin.
@@ -146,7 +146,7 @@ def _ground_heights(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndar
 
 
 def _lowest_points(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarray:
-    """Return the height of each geom's lowest point, in m; for other than round geoms, that of its bounding box."""
+    """Return the height of each geom's lowest point, in m; of geoms that are not round, their bounding box's."""
     # The third row of a rotation matrix has the heights of its axes.
     up = mj_data.geom_xmat.reshape(-1, 3, 3)[:, 2]
     center = mj_model.geom_aabb[:, :3]

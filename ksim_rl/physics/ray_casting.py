@@ -23,7 +23,7 @@ Groups = wp.types.vector(length=mujoco.mjNGROUP, dtype=wp.float32)
 class RayBatch:
     """N rays per world: write `start_EN3` (m) and `direction_EN3` (unit vectors), both in the world frame, then `cast`.
 
-    `refresh` must have run since the state changed. Rays hit geoms of MuJoCo's `geom_groups`, other than those of the
+    `refresh` must have run since the state changed. Rays hit geoms of MuJoCo's `geom_groups`, but none of the
     body with the id `exclude_body`.
 
     Attributes:
@@ -37,6 +37,7 @@ class RayBatch:
         self._world = world
         # All -1 would mean every group, so groups are switched one by one.
         self._chosen = [group in geom_groups for group in range(mujoco.mjNGROUP)]
+        # MuJoCo Warp takes floats, and C takes booleans.
         self._groups = Groups(*map(float, self._chosen))
         self._exclude_body = exclude_body
         shape = (world.num_envs, num_rays)
@@ -67,6 +68,7 @@ class RayBatch:
         found = self._distance, self._geom, self._normal
         m = world.warp_model
         d = world.warp_data_E
+        # True: geoms that are fixed to the world are hit, too.
         mjw.rays(m, d, self._start, self._direction, self._groups, True, self._exclude, *found)
 
 

@@ -29,7 +29,7 @@ from ksim_rl.physics.smooth.stages import calls_back, integration, smooth_dynami
 from ksim_rl.physics.views import FORCES_OF_BODIES
 
 Sensors = Literal["none", "contacts", "kept", "all"]
-"""Which sensors a substep computes: none, those of contacts, those that a refresh afterwards keeps, or all."""
+"""Which sensors a substep computes: none, contact sensors, the ones that a refresh afterwards keeps, or all."""
 
 
 class Substeps:

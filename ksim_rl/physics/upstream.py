@@ -147,7 +147,7 @@ def wake_trees(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
 
 
 def solve_as_they_do(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
-    """Launch MuJoCo Warp's own solver, and what its integrator "discrete" adds to the accelerations."""
+    """Launch MuJoCo Warp's own solver, and the terms that its integrator "discrete" adds to the accelerations."""
     mjw.solve(warp_model, warp_data_E)
     if warp_model.opt.integrator == mjw.IntegratorType.DISCRETE:
         turn_free_bodies(warp_model, warp_data_E, warp_data_E.qacc, warp_data_E.qacc, False)
@@ -185,8 +185,8 @@ def sensors_by_refresh(
     """Return two models on the same arrays: with the sensors that follow from qpos and qvel alone, and with the others.
 
     Contact, limit, touch-grid and geom-distance sensors read rows or contacts of the last substep's collision pass.
-    They, and those of `skip` (bool [nsensor]), keep that substep's value; rows that reset since then read zero. Sensors
-    can only be switched off all together, so the lists that `put_model` makes, one for each kernel, are replaced.
+    They, and the sensors of `skip` (bool [nsensor]), keep that substep's value; rows that reset since then read zero.
+    Sensors can only be switched off all together, so the lists that `put_model` makes, one per kernel, are replaced.
     """
     none = wp.zeros(0, dtype=int)
     # Lists of ids, which are split by whether a refresh may compute the sensor.

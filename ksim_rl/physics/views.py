@@ -49,6 +49,7 @@ def float_rows(warp_data_E: mjw.Data, names: tuple[str, ...]) -> list[wp.array]:
     rows = []
     for name in names:
         tensor = wp.to_torch(getattr(warp_data_E, name))
+        # Vectors, quaternions and matrices become single floats.
         width = tensor.numel() // warp_data_E.nworld
         rows.append(wp.from_torch(tensor.reshape(warp_data_E.nworld, width), dtype=wp.float32))
     return rows
@@ -66,6 +67,7 @@ def arrays(data: object, prefix: str = "") -> dict[str, wp.array]:
         value = getattr(data, field.name)
         if isinstance(value, wp.array):
             found[prefix + field.name] = value
+        # Contacts and constraints are dataclasses of their own.
         elif dataclasses.is_dataclass(value):
             found |= arrays(value, f"{field.name}.")
     return found
@@ -99,6 +101,7 @@ class DataViews:
     def show_views(self) -> None:
         """Make the views that are attributes, once the engine has its arrays."""
         self._views: dict[str, Tensor] = {}
+        # An attribute such as `qpos_EL` shows the array "qpos".
         for attribute in DataViews.__annotations__:
             setattr(self, attribute, self.view(attribute.rpartition("_")[0]))
 
@@ -108,6 +111,7 @@ class DataViews:
         Vectors, quaternions (w x y z) and matrices become trailing dims. Arrays that no `refresh` makes current, such
         as "efc.force" or "contact.dist", are refused: see `last_substep`.
         """
+        # A stale array would be read in silence.
         if name in self.array_names() and name not in READABLE:
             raise ValueError(
                 f"data array {name!r} is what the last substep computed on its way, and nothing refreshes it: read a "
@@ -120,6 +124,7 @@ class DataViews:
 
         Rows of `efc` beyond `nefc`, and all of `contact` after a reset, hold leftovers.
         """
+        # Views are made once, so that everybody has the same tensor.
         if name not in self._views:
             check_known("data array", name, self.array_names())
             self._views[name] = self.make_view(name)

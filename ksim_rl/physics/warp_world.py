@@ -71,6 +71,7 @@ class WarpWorld(World):
         expanded = self._expanded
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
         self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
+        # Our solver takes sparse rows only, and `mj_model` keeps the user's settings.
         stored_model = copy.copy(self.mj_model)
         if self.has_one_kernel_solver:
             stored_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
@@ -84,6 +85,7 @@ class WarpWorld(World):
                 follow_the_c_engine(self.warp_model)
             switch_off(self.mj_model, self.warp_model)
             let_actuators_add(self.mj_model, self.warp_model, expanded)
+            # The report of overflow tells of it, once per rollout.
             self.warp_model.opt.warn_overflow = 0
             if self.sim.tolerance is not None:
                 self.warp_model.opt.tolerance.fill_(self.sim.tolerance)
@@ -133,6 +135,7 @@ class WarpWorld(World):
                     self.sim.nan_guard, self.mj_model, state, self._fields, num_envs=num_envs, by_warp=True
                 )
         self.gravity_EL = gravity_EL
+        # From here on, callbacks that appear are the program's.
         self._callbacks = Callbacks(self.warp_model)
         self._arrays = views.arrays(self.warp_data_E)
         self.show_views()

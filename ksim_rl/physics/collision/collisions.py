@@ -121,7 +121,7 @@ def collisions(
     of_theirs = corrections(m, wp.array(others, dtype=wp.vec2i, device=device), their_ids)
 
     def launch() -> None:
-        # The hook is read at each launch, since a program may set one of its own.
+        # The hook is read at each launch, since a program may set a hook, too.
         hook = m.callback.contactfilter
         if isinstance(hook, Mending):
             # Our own contacts need no corrections.

@@ -141,7 +141,7 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
     # The geom is moved into the frame of the field.
     shape.pos = center
     shape.rot = wp.transpose(field_turn) @ shape.rot
-    # The prism, as a mesh of six points whose place and axes are those of the field.
+    # The prism, as a mesh of six points in the frame of the field.
     below.pos = wp.vec3(0.0)
     below.rot = wp.identity(n=3, dtype=float)
     below.vert = c.corners[slot]

@@ -97,7 +97,7 @@ def implicit_with_full_rows(
         place = slice(first, first + mj_model.M_rownnz[dof])
         stored[place] = rows.entry[dof, mj_model.M_colind[place]]
     places = wp.array(stored, dtype=int)
-    # Of lone bodies, derivatives by actuators alone are added to the inertia before they are solved for.
+    # Of single bodies, derivatives by actuators alone are added to the inertia before they are solved for.
     lone = wp.array(_entries_of_lone_bodies(m, rows.start, rows.count), dtype=int)
     by_actuators = _without_other_derivatives(full)
     slowed_E = wp.zeros_like(inertia_E)
@@ -120,7 +120,7 @@ def implicit_with_full_rows(
             mjw.implicit(full, full_E)
 
         return integrate
-    # MuJoCo Warp's "implicitfast" solves in the rows of `M`, so only lone bodies take full rows.
+    # MuJoCo Warp's "implicitfast" solves in the rows of `M`, so only single bodies take full rows.
     entries = _entries_of_lone_bodies(m, mj_model.M_rowadr, mj_model.M_rownnz)
     stored_lone = wp.array(entries, dtype=int)
     system_E = wp.zeros_like(d.M)

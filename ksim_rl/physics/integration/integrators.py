@@ -3,7 +3,7 @@
 A shallow variant of the model gives back the derivatives that its implicit integrators leave out:
 
 * Without actuation, or without dampers, they take no derivative at all. C drops only the derivatives of disabled parts.
-* They multiply a gain that depends on velocity by controls out of their range, and by those of another actuator where
+* They multiply a gain that depends on velocity by controls out of their range, and by another actuator's where
   one has several controls or none.
 * Of simple bodies, and of those with a free joint alone, they leave out the coupling of degrees of freedom; see
   `full_rows`.
@@ -152,7 +152,7 @@ def _with_all_derivatives(warp_model: mjw.Model) -> mjw.Model:
             changes[name] = wp.zeros_like(getattr(m, name))
     if not changes:
         return m
-    # The flags would leave out all derivatives; the fields above leave out those of the disabled parts.
+    # The flags would leave out all derivatives; the fields above leave out the disabled parts' only.
     opt = dataclasses.replace(m.opt, disableflags=flags & ~int(bits.ACTUATION | bits.DAMPER))
     return dataclasses.replace(m, opt=opt, **changes)
 

@@ -42,7 +42,7 @@ class ModelFiles:
 
 
 def files_of_model(source: str | Path) -> ModelFiles | None:
-    """Return the files of what `load_spec` takes; None for an XML string. A ValueError says what cannot be read."""
+    """Return the files of a source of `load_spec`; None for an XML string. A ValueError says what cannot be read."""
     path = model_file(source)
     if path is None:
         return None

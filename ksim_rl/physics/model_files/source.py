@@ -1,4 +1,4 @@
-"""Reads what a model is named by: a path, an XML text or a menagerie name."""
+"""Reads the text of a model from its name: a path, an XML text or a menagerie name."""
 
 import re
 from dataclasses import dataclass

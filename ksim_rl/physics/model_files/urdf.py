@@ -47,12 +47,14 @@ def ready_urdf(text: str, folder: Path) -> str:
         path = _mesh_path(html.unescape(match["name"].strip()), folder)
         return f"{match['start']}{match['quote']}{html.escape(path)}{match['quote']}"
 
+    # On the same lines, so that errors name the author's.
     return _MESH.sub(found_mesh, text)
 
 
 def packages_of(text: str, folder: Path) -> list[Path]:
     """Return the folders of the packages that a URDF text of `folder` takes meshes from."""
     found: dict[Path, None] = {}
+    # Meshes with plain paths belong to no package.
     for mesh in _MESH.finditer(text):
         in_package = _PACKAGE.fullmatch(html.unescape(mesh["name"].strip()))
         if in_package is None:

@@ -78,6 +78,7 @@ def replay(failure: Failure) -> Replay:
     # C would reset a diverged state by itself, which hides what is looked for.
     mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     mj_model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    # One data for all substeps: each starts from its own kept state.
     data = mujoco.MjData(mj_model)
     # Each substep reaches the state from which the next one starts; the last one's was kept apart.
     reached_qvel = [*failure.states["qvel"][1:], failure.reached["qvel"]]
@@ -115,6 +116,7 @@ def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
     heads = (
         "substep,time s,energy J,max |qvel|,of dof,max |qacc|,of dof,max |ctrl|,contacts,off Warp,C engine"
     )
+    # The head is a row as well, so that columns are as wide as both.
     rows: list[tuple[str, ...]] = [tuple(heads.split(","))]
     last = len(result.substeps) - 1
     for k, substep in enumerate(result.substeps):
@@ -136,6 +138,7 @@ def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
     kept = len(result.substeps)
     title = f"world {failure.world}: its last {kept} of {failure.substep} substeps; 0 is the one that broke"
     first = dof_name(mj_model, result.first)
+    # A state that was broken before is no fault of the physics.
     if result.was_broken_before:
         verdict = f"First: {first}, before substep 0 already. An event, a command or a reset wrote it there."
     else:
@@ -182,6 +185,7 @@ def _substep(data: mujoco.MjData, failure: Failure, k: int, reached_qvel: np.nda
     mujoco.mj_forward(mj_model, data)
     # The step itself gets the controls as they were.
     data.ctrl[:] = given
+    # Readings of the state before the step, which `mj_step` overwrites.
     energy = float(data.energy.sum())
     contacts = int(data.ncon)
     acceleration = _largest(data.qacc)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-# A lane keeps the factor of a limb, then that of the trunk, in its registers; larger ones take the dense Hessian.
+# A lane keeps the factor of a limb, then the trunk's, in its registers; larger ones take the dense Hessian.
 MOST_OF_TRUNK = 10
 MOST_OF_LIMB = 8
 MOST_LIMBS = 15
@@ -67,7 +67,7 @@ def _suits(limbs: Limbs, *, nv: int) -> bool:
 def row_stride(entries: int) -> int:
     """Return the floats from one row of so many entries to the next in shared memory.
 
-    Rows are whole groups of four floats, which are loaded at once. The number of groups is odd, so that the rows of
+    Rows are whole groups of four floats, which are loaded together. The number of groups is odd, so that the rows of
     neighbouring lanes begin in other banks of shared memory.
     """
     groups = -(-entries // 4)
@@ -75,5 +75,5 @@ def row_stride(entries: int) -> int:
 
 
 def padded(count: int) -> int:
-    """Return the next multiple of four: so many floats are loaded at once."""
+    """Return the next multiple of four: so many floats are loaded together."""
     return 4 * -(-count // 4)

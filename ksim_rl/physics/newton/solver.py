@@ -128,7 +128,7 @@ def solver(
         "efc_J": efc.J.reshape((d.nworld, -1)),
         "scratch": wp.empty((d.nworld, far_floats), dtype=float, device=device),
         **{name: wp.array(table, dtype=int, device=device) for name, table in limbs.tables(m.nv).items()},
-        # The order of the worlds is that of their numbers until the first sort.
+        # The worlds are in the order of their numbers until the first sort.
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
     }

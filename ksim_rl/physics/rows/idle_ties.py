@@ -88,7 +88,7 @@ def still_ties(
     J: wp.array3d[float],
     efc_D: wp.array2d[float],
 ):
-    """Let rows of ties without a Jacobian exert nothing, if they hold, or if no joint moves what they tie."""
+    """Let rows of ties without a Jacobian exert nothing, if they hold, or if no joint moves the tied bodies."""
     world, row = wp.tid()
     if row >= ne[world] or efc_type[world, row] != EQUALITY:
         return

@@ -52,6 +52,7 @@ class LimitSensors:
         self._of_state = wp.array(np.flatnonzero(of_state), dtype=int)
         self._of_refresh = wp.array(np.flatnonzero(present), dtype=int)
         self._of_forces = wp.array(np.flatnonzero(of_forces), dtype=int)
+        # One kernel reads all four kinds, by these two flags.
         is_speed = np.isin(mj_model.sensor_type, (JOINT_VEL, TENDON_VEL))
         is_of_tendon = np.isin(mj_model.sensor_type, (TENDON_POS, TENDON_VEL))
         self._is_speed = wp.array(is_speed, dtype=bool)
@@ -155,7 +156,7 @@ def _read_state(
         q = jnt_qposadr[of]
         v = jnt_dofadr[of]
         if jnt_type[of] == BALL:
-            # Its one limit is of the angle by which it is turned.
+            # Its one limit is of the angle by which it is turned, from a quaternion w x y z.
             turn = wp.normalize(
                 wp.vec4(qpos[world, q], qpos[world, q + 1], qpos[world, q + 2], qpos[world, q + 3])
             )

@@ -43,6 +43,7 @@ def check_delayed(mj_model: mujoco.MjModel) -> None:
     for sensor in range(mj_model.nsensor):
         kind = mj_model.sensor_type[sensor]
         (samples, interpolation) = mj_model.sensor_history[sensor]
+        # A `reduce` of 0 takes contacts as they come.
         takes_first = kind == mujoco.mjtSensor.mjSENS_CONTACT and mj_model.sensor_intprm[sensor, 1] == 0
         if takes_first and (samples or mj_model.nflex):
             raise ValueError(
@@ -50,6 +51,7 @@ def check_delayed(mj_model: mujoco.MjModel) -> None:
                 f"{'where a sensor is delayed' if samples else 'in a model with flexes'}: set its reduce to mindist, "
                 "maxforce or netforce"
             )
+        # The samples of a delayed sensor are kept before our cutoff is applied.
         bounded = kind == mujoco.mjtSensor.mjSENS_TOUCH and mj_model.sensor_cutoff[sensor] > 0.0
         if bounded and samples and interpolation:
             raise ValueError(
@@ -122,6 +124,7 @@ def check_signed_distance_fields(mj_model: mujoco.MjModel) -> None:
 
 def geoms_of(mj_model: mujoco.MjModel, kind: int, element: int) -> np.ndarray:
     """Return whether each geom is of an object of a sensor, bool [ngeom]; an object that is not named is all."""
+    # An object may be a geom, a body, or a body with all below it.
     geoms = np.arange(mj_model.ngeom)
     if kind == GEOM:
         return geoms == element
