@@ -122,12 +122,9 @@ def rows_left_out(warp_model: mjw.Model) -> Hook | None:
 
     Only a <pair> can name geoms of one rigid body, or of bodies that never move. In C sensors still read such contacts.
     """
-    m = warp_model
-    rigid_body = m.body_weldid.numpy()[m.geom_bodyid.numpy()]
-    # All bodies that no joint moves are one.
-    rigid_body[~m.body_isdofancestor.numpy()[rigid_body, : m.nv].any(-1)] = 0
+    rigid_body = _rigid_body_of_geoms(warp_model)
     # Without such a <pair>, no kernel needs to be launched.
-    if not (rigid_body[m.pair_geom1.numpy()] == rigid_body[m.pair_geom2.numpy()]).any():
+    if not _has_pairs_within(warp_model, rigid_body):
         return None
     of_geoms = wp.array(rigid_body, dtype=int)
 
@@ -139,6 +136,27 @@ def rows_left_out(warp_model: mjw.Model) -> Hook | None:
         wp.launch(kernels.leave_out_rows, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
 
     return leave_out
+
+
+def _rigid_body_of_geoms(warp_model: mjw.Model) -> np.ndarray:
+    """Return the rigid body that each geom belongs to, int [ngeom]."""
+    m = warp_model
+    rigid_body = m.body_weldid.numpy()[m.geom_bodyid.numpy()]
+    # All bodies that no joint moves are one.
+    rigid_body[~m.body_isdofancestor.numpy()[rigid_body, : m.nv].any(-1)] = 0
+    return rigid_body
+
+
+def _has_pairs_within(warp_model: mjw.Model, rigid_body: np.ndarray) -> bool:
+    """Return whether a <pair> names geoms of one rigid body."""
+    first = rigid_body[warp_model.pair_geom1.numpy()]
+    second = rigid_body[warp_model.pair_geom2.numpy()]
+    return bool((first == second).any())
+
+
+def has_pairs_of_one_body(warp_model: mjw.Model) -> bool:
+    """Return whether contacts may have no rows since no joint moves their geoms apart."""
+    return _has_pairs_within(warp_model, _rigid_body_of_geoms(warp_model))
 
 
 def has_rowless_contacts(warp_model: mjw.Model) -> bool:

@@ -77,6 +77,25 @@ def test_a_pair_of_one_rigid_body_does_not_stick(kernels: str) -> None:
     step_and_check(xml, KERNELS[kernels], names=("qpos", "qvel", "qacc", "qfrc_passive"), **CALM)
 
 
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("other", ("beside", "welded"))
+def test_an_actuator_does_not_adhere_by_a_pair_of_one_rigid_body(other: str, kernels: str) -> None:
+    xml = f"""
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="3 3 0.1"/>
+    <body name="foot" pos="0 0 0.04"><freejoint/>
+      <geom name="sole" size="0.045" mass="1"/><geom name="beside" size="0.045" pos="0.02 0 0" mass="1"/>
+      <body><geom name="welded" size="0.05" pos="0.03 0 0.05" mass="1"/></body></body>
+  </worldbody>
+  <contact><pair geom1="sole" geom2="{other}"/></contact>
+  <actuator><adhesion body="foot" ctrlrange="0 1" gain="4"/></actuator>
+</mujoco>
+"""
+    names = ("qpos", "qvel", "qfrc_actuator", "actuator_velocity")
+    step_and_check(xml, KERNELS[kernels], names=names, substeps=1, **CALM)
+
+
 @pytest.mark.parametrize("more", ("", '<body mocap="true"/>'), ids=("own reset", "their reset"))
 def test_a_reset_of_one_world_leaves_the_adhesion_of_another(more: str) -> None:
     world, mj_data, in_c = started(STUCK.format(integrator="Euler", more=more), KERNELS["ours"], **CALM)

@@ -1,9 +1,9 @@
 """Computes the transmissions of actuators that adhere to a body, whose moments its contacts decide.
 
 Such an actuator pulls along the mean of the normals of a body's contacts. MuJoCo Warp counts the pairs of geoms whose
-distance a sensor reads among the contacts, and upper corners of boxes on planes, so that the pull is weaker than C's:
-here they are hidden from it. And no refresh looks for contacts, so that these moments stay as the last substep left
-them; rows that reset read zero.
+distance a sensor reads among the contacts, and upper corners of boxes on planes, and pairs of one rigid body, so that
+the pull is weaker than C's: here they are hidden from it. And no refresh looks for contacts, so that these moments stay
+as the last substep left them; rows that reset read zero.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
@@ -16,14 +16,16 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.physics import kernels, upstream
-from ksim_rl.physics.contacts import has_rowless_contacts
+from ksim_rl.physics.contacts import has_pairs_of_one_body, has_rowless_contacts
 
 CONSTRAINT = int(upstream.ContactType.CONSTRAINT)
 
 
 def miscounts_contacts(warp_model: mjw.Model) -> bool:
     """Whether MuJoCo Warp's transmissions count contacts without rows as contacts of a body."""
-    return warp_model.nacttrnbody > 0 and has_rowless_contacts(warp_model)
+    if warp_model.nacttrnbody == 0:
+        return False
+    return has_rowless_contacts(warp_model) or has_pairs_of_one_body(warp_model)
 
 
 def transmissions_of_contacts(warp_model: mjw.Model, warp_data_E: mjw.Data) -> Callable[[], None]:
@@ -33,7 +35,7 @@ def transmissions_of_contacts(warp_model: mjw.Model, warp_data_E: mjw.Data) -> C
     geom = wp.empty_like(contact.geom)
     hiding = dataclasses.replace(warp_data_E, contact=dataclasses.replace(contact, geom=geom))
     d = warp_data_E
-    inputs = [contact.geom, contact.type, d.nacon]
+    inputs = [contact.geom, contact.type, contact.includemargin, d.nacon]
 
     def launch() -> None:
         wp.launch(_hide_rowless, dim=d.naconmax, inputs=inputs, outputs=[geom])
@@ -86,14 +88,21 @@ def _scatter_moments(
 
 @wp.kernel(enable_backward=False)
 def _hide_rowless(
-    geom: wp.array[wp.vec2i], kind: wp.array[int], nacon: wp.array[int], shown: wp.array[wp.vec2i]
+    geom: wp.array[wp.vec2i],
+    kind: wp.array[int],
+    includemargin: wp.array[float],
+    nacon: wp.array[int],
+    shown: wp.array[wp.vec2i],
 ):
-    """Copy the geoms of contacts; without rows they become -1, which MuJoCo Warp passes over."""
+    """Copy the geoms of contacts; without rows they become -1, which MuJoCo Warp passes over.
+
+    Contacts in a gap are shown: C counts them, though they have no rows either.
+    """
     contact = wp.tid()
     if contact >= nacon[0]:
         return
-    # Contacts with rows are the ones that C counts.
-    if kind[contact] & CONSTRAINT:
+    is_within_a_body = includemargin[contact] <= kernels.NO_ROWS
+    if kind[contact] & CONSTRAINT and not is_within_a_body:
         shown[contact] = geom[contact]
     else:
         shown[contact] = wp.vec2i(-1, -1)
