@@ -28,6 +28,7 @@ def _constant(values: tuple[float, ...], device: torch.device) -> Tensor:
 
 def array_constant(values: np.ndarray, device: torch.device) -> Float[Tensor, "*shape"]:
     """Return an array, such as a model's own values, as a float32 tensor; the same for the same values, for ever."""
+    # A flat tuple is the key of the cache; the view gives the shape back.
     return constant(values.ravel().tolist(), device).view(values.shape)
 
 
@@ -55,11 +56,13 @@ def _values_by_name(
     field: str, table: tuple[tuple[str, float], ...], names: tuple[str, ...]
 ) -> tuple[float, ...]:
     for pattern, _ in table:
+        # A pattern without a match is most likely a mistyped name.
         if not any(re.fullmatch(pattern, name) for name in names):
             raise ValueError(f"{field}: pattern {pattern!r} matches nothing: {near(pattern, names)}")
     values = []
     for name in names:
         matches = [(pattern, value) for pattern, value in table if re.fullmatch(pattern, name)]
+        # With two matches the value would depend on the order of the table.
         if len(matches) != 1:
             patterns = [pattern for pattern, _ in matches]
             raise ValueError(

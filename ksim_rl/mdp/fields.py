@@ -115,6 +115,7 @@ class FramedObservation(InFrame, ObservationTerm):
         """Return points of the world in the term's frame, m, flat, [E, 3N]."""
         if self.frame == "root":
             # Positions are relative to the origin of the frame; directions are not.
+            # The root's origin [E, 1, 3] broadcasts over the points.
             pos_EN3 = pos_EN3 - view.entity(self.entity).root_pos_EL[:, None]
         return self.vectors(view, pos_EN3)
 
@@ -123,6 +124,7 @@ class FramedObservation(InFrame, ObservationTerm):
         if self.frame == "root":
             # Rotations from world to root; [E, 1, 4] broadcasts over N.
             vector_EN3 = quaternion.rotate_inverse(view.entity(self.entity).root_quat_EL[:, None], vector_EN3)
+        # Observations are flat per env: x, y, z of the first point, then of the second.
         return vector_EN3.flatten(start_dim=1)
 
 
@@ -134,6 +136,7 @@ class RewardWhileCommanded(OfCommand, RewardTerm):
 
     def while_commanded(self, view: EnvView, value_E: Float[Tensor, " E"]) -> Float[Tensor, " E"]:
         """Return the value where the command asks to move, else 0."""
+        # A factor of 0 or 1 instead of a branch, which a captured step could not take.
         return value_E * is_commanded(view, self.command, self.command_threshold)
 
 

@@ -48,6 +48,7 @@ class RootHeightBelow(OfEntity, TerminationTerm):
     minimum_height: float
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        # Above the ground below, so that a robot on stairs does not count as fallen.
         return root_height(view, self.entity) < self.minimum_height
 
 
@@ -93,6 +94,7 @@ class RootVelocityAbove(OfEntity, TerminationTerm):
         ends_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         # Both limits are optional; either one ends the episode.
         if self.linear is not None:
+            # A NaN compares as False here; the env itself ends worlds whose state is not finite.
             ends_E = ends_E | (torch.linalg.vector_norm(root.root_lin_vel_w_EL, dim=-1) > self.linear)
         if self.angular is not None:
             ends_E = ends_E | (torch.linalg.vector_norm(root.root_ang_vel_b_EL, dim=-1) > self.angular)
@@ -131,6 +133,7 @@ class IllegalContact(OfContacts, TerminationTerm):
     threshold: NonNegative = 0.0
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
+        # One element is enough.
         return (contact_force(view, self.sensor) > self.threshold).any(-1)
 
 

@@ -83,6 +83,7 @@ class ActuatorForce(ObservationTerm):
     actuators: Patterns = ".*"
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        # By actuator, as tendons and muscles have no joint of their own.
         return view.world.actuator_force_EL[:, view.resolver.index("actuator", self.actuators)]
 
 
@@ -129,6 +130,7 @@ class RootAngVel(InFrame, ObservationTerm):
         entity = view.entity(self.entity)
         if self.frame == "root":
             return entity.root_ang_vel_b_EL
+        # In the world's axes it is rotated once per state.
         return entity.root_ang_vel_w_EL
 
 
@@ -248,6 +250,7 @@ class CameraImage(OfSensor, ObservationTerm, is_image=True):
         # The camera calls it by its channels.
         if self.output == "rgb":
             return camera.rgb_EHW3
+        # Depth and segmentation have one number per pixel, and no channels.
         return getattr(camera, f"{self.output}_EHW")
 
 

@@ -211,10 +211,10 @@ class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
         servos = [_servo(model, model.joint(joint).id, name) for joint in names]
         # MuJoCo's bias is (constant, -kp, -kd).
         column = 1 if name == "stiffness" else 2
-        # MuJoCo's bias acts on the actuator's length, gear * q, and its force through the gear again: hence
-        # the square.
         before_gear = -model.actuator_biasprm[servos, column]
         gear = model.actuator_gear[servos, 0]
+        # MuJoCo's bias acts on the actuator's length, gear * q, and its force through the gear again: hence
+        # the square.
         own = before_gear * gear * gear
         self._check_not_negative(name, names, own, pair)
         drawn_EN = drawn_EN[:, index_constant(builtin, view.device)]

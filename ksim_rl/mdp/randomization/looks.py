@@ -31,6 +31,7 @@ class RandomizeLightColor(RandomizeModelField, columns=3, lowest=0.0):
     @property
     def field(self) -> str:
         """The field of that part."""
+        # MuJoCo keeps each part of a light in a field of its own.
         return f"light_{self.part}"
 
 
@@ -53,6 +54,7 @@ class RandomizeMaterialShine(RandomizeModelField, lowest=0.0, highest=1.0):
     @property
     def field(self) -> str:
         """The field of that part."""
+        # MuJoCo keeps each part of a material in a field of its own.
         return f"mat_{self.part}"
 
 

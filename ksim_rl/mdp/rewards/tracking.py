@@ -152,7 +152,6 @@ class OfTilt(OfEntity):
         if self.body is None:
             return view.entity(self.entity).projected_gravity_EL[:, :2].square().sum(-1)
         # The world's z axis in the body's frame: the z components of the body's x and y axes.
-        # Axes are rows of `axes_E33`: rows x and y, component z.
         return view.body(self.body).axes_E33[:, :2, 2].square().sum(-1)
 
 

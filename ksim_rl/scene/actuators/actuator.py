@@ -103,9 +103,9 @@ class SubstepRing:
         """Return the value of `lag` substeps ago."""
         return self._ring_EKL[:, lag]
 
-    # `gather` wants an index as wide as its result.
     def at_rows(self, lag_E: Int64[Tensor, " E"]) -> Float[Tensor, "E L"]:
         """Return the value of each row's own number of substeps ago."""
+        # `gather` wants an index as wide as its result.
         index_E1L = lag_E[:, None, None].expand(-1, 1, self._ring_EKL.shape[2])
         return self._ring_EKL.gather(1, index_E1L)[:, 0]
 

@@ -22,6 +22,7 @@ class BuiltinActuator(JointActuator):
     def law(self, drive: Drive) -> Law:
         # One kind of target only, as the subclass says.
         (kind,) = self.takes
+        # The control is the target itself; this law runs only where another actuator delays it.
         return lambda _, target: getattr(target, f"{kind}_EN")
 
 

@@ -136,8 +136,8 @@ class DelayedActuator(Actuator):
             drawn_E = drive.integers(1, self.min_lag, self.max_lag)[:, 0]
             lag_E.copy_(torch.where(mask_E, drawn_E, lag_E))
 
-        # Push first: with lag 0 this substep's target arrives now.
         def late_EN(state: JointState, target: JointTarget) -> Tensor:
+            # Push first: with lag 0 this substep's target arrives now.
             ring.push(torch.cat([getattr(target, field) for field in fields], dim=1))
             arrived = ring.at_rows(lag_E).chunk(len(fields), dim=1)
             # Targets that it does not take pass through unchanged.

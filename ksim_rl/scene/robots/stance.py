@@ -33,8 +33,8 @@ def find_stance(
     ranges. Straight legs are bent, with the knees forward on two legs; others keep their crouch. Springs, which are
     `passive` joints, keep their length; rods of closed chains move with the rest, and hold together.
     """
-    # The free joint has the lowest type, 0.
     data = posed(mj_model, qpos)
+    # The free joint has the lowest type, 0.
     root = int(mj_model.jnt_type.argmin())
     first = int(mj_model.jnt_qposadr[root])
     # None for plain trees, which need no constraints.
@@ -99,8 +99,8 @@ def find_stance(
         bounds=[np.array([[wanted[0] + reach, *ends]]).T for reach, ends in ((-1.0, low), (1.0, high))],
         verbose=0,
     )
-    # The horizontal place of the root is free: it stands over the origin.
     data.qpos[columns] = x.ravel()
+    # The horizontal place of the root is free: it stands over the origin.
     data.qpos[first : first + 2] = 0.0
     return data.qpos.copy()
 
@@ -139,7 +139,6 @@ def stand(mj_model: mujoco.MjModel, *, seconds: float = 5.0) -> Standing:
     mujoco.mj_resetDataKeyframe(mj_model, data, 0)
     mujoco.mj_kinematics(mj_model, data)
     root = int(mj_model.jnt_type.argmin())
-    # Also the body's own orientation may be turned in the stance.
     body = int(mj_model.jnt_bodyid[root])
     first = int(mj_model.jnt_qposadr[root])
     start = data.qpos[first : first + 3].copy()

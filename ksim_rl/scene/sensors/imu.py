@@ -57,6 +57,7 @@ class ImuTracker(SensorTracker):
     @property
     def lin_acc_EL(self) -> Float[Tensor, "E 3"]:
         """Acceleration minus gravity, m/s^2: at rest it points up and is 9.81, in free fall 0; acceleration stage."""
+        # MuJoCo computes it in the substep, so that it lags behind a state that was just written.
         return self._view.sensor(f"{self._name}_accelerometer")
 
     @property
@@ -77,5 +78,6 @@ class ImuTracker(SensorTracker):
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw the unit's axes at its place."""
         site = view.world.mj_model.site(self._site).id
+        # Pictures are drawn on the host.
         origin = view.world.site_xpos_EL[env_index, site].cpu().numpy()
         visualizer.frame(origin, view.world.site_xmat_EL[env_index, site].cpu().numpy().reshape(3, 3))

@@ -59,6 +59,7 @@ def check_present(name: str, kind: str, wanted: str | None, elements: Sequence[A
     if wanted not in present:
         several: list[str] = []
         # A pattern where a name is expected is a likely mistake, and gets its own message.
+        # A name may be no valid pattern, and is then just unknown.
         with suppress(re.error):
             several = [other for other in present if other and re.fullmatch(str(wanted), other)]
         if several:
@@ -84,6 +85,7 @@ class MountedSensor(Sensor, ABC):
         # With both, or none, the place would be unclear.
         if (self.site is None) == (self.body is None):
             raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
+        # A position next to a site would be ignored in silence.
         if self.site is not None and any(self.pos):
             raise ValueError(
                 f"pos={self.pos!r} with site={self.site!r}: a site has its own place; give a body"

@@ -81,11 +81,13 @@ class Joints(_Elements):
     @quantity
     def acc_EL(self) -> Float[Tensor, "E L"]:
         """Accelerations, rad/s^2 or m/s^2; acceleration stage."""
+        # From the last substep: a write of the state does not change it.
         return self._state.world.qacc_EL[:, self.qvel]
 
     @quantity
     def effort_EL(self) -> Float[Tensor, "E L"]:
         """What actuators exert, N m or N, behind the gears; acceleration stage."""
+        # MuJoCo's sum over all actuators of the joint, after the gears and the joint's own limit.
         return self._state.world.qfrc_actuator_EL[:, self.qvel]
 
     @quantity
@@ -157,8 +159,8 @@ class Bodies(_Elements):
 
     @quantity
     def subtree_com_vel_EN3(self) -> Float[Tensor, "E N 3"]:
-        # A sensor stage of MuJoCo, computed only if something asked for it in construction.
         """Velocities of the centres of mass of bodies with all that hangs on them, m/s; first read in construction."""
+        # A sensor stage of MuJoCo, computed only if something asked for it in construction.
         return self._state.derived().view("subtree_linvel")[:, self.index]
 
 

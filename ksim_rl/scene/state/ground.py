@@ -36,9 +36,9 @@ class Ground:
         return torch.zeros_like(points_EN2[..., 0])
 
     def clearance(self, points_EN3: Float[Tensor, "E N 3"]) -> Float[Tensor, "E N"]:
-        # Flat ground needs no look-up: height above it is z.
         """Return how high points (world frame, m) are above the ground right below them, m."""
         height_EN = points_EN3[..., 2]
+        # Flat ground needs no look-up: height above it is z.
         if self.is_flat:
             return height_EN
         return height_EN - self.heights(points_EN3[..., :2])

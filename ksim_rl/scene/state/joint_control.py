@@ -108,6 +108,7 @@ def _no_motor(gaintype: int, biastype: int) -> str:
     """Return why an actuator is no motor whose control is its effort, or nothing."""
     plain_gains = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
     plain_biases = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+    # Muscles and user kinds compute their force in another way.
     if gaintype in plain_gains and biastype in plain_biases:
         return ""
     if gaintype not in plain_gains:
@@ -124,6 +125,7 @@ def _no_servo(
     integrates = dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
     if gaintype != mujoco.mjtGain.mjGAIN_FIXED:
         return "its gain is not fixed"
+    # Both are divided by.
     if force == 0.0 or gear == 0.0:
         return "its gain or gear is 0"
     if dyntype not in SMOOTHED and not integrates:

@@ -211,8 +211,8 @@ class WorldView:
         return self._simulation.derived().sensordata_EL[:, self._sensor_slices[name]]
 
     def parts(self) -> dict[str, object]:
-        # For messages about a term that writes where it only may read.
         """Return the objects that hold the quantities and tables of the view, by how a term spells them."""
+        # For messages about a term that writes where it only may read.
         parts: dict[str, object] = {
             "view": self,
             "view.joints()": self._every_joint,

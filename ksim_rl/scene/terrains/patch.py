@@ -55,6 +55,7 @@ class Lattice:
     @cached_property
     def ring_RC(self) -> np.ndarray:
         """Distance of each point to the centre, m, [R, C], in the norm whose circles are squares: max(|x|, |y|)."""
+        # Squares about the centre, as platforms, pyramids and trenches are.
         return np.maximum(np.abs(self.x_RC), np.abs(self.y_RC))
 
 
@@ -80,4 +81,5 @@ class TerrainPatch(Checked, ABC):
 
 def between(pair: tuple[float, float], difficulty: float) -> float:
     """Return the value of a pair at a difficulty in [0, 1]."""
+    # Either end may be the greater one.
     return pair[0] + difficulty * (pair[1] - pair[0])

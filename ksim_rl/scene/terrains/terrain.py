@@ -45,6 +45,7 @@ def add_look(spec: mujoco.MjSpec, *, repeat: float) -> None:
     textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = MATERIAL
     # Uniform: the pattern is measured in metres, not stretched over the geom.
     spec.add_material(name=MATERIAL, textures=textures, texuniform=True, texrepeat=[repeat, repeat])
+    # A directional light shines alike on all of the ground.
     spec.worldbody.add_light(pos=[0, 0, 4], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
