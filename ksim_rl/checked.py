@@ -1,4 +1,4 @@
-"""Config dataclasses that inherit `Checked` hold, once built, what the annotations of their fields say.
+"""Config dataclasses that inherit `Checked` hold, once built, values that fit the annotations of their fields.
 
 Bounds stand in the annotation: `stiffness: Positive`, `share: Share = 0.5`, `x: Annotated[float, Within(high=3.0)]`.
 Only what relates several fields to each other needs code: a method `_check_fields`. Constants of a class, which its
@@ -63,7 +63,7 @@ Name = Annotated[str, Filled("expected a name")]
 class Checked:
     """A base of dataclasses whose fields are checked against their annotations when one is built.
 
-    A ValueError names the field, the value and what would be valid.
+    A ValueError names the field, the value and the valid ones.
     """
 
     def __init_subclass__(cls, **given: Any) -> None:
@@ -161,6 +161,7 @@ def _check_union(field: str, value: object, options: Sequence[Any]) -> None:
             return
         except ValueError as error:
             errors.append(str(error))
+    # All options failed, so all of their reasons are told.
     raise ValueError("; or ".join(errors))
 
 

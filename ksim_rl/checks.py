@@ -1,4 +1,4 @@
-"""These checks refuse values by a ValueError, which names the field, the value and what would be valid."""
+"""These checks refuse values by a ValueError, which names the field, the value and the valid ones."""
 
 import argparse
 import difflib
@@ -14,12 +14,14 @@ MISFITS = (LookupError, TypeError, AttributeError, ArithmeticError)
 def near(name: str, choices: Iterable[str]) -> str:
     """Return a hint with the choices that resemble `name`, or with all of them when none does."""
     choices = sorted(set(choices))
+    # Case is ignored: names of classes are often typed in lower case.
     lower = {choice.lower(): choice for choice in choices}
     close = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.6)]
     if close:
         return f"did you mean {' or '.join(repr(choice) for choice in close)}?"
     if not choices:
         return "there is none to choose from"
+    # Twenty at most: the message is one line.
     shown = ", ".join(choices[:20])
     return f"valid: {shown}" + (f", ... ({len(choices)} in all)" if len(choices) > 20 else "")
 
@@ -55,6 +57,7 @@ def check_in_range(
         start = start.replace("[", "(")
     end = "inf)" if high is None else f"{high}]"
     bounds = f"{start}, {end}"
+    # bool is a kind of number in Python.
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f"{field}={value!r}: expected a number in {bounds}")
     # Not as a float, which would take a large int for its neighbour.
@@ -63,12 +66,13 @@ def check_in_range(
     else:
         number = float(value)
     below = low is not None and (number <= low if low_open else number < low)
+    # NaN differs from itself.
     if number != number or abs(number) == float("inf") or below or (high is not None and number > high):
         raise ValueError(f"{field}={value!r}: expected a finite number in {bounds}")
 
 
 def check_count(field: str, value: object, *, low: int = 1) -> None:
-    """Refuse what is no whole number, or one below `low`."""
+    """Refuse a value that is no whole number, or one below `low`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < low:
         raise ValueError(f"{field}={value!r}: expected a whole number >= {low}")
 
@@ -83,6 +87,7 @@ def check_choice(field: str, value: object, choices: Iterable[object]) -> None:
 
 def check_pair(field: str, value: object, *, low: float | None = None, high: float | None = None) -> None:
     """Refuse a range that is not a pair of finite, ordered numbers within `[low, high]`."""
+    # YAML gives lists where Python has tuples.
     if not isinstance(value, (tuple, list)) or len(value) != 2:
         raise ValueError(f"{field}={value!r}: expected a pair (low, high)")
     for index, number in enumerate(value):

@@ -1,1 +1,1 @@
-"""Shows our envs as those of other libraries, one module each, which alone imports the library."""
+"""Shows our envs as envs of other libraries, one module each, which alone imports the library."""

@@ -24,7 +24,7 @@ class RslRlVecEnv(VecEnv):
     Observations are a TensorDict [E] of the env's groups (or `keys`, see `Stepper`), which `obs_groups` of the runner's
     config refers to by name (`{"actor": ["actor"], "critic": ["critic"]}`). `extras["time_outs"]` marks truncations,
     which rsl_rl bootstraps; `extras["log"]` holds, every `log_interval` steps (best the runner's `num_steps_per_env`),
-    what the episodes that ended since then came to: per-term reward sums, metrics and shares of each termination.
+    figures of the episodes that ended since then: per-term reward sums, metrics and shares of each termination.
     """
 
     def __init__(self, env: EnvBase, *, keys: Keys = None, log_interval: int = 24) -> None:
@@ -35,6 +35,7 @@ class RslRlVecEnv(VecEnv):
             )
         if log_interval < 1:
             raise ValueError(f"log_interval={log_interval}: expected at least 1")
+        # The names that rsl_rl reads from its envs.
         self.env = env
         self.unwrapped = base_env
         self.num_envs = base_env.num_envs
@@ -42,6 +43,7 @@ class RslRlVecEnv(VecEnv):
         self.cfg = base_env.cfg
         self.num_actions = int(env.full_action_spec[env.action_key].shape[-1])
         self.max_episode_length = base_env.max_episode_length
+        # One graph for the env and all its transforms.
         self._stepper = Stepper(env, keys)
         self._log_interval = log_interval
         self._steps = 0
@@ -53,6 +55,7 @@ class RslRlVecEnv(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps_E: Int64[Tensor, " E"]) -> None:
+        # In place: the env and its recorded step hold this tensor.
         self.unwrapped.view.episode_step_E.copy_(steps_E)
 
     def get_observations(self) -> TensorDict:
@@ -71,6 +74,7 @@ class RslRlVecEnv(VecEnv):
         # A row that also failed has no value to bootstrap.
         extras: dict[str, Any] = {"time_outs": step.truncated_E & ~step.terminated_E}
         self._steps += 1
+        # Rarely, as figures are read back from the device.
         if self._steps % self._log_interval == 0:
             extras["log"] = self._episode_means()
         return self._tensordict(step.obs), step.reward_E, step.done_E.long(), extras

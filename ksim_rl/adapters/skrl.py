@@ -60,7 +60,7 @@ class SkrlWrapper(Wrapper):
 
     @property
     def observation_space(self) -> spaces.Box:
-        """The space of one row of what agents observe."""
+        """The space of one row of the agents' observations."""
         return self._joined_space(self._observed)
 
     @property
@@ -76,7 +76,7 @@ class SkrlWrapper(Wrapper):
         return self._action_space
 
     def reset(self) -> tuple[Float[Tensor, "E L"], dict[str, Any]]:
-        """Return what the next actions answer to; the first call resets all envs."""
+        """Return the observations that the next actions answer to; the first call resets all envs."""
         # skrl resets before each training; going on is what its wrappers of vector envs do.
         self._current = self._current or self._stepper.reset()
         return self._joined(self._current, self._observed), {}
@@ -95,7 +95,7 @@ class SkrlWrapper(Wrapper):
         return self._joined(step.obs, self._observed), reward_E1, terminated_E1, truncated_E1, infos
 
     def state(self) -> Float[Tensor, "E L"] | None:
-        """Return what critics see beside the observations of the last `reset` or `step`."""
+        """Return the critics' inputs, of the same state as the last observations of `reset` or `step`."""
         if self._seen:
             return self._joined(self._current or self._stepper.reset(), self._seen)
         return None

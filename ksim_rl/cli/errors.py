@@ -17,8 +17,10 @@ def report(error: Exception, *, about: str = "") -> int:
 
     Its traceback comes first where `KSIM_RL_TRACEBACK` asks for it, or where no message can explain it.
     """
+    # Python's own message is often empty.
     if isinstance(error, MemoryError):
         error = OSError(f"out of memory: {error}" if str(error) else "out of memory")
+    # These kinds are raised with messages for users; any other is a fault of ours.
     explained = isinstance(error, (ValueError, RuntimeError, OSError)) and not isinstance(
         error, NotImplementedError
     )
@@ -27,6 +29,7 @@ def report(error: Exception, *, about: str = "") -> int:
     notes = getattr(error, "__notes__", ())  # where in the config it was, for instance
     text = " ".join(" ".join((str(error), *notes)).split())
     say(f"error: {about}{text if explained and text else f'{type(error).__name__}: {text}'}")
+    # ValueError means that nothing was started: another code than a failed run's.
     if isinstance(error, ValueError):
         return REFUSED
     return FAILED
@@ -34,11 +37,12 @@ def report(error: Exception, *, about: str = "") -> int:
 
 @contextmanager
 def sigterm_interrupts() -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt as SIGINT does, so that what holds files and folders puts them in order."""
+    """Let SIGTERM raise KeyboardInterrupt as SIGINT does, so that holders of files and folders put them in order."""
 
     def interrupt(number: int, _frame: object) -> None:
         raise KeyboardInterrupt(number)
 
+    # Only the main thread may set handlers of signals.
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -51,6 +55,7 @@ def sigterm_interrupts() -> Iterator[None]:
 
 def interruption(stopped: KeyboardInterrupt) -> signal.Signals:
     """Return which signal it was."""
+    # SIGTERM comes with its number, Ctrl-C without.
     if stopped.args:
         return signal.Signals(stopped.args[0])
     return signal.SIGINT
@@ -58,6 +63,7 @@ def interruption(stopped: KeyboardInterrupt) -> signal.Signals:
 
 def say(text: str) -> None:
     """Print one line of the program's own on stderr, and which of several ranks says it."""
+    # Several ranks share a terminal.
     if os.environ.get("WORLD_SIZE", "1") != "1":
         rank = f"rank {os.environ['RANK']}: "
     else:

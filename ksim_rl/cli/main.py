@@ -80,10 +80,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         os.environ["PYTHONSAFEPATH"] = "1"
         show_warnings_as_lines()
     try:
+        # SIGTERM ends a run as Ctrl-C does: it saves and says so.
         with sigterm_interrupts():
             code = _dispatch(arguments)
     except KeyboardInterrupt as stopped:
         number = interruption(stopped)
+        # A command that writes catches the interruption itself.
         say(f"{number.name}: interrupted; nothing was being written")
         code = 128 + int(number)
     except Exception as error:
@@ -92,6 +94,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _dispatch(words: list[str]) -> int:
+    # `--plugin` may stand before the command, too.
     arguments, names = _without_plugins(words)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         show(USAGE)
@@ -110,7 +113,9 @@ def _dispatch(words: list[str]) -> int:
     module, _, function = COMMANDS[command].partition(":")
     with gc_disabled():
         run = getattr(importlib.import_module(module), function)
+        # Plug-ins before the command: it may name their tasks.
         importlib.import_module("ksim_rl.config.plugins").load_from_here(names, note=say)
+    # torchrun sets the number of ranks.
     if int(os.environ.get("WORLD_SIZE") or 1) == 1:
         return run(rest)
     with importlib.import_module("ksim_rl.ranks").joined(command):
@@ -124,6 +129,7 @@ def _without_plugins(arguments: list[str]) -> tuple[list[str], list[str]]:
     names = []
     following = iter(arguments)
     for argument in following:
+        # Both spellings: the name in the same word, or in the next one.
         flag, equals, name = argument.partition("=")
         if flag != "--plugin":
             left.append(argument)
@@ -145,6 +151,7 @@ def gc_disabled() -> Iterator[None]:
     try:
         yield
     finally:
+        # Objects of the imports live to the end: the collector need not look at them again.
         gc.freeze()
         gc.enable()
 

@@ -105,7 +105,7 @@ def _what_is_saved(folder: Path) -> str:
 
 @contextmanager
 def shown_working(text: str) -> Iterator[RunProgress]:
-    """Show on stderr that a command works, and what it compiles, while it says nothing else."""
+    """Show on stderr that a command works, and the kernels it compiles, while it says nothing else."""
     progress = RunProgress(1, console=Console(stderr=True, highlight=False))
     with compile_notice(progress.status), progress.busy(text):
         yield progress

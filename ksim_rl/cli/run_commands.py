@@ -66,7 +66,7 @@ def resume(arguments: list[str]) -> int:
         cfg = conf.changed(tree, saved.path, overrides)
     else:
         cfg = RunCfg.from_tree(tree)
-    # The device of this machine, not that of the machine where the run began.
+    # The device of this machine, not of the machine where the run began.
     cfg = dataclasses.replace(_on_these_ranks(cfg, saved), device=str(cfg.resolved_device()))
     if cfg.trainer.num_iterations < saved.iteration:
         raise ValueError(
@@ -88,7 +88,7 @@ def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
         return cfg
     data = cfg.data
     objective = cfg.objective
-    # Sizes in the config are those of one rank: the share changes, the whole stays.
+    # Sizes in the config are for one rank: the share changes, the whole stays.
     size = ranks.share_of(data, "num_env_states_per_minibatch", before)
     # At least one shard, also where there are now more ranks than shards were.
     shards = data.shards * before // now

@@ -118,7 +118,7 @@ def _primary_config(flags: argparse.Namespace) -> tuple[str, bool]:
 
 
 def _job_of_a_multirun() -> str:
-    """Return which job this is, for a message; nothing for a run of its own."""
+    """Return which job this is, for a message; nothing for a single run."""
     launched = HydraConfig.get()
     if launched.mode != RunMode.MULTIRUN:
         return ""
@@ -144,7 +144,7 @@ def _with_models_of(began: Path | None, cfg: RunCfg, *, note: Callable[[str], No
 
 
 def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str], began: Path | None) -> int:
-    plugins.load(())  # those of the environment, where a launcher runs the job in a process of its own
+    plugins.load(())  # plug-ins of the environment, where a launcher runs the job in another process
     plain: Any = OmegaConf.to_container(config, resolve=True)
     for path, value in reaching_outside(plain, given=given) if groups else ():
         raise ValueError(
@@ -153,7 +153,7 @@ def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str],
         )
     cfg = RunCfg.from_tree(plain)
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
-    # The run's own config must find what it names from anywhere.
+    # The run's own config must find its files from anywhere.
     if cfg.checkpoint is not None:
         cfg = dataclasses.replace(cfg, checkpoint=str(Path(cfg.checkpoint).resolve()))
     cfg = dataclasses.replace(cfg, objective=cfg.objective.with_absolute_paths())

@@ -1,4 +1,4 @@
-"""`ksim-rl warmup` compiles what a run needs ahead of time, and prints how long that took."""
+"""`ksim-rl warmup` compiles the kernels of a run ahead of time, and prints how long that took."""
 
 import dataclasses
 import time
@@ -22,8 +22,10 @@ def warmup(arguments: list[str]) -> int:
     if arguments and arguments[0] in ("-h", "--help"):
         show(USAGE)
         return 0
+    # Nothing is logged or evaluated: only compiling is wanted.
     cfg = conf.compose([*arguments, "logger=none", "trainer.eval_episodes=0"])
     check_sources(cfg)
+    # Resolved once, so that the message names the device that was used.
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     compiled: list[str] = []
     progress = RunProgress(1)
@@ -33,6 +35,7 @@ def warmup(arguments: list[str]) -> int:
         compiled.append(text)
         progress.status(text)
 
+    # One iteration uses all kernels of a training: physics, terms, networks and the update.
     with compile_notice(notice), progress.busy("compiling"):
         build(cfg).iterate()
     seconds = time.perf_counter() - began

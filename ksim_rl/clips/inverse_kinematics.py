@@ -1,7 +1,7 @@
 """Finds the joint positions that bring points of a robot to where they should be, on MuJoCo's C engine.
 
 Damped least squares (Levenberg, 1944; for robots Wampler, 1986): of all small steps the one that reduces the weighted
-squared errors most, with a price on the distance from a posture, so that what nothing asks for stays as it should.
+squared errors most, with a price on the distance from a posture, so that coordinates that no goal asks for stay put.
 """
 
 from collections.abc import Sequence

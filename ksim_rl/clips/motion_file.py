@@ -16,6 +16,7 @@ def velocities(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: floa
     """Return qvel by central differences, one-sided at the ends; angular velocities come from quaternions."""
     last = len(qpos_FL) - 1
     qvel_FM = np.zeros((len(qpos_FL), mj_model.nv))
+    # Over two frames in the middle, over one at both ends.
     for frame in range(len(qpos_FL)):
         before = max(frame - 1, 0)
         after = min(frame + 1, last)
@@ -26,15 +27,18 @@ def velocities(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: floa
 
 
 def _turned_to_own_frame(mj_model: mujoco.MjModel, qpos_FL: Array, qvel_FM: Array) -> Array:
+    # Only free joints have angular velocities in a moving frame here.
     free = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     for joint in free:
         quat = int(mj_model.jnt_qposadr[joint]) + 3
         turn = int(mj_model.jnt_dofadr[joint]) + 3
         for frame in range(len(qpos_FL)):
+            # The frame that mj_differentiatePos took as the first.
             before_4 = qpos_FL[max(frame - 1, 0), quat : quat + 4]
             own_4 = qpos_FL[frame, quat : quat + 4]
             world_3 = np.empty(3)
             back_4 = np.empty(4)
+            # From that frame into the world, and from the world into the frame's own.
             mujoco.mju_rotVecQuat(world_3, qvel_FM[frame, turn : turn + 3].copy(), before_4)
             mujoco.mju_negQuat(back_4, own_4)
             mujoco.mju_rotVecQuat(qvel_FM[frame, turn : turn + 3], world_3, back_4)
@@ -42,6 +46,7 @@ def _turned_to_own_frame(mj_model: mujoco.MjModel, qpos_FL: Array, qvel_FM: Arra
 
 
 def motion_bytes(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float) -> bytes:
+    # Without times of files in it, NumPy's archive is the same for the same arrays.
     """Return an .npz archive of a motion of the model; the same bytes for the same motion."""
     data = io.BytesIO()
     np.savez_compressed(

@@ -30,7 +30,7 @@ def read_csv(
     """Return the qpos of a model with a free root from a CSV file, resampled from `fps` to `wanted_fps`.
 
     `joints` names the file's columns behind the seventh, if they are not the model's hinges and slides in its order;
-    joints that it leaves out stay as in the model's first keyframe. A ValueError says what is wrong in which line.
+    joints that it leaves out stay as in the model's first keyframe. A ValueError names the fault and its line.
     """
     own = [mj_model.joint(i).name for i in scalar_joint_ids(mj_model)]
     # Files of retargeted motions often have the joints of another version of the robot.

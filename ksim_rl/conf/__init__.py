@@ -1,4 +1,4 @@
-"""Composes the config of `ksim-rl train` with Hydra, from YAML, the dataclasses and what is registered."""
+"""Composes the config of `ksim-rl train` with Hydra, from YAML, the dataclasses and the registered parts."""
 
 from ksim_rl.conf import spelling
 from ksim_rl.conf.command_line import changed, check_command_line, compose, fields_of, without_sweeps

@@ -1,4 +1,4 @@
-"""Makes the choices of the config groups from the dataclasses, and what each task sets over them."""
+"""Makes the choices of the config groups from the dataclasses, and each task's settings over them."""
 
 from collections.abc import Mapping
 from functools import partial

@@ -44,7 +44,7 @@ def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, value
     """Refuse overrides that name an unknown group, choice or field, or (with `values`) give a field a bad value.
 
     The primary config is `name`; sweeps such as `seed=1,2` need `multirun`. With `values` it returns the config, of
-    each job of a sweep. The ValueError is one line that names what is wrong, and the near names or the valid values.
+    each job of a sweep. The ValueError is one line that names the fault, and the near names or the valid values.
     """
     # Hydra keeps one global state: an earlier call in this process would be found in the way.
     GlobalHydra.instance().clear()

@@ -1,4 +1,4 @@
-"""Registers with Hydra what configs are composed of, and the config of a run that is made once more."""
+"""Registers the parts of configs with Hydra, and the config of a run that is made once more."""
 
 import os
 import re
@@ -51,7 +51,7 @@ OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 def register() -> None:
     """Let Hydra find other packages' configs, and store the groups' choices, the tasks and their training defaults.
 
-    The last go to the groups `task`, `task/training` (what holds for any objective) and `task/objective_training`.
+    The last go to the groups `task`, `task/training` (settings for any objective) and `task/objective_training`.
     """
     _register(plugins.named())
 
@@ -75,7 +75,7 @@ def _register(_named: tuple[str, ...]) -> None:
 def register_run(folder: Path, given: Collection[str] = ()) -> None:
     """Store the config that a run left in its folder, which is data, as the primary config `RUN_AGAIN`.
 
-    A ValueError names what is more than that, in the config or beside it; see `check_run_tree`.
+    A ValueError names anything else in the config or beside it; see `check_run_tree`.
     """
     path = folder / RUN_CONFIG
     tree = plain_data.read_yaml(path)
@@ -110,9 +110,9 @@ def config_files(folder: Path) -> list[Path]:
 def check_groups(folder: Path) -> None:
     """Refuse a folder of config groups that holds more than values for fields and choices of groups.
 
-    That is what the config of a run may not hold either (tags, anchors, resolvers such as `${oc.env:HOME}`), links, and
-    how Hydra launches, logs or calls back. References to other fields, such as `${num_envs}`, are values; there may be
-    `MOST_REFERENCES` of them.
+    Refused are, as in a run's config, tags, anchors and resolvers such as `${oc.env:HOME}`, and also links and settings
+    of how Hydra launches, logs or calls back. References to other fields, such as `${num_envs}`, are values, of which
+    `MOST_REFERENCES` are taken.
     """
     found = config_files(folder)
     if not any(len(path.parts) > 1 and path.name != RUN_CONFIG for path in found):

@@ -49,7 +49,7 @@ def run_python(
     text: str | None = None,
     seconds: float | None = None,
 ) -> "subprocess.CompletedProcess[str]":
-    """Run Python as `start_python` does, with `text` as its input, and return its exit code and what it printed.
+    """Run Python as `start_python` does, with `text` as its input, and return its exit code and its output.
 
     A child that takes longer than `seconds` is killed, and `subprocess.TimeoutExpired` is raised.
     """

@@ -78,7 +78,7 @@ def default_tree(cls: type, annotation: Any = None) -> dict[str, Any]:
 
 
 def from_tree(annotation: type[Config], tree: Any, path: str = "") -> Config:
-    """Build the dataclass that a tree describes; `path` precedes the fields in errors, which say what is valid."""
+    """Build the dataclass that a tree describes; `path` precedes the fields in errors, which name the valid values."""
     return build_value(annotation, tree, path)
 
 

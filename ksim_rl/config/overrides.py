@@ -43,7 +43,7 @@ def quoting(text: str) -> str:
 
 
 def check_parsed(tree: Mapping[str, Any], overrides: Iterable[Override]) -> None:
-    """Do the same with overrides that are parsed: each sees what the ones before it have added and dropped."""
+    """Do the same with parsed overrides: each sees fields that the ones before it have added and dropped."""
     # A copy, since later overrides are checked against added and dropped fields.
     tree = copy.deepcopy(dict(tree))
     for override in overrides:

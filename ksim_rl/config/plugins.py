@@ -1,6 +1,6 @@
 """Finds and imports plug-ins: other packages' tasks, terms, robots, transforms, networks and algorithms.
 
-An installed package declares what it has in its pyproject.toml, and is then known to every command:
+An installed package declares its parts in its pyproject.toml, and is then known to every command:
 
     [project.entry-points."ksim_rl.tasks"]
     my_robots = "my_robots.tasks"      # a module, or a package whose modules are all read
@@ -75,7 +75,7 @@ def load_from_here(names: Sequence[str], *, note: Callable[[str], None]) -> None
 
 
 def load(names: Sequence[str]) -> None:
-    """Import the plug-ins that a command or a caller names, with those of `KSIM_RL_PLUGINS`.
+    """Import the plug-ins that a command or a caller names, and the plug-ins of `KSIM_RL_PLUGINS`.
 
     Processes that this one starts load the same plug-ins, as the environment variable takes up the names. A ValueError
     names one that cannot be imported.
@@ -139,7 +139,7 @@ def packages() -> frozenset[str]:
 
 
 def hint(package: str) -> str:
-    """Return what a user who trusts a package does so that configs may name its classes."""
+    """Return the advice to a user who trusts a package, so that configs may name its classes."""
     return f"If you trust {package!r}, add --plugin {package} (in Python: plugins=[{package!r}])"
 
 

@@ -30,7 +30,7 @@ class Curves:
         return max((len(column) for column in self.columns.values()), default=0)
 
     def values(self, name: str) -> list[float]:
-        """Return what a metric was, where it was a finite number."""
+        """Return a metric's values, oldest first, where they were finite numbers."""
         return [value for value in self.columns.get(name, ()) if value is not None and math.isfinite(value)]
 
     def early(self, name: str) -> float | None:
@@ -52,6 +52,7 @@ class Curves:
     def setting(self, path: str, default: float) -> float:
         """Return a number of the config by dotted path, or the default where there is none."""
         value: Any = self.config
+        # A setting of another algorithm is missing: its default stands for it.
         for name in path.split("."):
             if isinstance(value, Mapping):
                 value = value.get(name)
@@ -61,6 +62,7 @@ class Curves:
         return float(value) if is_number else default
 
     @property
+    # At least three values, so that the median ignores one that is off.
     def _span(self) -> int:
         return max(3, round(SHARE * self.num_rows))
 
@@ -76,12 +78,14 @@ def read_run(folder: Path) -> Curves:
 
     Raises ValueError where there is no table of metrics, or it is damaged.
     """
+    # The folder itself, or the run folder of a checkpoint two levels below it.
     places = [folder, *folder.absolute().parents[:2]]
     found = next((place for place in places if (place / METRICS).is_file()), None)
     if found is None:
         raise ValueError(
             f"{folder}: there is no {METRICS}: name the folder of a run whose logger wrote one (logger.csv=true)"
         )
+    # A table without its config is still worth a diagnosis.
     if (found / CONFIG).is_file():
         config = plain_data.read_yaml(found / CONFIG)
     else:

@@ -28,20 +28,23 @@ class Finding:
 
 def findings(curves: Curves) -> list[Finding]:
     """Return the faults that the curves show, without those that follow from another one of them."""
+    # Too few rows: medians of the beginning and the end would be of the same ones.
     if curves.num_rows < LEAST_ROWS:
         return []
     seen = {fault: text for fault in FAULTS if (text := fault(curves)) is not None}
+    # Faults that another one explains would send the user to the wrong setting.
     follow = {effect for cause in seen for effect in EXPLAINS.get(cause, ())}
     found = []
     for fault, text in seen.items():
         if fault not in follow:
+            # The docstring's first paragraph is the reason, the second the change.
             reason, _, change = inspect.cleandoc(fault.__doc__ or "").partition("\n\n")
             found.append(Finding(name=fault.__name__, seen=text, reason=_line(reason), change=_line(change)))
     return found
 
 
 def one_line(folder: Path, name: str) -> str:
-    """Return in one line what a run's metrics show, or why they show nothing; `name` is what the user calls it."""
+    """Return the faults in a run's metrics in one line, or why there are none to see; `name` is the user's for it."""
     try:
         curves = read_run(folder)
     except ValueError as error:

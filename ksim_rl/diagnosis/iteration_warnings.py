@@ -1,10 +1,10 @@
-"""What was lost in one iteration is told here, from its metrics, so that a run can say it at once."""
+"""Names the losses of one iteration, from its metrics, so that a run can tell them immediately."""
 
 from collections.abc import Mapping, Sequence
 
 
 def warnings_of(losses: Sequence[str], metrics: Mapping[str, float]) -> dict[str, str]:
-    """Return what went wrong, by kind: `losses` are contacts or constraints that physics had no room for."""
+    """Return the faults, by kind: `losses` are contacts or constraints that physics had no room for."""
     texts = {
         text.split(":")[0].split(" needed")[0]: f"PHYSICS LOST CONTACTS OR CONSTRAINTS: {text}"
         for text in losses

@@ -1,4 +1,4 @@
-"""Networks and actions are measured here in some env states of a rollout, for what losses do not show."""
+"""Measures networks and actions in some env states of a rollout, for faults that losses do not show."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -17,7 +17,7 @@ from ksim_rl.modules import ACTIVATIONS, ObservationNormalizer, recurrent_module
 NUM_ENV_STATES = 512
 # A unit whose output moves less than that over all of them says nothing.
 LEAST_MOVEMENT = 1e-3
-# Of an action's range: what is nearer to a bound lies on it.
+# Share of an action's range: an action nearer to a bound counts as on it.
 BOUND_SHARE = 0.005
 
 
@@ -26,7 +26,7 @@ def probed(update: Any, env: EnvBase, rollout_ET: TensorDictBase | None) -> dict
     """Return what the `actor` and `critic` of an update, and the actions, are like in a rollout `["E","T"]`.
 
     `policy/dead_units` is the share of hidden units whose output is the same in all of its first env states,
-    `policy/observation_rms` the root mean square of what normalizers give there, 1 where their statistics fit, and
+    `policy/observation_rms` the root mean square of the normalizers' outputs there, 1 where their statistics fit, and
     `rollout/saturated_actions` the share of actions on their bounds or beyond. What there is not is left out, as are
     the networks where one is recurrent. Nothing is drawn or learned; the figures are read on the host.
     """
@@ -41,7 +41,7 @@ def probed(update: Any, env: EnvBase, rollout_ET: TensorDictBase | None) -> dict
     for network in [] if recurrent_modules(*networks) else networks:
         if any(rollout_ET.get(key, None) is None for key in network.in_keys):
             continue  # an update may keep less of a rollout than a network reads
-        # As new tensors: what networks write must not reach the rollout.
+        # As new tensors: outputs of networks must not reach the rollout.
         env_states_B = rollout_ET[:num_envs].select(*network.in_keys).reshape(-1)
         with _heard(network, ranges, squares), set_exploration_type(ExplorationType.DETERMINISTIC):
             network(env_states_B)

@@ -232,7 +232,7 @@ def _fill(
 def runner_source() -> str:
     """Return the text of `runner.py`: the modules of the folder `standalone` as one."""
     *parts, runner = ((STANDALONE / f"{name}.py").read_text() for name in PARTS)
-    # The docstring of the runner becomes that of the file; the other modules lose theirs.
+    # The docstring of the runner becomes the file's; the other modules lose theirs.
     doc, body = re.split(r'(?<=\n""")\n', runner, maxsplit=1)
     inner = [re.sub(r'\A""".*?"""\n', "", text, flags=re.DOTALL) for text in parts]
     # Imports of the package go: all names are in the one file then.
@@ -327,7 +327,7 @@ def _gains(
     ours: ManagerBasedRlEnv, laws: Sequence[Any], names: Sequence[str]
 ) -> tuple[list[float], list[float]]:
     """Return stiffness and damping by joint: the numbers of laws, and the model's gains for MuJoCo's servos."""
-    # Softnesses of servos are in the model, those of laws in the numbers that the laws were given.
+    # Gains of servos are in the model, gains of laws in the numbers that the laws were given.
     model = ours.world.mj_model
     found = dict.fromkeys(names, (0.0, 0.0))
     for law in laws:

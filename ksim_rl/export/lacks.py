@@ -1,4 +1,4 @@
-"""Says before a training what an export of its policy will lack, when there is time to mend it."""
+"""Names the parts that an export of a policy will lack, before its training, when there is time to mend it."""
 
 from collections.abc import Callable
 
@@ -12,11 +12,13 @@ from ksim_rl.trainers.run_cfg import RunCfg
 
 
 def say_lacks(cfg: RunCfg, env: EnvBase, note: Callable[[str], None]) -> None:
-    """Say in one line each what `export` will refuse or leave out of a policy that is trained in this env."""
+    """Name in one line each the terms that `export` will refuse or leave out of a policy trained in this env."""
+    # Other envs cannot be exported at all, which `export` says itself.
     ours = part(env, ManagerBasedRlEnv)
     if ours is None:
         return
     groups = [str(group) for group in cfg.modules.observation_keys("actor")]
+    # Describing is the part of an export that may fail; it writes nothing here.
     try:
         metadata(ours, controls.observations(ours, groups), note)
     except ValueError as error:

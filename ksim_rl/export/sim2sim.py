@@ -95,7 +95,7 @@ def sim2sim(
     check_closed(folder / "robot.xml")
     physics, words = _other_physics(meta, load_spec(folder / "robot.xml").option)
     note(f"running {episodes} episodes")
-    # Our own runner, not that of the folder, which may be a stranger's.
+    # Our own runner, not the folder's, which may be a stranger's.
     with tempfile.TemporaryDirectory() as temporary:
         program, output, replay = (Path(temporary) / name for name in ("runner.py", "out.json", "replay.npz"))
         program.write_text(runner_source())

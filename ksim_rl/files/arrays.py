@@ -21,12 +21,14 @@ def read_arrays(
     Their sizes are computed from their headers before memory is taken for them. Arrays of objects, which are pickles,
     are refused.
     """
+    # Read as a whole: the file cannot change between header and data.
     data = io.BytesIO(read_bytes(path, limit=limit, follows_links=follows_links))
     try:
         with zipfile.ZipFile(data) as archive:
             entries = archive.infolist()
             if len(entries) > MOST_ARRAYS:
                 raise ValueError(f"it has {len(entries)} arrays, more than {MOST_ARRAYS}")
+            # Sizes after unpacking, which a small archive may make huge.
             if sum(entry.file_size for entry in entries) > limit:
                 raise ValueError(f"its arrays are larger than {limit} bytes")
             return {entry.filename.removesuffix(SUFFIX): _read_array(archive, entry) for entry in entries}
@@ -35,6 +37,7 @@ def read_arrays(
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    # Header first: numpy would allocate the claimed shape before it reads.
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
         if version not in ((1, 0), (2, 0)):
@@ -44,9 +47,11 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
         else:
             reads = np.lib.format.read_array_header_2_0
         shape, in_columns, dtype = reads(file)
+        # Unpickling runs code of the file.
         if dtype.hasobject:
             raise ValueError(f"{entry.filename}: an array of objects, which are pickles")
         wanted = math.prod(shape) * dtype.itemsize
+        # Dimensions below zero would make a small product of a large shape.
         if min(shape, default=0) < 0 or wanted > entry.file_size:
             raise ValueError(
                 f"{entry.filename}: its header claims {wanted} bytes, and it has {entry.file_size}"
@@ -54,4 +59,5 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
         content = file.read(wanted)
     if len(content) != wanted:
         raise ValueError(f"{entry.filename}: {len(content)} bytes, where its header claims {wanted}")
+    # A copy, since an array over bytes cannot be written.
     return np.frombuffer(content, dtype=dtype).reshape(shape, order="F" if in_columns else "C").copy()

@@ -40,7 +40,7 @@ def open_regular(path: Path, *, limit: int, follows_links: bool = False) -> Bina
 
 
 def check_regular(path: Path, *, limit: int) -> None:
-    """Refuse what `open_regular` refuses, links apart, for libraries that open a file themselves."""
+    """Refuse the files that `open_regular` refuses, except links, for libraries that open a file themselves."""
     open_regular(path, limit=limit, follows_links=True).close()
 
 

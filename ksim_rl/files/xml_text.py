@@ -3,7 +3,7 @@
 import codecs
 import re
 
-# The longer marks first: that of UTF-32 begins with that of UTF-16.
+# The longer marks first: UTF-32's begins with UTF-16's.
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),

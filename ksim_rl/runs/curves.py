@@ -75,7 +75,7 @@ def _draw_panel(
 
 
 def dress(axes: Axes, title: str, *, over: str = "env states") -> None:
-    """Give a panel its title, the label of what it is drawn over, and a light grid."""
+    """Give a panel its title, the label of its horizontal axis, and a light grid."""
     axes.set_title(title, fontsize=10.5)
     axes.set_xlabel(over, fontsize=9)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))

@@ -1,4 +1,4 @@
-"""Runs are found in folders, and each is summed up from what it has left there so far."""
+"""Finds runs in folders, and sums each up from the files that it has written so far."""
 
 import csv
 import math

@@ -1,7 +1,7 @@
 """A run folder says how its run came about: command line, code, versions, hardware, and how each session ended.
 
 `run.json` has an entry per session: the first one, and one more for each time that the run was resumed. It is data:
-what others wrote is read as text. The environment's variables are never in it.
+entries of others are read as text. The environment's variables are never in it.
 """
 
 import dataclasses

@@ -14,6 +14,7 @@ def watch(run_folder: Path, *, holds: str, note: Callable[[str], None]) -> Calla
 
     def check() -> None:
         try:
+            # The same folder, and not another one of the same name.
             ours = os.path.samestat(begun, run_folder.stat()) and (run_folder / holds).exists()
         except OSError:
             ours = False
@@ -21,6 +22,7 @@ def watch(run_folder: Path, *, holds: str, note: Callable[[str], None]) -> Calla
             raise OSError(
                 f"{run_folder}: deleted or moved while this run wrote it: nothing more can be saved, so the run ends"
             )
+        # Told once, not at each check.
         if not said and not os.access(run_folder, os.W_OK):
             said.append(True)
             note(
@@ -32,12 +34,13 @@ def watch(run_folder: Path, *, holds: str, note: Callable[[str], None]) -> Calla
 
 @contextmanager
 def threads_that_fail(note: Callable[[str], None]) -> Iterator[None]:
-    """Say in one line what ends a thread, such as the one that writes TensorBoard's file; the run goes on."""
+    """Say in one line that a thread failed, such as the writer of TensorBoard's file; the run goes on."""
 
     def say(failed: threading.ExceptHookArgs) -> None:
         name = getattr(failed.thread, "name", "a thread")
         note(f"warning: {name} ended: {failed.exc_type.__name__}: {failed.exc_value}")
 
+    # Other threads of the program keep their own way of failing afterwards.
     previous = threading.excepthook
     threading.excepthook = say
     try:

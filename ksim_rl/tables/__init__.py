@@ -1,1 +1,1 @@
-"""Tables of results: what is measured how often stands in a YAML file, and one command runs it and writes the table."""
+"""Tables of results: a YAML file lists the measurements, and one command runs it and writes the table."""

@@ -24,8 +24,10 @@ def means_of(points: Sequence[Point], names: Iterable[str]) -> dict[str, float]:
 def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | None:
     """Return the end of the first `HELD_STATES` env states over which all levels hold in the mean; None: never."""
     for index, point in enumerate(points):
+        # Too little is left of the run to hold the levels over.
         if points[-1]["env_states"] < point["env_states"] + HELD_STATES:
             return None
+        # From this point on, for as many env states as have to be held.
         held = [other for other in points[index:] if other["env_states"] <= point["env_states"] + HELD_STATES]
         means = means_of(held, levels)
         if all(means.get(name, -math.inf) >= level for name, level in levels.items()):
@@ -34,9 +36,10 @@ def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | Non
 
 
 def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return what the seeds come to: a mean return, a median of seconds (None is infinite), or a lowest share."""
+    """Return the figure of all seeds: a mean return, a median of seconds (None is infinite), or a lowest share."""
     if row.measure == "return":
         return statistics.fmean(result["evaluation"]["return_mean"] for result in results)
+    # The worst seed counts.
     if row.measure == "success":
         return min(result["trials"]["success"] for result in results)
     seconds = []
@@ -53,8 +56,10 @@ def is_reached(row: Row, results: Sequence[Mapping[str, Any]]) -> bool | None:
     value = value_of(row, results)
     found = []
     if row.goal is not None:
+        # Seconds should be few, returns and shares many.
         is_good = value is not None and (value <= row.goal if row.measure == "seconds" else value >= row.goal)
         found.append(is_good)
+    # With seconds the levels are the measure itself; else each seed has to have them.
     for name, level in row.levels.items() if row.measure != "seconds" else ():
         found += [result["means"].get(name, -math.inf) >= level for result in results]
     if row.most_falls is not None:

@@ -1,4 +1,4 @@
-"""Draws a table: each row's seeds and their summary, beside what others report."""
+"""Draws a table: each row's seeds and their summary, beside published figures."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,8 +21,10 @@ def draw(table: Table, rows: Mapping[str, Sequence[Mapping[str, Any]]], path: Pa
         complete = [name for name in names if name in rows]
         if complete:
             groups.append((group, complete))
+    # Rows of panels, rounded up.
     down = -(-len(groups) // 3)
     across = min(len(groups), 3)
+    # The panel with the most rows gives the height of all.
     most = max(len(names) for _, names in groups)
     figure = Figure(figsize=(6.0 * across, (1.8 + 0.27 * most) * down), layout="constrained")
     FigureCanvasAgg(figure)
@@ -30,16 +32,20 @@ def draw(table: Table, rows: Mapping[str, Sequence[Mapping[str, Any]]], path: Pa
     for place, (group, names) in enumerate(groups):
         axes = figure.add_subplot(down, across, place + 1)
         for line, name in enumerate(names):
+            # Each seed is a dot, their summary a line.
             for result in (*[[one] for one in rows[name]], rows[name]):
                 if (value := value_of(table.rows[name], result)) is not None:
                     axes.plot([value], [line], "|" if result is rows[name] else ".", color=OURS, ms=12)
+        # Each publication keeps its marker and colour within a panel.
         others = list(dict.fromkeys(key for name in names for key in table.rows[name].published))
         for other, (marker, color) in zip(others, OTHERS, strict=False):
             pairs = [(table.rows[n].published.get(other), line) for line, n in enumerate(names)]
             values, lines = zip(*((v, line) for v, line in pairs if v is not None), strict=True)
             axes.plot(values, lines, marker, color=color, ms=4, label=other)
+        # An empty plot, for the legend.
         axes.plot([], [], "|", color=OURS, label="ours, and its seeds")
         axes.set_yticks(range(len(names)), [name.rpartition("/")[2] for name in names], fontsize=8)
+        # The first row on top.
         axes.set_ylim(len(names) - 0.5, -0.5)
         axes.set_xlim(left=0.0)
         axes.set_xlabel(table.rows[names[0]].measure, fontsize=9)

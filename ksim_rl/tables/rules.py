@@ -9,7 +9,7 @@ from ksim_rl.config.plain_data import check_plain
 
 # Names of tables, groups and rows become parts of paths.
 NAME = re.compile(r"\w[\w .+-]{0,99}")
-# Fields of a run's config that a row has under names of its own.
+# Fields of a run's config that a row has under other names.
 OF_ROWS = ("task", "objective", "seed", "trainer.num_iterations")
 
 

@@ -36,7 +36,7 @@ class Runs:
         self._of = cache(lambda name: run_cfg(table.rows[name], 1, smoke=smoke))
 
     def results(self) -> dict[str, dict[int, dict[str, Any]]]:
-        """Return the results that count, by row and seed: those of the settings that the row has now."""
+        """Return the results that count, by row and seed: results of the settings that the row has now."""
         found: dict[str, dict[int, dict[str, Any]]] = {}
         for name, row in self.table.rows.items():
             paths = {seed: self.folder / name / f"seed_{seed}.json" for seed in row.seeds}
@@ -115,7 +115,7 @@ class Runs:
     def _next(
         self, waiting: list[Job], elsewhere: set[Job], note: Callable[[str], None]
     ) -> tuple[Job, IO[str]] | None:
-        """Take a job that no other process does now, with its log, or None; what another has done is not done again."""
+        """Take a job that no other process does now, with its log, or None; others' finished jobs are not redone."""
         # A copy, since jobs are taken out of it.
         for job in list(waiting):
             log = self._claimed(job)
@@ -123,7 +123,7 @@ class Runs:
                 elsewhere.add(job)
                 continue
             waiting.remove(job)
-            # The results that count in a smoke test are those of its own time.
+            # In a smoke test only results of its own time count.
             if (job in elsewhere or not self.smoke) and job[1] in self.results()[job[0]]:
                 note(f"{job[0]}, seed {job[1]}: done by another process")
                 log.close()

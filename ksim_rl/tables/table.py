@@ -1,4 +1,4 @@
-"""Reads a table: rows (task, objective, overrides, env states, seeds), what is measured, what others got.
+"""Reads a table: rows (task, objective, overrides, env states, seeds), measures, and published figures.
 
 A file has groups, whose rows inherit the fields of their group; docs/tables.md shows one.
 """
@@ -84,7 +84,7 @@ class Mean(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class Table(Checked):
-    """Rows by `<group>/<name>`, or by name in the group ""; `notes` is a paragraph below, `source` what `load` took."""
+    """Rows by `<group>/<name>`, or by name in the group ""; `notes` stands below, `source` is `load`'s argument."""
 
     name: str
     source: str = ""

@@ -1,4 +1,4 @@
-"""Computes the demands of a motion on a robot: torques, where the ground must push, and what touches what.
+"""Computes the demands of a motion on a robot: torques, the ground's push, and contacts of the robot with itself.
 
 MuJoCo's inverse dynamics (`mj_inverse` without contacts) gives the wrench that the ground must exert on the floating
 root, and the joint torques beside it. Wrenches of two feet that stand are shared by where the zero-moment point lies

@@ -1,4 +1,4 @@
-"""Compares a robot's bodies with those of a reference motion, in the world and seen from an anchor body.
+"""Compares a robot's bodies with a reference motion's, in the world and seen from an anchor body.
 
 An aligned motion is moved and turned about the vertical so that its anchor stands where the robot's does, at its own
 height: a robot that has drifted is not asked to jump back. That is the rule of BeyondMimic (Liao et al., 2025).

@@ -1,6 +1,6 @@
 """These terms observe, rate and end episodes in which a robot follows a motion with its whole body.
 
-Kernels and limits are those of mjlab's tracking task (its src/mjlab/tasks/tracking, commit 0eda4e7), which has them
+Kernels and limits are as in mjlab's tracking task (its src/mjlab/tasks/tracking, commit 0eda4e7), which has them
 from BeyondMimic (Liao et al., 2025): errors are means over bodies, and of their squares.
 """
 

@@ -1,6 +1,6 @@
 """Counts how often a policy follows a motion from its start to its end, over many trials in drawn worlds.
 
-`ksim-rl eval RUN --trials 1024` runs them. The protocol is that of mjlab 1.x's evaluation of tracking policies
+`ksim-rl eval RUN --trials 1024` runs them. The protocol is mjlab 1.x's, from its evaluation of tracking policies
 (src/mjlab/tasks/tracking/scripts/evaluate.py): sensor noise, drawn worlds and errors at the start are on, pushes are
 off unless they are asked for, and a trial succeeds if the motion ends before a limit on errors ends the trial: 0.25 m
 in the height of the anchor and of feet and hands, 0.8 in how upright the anchor is (`ksim_rl.tracking.tasks`).

@@ -18,7 +18,7 @@ MOST_GEOMS = 20_000
 _KIND = mujoco.mjtGeom
 # Kinds whose shape stands in the model's data.
 _OF_MODEL = (_KIND.mjGEOM_MESH, _KIND.mjGEOM_SDF, _KIND.mjGEOM_HFIELD)
-# A line has no width in m; this is what it is drawn with.
+# A line has no width in m; it is drawn with this one.
 _LINE_RADIUS = 0.004
 # Sides of round shapes: more cost time in the browser and look the same.
 _SHADES = 24

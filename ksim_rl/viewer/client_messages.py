@@ -22,6 +22,7 @@ def checked(raw: str | bytes, widgets: Mapping[str, Any]) -> bytes | None:
 
     `widgets` are viser's handles by the identifier that its messages have.
     """
+    # viser's messages are binary.
     if not isinstance(raw, bytes):
         return None
     try:
@@ -31,18 +32,22 @@ def checked(raw: str | bytes, widgets: Mapping[str, Any]) -> bytes | None:
     if not isinstance(message, dict):
         return None
     kind = message.get("type")
+    # The camera of the page has numbers only.
     if kind == CAMERA:
         entries = [entry for name, entry in message.items() if name != "type"]
         return raw if all(map(_is_pose, entries)) else None
+    # Exactly these fields: others would reach code of viser that nobody has checked.
     if kind != UPDATE or message.keys() != {"type", "uuid", "updates"}:
         return None
     uuid = message["uuid"]
     updates = message["updates"]
     if not isinstance(uuid, str) or not isinstance(updates, dict) or updates.keys() != {"value"}:
         return None
+    # Only values that the widget itself could send.
     value = _allowed(updates["value"], widgets.get(uuid))
     if value is None:
         return None
+    # Packed again, so that nothing else of the message gets through.
     return msgspec.msgpack.encode({"type": UPDATE, "uuid": uuid, "updates": {"value": value}})
 
 
@@ -70,6 +75,7 @@ def _is_pose(entry: object) -> bool:
 
 def _allowed(value: Any, widget: Any) -> Any:
     """Return the value that a widget may take for the one that a page has sent, or None."""
+    # The widgets that the panel has; all others are refused.
     if isinstance(widget, viser.GuiButtonHandle | viser.GuiCheckboxHandle):
         return value if isinstance(value, bool) else None
     if isinstance(widget, viser.GuiDropdownHandle | viser.GuiButtonGroupHandle):

@@ -25,7 +25,7 @@ _EVERYWHERE = ("0.0.0.0", "::", "")
 
 
 class Gate:
-    """Stands before the two ports of one viewer that listens on `host`, and counts what it did not let in.
+    """Stands before the two ports of one viewer that listens on `host`, and counts the messages that it did not let in.
 
     Attributes:
         token: the first part of each path that is answered.
@@ -33,18 +33,21 @@ class Gate:
     """
 
     def __init__(self, host: str) -> None:
+        # New for each viewer: an address that was once seen is of no use later.
         self.token = secrets.token_urlsafe(16)
         self.ignored = 0
         self._host = host
         self._count = threading.Lock()
+        # Names by which a browser of this machine, or of the network, may ask.
         self._names = {"localhost", host.lower()}
         self._is_local = _is_address(host, local=True) or host == "localhost"
+        # A viewer for this machine alone answers to no name of the network.
         if not self._is_local:
             name = socket.gethostname().lower()
             self._names |= {name, f"{name}.local"}
 
     def address(self, port: int) -> str:
-        """Return what a browser of this machine opens."""
+        """Return the address that a browser of this machine opens."""
         if self._host in _EVERYWHERE:
             name = "localhost"
         else:
@@ -58,16 +61,20 @@ class Gate:
 
     def refusal(self, request: Request) -> Response | None:
         """Return the answer to a request that is not let in, or None."""
+        # Two Host headers could mean one thing to us and another to the browser.
         try:
             host = request.headers.get("Host", "")
             origin = request.headers.get("Origin")
         except MultipleValuesError:
             return _forbidden("expected one Host and one Origin")
+        # Other names are refused: by such a name a page of another site would reach this machine.
         if not self._is_own(host):
             return _forbidden("the address has another name than that of the machine")
+        # Browsers send the origin with each WebSocket: pages of other sites are refused.
         if origin is not None and origin != f"http://{host}":
             return _forbidden("only its own page may connect")
         first = request.path.partition("?")[0].split("/")[1:2]
+        # In constant time, so that the token cannot be guessed letter by letter.
         if not hmac.compare_digest("".join(first).encode(), self.token.encode()):
             return _forbidden("open the address that the command printed, with all that follows the port")
         return None
@@ -91,6 +98,7 @@ def check_listens(host: str, port: int) -> None:
     if not 1 <= port <= 65000:
         raise ValueError(f"port {port}: expected 1 to 65000")
     try:
+        # Bound for a moment: only the system knows which addresses are its own.
         kind, _, _, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(kind, socket.SOCK_STREAM) as tried:
             tried.bind(place)

@@ -15,7 +15,7 @@ from websockets.http11 import Request, Response
 from ksim_rl.viewer.client_messages import MOST_BYTES, checked
 from ksim_rl.viewer.gate import MESSAGES_PER_S, MOST_CLIENTS, Gate
 
-# Messages of one client that wait for viser, and how many may come at once before their pace counts.
+# Messages of one client that wait for viser, and seconds of messages that may come before their pace counts.
 _MOST_WAITING = 16
 _BURST_S = 0.5
 _serve = websockets.asyncio.server.serve
@@ -24,8 +24,10 @@ _one_at_a_time = threading.Lock()
 
 def start(gate: Gate, *, host: str, port: int, label: str) -> viser.ViserServer:
     """Start viser's server on a port, or the next one that is free, with `gate` before it."""
+    # viser prints an address without the token.
     with contextlib.redirect_stdout(io.StringIO()), _gated(gate) as made:
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    # Another viser may start its server in another way: then nothing would guard it.
     if not made:
         server.stop()
         raise RuntimeError(
@@ -38,7 +40,7 @@ def start(gate: Gate, *, host: str, port: int, label: str) -> viser.ViserServer:
 
 
 class _Clients:
-    """The connections of one server, each of which reads what `checked` lets through of `widgets`, at a pace."""
+    """The connections of one server, each of which reads messages for `widgets` that pass `checked`, at a pace."""
 
     def __init__(self, gate: Gate) -> None:
         self.gate = gate
@@ -47,6 +49,7 @@ class _Clients:
 
     async def handle(self, handler: Any, connection: ServerConnection) -> None:
         """Let viser serve a connection, unless there are too many."""
+        # A page more is told the reason, which its browser can show.
         if self._open >= MOST_CLIENTS:
             await connection.close(1013, f"{MOST_CLIENTS} pages are open already")
             return
@@ -65,6 +68,7 @@ class _Clients:
 
             async def recv(self, decode: bool | None = None) -> Any:
                 while True:
+                    # Messages that are refused are counted, and the next one is waited for.
                     raw = await super().recv(decode)
                     await self._keep_pace()
                     message = checked(raw, clients.widgets)
@@ -75,6 +79,7 @@ class _Clients:
             async def _keep_pace(self) -> None:
                 # What is not read stays with the client, whose own queue then fills.
                 now = asyncio.get_running_loop().time()
+                # A pause earns half a second of messages at most.
                 self._free_at = max(self._free_at, now - _BURST_S) + 1.0 / MESSAGES_PER_S
                 await asyncio.sleep(max(0.0, self._free_at - now))
 
@@ -89,6 +94,7 @@ def _gated(gate: Gate) -> Iterator[list[_Clients]]:
     """
     made: list[_Clients] = []
 
+    # Stands in for the function of websockets while viser starts its server.
     def serve(handler: Any, *where: Any, **options: Any) -> Any:
         clients = _Clients(gate)
         own = options["process_request"]
@@ -96,6 +102,7 @@ def _gated(gate: Gate) -> Iterator[list[_Clients]]:
 
         def answer(connection: ServerConnection, request: Request) -> Response | None:
             response = gate.refusal(request)
+            # viser knows no tokens: its own handler sees the path without it.
             if response is None:
                 response = own(connection, gate.without_token(request))
             return response
@@ -103,10 +110,12 @@ def _gated(gate: Gate) -> Iterator[list[_Clients]]:
         async def handle(connection: ServerConnection) -> None:
             await clients.handle(handler, connection)
 
+        # Ours come last, so that they replace viser's limits.
         limits = {"max_size": MOST_BYTES, "max_queue": _MOST_WAITING}
         own_way = {"process_request": answer, "create_connection": clients.connection()}
         return _serve(handle, *where, **{**options, **limits, **own_way})
 
+    # One server at a time, since the function of a library is replaced for all threads.
     with _one_at_a_time:
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
         try:

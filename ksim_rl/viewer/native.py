@@ -14,12 +14,13 @@ from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.viewer.session import SPEEDS, Session
 
 FRAME_S = 1.0 / 60.0
-# MuJoCo's window itself takes all letters, to switch what it draws.
+# MuJoCo's window itself takes all letters, to switch parts of its picture.
 HELP = "space pauses, right steps, Backspace resets, Enter pushes, - and = set the speed, up and down the env"
 
 
 def check_display() -> None:
     """Raise a ValueError where there is no display to open a window on."""
+    # GLFW warns where there is no display; our error says it better.
     with warnings.catch_warnings(category=glfw.GLFWError, action="ignore"):
         if not glfw.init():
             raise ValueError("--viewer native: no display to open a window on; --viewer browser needs none")
@@ -27,16 +28,18 @@ def check_display() -> None:
 
 
 def show(session: Session, *, note: Callable[[str], None]) -> None:
-    """Show a session in a window until that is closed; keys are those of `HELP`.
+    """Show a session in a window until that is closed; `HELP` lists the keys.
 
     Without a display it waits forever: see `check_display`.
     """
+    # A copy, since the shown env's own fields are written into it.
     mj_model = copy.copy(session.ours.world.mj_model)
     data = mujoco.MjData(mj_model)
     keys = _keys(session)
 
     def pressed(code: int) -> None:
         if code in keys:
+            # Called in the window's thread.
             session.ask(keys[code])
 
     note(HELP)
@@ -49,10 +52,12 @@ def show(session: Session, *, note: Callable[[str], None]) -> None:
             if session.error and session.error != said:
                 note(f"paused by an error: {session.error}; space goes on")
             said = session.error
+            # The window draws in a thread of its own: hold it while the state changes.
             with window.lock():
                 pose_env(mj_model, data, session.ours.world, session.env_index)
                 marks = window.user_scn
                 assert marks is not None
+                # The marks of the last frame.
                 marks.ngeom = 0
                 session.ours.update_visualizers(DebugVisualizer(mj_model, marks), session.env_index)
             window.sync()

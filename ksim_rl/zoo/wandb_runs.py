@@ -13,6 +13,7 @@ from ksim_rl.trainers.loggers import LoggerCfg, WandbCfg, check_installed, kept_
 
 KIND = "ksim_rl_run"
 ADDRESS = re.compile(r"[\w.-]+/[\w.-]+/[\w-]+", re.ASCII)
+# The files of an artifact of ours; any other name is refused before a download.
 FILES = re.compile(r"(config\.yaml|video\.mp4|policy\.onnx|checkpoint/\d+/[a-z]+\.(json|safetensors))")
 
 
@@ -21,6 +22,7 @@ def upload(cfg: WandbCfg, run: Path, *, note: Callable[[str], None]) -> None:
 
     What cannot be sent is said in a line: the training stands without it.
     """
+    # Whatever goes wrong here, the training is done and stays.
     try:
         import wandb  # pyright: ignore[reportMissingImports]
 
@@ -29,11 +31,13 @@ def upload(cfg: WandbCfg, run: Path, *, note: Callable[[str], None]) -> None:
         files |= {f"checkpoint/{newest.name}/{path.name}": path for path in newest.iterdir()}
         mode = "offline" if cfg.offline else None
         with tempfile.TemporaryDirectory() as temporary:
+            # A policy may have no form in ONNX; the checkpoint is sent all the same.
             try:
                 export(run, Path(temporary), episodes=0, note=lambda _: None)
                 files["policy.onnx"] = Path(temporary) / "policy.onnx"
             except ValueError as error:
                 note(f"no policy.onnx for Weights & Biases: {error}")
+            # The run that the logger has opened on the service.
             own = kept_id(run)
             account = {"project": cfg.project, "entity": cfg.entity, "id": own, "resume": "allow"}
             session = wandb.init(dir=str(run), mode=mode, **account)
@@ -59,16 +63,20 @@ def download(address: str, folder: Path, *, note: Callable[[str], None]) -> Path
     try:
         import wandb  # pyright: ignore[reportMissingImports]
 
+        # Newest last.
         found = [entry for entry in wandb.Api().run(address).logged_artifacts() if entry.type == KIND]
     except Exception as error:
         raise ValueError(f"wandb:{address}: {type(error).__name__}: {error}") from error
     if not found:
         raise ValueError(f"wandb:{address}: no checkpoint was uploaded: train with logger=wandb")
+    # Before the download: names could lead out of the folder.
     for name in found[-1].manifest.entries:
         if not FILES.fullmatch(name):
             raise ValueError(f"wandb:{address}: {name!r} is no file of a run")
+    # An address has slashes, a folder must not.
     target = folder / address.replace("/", "_")
     make_folder(target, below=folder)
+    # Before, so that nothing is written through a link, and after, for links that came along.
     plain_data.check_links(target, below=("checkpoint",))
     found[-1].download(root=str(target))
     plain_data.check_links(target, below=("checkpoint",))

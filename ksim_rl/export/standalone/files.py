@@ -61,7 +61,7 @@ def read(path: Path, most: int = MOST_BYTES) -> bytes:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return an export's metadata; a ValueError says what is wrong with the file."""
+    """Return an export's metadata; a ValueError names the fault of the file."""
     # 64 MiB, far more than the largest description.
     content = read(path, 2**26)
     try:

@@ -46,7 +46,7 @@ class Policy:
                 else np.repeat(frame[:, None, slice(*spec["columns"])], spec["shape"][0], 1)
                 for spec in self.specs
             ]
-        # The order of `states` is that of `specs`, and of the outputs after the actions.
+        # `states`, `specs` and the outputs after the actions have the same order.
         feed = {"obs": frame} | {s["input"]: v for s, v in zip(self.specs, self.states, strict=True)}
         actions, *self.states = (np.asarray(value) for value in self.session.run(self.outputs, feed))
         return actions[0].astype(np.float64)

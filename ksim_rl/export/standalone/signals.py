@@ -386,7 +386,7 @@ class Signals:
 
     def _velocities(self, kind: str, ids: list[int], local: bool = False) -> Array:
         """Return angular, then linear velocity of the frames of bodies or sites, [N, 6]."""
-        # mjOBJ_XBODY is the body's own frame; mjOBJ_BODY would be that of its inertia.
+        # mjOBJ_XBODY is the body's own frame; mjOBJ_BODY would be the frame of its inertia.
         of_kind = mujoco.mjtObj.mjOBJ_XBODY if kind == "body" else mujoco.mjtObj.mjOBJ_SITE
         found = np.zeros((len(ids), 6))
         for row, number in zip(found, ids, strict=True):
