@@ -120,7 +120,7 @@ class RolloutUpdate(ABC):
                 for _ in range(work.warmup + 1):
                     work()
         self.load_state_dict(kept)
-        # Means are no part of the state, and would show what the made-up rollout measured.
+        # Means are no part of the state, and would show the numbers of the made-up rollout.
         for tensor in (*self._means.values(), self._longest_skip):
             tensor.zero_()
 

@@ -14,7 +14,8 @@ _read: set[str] = set()
 
 
 def register(algorithm: Algorithm, *, origin: str = "a call of register") -> None:
-    """Add an algorithm; once more is the same, and another one of its name a ValueError."""
+    """Add an algorithm; adding it again does nothing, and another one of its name is a ValueError."""
+    # Only another object is a conflict: a plug-in and the program may both add the same one.
     first, known = _found.setdefault(algorithm.name, (origin, algorithm))
     if known is not algorithm:
         raise ValueError(

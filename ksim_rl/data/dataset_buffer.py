@@ -91,6 +91,7 @@ def rollout_length(num_env_states_per_minibatch: int, num_minibatches: int, num_
 
 
 def _near_multiples(value: int, factor: int) -> str:
+    # The neighbours on either side, for the message of the error.
     below = value // factor * factor
     return " or ".join(str(number) for number in (below, below + factor) if number > 0)
 
@@ -123,6 +124,7 @@ class DatasetBuffer(ReplayBuffer):
         sampler: Sampler | None = None,
         device: torch.device | str = "auto",
     ) -> None:
+        # TorchRL's buffer wraps its storage in its own methods; this one is read directly as well.
         self._dataset = DatasetStorage(cfg.num_env_states, device=device)
         if sampler is None:
             sampler = EpochSampler(seed=seed, shards=cfg.shards, num_minibatches=cfg.num_minibatches)
@@ -197,6 +199,6 @@ def _labelled(data: TensorDictBase, info: dict[Any, Any]) -> TensorDictBase:
     """Name the dims of a sample `["B"]` or `["B","T"]`, and write into it the burn-in flags of its sampler."""
     if BURN_IN_KEY in info:
         data.set(BURN_IN_KEY, info[BURN_IN_KEY])
-        # Steps of the burn-in have no loss of their own.
+        # Steps of the burn-in take no part in a loss.
         data.set(MASK_KEY, data.get(MASK_KEY) & info[MASK_KEY])
     return dims.name(data, *(dims.B, dims.T)[: data.batch_dims])

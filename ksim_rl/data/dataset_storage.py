@@ -41,8 +41,8 @@ class DatasetStorage(TensorStorage):
 
     The first write allocates it; later ones copy into the same addresses, so that a captured update stays valid.
 
-    A row with a non-finite element in any leaf is removed without a host sync: its numbers become those of the first
-    row that is finite (its flags stay), `("collector", "mask")` reads False there, and `non_finite_count` grows by one.
+    A row with a non-finite element in any leaf is removed without a host sync: its numbers become the numbers of the
+    first row that is finite (its flags stay), `("collector", "mask")` is False there, and `non_finite_count` grows.
     All rows stay finite, so nothing non-finite reaches a loss or, through a zero times infinity, a gradient; and
     TorchRL's losses leave rows with a False mask out of their means. (Zeros instead of a finite row would not do: a
     standard deviation of zero has no logarithm.) If no row at all is finite, the leaves are zero where they were not,

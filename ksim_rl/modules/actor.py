@@ -422,7 +422,7 @@ def make_probabilistic(
         in_keys=[PARAMETERS] if mixed else parameter_keys,
         out_keys=action_keys,
         spec=action_spec,
-        # A method, so that the bounds are those of the head wherever it is moved or copied.
+        # A method, so that the bounds are the head's wherever it is moved or copied.
         distribution_class=head.distribution,  # type: ignore[union-attr,arg-type]
         return_log_prob=True,
         default_interaction_type=ExplorationType.RANDOM,

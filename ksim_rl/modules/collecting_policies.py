@@ -49,6 +49,7 @@ class ExploringPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write "action" [E, action_dim]."""
+        # A selection, so that only the action is written into the env's data.
         acting = self.actor(tensordict.select(*self.in_keys))
         action = acting.get("action")
         # Policies that draw their own actions, as SAC's, add no noise here.

@@ -79,6 +79,7 @@ class QNetwork(ObservingNetwork):
         support = torch.linspace(cfg.v_min, cfg.v_max, cfg.num_atoms, device=device)
         # It follows from the config, so that it is no part of a checkpoint.
         self.register_buffer("support", support if cfg.num_atoms > 1 else None, persistent=False)
+        # Observations and action side by side are the inputs of the first layer.
         self.layers = cfg.build(
             obs_dim + action_dim, cfg.num_atoms, num_networks=cfg.num_networks, device=device
         )
@@ -105,7 +106,7 @@ def make_q_network(
     It writes "state_action_value" [..., N], or with atoms "state_action_logits" [..., N, A].
     """
     network = QNetwork(cfg, obs_dim=obs_dim, action_dim=action_dim, device=device)
-    # The key tells the losses what the numbers are: values, or logits of the atoms.
+    # The key tells values from logits of the atoms.
     if cfg.num_atoms == 1:
         out_key = "state_action_value"
     else:

@@ -161,7 +161,7 @@ class Layers(nn.Sequential):
             if not isinstance(layer, nn.Linear | EnsembleLinear):
                 out = layer(out)
                 continue
-            # The exact weights get the gradients; their rounded copies are what is multiplied.
+            # The exact weights get the gradients; their rounded copies are multiplied.
             out = _Product.apply(out, layer.weight, rounded.pop(0))
             if not parts or not isinstance(parts[0], nn.LayerNorm | EnsembleLayerNorm):
                 out = out + layer.bias.to(out.dtype)
@@ -199,7 +199,7 @@ class _Product(Function):
         fan_in, fan_out = ctx.sizes = weight.mT.shape if ctx.alone else weight.shape[1:]
         networks = len(rounded)
         ctx.is_shared = len(features_NBK) < networks
-        # What all networks read is cast once, unless weights learn by it: their gradient would copy it again.
+        # An input of all networks is cast once, unless weights learn by it: their gradient would copy it again.
         features = features_NBK.expand(networks if ctx.needs_input_grad[1] else -1, -1, -1)
         features = _padded(features, -fan_in % 8).expand(networks, -1, -1)
         ctx.save_for_backward(features, rounded)

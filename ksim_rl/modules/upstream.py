@@ -20,7 +20,7 @@ fused_gru_cell_backward = _ATEN._thnn_fused_gru_cell_backward
 
 
 class TensorModule(TensorDictModule):
-    """A `TensorDictModule` of tensors; that of tensordict 0.14 imports pandas to see whether an output is a frame."""
+    """A `TensorDictModule` of tensors; the one of tensordict 0.14 imports pandas to look for data frames."""
 
     def _write_to_tensordict(
         self, tensordict: Any, tensors: Any, tensordict_out: Any = None, out_keys: Any = None

@@ -179,7 +179,7 @@ class RolloutEstimator(ValueEstimatorBase):
     ) -> Tensor:
         critic = self.value_network
         assert isinstance(critic, TensorDictModule)
-        # A recurrent critic, too, takes each element as one step here: it goes on from the state that lies beside it.
+        # A recurrent critic, too, takes each element as one step here: it goes on from the state stored with it.
         with nullcontext() if params is None else params.to_module(critic), steps_of(critic):
             return self._in_rows(
                 lambda rows: critic(rows).get(self.tensor_keys.value),

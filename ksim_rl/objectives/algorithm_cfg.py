@@ -156,7 +156,7 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
 class AMPCfg(PPOCfg):
     """PPO on the task's reward and on a style reward, learned from reference motions (Peng et al., arXiv 2104.02180).
 
-    A discriminator tells transitions of the motions from those of the policy; the style reward, in [0, 1] per step, is
+    A discriminator tells transitions of the motions from the policy's; the style reward, in [0, 1] per step, is
     how much a transition looks like the motions. PPO maximizes the sum `task_coeff * reward + style_coeff * style`;
     where the env multiplies its rewards by the step's seconds, a fitting `style_coeff` is as small. The
     group `style_group` is compared: its terms read positions and velocities, no commands, actions, contacts or forces,

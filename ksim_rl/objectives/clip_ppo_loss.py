@@ -197,7 +197,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         if mask is None:
             means = table.flatten(1).mean(1)
         else:
-            # A where instead of a product: what is left out may be anything, and zero times infinity is NaN.
+            # A where instead of a product: values left out may be anything, and zero times infinity is NaN.
             table = torch.where(mask, table, torch.zeros_like(table))
             means = table.flatten(1).sum(1) / mask.sum().clamp_min(1)
         return dict(zip(columns, means.unbind(0), strict=True))
@@ -216,7 +216,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             return super()._standardize_advantage(advantage, tensordict)
         if mask_B is None:
             mask_B = torch.ones_like(advantage, dtype=torch.bool)
-        # The bound is that of TorchRL.
+        # The bound is TorchRL's.
         return standardized(advantage, mask_B, lowest_std=torch.finfo(torch.float32).resolution)
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor | TensorDictBase:

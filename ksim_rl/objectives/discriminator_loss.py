@@ -28,7 +28,7 @@ def discriminator_loss(
     `accuracy`, the share of transitions on their side of zero. With `mask_B` there are as many r as p (C is B), and the
     pairs where it is True count.
     """
-    # The penalty is on the slope at the features, which therefore need a gradient of their own.
+    # The penalty is on the slope at the features, which therefore need a gradient as well.
     reference_CL = reference_CL.detach().requires_grad_()
     reference_C = judge(reference_CL)
     policy_B = judge(policy_BL)
@@ -43,6 +43,7 @@ def discriminator_loss(
     loss = mean((reference_C - 1.0).square()) + mean((policy_B + 1.0).square())
     loss = loss + 0.5 * gradient_penalty * penalty
     with torch.no_grad():
+        # A transition counts as judged right if its score has the sign of its side.
         accuracy = (mean((reference_C > 0.0).float()) + mean((policy_B < 0.0).float())) / 2
         logged = {
             "loss": loss.detach(),

@@ -94,7 +94,7 @@ def compare_rows(
 class Compared(Function):
     """The cross entropies [B, N] of N distributions to their targets, and their means; means twice without targets.
 
-    Arguments are those of `compare`, with whether the lowest counts at the end. Only the first result has gradients,
+    Arguments are as in `compare`, with whether the lowest counts at the end. Only the first result has gradients,
     which have the dtype of the logits, and the same bits each time.
     """
 

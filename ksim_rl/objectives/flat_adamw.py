@@ -17,7 +17,7 @@ ALIGNMENT = 32
 class FlatAdamW(torch.optim.Optimizer):
     """AdamW (Loshchilov and Hutter, arXiv 1711.05101) on parameters that lie end to end, as do their moments.
 
-    From then on the parameters, and those of a `target` that follows each step by the share `tau` of the config, are
+    From then on the parameters, and the `target`'s, which follow each step by the share `tau` of the config, are
     parts of one tensor; they keep their names, and `state` has the parts of the moments. The learning rate, a tensor []
     on the device, may change in place.
     """

@@ -104,7 +104,7 @@ def rate_bounds(cfg: OnPolicyCfg, optimizer: torch.optim.Optimizer) -> Float32[T
 
 @torch.no_grad()
 def anneal_learning_rate_(cfg: OnPolicyCfg, optimizer: torch.optim.Optimizer, *, done: float) -> None:
-    """Bound the learning rate for what follows on a share `done`, in [0, 1], of the run, if `cfg` anneals it."""
+    """Bound the learning rate for the rest of a run after a share `done`, in [0, 1], if `cfg` anneals it."""
     if not 0.0 <= done <= 1.0:
         raise ValueError(f"done={done!r}: expected the share of the run that is done, in [0, 1]")
     if cfg.anneal_learning_rate:
@@ -143,7 +143,7 @@ def go_back(
     mask: Bool[Tensor, "*rows"] | None = None,
     beside: Iterable[Float[Tensor, ""]] = (),
 ) -> None:
-    """Compute the gradients of each loss, means over all ranks; losses and what is `beside` become means in place.
+    """Compute the gradients of each loss, means over all ranks; losses and the tensors `beside` become means in place.
 
     A loss is a mean over the rows that `mask` marks, or over all: each rank weighs as much as it has of these. No loss
     may reach a parameter of another's optimizer.

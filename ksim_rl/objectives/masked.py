@@ -22,7 +22,7 @@ def mask_of(env_states: TensorDictBase, like_B: Float[Tensor, "*batch"]) -> Bool
 
 def masked_mean(values: Float[Tensor, "*batch"], mask: Bool[Tensor, "*batch"]) -> Float[Tensor, ""]:
     """Return the mean of the values that `mask` marks; 0 where it marks none."""
-    # A where instead of a product: what is left out may be anything, and zero times infinity is NaN.
+    # A where instead of a product: values left out may be anything, and zero times infinity is NaN.
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
 
 

@@ -221,7 +221,7 @@ class OffPolicyLoss(LossModule):
             given = next_predicted, reward_B1, discount_B1, self.value_reduction
             loss_BN, values_BN = compare(predicted, self.support_A, *given)
             loss_B = loss_BN.sum(-1)
-            # As in Rainbow (Hessel et al., arXiv 1710.02298), what is minimized is the priority.
+            # As in Rainbow (Hessel et al., arXiv 1710.02298), the loss itself is the priority.
             td_error_B = loss_BN.detach().amax(-1)
         # Prioritized replay reads the error of each env state from here.
         tensordict.set(keys.priority, td_error_B)
@@ -242,7 +242,7 @@ class OffPolicyLoss(LossModule):
             mask = tensordict.get(key, None)
             if mask is not None:
                 weight_B = weight_B * self._expand_loss_mask(mask, column_B)
-        # A where instead of a product: what is left out may be anything, and zero times infinity is NaN.
+        # A where instead of a product: a value that is left out may be anything, and zero times infinity is NaN.
         column_B = torch.where(weight_B > 0.0, column_B * weight_B, 0.0)
         # In two steps: the compiler makes one block of a sum to 8192 numbers, which takes three times as long.
         parts = math.gcd(len(column_B), 64)

@@ -1,4 +1,4 @@
-"""Makes one gradient step of PPO, and builds what it needs from one config."""
+"""Makes one gradient step of PPO, and builds its parts from one config."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -40,6 +40,7 @@ def in_precision(loss: Loss, precision: str, *, device: torch.device | str) -> L
     """
     if precision == "float32":
         return loss
+    # Autocast is entered around the loss only: the backward pass takes the dtypes of the forward pass.
     dtype = getattr(torch, precision)
     kind = torch.device(device).type
 
@@ -92,11 +93,12 @@ def make_symmetric(
 ) -> Loss:
     """Return `loss` with the symmetry that `cfg` asks for.
 
-    Raises ValueError where `maps` lacks the mirror image of "action" or of what the networks of `loss` read.
+    Raises ValueError where `maps` lacks the mirror image of "action" or of an input of the networks of `loss`.
     """
     if cfg.symmetry == "none":
         return loss
     actor: Any = loss.actor_network
+    # All that either network reads must have an image, or the mirrored half would be half mirrored.
     read = [*actor.in_keys, *loss.critic_network.in_keys]
     mirror = SymmetricAugmentation(maps, read=read, symmetry=cfg.symmetry, device=device)
     if cfg.symmetry == "augment":
@@ -121,7 +123,7 @@ def ppo_step(
     """Make one gradient step on a minibatch. Makes no host sync and can be captured in a CUDA graph.
 
     With the adaptive schedule the learning rate is changed before the step, as in rsl_rl, by the `kl` that the loss
-    returns beside its `loss_*`. A step whose loss or gradient is not finite changes no parameter, moment or step count
+    returns with its `loss_*`. A step whose loss or gradient is not finite changes no parameter, moment or step count
     of the optimizer, which must be fused, with a tensor as learning rate. Returned are the tensors that the loss
     returns, detached, and `loss`, `grad_norm` (before clipping), `learning_rate` (of this step), `skipped` (0 or 1).
     """
@@ -146,7 +148,7 @@ def ppo_step(
     if guard is not None:
         guard.count_(found_inf)
     return {
-        # Without the entropies of several actions, in a TensorDict beside their sum.
+        # Without the entropies of several actions, which are in a TensorDict next to their sum.
         **measured,
         "loss": total.detach(),
         "grad_norm": grad_norm,

@@ -97,6 +97,7 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         if delay.hold_probability:
             chance = random.uniform(self._step_keys("step/hold", shared=not delay.per_env), 1)[:, 0]
             due = due & (chance >= delay.hold_probability)
+        # Drawn for all rows and taken where due: the size of a draw does not depend on the data.
         drawn_E = self._draw(self._step_keys("step/lag", shared=not delay.per_env))
         self.lag_E.copy_(torch.where(due, drawn_E, self.lag_E))
 

@@ -45,12 +45,12 @@ def _launch(
     lowest: int,
     highest: int,
 ) -> Tensor:
-    """Go on by one step: write its values, and return those of some steps ago, N frames of L elements per env.
+    """Go on by one step: write its values, and return values of some steps ago, N frames of L elements per env.
 
-    The ring has M slots per env. `lag_E` (int64, 0 for None) is that of the newest frame, which is the last, below M;
+    The ring has M slots per env. `lag_E` (int64, 0 for None) is the lag of the newest frame, the last one, below M;
     one that reaches back beyond the reset gives the value of that. The age, the steps since each env's reset, is
     changed in place; of several rings with one age only the last one `counts` it on. `parts` are sizes in bytes (int32)
-    of what a value consists of: all frames of the first part are returned, then all of the second one, and so on.
+    of the parts of a value: all frames of the first part are returned, then all of the second one, and so on.
 
     With a mask no step is made: its rows begin with these values, and each row's value is returned N times. With a
     `draw_count_E`, the resets of each row, these rows also draw new lags: those of `ksim_rl.device.random.integers` at
@@ -117,7 +117,7 @@ def _turn_in_torch(
     lowest: int,
     highest: int,
 ) -> Tensor:
-    """Do what the kernel does: see `_launch`."""
+    """Do the work of the kernel in torch: see `_launch`."""
     num_rows = ring_EM.shape[0]
     num_slots = ring_EM.shape[1]
     ring_EML = ring_EM.view(num_rows, num_slots, -1)

@@ -318,7 +318,7 @@ class KeyedTransform(RowTransform):
 
 
 def held_transforms(env: EnvBase, kind: type[Held]) -> Iterator[Held]:
-    """Yield each transform of a kind that an env holds, also those of a `TransformedEnv` further inside."""
+    """Yield each transform of a kind that an env holds, also in a `TransformedEnv` further inside."""
     inner: Any = env
     while isinstance(inner, TransformedEnv):
         for module in inner.transform.modules():

@@ -30,6 +30,7 @@ def path_of(key: NestedKey) -> tuple[Any, ...]:
 
 def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> TensorSpec:
     """Return the spec of `key`; the KeyError of a missing one lists the near names."""
+    # Compared as text: a nested key may be spelt as a tuple or as one name.
     leaves = {spell(leaf): leaf for leaf in observation_spec.keys(True, True)}
     if spell(key) not in leaves:
         raise KeyError(f"{owner}: the env has no {key!r}: {checks.near(spell(key), leaves)}")
@@ -85,6 +86,7 @@ def bounded(
 
 def multiply_bounds(a: Ends, b: Ends) -> Ends:
     """Return the range of x * y for x in a, y in b; 0 times infinity is 0, as no finite x exceeds it."""
+    # The extremes of a product over two intervals lie at their ends.
     corners = torch.stack(
         [torch.nan_to_num(x * y, nan=0.0, posinf=torch.inf, neginf=-torch.inf) for x in a for y in b]
     )

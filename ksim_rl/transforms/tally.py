@@ -45,6 +45,7 @@ def _tally(
     # The kernel reads rewards by address, one after the other.
     if reward_E is not None:
         reward_E = reward_E.contiguous()
+    # Copies are outputs of the same launch: the kept tensors change in place with the next step.
     step_out_E = torch.empty_like(step_E)
     total_out_E = torch.empty_like(total_E)
     device = step_E.device

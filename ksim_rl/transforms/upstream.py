@@ -69,6 +69,7 @@ def hear_seeds(env: EnvBase | None, seed_transforms: Callable[[TransformedEnv, i
     The method of that one env is covered; a class that defines `set_seed` keeps it.
     """
     if isinstance(env, TransformedEnv) and type(env).set_seed is TransformedEnv.set_seed:
+        # In the instance, which stock code looks at before its class.
         vars(env).setdefault("set_seed", _SetSeed(env, seed_transforms))
 
 

@@ -38,7 +38,7 @@ class Teacher:
 def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
     """Read the policy of a run folder or a checkpoint, for the env of a student, whose config gives the device.
 
-    A ValueError says what is absent or damaged, or which observation or tensor this env has not, or has otherwise.
+    A ValueError names what is absent or damaged, or an observation or tensor that this env lacks or has otherwise.
     """
     with naming(f"objective.teacher={str(path)!r}"):
         saved = checkpoint.load_latest(path)

@@ -69,6 +69,7 @@ class DistillationUpdate(DatasetUpdate):
         loss = DistillationLoss(actor, teacher.policy, loss=cfg.loss)
         super().__init__(cfg, loss=loss, networks={"actor": actor}, logged=LOGGED, **shared)
         self.teacher_share = torch.tensor(cfg.teacher_share, device=self.device)
+        # A teacher that never acts need not run while data are collected.
         helps = cfg.teacher_share > 0.0
         self.behavior: TensorDictModuleBase = actor
         # Without the divergence nothing learns how far actions should scatter.

@@ -34,7 +34,7 @@ def make_fused_ppo(
     update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None = None
 ) -> "FusedPPO | NotFused":
     """Build the fused gradient steps of a PPO update, or say why torch has to make them."""
-    # The cheap reasons first: what the update runs on, and how it draws its minibatches.
+    # The cheap reasons first: device, and the way in which minibatches are drawn.
     if update.device.type != "cuda" or importlib.util.find_spec("triton") is None:
         return NotFused("they need CUDA and Triton")
     if update.dataset.cfg.shards > 1:
@@ -71,7 +71,7 @@ def make_fused_ppo(
 class FusedBehavior(ProbabilisticTensorDictSequential):
     """Acts as `actor`, with means that are bit for bit as in the first gradient step, by its chained kernels.
 
-    The weights are those that the actor has at each call, or where `steady` began.
+    The weights are taken from the actor at each call, or once where `steady` begins.
     """
 
     def __init__(self, actor: ProbabilisticTensorDictSequential, fused: "FusedPPO") -> None:
@@ -117,7 +117,9 @@ def fused_networks(
         return NotFused(f"the policy is no {DiagonalGaussian.__name__} or {TanhGaussian.__name__}")
     # The actor's head is its last layer; the std is handed over separately.
     layers = [*_layers(policy.trunk), head.loc], _layers(value.layers)
+    # The kernels have one activation for all hidden layers.
     activations = {type(part) for part in (*policy.trunk, *value.layers)} - {nn.Linear}
+    # Except for linear layers, nothing but one known activation may stand between the layers.
     if len(activations) != 1 or not activations <= {*ACTIVATIONS}:
         present = sorted(kind.__name__ for kind in activations)
         known = sorted(kind.__name__ for kind in ACTIVATIONS)

@@ -92,7 +92,7 @@ class FusedDataset:
         self._take_observations(1, following, next_obs, num_envs=num_envs, LISTED=bool(self.listed))
         evaluate(next_obs, self._signals[1], **self.listed)
         programs = parts(num_envs, ENVS)
-        # Each program leaves the moments of its advantages, which standardize those of all ranks.
+        # Each program leaves the moments of its advantages, which standardize the advantages of all ranks.
         moments = self.records.new_empty(programs, 3)
         signals = {key: _time_major(following.get(key)) for key in ("reward", "done", "terminated")}
         sizes = {"num_envs": num_envs, "STEPS": length, "BLOCK": ENVS}
@@ -132,6 +132,7 @@ class FusedDataset:
 
     def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor, **changes: Any) -> None:
         observer = self._networks.observers[network]
+        # Inputs of the network side by side, in the order of the rows of `obs`.
         source = _time_major(observer.read(part_ET))
         block = _block(self._arguments["LANES"])
         own = {"source": source, "obs": obs, "num_rows": len(source), "WIDTH": source.shape[1], "num_envs": 0}
@@ -145,6 +146,7 @@ def as_tf32(values: Float[Tensor, "*?shape"]) -> Float[Tensor, "*?shape"]:
     They cut the others off, which makes each product smaller by 0.07 percent in the mean, and outputs by several times
     that: for an action with a standard deviation of a hundredth, a large change of its probability.
     """
+    # Half of the bits that are cut off is added first, which rounds to the nearest.
     rounded = (values.view(torch.int32) + 0x1000 & -0x2000).view(torch.float32)
     return torch.where(values.isnan(), values, rounded)
 

@@ -36,7 +36,7 @@ def read_observations(
         later = row + num_envs
         follows = (later < num_rows)[:, None] & (column < STORED)
         begun = tl.load(known + later[:, None] * STORED + column, mask=follows, other=0.0)
-        # Where no reset lies between, the next observation is what the next step begins with.
+        # Where no reset lies between, the next observation is the same as the next step's first.
         same = (later < num_rows) & (tl.sum(tl.where(value == begun, 0, 1), 1) == 0)
         tl.store(next_values + row, tl.load(values + later, mask=same, other=0.0), mask=same)
         keep = keep & (same == 0)

@@ -94,7 +94,7 @@ class FusedParameters:
         # The parameters in padded form, in float32 and in the dtype of the products.
         self.exact = torch.zeros(2, layout.num_padded, device=device)
         self.weights = torch.zeros(2, layout.num_padded, dtype=dtype, device=device)
-        # The biases of both networks in float32; rows are as far apart as those of `exact`.
+        # The biases of both networks in float32; rows are as far apart as in `exact`.
         self.biases_2N = self.exact[:, layout.num_weights :]
         # The optimizer's number of steps before the first gradient step of the update, and after each.
         self.steps = torch.zeros(num_steps + 1, device=device)
@@ -436,7 +436,7 @@ class FusedPPO:
         launch(adam_step, grid, given, summary=summary, steps=self.parameters.steps[step:], **sizes)
 
     def _evaluate(self, obs_DL: Tensor, values_D: Tensor, **listed: Tensor) -> None:
-        """Write the values of observations; `listed`, those of some rows to some places (see `network_outputs`)."""
+        """Write the values of observations; `listed`, of some rows to some places (see `network_outputs`)."""
         if self.layout.chained:
             return self._answer(1, obs_DL, values_D, **listed)
         *layers, last = self.networks.critic

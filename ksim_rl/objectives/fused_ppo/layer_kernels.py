@@ -1,6 +1,6 @@
 """The Triton kernels that run one layer of both networks at a time, for networks of any depth.
 
-They serve where the chained ones of `mlp_kernels` do not fit. A layer leaves, beside its outputs, the slopes of its
+They serve where the chained kernels of `mlp_kernels` do not fit. A layer leaves its outputs, and the slopes of its
 activation where the gradient of the layer's outputs is written later; products are as in `mlp_kernels`.
 
 `fan_in` and `fan_out` are a layer's padded widths, `..._at` first columns or elements; all are multiples of 16.
@@ -120,7 +120,7 @@ def output_gradients(
     left = inputs + rows[:, None] * INPUTS
     out = _linear(left, weights, biases, output, keep, fan_in, BLOCK, OUT, DEPTH, TILE_STAGES)
     record = records + tl.load(order + rows, mask=valid, other=0).to(tl.int64) * RECORD
-    # Which rows have a loss of their own; images have the mirror loss only.
+    # Which rows have a PPO loss; images have the mirror loss only.
     judged = valid
     if MIRROR:
         judged = rows < num_rows // 2
@@ -140,8 +140,8 @@ def output_gradients(
         if STATE_STD:
             tl.store(slope_rows + (OUT + output[None, :]), operand(d_std, dtype, TF32), mask=keep)
         if MIRROR:
-            # A mirror map is its own inverse, so that both of a pair have the same gradient: at what the one says,
-            # against the image of what the other one says. The image of outputs is that of the weights' rows.
+            # A mirror map is its own inverse, so that both of a pair have the same gradient: at the outputs of the
+            # one, against the image of the other's outputs. The image of outputs comes from permuted rows of weights.
             other = inputs + ((rows + num_rows // 2) % num_rows)[:, None] * INPUTS
             signed = tl.load(image_of + output)
             source = tl.abs(signed) - 1

@@ -120,7 +120,7 @@ class FusedLayout:
     then all biases and the std, in blocks whose sizes are the same in both rows: the outputs are padded to `out`,
     a power of two, and so is the observation to `obs` where the kernels are `chained`, though it is `stored` as a
     multiple of 16; what else differs between both, or is no multiple of 16, is padded to one. The outputs of a
-    `std_layer` follow those of the last layer, its biases in the place of the std. Padding is zero, as is its gradient.
+    `std_layer` follow the last layer's, its biases in the place of the std. Padding is zero, as is its gradient.
     """
 
     def __init__(self, networks: FusedNetworks, *, chained: bool | None = None) -> None:
@@ -140,7 +140,7 @@ class FusedLayout:
             self.obs = power_of_two(self.stored)
         else:
             self.obs = self.stored
-        # What is stored as two powers of two, where these are less than `obs`.
+        # The stored columns as two powers of two, where these are less than `obs`.
         head = 1 << (self.stored.bit_length() - 1)
         if self.stored > head:
             rest = power_of_two(self.stored - head)
@@ -158,7 +158,7 @@ class FusedLayout:
             outputs = self.out
         else:
             outputs = 2 * self.out
-        # Each layer's blocks begin where those of the layer before it end.
+        # Each layer's blocks begin where the blocks of the layer before it end.
         widths = (self.obs, *self.hidden, outputs)
         self.places: list[LayerPlace] = []
         weight = bias = column = gradient = 0
@@ -325,7 +325,7 @@ def launch(
 ) -> None:
     """Run `grid` programs of a Triton kernel, whose signature type checkers cannot read, on the current stream.
 
-    It gets those of `arguments` and `changes` that are its parameters; where `only_compiles` is set it only compiles.
+    It gets the `arguments` and `changes` that are its parameters; where `only_compiles` is set it only compiles.
     """
     given = {**arguments, **changes}
     if only_compiles.get():

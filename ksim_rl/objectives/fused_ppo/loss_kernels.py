@@ -1,9 +1,9 @@
 """Generalized advantages, and the clipped losses of PPO with their gradients, as Triton functions.
 
-The losses are those of `ClipPPOLoss`, for a diagonal gaussian, or for one that a tanh squashes: actions are then those
+The losses are `ClipPPOLoss`'s, for a diagonal gaussian, or for one that a tanh squashes: actions are then taken
 before the tanh. The gradients are of the sum over the env states, not of the mean. `docs/fused_ppo.md` derives them.
 
-What is known of an env state is one record: `OUT` columns each of the action, of the old mean and of the old standard
+The data of an env state are one record: `OUT` columns each of the action, of the old mean and of the old standard
 deviation, then `LOG_PROB`, `ADVANTAGE`, `VALUE`, `TARGET` and `MASK`, counted from column 3 OUT.
 """
 
@@ -190,7 +190,7 @@ def estimate_advantages(
         gap = tl.where(counted, advantage - means, 0.0)
         means += gap / tl.maximum(counts, 1.0)
         squares += gap * tl.where(counted, advantage - means, 0.0)
-    # The envs' own moments are merged into those of the program.
+    # The envs' own moments are merged into the moments of the program.
     count = tl.sum(counts)
     mean = tl.sum(counts * means) / tl.maximum(count, 1.0)
     moments += tl.program_id(0) * 3

@@ -1,7 +1,7 @@
 """The Triton kernels that run a whole MLP, forward and back, for a block of env states at a time.
 
 The widest hidden layer never exists as a whole: its columns are computed in chunks, and each chunk is multiplied into
-the next layer at once. Products take the weights' dtype (bfloat16, or float32, as TF32 on a GPU), sums float32.
+the next layer directly. Products take the weights' dtype (bfloat16, or float32, as TF32 on a GPU), sums float32.
 
 `docs/fused_ppo.md` has a diagram of the memory and derives the gradients. D env states are in the dataset, B in the
 minibatch; OBS and OUT are the padded widths of observation and outputs, H1 to H3 those between, and ACTIONS
@@ -94,7 +94,7 @@ def _outputs(
         if STORE:
             tl.store(inputs + (input_rows + rest_column), rest, mask=keep)
     acc = tl.zeros((BLOCK, H2), dtype=tl.float32)
-    # Biases are loaded a chunk ahead: those of the same chunk each thread would copy to shared memory, like weights.
+    # Biases are loaded a chunk ahead: each thread would copy the present chunk's to shared memory, like weights.
     bias = tl.load(biases + column)
     for first in tl.range(0, H1, CHUNK, num_stages=STAGES):
         # A chunk of the first hidden layer is computed, activated, and directly multiplied into the second.
@@ -323,12 +323,12 @@ def weight_gradients(
     bias = tl.load(tile + 7)
     row, lane = tl.arange(0, DEPTH), tl.arange(0, TILE)
     column = lane[None, :]
-    # What is past the tile's own columns is not read: of a network's last tiles that is most.
+    # Columns past the tile's own are not read: in a network's last tiles these are most.
     reads, inside = lane < input_columns, lane < gradient_columns
     inputs += network.to(tl.int64) * num_rows * INPUTS + first_input
     slopes += network.to(tl.int64) * num_rows * GRADIENTS + first_gradient
     acc = tl.zeros((TILE, TILE), dtype=tl.float32)
-    # The smallest product that there is, of which one column is used: a sum over rows of its own would take longer.
+    # The smallest product that there is, of which one column is used: a separate sum over rows would take longer.
     sums = tl.zeros((TILE, 16), dtype=tl.float32)
     one = (tl.arange(0, 16)[None, :] == row[:, None] * 0).to(inputs.dtype.element_ty)
     for first in tl.range(0, ROWS, DEPTH, num_stages=TILE_STAGES):

@@ -1,6 +1,6 @@
 """The Triton kernels between a minibatch and the next: sums, statistics, learning rate, Adam.
 
-What a gradient step measures is one row of `SUMMARY` columns.
+The measurements of a gradient step are one row of `SUMMARY` columns.
 """
 
 import triton
@@ -30,7 +30,7 @@ GRAD_NORM = tl.constexpr(SUMMARY.index("grad_norm"))
 SKIPPED = tl.constexpr(SUMMARY.index("skipped"))
 SKIPPED_IN_A_ROW = tl.constexpr(SUMMARY.index("skipped_in_a_row"))
 LOSS_MIRROR = tl.constexpr(SUMMARY.index("loss_mirror"))
-# Behind it stands which share of all ranks' rows took part: those of this rank, and once these are added up, all.
+# Behind it stands the share of all ranks' rows that took part: of this rank, and after the sum over ranks, of all.
 SHARE = tl.constexpr(len(SUMMARY))
 # As in TorchRL's explained variance: the resolution of float32.
 EPS = tl.constexpr(1.1920929e-07)
@@ -52,7 +52,7 @@ def _block_sums(
 
 @triton.jit
 def _merged(count, mean, squares, size, total, own):
-    # With `size` more numbers, of which there are the sum and that of squares about their mean (Chan et al., 1979).
+    # With `size` more numbers, given by their sum and the sum of squares about their mean (Chan et al., 1979).
     share = size / tl.maximum(count + size, 1.0)
     gap = total / tl.maximum(size, 1.0) - mean
     return mean + gap * share, squares + own + gap * gap * count * share
@@ -214,7 +214,7 @@ def adam_step(
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = at < SIZE
-    # What is far away is asked for before threads wait for each other.
+    # Distant memory is asked for before threads wait for each other.
     place = tl.load(places + at)
     parameter = tl.load(parameters + at)
     mean = tl.load(means + at)
@@ -270,7 +270,7 @@ def mean_steps(
     at, inside = summary + row * COLUMNS, row < STEPS
     # Rows beyond the steps count as skipped.
     made = tl.load(at + SKIPPED, mask=inside, other=1.0) == 0.0
-    # What a skipped step measured would spoil the means.
+    # The measurements of a skipped step would spoil the means.
     column = tl.arange(0, COLUMNS)
     total = tl.sum(tl.load(at + column[None, :], mask=made, other=0.0), 0)
     tl.store(step_means + column, total / tl.maximum(tl.sum(made.to(tl.float32)), 1.0))

@@ -38,6 +38,7 @@ class GroupSpec:
             raise checks.unknown_name(f"term of group {self.name!r}", str(term), map(last_name, self.terms))
         if len(found) > 1:
             raise ValueError(f"group {self.name!r} has {len(found)} terms named {term!r}: give the whole key")
+        # Columns of the terms before it.
         start = sum(self.sizes[: found[0]])
         return slice(start, start + self.sizes[found[0]])
 

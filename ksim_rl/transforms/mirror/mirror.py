@@ -86,6 +86,7 @@ def concatenate(maps: Sequence[MirrorMap]) -> MirrorMap:
     source: list[int] = []
     signs: list[float] = []
     for mirror in maps:
+        # Columns of a map count from the start of its own part.
         start = len(source)
         source += [start + column for column in mirror.source]
         signs += mirror.signs
@@ -148,6 +149,7 @@ class Mirror(KeyedTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         self._replace_leaves(observation_spec, self._widened)
         self._size_rows(observation_spec)
+        # One flag per env, which observations and actions share: an episode is mirrored as a whole.
         self._size_buffer("mirrored_E", torch.bool)
         return observation_spec
 

@@ -25,7 +25,7 @@ NUM_PARAMETERS = 7
 BIAS_INDEX = 0x40000000
 WALK_INDEX = 0x80000000
 DROPOUT_INDEX = 0xC0000000
-"""Where the draws of biases, of drifts and of lost readings begin among those of a row, as in `noise.cpp`."""
+"""Where the draws of biases, of drifts and of lost readings begin among a row's draws, as in `noise.cpp`."""
 
 _MODES = {"forward": 0, "step": 1, "reset": 2}
 
@@ -113,7 +113,7 @@ def _noise_in_torch(
     stream: int,
     counter: Tensor,
 ) -> Tensor:
-    """Do what the kernel does: see `_launch`."""
+    """Do the work of the kernel in torch: see `_launch`."""
     num_columns = flags_L.numel()
     if not clean_EL.numel():
         return torch.empty_like(clean_EL)
