@@ -15,7 +15,7 @@ from ksim_rl.device.capture import Captured
 class GraphStep:
     """`env.step_and_maybe_reset` as it was when a graph of whole rollouts was recorded.
 
-    The arguments are those of `CompiledStep`; making it leaves the env as it was. Where there are no CUDA graphs it is
+    The arguments are the same as of `CompiledStep`; making it leaves the env as it was. Without CUDA graphs it is
     the env's own step, and never differs.
     """
 

@@ -47,7 +47,7 @@ class Recording:
             self._by_term = inner.values_by_term
         # Other envs cannot be put back to where they were before a comparison.
         self._can_return = part(env, SimulatedWorld) is not None
-        # On CUDA the graph of a rollout holds what the policy does in Python, too.
+        # On CUDA the graph of a rollout also freezes the policy's Python.
         if self._has_graph:
             others = {"policy": policy}
         else:
@@ -136,7 +136,7 @@ class Recording:
                     check.own_step()
 
     def _forget(self, changes: list[Change]) -> None:
-        """Drop what was recorded, and wait with the next recording if this is not the first time."""
+        """Drop the recordings, and wait with the next one if this is not the first time."""
         # 0, 1, 3, 7 ... rollouts: twice as long after each recording that was dropped.
         self._times += self._is_recorded
         self._waiting = (1 << max(self._times - 1, 0)) - 1
@@ -161,7 +161,7 @@ class Recording:
         """Compare the recorded step with the env's own, if it is time to."""
         if not self._can_return:
             return
-        # Taken right after the graph of the rollout, while Python is still what the graph was captured from.
+        # Taken right after the graph of the rollout, while Python is still the same as in the graph.
         if self.compiled_step is None and self._graph_step is None:
             self._graph_step = GraphStep(self._env, root_E, act(), self._by_term)
         # Only at powers of two, so that comparisons cost less and less of a long run.

@@ -181,7 +181,7 @@ class RolloutCollector:
             return self.policy(self._root.copy())
 
     def _renew_root(self) -> None:
-        """Reset all envs where transforms have changed what an episode begins with."""
+        """Reset all envs if transforms have changed the values that an episode begins with."""
         assert self._root is not None
         known = {id(transform) for transform in self._transforms}
         added = [one for one in held_transforms(self.env, Transform) if id(one) not in known]

@@ -57,7 +57,7 @@ class StepCheck:
         self.given: dict[NestedKey, Tensor] = {}
         for key in tensordict.keys(True, True):
             if key not in self._root_keys:
-                # Dense and in memory of their own, as later ones are copied here.
+                # Dense and in separate memory, as later ones are copied here.
                 self.given[key] = tensordict.get(key).clone(memory_format=torch.contiguous_format)
                 self._tensordict.set(key, self.given[key])
 

@@ -167,7 +167,7 @@ class _Tracer:
 
 
 def _asked(function: Any) -> str | None:
-    """Return what a function of C asks the host for, None if nothing."""
+    """Return the kind of answer that a C function gets from the host, or None."""
     name = getattr(function, "__name__", "")
     owner = getattr(function, "__self__", None)
     # Functions of modules: `time.time`, `os.listdir`, `open`.

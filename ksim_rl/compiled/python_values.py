@@ -25,7 +25,7 @@ MOST_ITEMS = 10_000
 """Only the length of a larger container is watched."""
 ABSENT = "(absent)"
 _MODULE_PARTS = ("_modules", "_buffers", "_parameters")
-# A reference to what the last step returned.
+# A reference to the root that the last step returned.
 _CHANGES_BY_ITSELF = frozenset({"last_root"})
 _ITERATORS = ("builtins", "itertools")
 
@@ -176,7 +176,7 @@ class _Search:
         self._hold(listed, path, listed.read, _attribute)
 
     def _at_tensor(self, tensor: Tensor, path: str) -> None:
-        # Of a tensor on another device than that of the env, the numbers become constants of a recording.
+        # Numbers of a tensor on another device than the env's become constants of a recording.
         if tensor.device.type != self._device.type:
             read = lambda: {"version": tensor._version}  # noqa: E731
             self._hold(tensor, path, read, _attribute)
@@ -214,7 +214,7 @@ class _Search:
             frame = generator.gi_frame
             if frame is None:
                 return {"place": "its end"}
-            # What it goes through stands among its locals, or is what it yields from.
+            # The iterated object is among its locals, or is the generator that it yields from.
             return {"place": frame.f_lasti, "source": generator.gi_yieldfrom, **frame.f_locals}
 
         self._hold(generator, path, read, _attribute)
@@ -271,7 +271,7 @@ class _Search:
         self._hold(cls, path, read, spell, table=vars(cls))
 
     def _at_module(self, module: types.ModuleType, path: str) -> None:
-        """Do nothing: a function looks at what it reads of a module."""
+        """Do nothing: the names that a function reads of a module are looked at with the function."""
 
     # -- functions -----------------------------------------------------------------------------------------------
 

@@ -1,8 +1,8 @@
 """Writes torch operations as C++ for one row of a batch; `tape` makes kernels of it.
 
 Each function writes loops that read and write elements through `Cells`, which knows where a tensor lies: in the
-memory of the device, or in an array of the row's own. The operations are those of torch, with its rules for types and
-for numbers that are not finite.
+memory of the device, or in an array of the row's own. The operations follow torch, with its rules for types and for
+numbers that are not finite.
 """
 
 import math
@@ -86,7 +86,7 @@ _TESTS = {
 }
 _FILLS = {"empty": 0, "empty_like": 0, "new_empty": 0, "new_zeros": 0, "ones": 1, "ones_like": 1, "zeros": 0}
 _FILLS |= {"zeros_like": 0, "new_ones": 1}
-# What a sum starts from, what each element `e` does to it, and what comes of it over `count` of them.
+# The start of a sum `s`, its update by an element `e`, and the result of `count` elements.
 _REDUCTIONS = {
     "all": ("1", "s = s && e != 0", "s"),
     "amax": ("-INFINITY", "s = high(s, e)", "s"),
@@ -412,7 +412,7 @@ def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
     seed, stream, counter, _, first_row, n, kind, low, high, start, span = args
     plain = cells.uniform
     if counter.ndim:
-        count = cells.at(counter, [])  # each row has a counter of its own
+        count = cells.at(counter, [])  # each row has its own counter
     else:
         count = plain.at(counter, [])
     low_ = literal(low, "float")

@@ -157,7 +157,7 @@ class Tape:
             part()
 
     def _does_something(self, operation: Operation) -> bool:
-        """Whether numbers change: a view changes none, and those of the host are known already."""
+        """Whether numbers on the device change: a view changes none, and numbers of the host are constants."""
         made = [tensor for tensor in operation.made if self._memory.made.get(_storage(tensor)) is tensor]
         return any(tensor.numel() and tensor.device == self._device for tensor in (*operation.written, *made))
 
@@ -240,7 +240,7 @@ class Tape:
         return own
 
     def _own_width(self, kernel: Kernel, place: int) -> int:
-        """Return how many numbers of a storage a row of a kernel uses; 0 where that cannot be a piece of its own."""
+        """Return how many numbers of a storage a row of a kernel uses; 0 where they cannot be an array of the row."""
         width = self._memory.width(place)
         distances = kernel.use.distances.get(place, {0})
         # Without rows each thread keeps a copy of the whole storage.
@@ -304,7 +304,7 @@ class Tape:
             lanes = 0
         # Only pointers that no operation writes may be `const`, and be loaded ahead.
         read = {name: ctype for name, ctype in pointed.items() if name not in changed}
-        # No two of them overlap, so that numbers may be read ahead of what is written, unless by another lane.
+        # No two pointers overlap, so reads may move ahead of writes, unless another lane does the writing.
         kept = "" if lanes else "__restrict__"
         pointers = ", ".join(
             f"const {ctype}* __restrict__ {name}" if name in read else f"{ctype}* {kept} {name}"

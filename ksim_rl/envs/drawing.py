@@ -41,7 +41,7 @@ def draw(
     env_index: int,
     drawn: Collection[str] | None,
 ) -> None:
-    """Let parts draw one env, all of them or those of the names `drawn`; a ValueError names one that moves it."""
+    """Let parts draw one env, all of them or only the ones named in `drawn`; a ValueError names one that moves it."""
     # Drawing must not move the robot. Only torch's writes, as the other check would slow each picture down.
     with driver.guard.watching(past_torch=False):
         for name, part in parts.items():

@@ -34,7 +34,7 @@ def explain(
 ) -> str:
     """Return one table per manager: index, name, shape, weight, mode and parameters other than defaults of each term.
 
-    `shapes` are those of observation terms, [E, ...], and `action_sizes` numbers of columns; lines are `width` long.
+    `shapes` are of observation terms, [E, ...], and `action_sizes` are numbers of columns; lines are `width` long.
     """
     output = io.StringIO()
     console = Console(
@@ -135,7 +135,7 @@ def _hooks(driver: EnvDriver) -> list[str]:
 
 
 def _keys(transform: Transform) -> str:
-    """Return what a transform reads and, where that is elsewhere, writes."""
+    """Return the keys that a transform reads and, if they differ, the keys that it writes."""
     keys = [[*transform.in_keys, *transform.in_keys_inv], [*transform.out_keys, *transform.out_keys_inv]]
     reads, writes = (", ".join(map(spell, part)) for part in keys)
     if reads == writes:
@@ -175,7 +175,7 @@ def _parameters(value: Any, *, without: tuple[str, ...] = ()) -> str:
         given = getattr(value, field.name)
         default = field.default
         if field.default_factory is not dataclasses.MISSING:
-            # A default that is made anew each time is compared by value.
+            # A default from a factory is another object each time, and compared by value.
             default = field.default_factory()
         if field.name not in without and given != default:
             parts.append(f"{field.name}={_shown(given)}")

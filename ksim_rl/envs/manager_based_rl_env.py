@@ -205,7 +205,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         driver, world = self.driver, self.world
         action_EL = self._checked_action(tensordict.get("action"))
-        # A graph would go on reading what the step before it computed, which no replay computes again.
+        # Else a graph would read quantities of the step before, which no replay computes again.
         driver.forget()
         driver.step_count.add_(1)
         self.event_manager.step()
@@ -252,7 +252,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.curriculum_manager.reset(mask_E)
         self.world.reset(mask_E)
         self.view.restore_default(mask_E)
-        driver.buffers.clear(mask_E)  # memory of terms, but what they keep
+        driver.buffers.clear(mask_E)  # memory of terms, except buffers with `keep`
         self.view.targets.reset(mask_E)
         self.joint_drives.reset(mask_E)  # draws the lags of the new episode
         driver.episode_step_E.masked_fill_(mask_E, 0)
@@ -356,7 +356,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> None:
-        """Continue from a `state_dict`; a ValueError says what differs in that of another env.
+        """Continue from a `state_dict`; a ValueError says how the state of another env differs.
 
         Without `strict`, entries that are missing stay as they are, and unknown ones are left out.
         """
@@ -414,7 +414,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         *,
         drawn: Collection[str] | None = None,
     ) -> None:
-        """Let each part of `setup_manager_visualizers`, or those of the names `drawn`, draw one env.
+        """Let each part of `setup_manager_visualizers`, or only the ones named in `drawn`, draw one env.
 
         It is the one that the viewer shows, unless `env_index` says otherwise.
         """

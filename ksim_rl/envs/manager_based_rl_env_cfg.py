@@ -29,7 +29,7 @@ class ManagerBasedRlEnvCfg(Checked):
 
     The env emits each observation term once as `("obs", term)`, clean; `envs.make` compiles the groups into transforms
     that add noise, delay and history and write one vector per group. It appends `transforms` to these, in this order:
-    what the env emits passes them from the first to the last, and an action from the last to the first.
+    outputs of the env pass them from the first to the last, and actions from the last to the first.
     """
 
     decimation: Count  # physics substeps per env step

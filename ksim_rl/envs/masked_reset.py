@@ -49,14 +49,14 @@ class MaskedReset(EnvBase):
     """Base of an env with batch size [E] whose `_reset` honours the mask `"_reset"` (bool, [E, 1]), all-False included.
 
     Write `class MyEnv(MaskedReset)` instead of `class MyEnv(EnvBase)`, with `_step`, `_reset` and `_set_seed` as
-    TorchRL asks for. `_reset` must change the state of the masked rows only; what it returns in the other rows is
+    TorchRL asks for. `_reset` must change the state of the masked rows only; its return values in the other rows are
     ignored, so it may return anything there. It gives:
 
     * `maybe_reset`: `_reset` runs at every step with `done` as its mask, so that nothing is read by the host.
       Trajectories equal TorchRL's own if the draws in `_reset` are keyed per row (see `ksim_rl.device.random`).
     * `reset(tensordict, seed=, env_ids=, options=)`: untouched rows come back with their last root values.
     * `seed(seed=-1)`: returns the seed used. It ends in `_set_seed`, so that is where an env stores it. On the class,
-      which has no draws of its own, it seeds Python, NumPy and torch.
+      which draws nothing itself, it seeds Python, NumPy and torch.
     * `rollout` labelled ("E", "T"), and the label "E" on all that `step` and `reset` return.
 
     An env with batch size [] and foreign simulators (Gym, batched processes) keep TorchRL's own reset: those cannot
@@ -106,7 +106,7 @@ class MaskedReset(EnvBase):
         options: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> TensorDictBase:
-        """Reset all rows, or those of `env_ids` or of the mask `tensordict["_reset"]` (bool, [E] or [E, 1]).
+        """Reset all rows, or the rows `env_ids`, or the rows of the mask `tensordict["_reset"]` (bool, [E] or [E, 1]).
 
         Untouched rows keep their state and come back with their last root values, or with those of `tensordict`, which
         is updated in place. `seed` is set first, as `env.seed(seed)` does. `env_ids` are checked on the host: inside a

@@ -27,7 +27,7 @@ _MANAGERS = (
     "metric_manager",
     "curriculum_manager",
 )
-# Emptied whenever the state changes, filled on the way, a note of what was said, or what the device tells the host
+# Caches that change by themselves, notes of warnings that were given, and a flag that the device copies to the host
 # after a step (`ActionManager`).
 _CACHES = frozenset({"cache", "command_cache", "_has_warned", "_accepts_any", "_arrived"})
 # TorchRL's own, of the keys of specs.
@@ -120,7 +120,7 @@ def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Any]:
 
 
 def _of_env(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    # The config is a part of its own, since most of its fields are read once.
+    # The config is a separate part, since most of its fields are read once.
     left_out = ("cfg", _KEYS_OF_SPECS)
     own = {name: value for name, value in attributes_of(env).items() if name not in left_out}
     # The one field of the config that each step reads.

@@ -45,7 +45,7 @@ class RecordedPython:
 
     `others` are objects whose Python becomes part of the recording as well, by name: a policy. A step that puts a
     tensor in the place of another one may still be recorded, if it writes it before it reads it. Where the numbers of
-    the recording are compared with those of Python, `is_compared`, that is left to them; else it is refused as well.
+    the recording are compared with Python's, `is_compared`, the comparison decides; else it is refused as well.
     """
 
     def __init__(
@@ -90,10 +90,11 @@ class RecordedPython:
         self._calls = 0
 
     def changes(self) -> list[Change]:
-        """Return what has changed since the last `look`; a FrozenPythonError if it cannot have an effect any more."""
+        """Return the changes since the last `look`; a FrozenPythonError for one that cannot have an effect any more."""
         found = [change for change in self._watch.changes() if _place(change) not in self._replaced]
         for change in found:
             instead = why_not(change)
+            # A change without any effect is worse than an error: the user believes that it works.
             if instead is not None:
                 raise FrozenPythonError(f"{change}, without effect: {instead}")
         return found

@@ -17,9 +17,9 @@ class Rehearsed(Protocol):
 def rehearse(
     driver: EnvDriver, *, laws: JointDrives, writing: Sequence[Rehearsed], reading: Sequence[Rehearsed]
 ) -> None:
-    """Run all terms, and put back all that has changed; a ValueError names the one that wrote what it must not.
+    """Run all terms, and put back all changes; a ValueError names a term that wrote memory of others.
 
-    `writing` are the managers of terms that write the worlds, `reading` those of terms that only read them.
+    `writing` are the managers of terms that write the worlds, `reading` the managers of terms that only read them.
     """
     # Watches all writes, and puts the state back at the end.
     with driver.guard.rehearsal():

@@ -36,7 +36,7 @@ class _Room:
 def with_room(make: Callable[[], EnvBase], *, note: Callable[[str], None]) -> EnvBase:
     """Return an env that `make` builds, built once more where its worlds lost contacts or rows in a rehearsal.
 
-    The new one has room for what was needed, with a margin, as has each later world of the same model in this process.
+    The new one has the needed room, with a margin, and so has each later world of the same model in this process.
     `note` is told so in one line. A number of rows or contacts that the env's `sim` gives stays as it is; then `note`
     is told what was lost. An env that is no `ManagerBasedRlEnv`, or whose room is certain, is not rehearsed.
     """
@@ -81,7 +81,7 @@ def _grown(first: _Room, last: _Room) -> str:
 
 
 def rehearse_room(env: ManagerBasedRlEnv) -> OverflowReport:
-    """Reset all envs, let them take random actions for a second, and put everything back; return what was needed."""
+    """Reset all envs, take random actions for a second, and put everything back; return the report of needed room."""
     steps = min(MOST_STEPS, math.ceil(SECONDS / env.step_dt))
     # Everything below is undone from this state.
     saved = env.state_dict()
@@ -101,7 +101,7 @@ def rehearse_room(env: ManagerBasedRlEnv) -> OverflowReport:
             _, state = env.step_and_maybe_reset(state)
     report = env.world.overflow_report()
     env.load_state_dict(saved)
-    # What was not finite here is of no state that anybody sees.
+    # Non-finite numbers of the rehearsal are of no state that anybody sees.
     env.driver.non_finite.start()
     env.world.forget_failures()
     return report

@@ -1,4 +1,4 @@
-"""Defines a task: an env config under a name, with what is known about training it."""
+"""Defines a task: an env config under a name, with settings for training."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class Training(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """An env config with what is known about training it; at the top level of a module of `ksim_rl/tasks/`.
+    """An env config with settings for training; it is at the top level of a module of `ksim_rl/tasks/`.
 
     A module of many tasks may hold them in a sequence `TASKS` instead.
 

@@ -52,7 +52,7 @@ class RewardTerm(Term):
         """Return the unweighted reward of the current state, float32 [E]."""
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
-        """Draw what the reward of one env looks at (nothing by default)."""
+        """Draw the quantities that the reward of one env depends on (nothing by default)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ def can_reset_nothing(env: EnvBase) -> bool:
     # Their reset is a call of foreign code, which resets at least one.
     if isinstance(innermost(env), _EnvWrapper | BatchedEnvBase):
         return False
-    # One "done" at the root, beside "terminated".
+    # One "done" at the root, next to "terminated".
     return bool(env.batch_size) and env.reset_keys == ["_reset"] and env._simple_done
 
 
@@ -41,7 +41,7 @@ def complete_done(env: EnvBase, root: TensorDictBase) -> None:
 def let_none_keep_names() -> None:
     """Let `TensorDictBase.refine_names` keep the names of dims for which it is given None, instead of refusing them.
 
-    `MultiSyncCollector` names the time dim of what it has stacked by `refine_names(None, None, "time")`, and so would
+    `MultiSyncCollector` names the time dim of stacked data by `refine_names(None, None, "time")`, and so would
     crash on the "E" of any env that labels its dims.
     """
     refine_names: Any = TensorDictBase.refine_names

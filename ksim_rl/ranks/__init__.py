@@ -1,4 +1,4 @@
-"""Several processes train together here: each is a rank with envs of its own, started by torchrun, one per GPU.
+"""Lets several processes train together: each is a rank with its own envs, started by torchrun, one per GPU.
 
 All numbers are drawn by an env's place among those of all ranks, means are over all ranks, and rank 0 writes. A process
 that was not started so is one of one, for which nothing here does anything.

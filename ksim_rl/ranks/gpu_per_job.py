@@ -17,7 +17,7 @@ _taken: list[IO[str]] = []  # open, and so locked, until the process ends
 
 
 class GpuPerJob(Callback):
-    """Gives each process that runs jobs of a multirun a GPU of its own; Hydra calls it before each job."""
+    """Gives each process that runs jobs of a multirun its own GPU; Hydra calls it before each job."""
 
     def on_job_start(self, config: DictConfig, **_: Any) -> None:
         """Take a GPU, unless the config names one."""

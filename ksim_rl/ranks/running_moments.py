@@ -12,7 +12,7 @@ from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments
 from ksim_rl.ranks.reduce import merged
 
 # Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows. Short ones hold up
-# little of what else a GPU does. Then those of so many parts are merged, and at last those of all these groups.
+# little other work of a GPU. Then the moments of so many parts are merged, and at last of all these groups.
 MOST_PARTS = 2048
 LEAST_ROWS = 16
 GROUP = 32
@@ -87,7 +87,7 @@ class RunningMoments(nn.Module):
     variances" (1979), in float64, and equal the two-pass mean and variance of everything seen. They are added in one
     order. No method makes the host wait or moves a buffer, so all can be captured in a CUDA graph.
 
-    With several ranks, each keeps the moments of its own rows, and `publish` merges those of all ranks into `mean` and
+    With several ranks, each keeps the moments of its own rows, and `publish` merges the moments of all into `mean` and
     `var`: bit-identical everywhere, and equal to one process that saw all the rows.
 
     `mean` and `var`, float32 [L], of all ranks, are 0 and 1 before the first `publish`; `count`, int64 [], is the rows

@@ -132,7 +132,7 @@ def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
 
 
 def _merged_moments(prefix: str, parts: list[Tensors]) -> Tensors:
-    """Give rank 0 what all ranks have counted, and the others nothing; `mean` and `var` are those of all already."""
+    """Give rank 0 the counts of all ranks, and the others nothing; `mean` and `var` are of all ranks already."""
     merged = {
         leaf.removeprefix(prefix): tensor for leaf, tensor in parts[0].items() if leaf.startswith(prefix)
     }

@@ -66,7 +66,7 @@ def joined(command: str) -> Iterator[None]:
     # Before the first collective on CUDA, which would run on GPU 0 otherwise.
     if backend != "gloo":
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    # A connection of its own: its thread must not wait for another's key.
+    # A separate connection: its thread must not wait for another's key.
     heart = heartbeat.Heartbeat(_of_attempt(store.of_run(store.connected())))
     # Other versions may have other collectives, and would wait for each other.
     same = {"ksim_rl": _version(), "torch": torch.__version__, "Python": platform.python_version()}
@@ -173,7 +173,7 @@ def _backend() -> str:
         raise ValueError(
             "this torch has no NCCL, without which GPUs cannot train together: install a CUDA build"
         )
-    # Both: tensors of the host travel by gloo, those of GPUs by NCCL.
+    # Both: tensors of the host travel by gloo, and tensors of GPUs by NCCL.
     return "cpu:gloo,cuda:nccl"
 
 

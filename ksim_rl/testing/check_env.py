@@ -40,7 +40,7 @@ def check_memory(env: EnvBase, num_steps: int) -> None:
     replays = Replays(env, num_steps)
     root = replays.start()
     counts = []
-    # Two equal rounds: what the first one keeps may be a cache, what the second one adds is a leak.
+    # Two equal rounds: tensors that the first one keeps may be a cache, more in the second one are a leak.
     for _ in range(2):
         for index in range(_GROWTH_STEPS):
             _, root = replays.step(root, index % num_steps)

@@ -20,7 +20,7 @@ TOLERANCE = 1e-2
 # and the factor by which a row may differ more than that.
 MOVED = 1e-5
 ALLOWANCE = 10.0
-# Iterations after which the C engine has solved a step: with those of a model it may be the one that stops early.
+# Iterations after which the C engine has solved a step: with a model's own number it, too, may stop early.
 SOLVED = 100
 # m: without a margin C has contacts of boxes and meshes with height fields less deep than they are (docs/upstream.md).
 LEAST_MARGIN = 1e-7

@@ -112,7 +112,7 @@ def _check_end(next_E: TensorDictBase, root: TensorDictBase, keys: list[NestedKe
 
 
 def _others_changed(before: Tensor, after: Tensor, num_envs: int) -> bool:
-    """Say if anything but row 0 changed, for each dim that may be that of the envs (a ring may have E frames)."""
+    """Whether anything but row 0 changed, for each dim that may be the env dim (a ring may have E frames)."""
     dims = [dim for dim, size in enumerate(before.shape) if size == num_envs]
     return all(
         not same_bits(before.narrow(dim, 1, num_envs - 1), after.narrow(dim, 1, num_envs - 1)) for dim in dims

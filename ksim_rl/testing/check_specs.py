@@ -112,7 +112,7 @@ def _check_values(tensordict: TensorDictBase, env: EnvBase, when: str) -> None:
     spec = env.full_observation_spec
     for key in spec.keys(True, True):
         value = tensordict.get(key, None)
-        if value is None:  # `check_env_specs` lists what is missing and what is too much
+        if value is None:  # `check_env_specs` lists keys that are missing or too many
             continue
         if reason := misfit(value, spec[key]):
             raise AssertionError(f"observation {key!r}, {_written_by(env, key)}, {reason} (at {when})")

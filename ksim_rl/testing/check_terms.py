@@ -1,4 +1,4 @@
-"""Finds terms of a `ManagerBasedRlEnv` that write what is not their own, such as a reward that moves the robot."""
+"""Finds terms of a `ManagerBasedRlEnv` that write memory of others, such as a reward that moves the robot."""
 
 from torchrl.envs import EnvBase
 
@@ -8,7 +8,7 @@ from ksim_rl.testing.replays import Replays, end_episodes_at_next_step
 
 
 def check_terms(env: EnvBase, num_steps: int) -> None:
-    """Terms write what is their own: an event the state, in its rows, a reward nothing but its buffers."""
+    """Terms write only their own memory: an event the state, in its rows, a reward nothing but its buffers."""
     base_env = part(env, ManagerBasedRlEnv)
     if base_env is None:
         return

@@ -142,7 +142,7 @@ def algorithm_of(cfg: RunCfg) -> Algorithm:
 def make_update(cfg: RunCfg, env: EnvBase, *, resumed: Mapping[str, Any] | None = None) -> Update:
     """Build everything that learns in a run, with all its memory allocated; see `Algorithm.update`."""
     algorithm = algorithm_of(cfg)
-    # Without means over ranks each would train a policy of its own, unnoticed.
+    # Without means over ranks each would train a different policy, unnoticed.
     if ranks.size() > 1 and not algorithm.on_ranks:
         raise ValueError(f"objective={algorithm.name} trains on one rank only: start it without torchrun")
     return algorithm.update(cfg, env, resumed)

@@ -46,7 +46,7 @@ def build(
     nothing is written; without `resume_from` a new run starts, with the weights of `cfg.checkpoint` if it has one.
     Raises ValueError where a logger's package is missing, or a checkpoint is of another network or env.
     """
-    # First what is cheap to refuse.
+    # Before anything is built, which takes long.
     check_installed(cfg.logger)
     # Before any network is made, as the weights are drawn from it.
     torch.manual_seed(cfg.seed)
@@ -107,7 +107,7 @@ def build(
 
 
 def default_threads(device: torch.device) -> int:
-    """Return torch's threads on the CPU: beside CUDA all cores but one; one on the CPU, whose sums depend on them."""
+    """Return torch's CPU threads: with CUDA all cores but one; without it one, as sums depend on their number."""
     if device.type == "cuda":
         return max(1, min((os.cpu_count() or 1) - 1, MOST_THREADS_BESIDE_CUDA))
     return 1
@@ -143,8 +143,8 @@ def build_evaluator(
 ) -> Evaluator:
     """Build an evaluator with its own envs, without sensor noise and curricula.
 
-    Weights and ranges are those of the config, whatever curricula have come to in training. With a `note`, which is
-    told so, the worlds get room as those of training do, which they have already in the process of a run.
+    Weights and ranges are those of the config, whatever levels curricula have reached in training. With a `note`, the
+    worlds get room by a rehearsal, as in training, and `note` is told; in the process of a run they have it already.
     """
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET

@@ -219,7 +219,7 @@ def load_latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> C
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what a crash left behind while writing or deleting."""
+    """Delete leftovers of a crash while writing or deleting."""
     for entry in folder.iterdir() if folder.is_dir() else ():
         if entry.name.startswith((WRITING, _DISCARDED)):
             shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
@@ -247,7 +247,7 @@ def check_columns(saved: Columns, own: Columns) -> None:
 
 
 def _seal(manifest: dict[str, Any]) -> bytes:
-    # In the order of the config: that of the observation terms, for one, is that of the networks' inputs.
+    # Not sorted: the order of observation terms in the config is the order of the networks' inputs.
     body = json.dumps(manifest, allow_nan=False, separators=(",", ":"))
     return f'{{"manifest_sha256":"{_sha256(body.encode())}",\n"manifest":{body}}}\n'.encode()
 

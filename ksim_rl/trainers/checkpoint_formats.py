@@ -36,7 +36,7 @@ def _in_order_of(group: Mapping[str, Any], columns: Mapping[str, Sequence[int]])
     return {**group, "terms": {name: terms[name] for name in sorted(terms, key=starts.__getitem__)}}
 
 
-# From each older version to the one after it; what has no entry is refused.
+# From each older version to the one after it; a version without an entry is refused.
 MIGRATIONS: dict[int, Callable[[State, Config], tuple[State, Config]]] = {1: _from_1}
 
 

@@ -53,8 +53,10 @@ def keep_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None]) -
             record[name] = known
             continue
         files = files_of_model(source)
+        # A model that is built in code has no files.
         if files is not None:
             record[name] = _keep(name, source, files, run_folder, note)
+    # An unchanged record is not written again.
     if record != earlier:
         plain = {name: dataclasses.asdict(kept) for name, kept in record.items()}
         write_whole(run_folder / RECORD, json.dumps(plain, indent=2) + "\n")
@@ -75,7 +77,7 @@ def with_kept_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], Non
         kind, _, entity = name.partition("/")
         if kept is None:
             continue  # a run of before there were copies
-        if _is_copy(source, kept):  # that of a run which went on with it, and may lie elsewhere by now
+        if _is_copy(source, kept):  # of a run that went on with its copy, and may lie elsewhere now
             changed[kind][entity] = _with_source(
                 changed[kind][entity], str(_checked_copy(name, kept, run_folder))
             )
@@ -138,7 +140,7 @@ def _keep(
 
 
 def _is_whole(copy: Path, kept: KeptModel) -> bool:
-    """Return whether a copy finds all files of the model beside it, and these alone."""
+    """Return whether a copy finds all files of the model next to it, and only these."""
     try:
         files = files_of_model(copy)
     except ValueError:

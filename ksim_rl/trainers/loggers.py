@@ -32,7 +32,7 @@ class MetricLogger(Protocol):
         """Record metrics at `step`, the number of env states so far."""
 
     def close(self) -> None:
-        """Write out what is buffered and release the files."""
+        """Write out buffered metrics and release the files."""
 
 
 @dataclass(frozen=True, kw_only=True)

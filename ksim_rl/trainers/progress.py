@@ -125,7 +125,7 @@ class RunProgress:
         self.console.print(printable(text), markup=False, soft_wrap=True)
 
     def status(self, text: str) -> None:
-        """Show what is going on now; in a pipe, a repetition of the same beginning is printed once."""
+        """Show the present activity; in a pipe, texts that begin alike are printed once."""
         beginning = text.split(":")[0]
         if self._live is not None:
             self._status = text

@@ -324,7 +324,7 @@ def up_to_date(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return the config tree of a run as this version writes it."""
     tree = dict(tree)
     objective = tree.get("objective")
-    # Up to 0.1 an objective without a class was that of PPO.
+    # Up to 0.1 an objective without a class was PPO's.
     if isinstance(objective, Mapping) and "_target_" not in objective:
         tree["objective"] = {"_target_": "ksim_rl.objectives.PPOCfg", **objective}
     task = tree.get("task")

@@ -1,4 +1,4 @@
-"""Runs a training in a folder of its own: config, training, evaluation, learning curves, video."""
+"""Runs a training in a run folder: config, training, evaluation, learning curves, video."""
 
 import dataclasses
 import json

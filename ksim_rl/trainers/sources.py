@@ -19,7 +19,7 @@ NAMED_LATER = ("curriculum", "command", "physics")
 def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
     """Refuse a run whose checkpoints, loggers' packages, robots' files or targets are not there, by a ValueError.
 
-    Nothing is compiled or written. A run that `resumes` has in its checkpoint what it started from.
+    Nothing is compiled or written. A run that `resumes` has its starting point in its own checkpoint.
     """
     check_installed(cfg.logger)
     named = {"checkpoint": cfg.checkpoint}
@@ -38,7 +38,7 @@ def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
 
 
 def check_targets(cfg: RunCfg, measured: Iterable[str] | None = None) -> None:
-    """Refuse names in `stop_at` that no metric will have; its algorithm names what it has `measured`."""
+    """Refuse names in `stop_at` that no metric will have; `measured` are the names of the algorithm's own metrics."""
     task = cfg.task
     if measured is None:
         measured = None

@@ -433,7 +433,7 @@ class Trainer:
         """Continue where `state_dict` was taken; a ValueError where networks, observations or env are others."""
         checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
         hooks = paired(self._own_hooks, state["hooks"], keeps=_keeps)
-        # A first reset allocates what the collector and the transforms keep, before the saved values go in.
+        # A first reset allocates the state of collector and transforms, before the saved values go in.
         self.collector.reset()
         state = checkpoint.own_part(state, self.state_dict)  # of this rank
         self.update.load_state_dict(state["update"])

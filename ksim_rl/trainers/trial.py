@@ -1,7 +1,7 @@
 """Trains the first iterations of a run in child processes, to find a number of envs that fits.
 
-A process that ran out of GPU memory is no place to try again: torch, for one, never releases what a graph had taken
-that broke while it was recorded.
+A process that ran out of GPU memory cannot try again: torch, for one, never releases the memory of a graph whose
+capture failed.
 """
 
 import dataclasses

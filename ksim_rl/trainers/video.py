@@ -16,7 +16,7 @@ from ksim_rl.envs.contract import Pictures, part
 from ksim_rl.files.writing import whole_file
 from ksim_rl.trainers.interrupt import InterruptRequest
 
-# Pictures per second of simulated time. Software takes 50 to 90 ms for each, many times what a step of one env takes.
+# Pictures per second of simulated time. Software rendering takes 50 to 90 ms each, far more than a step of one env.
 FPS = 25.0
 # Why rendering failed in this process, once it did. MuJoCo aborts the process when it tries a second time without a
 # working OpenGL platform.
@@ -38,9 +38,9 @@ def record(
     seed: int = 0,
     status: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Let the policy act, deterministically, and write what a camera sees; return the file written.
+    """Let the policy act, deterministically, and write the pictures of a camera; return the file written.
 
-    The env has the part `Pictures`, and `path` ends in `.mp4`; without a video encoder a `.gif` beside it is written
+    The env has the part `Pictures`, and `path` ends in `.mp4`; without a video encoder a `.gif` next to it is written
     instead. It plays at real speed, `step_dt` being the seconds of an env step, with as near to `fps` pictures per
     second as whole steps allow: at most one each. A VideoUnavailableError says why nothing can be rendered, and a fix.
     """
@@ -82,7 +82,7 @@ def record(
     try:
         return _write(path, first, frames, fps=shown)
     except (ImportError, RuntimeError, OSError):
-        # No ffmpeg for this platform: a GIF needs only Pillow. The frames begin anew, as the generator is spent.
+        # No ffmpeg for this platform: a GIF needs only Pillow. The frames begin again, as the generator is spent.
         frames = acting()
         return _write(path.with_suffix(".gif"), next(frames), frames, fps=shown)
 

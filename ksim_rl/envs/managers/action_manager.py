@@ -52,7 +52,7 @@ class ActionManager:
             self.bounds_L2 = torch.cat(given)
         else:
             self.bounds_L2 = None
-        # Pinned, and read as an array: looking at what has arrived there never waits for the device.
+        # Pinned, and read as an array: reading the last copied value never waits for the device.
         pinned = torch.device(view.device).type == "cuda"
         self._accepts_any = torch.ones(1, dtype=torch.bool, pin_memory=pinned)
         self._arrived = self._accepts_any.numpy()

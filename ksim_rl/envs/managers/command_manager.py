@@ -87,7 +87,7 @@ class CommandManager:
     def refresh(self, mask_E: Bool[Tensor, " E"], *, is_step: bool = False) -> None:
         """Recompute the command vectors of the rows of `mask_E` from the current state and targets.
 
-        What terms keep advances in these rows only; what all envs share of it, only if this `is_step` of the env.
+        Buffers of terms advance in these rows only; values that all envs share, only if this `is_step` of the env.
         """
         for name in self._terms:
             # A term that writes while it is read must not advance the rows that are not refreshed.
@@ -121,7 +121,7 @@ class CommandManager:
             self._computed(name)
 
     def _computed(self, name: str) -> Tensor:
-        """Return the vector of a term in the current state, and learn what it writes on the way."""
+        """Return the vector of a term in the current state, and note the tensors that it writes on the way."""
         term = self._terms[name]
         with self._driver.scope(f"commands/{name}", part=term) as written:
             value_EK = term(self._view)
@@ -130,7 +130,7 @@ class CommandManager:
         return value_EK
 
     def _check(self, name: str, value_EK: object) -> None:
-        """Refuse what is no row per env, by the term's name."""
+        """Refuse a value that has not one row per env, by the term's name."""
         expected = f"expected [{self._view.num_envs}, K], one row per env"
         if not isinstance(value_EK, Tensor):
             raise ValueError(f"command term {name!r} returns {type(value_EK).__name__}: {expected}")

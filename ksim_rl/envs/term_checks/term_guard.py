@@ -115,7 +115,7 @@ class TermGuard:
     def watch(
         self, scope: str, part: object, mask_E: Bool[Tensor, " E"] | None
     ) -> AbstractContextManager[Mapping[str, Kept]]:
-        """Return the watch of one call of `part`, which gives what it writes of its own; None is not watched.
+        """Return the watch of one call of `part`, which yields its own tensors that it writes; None is not watched.
 
         `mask_E` are the rows that it may write; without it, all.
         """
@@ -148,7 +148,7 @@ class TermGuard:
             with _Writes(look):
                 yield call.written
         except Exception as error:
-            # TorchScript makes an error of its own of it, which says nothing.
+            # TorchScript wraps it in another error, whose text says nothing.
             if refusals and error is not refusals[0]:
                 raise refusals[0] from error
             raise
@@ -161,7 +161,7 @@ class TermGuard:
     # -- by torch ------------------------------------------------------------------------------------------------
 
     def _look(self, call: _Call, operator: str, tensor: Tensor) -> ValueError | None:
-        """Return what is wrong with a write, if anything is."""
+        """Return the error for a write that is not allowed, else None."""
         piece = self._memory.holder(tensor)
         if piece is None:
             return None
@@ -176,7 +176,7 @@ class TermGuard:
         return ValueError(refusal(call.scope, call.part, how, name, piece))
 
     def _keep(self, call: _Call, piece: Piece) -> None:
-        """Remember what a term writes of its own, and so advances with each call."""
+        """Remember a tensor of the term's own that it writes, and so advances with each call."""
         is_own = piece.owner in (call.scope, MOCAP)
         if is_own and piece.tensor is not None:
             call.written[piece.name] = Kept(piece.tensor, piece.has_rows)
@@ -197,7 +197,7 @@ class TermGuard:
         return copies
 
     def _compare(self, call: _Call, before: list[_Copy]) -> None:
-        """Refuse what has changed and is not the term's, or not in its rows."""
+        """Refuse changes of memory that is not the term's, or not in its rows."""
         with recording.paused():
             for piece, bits, old_bits in before:
                 # Most pieces are untouched: the cheap test comes first.
@@ -218,10 +218,10 @@ class TermGuard:
                     )
 
     def _leaves_its_rows(self, call: _Call, piece: Piece, bits: Tensor, old_bits: Tensor) -> bool:
-        """Whether a call with a mask has changed what the mask does not name."""
+        """Whether a call with a mask has changed rows outside of the mask."""
         if call.mask_E is None:
             return False
-        # What an event keeps, and what it presses with, may go on in rows in which nothing new begins. In a rehearsal
+        # Buffers and forces of an event may change in rows in which nothing new begins. In a rehearsal
         # nothing has begun. A command draws in its rows only.
         is_pressing = piece.owner == INPUT and not self._rehearses
         is_kept = piece.owner == call.scope and not call.scope.startswith("commands/")

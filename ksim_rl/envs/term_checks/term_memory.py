@@ -151,7 +151,7 @@ class TermMemory:
         """Return the number of entries of each kind that still grows while an env is constructed."""
         simulation = self._simulation
         readings = self._readings
-        # Caches are left out, as quantities are looked up anew each time.
+        # Caches are left out, as quantities are looked up again each time.
         growing = (
             simulation.buffers.by_name(),
             simulation.shared_values.by_name(),
@@ -170,7 +170,7 @@ class TermMemory:
             *self._of_worlds(),
             *self._of_tables(),
         ]
-        # What is listed first keeps its name: of a per-world field, that of the view, not that of Warp's model.
+        # The first name of a piece stays: a per-world field is called as in the view, not as in Warp's model.
         by_start: dict[int, Piece] = {}
         for piece in found:
             by_start.setdefault(piece.start, piece)
@@ -272,7 +272,7 @@ def _aliases(view: EnvView) -> dict[tuple[int, str], str]:
 
 
 def _tensors_of(part: object) -> Iterator[tuple[str, Tensor]]:
-    """Return the tensors that are attributes of an object, tables of tensors included, by what terms call them."""
+    """Return the tensors that are attributes of an object, tables of tensors included, with their names in terms."""
     for name, value in vars(part).items():
         if name == "cache":
             continue
@@ -281,7 +281,7 @@ def _tensors_of(part: object) -> Iterator[tuple[str, Tensor]]:
 
 
 def _leaves(name: str, value: Any) -> Iterator[tuple[str, Tensor]]:
-    """Return the tensors of a value: itself, or the fields of a named tuple, or what a tuple or list holds."""
+    """Return the tensors of a value: itself, the fields of a named tuple, or the items of a tuple or list."""
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
         for field, part in value._asdict().items():  # pyright: ignore[reportAttributeAccessIssue]
             yield from _leaves(f"{name}.{field}", part)
