@@ -60,9 +60,9 @@ class CartpolePosition(ObservationTerm):
     """Position of the cart, m, and cosine and sine of the pole's angle from upright, [E, 3]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
-        # Cosine and sine have no jump at half a turn.
         cart_E1 = view.joints("slider").pos_EL
         angle_E1 = view.joints("hinge").pos_EL
+        # Cosine and sine have no jump at half a turn.
         return torch.cat((cart_E1, torch.cos(angle_E1), torch.sin(angle_E1)), dim=-1)
 
 
@@ -311,8 +311,8 @@ class ReacherPose(ObservationTerm):
     """Cosine and sine of the shoulder's angle, and the wrist's angle, rad, [E, 3]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
-        # The wrist has limits, and no whole turns.
         shoulder_E1, wrist_E1 = view.joint_pos_EL.split(1, dim=-1)
+        # The wrist has limits, and no whole turns.
         return torch.cat((torch.cos(shoulder_E1), torch.sin(shoulder_E1), wrist_E1), dim=-1)
 
 

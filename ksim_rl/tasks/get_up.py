@@ -63,8 +63,8 @@ class Standing(RewardTerm):
         # Squared, so that lying on the belly at half height gives little.
         up_E = (upright(view) * risen(view, self.standing_height)).square()
         stray_E = view.joint_pos_rel_EL.square().mean(-1) / self.pose_std**2
-        # Both exponents add up: one exponential for pose and speed.
         motion_E = view.joint_vel_EL.square().mean(-1) / self.speed_std**2
+        # Both exponents add up: one exponential for pose and speed.
         return up_E * torch.exp(-stray_E - motion_E)
 
 

@@ -101,8 +101,8 @@ class DelayedActuator(Actuator):
     max_lag: WholeNumber
 
     def _check_fields(self) -> None:
-        # Equal bounds mean a fixed lag.
         super()._check_fields()
+        # Equal bounds mean a fixed lag.
         if self.min_lag > self.max_lag:
             raise ValueError(f"min_lag={self.min_lag} exceeds max_lag={self.max_lag}")
 

@@ -86,10 +86,10 @@ def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
     """
     root = _root_of(mj_model)
     # Bodies without joints are parts of the body that they are welded to.
-    # Points of collision geoms by moving body, world frame, in the given pose.
     weld = mj_model.body_weldid
     moving = [b for b in range(root, mj_model.nbody) if weld[b] == b and mj_model.body_rootid[b] == root]
     upright = posed(mj_model, qpos)
+    # Points of collision geoms by moving body, world frame, in the given pose.
     parts = {b: list(_points(mj_model, upright, b).values()) for b in moving}
     points = {b: np.concatenate(of_body) for b, of_body in parts.items() if of_body}
     if not points:
@@ -143,8 +143,8 @@ def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
 
 def _straight(mj_model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     """Return the pose with all joints at their references, and the root as it is in `qpos`."""
-    # The free joint has the lowest joint type, 0.
     straight = mj_model.qpos0.copy()
+    # The free joint has the lowest joint type, 0.
     first = int(mj_model.jnt_qposadr[mj_model.jnt_type.argmin()])
     straight[first : first + 7] = qpos[first : first + 7]
     return straight

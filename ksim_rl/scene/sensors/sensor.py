@@ -58,10 +58,10 @@ def check_present(name: str, kind: str, wanted: str | None, elements: Sequence[A
     present = [element.name for element in elements]
     if wanted not in present:
         several: list[str] = []
-        # A pattern where a name is expected is a likely mistake, and gets its own message.
         # A name may be no valid pattern, and is then just unknown.
         with suppress(re.error):
             several = [other for other in present if other and re.fullmatch(str(wanted), other)]
+        # A pattern where a name is expected is a likely mistake, and gets its own message.
         if several:
             raise ValueError(
                 f"scene.sensors.{name}: {wanted!r} matches {several}, but the sensor takes the name of one {kind} "

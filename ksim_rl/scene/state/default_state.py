@@ -29,10 +29,10 @@ def held(mj_model: mujoco.MjModel, qpos_L: np.ndarray) -> Held:
     ctrl_L = np.zeros(mj_model.nu)
     act_L = np.zeros(mj_model.na)
     for actuator in range(mj_model.nu):
-        # Efforts hold nothing by themselves; actuators of sites or bodies have no position to hold.
         on_joint = drives_scalar_joint(mj_model, actuator)
         on_tendon = mj_model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_TENDON
         control = joint_control(mj_model, actuator)
+        # Efforts hold nothing by themselves; actuators of sites or bodies have no position to hold.
         if control.refusal or control.kind == "effort" or not (on_joint or on_tendon):
             continue
         # MuJoCo's length is gear * position.

@@ -46,7 +46,6 @@ class WorldView:
         soft_joint_pos_limit_factor: float = 1.0,
         entities: Sequence[str] = (),
     ) -> None:
-        # Shared with the simulation: these are its own tensors, not copies.
         self._simulation = simulation
         self.world = simulation.world
         self.num_envs = simulation.num_envs
@@ -54,6 +53,7 @@ class WorldView:
         self.physics_dt = simulation.physics_dt
         self.step_dt = simulation.step_dt
         self.max_episode_length = simulation.max_episode_length
+        # Shared with the simulation: these are its own tensors, not copies.
         self.buffers = simulation.buffers
         self.seed = simulation.seed
         self.step_count = simulation.step_count
@@ -93,9 +93,9 @@ class WorldView:
         self.joint_pos_target_EL = self.targets.pos_EL
         self.joint_vel_target_EL = self.targets.vel_EL
         self.joint_effort_target_EL = self.targets.effort_EL
-        # Zeros and infinities take the place of limits that a model does not have.
         self.actuator_params = ActuatorParams(self.buffers, self.resolver.names("joint"), self.device)
         ctrl_range = torch.tensor(model.actuator_ctrlrange, device=self.device, dtype=torch.float32)
+        # Infinite where the model has no limit.
         self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
         self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
         # Zero unless an event draws it.
