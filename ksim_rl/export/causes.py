@@ -57,7 +57,7 @@ def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[
         start += term["size"]
         causes = _of_observation(term["name"], ours[:, columns], theirs[:, columns], episode)
         obs_differs = obs_differs or bool(causes)
-        # The last action follows from what happens to actions, which the targets show.
+        # The last action follows from the action chain, which the targets show.
         found += [] if term["value"] == {"quantity": "action"} else causes
     # The network itself: it was given the recorded observation, so only its file can explain a difference.
     ours, theirs, _ = signal("action")
@@ -266,7 +266,7 @@ def _shift(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, tolerance:
         # Rows of two episodes are not neighbours in time.
         whole = episode[late] == episode[early]
         error = _error(ours[early][whole], theirs[late][whole])
-        # It has to fit well, and clearly better than what was found so far.
+        # It has to fit well, and clearly better than the best so far.
         if whole.any() and error <= min(tolerance, 0.3 * best):
             best = error
             found = shift

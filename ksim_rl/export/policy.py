@@ -138,7 +138,7 @@ class ExportedPolicy(nn.Module):
             values[group] = torch.cat(terms, -1)
         actions: list[Tensor] = []
         for part in self.parts:
-            # Recurrent modules step by formula, as they wait for resets that an export has not.
+            # By the formula of one step: the module itself reads reset flags, which an export has not.
             if isinstance(part, RecurrentModule):
                 features, kept = _recurrent(part, values, [given.pop(0) for _ in part.state_keys])
                 values[part.feature_key] = features
@@ -339,8 +339,7 @@ def greatest_difference(policy: ExportedPolicy, path: Path) -> float:
             key: answer["next", *key] for part in policy.parts for key in getattr(part, "state_keys", ())
         }
         wanted = torch.cat([_row(answer[key]) for key in policy.action_keys], -1).numpy()
-        # `max` of numpy passes NaN on; `max` of Python would not.
-        # Also where one of the two is NaN.
+        # Also where one of the two is NaN, which numpy's `max` passes on, and Python's may not.
         difference = (np.abs(actions - wanted) / np.maximum(np.abs(wanted), 1.0)).max()
         worst = max(worst, float("inf") if np.isnan(difference) else float(difference))
     return worst

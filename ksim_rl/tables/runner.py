@@ -32,7 +32,7 @@ class Runs:
         self.folder = folder
         self.run_folder = run_folder
         self.smoke = smoke
-        # Composing a config takes a second, and each row is asked for many times.
+        # Composing a config is slow, and each row is asked for many times.
         self._of = cache(lambda name: run_cfg(table.rows[name], 1, smoke=smoke))
 
     def results(self) -> dict[str, dict[int, dict[str, Any]]]:
@@ -76,7 +76,7 @@ class Runs:
         try:
             while waiting or running:
                 is_over = time.monotonic() > until
-                # Time is up: nothing starts any more, and what runs is ended.
+                # Time is up: nothing starts any more, and running jobs are ended.
                 if is_over:
                     left = left + len(waiting)
                     waiting = []

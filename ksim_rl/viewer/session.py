@@ -143,7 +143,7 @@ class Session:
     @property
     def observations(self) -> Mapping[str, Float[Tensor, " ?L"]]:
         """The clean reading of each observation term that is a vector, of the shown env."""
-        # The root of the next step, which is what a policy sees now. Images are left out.
+        # The root of the next step: the policy's present input. Images are left out.
         terms = self._root_E.get("obs")
         return {key: terms.get(key)[self.env_index] for key in terms.keys() if terms.get(key).ndim == 2}
 
