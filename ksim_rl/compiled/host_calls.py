@@ -71,6 +71,7 @@ def host_calls(parts: Mapping[str, Any]) -> Iterator[list[HostCall]]:
     tracer = _Tracer(parts)
     # A profiler of the user, such as cProfile, is put back afterwards.
     before = sys.getprofile()
+    # A profiler, since it also sees C functions that a module has imported by name.
     sys.setprofile(tracer.notice)
     try:
         yield tracer.found

@@ -35,6 +35,7 @@ def state_of(source: Any) -> int:
     if isinstance(source, random.Random):
         return hash(source.getstate())
     if isinstance(source, np.random.Generator):
+        # States of NumPy are nested dicts with arrays, which have no hash.
         return hash(_hashable(source.bit_generator.state))
     return hash(_hashable(source.get_state(legacy=False)))
 
@@ -63,6 +64,7 @@ def place_of(iterator: Any) -> str | None:
         except (TypeError, AttributeError):
             return None
     # What it goes through may be large, and is looked at elsewhere if it can change.
+    # `__reduce__` gives the iterated object and the position; only plain ones can be compared.
     plain = [argument for argument in arguments if issubclass(type(argument), PLAIN)]
     # Chains and zips hold other iterators, which have places, too.
     nested = [item for part in arguments if isinstance(part, tuple) for item in part]

@@ -120,6 +120,7 @@ class _Remembered:
 def listed(changes: Iterable[Change], *, most: int = 4) -> str:
     """Return the changes as one text."""
     texts = list(dict.fromkeys(map(str, changes)))
+    # A changed transform may change dozens of values: the first few tell enough.
     if len(texts) > most:
         more = f"; and {len(texts) - most} more"
     else:

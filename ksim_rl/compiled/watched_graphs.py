@@ -58,4 +58,5 @@ class WatchedGraphs:
         )
         for graph in self._graphs:
             graph.forget()
+            # Once eager, a graph stays so for the rest of the run.
             graph.is_eager |= runs_python

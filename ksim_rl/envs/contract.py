@@ -93,6 +93,7 @@ class SimulatedWorld(ABC):
 class Pictures(ABC):
     """Pictures of the current state, in the mode that the env was built with."""
 
+    # Each `without` completes the line "<class> has ..." at the start of a run.
     without: ClassVar[str] = "no pictures: videos are off"
     render_mode: str | None
 

@@ -20,6 +20,7 @@ def drawings(
     `sensors` are the readers of the env's, and `rewards` those that are computed; others have no quantities to draw.
     """
     found: dict[str, Drawing] = {}
+    # Names are "<room>/<name>", as in `viewer.draw`.
     for room, base, parts in (
         ("commands", CommandTerm, cfg.commands),
         ("rewards", RewardTerm, {name: cfg.rewards[name] for name in rewards}),

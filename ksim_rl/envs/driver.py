@@ -25,6 +25,7 @@ class EnvDriver(Simulation):
 
     def __init__(self, world: World, *, step_dt: float, max_episode_length: int = 0, **parts: Any) -> None:
         super().__init__(world, step_dt=step_dt, max_episode_length=max_episode_length)
+        # Before the view, which shows them to terms.
         self.readings = Readings(self)
         self.non_finite = NonFiniteTerms(self.num_envs, self.step_count)
         self.view = EnvView(self, self.readings, **parts)

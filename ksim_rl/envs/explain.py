@@ -41,6 +41,7 @@ def explain(
         file=output, force_jupyter=False, width=width, highlight=False, markup=False, color_system=None
     )
     show = partial(_show, console)
+    # Inputs and outputs of the policy first, then what rates and disturbs it.
     console.print(_summary(cfg, driver))
     for group, group_cfg in cfg.observations.items():
         rows = []
@@ -51,6 +52,7 @@ def explain(
             if len(shape) == 1:
                 shape = (shape[0] * group_cfg.num_frames(name),)
             widths.append(shape)
+            # Noise, delay, history and the like of this group.
             chain = _parameters(term_cfg, without=("term",))
             rows.append((name, str(shape), chain, _described(term_cfg.term)))
         # An image stands alone in its group; vectors are concatenated.
@@ -77,6 +79,7 @@ def explain(
     }
     rows = [(name, shown[name], _described(term, ("weight",))) for name, term in cfg.rewards.items()]
     if cfg.scale_rewards_by_dt:
+        # Weights are per second then, and a step adds this share.
         scaled = f"times {driver.step_dt:g} s"
     else:
         scaled = "per step"
@@ -138,6 +141,7 @@ def _keys(transform: Transform) -> str:
     """Return the keys that a transform reads and, if they differ, the keys that it writes."""
     keys = [[*transform.in_keys, *transform.in_keys_inv], [*transform.out_keys, *transform.out_keys_inv]]
     reads, writes = (", ".join(map(spell, part)) for part in keys)
+    # A transform in place needs no arrow.
     if reads == writes:
         return reads
     return f"{reads} -> {writes}"

@@ -35,6 +35,7 @@ _quick = QuickLaunch(
 def _count_now(table_EL: Tensor, term_L: Tensor, step: Tensor, first_N: Tensor, count_N: Tensor) -> None:
     num_rows, width = table_EL.shape
     tensors = table_EL, term_L, step, first_N, count_N
+    # One thread for each number of the table.
     _quick(table_EL.device, (num_rows, width), width, num_rows, *map(address, tensors))
 
 
@@ -66,6 +67,7 @@ class NonFiniteTerms:
             self._columns[key] = torch.tensor(columns, dtype=torch.int32, device=self._device)
             self._names += [f"{kind} {name!r}" for name in names]
             return
+        # Metrics and rewards may have other dtypes.
         if table_EL.dtype != torch.float32 or not table_EL.is_contiguous():
             # The kernel reads float32 rows that lie one behind the other.
             table_EL = table_EL.float().contiguous()

@@ -80,6 +80,7 @@ class RecordedPython:
             changes = self._watch.changes()
             if self._is_compared:
                 self._replaced = {_place(change) for change in changes if change.is_of_tensors}
+            # Replaced tensors are judged by the comparison of numbers, if there is one.
             self._refuse(calls, [change for change in changes if _place(change) not in self._replaced])
         self._calls += 1
         # Values as they are after this step: later changes come from outside.
@@ -103,6 +104,7 @@ class RecordedPython:
         return python_parts(self._env) | self._others
 
     def _refuse(self, calls: Sequence[HostCall], changes: Sequence[Change]) -> None:
+        # Calls first: they are the cause, and a changed value is often their effect.
         if calls:
             found = "; ".join(dict.fromkeys(map(str, calls[:3])))
             instead = INSTEAD[calls[0].what]

@@ -24,6 +24,7 @@ class SignalKeys(NamedTuple):
         """Return a copy of the tree, not of the tensors, with reward, done and terminated under TorchRL's names too."""
         rollout_ET = rollout_ET.copy()
         for key, own in zip(STANDARD.following, self.following, strict=True):
+            # The same tensors under a second name; nothing is copied.
             rollout_ET.set(key, rollout_ET.get(own))
         return rollout_ET
 

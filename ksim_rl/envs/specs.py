@@ -36,6 +36,7 @@ def make_specs(
         for group, values in readings.items()
         if values
     }
+    # Shapes with the batch dim, as specs of an env have them.
     shape_E1 = torch.Size((*batch_size, 1))
     shape_EL = torch.Size((*batch_size, size))
     # Only where all columns have bounds; see `ActionManager`.
@@ -43,6 +44,7 @@ def make_specs(
     if bounds_L2 is not None:
         low_EL, high_EL = (edge_L.expand(shape_EL).clone() for edge_L in bounds_L2.unbind(-1))
         action = Bounded(low_EL, high_EL, shape=shape_EL, dtype=torch.float32, device=device)
+    # bool [E, 1] each, as TorchRL has them.
     flags = {
         name: Binary(n=1, shape=shape_E1, dtype=torch.bool, device=device)
         for name in ("done", "terminated", "truncated")

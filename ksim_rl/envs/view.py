@@ -35,6 +35,7 @@ class Readings:
         self.reward_weights: dict[str, Float[Tensor, ""]] = {}
         self.episode_rewards: dict[str, Float[Tensor, " E"]] = {}
         self.terminations: dict[str, Bool[Tensor, " E"]] = {}
+        # The termination manager writes both in place at each step.
         self.terminated_E = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.truncated_E = torch.zeros_like(self.terminated_E)
         # No columns yet: the action manager puts its buffers here.
@@ -76,6 +77,7 @@ class EnvView(WorldView):
         self.terminations: Mapping[str, Bool[Tensor, " E"]] = MappingProxyType(readings.terminations)
         self.terminated_E = readings.terminated_E
         self.truncated_E = readings.truncated_E
+        # The same tensor for the life of the env, so it needs no property.
         self.level = readings.level
         self.command_cache = readings.command_cache
 

@@ -46,6 +46,7 @@ def joined(command: str) -> Iterator[None]:
         raise ValueError(
             f"{command} is for one process: start it without torchrun ({' and '.join(COMMANDS)} take it)"
         )
+    # WORLD_SIZE alone may be left over in a shell.
     missing = [name for name in VARIABLES if name not in os.environ]
     if missing:
         raise ValueError(
@@ -78,6 +79,7 @@ def joined(command: str) -> Iterator[None]:
             yield
             heart.done()
     except BaseException as error:
+        # The others end with this reason, instead of waiting for a rank that is gone.
         heart.ended(error)
         raise
     dist.destroy_process_group()

@@ -25,6 +25,7 @@ class Timing:
         self._began = time.perf_counter()
         if self._device.type == "cuda":
             events = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            # Events take no time of the host, and do not wait for the device.
             events[0].record(torch.cuda.current_stream(self._device))
             self._events.append(events)
 

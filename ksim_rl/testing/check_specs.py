@@ -83,6 +83,7 @@ def check_actions(env: EnvBase, num_steps: int) -> None:
         "no leaf dim": action[..., 0],
         "dtype float64": action.double() if action.dtype != torch.float64 else action.float(),
     }
+    # From a new root each time, since a refused step may have changed it.
     for what, bad in wrong.items():
         td = env.reset()
         try:
@@ -103,6 +104,7 @@ def _check_spec_names(spec: Composite, where: str, batch_dims: int) -> None:
             f"{where} has the names {spec.names}: expected ['{dims.E}']. "
             f"Set `spec.names = ['{dims.E}']` where it is made"
         )
+    # Nested composites have names of their own.
     for key, child in spec.items():
         if isinstance(child, Composite):
             _check_spec_names(child, f"{where}[{key!r}]", batch_dims)
@@ -130,6 +132,7 @@ def _check_values(tensordict: TensorDictBase, env: EnvBase, when: str) -> None:
 
 def _written_by(env: EnvBase, key: NestedKey) -> str:
     """Return which transform wrote an observation last, or that the env did."""
+    # From the outermost wrapper inwards; within one wrapper the last transform counts.
     found = "written by the env"
     # The outermost wrapper writes last.
     while isinstance(env, TransformedEnv):

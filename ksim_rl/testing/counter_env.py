@@ -104,6 +104,7 @@ class CounterEnv(EnvBase):
             mask_E = torch.ones_like(self.count_E, dtype=torch.bool)
         else:
             mask_E = mask.reshape(-1)
+        # Only the rows of the mask, which may be empty.
         self.count_E.copy_(torch.where(mask_E, 0, self.count_E))
         self.episode_E.add_(mask_E)
         flag = torch.zeros((*self.batch_size, 1), dtype=torch.bool, device=self.device)
@@ -112,4 +113,5 @@ class CounterEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self.seed_value.fill_(0 if seed is None else seed)
+        # The draws depend on seed and episode, so the same seed repeats them from the start.
         self.episode_E.zero_()

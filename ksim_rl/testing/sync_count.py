@@ -98,6 +98,7 @@ class _Operations(_Counting, TorchDispatchMode):
 
 
 def _why_it_syncs(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> str | None:
+    # The name without the overload, such as "aten::index".
     name = func._schema.name
     if name in _ALWAYS:
         return _ALWAYS[name]
@@ -112,6 +113,7 @@ def _why_it_syncs(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> s
         return "repeat_interleave without output_size"
     if name == "aten::_to_copy" and _differs(args[0].device, kwargs.get("device")):
         return "copy to another device"
+    # `a.copy_(b)` has the target first.
     if name == "aten::copy_" and isinstance(args[1], Tensor) and _differs(args[0].device, args[1].device):
         # `copy_(source, non_blocking=True)` into pinned memory returns before the copy is done.
         into_pinned = len(args) > 2 and args[2] and args[0].is_cpu and args[0].is_pinned()
@@ -128,6 +130,7 @@ def _differs(here: torch.device, there: torch.device | None) -> bool:
 def _place() -> str:
     """Return file:line of the innermost frames outside torch."""
     places = []
+    # Frames of torch and of this module say nothing about the cause.
     for frame in traceback.extract_stack():
         is_internal = any(part in frame.filename for part in _INTERNAL)
         if not is_internal:

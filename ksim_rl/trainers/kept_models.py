@@ -69,6 +69,7 @@ def with_kept_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], Non
     default a warning) says so. Where there is no copy, a changed file is warned of by name.
     """
     note = note or _warn
+    # By "robots/NAME" or "objects/NAME".
     record = read_record(run_folder)
     scene = cfg.task.scene
     changed: dict[str, dict[str, Any]] = {kind: dict(getattr(scene, kind)) for kind in KINDS}
@@ -82,6 +83,7 @@ def with_kept_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], Non
                 changed[kind][entity], str(_checked_copy(name, kept, run_folder))
             )
             continue
+        # Such as by an override on the command line.
         if source != kept.source:
             continue  # another model, which was asked for
         why = _difference(source, kept)

@@ -44,6 +44,7 @@ def judged_by(cfg: RunCfg, *, trained: str, given: Collection[str] = ()) -> tupl
     if engine != trained or engine != "c":
         return cfg, f"on {ENGINES[engine]} (trained on {ENGINES[trained]})"
     changes, words = _changes(cfg.task, given)
+    # Half the time step needs twice the substeps, so that an env step lasts as long as in training.
     sim = dataclasses.replace(cfg.task.sim, **changes)
     decimation = cfg.task.decimation
     if "timestep" in changes:
@@ -55,6 +56,7 @@ def judged_by(cfg: RunCfg, *, trained: str, given: Collection[str] = ()) -> tupl
 
 def other_integrator(option: mujoco.MjOption) -> tuple[str, str]:
     """Return the integrator by which a run of this one is judged, and how to say that."""
+    # "mjINT_IMPLICITFAST" is "implicitfast" in a config.
     own = mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_").lower()
     other = _OTHER_INTEGRATOR.get(own, "euler")
     return other, f"with integrator {other} instead of {own}"
@@ -72,6 +74,7 @@ def same_time_step(timestep: float) -> str:
 
 def _changes(task: ManagerBasedRlEnvCfg, given: Collection[str]) -> tuple[dict[str, Any], list[str]]:
     """Return the fields of `SimCfg` to change, and how to say that."""
+    # The model's own options count where the config leaves them open.
     spec = build_spec(task.scene)
     task.sim.apply_to(spec)
     changes: dict[str, Any] = {}
@@ -82,6 +85,7 @@ def _changes(task: ManagerBasedRlEnvCfg, given: Collection[str]) -> tuple[dict[s
     timestep = float(spec.option.timestep)
     if f"{PREFIX}timestep" in given:
         return changes, words
+    # Lags in substeps would be half as long in seconds with half the time step.
     if _counts_substeps(task):
         words.append(same_time_step(timestep))
         return changes, words

@@ -37,6 +37,7 @@ def load_networks(update: Update, state: Mapping[str, Any], path: Path) -> None:
         update.load_weights(state)
     except KeyError as error:
         raise ValueError(f"{path}: of another algorithm: it has no network {error}") from error
+    # Another number or size of layers.
     except ValueError as error:
         raise ValueError(
             f"{path}: its networks are others: {error}; choose objective and modules as the "

@@ -77,6 +77,7 @@ def refusal(scope: str, part: object, how: str, name: str, piece: Piece) -> str:
     else:
         effect = ""
     # The advice repeats the term's own expression where it has one.
+    # Only names that begin with "view." are valid code in a term.
     read = name if name.startswith("view.") else "x"
     fix = (
         f"Write `error = {read} - 0.5` instead of `error = {read}; error -= 0.5`, or change `{read}.clone()`"
