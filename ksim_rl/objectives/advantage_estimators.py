@@ -162,7 +162,7 @@ class RolloutEstimator(ValueEstimatorBase):
         read: list[Any] = [tensordict.get(place, None) for place in places]
         # An env without "terminated" ends all its episodes by "done".
         read[-1] = read[-2] if read[-1] is None else read[-1]
-        # All signals must agree: a [E, T] reward with a [E, T, 1] value would broadcast to [E, T, T].
+        # All signals must agree: shapes that differ by a dim could broadcast without an error.
         shapes: list[tuple[int, ...] | None] = []
         for signal in read:
             shapes.append(None if signal is None else tuple(signal.shape))

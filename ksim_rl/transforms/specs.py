@@ -30,7 +30,7 @@ def path_of(key: NestedKey) -> tuple[Any, ...]:
 
 def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> TensorSpec:
     """Return the spec of `key`; the KeyError of a missing one lists the near names."""
-    # Compared as text: a nested key may be spelt as a tuple or as one name.
+    # As text, in which the error can look for near names.
     leaves = {spell(leaf): leaf for leaf in observation_spec.keys(True, True)}
     if spell(key) not in leaves:
         raise KeyError(f"{owner}: the env has no {key!r}: {checks.near(spell(key), leaves)}")

@@ -33,7 +33,6 @@ def make_off_policy_update(
     objective: Any = cfg.objective
     actor: Any = make_off_policy_policy(cfg, env)
     spec: Any = env.observation_spec
-    # The critics read "critic" and the action, whose range the actor's bounds give.
     critic = make_q_network(
         part_of(cfg, "modules.critic", QNetworkCfg),
         obs_dim=spec["critic"].shape[-1],
