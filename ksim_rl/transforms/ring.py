@@ -147,7 +147,7 @@ def _turn_in_torch(
     # Read before the write: a lag of zero takes the value itself, not the slot.
     kept_ENL = ring_EML.gather(1, place_EN[..., None].expand(-1, -1, value_EL.shape[1]))
     frames_ENL = torch.where(lag_EN[..., None] == 0, value_EL[:, None], kept_ENL)
-    # Rows that do not write put back what the slot has: no size depends on the mask.
+    # Rows that do not write put back their slot: no size depends on the mask.
     rows_E = torch.arange(num_rows, device=value_E.device)
     ring_EML[rows_E, slot_E] = torch.where(writes_E[:, None], value_EL, ring_EML[rows_E, slot_E])
     if counts:
@@ -170,7 +170,7 @@ def _draw_lags_in_torch(
     highest: int,
 ) -> None:
     num_rows = len(begins_E)
-    # The resets that the rows reach, of which only those of masked rows are kept.
+    # The resets that the rows reach; only masked rows keep theirs.
     count_E = draw_count_E.reshape(-1) + 1
     first_row = ranks.first_row(num_rows)
     keys = in_torch.keys_of(seed, stream, count_E, num_rows=num_rows, first_row=first_row)

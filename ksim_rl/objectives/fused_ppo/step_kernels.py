@@ -240,7 +240,7 @@ def adam_step(
     new_mean = mean + (gradient - mean) * (1.0 - beta1)
     new_variance = beta2 * variance + (1.0 - beta2) * gradient * gradient
     change = (rate / correction1) * new_mean / (tl.sqrt(new_variance) / tl.sqrt(correction2) + adam_eps)
-    # A step that is not finite writes back what was there.
+    # A step that is not finite writes back the old values.
     parameter = tl.where(made, parameter - change, parameter)
     tl.store(parameters + at, parameter)
     tl.store(means + at, tl.where(made, new_mean, mean))

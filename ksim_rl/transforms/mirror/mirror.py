@@ -202,7 +202,7 @@ class Mirror(KeyedTransform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
         pairs = zip(self.in_keys_inv, self.out_keys_inv, strict=True)
-        # Buffers of actions are numbered after those of observations.
+        # Buffers of actions are numbered after the observations.
         for index, (key, out_key) in enumerate(pairs, start=len(self.in_keys)):
             tensordict.set(key, self._seen(index, tensordict.get(out_key), tensordict.batch_size))
         return tensordict
