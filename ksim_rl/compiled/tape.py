@@ -319,7 +319,7 @@ class Tape:
         fields = " ".join(names[place] for place in given)
         launch = QuickLaunch(arguments_of((ADDRESS, fields)), text, block_dim=BLOCK)
         kernel.launch = partial(launch, self._device, (self._num_rows, max(lanes, 1)), *given)
-        # What only the kernel knew is free from here on.
+        # Tensors that only this kernel uses need no reference here.
         self._kept += [
             tensor for one, _ in kernel.operations for tensor in one.read() if _storage(tensor) in given
         ]

@@ -72,6 +72,6 @@ def attempt(run: dist.Store, *, rank: int, size: int) -> int:
                 waiting.discard(other)
         if time.monotonic() > until:
             raise RuntimeError(f"rank {min(waiting)} did not start within {JOIN_S:.0f} s")
-        # s; short beside the seconds in which ranks start.
+        # Seconds; short compared with the time in which ranks start.
         time.sleep(0.02)
     return number

@@ -45,7 +45,7 @@ def check_partial_reset(env: EnvBase, num_steps: int) -> None:
     root = replays.start()
     for index in range(num_steps):
         _, root = replays.step(root, index)
-    # `TensorDict.clone` adds zero to what lies on a device, which takes the sign of a negative one.
+    # `TensorDict.clone` adds zero to tensors on a device, which takes the sign of a negative zero.
     before = _rows_of_state(env)
     root_before = root.apply(torch.clone)
     assert root_before is not None

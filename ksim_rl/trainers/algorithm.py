@@ -117,7 +117,7 @@ class Algorithm:
     cfg: type[AlgorithmCfg]  # a run whose objective is one of these, or of a subclass, is trained by it
     update: Callable[[RunCfg, EnvBase, Mapping[str, Any] | None], Update]
     policy: Callable[[RunCfg, EnvBase], TensorDictModuleBase]  # its weights: `update/actor` of a checkpoint
-    data: DatasetCfg | ReplayCfg  # what `objective=<name>` chooses beside its settings, as are the modules
+    data: DatasetCfg | ReplayCfg  # chosen by `objective=<name>` along with its settings, as are the modules
     modules: ModulesCfg = field(default_factory=ModulesCfg)
     on_ranks: bool = False  # whether several ranks may train with it: its update takes means over them
 

@@ -1,7 +1,7 @@
 """Keeps the model files of a run with their hashes, and tells a resumed run where a file has changed since.
 
 `models.json` of a run folder says of each robot and object whose model is a file: its path, the hash of all its files,
-and where in the folder `models` a copy lies. Models of the menagerie, and those that are too large, have a hash alone.
+and where in the folder `models` a copy lies. Models of the menagerie, and models that are too large, have only a hash.
 """
 
 import dataclasses

@@ -96,7 +96,7 @@ class EvaluationHook(Hook):
         for text in losses_of(self.evaluator.env):
             trainer.progress.note(f"warning: evaluation at iteration {trainer.iteration}: {text}")
         trainer.evaluation = evaluation
-        self._evaluated_at = trainer.iteration
+        self._evaluated_at = trainer.iteration  # so that the end is not evaluated twice
         figures = {f"evaluation/{name}": value for name, value in asdict(evaluation).items()}
         trainer.log(figures | probed(trainer.update, trainer.collector.env, trainer.rollout_ET))
 
@@ -319,7 +319,7 @@ class Trainer:
         env = self.collector.env
         seconds = self.clock.lap()
         if read.pop(INTERRUPTED, 0.0):
-            self._told_to_end = True
+            self._told_to_end = True  # all ranks read the same sum, and end together
             self.interrupt.signal = self.interrupt.signal or signal.SIGTERM
         clock = part(env, EpisodeClock)
         physics = explain_physics(env, read)  # waits for the device only after a failure
@@ -331,7 +331,7 @@ class Trainer:
             longest_s = 0.0  # rewards are then per episode, not per second
         else:
             longest_s = clock.max_episode_length_s
-        self.metrics = episode_means(read, max_episode_length_s=longest_s)
+        self.metrics = episode_means(read, max_episode_length_s=longest_s)  # sums become means of episodes
         self.metrics |= physics.metrics | {
             "iteration": iteration,
             "seconds": self.clock.total,
@@ -376,7 +376,7 @@ class Trainer:
         self._target_met |= bool(targets) and all(reached)
         for name in targets:
             known = name in self.metrics or name.startswith("evaluation/")
-            if not known and "episode/return" in self.metrics:
+            if not known and "episode/return" in self.metrics:  # else terms have no metrics yet
                 self._warn_once(name, f"stop_at: {name!r} is no metric: {near(name, self.metrics)}")
 
     def _warn(self, losses: Sequence[str], metrics: Mapping[str, float], iteration: int) -> None:

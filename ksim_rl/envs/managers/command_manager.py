@@ -49,7 +49,7 @@ class CommandManager:
             driver.non_finite.watch("command", self.values[name], (name,), value_EK.shape[1:])
 
     def time_left(self, name: str) -> Float[Tensor, " E"]:
-        """Return the seconds until each env resamples, [E]; infinite for a command that resets alone resample."""
+        """Return the seconds until each env resamples, [E]; infinite for a command that only resets resample."""
         if name in self._clocks:
             return self._clocks[name]
         # No clock: this command lasts for the episode.
@@ -95,7 +95,7 @@ class CommandManager:
             with only_in_rows(mask_E, kept, is_step=is_step) if kept else nullcontext():
                 value_EK = self._computed(name)
             held_EK = self.values[name]
-            # In place, as policies and captured graphs hold this address.
+            # In place, as the view and captured graphs hold this address.
             held_EK.copy_(torch.where(mask_E[:, None], value_EK, held_EK))
             self._driver.non_finite.watch("command", held_EK, (name,), (held_EK.shape[1],))
         # Quantities that follow from commands are stale now.

@@ -100,7 +100,7 @@ class RewardManager(_OutcomeManager):
         value_ER = torch.stack(values, dim=-1)
         self._driver.non_finite.watch(self.kind, value_ER, self.names)
         weighted_ER = value_ER * (self.weights_R * self._scale)
-        # Before the sums, as one NaN would spoil all later values of the log.
+        # Failed rows give 0 before the sums, where a NaN would stay until the log is cleared.
         weighted_ER = torch.where(finite_E[:, None], weighted_ER, 0.0)
         self.episode_sums_ER.add_(weighted_ER)
         return weighted_ER.sum(-1)
