@@ -1,5 +1,6 @@
 """What MuJoCo's C engine reaches from a state, by the name of each quantity that a view or a sensor shows."""
 
+import copy
 from collections.abc import Mapping
 
 import mujoco
@@ -59,6 +60,9 @@ def run(
 
     The first are of the last substep, the second what they are in the state that it reached, as World.refresh says.
     """
+    mj_model = copy.copy(mj_model)
+    # With it C's sensors of kinetic energy read the evaluation before (docs/upstream.md).
+    mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     mj_data = put(state, mj_model)
     for _ in range(substeps - 1):
         mujoco.mj_step(mj_model, mj_data)

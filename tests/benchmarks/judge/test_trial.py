@@ -44,3 +44,11 @@ def test_a_refusal_is_no_finding():
     verdict = judge(XML.replace("<worldbody>", '<option solver="PGS"/><worldbody>'))
     assert "mjSOL_PGS" in verdict.refused
     assert verdict.states == 0
+
+
+def test_kinetic_energy_is_compared_of_the_same_state():
+    option = '<option><flag energy="enable"/></option>'
+    xml = XML.replace("<worldbody>", option + "<worldbody>").replace(
+        "<sensor>", '<sensor><e_kinetic name="kinetic"/>'
+    )
+    assert judge(xml, kernels="theirs").findings == ()
