@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
+from benchmarks.judge import accepted
 from benchmarks.judge.worlds import Arrays, put
 from ksim_rl.physics.refresh import COLLISION_SENSORS
 
@@ -84,6 +85,17 @@ def run(
         found[f"sensor {name_of(mj_model, sensor)}"] = last[columns].copy()
         found[f"sensor {name_of(mj_model, sensor)} later"] = later[columns].copy()
     return found, mj_data
+
+
+def touched_accepted(mj_model: mujoco.MjModel, state: Mapping[str, np.ndarray], substeps: int) -> bool:
+    """Return whether contacts that may differ are there in a substep before the last one."""
+    mj_data = put(state, mj_model)
+    for _ in range(substeps - 1):
+        mujoco.mj_step(mj_model, mj_data)
+        contact = mj_data.contact
+        if accepted.depths(np.array(contact.geom), np.array(contact.dist), mj_model.geom_type):
+            return True
+    return False
 
 
 def refresh(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:

@@ -232,7 +232,11 @@ class _Trial:
                     world=row,
                     when=when,
                 )
-                self._add(findings=(*self.verdict.findings, *differing))
+                # Such contacts decide what follows, too, when they have gone.
+                if differing and c_engine.touched_accepted(mj_model, state, substeps):
+                    self._add(accepted=self.verdict.accepted + 1)
+                else:
+                    self._add(findings=(*self.verdict.findings, *differing))
             self.states[row] = state_of(mj_data)
 
     def _has_accepted(

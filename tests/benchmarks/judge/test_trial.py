@@ -1,9 +1,12 @@
 """A trial sees what views, resets and hooks show, and fails where one of them is wrong."""
 
+import mujoco
 import pytest
 import torch
 
+from benchmarks.judge.c_engine import touched_accepted
 from benchmarks.judge.trial import judge
+from benchmarks.judge.worlds import state_of
 from ksim_rl.physics.warp_world import WarpWorld
 
 XML = """
@@ -52,3 +55,17 @@ def test_kinetic_energy_is_compared_of_the_same_state():
         "<sensor>", '<sensor><e_kinetic name="kinetic"/>'
     )
     assert judge(xml, kernels="theirs").findings == ()
+
+
+def test_contacts_that_may_differ_are_looked_for_in_each_substep():
+    ball = '<geom type="ellipsoid" size="0.1 0.1 0.1"/>'
+    xml = f"<mujoco><worldbody>{ball}<body pos='0 0 0.199'><freejoint/>{ball}</body></worldbody></mujoco>"
+    mj_model = mujoco.MjModel.from_xml_string(xml)
+    mj_data = mujoco.MjData(mj_model)
+    # So fast that they touch in the first substep alone.
+    mj_data.qvel[2] = 10.0
+    state = state_of(mj_data)
+    assert touched_accepted(mj_model, state, 3)
+    assert not touched_accepted(mj_model, state, 1)
+    mj_data.qpos[2] = 1.0
+    assert not touched_accepted(mj_model, state_of(mj_data), 3)
