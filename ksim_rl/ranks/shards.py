@@ -125,9 +125,7 @@ def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
     stem = leaf.rpartition(".")[0]
     prefix = f"{room}/{stem}." if stem else f"{room}/"
     if all(f"{prefix}{part}" in parts[0] for part in (_COUNT, _MEAN, _SQUARES)):
-        if name.startswith(prefix):
-            return _merged_moments(prefix, parts)[name.removeprefix(prefix)]
-        return tensors[0]
+        return _merged_moments(prefix, parts)[name.removeprefix(prefix)]
     return tensors[0]
 
 

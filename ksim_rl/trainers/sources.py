@@ -40,9 +40,8 @@ def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
 def check_targets(cfg: RunCfg, measured: Iterable[str] | None = None) -> None:
     """Refuse names in `stop_at` that no metric will have; `measured` are the names of the algorithm's own metrics."""
     task = cfg.task
-    if measured is None:
-        measured = None
-    else:
+    if measured is not None:
+        # Read for each name, and once more for the error.
         measured = list(measured)
     known = [*ALWAYS, *(f"episode/{name}" for name in EPISODE)]
     # A term of weight 0 is not computed.

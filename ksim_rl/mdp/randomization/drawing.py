@@ -64,9 +64,7 @@ def _launch(
     # A warp shares the elements of a world on a GPU; on a CPU one thread does a row.
     lanes = 32 if field_ENC.is_cuda else 1
     # The kernel reads the mask as bytes, one after the other; a null address means all worlds.
-    if mask_E is None:
-        mask_E = None
-    else:
+    if mask_E is not None:
         mask_E = mask_E.contiguous()
     if follower_ENF is None:
         followers = 0

@@ -13,6 +13,8 @@ from ksim_rl.scene.names import Patterns
 _KINDS = ("sliding", "torsional", "rolling")
 # From which number of dimensions on a contact feels each kind.
 _DIMENSIONS = (3, 4, 6)
+# A pair has two tangents for sliding and two for rolling.
+_KIND_OF_PAIR_COLUMN = (0, 0, 1, 2, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +63,7 @@ class RandomizePairFriction(
         model = view.world.mj_model
         lines: list[str] = []
         for column in self.ranges_by_column():
-            kind = (column + 1) // 2
+            kind = _KIND_OF_PAIR_COLUMN[column]
             dull = [pair for pair in self.ids(view) if model.pair_dim[pair] < _DIMENSIONS[kind]]
             if dull:
                 names = ", ".join(model.pair(pair).name for pair in dull)

@@ -3,6 +3,7 @@
 import warnings
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 
@@ -112,3 +113,24 @@ def test_one_pair_of_numbers_is_for_sliding():
 )
 def test_one_pair_of_numbers_is_for_columns_that_mean_the_same(event, count):
     assert list(event.ranges_by_column()) == list(range(count))
+
+
+@pytest.mark.parametrize("column", range(5))
+def test_a_build_warns_of_columns_of_pairs_that_no_contact_of_the_c_engine_feels(column):
+    pair = '<contact><pair name="p" geom1="box" geom2="floor" condim="{condim}"/></contact></mujoco>'
+    for condim in (3, 4, 6):
+        text = BOX.format(**PLAIN).replace("</mujoco>", pair.format(condim=condim))
+        _, said = build(text, mdp.RandomizePairFriction(pairs="p", ranges={column: (0.4, 0.5)}))
+        model = mujoco.MjModel.from_xml_string(text)
+        model.opt.gravity = (3.0, 2.0, -9.81)
+        forces = []
+        # What a contact does not feel changes no force.
+        for friction in (0.01, 0.3):
+            model.pair_friction[0] = 0.1
+            model.pair_friction[0, column] = friction
+            data = mujoco.MjData(model)
+            data.qvel[:] = (0.3, 0.2, 0.0, 0.5, 0.4, 2.0)
+            mujoco.mj_forward(model, data)
+            forces.append(data.qfrc_constraint.copy())
+        is_felt = not np.array_equal(*forces)
+        assert bool(said) == (not is_felt), (condim, said)
