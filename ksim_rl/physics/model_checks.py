@@ -93,6 +93,7 @@ def warp_model_of(mj_model: mujoco.MjModel, batch_sizes: dict[str, int] | None =
     # Features that `put_model` takes and computes otherwise than C come first.
     check_sensors(mj_model)
     check_fluid(mj_model)
+    check_motors(mj_model)
     _check_still_tendons(mj_model)
     try:
         with warnings.catch_warnings():
@@ -146,6 +147,18 @@ def check_fluid(mj_model: mujoco.MjModel) -> None:
                 "derivative of its drag wrong for integrator='implicit': choose integrator='implicitfast' "
                 "(task.sim.integrator)"
             )
+
+
+def check_motors(mj_model: mujoco.MjModel) -> None:
+    """Refuse DC motors with activations and Runge-Kutta: MuJoCo Warp moves these by whole timesteps in each stage."""
+    if mj_model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+        return
+    is_motor = mj_model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR
+    for actuator in np.flatnonzero(is_motor & (mj_model.actuator_actnum > 0)):
+        raise ValueError(
+            f"{_element(mj_model, 'actuator', int(actuator))} is a DC motor with activations, which MuJoCo Warp takes "
+            "wrong in the stages of integrator='RK4': choose integrator='implicitfast' (task.sim.integrator)"
+        )
 
 
 def _check_still_tendons(mj_model: mujoco.MjModel) -> None:

@@ -185,3 +185,12 @@ def test_ellipsoids_in_a_fluid_are_refused_with_the_integrator_that_has_them_wro
         started(xml.format("implicit", jointed), KERNELS["ours"])
     step_and_check(xml.format("implicit", lone), KERNELS["ours"])
     step_and_check(xml.format("implicitfast", jointed), KERNELS["ours"])
+
+
+def test_motors_with_activations_are_refused_with_runge_kutta() -> None:
+    motor = '<dcmotor joint="h" motorconst="0.1" resistance="1"{}/>'
+    with_current = motor.format(' inductance="0.1"')
+    with pytest.raises(ValueError, match="DC motor with activations.*choose integrator='implicitfast'"):
+        started(WITH_ACTUATORS.format(integrator="RK4", actuators=with_current), KERNELS["ours"])
+    step_and_check(WITH_ACTUATORS.format(integrator="RK4", actuators=motor.format("")), KERNELS["ours"])
+    step_and_check(WITH_ACTUATORS.format(integrator="implicitfast", actuators=with_current), KERNELS["ours"])

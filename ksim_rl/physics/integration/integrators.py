@@ -58,7 +58,7 @@ def integrator(
     if warp_model.opt.integrator == _KINDS.RK4:
         kept = FORCES_OF_STAGES
         if warp_model.na > 0 and warp_model.has_actuator_dcmotor:
-            # C integrates activations of such motors by velocities of the start, and leaves these.
+            # C leaves velocities of the start where a model has DC motors and activations.
             kept = (*kept, "actuator_velocity")
         integrate = _keeping_readings(integrate, warp_data_E, kept)
     # Where trees may sleep, MuJoCo Warp computes some readings once more after the step.
