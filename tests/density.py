@@ -75,11 +75,7 @@ def _lines(node: ast.stmt) -> int:
 
 @cache
 def _tokens_and_lines(text: str) -> tuple[int, int]:
-    docstrings: set[int] = set()
-    for node in ast.walk(signatures.parse(text)):
-        is_documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-        if is_documented and ast.get_docstring(node, clean=False) is not None:
-            docstrings.update(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+    docstrings = signatures.docstring_lines(text)
     tokens = 0
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):

@@ -148,12 +148,7 @@ class House:
 @cache
 def words_of_code(text: str) -> int:
     """Return the number of names, keywords, numbers and strings, without comments and docstrings."""
-    docstrings = {
-        node.body[0].lineno
-        for node in ast.walk(signatures.parse(text))
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-        and ast.get_docstring(node, clean=False) is not None
-    }
+    docstrings = signatures.docstring_lines(text)
     kinds = (tokenize.NAME, tokenize.NUMBER, tokenize.STRING)
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     return sum(

@@ -54,6 +54,18 @@ def parse(text: str) -> ast.Module:
 
 
 @functools.cache
+def docstring_lines(text: str) -> frozenset[int]:
+    """Return the numbers of the lines that docstrings stand in."""
+    lines: set[int] = set()
+    for node in ast.walk(parse(text)):
+        is_documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        if is_documented and ast.get_docstring(node, clean=False) is not None:
+            docstring = node.body[0]
+            lines.update(range(docstring.lineno, (docstring.end_lineno or 0) + 1))
+    return frozenset(lines)
+
+
+@functools.cache
 def _parse(text: str) -> ast.Module:
     return ast.parse(text)
 

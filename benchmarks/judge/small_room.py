@@ -7,6 +7,7 @@ import mujoco
 
 from benchmarks.judge.comparison import Finding
 from benchmarks.judge.worlds import Arrays, put, put_all
+from ksim_rl.physics.capacity import capacities
 from ksim_rl.physics.warp_world import WarpWorld
 
 # Rows and contacts that there is room for, and so many rows more are surely needed: few models need none.
@@ -34,11 +35,11 @@ def untold_overflow(beside: WarpWorld, states: Sequence[Arrays]) -> tuple[Findin
     mj_model = beside.mj_model
     needed = rows_of(mj_model, states)
     small = dataclasses.replace(beside.sim, njmax=ROWS, nconmax=CONTACTS)
-    world = WarpWorld(mj_model, num_envs=len(states), device=beside.device, sim=small)
     # The integrator "discrete" has room for a few rows more than were asked for.
-    if max(needed) < world.njmax + MORE:
-        world.close()
+    room, _ = capacities(mj_model, small)
+    if max(needed) < room + MORE:
         return None
+    world = WarpWorld(mj_model, num_envs=len(states), device=beside.device, sim=small)
     put_all(world, list(states))
     world.step(1)
     report = world.overflow_report()
@@ -50,7 +51,7 @@ def untold_overflow(beside: WarpWorld, states: Sequence[Arrays]) -> tuple[Findin
         Finding(
             quantity="overflow untold",
             error=float(needed[row]),
-            limit=float(world.njmax),
+            limit=float(room),
             world=row,
             when="step(1) in worlds with little room",
         ),

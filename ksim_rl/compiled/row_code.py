@@ -197,12 +197,8 @@ def _pointwise(
         computed = tensors[0].dtype  # tests give bools, and compare in the operands' type
         for operand in operands[1:]:
             if isinstance(operand, Tensor):
-                other = operand.dtype
-            else:
-                other = type(operand)
-            if isinstance(operand, Tensor):
                 computed = torch.result_type(tensors[0], operand)
-            elif other is float and not computed.is_floating_point:
+            elif type(operand) is float and not computed.is_floating_point:
                 computed = torch.get_default_dtype()
     ctype = CTYPES[computed]
     if name == "bitwise_not" and computed == torch.bool:

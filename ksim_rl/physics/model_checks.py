@@ -224,14 +224,6 @@ def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) 
         )
 
 
-def may_sleep(mj_model: mujoco.MjModel) -> bool:
-    """Whether trees may fall asleep: islands do, so that nothing sleeps where they are switched off."""
-    opt = mj_model.opt
-    is_asked_for = bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
-    has_islands = not opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ISLAND
-    return is_asked_for and has_islands
-
-
 def check_asleep(mj_model: mujoco.MjModel) -> None:
     """Refuse equalities of tendons where trees may sleep: MuJoCo ends the program that steps them."""
     tied = np.flatnonzero(mj_model.eq_type == mujoco.mjtEq.mjEQ_TENDON)

@@ -131,17 +131,16 @@ def set_fixed_constants(warp_model: mjw.Model) -> None:
     mjw.set_const(warp_model, None, FIXED)  # pyright: ignore[reportArgumentType]
 
 
-def may_sleep(warp_model: mjw.Model) -> bool:
-    """Return whether trees may fall asleep."""
-    flags = warp_model.opt
+def may_sleep(options: mujoco.MjOption | mjw.Option) -> bool:
+    """Return whether trees may fall asleep, by the options of a model of MuJoCo or of MuJoCo Warp."""
     # Islands fall asleep, so that nothing does where they are switched off.
-    has_islands = not flags.disableflags & mjw.DisableBit.ISLAND
-    return has_islands and bool(flags.enableflags & mjw.EnableBit.SLEEP)
+    has_islands = not options.disableflags & mjw.DisableBit.ISLAND
+    return has_islands and bool(options.enableflags & mjw.EnableBit.SLEEP)
 
 
 def wake_trees(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     """Wake the sleeping trees that something disturbs, as `forward` does first."""
-    if may_sleep(warp_model):
+    if may_sleep(warp_model.opt):
         wake(warp_model, warp_data_E)
         update_sleep(warp_model, warp_data_E)
 

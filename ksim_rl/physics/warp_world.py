@@ -24,7 +24,7 @@ from ksim_rl.physics.constants.masked_constants import MaskedConstants
 from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.field_effects import as_if_drawn
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields
-from ksim_rl.physics.model_checks import may_sleep, warp_model_of
+from ksim_rl.physics.model_checks import warp_model_of
 from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
@@ -75,7 +75,7 @@ class WarpWorld(World):
         stored_model = copy.copy(self.mj_model)
         if self.has_one_kernel_solver:
             stored_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-        if not may_sleep(self.mj_model):
+        if not upstream.may_sleep(self.mj_model.opt):
             # MuJoCo Warp's solver looks at this flag alone, and writes to arrays that it has not made without islands.
             stored_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)

@@ -194,15 +194,13 @@ class BrowserScene:
         infinite = geom.size[0] <= 0 or geom.size[1] <= 0
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, np.asarray(geom.mat, dtype=np.float64).ravel())
-        # MuJoCo moves the picture of an infinite plane about with the camera.
         if infinite:
+            # MuJoCo moves the picture of an infinite plane about with the camera.
             position = self._mj_model.geom_pos[geom.objid]
-        else:
-            position = geom.pos
-        if infinite:
             width = 40.0
             height = 40.0
         else:
+            position = geom.pos
             width = 2 * float(geom.size[0])
             height = 2 * float(geom.size[1])
         place = {"wxyz": quat, "position": np.asarray(position, dtype=np.float64)}

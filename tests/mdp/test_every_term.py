@@ -9,29 +9,11 @@ from typing import Any
 import pytest
 import yaml
 
+from benchmarks.pages import terms
 from ksim_rl import mdp
 from ksim_rl.envs import from_tree, to_tree
-from ksim_rl.envs.term import (
-    ActionTerm,
-    CommandTerm,
-    CurriculumTerm,
-    EventTerm,
-    MetricTerm,
-    ObservationTerm,
-    RewardTerm,
-    TerminationTerm,
-)
 
-KINDS = (
-    ActionTerm,
-    CommandTerm,
-    CurriculumTerm,
-    EventTerm,
-    MetricTerm,
-    ObservationTerm,
-    RewardTerm,
-    TerminationTerm,
-)
+KINDS = tuple(terms.KINDS.values())
 SCALARS = {str: "x", float: 0.5, int: 1, bool: True}
 # Where one of several optional fields must be given.
 ALSO = {

@@ -62,7 +62,7 @@ def integrator(
             kept = (*kept, "actuator_velocity")
         integrate = _keeping_readings(integrate, warp_data_E, kept)
     # Where trees may sleep, MuJoCo Warp computes some readings once more after the step.
-    elif upstream.may_sleep(warp_model):
+    elif upstream.may_sleep(warp_model.opt):
         integrate = _keeping_readings(integrate, warp_data_E, READ_ONCE)
     # MuJoCo Warp moves activations of disabled actuators; C does not.
     columns = still_activations(mj_model)

@@ -50,7 +50,7 @@ def mended_runge_kutta(
     if mends:
         hooks.setdefault(hook, []).extend(mends)
     readings = _LastReadings(warp_data_E)
-    may_sleep = upstream.may_sleep(warp_model)
+    may_sleep = upstream.may_sleep(warp_model.opt)
     if may_sleep:
         hooks.setdefault(hook, []).append(readings.take)
     keeps_rate = acts and warp_model.na > 0

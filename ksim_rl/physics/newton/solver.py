@@ -7,11 +7,11 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.physics.model_checks import may_sleep
 from ksim_rl.physics.native import FEW_WORLDS
 from ksim_rl.physics.newton.kernel import CUDA_LANES, launcher, layout, put_longest_first
 from ksim_rl.physics.newton.limbs import limbs_of
 from ksim_rl.physics.sim_cfg import SimCfg
+from ksim_rl.physics.upstream import may_sleep
 
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
@@ -52,7 +52,7 @@ def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
         "no iterations are allowed": opt.iterations < 1,
         "there are noslip iterations": opt.noslip_iterations > 0,
         "warm starts are off": bool(opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART),
-        "bodies may sleep": may_sleep(mj_model),
+        "bodies may sleep": may_sleep(opt),
         "energies are computed": bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY),
         "there are flexes": mj_model.nflex > 0,
         f"there are {nv} degrees of freedom, outside of 1 to {MOST_DOFS}": not 0 < nv <= MOST_DOFS,

@@ -247,18 +247,15 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
     # Stiffness by joint: the largest of three needs.
     gains = {}
     for j in names:
-        # What a joint must carry: a leg's joint the whole robot, any other joint its own subtree.
         if j not in of_legs:
+            # Any other joint carries its own subtree.
             over = mj_model.jnt_bodyid[j]
-        else:
-            over = 0
-        # Two legs share the load; on four, toppling over a single joint is not to be feared.
-        if j not in of_legs:
             share = 1.0
-        elif biped:
-            share = 0.5
         else:
-            share = 0.0
+            # A leg's joint carries the whole robot. Two legs share the load; on four, toppling over a single joint is
+            # not to be feared.
+            over = 0
+            share = 0.5 if biped else 0.0
         # Only height over a horizontal axis topples: m of lever per rad.
         lever = np.hypot(*data.xaxis[j, :2]) * max(0.0, data.subtree_com[over, 2] - data.xanchor[j, 2])
         topples = share * mj_model.body_subtreemass[over] * GRAVITY * lever
