@@ -17,6 +17,8 @@ def near(name: str, choices: Iterable[str]) -> str:
     # Case is ignored: names of classes are often typed in lower case.
     lower = {choice.lower(): choice for choice in choices}
     close = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.6)]
+    # A name that was cut short differs from each in too much.
+    close = close or [choice for choice in choices if name and choice.lower().startswith(name.lower())][:3]
     if close:
         return f"did you mean {' or '.join(repr(choice) for choice in close)}?"
     if not choices:

@@ -15,11 +15,12 @@ from benchmarks.pages import (
     tasks,
     terms,
     terrain_course,
+    view,
 )
 from benchmarks.pages.committed import results
 
 DOCS = Path(__file__).parents[2] / "docs"
-WHOLE: dict[str, Callable[[], str]] = {"terms.md": terms.page, "tasks.md": tasks.page}
+WHOLE: dict[str, Callable[[], str]] = {"terms.md": terms.page, "tasks.md": tasks.page, "view.md": view.page}
 # By page and name: a part stands between two comments, `<!-- made: NAME -->` and `<!-- end: NAME -->`.
 PARTS: dict[str, dict[str, Callable[[], str]]] = {
     "learning.md": {

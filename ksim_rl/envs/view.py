@@ -49,6 +49,8 @@ class Readings:
 class EnvView(WorldView):
     """The typed view of an env that each term is called with: a `WorldView` with sensors, commands and rewards.
 
+    All that a term can read, with shapes, units, frames and stages, is in docs/view.md.
+
     Attributes:
         sensors: the readers of `scene.sensors` by name; `contact`, `imu`, `rays` and `camera` give them by kind.
         commands: by name, [E, K] each, as the policy saw them before this step.
@@ -56,8 +58,8 @@ class EnvView(WorldView):
         reward_weights: by term, [] each; a curriculum may change these in place.
         episode_rewards: by term, the weighted sum over the episode so far, [E] each.
         terminations: by term, and "non_finite": which envs end, bool [E], as the step found it.
-        terminated_E, truncated_E: which envs the step found to end by a condition that is no time-out, and by a
-            time-out, bool [E]; `is_finite_horizon` does not matter here.
+        terminated_E: which envs the step found to end by a condition that is no time-out, bool [E].
+        truncated_E: which envs the step found to end by a time-out, bool [E], whatever `is_finite_horizon` says.
         level: the difficulty in [0, 1] that a curriculum drives, [] on the device; 1 where none does. It is one tensor
             for the life of the env, changed in place, so that what scales with difficulty may hold on to it.
         command_cache: values that depend on commands only; emptied when these change.

@@ -14,19 +14,24 @@ from ksim_rl.checks import near
 from ksim_rl.files.arrays import read_arrays
 from ksim_rl.files.reading import MOST_DATA_BYTES
 from ksim_rl.scene.names import Index, scalar_joint_ids
+from ksim_rl.scene.near_names import NearNames
 
 KEYS = ("fps", "qpos", "qvel")
 _OPTIONAL = ("joint_names",)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReferenceMotion:
-    """F frames of generalized positions and velocities in MuJoCo's layout, `fps` of them per second.
+class ReferenceMotion(NearNames):
+    """F frames of generalized positions and velocities in MuJoCo's layout.
 
     Attributes:
+        fps: frames per second.
+        qpos_FL, qvel_FL: positions and velocities in MuJoCo's layout.
         quats: the columns of qpos at which unit quaternions (w, x, y, z) begin.
-        joint_pos_FL, joint_vel_FL: the columns of hinges and slides, as in `view.joint_pos_EL`.
-        body_pos_FN3, body_quat_FN4: the poses of all bodies (the world first), world frame, m and (w, x, y, z).
+        joint_pos_FL: positions of hinges and slides, rad or m.
+        joint_vel_FL: velocities of hinges and slides, rad/s or m/s.
+        body_pos_FN3: positions of all bodies, the world first, m, world frame.
+        body_quat_FN4: orientations of all bodies, the world first, body to world, (w, x, y, z).
     """
 
     fps: float

@@ -81,17 +81,17 @@ class CameraTracker(SensorTracker):
 
     @property
     def rgb_EHW3(self) -> UInt8[Tensor, "E H W 3"]:
-        """Colors; the first row is the top of the picture."""
+        """Colors; the first row is the top of the picture; position stage."""
         return self._read("rgb")
 
     @property
     def depth_EHW(self) -> Float[Tensor, "E H W"]:
-        """Distance along the camera's axis, m, at most `max_depth`."""
+        """Distance along the camera's axis, at most `max_depth`, m; position stage."""
         return self._read("depth")
 
     @property
     def segmentation_EHW(self) -> Int32[Tensor, "E H W"]:
-        """Ids of the geoms that are seen, -1 for none."""
+        """Ids of the geoms that are seen, -1 for none; position stage."""
         return self._read("segmentation")
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:

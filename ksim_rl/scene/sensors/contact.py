@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 from ksim_rl.checks import naming
 from ksim_rl.physics.sensors.contact_sensors import MATCHED, NET, STRONGEST
 from ksim_rl.scene.names import as_index, match_names
+from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker, check_present
 from ksim_rl.scene.small_matrices import product
@@ -118,19 +119,23 @@ class ContactState(NamedTuple):
     position_EN3: Float[Tensor, "E N 3"]
     """Point of contact (weighted by force if there are several), m, world frame, [E, N, 3]; 0 without contact."""
     air_time_EN: Float[Tensor, "E N"]
-    """Seconds since the element left the ground, [E, N]; 0 while it touches."""
+    """Time since the element left the ground, s, [E, N]; 0 while it touches."""
     last_air_time_EN: Float[Tensor, "E N"]
-    """Seconds that the last completed flight took, [E, N]."""
+    """Time that the last completed flight took, s, [E, N]."""
     contact_time_EN: Float[Tensor, "E N"]
-    """Seconds since the element touched down, [E, N]; 0 while it is in the air."""
+    """Time since the element touched down, s, [E, N]; 0 while it is in the air."""
     last_contact_time_EN: Float[Tensor, "E N"]
-    """Seconds that the last completed contact took, [E, N]."""
+    """Time that the last completed contact took, s, [E, N]."""
     first_contact_EN: Float[Tensor, "E N"]
     """1 in the env step in which the element touched down, else 0, [E, N]."""
     first_air_EN: Float[Tensor, "E N"]
     """1 in the env step in which the element left the ground, else 0, [E, N]."""
     force_history_ESN3: Float[Tensor, "E S N 3"]
-    """`force_EN3` of each substep of the env step, oldest first, [E, S, N, 3]; S is 1 without `every_substep`."""
+    """`force_EN3` of each substep, oldest first, N, world frame, [E, S, N, 3]; S is 1 without `every_substep`."""
+
+    # A named tuple takes no second base.
+    if not TYPE_CHECKING:
+        __getattr__ = NearNames.__getattr__
 
 
 _CLOCKS = tuple(name.removesuffix("_EN") for name in ContactState._fields if name.endswith("_EN"))

@@ -51,23 +51,23 @@ class ImuTracker(SensorTracker):
 
     @property
     def ang_vel_EL(self) -> Float[Tensor, "E 3"]:
-        """Angular velocity, rad/s; velocity stage."""
+        """Angular velocity, rad/s, sensor frame; velocity stage."""
         return self._view.sensor(f"{self._name}_gyro")
 
     @property
     def lin_acc_EL(self) -> Float[Tensor, "E 3"]:
-        """Acceleration minus gravity, m/s^2: at rest it points up and is 9.81, in free fall 0; acceleration stage."""
+        """Acceleration minus gravity (at rest 9.81 up), m/s^2, sensor frame; acceleration stage."""
         # MuJoCo computes it in the substep, so that it lags behind a state that was just written.
         return self._view.sensor(f"{self._name}_accelerometer")
 
     @property
     def quat_EL(self) -> Float[Tensor, "E 4"]:
-        """Orientation, from the unit's axes to the world's, (w, x, y, z); position stage."""
+        """Orientation, sensor to world, (w, x, y, z); position stage."""
         return self._view.sensor(f"{self._name}_orientation")
 
     @property
     def projected_gravity_EL(self) -> Float[Tensor, "E 3"]:
-        """Unit vector of world -z; position stage."""
+        """Direction of world -z, a unit vector, sensor frame; position stage."""
         cache = self._view.cache
         key = f"imu/{self._name}.projected_gravity"
         # Computed once per state, however many terms read it.

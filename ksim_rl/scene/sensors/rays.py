@@ -6,7 +6,7 @@ Patterns are in the sensor's own axes: x forward, y left, z up.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ksim_rl.checked import Checked, Count, Filled, Positive, Within
 from ksim_rl.physics.ray_casting import RayBatch
+from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import GeomGroup, MountedSensor, SensorTracker
 from ksim_rl.scene.small_matrices import product
@@ -126,13 +127,17 @@ class RayState(NamedTuple):
     """The first hits of N rays, float32 unless stated otherwise; position stage."""
 
     distance_EN: Float[Tensor, "E N"]
-    """m from where the ray starts, [E, N]; `max_distance` where nothing is hit within it."""
+    """Distance from where the ray starts, m, [E, N]; `max_distance` where nothing is hit within it."""
     hit_EN: Bool[Tensor, "E N"]
     """Whether something is hit within `max_distance`, bool [E, N]."""
     point_EN3: Float[Tensor, "E N 3"]
-    """The end of the ray, world frame, m, [E, N, 3]."""
+    """The end of the ray, m, world frame, [E, N, 3]."""
     normal_EN3: Float[Tensor, "E N 3"]
     """Unit normal of the surface that is hit, world frame, [E, N, 3]; zero where there is none."""
+
+    # A named tuple takes no second base.
+    if not TYPE_CHECKING:
+        __getattr__ = NearNames.__getattr__
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +193,7 @@ class RayTracker(SensorTracker):
 
     @property
     def origin_E3(self) -> Float[Tensor, "E 3"]:
-        """Place of the sensor, world frame, m."""
+        """Place of the sensor, m, world frame; position stage."""
         return self._view.derived().site_xpos_EL[:, self._site]
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:

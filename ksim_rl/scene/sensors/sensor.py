@@ -11,6 +11,7 @@ import mujoco
 
 from ksim_rl.checked import Checked, Within
 from ksim_rl.checks import near
+from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.state.world_view import WorldView
 
@@ -18,7 +19,7 @@ GeomGroup = Annotated[int, Within(low=0, high=mujoco.mjNGROUP - 1)]
 """One of MuJoCo's geom groups."""
 
 
-class SensorTracker:
+class SensorTracker(NearNames):
     """Reads one sensor. What it reads on demand belongs in `view.cache`, so that it is read once per state.
 
     With `every_substep`, `update_substep` runs after each physics substep, at which the worlds then compute their

@@ -8,15 +8,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.scene.names import as_index, scalar_joint_ids
+from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.state.quantity import first_of, quantity
 from ksim_rl.scene.state.simulation import Simulation
 
 
-class _Elements:
+class _Elements(NearNames):
     """N named elements of one kind, in the order of the patterns that match them.
 
-    `ids` are theirs in the model (of joints: among its hinges and slides); `index` (a slice, or int64 on the device) is
-    the same, to index the dim of this kind. Poses and velocities are in the world frame.
+    Attributes:
+        names: their names, in this order.
+        ids: their ids in the model, of joints among its hinges and slides.
+        index: the same, a slice or int64 on the device, to index the dim of this kind.
+        cache: a dict of computed quantities; it is emptied whenever the state changes.
     """
 
     def __init__(self, state: Simulation, ids: Sequence[int], names: Sequence[str]) -> None:
@@ -41,7 +45,8 @@ class JointTables(NamedTuple):
 class Joints(_Elements):
     """The hinges (rad) and slides (m) that some patterns match: `view.joints("hip.*").pos_EL`.
 
-    `qpos` and `qvel` are their columns in MuJoCo's state.
+    Attributes:
+        qpos, qvel: their columns in MuJoCo's state.
     """
 
     def __init__(
@@ -92,7 +97,7 @@ class Joints(_Elements):
 
     @quantity
     def pos_rel_EL(self) -> Float[Tensor, "E L"]:
-        """Positions minus the default pose."""
+        """Positions minus the default pose, rad or m; position stage."""
         # Computed once for all joints, of which parts take columns.
         if self is self._every_joint:
             return self.pos_EL - self._tables.default_pos_EL
@@ -100,12 +105,12 @@ class Joints(_Elements):
 
     @property
     def default_pos_EL(self) -> Float[Tensor, "E L"]:
-        """Positions in the default pose, which events may move."""
+        """Positions in the default pose, rad or m, which events may move."""
         return self._tables.default_pos_EL[:, self.index]
 
     @property
     def soft_limits_L2(self) -> Float[Tensor, "L 2"]:
-        """Low and high end of `scene.soft_joint_pos_limit_factor` of each range, infinite where there is none."""
+        """Ends of `scene.soft_joint_pos_limit_factor` of each range, rad or m, infinite where there is none."""
         return self._tables.soft_limits_L2[self.index]
 
     @property
@@ -127,45 +132,50 @@ class Bodies(_Elements):
 
     @quantity
     def pos_EN3(self) -> Float[Tensor, "E N 3"]:
-        """Positions of the body frames, m."""
+        """Positions of the body frames, m, world frame; position stage."""
         return self._state.derived().xpos_EL[:, self.index]
 
     @quantity
     def quat_EN4(self) -> Float[Tensor, "E N 4"]:
-        """Orientations, body to world, (w, x, y, z)."""
+        """Orientations, body to world, (w, x, y, z); position stage."""
         return self._state.derived().xquat_EL[:, self.index]
 
     @quantity
     def axes_EN33(self) -> Float[Tensor, "E N 3 3"]:
-        """The x, y and z axes of the bodies, a unit vector each."""
+        """The x, y and z axes of the bodies, a unit vector each, world frame; position stage."""
         # MuJoCo's matrix has the axes as columns; rows are easier to pick.
         return self._state.derived().xmat_EL[:, self.index].transpose(-1, -2)
 
     @quantity
     def lin_vel_EN3(self) -> Float[Tensor, "E N 3"]:
-        """Linear velocities of the origins of the body frames, m/s."""
+        """Linear velocities of the origins of the body frames, m/s, world frame; velocity stage."""
         return self._state.point_velocity(self.pos_EN3, self.index)
 
     @quantity
     def ang_vel_EN3(self) -> Float[Tensor, "E N 3"]:
-        """Angular velocities, rad/s."""
+        """Angular velocities, rad/s, world frame; velocity stage."""
         # `cvel` is angular first, linear second.
         return self._state.derived().cvel_EL[:, self.index, 0:3]
 
     @quantity
     def subtree_com_pos_EN3(self) -> Float[Tensor, "E N 3"]:
-        """Centres of mass of the bodies with all that hangs on them, m."""
+        """Centres of mass of the bodies with all that hangs on them, m, world frame; position stage."""
         return self._state.derived().subtree_com_EL[:, self.index]
 
     @quantity
     def subtree_com_vel_EN3(self) -> Float[Tensor, "E N 3"]:
-        """Velocities of the centres of mass of bodies with all that hangs on them, m/s; first read in construction."""
+        """Velocities of these centres of mass, m/s, world frame; velocity stage; first read in construction."""
         # A sensor stage of MuJoCo, computed only if something asked for it in construction.
         return self._state.derived().view("subtree_linvel")[:, self.index]
 
 
-class Body:
-    """The body `name` with index `id` in the model: `view.body("torso").lin_vel_EL`; units as in `Bodies`."""
+class Body(NearNames):
+    """One body: `view.body("torso").lin_vel_EL`.
+
+    Attributes:
+        name: its name.
+        id: its index in the model.
+    """
 
     def __init__(self, bodies: Bodies) -> None:
         # Exactly one, or unpacking fails.
@@ -191,22 +201,27 @@ class Sites(_Elements):
 
     @quantity
     def pos_EN3(self) -> Float[Tensor, "E N 3"]:
-        """Positions, m."""
+        """Positions, m, world frame; position stage."""
         return self._state.derived().site_xpos_EL[:, self.index]
 
     @quantity
     def height_EN(self) -> Float[Tensor, "E N"]:
-        """Heights above the ground right below, m."""
+        """Heights above the ground right below, m; position stage."""
         return self._state.ground.clearance(self.pos_EN3)
 
     @quantity
     def lin_vel_EN3(self) -> Float[Tensor, "E N 3"]:
-        """Linear velocities, m/s."""
+        """Linear velocities, m/s, world frame; velocity stage."""
         return self._state.point_velocity(self.pos_EN3, self._bodies)
 
 
-class Site:
-    """The site `name` with index `id` in the model: `view.site("finger").pos_EL`; units as in `Sites`."""
+class Site(NearNames):
+    """One site: `view.site("finger").pos_EL`.
+
+    Attributes:
+        name: its name.
+        id: its index in the model.
+    """
 
     def __init__(self, sites: Sites) -> None:
         (self.name,) = sites.names

@@ -7,18 +7,25 @@ from torch import Tensor
 
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import scalar_joint_ids
+from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.state.elements import Bodies, Body, Joints
 from ksim_rl.scene.state.quantity import quantity
 from ksim_rl.scene.state.simulation import Simulation
 
 
-class Entity:
+class Entity(NearNames):
     """A robot or object, addressed by name: `view.entity("cube").root_pos_EL`.
 
-    The root is the body of the entity's first joint if that is free (`free_root`), else its first body; `root_qpos` and
-    `root_qvel` are columns of the free joint, empty if the root is fixed. `prefix` stands before the names of its
-    elements, and is empty if it is alone in the scene; `joints` are its hinges and slides. `default_root_pos_L` (m) and
-    `default_root_quat_L` are the pose at reset, world frame.
+    Attributes:
+        name: its key in `scene.robots` or `scene.objects`.
+        prefix: what stands before the names of its elements; empty if it is alone in the scene.
+        free_root: whether its first joint is free.
+        root: the body of its first joint if that is free, else its first body.
+        root_qpos, root_qvel: columns of the free joint in MuJoCo's state, empty if the root is fixed.
+        joints: its hinges and slides.
+        default_root_pos_L: position of the root at reset, m, world frame.
+        default_root_quat_L: orientation of the root at reset, body to world, (w, x, y, z).
+        cache: a dict of computed quantities; it is emptied whenever the state changes.
     """
 
     def __init__(
@@ -68,7 +75,7 @@ class Entity:
 
     @quantity
     def root_pos_EL(self) -> Float[Tensor, "E 3"]:
-        """Position of the root body's frame in the world, m."""
+        """Position of the root body's frame, m, world frame; position stage."""
         # From the state itself, which is current also between a write and the next refresh.
         if self.free_root:
             return self._free_qpos_EL[:, :3]
@@ -76,25 +83,25 @@ class Entity:
 
     @quantity
     def root_quat_EL(self) -> Float[Tensor, "E 4"]:
-        """Orientation of the root body, body to world, (w, x, y, z)."""
+        """Orientation of the root body, body to world, (w, x, y, z); position stage."""
         if self.free_root:
             return self._free_qpos_EL[:, 3:]
         return self.root.quat_EL
 
     @quantity
     def projected_gravity_EL(self) -> Float[Tensor, "E 3"]:
-        """Unit vector of gravity (world -z) in the root body's frame."""
+        """Gravity's direction (world -z), a unit vector, body frame; position stage."""
         # The world's -z axis, also where a world's gravity points elsewhere.
         return quaternion.rotate_inverse(self.root_quat_EL, self._down.expand(self._state.world.num_envs, 3))
 
     @quantity
     def heading_E(self) -> Float[Tensor, " E"]:
-        """Yaw of the root body, rad in [-pi, pi]."""
+        """Yaw of the root body in [-pi, pi], rad; position stage."""
         return quaternion.yaw(self.root_quat_EL)
 
     @quantity
     def root_lin_vel_w_EL(self) -> Float[Tensor, "E 3"]:
-        """Linear velocity of the root body's frame origin, world frame, m/s."""
+        """Linear velocity of the root body's frame origin, m/s, world frame; velocity stage."""
         # MuJoCo keeps a free joint's linear velocity in the world frame.
         if self.free_root:
             return self._free_qvel_EL[:, :3]
@@ -102,12 +109,12 @@ class Entity:
 
     @quantity
     def root_lin_vel_b_EL(self) -> Float[Tensor, "E 3"]:
-        """Linear velocity of the root body's frame origin, body frame, m/s."""
+        """Linear velocity of the root body's frame origin, m/s, body frame; velocity stage."""
         return quaternion.rotate_inverse(self.root_quat_EL, self.root_lin_vel_w_EL)
 
     @quantity
     def root_ang_vel_w_EL(self) -> Float[Tensor, "E 3"]:
-        """Angular velocity of the root body, world frame, rad/s."""
+        """Angular velocity of the root body, rad/s, world frame; velocity stage."""
         # The other way round than above: qvel has it in the body frame.
         if self.free_root:
             return quaternion.rotate(self.root_quat_EL, self.root_ang_vel_b_EL)
@@ -115,7 +122,7 @@ class Entity:
 
     @quantity
     def root_ang_vel_b_EL(self) -> Float[Tensor, "E 3"]:
-        """Angular velocity of the root body, body frame, rad/s."""
+        """Angular velocity of the root body, rad/s, body frame; velocity stage."""
         if self.free_root:  # MuJoCo keeps a free joint's angular velocity in the body frame
             return self._free_qvel_EL[:, 3:]
         return quaternion.rotate_inverse(self.root_quat_EL, self.root_ang_vel_w_EL)

@@ -6,16 +6,21 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from ksim_rl.scene.near_names import NearNames
 
-class Ground:
-    """Flat ground at z = 0, without end. Terrains that differ between worlds refine it."""
+
+class Ground(NearNames):
+    """Flat ground at z = 0, without end. Terrains that differ between worlds refine it.
+
+    Attributes:
+        is_flat: whether all heights and origins are zero.
+        half_width: from a world's origin to the edge of its ground, along x and y, m; there is nothing beyond it.
+        num_levels: how many levels of difficulty there are.
+    """
 
     is_flat: bool = True
-    """Whether all heights and origins are zero."""
     half_width: float = math.inf
-    """m from a world's origin to the edge of its ground, along x and y; beyond it there is nothing to stand on."""
     num_levels: int = 1
-    """How many levels of difficulty there are."""
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
         self._origins_E3 = torch.zeros(num_envs, 3, device=device)
@@ -23,7 +28,7 @@ class Ground:
 
     @property
     def origins_E3(self) -> Float[Tensor, "E 3"]:
-        """Where each env starts: a point on the ground, world frame, m."""
+        """Where each env starts: a point on the ground, m, world frame."""
         return self._origins_E3
 
     @property

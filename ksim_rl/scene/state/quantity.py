@@ -19,6 +19,8 @@ def quantity(compute: Callable[[Any], Shaped[Tensor, "*shape"]]) -> property:
         return value
 
     read.__name__ = name
+    # For whoever asks for the shape.
+    read.__annotations__["return"] = compute.__annotations__["return"]
     return property(read, doc=compute.__doc__)
 
 
@@ -27,18 +29,31 @@ class QuantityOf(property):
 
     part: str
     cached_as: str
+    whole: property
+
+
+class FirstOf(property):
+    """A property that is the first element's part of the quantity `whole` of several elements."""
+
+    whole: property
 
 
 def quantity_of(part: str, whole: property) -> QuantityOf:
     """Make a property that is the quantity `whole` of the object in the attribute `part`."""
     made = QuantityOf(lambda owner: whole.__get__(getattr(owner, part)), doc=whole.__doc__)
+    # A subclass of property has its class's docstring otherwise.
+    made.__doc__ = whole.__doc__
     # Kept for whoever asks which cache a read goes to.
     made.part = part
+    made.whole = whole
     made.cached_as = getattr(whole.fget, "__name__", "")
     return made
 
 
-def first_of(part: str, whole: property) -> property:
+def first_of(part: str, whole: property) -> FirstOf:
     """Make a property that is the first of the N elements whose quantity [E, N, ...] the object in `part` has."""
     # The part has a single element: [E, 1, ...] becomes [E, ...].
-    return property(lambda owner: whole.__get__(getattr(owner, part))[:, 0], doc=whole.__doc__)
+    made = FirstOf(lambda owner: whole.__get__(getattr(owner, part))[:, 0], doc=whole.__doc__)
+    made.__doc__ = whole.__doc__
+    made.whole = whole
+    return made

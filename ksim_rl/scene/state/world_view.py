@@ -13,6 +13,7 @@ from ksim_rl.device import random
 from ksim_rl.physics import World
 from ksim_rl.scene.motions.motion import ReferenceMotion, load_motion
 from ksim_rl.scene.names import NameResolver, Patterns, as_index, as_patterns, scalar_joint_ids
+from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.state.buffers import ActuatorParams
 from ksim_rl.scene.state.default_state import DefaultState
 from ksim_rl.scene.state.elements import Bodies, Body, Joints, JointTables, Site, Sites
@@ -25,7 +26,7 @@ from ksim_rl.scene.state.simulation import Simulation
 Points = TypeVar("Points", Bodies, Sites)
 
 
-class WorldView:
+class WorldView(NearNames):
     """A typed view of the worlds: names, joints, bodies, sites, entities, clocks, buffers, keyed draws and writes.
 
     Position- and velocity-stage quantities (poses, velocities, most sensors) are of the current state.
@@ -35,8 +36,35 @@ class WorldView:
 
     Attributes:
         cache: a dict for a term's own quantities; it is emptied whenever the state changes.
-        entities: robots and objects by name; `robot` is the first, whose quantities and writes the view has too.
-        joint_pos_target_EL, joint_vel_target_EL, joint_effort_target_EL: targets of joints; SI units.
+        num_envs: how many worlds there are.
+        device: where all tensors are.
+        physics_dt: duration of a physics substep, s.
+        step_dt: duration of an env step, s.
+        max_episode_length: of episodes, in env steps; 0 for no limit.
+        seed: seed of all draws, int64 [].
+        step_count: how many env steps have begun, int64 [].
+        reset_count_E: how often each env was reset, int64 [E].
+        episode_step_E: env steps since the last reset, int64 [E].
+        time_out_offset_E: env steps by which a staggered episode times out earlier, int64 [E].
+        entities: robots and objects by name.
+        robot: the first of them, whose quantities and writes the view has too.
+        free_root: whether the first robot moves freely.
+        num_joints: how many hinges and slides there are.
+        default_qpos_L, default_qvel_L: the state at reset, in MuJoCo's layout.
+        default_joint_pos_EL: positions of joints in the default pose, rad or m, which events may move.
+        soft_joint_pos_limits_L2: ends of `scene.soft_joint_pos_limit_factor` of each joint's range, rad or m.
+        encoder_bias_EL: what the encoders read beyond the positions of joints, rad or m.
+        joint_pos_target_EL: positions that joints are asked for, rad or m.
+        joint_vel_target_EL: velocities that joints are asked for, rad/s or m/s.
+        joint_effort_target_EL: efforts that joints are asked for, N m or N.
+        ctrl_limits_L2: ends of the range of each actuator's control, infinite where there is none.
+        actuator_params: numbers of explicit actuators: `actuator_param`.
+        targets: what turns the targets of joints into controls.
+        write_root_pose, write_root_velocity: methods of `robot`.
+        default_state: the state that resets restore.
+        world: the worlds themselves: `derived`.
+        resolver: what finds elements of the model by names.
+        buffers: tensors with a row per env that terms keep: `buffer`.
     """
 
     def __init__(
