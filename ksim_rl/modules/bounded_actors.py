@@ -102,6 +102,12 @@ class SquashedPolicy(BoundedActor):
         high = self.cfg.log_std_max
         return loc, (low + 0.5 * (high - low) * (raw.tanh() + 1.0)).exp()
 
+    def distribution(
+        self, loc: Float[Tensor, "*batch action_dim"], scale: Float[Tensor, "*batch action_dim"]
+    ) -> TanhGaussian:
+        """Return the distribution of actions within this policy's bounds."""
+        return TanhGaussian(loc, scale, low=self.low, high=self.high)
+
 
 def make_deterministic_actor(cfg: DeterministicActorCfg, **network: Any) -> TensorDictModule:
     """Build a policy that reads "actor" and writes "action" [..., action_dim], within the bounds of the spec."""
@@ -120,8 +126,7 @@ def make_squashed_actor(cfg: SquashedActorCfg, **network: Any) -> ProbabilisticA
         TensorModule(policy, in_keys=["actor"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=["action"],
-        distribution_class=TanhGaussian,
-        # The buffers themselves: a state dict that is loaded in place shows in them.
-        distribution_kwargs={"low": policy.low, "high": policy.high},
+        # A method, so that the bounds are the policy's wherever it is moved or copied.
+        distribution_class=policy.distribution,  # type: ignore[arg-type]
         default_interaction_type=ExplorationType.RANDOM,
     )

@@ -70,6 +70,7 @@ class OffPolicyLoss(LossModule):
     tensor_keys: _AcceptedKeys  # type: ignore[assignment]
     actor_network: Any
     critic_network: Any
+    support_A: Tensor | None
 
     def __init__(
         self,
@@ -89,7 +90,8 @@ class OffPolicyLoss(LossModule):
         shared: Any = {id(own): own for own in critic_network.modules() if isinstance(own, RunningMoments)}
         # Under a name that `parameters()` leaves out.
         self._target_critic = copy.deepcopy(critic_network, memo=shared).requires_grad_(False)
-        self.support_A = support_A
+        # A buffer, which moves with the networks; it follows from the config, so it is no part of a checkpoint.
+        self.register_buffer("support_A", support_A, persistent=False)
         self.gamma = gamma
         self.value_reduction: ValueReduction = value_reduction
         self.reduction, self._selected = "mean", list[Any](self._written)
@@ -313,6 +315,9 @@ class TD3Loss(OffPolicyLoss):
     deviation and the bound of the noise, in units of half the range [low_L, high_L] of an action.
     """
 
+    low_L: Tensor
+    high_L: Tensor
+
     def __init__(
         self,
         actor_network: TensorDictModuleBase,
@@ -327,8 +332,9 @@ class TD3Loss(OffPolicyLoss):
         super().__init__(actor_network, critic_network, **options)
         check_in_range("target_noise", target_noise, low=0.0)
         check_in_range("target_noise_clip", target_noise_clip, low=0.0)
-        self.low_L = low_L
-        self.high_L = high_L
+        # Buffers, which move with the networks; they are the env's, so they are no part of a checkpoint.
+        self.register_buffer("low_L", low_L, persistent=False)
+        self.register_buffer("high_L", high_L, persistent=False)
         self.target_noise = target_noise
         self.target_noise_clip = target_noise_clip
 

@@ -76,7 +76,10 @@ def prepare_spec(spec: mujoco.MjSpec, per_world_fields: Iterable[str]) -> None:
 
 
 def write_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> None:
-    """Write one row of `World.per_world_fields` into a model of the C engine, in place, and the constants of it."""
+    """Write one row of `World.per_world_fields` into a model of the C engine, in place, and the constants of it.
+
+    Fields that the C engine does not know are left out. Raises ValueError where a field has another size in the model.
+    """
     _copy_fields(mj_model, fields)
     # Constants do not follow from how things look, nor from gravity.
     shown = ("mat_", "light_", "cam_fovy", "cam_intrinsic", "geom_matid", "geom_rgba", GRAVITY)
@@ -95,6 +98,9 @@ def _copy_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> 
             target = mj_model.opt.gravity
         else:
             target = getattr(mj_model, name, None)
-        # A few of MuJoCo Warp's fields are its own, or laid out otherwise.
-        if target is not None and target.size == value.size:
-            target[:] = value.reshape(target.shape)
+        # A few of MuJoCo Warp's fields are its own.
+        if target is None:
+            continue
+        if target.size != value.size:
+            raise ValueError(f"{name} has {value.size} numbers: the model has {target.size}")
+        target[:] = value.reshape(target.shape)

@@ -84,3 +84,10 @@ def test_what_they_refuse(kind):
         kind(action_bound=0.0)
     with pytest.raises(ValueError, match="log_std_min"):
         SquashedActorCfg(log_std_min=1.0, log_std_max=1.0)
+
+
+def test_bounds_move_with_the_policy():
+    sizes = {"obs_dim": 4, "action_spec": Bounded(LOW, HIGH, (2,))}
+    actor = make_squashed_actor(SquashedActorCfg(hidden_dims=(16,)), **sizes).to("meta")
+    action = actor(TensorDict({"actor": torch.randn(5, 4, device="meta")}, [5]))["action"]
+    assert action.device.type == "meta"

@@ -59,3 +59,15 @@ def test_losses_and_gradients_are_those_of_torchrl(num_networks, extra):
         torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-5, atol=1e-6)
     else:
         assert_gradients_are_alike(critic, stock)
+
+
+def test_bounds_and_atoms_move_with_the_networks():
+    actor, critic = networks()
+    bound = torch.ones(ACTION)
+    loss = TD3Loss(actor, critic, low_L=-bound, high_L=bound, support_A=torch.linspace(-1.0, 1.0, 5))
+    state = loss.state_dict()
+    moved = loss.to("meta")
+    for own in (moved.low_L, moved.high_L, moved.support_A):
+        assert own.device.type == "meta"
+    # They follow from env and config, so that a checkpoint does not hold them.
+    assert not [name for name in state if name.endswith(("low_L", "high_L", "support_A"))]

@@ -238,6 +238,10 @@ WRONG = {
         "field/nq, float32",
         lambda failure: {"fields": {"nq": np.zeros(1, np.float32)}},
     ),
+    "a field of another size": (
+        "field/body_mass has 7 numbers: its model has",
+        lambda failure: {"fields": {"body_mass": np.ones(7, np.float32)}},
+    ),
 }
 
 

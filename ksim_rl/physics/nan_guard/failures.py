@@ -137,3 +137,6 @@ def _check(failure: Failure) -> None:
     for name, array in failure.fields.items():
         if name not in (*per_world_fields(), GRAVITY) or array.dtype not in (np.float32, np.int32):
             raise ValueError(f"{_FIELD}{name}, {array.dtype}: no model field that may differ between worlds")
+        own = getattr(failure.mj_model, name, None)
+        if own is not None and own.size != array.size:
+            raise ValueError(f"{_FIELD}{name} has {array.size} numbers: its model has {own.size}")
