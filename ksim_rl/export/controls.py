@@ -166,9 +166,10 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
         alpha = None
     shared = {"clip": term.clip, "tanh": term.tanh, "alpha": alpha}
     offset = _numbers(view, term, "offset")
-    # World 0 stands for all worlds here.
-    if getattr(term, "use_default_offset", False):
-        default = view.joints(term.joints).default_pos_EL[0].tolist()
+    from_default = getattr(term, "use_default_offset", False)
+    # The model's own pose: what events draw around it differs from world to world.
+    if from_default:
+        default = view.default_qpos_L[view.joints(term.joints).qpos].tolist()
         offset = [a + b for a, b in zip(offset, default, strict=True)]
     # Positions and velocities are not limited here: servos and joints have limits of their own.
     if kind == "effort":
@@ -179,6 +180,7 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
         "kind": kind,
         "names": names,
         "relative": isinstance(term, mdp.RelativeJointPositionAction),
+        "from_default": from_default,
         # JSON has no infinity.
         "limits": [-1e30, 1e30] if limits_K2 is None else limits_K2.T.tolist(),
         **shared,

@@ -273,7 +273,8 @@ def metadata(
     # Controllers for mjlab's policies read the first entries, by these names.
     gains = _gains(ours, laws, names)
     if names:
-        by_term = [view.joints(n).default_pos_EL[0].tolist() for n in (asked, names)]
+        # The model's own pose: what events draw around it differs from world to world.
+        by_term = [view.default_qpos_L[view.joints(n).qpos].tolist() for n in (asked, names)]
     else:
         by_term = [[], []]
     scales = [s for a in actions for s in np.broadcast_to(a["scale"], len(a["names"])).tolist()]

@@ -177,8 +177,8 @@ def _joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
 
 def _relative_joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
     mirror = _joints(env, joints)
-    # All envs start with the same default pose here: the first row stands for all.
-    default_K = env.view.joints(joints).default_pos_EL[0]
+    # The model's own pose: what events draw around it is as likely on either side.
+    default_K = env.view.default_qpos_L[env.view.joints(joints).qpos]
     _check_symmetric("the default pose", default_K, mirror(default_K))
     return mirror
 

@@ -18,7 +18,7 @@ import torch
 pytest.importorskip("onnxruntime", reason="needs the extra: pip install ksim_rl[export]")
 onnx = pytest.importorskip("onnx", reason="needs the extra: pip install ksim_rl[export]")
 
-from ksim_rl import envs  # noqa: E402
+from ksim_rl import envs, mdp  # noqa: E402
 from ksim_rl.envs import ManagerBasedRlEnv  # noqa: E402
 from ksim_rl.envs.contract import part  # noqa: E402
 from ksim_rl.envs.term import ObservationTerm, RewardTerm  # noqa: E402
@@ -99,6 +99,21 @@ def test_what_the_c_engine_trained_is_judged_in_other_physics(tmp_path):
     assert report.causes == []
     assert report.return_ratio == pytest.approx(1.0, abs=0.02)
     assert report.return_ratio != pytest.approx(1.0, abs=1e-9)
+
+
+def test_default_poses_that_differ_between_worlds_are_recorded_and_are_not_the_robots(tmp_path):
+    def change(cfg):
+        drawn = {"default_pose": mdp.RandomizeDefaultJointPos(ranges=(-0.2, 0.2))}
+        return dataclasses.replace(cfg, events={**drawn, **cfg.events})
+
+    own = exported("quadruped_velocity_flat", tmp_path / "own")
+    folder = exported("quadruped_velocity_flat", tmp_path / "export", change=change)
+    # A robot stands in the pose of its model, not in one that world 0 drew.
+    described = [json.loads((path / "export.json").read_text()) for path in (own, folder)]
+    for name in ("default_joint_pos", "joints", "actions"):
+        assert described[0][name] == described[1][name]
+    # Each observation, target and force of single steps is compared.
+    assert report_of(folder, episodes=4).causes == []
 
 
 FULL = ("arm_push", "cheetah_run", "hopper_stand", "pendulum_swingup", "quadruped_get_up")

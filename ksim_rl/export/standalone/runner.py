@@ -124,7 +124,12 @@ class Runner(Signals):
             if second:
                 given, value = np.split(given, 2)
                 self.targets["vel"].update(zip(names, second(value), strict=True))
-            value = shape(given) + (self.data.qpos[at] if spec["relative"] else 0.0)
+            value = shape(given)
+            if spec["relative"]:
+                value = value + self.data.qpos[at]
+            # The offset has the model's own pose in it; exports of before 0.2.0 do not say so.
+            if spec.get("from_default"):
+                value = value + [self.default[name] - self.own_default[name] for name in names]
             self.targets[kind].update(zip(names, np.clip(value, *spec["limits"]), strict=True))
 
         return joints

@@ -215,10 +215,12 @@ class Signals:
         # Addresses differ from joint numbers as soon as there is a free or ball joint.
         names = meta["joints"]["names"]
         self.joints = {n: (int(model.joint(n).qposadr[0]), int(model.joint(n).dofadr[0])) for n in names}
+        # The model's own pose, and this episode's, which a recorded start may have drawn around it.
+        self.own_default = dict(zip(names, meta["joints"]["default_pos"], strict=True))
+        self.default = dict(self.own_default)
         # Errors of joint encoders, rad, which a recorded start may set.
-        self.default = dict(zip(names, meta["joints"]["default_pos"], strict=True))
-        # Commands are zero until the caller gives one.
         self.bias = dict.fromkeys(names, 0.0)
+        # Commands are zero until the caller gives one.
         sizes = {n: check_count(f"commands.{n}.size", c["size"]) for n, c in meta["commands"].items()}
         self.command: dict[str, Array] = {name: np.zeros(size) for name, size in sizes.items()}
         self.contacts = {name: Contacts(spec, model) for name, spec in meta["contacts"].items()}
@@ -327,8 +329,13 @@ class Signals:
                 "joint_effort": lambda: data.qfrc_actuator[vel],
             }
             if name == "joint_pos_rel":
-                default = np.array([self.default[joint] for joint in names])
-                return lambda: of_joints["joint_pos"]() - default
+
+                def joint_pos_rel() -> Array:
+                    # Looked up at each reading, since a recorded start may bring another default pose.
+                    default = [self.default[joint] for joint in names]
+                    return of_joints["joint_pos"]() - default
+
+                return joint_pos_rel
             return of_joints[name]
         # Bodies and sites, in the world frame. `data` is the same object for good, so its arrays may be kept.
         if "bodies" in node or "sites" in node:
