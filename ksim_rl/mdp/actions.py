@@ -89,11 +89,15 @@ class JointPositionAction(JointAction):
 
     use_default_offset: bool = True
 
-    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
+    def target(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> Float[Tensor, "E K"]:
+        """Return the positions that an action asks for."""
         target_EK = self.shaped(view, action_EK)
         if self.use_default_offset:
-            target_EK = target_EK + view.joints(self.joints).default_pos_EL
-        view.write_joint_pos_target(self.joints, target_EK)
+            return target_EK + view.joints(self.joints).default_pos_EL
+        return target_EK
+
+    def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
+        view.write_joint_pos_target(self.joints, self.target(view, action_EK))
 
 
 @dataclass(frozen=True, kw_only=True)

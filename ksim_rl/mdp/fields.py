@@ -119,6 +119,11 @@ class FramedObservation(InFrame, ObservationTerm):
             pos_EN3 = pos_EN3 - view.entity(self.entity).root_pos_EL[:, None]
         return self.vectors(view, pos_EN3)
 
+    def rotations6d(self, view: EnvView, axes_EN33: Float[Tensor, "E N 3 3"]) -> Float[Tensor, "E L"]:
+        """Return the x axis, then the y axis, of frames whose axes are the rows, in the term's axes, flat, [E, 6N]."""
+        # [E, N, 2, 3] as [E, 2N, 3]: each axis is a vector to rotate.
+        return self.vectors(view, axes_EN33[:, :, :2].flatten(start_dim=1, end_dim=2))
+
     def vectors(self, view: EnvView, vector_EN3: Float[Tensor, "E N 3"]) -> Float[Tensor, "E L"]:
         """Return vectors of the world in the term's axes, flat, [E, 3N]."""
         if self.frame == "root":

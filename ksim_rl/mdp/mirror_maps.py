@@ -111,7 +111,7 @@ _RULES: Mapping[type, Callable[[Any, ManagerBasedRlEnv], MirrorMap]] = {
     mdp.ImuReading: lambda term, env: _IMU[term.quantity],
     mdp.Command: lambda term, env: term_mirror(env.cfg.commands[term.command], env),
     **dict.fromkeys(
-        (mdp.JointVel, mdp.JointAcc, mdp.JointEffort, mdp.JointPos),
+        (mdp.JointVel, mdp.JointAcc, mdp.JointEffort, mdp.JointPos, mdp.JointPosTarget),
         lambda term, env: _joints(env, term.joints),
     ),
     mdp.JointPosRel: lambda term, env: _relative_joints(env, term.joints),

@@ -161,3 +161,18 @@ class ResetToMotion(OfMotion, EventTerm):
     def draw_share(self, view: EnvView) -> Float[Tensor, " E"]:
         """Draw where in the motion each env would begin, as a share of its duration."""
         return view.uniform(1, *self.start_range)[:, 0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowMotion(OfMotion, EventTerm):
+    """Put the whole scene into the state that a reference motion has at this env step; from its end it begins again.
+
+    In an env whose episodes last one step it plays the motion exactly: `showing_motion` makes one of any config.
+    """
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        motion = view.motion(self.file)
+        passed = torch.remainder(view.step_count * view.step_dt, motion.duration_s)
+        qpos_EL, qvel_EL = motion.sample(passed.to(torch.float32).expand(view.num_envs))
+        view.write_qpos(mask_E, qpos_EL if motion_shift(view) is None else view.at_origins(qpos_EL))
+        view.write_qvel(mask_E, qvel_EL)

@@ -275,10 +275,31 @@ def _discounted_errors(
     return adv_ET, adv_ET + signals.value_ET_t, finite_ET
 
 
-class GAE(RolloutEstimator, value.GAE):
-    """Computes `advantage` and `value_target` (Schulman et al., arXiv 1506.02438) as TorchRL's `GAE` does."""
+def _with_own_targets(
+    estimate: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], lmbda: Tensor, value_lmbda: float | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the results of `estimate(lmbda)`, with the value targets of another lambda if there is one."""
+    adv_ET, target_ET, finite_ET = estimate(lmbda)
+    if value_lmbda is not None:
+        _, target_ET, _ = estimate(torch.full_like(lmbda, value_lmbda))
+    return adv_ET, target_ET, finite_ET
 
-    def __init__(self, *, lmbda: float, normalize_advantage: bool = False, **options: Any) -> None:
+
+class GAE(RolloutEstimator, value.GAE):
+    """Computes `advantage` and `value_target` (Schulman et al., arXiv 1506.02438) as TorchRL's `GAE` does.
+
+    With `value_lmbda` targets have a lambda of their own: 1 makes them Monte Carlo returns, which the value bootstraps
+    at the end of the rollout and at truncations.
+    """
+
+    def __init__(
+        self,
+        *,
+        lmbda: float,
+        value_lmbda: float | None = None,
+        normalize_advantage: bool = False,
+        **options: Any,
+    ) -> None:
         super().__init__(
             lmbda=lmbda,
             normalize_advantage=normalize_advantage,
@@ -286,9 +307,13 @@ class GAE(RolloutEstimator, value.GAE):
             vectorized=False,
             **options,
         )
+        self._value_lmbda = value_lmbda
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        return _discounted_errors(signals, self.gamma, self.lmbda)
+        def estimate(lmbda: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            return _discounted_errors(signals, self.gamma, lmbda)
+
+        return _with_own_targets(estimate, self.lmbda, self._value_lmbda)
 
 
 class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
@@ -297,18 +322,24 @@ class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
     It is TorchRL's `TDLambdaEstimator` (Sutton and Barto, Reinforcement Learning, 2nd ed., section 12.1): the return
     G_t = r_t + gamma ((1 - lambda) V(s_{t+1}) + lambda G_{t+1}), cut at the end of an episode. It equals
     `GAE`, except where the value after a step differs from the value of the next step, as with a target critic.
+    `value_lmbda` is as in `GAE`.
     """
 
-    def __init__(self, *, lmbda: float, **options: Any) -> None:
+    def __init__(self, *, lmbda: float, value_lmbda: float | None = None, **options: Any) -> None:
         super().__init__(lmbda=lmbda, vectorized=False, **options)
+        self._value_lmbda = value_lmbda
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         # G_{t+1} is V_{t+1} + A_{t+1}: TD errors with this mean of both values after a step sum up to G_t - V_t.
         after_ET = signals.value_ET_t_plus_1
         # A value that is not finite must not spoil the step before it, whose mean would be NaN.
         following_ET = _shifted(signals.value_ET_t.nan_to_num(0.0, 0.0, 0.0), after_ET, signals.time_dim)
-        mean_ET = torch.where(signals.done_ET, after_ET, after_ET + self.lmbda * (following_ET - after_ET))
-        return _discounted_errors(replace(signals, value_ET_t_plus_1=mean_ET), self.gamma, self.lmbda)
+
+        def estimate(lmbda: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            mean_ET = torch.where(signals.done_ET, after_ET, after_ET + lmbda * (following_ET - after_ET))
+            return _discounted_errors(replace(signals, value_ET_t_plus_1=mean_ET), self.gamma, lmbda)
+
+        return _with_own_targets(estimate, self.lmbda, self._value_lmbda)
 
 
 class VTrace(RolloutEstimator, value.VTrace):

@@ -98,6 +98,8 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
     Attributes:
         advantage: "gae", "td_lambda" (lambda returns; the same numbers in the rollout of a collector), or "vtrace",
             whose weights follow the policy from epoch to epoch, within `rho_thresh` and `c_thresh`; see `VTrace`.
+        value_lmbda: the lambda of value targets, where it is not `lmbda`: 1 makes them Monte Carlo returns, which end
+            with the critic's value at the end of a rollout or at a time limit. "vtrace" has no such.
         estimate_each_epoch: estimate advantages and value targets again before each epoch, with the present networks,
             instead of once (Andrychowicz et al., arXiv 2006.05990, section 3.5). "vtrace" always does.
         min_advantage_std: with `normalize_advantage="dataset"` advantages are divided by their standard deviation, at
@@ -115,6 +117,7 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
     advantage: Literal["gae", "td_lambda", "vtrace"] = "gae"
     gamma: Share = 0.99
     lmbda: Share = 0.95
+    value_lmbda: Share | None = None
     rho_thresh: Positive = 1.0
     c_thresh: Positive = 1.0
     estimate_each_epoch: bool = False
@@ -131,6 +134,11 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        if self.value_lmbda is not None and self.advantage == "vtrace":
+            raise ValueError(
+                f"value_lmbda={self.value_lmbda!r} with advantage='vtrace', whose targets follow from the ratios of "
+                "the policies: leave it out, or use advantage='gae'"
+            )
         # A setting without effect is refused, so that nobody believes in a floor that is not there.
         if self.min_advantage_std != PPOCfg.min_advantage_std and self.normalize_advantage != "dataset":
             raise ValueError(

@@ -65,7 +65,7 @@ def make_advantage(
     }
     if cfg.advantage == "vtrace":
         return VTrace(actor=actor, rho_thresh=cfg.rho_thresh, c_thresh=cfg.c_thresh, **options)
-    return {"gae": GAE, "td_lambda": TDLambda}[cfg.advantage](**options)
+    return {"gae": GAE, "td_lambda": TDLambda}[cfg.advantage](value_lmbda=cfg.value_lmbda, **options)
 
 
 def make_loss(cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule) -> ClipPPOLoss:

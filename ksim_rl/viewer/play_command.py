@@ -24,7 +24,7 @@ from ksim_rl.trainers.other_physics import ENGINE, judged_by, trained_with
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.trainers.run_folder import policy_of, without_nan_guard
 from ksim_rl.trainers.video import FPS
-from ksim_rl.viewer.session import AGENTS, Conditions, Session, UntrainedAgent
+from ksim_rl.viewer.session import AGENTS, Conditions, Session, UntrainedAgent, showing_motion
 from ksim_rl.zoo import locate
 
 DEMO = "zoo:cartpole"
@@ -138,6 +138,10 @@ def _parser() -> OneLineParser:
     )
     parser.add_argument("--agent", choices=AGENTS, help="act without a policy: not at all, or at random")
     parser.add_argument(
+        "--motion",
+        help="play a reference motion in the scene of a task, without physics: its name, or a file",
+    )
+    parser.add_argument(
         "--num-envs", type=int, default=4, help="of a viewer, which shows one at a time; default: 4"
     )
     parser.add_argument(
@@ -181,6 +185,8 @@ def _check(options: argparse.Namespace) -> None:
 
 def _find(options: argparse.Namespace) -> Played:
     """Find the run or the task, with the changes to its config."""
+    if options.motion is not None:
+        return _motion(options)
     first, *overrides = options.what
     # A path may hold "=", so one that exists is a run.
     if "=" in first and not Path(first).exists():
@@ -209,6 +215,18 @@ def _find(options: argparse.Namespace) -> Played:
         return _without_policy(policy.cfg, options.agent)
     title = f"{policy.cfg.task_name}, iteration {policy.iteration}{physics}"
     return Played(cfg=policy.cfg, title=title, folder=saved.run_folder, actor=policy.actor)
+
+
+def _motion(options: argparse.Namespace) -> Played:
+    """Return a motion to play in the scene of a task."""
+    if not any(text.startswith("task=") for text in options.what):
+        raise ValueError(f"--motion {options.motion}: name a task with the motion's robot: task=NAME")
+    if options.agent is not None:
+        raise ValueError(f"--motion {options.motion} with --agent {options.agent}: nothing acts in a motion")
+    cfg = conf.compose([*options.what, f"device={options.device}"])
+    shown = dataclasses.replace(cfg, task=showing_motion(cfg.task, options.motion))
+    played = _without_policy(shown, "zero")
+    return dataclasses.replace(played, title=f"{cfg.task_name}, motion {options.motion}")
 
 
 def _without_policy(cfg: RunCfg, agent: str) -> Played:

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from ksim_rl import mdp
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from ksim_rl.envs.contract import part
@@ -67,6 +68,23 @@ class Conditions:
                 and (self.randomization or not (event.per_world_fields or event.mode == "startup"))
             }
         return replace(cfg, observations=groups, transforms=transforms, events=events, curriculum={})
+
+
+def showing_motion(cfg: ManagerBasedRlEnvCfg, file: str) -> ManagerBasedRlEnvCfg:
+    """Return the config of an env that plays a reference motion, whatever acts: each step is an episode of its own.
+
+    Each root is the motion's exact state; physics runs in between, and what it comes to is thrown away.
+    """
+    return dataclasses.replace(
+        cfg,
+        events={"motion": mdp.ShowMotion(file=file)},
+        terminations={"next_frame": mdp.TimeOut()},
+        # Shorter than any env step, of which an episode has at least one.
+        episode_length_s=1e-6,
+        rewards={},
+        metrics={},
+        curriculum={},
+    )
 
 
 class UntrainedAgent(TensorDictModuleBase):

@@ -66,9 +66,9 @@ def test_a_term_survives_yaml(name):
 # What terms share.
 BASES = """
     BodyObservation EncodedJoints FramedObservation GaussianReward HeldCommand JointAction JointLimitReward JointReset
-    LevelCurriculum OfBodies Randomize RandomizeActuator RandomizeBodyField RandomizeField RandomizeJointField
+    LevelCurriculum OfBodies OfSwing Randomize RandomizeActuator RandomizeBodyField RandomizeField RandomizeJointField
     RandomizeModelField RandomizeNumber RandomizePos RandomizeTendonField RandomizeTurn RewardWeight
-    RewardWhileCommanded SteppedLevel Symmetry
+    RewardWhileCommanded SteeredAction SteppedLevel Symmetry
 """
 
 

@@ -22,6 +22,7 @@ def test_defaults_are_valid_and_frozen():
         ("symmetry_coeff", -0.5),
         ("gamma", 1.1),
         ("lmbda", -0.1),
+        ("value_lmbda", 1.1),
         ("clip_epsilon", 0.0),
         ("clip_epsilon", 1.5),
         ("clip_value", -0.2),
@@ -58,3 +59,9 @@ def test_a_bound_of_advantages_that_are_not_scaled_is_refused():
 
 def test_a_fixed_learning_rate_has_no_bounds():
     assert PPOCfg(learning_rate=0.5, schedule="fixed").learning_rate == 0.5
+
+
+def test_vtrace_has_no_targets_of_another_lambda():
+    assert PPOCfg(value_lmbda=1.0).value_lmbda == 1.0
+    with pytest.raises(ValueError, match=r"value_lmbda=1\.0 with advantage='vtrace'.*use advantage='gae'"):
+        PPOCfg(value_lmbda=1.0, advantage="vtrace")

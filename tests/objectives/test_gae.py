@@ -5,7 +5,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.objectives import ClipPPOLoss as StockClipPPOLoss
 from torchrl.objectives import value
 
-from ksim_rl.objectives import GAE
+from ksim_rl.objectives import GAE, TDLambda
 from ksim_rl.testing import count_syncs
 from tests.objectives.problems import networks, rollout
 
@@ -17,6 +17,26 @@ def _stock(critic, data, **options):
     gae = value.GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic, vectorized=False, time_dim=1, **options)
     with torch.no_grad():
         return gae(data.clone())
+
+
+@pytest.mark.parametrize("kind", [GAE, TDLambda])
+def test_value_targets_of_another_lambda_are_those_of_an_estimator_with_it(kind):
+    actor, critic = networks()
+    data = rollout(actor, num_envs=16, length=12, end_probability=0.15)
+    out = kind(gamma=GAMMA, lmbda=LMBDA, value_lmbda=1.0, critic=critic)(data.clone())
+    plain = kind(gamma=GAMMA, lmbda=LMBDA, critic=critic)(data.clone())
+    monte_carlo = kind(gamma=GAMMA, lmbda=1.0, critic=critic)(data.clone())
+    assert torch.equal(out["advantage"], plain["advantage"])
+    assert torch.equal(out["value_target"], monte_carlo["value_target"])
+    assert not torch.allclose(out["value_target"], plain["value_target"], atol=0.01)
+
+
+def test_monte_carlo_targets_are_the_discounted_rewards_up_to_the_end():
+    data = _known([1.0, 2.0, 3.0, 4.0], values=[9.0] * 4, next_values=[9.0, 9.0, 9.0, 5.0], terminated=[1])
+    out = GAE(gamma=0.5, lmbda=0.3, value_lmbda=1.0, critic=_critic())(data)
+    # The rollout's end is no episode's: there the value 5 stands for what follows.
+    expected = [1.0 + 0.5 * 2.0, 2.0, 3.0 + 0.5 * (4.0 + 0.5 * 5.0), 4.0 + 0.5 * 5.0]
+    torch.testing.assert_close(out["value_target"].flatten(), torch.tensor(expected))
 
 
 @pytest.mark.parametrize("normalize", [False, True])

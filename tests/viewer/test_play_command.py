@@ -1,9 +1,12 @@
 """`ksim-rl play` refuses what it cannot show before anything compiles, and shows agents without a policy."""
 
 import pytest
+import torch
 
 from ksim_rl.cli.main import main
+from ksim_rl.envs import ManagerBasedRlEnv, make_cfg
 from ksim_rl.viewer.play_command import addresses
+from ksim_rl.viewer.session import showing_motion
 
 
 @pytest.mark.parametrize(
@@ -17,6 +20,8 @@ from ksim_rl.viewer.play_command import addresses
         (["RUN", "--fps", "0"], "--fps=0.0: expected a finite number in (0.0, inf)"),
         (["RUN", "--seconds", "-1"], "--seconds=-1.0: expected a finite number in (0.0, inf)"),
         (["RUN", "--num-envs", "0"], "--num-envs=0: expected a whole number >= 1"),
+        (["RUN", "--motion", "walker_walk"], "--motion walker_walk: name a task with the motion's robot"),
+        (["task=walker_track", "--motion", "walker_walk", "--agent", "zero"], "nothing acts in a motion"),
         (["RUN", "--output", "clip.avi"], "ends in .mp4 or .gif"),
     ],
 )
@@ -39,3 +44,19 @@ def test_the_window_is_refused_without_a_display(monkeypatch, capsys):
 def test_both_ports_are_forwarded():
     lines = addresses("http://127.0.0.1:8090", "http://127.0.0.1:8092")
     assert "ssh -N -L 8090:127.0.0.1:8090 -L 8092:127.0.0.1:8092 THIS_MACHINE" in lines[1]
+
+
+@pytest.mark.parametrize("task", ["walker_track", "walker_walk"])
+def test_a_motion_is_shown_exactly_from_frame_to_frame(task):
+    cfg = make_cfg(task, ["task.scene.num_envs=2"])
+    env = ManagerBasedRlEnv(showing_motion(cfg, "walker_walk"))
+    motion = env.view.motion("walker_walk")
+    root_E = env.reset()
+    for step in range(4):
+        qpos_EL, qvel_EL = motion.sample(torch.full((2,), step * env.step_dt))
+        torch.testing.assert_close(env.world.qpos_EL, qpos_EL)
+        torch.testing.assert_close(env.world.qvel_EL, qvel_EL)
+        torch.testing.assert_close(
+            env.view.bodies("torso").pos_EN3[:, 0, 0], qpos_EL[:, 0], atol=1e-5, rtol=0
+        )
+        _, root_E = env.step_and_maybe_reset(root_E.set("action", env.action_spec.rand()))

@@ -52,10 +52,15 @@ class BodyRotation6d(BodyObservation):
     """The x axis, then the y axis, of each body, without jumps (Zhou et al. 2019), [E, 6N]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
-        # Axes are rows here, so that the first two rows are the x and y axes.
-        axes_EN23 = view.bodies(self.bodies).axes_EN33[:, :, :2]
-        # [E, N, 2, 3] as [E, 2N, 3]: each axis is a vector to rotate.
-        return self.vectors(view, axes_EN23.flatten(start_dim=1, end_dim=2))
+        return self.rotations6d(view, view.bodies(self.bodies).axes_EN33)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SiteRotation6d(OfSites, FramedObservation):
+    """The x axis, then the y axis, of each site, without jumps (Zhou et al. 2019), [E, 6N]; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return self.rotations6d(view, view.sites(self.sites).axes_EN33)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +93,20 @@ class CenterOfMassVel(BodyObservation):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.bodies(self.bodies).subtree_com_vel_EN3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CenterOfMassInertia(ObservationTerm):
+    """Inertia of each body about the centre of mass of its whole tree, in the world's axes, [E, 10N]; position stage.
+
+    MuJoCo's `cinert`, per body: moments xx, yy, zz, xy, xz, yz (kg m^2), mass times the offset from that centre (kg m),
+    and mass (kg). The body alone counts, without what hangs on it.
+    """
+
+    bodies: Patterns
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.bodies(self.bodies).inertia_EN10.flatten(start_dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,6 +53,14 @@ class JointPosRel(EncodedJoints):
 
 
 @dataclass(frozen=True, kw_only=True)
+class JointPosTarget(OfJoints, ObservationTerm):
+    """Positions that joints were last asked for, rad or m, [E, L]; beside `JointPos` it shows how well they follow."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        return view.joint_pos_target_EL[:, view.joints(self.joints).index]
+
+
+@dataclass(frozen=True, kw_only=True)
 class JointVel(OfJoints, ObservationTerm):
     """Velocities of joints, rad/s or m/s, [E, L]; velocity stage."""
 

@@ -4,6 +4,7 @@ Poses and velocities are of the current state, contacts and forces of the last p
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import torch
 from jaxtyping import Float
@@ -13,6 +14,7 @@ from ksim_rl.checked import NonNegative, Positive
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.constants import index_constant
 from ksim_rl.mdp.fields import OfContacts, OfFeet, OfSensor, OfSites, RewardWhileCommanded, contact_force
 
 
@@ -67,22 +69,59 @@ class FootClearance(OfSites, RewardWhileCommanded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FootSwingHeight(OfFeet, RewardWhileCommanded):
-    """active * sum_f landed_f * (peak_f / target_height - 1)^2, [E]; `peak` is the greatest height of the swing, m."""
+class OfSwing(OfFeet, RewardWhileCommanded):
+    """A reward of how high feet swing, which is known in the step of touch-down."""
 
     target_height: Positive
 
-    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+    def peak(self, view: EnvView) -> Float[Tensor, "E F"]:
+        """Return the greatest height of each foot in its present swing, or the one that ends in this step, m."""
         contact = self.contact(view)
         height_EF = view.sites(self.sites).height_EN
         held_EF = view.buffer("peak_EF", height_EF.shape[-1])
         # Grows in the air only: at touch-down it still holds the peak of the swing.
         peak_EF = torch.where(contact.found_EN > 0, held_EF, torch.maximum(held_EF, height_EF))
-        # Starts again with the next swing, after the cost below has been computed from `peak_EF`.
+        # Starts again with the next swing.
         held_EF.copy_(torch.where(contact.first_contact_EN > 0, 0.0, peak_EF))
+        return peak_EF
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootSwingHeight(OfSwing):
+    """active * sum_f landed_f * (peak_f / target_height - 1)^2, [E]; `peak` is the greatest height of the swing, m."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        miss_EF = (self.peak(view) / self.target_height - 1.0).square()
         # Paid once per swing, in the step of touch-down.
-        cost_E = ((peak_EF / self.target_height - 1.0).square() * contact.first_contact_EN).sum(-1)
-        return self.while_commanded(view, cost_E)
+        return self.while_commanded(view, (miss_EF * self.contact(view).first_contact_EN).sum(-1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootSwingPeak(OfSwing):
+    """active * max_f landed_f * min(peak_f, target_height), m, [E]: earned at touch-down by the highest swing."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        earned_EF = self.peak(view).clamp(max=self.target_height)
+        return self.while_commanded(view, (earned_EF * self.contact(view).first_contact_EN).amax(-1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeetTooClose(OfSites, RewardTerm):
+    """1 while any two of the sites are less than `min_distance` (m) apart, else 0, [E]; position stage."""
+
+    min_distance: Positive
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        pos_EF3 = view.sites(self.sites).pos_EN3
+        pairs = list(combinations(range(pos_EF3.shape[1]), 2))
+        if not pairs:
+            raise ValueError(f"sites={self.sites!r} match one site: give at least two")
+        first, second = zip(*pairs, strict=True)
+        gap_EP3 = (
+            pos_EF3[:, index_constant(first, view.device)] - pos_EF3[:, index_constant(second, view.device)]
+        )
+        near_EP = torch.linalg.vector_norm(gap_EP3, dim=-1) < self.min_distance
+        return near_EP.any(-1).to(torch.float32)
 
 
 @dataclass(frozen=True, kw_only=True)

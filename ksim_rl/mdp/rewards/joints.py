@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checked import Positive, Within
+from ksim_rl.checked import NonNegative, Positive, Within
 from ksim_rl.checks import check_choice
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
@@ -84,6 +84,46 @@ class JointAccL2(OfJoints, RewardTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.joints(self.joints).acc_EL.square().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointJerkL2(OfJoints, RewardTerm):
+    """Sum of squared jerks of joints, (rad/s^3)^2 or (m/s^3)^2, [E]: of velocities at three env steps, as a finite
+    difference; 0 in the first two steps of an episode.
+    """
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        return second_difference(view, view.joints(self.joints).vel_EL).square().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnreachableTargetL2(OfJoints, RewardTerm):
+    """Sum over joints of the square of how far a position target is out of reach, rad^2 or m^2, [E].
+
+    In an env step of length t a joint gets `max_velocity` t + `max_acceleration` t^2 / 2 away from where it was when it
+    began (rad/s and rad/s^2, or m). What the target asks for beyond that is counted; 0 in the first step of an episode.
+    Both limits are by regular expressions that match each joint once.
+    """
+
+    max_velocity: Mapping[str, NonNegative]
+    max_acceleration: Mapping[str, NonNegative]
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        joints = view.joints(self.joints)
+        speed_L = values_by_name("max_velocity", self.max_velocity, joints.names)
+        acceleration_L = values_by_name("max_acceleration", self.max_acceleration, joints.names)
+        step = view.step_dt
+        pairs = zip(speed_L, acceleration_L, strict=True)
+        reach_L = constant(
+            [speed * step + acceleration * step**2 / 2 for speed, acceleration in pairs], view.device
+        )
+        # Where the step began: the positions that this term saw last.
+        last_EL = view.buffer("last_pos_EL", len(joints))
+        asked_EL = (view.joint_pos_target_EL[:, joints.index] - last_EL).abs()
+        last_EL.copy_(joints.pos_EL)
+        beyond_E = (asked_EL - reach_L).clamp(min=0.0).square().sum(-1)
+        # The first step has no position before it: the buffer's zero is not one.
+        return torch.where(view.episode_step_E <= 1, 0.0, beyond_E)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +219,14 @@ def change(view: EnvView, name: str, value_EL: Float[Tensor, "E L"]) -> Float[Te
     # In place and after the difference was taken.
     last_EL.copy_(value_EL)
     return change_EL
+
+
+def second_difference(view: EnvView, value_EL: Float[Tensor, "E L"]) -> Float[Tensor, "E L"]:
+    """Return the second derivative of a value by time over three env steps, 0 in the first two of an episode."""
+    rate_EL = change(view, "last_value_EL", value_EL) / view.step_dt
+    second_EL = change(view, "last_rate_EL", rate_EL) / view.step_dt
+    # A buffer's zero is neither a value nor a rate: the first rate, and the first two changes of it, mean nothing.
+    return torch.where(view.episode_step_E[:, None] <= 2, 0.0, second_EL)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ksim_rl.checked import NonNegative, Positive
+from ksim_rl.checked import NonNegative, Positive, Range
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
@@ -27,8 +27,14 @@ from ksim_rl.mdp.fields import (
     is_commanded,
     root_height,
 )
+from ksim_rl.mdp.rewards.joints import second_difference
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
+
+Turn = Literal["both", "roll", "pitch"]
+_RATE_COLUMNS = {"both": slice(0, 2), "roll": slice(0, 1), "pitch": slice(1, 2)}
+# A turn about x moves the vertical out of y, and the other way round.
+_TILT_COLUMNS = {"both": slice(0, 2), "roll": slice(1, 2), "pitch": slice(0, 1)}
 
 
 def tolerance(
@@ -143,16 +149,21 @@ class TrackJointPosition(OfCommand, OfJoints, GaussianReward):
 
 @dataclass(frozen=True, kw_only=True)
 class OfTilt(OfEntity):
-    """A reward of the tilt of a body; None is the root of `entity`."""
+    """A reward of the tilt of a body, or of its roll or pitch alone; None is the root of `entity`."""
 
     body: str | None = None
+    about: Turn = "both"
 
     def tilt(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Return |g_xy|^2, `g` the direction of gravity in the body's frame: the squared sine of the tilt."""
+        """Return |g_xy|^2, `g` the direction of gravity in the body's frame: the squared sine of the tilt.
+
+        Of a roll alone it is g_y^2, of a pitch g_x^2.
+        """
+        columns = _TILT_COLUMNS[self.about]
         if self.body is None:
-            return view.entity(self.entity).projected_gravity_EL[:, :2].square().sum(-1)
+            return view.entity(self.entity).projected_gravity_EL[:, columns].square().sum(-1)
         # The world's z axis in the body's frame: the z components of the body's x and y axes.
-        return view.body(self.body).axes_E33[:, :2, 2].square().sum(-1)
+        return view.body(self.body).axes_E33[:, columns, 2].square().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +190,24 @@ class RootHeightL2(OfEntity, RewardTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return (root_height(view, self.entity) - self.target_height).square()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootHeightInside(OfEntity, RewardTerm):
+    """1 while the root frame's height above the ground is inside `height`, m, [E]; outside it falls linearly.
+
+    It is 0 from `margin` (m) outside on; position stage.
+    """
+
+    height: Range
+    margin: Positive
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        low, high = self.height
+        height_E = root_height(view, self.entity)
+        return tolerance(
+            height_E, low=low, high=high, margin=self.margin, value_at_margin=0.0, shape="linear"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,10 +251,16 @@ class LinVelZL2(OfEntity, RewardTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class AngVelXYL2(OfEntity, RewardTerm):
-    """|w_xy|^2, `w` the root's angular velocity in its own frame, (rad/s)^2, [E]; velocity stage."""
+    """|w_xy|^2, `w` the root's angular velocity in its own frame, (rad/s)^2, [E]; velocity stage.
+
+    `about` takes the rate of roll, w_x^2, or of pitch, w_y^2, alone.
+    """
+
+    about: Turn = "both"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        return view.entity(self.entity).root_ang_vel_b_EL[:, :2].square().sum(-1)
+        columns = _RATE_COLUMNS[self.about]
+        return view.entity(self.entity).root_ang_vel_b_EL[:, columns].square().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,6 +299,20 @@ class LinkAccelerationL2(RewardTerm):
         last_EN3.copy_(vel_EN3)
         # The first step has no velocity before it: the buffer's zero is not one.
         return torch.where(view.episode_step_E <= 1, 0.0, acceleration_EN3.square().sum((-2, -1)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkJerkL2(RewardTerm):
+    """Sum over bodies of |j|^2, (m/s^3)^2, [E], `j` the change of `LinkAccelerationL2`'s acceleration per env step.
+
+    Velocity stage. 0 in the first two steps of an episode.
+    """
+
+    bodies: Patterns
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        vel_EL = view.bodies(self.bodies).lin_vel_EN3.flatten(start_dim=1)
+        return second_difference(view, vel_EL).square().sum(-1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -288,6 +288,7 @@ def why_not_fused(
     # Settings for which there are no kernels.
     refused = {
         "advantage": cfg.advantage != "gae",
+        "value_lmbda": cfg.value_lmbda is not None,
         "estimate_each_epoch": cfg.estimates_each_epoch,
         "normalize_advantage": cfg.normalize_advantage == "minibatch",
     }

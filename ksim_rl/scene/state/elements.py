@@ -158,6 +158,11 @@ class Bodies(_Elements):
         return self._state.derived().cvel_EL[:, self.index, 0:3]
 
     @quantity
+    def inertia_EN10(self) -> Float[Tensor, "E N 10"]:
+        """Inertias about the centres of mass of the bodies' trees, as MuJoCo's `cinert` has them."""
+        return self._state.derived().view("cinert")[:, self.index]
+
+    @quantity
     def subtree_com_pos_EN3(self) -> Float[Tensor, "E N 3"]:
         """Centres of mass of the bodies with all that hangs on them, m, world frame; position stage."""
         return self._state.derived().subtree_com_EL[:, self.index]
@@ -203,6 +208,12 @@ class Sites(_Elements):
     def pos_EN3(self) -> Float[Tensor, "E N 3"]:
         """Positions, m, world frame; position stage."""
         return self._state.derived().site_xpos_EL[:, self.index]
+
+    @quantity
+    def axes_EN33(self) -> Float[Tensor, "E N 3 3"]:
+        """The x, y and z axes of the sites, a unit vector each."""
+        # MuJoCo's matrix has the axes as columns, as that of bodies.
+        return self._state.derived().site_xmat_EL[:, self.index].view(-1, len(self), 3, 3).mT
 
     @quantity
     def height_EN(self) -> Float[Tensor, "E N"]:

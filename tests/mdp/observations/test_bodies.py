@@ -56,6 +56,26 @@ def test_orientations(chain):
         close(engine(bench, matrices), bench.world.qpos_EL.new_tensor(np.array(rows)))
 
 
+def test_orientations_of_sites(chain):
+    bench, _, _ = chain
+    names = ("right_foot", "imu") if bench.world.mj_model.nsite == 3 else ("tip", "eye")
+    ids = [bench.world.mj_model.site(name).id for name in names]
+
+    def six(d, turn):
+        return np.concatenate([(turn @ d.site_xmat[i].reshape(3, 3))[:, :2].T.ravel() for i in ids])
+
+    world = bench.read(mdp.SiteRotation6d(sites=names, frame="world"))
+    close(world, engine(bench, lambda m, d: six(d, np.eye(3))))
+    close(bench.read(mdp.SiteRotation6d(sites=names)), engine(bench, lambda m, d: six(d, rotation(d))))
+
+
+def test_inertias(chain):
+    bench, names, ids = chain
+    close(
+        bench.read(mdp.CenterOfMassInertia(bodies=names)), engine(bench, lambda m, d: d.cinert[ids].ravel())
+    )
+
+
 @pytest.mark.parametrize(("term", "part"), [(mdp.BodyLinVel, "linear"), (mdp.BodyAngVel, "angular")])
 def test_velocities(chain, term, part):
     bench, names, ids = chain

@@ -107,6 +107,36 @@ def test_swing_height_forgets_at_a_reset(boxes):
     assert value[1] > 2.0
 
 
+def test_the_highest_swing_earns_its_height_at_landing(boxes):
+    term = mdp.FootSwingPeak(sensor="touch", sites=("a", "b"), target_height=0.25, **GATE)
+    boxes.command([MOVING, IDLE])
+    earned = []
+    for low, high in ((0.0, 0.0), (0.02, 0.1), (0.0, 0.0), (0.0, 0.6), (0.0, 0.0), (0.0, 0.0)):
+        boxes.place(qpos=boxes_at(low, high), qvel=torch.zeros(12))
+        boxes.step()
+        height = float(boxes.world.site_xpos_EL[0, 1, 2])
+        earned.append((boxes.read(term, "rewards/swing").tolist(), height))
+    values = [value for value, _ in earned]
+    # Paid where the swing ends, for its peak, 0.25 m at most; box a swings lower, at the same time.
+    assert values[0] == values[1] == values[3] == values[5] == [0.0, 0.0]
+    assert values[2] == [pytest.approx(earned[1][1], abs=1e-6), 0.0]
+    assert values[4] == [pytest.approx(0.25), 0.0]
+
+
+def test_feet_are_too_close_if_any_two_are(make_bench):
+    bodies = "".join(
+        f'<body name="{name}" pos="0 {y} 0"><joint name="{name}" type="slide" axis="0 1 0"/>'
+        f'<geom size="0.01"/><site name="{name}"/></body>'
+        for name, y in (("a", 0), ("b", 1), ("c", 2))
+    )
+    bench = make_bench(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>", 3)
+    term = mdp.FeetTooClose(sites=("a", "b", "c"), min_distance=0.3)
+    bench.place(qpos=[(0, 0, 0), (0, 0.75, 0), (2.2, 0, 0)])
+    assert bench.read(term, "rewards/x").tolist() == [0.0, 1.0, 1.0]
+    with pytest.raises(ValueError, match="match one site: give at least two"):
+        bench.read(mdp.FeetTooClose(sites="a", min_distance=0.3), "rewards/x")
+
+
 def test_soft_landing_is_the_impact_force_at_touch_down_only(boxes):
     term = mdp.SoftLanding(sensor="touch", **GATE)
     boxes.command([MOVING, IDLE])

@@ -49,6 +49,33 @@ def test_acceleration_is_torque_by_inertia(wheels):
     check(wheels, mdp.JointAccL2(joints="right"), [4.0**2, 0.0], atol=1e-3)
 
 
+def test_jerk_is_the_second_difference_of_velocities(wheels):
+    # Velocities v(t) = (t^2, -2 t^2) in env steps of 0.02 s: second difference 2 and -4 rad/s per step^2.
+    term = mdp.JointJerkL2()
+    per_step2 = 0.02**2
+    for step in range(1, 5):
+        wheels.view.episode_step_E.fill_(step)
+        wheels.place(qvel=(step**2, -2.0 * step**2))
+        expected = 0.0 if step <= 2 else (2.0 / per_step2) ** 2 + (4.0 / per_step2) ** 2
+        torch.testing.assert_close(wheels.read(term, "rewards/jerk"), torch.full((2,), expected))
+
+
+def test_a_target_is_out_of_reach_beyond_what_speed_and_acceleration_allow(free_body):
+    term = mdp.UnreachableTargetL2(
+        max_velocity={"left_hip": 5.0, "right_hip": 0.0},
+        max_acceleration={"left_hip": 0.0, "right_hip": 100.0},
+    )
+    # An env step of 20 ms: 0.1 rad by speed, 0.02 rad by acceleration.
+    free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0.2, 0.4))
+    free_body.view.joint_pos_target_EL.copy_(torch.tensor([[0.25, 0.41], [0.4, 0.4], [0.2, 0.3]]))
+    free_body.view.episode_step_E.fill_(1)
+    check(free_body, term, [0.0, 0.0, 0.0])
+    free_body.view.episode_step_E.fill_(2)
+    # The joints have moved on to their targets; what counts is where the step began.
+    free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0.4, 0.3))
+    check(free_body, term, [0.0, 0.1**2, 0.08**2])
+
+
 def test_effort_and_force_differ_by_the_gear(wheels):
     check(wheels, mdp.JointEffortL2(), [37.0, 1.0])
     check(wheels, mdp.JointEffortL2(joints="right"), [1.0, 0.0])

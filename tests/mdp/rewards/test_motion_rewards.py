@@ -60,6 +60,17 @@ def test_links_of_a_falling_body_accelerate_with_gravity(free_body):
     check(free_body, term, [2 * 9.81**2, 0.0, 2 * 9.81**2], atol=0.05)
 
 
+def test_the_jerk_of_links_is_the_change_of_their_acceleration(free_body):
+    # The root's velocity is (t^2, 0, 0) in env steps, and "right" moves with it.
+    term = mdp.LinkJerkL2(bodies=("trunk", "right"))
+    for step in range(1, 5):
+        free_body.view.episode_step_E.fill_(step)
+        free_body.place(qpos=(0, 0, 9, 1, 0, 0, 0, 0, 0), qvel=(step**2, 0, 0, 0, 0, 0, 0, 0))
+        expected = 0.0 if step <= 2 else 2 * (2.0 / 0.02**2) ** 2
+        value = free_body.read(term, "rewards/jerk")
+        torch.testing.assert_close(value, torch.full((3,), expected), rtol=1e-4, atol=1e-3)
+
+
 def test_joints_may_move_unless_the_command_is_to_stand(free_body):
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0), qvel=(0, 0, 0, 0, 0, 0, 3, -4))
     free_body.command([[0.0, 0.0, 0.0], [0.03, 0.0, -0.02], [0.0, 0.04, 0.02]])
