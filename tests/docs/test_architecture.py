@@ -40,3 +40,20 @@ def test_the_drawing_has_each_room() -> None:
     modules = {file.stem for file in PACKAGE.glob("*.py")}
     assert rooms() <= drawn
     assert drawn <= rooms() | modules
+
+
+def test_the_reference_on_the_site_is_in_these_groups() -> None:
+    site = (REPOSITORY / "mkdocs.yml").read_text()
+    api = site.partition("  - API:\n")[2].partition("  - Changelog:")[0]
+    found: dict[str, str] = {}
+    for line in api.splitlines():
+        if heading := re.fullmatch(r"      - (\w+):", line):
+            group = heading[1].lower()
+        elif page := re.search(r"reference/([\w.]+)\.md", line):
+            found[page[1]] = group
+    for module, group in found.items():
+        # The doors `envs.tasks`, `envs.mdp` and their like lead to rooms of the same name.
+        door = module.split(".")[-1]
+        room = door if door in rooms() else module.split(".")[0]
+        assert group == house.group_of(room), module
+    assert set(found.values()) == set(house.GROUPS)
