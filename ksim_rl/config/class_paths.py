@@ -66,6 +66,7 @@ def find(
             f"{where}: only classes of these packages are built: {', '.join(sorted(allowed))}. {plugins.hint(package)}"
         )
     names: list[str] = []
+    declined: Any = None
     # The path as written, then the packages that may export the class now.
     for candidate in _modules(module_name):
         try:
@@ -82,8 +83,14 @@ def find(
         found = vars(module).get(class_name)
         if isinstance(found, type) and accepts(found) and found.__module__.split(".")[0] in allowed:
             return found
+        declined = declined or found
         # For the error: the names that would have been accepted.
         names += [name for name, value in vars(module).items() if isinstance(value, type) and accepts(value)]
+    if isinstance(declined, type) and not accepts(declined):
+        raise ValueError(
+            f"{where}: a class, and no {kind}: a config names the {kind} that makes such a thing, as docs/learning.md "
+            "has it for networks"
+        )
     if not names:
         raise ValueError(f"{where}: no module {module_name!r} with a {kind}")
     raise ValueError(f"{where}: no {kind} {class_name!r} there: {near(class_name, names)}")

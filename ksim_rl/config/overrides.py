@@ -11,6 +11,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from ksim_rl.checks import near
+from ksim_rl.config.class_paths import TARGET
 
 # Letters that a value of one word may hold without quotes.
 UNQUOTED = frozenset(string.ascii_letters + string.digits + "_/.:+-%*@?")
@@ -94,7 +95,12 @@ def check_key(tree: Mapping[str, Any], key: str) -> None:
         else:
             above = ".".join(parts[:depth])
             names = level if isinstance(level, Mapping) else ()
-            choices = [str(name) for name in names if name != "_target_"]
+            choices = [str(name) for name in names if name != TARGET]
+            # The class follows from the field so far: it is named by an entry that is added.
+            if part == TARGET and above:
+                raise ValueError(
+                    f"unknown field {key!r}: {above} names no class yet: add it, '+{above}.{TARGET}=...'"
+                )
             if above:
                 where = f"{above} has no field {part!r}: "
             else:

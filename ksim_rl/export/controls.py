@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from ksim_rl import mdp
-from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.view import EnvView
 from ksim_rl.export.describe import NotDescribedError, describe, joint_names, names_of
+from ksim_rl.export.task_transforms import lag
 from ksim_rl.mdp.actions import per_joint
 from ksim_rl.scene.actuators import (
     Actuator,
@@ -17,7 +18,7 @@ from ksim_rl.scene.actuators import (
 from ksim_rl.scene.actuators.builtin import BuiltinActuator
 from ksim_rl.scene.actuators.joint_drives import driven_joints
 from ksim_rl.scene.state.joint_control import TargetKind
-from ksim_rl.transforms import ActionClip, ActionDelay, ActionLowPass, DelayCfg
+from ksim_rl.transforms import DelayCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, history_cfg
 from ksim_rl.transforms.low_pass import smoothing
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
@@ -48,15 +49,6 @@ def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
     walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
     errors = {"walk_std": walk, "resolution": grain, "dropout": cfg.dropout, "lost": cfg.lost}
     return {**found, "bias": noise(cfg.bias, size), **errors}
-
-
-def lag(cfg: DelayCfg | None, shared: str | None = None) -> Plain | None:
-    """Return a lag in env steps."""
-    if cfg is None:
-        return None
-    # `initial` None: the first value of an episode fills the lag.
-    draws = {"resample_every": cfg.resample_every, "hold_probability": cfg.hold_probability}
-    return {"min": cfg.min_lag, "max": cfg.max_lag, **draws, "shared": shared, "initial": None}
 
 
 def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[Plain]:
@@ -98,29 +90,6 @@ def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[Plain]:
                     "history_length": frames.length if frames else 1,
                     "history_stride": frames.stride if frames else 1,
                 }
-            )
-    return found
-
-
-def action_chain(cfg: ManagerBasedRlEnvCfg) -> list[Plain]:
-    """Return the stages that an action passes on its way to the action terms, in this order."""
-    found: list[Plain] = []
-    # The transform that was appended last meets an action first.
-    for name, transform in reversed(list(cfg.transforms.items())):
-        kind = transform.transform
-        given = transform.arguments
-        if kind is ActionDelay:
-            found.append({"kind": "delay", **(lag(given["delay"]) or {}), "initial": given["initial"]})
-        elif kind is ActionLowPass:
-            found.append({"kind": "low_pass", "alpha": given["alpha"], "initial": given["initial"]})
-        elif kind is ActionClip:
-            low, high = given["clip"]
-            found.append({"kind": "clip", "low": low, "high": high})
-        # Transforms of rewards change nothing on the robot.
-        elif not kind.__name__.startswith("Reward"):
-            raise NotDescribedError(
-                f"task.transforms.{name}: {kind.__name__} has no description: an export takes ActionDelay, "
-                "ActionLowPass and ActionClip; use the fields of observation groups and action terms for the others"
             )
     return found
 

@@ -16,6 +16,7 @@ from ksim_rl.export import controls, policy
 from ksim_rl.export.describe import NotDescribedError, describe, joint_names
 from ksim_rl.export.record import Recording
 from ksim_rl.export.robot import write_robot
+from ksim_rl.export.task_transforms import TaskTransforms, check_equal, sort_transforms, with_transforms
 from ksim_rl.files.writing import check_folder, check_own, whole_folder
 from ksim_rl.physics import prepare_spec
 from ksim_rl.runs import record
@@ -28,6 +29,7 @@ from ksim_rl.scene.state.joint_control import joint_control
 from ksim_rl.terminal import show
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, UNLIMITED_EPISODE_STEPS, build_env
+from ksim_rl.trainers.run_cfg import RunCfg
 from ksim_rl.trainers.run_folder import Policy, policy_of
 
 STANDALONE = Path(__file__).parent / "standalone"
@@ -144,14 +146,24 @@ def _fill(
     cfg = dataclasses.replace(trained.cfg, task=dataclasses.replace(trained.cfg.task, curriculum={}))
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET
+    groups: list[Any] = cfg.modules.observation_keys("actor")
+    transforms = sort_transforms(cfg.task, groups)
+    for name in transforms.training_only:
+        note(f"task.transforms.{name} acts in training only, and is left out")
+    kept = {name: one for name, one in cfg.task.transforms.items() if name not in transforms.removed}
+    whole = cfg
+    cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, transforms=kept))
+    if transforms.in_policy:
+        note(f"made a part of the policy: task.transforms.{', task.transforms.'.join(transforms.in_policy)}")
+        _check_transforms(whole, cfg, transforms, groups, seed)
+    actor = with_transforms(trained.actor.cpu(), transforms)
     # At least as many envs as episodes are traced.
     env = build_env(cfg, num_envs=max(episodes, TRACED), seed=seed)
     ours = part(env, ManagerBasedRlEnv)
     assert ours is not None  # the env of a config is ours
-    groups: list[Any] = cfg.modules.observation_keys("actor")
     terms = {str(group): controls.observations(ours, [str(group)]) for group in groups}
     # Descriptions before files: a term without one is refused before minutes of work.
-    meta = metadata(ours, [term for of_group in terms.values() for term in of_group], note)
+    meta = metadata(ours, [term for of_group in terms.values() for term in of_group], transforms, note)
     columns = {
         group: [
             policy.Column(
@@ -165,7 +177,7 @@ def _fill(
         for group in groups
     }
     # In evaluation mode normalizers stop learning; on the CPU as the files are for it.
-    exported = policy.ExportedPolicy(trained.actor.cpu().eval(), columns)
+    exported = policy.ExportedPolicy(actor.eval(), columns)
     note("writing policy.onnx and policy.pt2")
     policy.write(exported, folder)
     difference = policy.greatest_difference(exported, folder / "policy.onnx")
@@ -201,7 +213,6 @@ def _fill(
         shared: dict[str, Any] = {"groups": groups, "order": order, "seed": seed}
         shared["joints"] = meta["joints"]["names"]
         shared["params"] = sorted({name for law in meta["actuators"] for name in law["numbers"]})
-        actor = trained.actor
         steps = ours.max_episode_length or UNLIMITED_EPISODE_STEPS
         recorded = Recording(env, ours, actor, steps=steps, **shared)
         figures = recorded.figures[:episodes]
@@ -229,6 +240,19 @@ def _fill(
     )
 
 
+def _check_transforms(
+    whole: RunCfg, reduced: RunCfg, transforms: TaskTransforms, groups: Sequence[Any], seed: int
+) -> None:
+    """Compare the env of a run with one whose transforms are parts of the policy."""
+    one = build_env(whole, num_envs=TRACED, seed=seed)
+    other = build_env(reduced, num_envs=TRACED, seed=seed)
+    try:
+        check_equal(one, other, transforms, groups)
+    finally:
+        one.close(raise_if_closed=False)
+        other.close(raise_if_closed=False)
+
+
 def runner_source() -> str:
     """Return the text of `runner.py`: the modules of the folder `standalone` as one."""
     *parts, runner = ((STANDALONE / f"{name}.py").read_text() for name in PARTS)
@@ -240,7 +264,10 @@ def runner_source() -> str:
 
 
 def metadata(
-    ours: ManagerBasedRlEnv, terms: list[dict[str, Any]], note: Callable[[str], None]
+    ours: ManagerBasedRlEnv,
+    terms: list[dict[str, Any]],
+    transforms: TaskTransforms,
+    note: Callable[[str], None],
 ) -> dict[str, Any]:
     """Return the description of the env; rewards, metrics and terminations without a description are left out.
 
@@ -292,7 +319,7 @@ def metadata(
         "joints": {"names": names, "default_pos": by_term[1], "limits": _limits(ours, names)},
         "observations": terms,
         "actions": actions,
-        "action_chain": controls.action_chain(cfg),
+        "action_chain": transforms.stages,
         "actuators": laws,
         "commands": {
             name: {"size": value.shape[-1], "kind": type(cfg.commands[name]).__name__}

@@ -8,6 +8,7 @@ from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.contract import part
 from ksim_rl.export import controls
 from ksim_rl.export.folder import metadata
+from ksim_rl.export.task_transforms import sort_transforms
 from ksim_rl.trainers.run_cfg import RunCfg
 
 
@@ -20,6 +21,9 @@ def say_lacks(cfg: RunCfg, env: EnvBase, note: Callable[[str], None]) -> None:
     groups = [str(group) for group in cfg.modules.observation_keys("actor")]
     # Describing is the part of an export that may fail; it writes nothing here.
     try:
-        metadata(ours, controls.observations(ours, groups), note)
+        transforms = sort_transforms(ours.cfg, groups)
+        for name in transforms.training_only:
+            note(f"task.transforms.{name} acts in training only: an export leaves it out")
+        metadata(ours, controls.observations(ours, groups), transforms, note)
     except ValueError as error:
         note(f"`ksim-rl export` will refuse this run: {error}")

@@ -14,7 +14,7 @@ from ksim_rl.checks import MISFITS, OneLineParser
 from ksim_rl.config.child_processes import run_python
 from ksim_rl.export.causes import Cause, find_causes
 from ksim_rl.export.folder import export, runner_source
-from ksim_rl.export.standalone.files import check_closed, read_arrays, read_json
+from ksim_rl.export.standalone.files import check_closed, lacking, read_arrays, read_json
 from ksim_rl.physics import load_spec
 from ksim_rl.terminal import printable, show
 from ksim_rl.trainers.other_physics import half_time_step, other_integrator, same_time_step
@@ -52,6 +52,8 @@ class Report:
         if self.physics:
             lines.append(f"which trained it: {self.physics}; single steps are compared in the same physics")
         lines.append(f"{'':<44}{'recorded':>12}{'C engine':>12}{'difference':>12}")
+        # A return without some terms is another one than training prints.
+        without = lacking({"left_out": self.left_out})
         for name, value in self.theirs.items():
             if name in self.ours:
                 own = self.ours[name]
@@ -60,7 +62,8 @@ class Report:
                     share = f"{value / own - 1.0:+.1%}"
                 else:
                     share = f"{value - own:+.3g}"
-                lines.append(f"{name:<44}{own:>12.4g}{value:>12.4g}{share:>12}")
+                line = f"{name:<44}{own:>12.4g}{value:>12.4g}{share:>12}"
+                lines.append(line + without if name == "return" else line)
         lines += [f"left out, since it has no description: {name}" for name in self.left_out]
         lines.append(f"return ratio {self.return_ratio:.4f} +- {self.standard_error:.4f} (standard error)")
         if self.causes:

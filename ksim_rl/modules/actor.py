@@ -27,8 +27,8 @@ from ksim_rl.modules.distributions import (
     TruncatedGaussian,
     VectorDistribution,
 )
-from ksim_rl.modules.mlp import Device, linear, mlp
-from ksim_rl.modules.network import ObservingNetwork, OnPolicyNetworkCfg
+from ksim_rl.modules.mlp import Device, linear
+from ksim_rl.modules.network import ObservingNetwork, OnPolicyNetworkCfg, built
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.transforms.specs import path_of
 
@@ -369,7 +369,7 @@ class PolicyNetwork(ObservingNetwork):
 
     def __init__(self, cfg: ActorCfg, *, obs_dim: int, head: nn.Module, device: Device = None) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
-        self.trunk = mlp(obs_dim, cfg.hidden_dims, None, activation=cfg.activation, device=device)
+        self.trunk, self.feature_dim = built(cfg, obs_dim, None, device=device)
         self.head = head
 
     def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> tuple[Float[Tensor, "*batch ?N"], ...]:
@@ -398,14 +398,9 @@ def make_actor(
         if action_dim is None:
             raise ValueError("make_actor needs action_spec, or action_dim")
         action_spec = Unbounded(action_dim)
-    # Without hidden layers the head reads the observations themselves.
-    if cfg.hidden_dims:
-        feature_dim = cfg.hidden_dims[-1]
-    else:
-        feature_dim = obs_dim
     # Drawn after the layers below it, so that one seed gives the same network whatever the head.
     network = PolicyNetwork(cfg, obs_dim=obs_dim, head=nn.Identity(), device=device)
-    network.head, action_keys = make_head(cfg, action_spec, feature_dim, device=device)
+    network.head, action_keys = make_head(cfg, action_spec, network.feature_dim, device=device)
     return make_probabilistic(network, list(cfg.in_keys), action_keys, action_spec)
 
 

@@ -98,7 +98,10 @@ def _observation(tensordict: TensorDictBase, module: TensorDictModule, dim: int)
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkCfg(Checked):
-    """The fields of the configs of all networks, which can normalize observations by running statistics inside."""
+    """The fields of the configs of all networks, which can normalize observations by running statistics inside.
+
+    A subclass with a `build` of its own makes any network of it, and configs name it by `_target_`.
+    """
 
     hidden_dims: tuple[Count, ...] = (512, 256, 128)
     activation: str = "elu"
@@ -109,6 +112,41 @@ class NetworkCfg(Checked):
         # The class is frozen; a config file gives a list.
         object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
         check_choice("activation", self.activation, ACTIVATIONS)
+
+    def build(self, input_dim: int, output_dim: int | None, **options: Any) -> nn.Module:
+        """Return the layers, which map [..., input_dim] to [..., output_dim]: here an `mlp` of these fields.
+
+        Without `output_dim`, as an actor needs them below its head, they give features of any width. `options` are
+        others of `mlp`: "device", where the weights belong, and perhaps "output_gain", "layer_norm" and "num_networks".
+        """
+        return mlp(input_dim, self.hidden_dims, output_dim, activation=self.activation, **options)
+
+
+def built(cfg: NetworkCfg, input_dim: int, output_dim: int | None, **options: Any) -> tuple[nn.Module, int]:
+    """Return the layers that a config builds, and the width of their outputs.
+
+    A ValueError tells where they give another shape than [..., output_dim].
+    """
+    layers = cfg.build(input_dim, output_dim, **options)
+    maker = f"{type(cfg).__name__}.build(input_dim={input_dim}, output_dim={output_dim})"
+    if not isinstance(layers, nn.Module):
+        raise ValueError(f"{maker} returns a {type(layers).__name__}: expected a torch.nn.Module")
+    # Tried on two rows; statistics of batches stay as they are.
+    layers.eval()
+    try:
+        with torch.no_grad():
+            outputs = layers(torch.zeros(2, input_dim, device=options.get("device")))
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(f"{maker}: it cannot map observations [2, {input_dim}]: {error}") from error
+    finally:
+        layers.train()
+    expected = "[2, number of features]" if output_dim is None else f"[2, {output_dim}]"
+    if not isinstance(outputs, Tensor):
+        raise ValueError(f"{maker}: it gives a {type(outputs).__name__}, and no tensor {expected}")
+    fits = outputs.ndim == 2 and len(outputs) == 2 and output_dim in (None, outputs.shape[-1])
+    if not fits:
+        raise ValueError(f"{maker}: it maps [2, {input_dim}] to {list(outputs.shape)}: expected {expected}")
+    return layers, outputs.shape[-1]
 
 
 def _hashable(key: str | Sequence[str]) -> str | tuple[str, ...]:
@@ -143,10 +181,10 @@ class OffPolicyNetworkCfg(NetworkCfg, hidden_dims=(256, 256), activation="relu")
     layer_norm: bool = False
     output_gain: NonNegative = 1.0
 
-    def build(self, input_dim: int, output_dim: int, **options: Any) -> nn.Sequential:
-        """Return the `mlp` of these fields; `options` are its others."""
+    def build(self, input_dim: int, output_dim: int | None, **options: Any) -> nn.Module:
+        """Return the layers: see `NetworkCfg.build`."""
         options |= {"layer_norm": self.layer_norm, "output_gain": self.output_gain}
-        return mlp(input_dim, self.hidden_dims, output_dim, activation=self.activation, **options)
+        return super().build(input_dim, output_dim, **options)
 
 
 class ObservingNetwork(nn.Module):
@@ -189,14 +227,13 @@ class SharedTrunkCfg(OnPolicyNetworkCfg):
 
 
 class LayeredNetwork(ObservingNetwork):
-    """Maps observations [..., L_i] to the outputs of an MLP of the config's layers; `options` are for `mlp`."""
+    """Maps observations [..., L_i] to the outputs of the layers that the config builds; `options` are for `build`."""
 
     def __init__(
         self, cfg: NetworkCfg, *, obs_dim: int, output_dim: int | None, device: Device = None, **options: Any
     ) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
-        options |= {"activation": cfg.activation, "device": device}
-        self.layers = mlp(obs_dim, cfg.hidden_dims, output_dim, **options)
+        self.layers, self.output_dim = built(cfg, obs_dim, output_dim, device=device, **options)
 
     def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch M"]:
         """Return the outputs for observations that stand side by side."""

@@ -143,6 +143,8 @@ def test_a_reward_without_a_description_counts_on_neither_side(tmp_path):
 
     report = report_of(exported("cartpole_balance", tmp_path / "export", change=change), episodes=4)
     assert report.left_out == ["rewards.riddle"] and report.ours["reward/riddle"] > 0
+    (line,) = [line for line in report.table().splitlines() if line.startswith("return  ")]
+    assert line.endswith("  without riddle")
     assert report.return_ratio == pytest.approx(1.0, abs=1e-3)
 
 

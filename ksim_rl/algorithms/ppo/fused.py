@@ -112,6 +112,8 @@ def fused_networks(
     # Exact types: a subclass may compute something else.
     if type(policy) is not PolicyNetwork or type(value) is not ValueNetwork:
         return NotFused("the networks are not those of make_actor and make_critic")
+    if any(type(layers) is not nn.Sequential for layers in (policy.trunk, value.layers)):
+        return NotFused("the networks are of layers of their own")
     head: Any = policy.head
     if type(head) not in (GaussianHead, TanhGaussianHead):
         return NotFused(f"the policy is no {DiagonalGaussian.__name__} or {TanhGaussian.__name__}")

@@ -63,10 +63,10 @@ def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSe
     trunk = None
     shared = 0
     if modules.trunk is not None:
-        shared = modules.trunk.hidden_dims[-1]
         trunk = make_shared_trunk(
             modules.trunk, obs_dim=observation_dim(spec, modules.trunk.in_keys), device=device
         )
+        shared = trunk.module.output_dim
 
     def width(keys: tuple[ObservationKey, ...]) -> int:
         # The trunk's features are no observation of the env, and have their own width.

@@ -225,3 +225,10 @@ def _check_shape(path: Path, name: str, value: Array, shape: tuple[int, ...]) ->
     # MuJoCo would only warn about NaN, and reset the state.
     if not np.isfinite(value).all():
         raise ValueError(f"{path}: {name!r} holds numbers that are not finite")
+
+
+def lacking(meta: dict[str, Any]) -> str:
+    """Return the end of a return's line, which names the rewards that are not in it; nothing where all are."""
+    names = [str(name) for name in meta.get("left_out", ())]
+    rewards = [name.removeprefix("rewards.") for name in names if name.startswith("rewards.")]
+    return f"  without {', '.join(rewards)}" if rewards else ""
