@@ -35,6 +35,13 @@ def new(arguments: list[str]) -> int:
     parser.add_argument(
         "--pose", metavar="NAME", help='the keyframe to stand in, or "qpos0"; default: the first that stands'
     )
+    parser.add_argument(
+        "--drop",
+        metavar="BODY",
+        action="append",
+        default=[],
+        help="leave a body out, such as a prop; repeatable",
+    )
     parser.add_argument("--name", help="of the package; default: that of the model")
     parser.add_argument("--output", type=Path, help="the new folder; default: the package's name, here")
     options = parser.parse_args(arguments)
@@ -46,7 +53,7 @@ def new(arguments: list[str]) -> int:
     if folder.exists():
         raise ValueError(f"{folder}: exists already; choose another folder with --output")
     with shown_working(f"analysing {options.model}"):
-        found = analyse(options.model, pose=options.pose)
+        found = analyse(options.model, pose=options.pose, drop=options.drop)
     robot = replace(found.robot, name=name, model=MODEL)
     # Standing through the whole trial; else the package has no test that asks for it.
     stands = found.stands_s >= TRIAL_S

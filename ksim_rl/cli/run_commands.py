@@ -224,6 +224,13 @@ def robot(arguments: list[str]) -> int:
     parser.add_argument(
         "--pose", metavar="NAME", help='the keyframe to stand in, or "qpos0"; default: the first that stands'
     )
+    parser.add_argument(
+        "--drop",
+        metavar="BODY",
+        action="append",
+        default=[],
+        help="leave a body out, such as a prop; repeatable",
+    )
     parser.add_argument("--code", action="store_true", help="print Python to paste, in place of the table")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw the stance into this file")
     options = parser.parse_args(arguments)
@@ -231,7 +238,7 @@ def robot(arguments: list[str]) -> int:
         raise ValueError(f"--picture {options.picture}: expected a file that ends in .png")
     # Trials of several poses take seconds.
     with shown_working(f"analysing {options.model}"):
-        found = analyse(options.model, pose=options.pose)
+        found = analyse(options.model, pose=options.pose, drop=options.drop)
     show(found.code() if options.code else found.table(), end="")
     if options.picture is not None:
         found.draw(options.picture)

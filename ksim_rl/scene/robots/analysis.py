@@ -4,6 +4,7 @@ import dataclasses
 import io
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -178,8 +179,10 @@ TASK = velocity.VelocityTask.for_robot({name})
             picture.save(temporary)
 
 
-def analyse(source: Source, *, pose: str | None = None) -> RobotAnalysis:
+def analyse(source: Source, *, pose: str | None = None, drop: Sequence[str] = ()) -> RobotAnalysis:
     """Analyse a legged robot from a source for `physics.load_spec`: a file, a menagerie name, XML or a spec.
+
+    Bodies to `drop` are left out, with all that hangs on them: props with a free joint of their own, for instance.
 
     Keyframes and the model's own pose, "qpos0", are tried in this order, but for those in which the robot lies; the
     first from which it stands is taken, or else that from which it stands longest. `pose` names the one to take.
@@ -188,7 +191,7 @@ def analyse(source: Source, *, pose: str | None = None) -> RobotAnalysis:
     motor under PD control. They are raised where the load would bend a joint by more than `MOST_SAG`, to twice the
     stiffness that keeps a joint's load from toppling over it, and in the legs until the robot stands.
     """
-    model = read_model(source)
+    model = read_model(source, drop)
     found: list[RobotAnalysis] = []
     refused: list[ValueError] = []
     for start in starting_poses(model.mj_model, pose):
@@ -391,6 +394,7 @@ def _robot(
         foot_sites=tuple(leg.foot for leg in anatomy.legs),
         collision_geoms=(*anatomy.hulls, *soles),
         sites=tuple(sites),
+        dropped=model.dropped,
         free_root=model.frees_root,
         root_turn=model.root_turn,
     )

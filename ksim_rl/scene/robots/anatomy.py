@@ -158,9 +158,15 @@ def _root_of(mj_model: mujoco.MjModel) -> int:
         return int(mj_model.jnt_bodyid[free[0]])
     if not bodies:
         raise ValueError(NO_FREE_JOINT)
+    # The robot has most of the joints; props have their free one alone.
+    trees = mj_model.body_rootid[mj_model.jnt_bodyid]
+    joints = {name: int((trees == mj_model.body(name).id).sum()) for name in bodies}
+    robot = max(bodies, key=lambda name: joints[name])
+    props = [name for name in bodies if name != robot]
+    flags = " ".join(f"--drop {name}" for name in props)
     raise ValueError(
         f"the model has {len(bodies)} free joints, of the bodies {', '.join(bodies)}: expected one, that of the "
-        "robot's root body; delete the others' bodies from a copy of the file"
+        f"robot's root body; leave the others out by {flags} (in Python: analyse(..., drop={props!r}))"
     )
 
 

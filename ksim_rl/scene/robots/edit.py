@@ -17,6 +17,8 @@ from ksim_rl.scene.state.joint_control import control_of_spec
 
 Vector = tuple[float, ...]
 BALL_AT_REST = (1.0, 0.0, 0.0, 0.0)
+VISIBLE = 2
+"""The group of robots' visual geoms; those up to it are shown by custom."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,11 +187,20 @@ def drop_references(spec: mujoco.MjSpec, kind: mujoco.mjtObj, names: Collection[
             spec.delete(entry)
 
 
+def drop_bodies(spec: mujoco.MjSpec, names: Iterable[str]) -> None:
+    """Delete bodies with all that hangs on them and refers to them; keyframes keep the columns of what stays."""
+    for name in names:
+        check_known("body", name, [body.name for body in spec.bodies])
+        # MuJoCo deletes sensors, actuators, tendons, pairs and equalities along, and columns of keyframes.
+        spec.delete(spec.body(name))
+
+
 def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom]) -> None:
     """Delete all geoms that can collide and add `geoms`; visual geoms, masses and inertias of all bodies stay.
 
-    What a tendon wraps around stays too, and collides no more. Explicit pairs of geoms are contacts of the old ones,
-    and go with them, as sensors of the old ones do.
+    What a tendon wraps around stays too, and collides no more, as do the geoms of bodies of which one would see nothing
+    without them; these lose their names. Explicit pairs of geoms are contacts of the old ones, and go with them, as
+    sensors of the old ones do.
     """
     bodies = {body.name: body for body in spec.bodies}
     for geom in geoms:
@@ -204,8 +215,14 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
     deleted = {geom.name for geom in colliding if geom.name not in wrapped}
     # Geoms without names have no references.
     drop_references(spec, mujoco.mjtObj.mjOBJ_GEOM, deleted - {""})
+    looks = {geom.parent.name for geom in spec.geoms if geom not in colliding and geom.group <= VISIBLE}
     for geom in colliding:
         if geom.name in wrapped:
+            geom.contype = geom.conaffinity = 0
+        elif geom.group <= VISIBLE and geom.parent.name not in looks:
+            # Files without visual geoms show what collides; a new geom may want the name.
+            geom.name = ""
+            geom.group = VISIBLE
             geom.contype = geom.conaffinity = 0
         else:
             spec.delete(geom)

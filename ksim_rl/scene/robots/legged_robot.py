@@ -94,9 +94,10 @@ class MenagerieRobot(Checked):
 class ModelRobot(MenagerieRobot):
     """The same with all facts as fields, such as `analyse` proposes them; `model` is a source for `load_spec`.
 
-    Bodies and joints without a name are called by kind and place, such as "body3". `free_root` frees a base that the
-    model fixes to the world, and `root_turn` (w, x, y, z) turns the frame of the root, see `turn_root`. The model's
-    own actuators are replaced as a whole; joints that `actuators` leave out are passive.
+    Bodies and joints without a name are called by kind and place, such as "body3". `dropped` bodies, such as props, are
+    left out with all that hangs on them. `free_root` frees a base that the model fixes to the world, and `root_turn`
+    (w, x, y, z) turns the frame of the root, see `turn_root`. The model's own actuators are replaced as a whole; joints
+    that `actuators` leave out are passive.
     """
 
     name: str
@@ -109,11 +110,13 @@ class ModelRobot(MenagerieRobot):
     sites: tuple[edit.Site, ...]
     imu: str = "imu"
     overlaps: tuple[tuple[str, str], ...] = ()
+    dropped: tuple[str, ...] = ()
     free_root: bool = False
     root_turn: tuple[float, float, float, float] = UPRIGHT
 
     def _ready(self, spec: mujoco.MjSpec) -> None:
         name_all(spec)
+        edit.drop_bodies(spec, self.dropped)
         if self.free_root:
             free_root(spec, self.root_body)
         if self.root_turn != UPRIGHT:

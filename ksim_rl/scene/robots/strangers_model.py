@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from ksim_rl.physics.load import Source
 from ksim_rl.physics.model_files.source import is_xml, read_source
 from ksim_rl.physics.model_files.urdf import is_urdf
 from ksim_rl.scene.names import TO_JOINTS
-from ksim_rl.scene.robots.edit import reset_options
+from ksim_rl.scene.robots.edit import drop_bodies, reset_options
 from ksim_rl.scene.robots.upright_root import (
     UPRIGHT,
     Quaternion,
@@ -29,7 +30,7 @@ from ksim_rl.scene.robots.upright_root import (
 class StrangersModel:
     """A model with names for all, a free root, and the task's options; `source` is its source for `load_spec`.
 
-    `frees_root` and `root_turn` are changes to it, as `ModelRobot` has them, and `notes` say so.
+    `dropped`, `frees_root` and `root_turn` are changes to it, as `ModelRobot` has them, and `notes` say so.
     """
 
     name: str
@@ -37,6 +38,7 @@ class StrangersModel:
     spec: mujoco.MjSpec
     mj_model: mujoco.MjModel
     notes: tuple[str, ...]
+    dropped: tuple[str, ...] = ()
     frees_root: bool = False
     root_turn: Quaternion = UPRIGHT
 
@@ -63,8 +65,11 @@ class StrangersModel:
         return model, turned
 
 
-def read_model(source: Source) -> StrangersModel:
-    """Read a robot's model from a source for `load_spec`; a URDF file's base is freed, since URDF cannot say so."""
+def read_model(source: Source, drop: Sequence[str] = ()) -> StrangersModel:
+    """Read a robot's model from a source for `load_spec`, without some bodies.
+
+    A URDF file's base is freed, since URDF cannot say that it is free.
+    """
     spec = load_spec(source)
     name = robot_name(source, spec)
     # A spec has no file that could be named again, so its text is kept.
@@ -77,6 +82,9 @@ def read_model(source: Source) -> StrangersModel:
     reset_options(spec)
     if named := name_all(spec):
         notes.append(f"no names, so they get these: {', '.join(named)}")
+    drop_bodies(spec, drop)
+    if drop:
+        notes.append(f"left out, with all that hangs on them: {', '.join(drop)}")
     # Only URDF cannot say that its base is free; a fixed MJCF model is meant to be.
     root = fixed_root(spec)
     frees = root is not None and not isinstance(source, mujoco.MjSpec) and is_urdf(read_source(source).text)
@@ -96,6 +104,7 @@ def read_model(source: Source) -> StrangersModel:
         spec=spec,
         mj_model=load_model(spec),
         notes=tuple(notes),
+        dropped=tuple(drop),
         frees_root=frees,
     )
 

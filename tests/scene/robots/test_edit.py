@@ -53,7 +53,8 @@ def test_replaced_geoms_ignore_default_classes_and_keep_looks_and_mass(spec):
     )
     edit.replace_collision_geoms(spec, (ball, rod))
     model = spec.compile()
-    assert {model.geom(i).name for i in range(model.ngeom)} == {"look", "ball", "rod"}
+    # What alone one sees of a body stays, without its name.
+    assert {model.geom(i).name for i in range(model.ngeom)} == {"look", "", "ball", "rod"}
     np.testing.assert_allclose(model.body_mass, before)
     plain = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><geom name='ball' size='0.05'/></worldbody></mujoco>"

@@ -296,3 +296,56 @@ def test_the_base_of_a_urdf_file_is_freed(tmp_path):
     assert {joint.effort_limit for joint in found.joints} == {40.0}
     mj_model = found.robot.spec().compile()
     assert mj_model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and mj_model.nv == 14
+
+
+# -- props, and what one sees ------------------------------------------------------------------------------------
+
+
+PROP = """<body name="{name}" pos="1 0 0.2"><freejoint/><geom name="{name}" size="0.1" mass="1"/></body>"""
+KEY = """<keyframe><key name="up" qpos="{first}0 0 0.5 1 0 0 0 0.1 -0.2 0.1 -0.2 0.1 -0.2 0.1 -0.2"/></keyframe>"""
+
+
+def with_props(*props: str) -> str:
+    text = dog(extra=KEY.format(first="1 0 0.2 1 0 0 0 " * len(props)))
+    bodies = "".join(PROP.format(name=name) for name in props)
+    return text.replace("<worldbody>", f"<worldbody>{bodies}", 1)
+
+
+def test_props_are_named_and_may_be_dropped():
+    text = with_props("ball", "cube")
+    with pytest.raises(ValueError, match="3 free joints.*by --drop ball --drop cube"):
+        analyse(text)
+    found = analyse(text, drop=("ball", "cube"))
+    alone = analyse(with_props())
+    assert found.robot.dropped == ("ball", "cube") and "left out" in " ".join(found.notes)
+    assert found.mass == alone.mass and found.stands_s == alone.stands_s
+    ours, theirs = found.robot.spec().compile(), alone.robot.spec().compile()
+    np.testing.assert_allclose(ours.key_qpos, theirs.key_qpos)
+    assert names(ours, "body", ours.nbody) == names(theirs, "body", theirs.nbody)
+
+
+def test_a_body_to_drop_that_is_not_there_gets_the_near_names():
+    with pytest.raises(ValueError, match="unknown body 'bal'.*'ball'"):
+        analyse(with_props("ball"), drop=("bal",))
+
+
+def test_robots_without_visual_geoms_keep_their_looks_and_inertia():
+    robot = analyse(dog()).robot
+    given = mujoco.MjModel.from_xml_string(dog())
+    made = robot.spec().compile()
+    for number in range(1, given.nbody):
+        name = given.body(number).name
+        own = made.geom_bodyid == made.body(name).id
+        seen = own & (made.geom_group <= 2)
+        assert seen.sum() == (given.geom_bodyid == number).sum(), name
+        assert not (made.geom_contype[seen] | made.geom_conaffinity[seen]).any()
+        assert made.body(name).mass == pytest.approx(given.body(name).mass)
+        np.testing.assert_allclose(made.body(name).inertia, given.body(name).inertia, rtol=1e-6)
+
+
+def test_visual_geoms_of_a_file_are_all_that_one_sees():
+    both = TOE + '<geom name="look_{name}" size="0.03" contype="0" conaffinity="0" group="2" mass="0"/>'
+    spec = mujoco.MjSpec.from_string(dog(foot=both.replace("_{name}", "")).replace('name="look"', ""))
+    replace_collision_geoms(spec, [])
+    shanks = [geom for geom in spec.geoms if geom.parent.name.endswith("shank")]
+    assert len(shanks) == 4 and all(geom.group == 2 and not geom.contype for geom in shanks)
