@@ -86,6 +86,7 @@ TESTS = {
         "gather_controls": SINGLE_MODELS,
         "leave_out_rows": SINGLE_MODELS,
         "loosen_rowless": SINGLE_MODELS,
+        "rate_exact_filters": SINGLE_MODELS,
         "shifted_time": SINGLE_MODELS,
         "sparse_velocity": SINGLE_MODELS,
         "spread_columns": SINGLE_MODELS,

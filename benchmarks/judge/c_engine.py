@@ -88,11 +88,13 @@ def run(
 
 
 def touched_accepted(mj_model: mujoco.MjModel, state: Mapping[str, np.ndarray], substeps: int) -> bool:
-    """Return whether contacts that may differ are there in a substep before the last one."""
+    """Return whether what may differ is there in a substep before the last one: contacts, or rows without weight."""
     mj_data = put(state, mj_model)
     for _ in range(substeps - 1):
         mujoco.mj_step(mj_model, mj_data)
         contact = mj_data.contact
+        if accepted.has_weightless_rows(mj_data):
+            return True
         if accepted.depths(np.array(contact.geom), np.array(contact.dist), mj_model.geom_type):
             return True
     return False

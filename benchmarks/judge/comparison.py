@@ -13,8 +13,12 @@ from benchmarks.judge.worlds import Arrays, perturbed
 DIRECT, SOLVED = 1e-4, 1e-3
 # How many times the change that rounding makes in C.
 TIMES = 30.0
-# The least scale of a quantity, in its units.
+# The least scale of a quantity, in its units; of what a sensor reads, that of the quantity that it is made of.
 LEAST_SCALE = {"qacc": 10.0, "cacc": 10.0, "cfrc_int": 5.0, "cfrc_ext": 5.0}
+LEAST_SCALE |= dict.fromkeys(("sensor force", "sensor torque"), LEAST_SCALE["cfrc_int"])
+LEAST_SCALE |= dict.fromkeys(
+    ("sensor accelerometer", "sensor framelinacc", "sensor frameangacc"), LEAST_SCALE["cacc"]
+)
 # What follows from poses, and from the state that a substep starts from.
 OF_POSES = (
     *(
@@ -57,8 +61,13 @@ class Finding:
     @property
     def kind(self) -> str:
         """What a shrunk model must still fail in: the quantity, of sensors their type."""
-        words = self.quantity.split()
-        return " ".join(words[:2]) if words[0] == "sensor" else words[0]
+        return kind_of(self.quantity)
+
+
+def kind_of(quantity: str) -> str:
+    """Return a quantity without the name of a sensor: of sensors their type."""
+    words = quantity.split()
+    return " ".join(words[:2]) if words[0] == "sensor" else words[0]
 
 
 def limit_of(mj_model: mujoco.MjModel, quantity: str, substeps: int) -> float:
@@ -117,12 +126,13 @@ def differences(
 
 
 def scales_of(worlds: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
-    """Return the scale of each quantity: its largest value in C's worlds, and 1 at least."""
+    """Return the scale of each quantity: its largest value in C's worlds, and the least one of its kind at least."""
     found: dict[str, float] = {}
     for quantities in worlds:
         for name, value in quantities.items():
             largest = float(np.abs(value).max(initial=0.0))
-            found[name] = max(found.get(name, LEAST_SCALE.get(name, 1.0)), largest)
+            least = LEAST_SCALE.get(kind_of(name), 1.0)
+            found[name] = max(found.get(name, least), largest)
     return found
 
 

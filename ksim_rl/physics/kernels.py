@@ -6,6 +6,7 @@
 
 from collections.abc import Sequence
 
+import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
@@ -17,6 +18,8 @@ HAS_ROWS = int(upstream.ContactType.CONSTRAINT)
 UPRIGHT = wp.constant(1.0e-6)
 # No contact is so deep, m, that it has rows below this margin.
 NO_ROWS = wp.constant(-1.0e10)
+# Least time constant of a filter, s.
+MINVAL = wp.constant(float(mujoco.mjMINVAL))
 
 
 @wp.kernel(enable_backward=False)
@@ -220,3 +223,26 @@ def shifted_time(before: wp.array[float], timestep: wp.array[float], fraction: f
     """Write each world's time, some timesteps later."""
     world = wp.tid()
     time[world] = before[world] + fraction * timestep[world % timestep.shape[0]]
+
+
+@wp.kernel(enable_backward=False)
+def rate_exact_filters(
+    actuators: wp.array[int],
+    actadr: wp.array[int],
+    dynprm: wp.array2d[upstream.vec10],
+    timestep: wp.array[float],
+    act_dot: wp.array2d[float],
+    fraction: float,
+    act: wp.array2d[float],
+):
+    """Move exact filters by their rate over a fraction of the timestep.
+
+    They were moved by that fraction of their exact path over all of it.
+    """
+    world, i = wp.tid()
+    actuator = actuators[i]
+    h = timestep[world % timestep.shape[0]]
+    tau = wp.max(dynprm[world % dynprm.shape[0], actuator][0], MINVAL)
+    exact = tau * (1.0 - wp.exp(-h / tau))
+    column = actadr[actuator]
+    act[world, column] = act[world, column] + fraction * act_dot[world, column] * (h - exact)

@@ -25,6 +25,8 @@ ENUM_FIELDS = {
     "sensor_type": mujoco.mjtSensor,
 }
 MOST_TIMESTEP = 0.1
+# Below this, in 1/kg, a weight is rounding error.
+WEIGHTLESS = 1e-12
 # Numbers that nobody means to be negative.
 _OPTIONS = (
     "iterations ls_iterations ccd_iterations noslip_iterations sdf_iterations sdf_initpoints density viscosity "
@@ -221,6 +223,29 @@ def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) 
             f"per_world_fields has {moving[0]!r}, but {_element(mj_model, 'body', int(simple[0]))} is compiled as "
             "simple, with its centre of mass fixed at its origin: call prepare_spec(spec, per_world_fields) before "
             'compiling, or set simple="false" in its XML'
+        )
+
+
+def warn_of_weightless(mj_model: mujoco.MjModel, pairs: np.ndarray) -> None:
+    """Warn of a geom on a body that turns about its centre of mass where it may touch what is fixed.
+
+    No joint moves that centre, so that MuJoCo gives the contact no weight, and takes it for as hard as numbers allow.
+
+    Args:
+        mj_model: the model.
+        pairs: the geoms that may touch, [N, 2].
+    """
+    bodies = mj_model.geom_bodyid[pairs]
+    moves = (mj_model.body_treeid[bodies] >= 0).any(-1)
+    weightless = mj_model.body_invweight0[bodies, 0].sum(-1) < WEIGHTLESS
+    found = np.flatnonzero(moves & weightless)
+    if found.size:
+        first, second = (_element(mj_model, "geom", int(geom)) for geom in pairs[found[0]])
+        warnings.warn(
+            f"{first} and {second} may touch, of which one is fixed and the other turns about its centre of mass: "
+            "MuJoCo gives their contact no weight, and its forces are rounding error, in C too. Move the joint away "
+            "from the centre of mass, or keep the two apart by contype, conaffinity or <exclude/>",
+            stacklevel=3,
         )
 
 

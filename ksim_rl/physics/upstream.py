@@ -63,6 +63,7 @@ from mujoco_warp._src.types import Stage as Stage
 
 # The type of a contact's friction and of its impedance.
 from mujoco_warp._src.types import vec5 as vec5
+from mujoco_warp._src.types import vec10 as vec10
 from torch import Tensor
 
 GEOM_TYPES = {kind.name: int(kind) for kind in mjw.GeomType}

@@ -24,7 +24,7 @@ from ksim_rl.physics.constants.masked_constants import MaskedConstants
 from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.field_effects import as_if_drawn
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields
-from ksim_rl.physics.model_checks import warp_model_of
+from ksim_rl.physics.model_checks import warn_of_weightless, warp_model_of
 from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
@@ -81,6 +81,7 @@ class WarpWorld(World):
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
         with memory_for(num_envs, self.device), warp_scope(self.device):
             self.warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
+            warn_of_weightless(self.mj_model, self.warp_model.nxn_geom_pair_filtered.numpy())
             with as_if_drawn(self.warp_model, expanded):
                 follow_the_c_engine(self.warp_model)
             switch_off(self.mj_model, self.warp_model)

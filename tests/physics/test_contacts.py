@@ -1,5 +1,7 @@
 """Contacts that MuJoCo Warp alone finds otherwise are those of the C engine."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
@@ -228,3 +230,25 @@ def test_all_pairs_make_contacts_and_rows_where_joints_can_heed_them(one_kernel:
             ]
         np.testing.assert_allclose(world.last_substep("qacc")[row], mj_data.qacc, rtol=1e-3, atol=1e-3)
         np.testing.assert_allclose(world.sensordata_EL[row], mj_data.sensordata, rtol=1e-3, atol=1e-2)
+
+
+BEAM = (
+    '<mujoco><worldbody><geom name="ground" type="plane" size="1 1 1"/><body pos="0 0 1">{joint}'
+    '<geom name="beam" type="capsule" size="0.05 0.1" euler="0 90 0" pos="{off} 0 0"/></body></worldbody></mujoco>'
+)
+HINGE = '<joint axis="0 1 0"/>'
+
+
+@pytest.mark.parametrize(
+    ("joint", "off", "warns"), ((HINGE, 0.0, True), (HINGE, 0.02, False), ("<freejoint/>", 0.0, False))
+)
+def test_what_turns_about_its_centre_of_mass_and_may_touch_the_ground_is_warned_of(
+    joint: str, off: float, warns: bool
+) -> None:
+    mj_model = load_model(BEAM.format(joint=joint, off=off))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        World(mj_model, num_envs=1, sim=SimCfg(engine="warp"))
+    told = [str(warning.message) for warning in caught if "no weight" in str(warning.message)]
+    assert len(told) == warns
+    assert all("geom 'ground' and geom 'beam' may touch" in text for text in told)

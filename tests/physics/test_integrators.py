@@ -103,10 +103,12 @@ def test_what_acts_on_a_body_as_a_whole_is_implicit(
     step_and_check(xml, KERNELS[kernels], speed=3.0)
 
 
-def test_runge_kutta_leaves_the_rates_of_its_last_stage() -> None:
+@pytest.mark.parametrize("flag", ("", '<flag sleep="enable"/>'))
+@pytest.mark.parametrize("kind", ("filter", "filterexact"))
+def test_runge_kutta_leaves_the_rates_of_its_last_stage(kind: str, flag: str) -> None:
     xml = (
-        f'<mujoco><option timestep="0.01" integrator="RK4"/><worldbody>{HINGE}</worldbody><actuator>'
-        '<general joint="h" dyntype="filter" dynprm="0.05" gainprm="2"/></actuator></mujoco>'
+        f'<mujoco><option timestep="0.01" integrator="RK4">{flag}</option><worldbody>{HINGE}</worldbody><actuator>'
+        f'<general joint="h" dyntype="{kind}" dynprm="0.05" gainprm="2"/></actuator></mujoco>'
     )
     step_and_check(xml, KERNELS["ours"], names=("qpos", "qvel", "act", "act_dot"))
 

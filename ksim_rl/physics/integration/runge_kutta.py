@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import mujoco_warp as mjw
+import numpy as np
 import warp as wp
 
 from ksim_rl.physics import kernels, upstream
@@ -35,8 +36,8 @@ def mended_runge_kutta(
     """Return a launcher of `mjw.rungekutta4`, and `mend` after the rows of each of its stages.
 
     Rows that tie bodies are made a second time, when the velocities belong to the stage and not to the one before.
-    It leaves the readings and the `act_dot` of the last stage, as C does, and not the mean of all four rates, and
-    delayed controls are those of the stage's own time.
+    It leaves the readings and the `act_dot` of the last stage, as C does, and not the mean of all four rates. Delayed
+    controls are those of the stage's own time, and exact filters reach the stage by their rate, as in C.
     """
     d = warp_data_E
     # Whether actuation is on: a disabled one calls no callback of controls.
@@ -58,6 +59,9 @@ def mended_runge_kutta(
     if keeps_rate:
         # Each stage overwrites the copy, so that the last one's is left.
         hooks.setdefault("act_dyn", []).append(lambda: wp.copy(last_rate_E, d.act_dot))
+    filters = _ExactFilters(warp_model, warp_data_E)
+    if acts and filters.exist:
+        hooks.setdefault("control", []).append(filters.rate)
     clock = _StageClock(warp_model, warp_data_E)
     # Without actuators nothing calls the second of these, and nothing is delayed that a stage reads.
     if acts and warp_model.nactuator > 0 and warp_model.nhistory > 0:
@@ -72,6 +76,7 @@ def mended_runge_kutta(
 
     def launch(substep_warp_model: mjw.Model) -> None:
         clock.start()
+        filters.start()
         readings.start()
         # Hooks are set for this call alone, so that the program's own callbacks stay visible.
         callback = _with_hooks(substep_warp_model.callback, hooks)
@@ -160,6 +165,31 @@ class _StageClock:
     def put_back(self) -> None:
         """Launch the time of the first stage again, from which the step goes on."""
         wp.copy(self._time_E, self._before_E)
+
+
+class _ExactFilters:
+    """Activations of exact filters, which MuJoCo Warp moves to a stage by a part of their exact path over the step."""
+
+    def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+        is_exact = warp_model.actuator_dyntype.numpy() == int(mjw.DynType.FILTEREXACT)
+        self.exist = bool(is_exact.any())
+        self._actuators = wp.array(np.flatnonzero(is_exact), dtype=int, device=warp_data_E.act.device)
+        self._warp_model = warp_model
+        self._warp_data_E = warp_data_E
+        self._stage = 0
+
+    def start(self) -> None:
+        """Await the first stage after the beginning of the step."""
+        self._stage = 0
+
+    def rate(self) -> None:
+        """Launch what moves them by their rate, before the stage computes the next one."""
+        m, d = self._warp_model, self._warp_data_E
+        fraction = STAGE_TIMES[self._stage]
+        self._stage += 1
+        inputs = [self._actuators, m.actuator_actadr, m.actuator_dynprm, m.opt.timestep, d.act_dot, fraction]
+        dim = (d.nworld, self._actuators.size)
+        wp.launch(kernels.rate_exact_filters, dim=dim, inputs=inputs, outputs=[d.act])
 
 
 def _with_hooks(callback: Any, hooks: dict[str, list[Callable[[], None]]]) -> Any:

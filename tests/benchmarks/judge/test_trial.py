@@ -4,6 +4,7 @@ import mujoco
 import pytest
 import torch
 
+from benchmarks.judge import accepted
 from benchmarks.judge.c_engine import touched_accepted
 from benchmarks.judge.trial import judge
 from benchmarks.judge.worlds import state_of
@@ -16,6 +17,17 @@ XML = """
     <body pos="0 0 0.1"><joint name="j" type="slide" axis="0 0 1" damping="0.5"/><geom size="0.1"/></body>
   </worldbody>
   <sensor><jointpos joint="j" name="height"/></sensor>
+</mujoco>
+"""
+# A beam that lies on the ground, and turns about its middle.
+BALANCED = """
+<mujoco>
+  <worldbody>
+    <geom name="ground" type="plane" size="1 1 1"/>
+    <body pos="0 0 0.045">
+      <joint type="hinge" axis="0 1 0"/><geom name="beam" type="capsule" size="0.05 0.1" euler="0 90 0"/>
+    </body>
+  </worldbody>
 </mujoco>
 """
 
@@ -69,3 +81,12 @@ def test_contacts_that_may_differ_are_looked_for_in_each_substep():
     assert not touched_accepted(mj_model, state, 1)
     mj_data.qpos[2] = 1.0
     assert not touched_accepted(mj_model, state_of(mj_data), 3)
+
+
+def test_rows_without_weight_are_judged_by_positions_alone(monkeypatch: pytest.MonkeyPatch):
+    verdict = judge(BALANCED, kernels="theirs")
+    assert verdict.findings == ()
+    assert verdict.weightless > 0
+    monkeypatch.setattr(accepted, "POSITION_CEILING", -1.0)
+    quantities = {finding.quantity for finding in judge(BALANCED, kernels="theirs").findings}
+    assert quantities == {"qpos without weight"}
