@@ -1,7 +1,7 @@
 """Config dataclasses that inherit `Checked` hold, once built, values that fit the annotations of their fields.
 
 Bounds stand in the annotation: `stiffness: Positive`, `share: Share = 0.5`, `x: Annotated[float, Within(high=3.0)]`.
-Only what relates several fields to each other needs code: a method `_check_fields`. Constants of a class, which its
+Only rules that relate several fields need code: a method `_check_fields`. Constants of a class, which its
 bases declare, and other defaults for their fields may stand in its statement: `class Jump(EventTerm, mode="interval")`.
 """
 

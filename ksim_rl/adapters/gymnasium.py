@@ -27,7 +27,8 @@ class GymnasiumVectorEnv(VectorEnv):
     `infos["final_obs"]` has its last observations and `infos["_final_obs"]` the mask, as Gymnasium's own vector envs do
     with `AutoresetMode.SAME_STEP`. Arrays are NumPy's, and `final_obs` is an object array with one dict per ended env
     (else None). With `tensors` they are tensors on the env's device without any host sync, and `final_obs` is a dict of
-    tensors [E, L] for all rows. The env is what `envs.make` returns, or any of batch size [E] with a continuous action.
+    tensors [E, L] for all rows. The env comes from `envs.make`, or is any env of batch size [E] with a continuous
+    action.
     """
 
     def __init__(self, env: EnvBase, *, keys: Keys = None, tensors: bool = False) -> None:

@@ -23,9 +23,10 @@ except ImportError as error:
 class SkrlWrapper(Wrapper):
     """Steps an env for skrl, with tensors on its device; rows that ended come back in their next episode.
 
-    What agents observe [E, L] are the leaves at `keys`, side by side. What `state` returns, for critics that see more,
-    are those at `state_keys`; without any it is None. `infos["final_obs"]` has the observations of the states reached.
-    The env keeps its own seed, and only the first `reset` resets it, as skrl's wrappers of vector envs do.
+    Agents observe the leaves at `keys`, side by side [E, L]. Critics that see more read
+    the leaves at `state_keys` through `state`; without any it is None. `infos["final_obs"]` has the observations of the
+    states reached. The env keeps its own seed, and only the first `reset` resets it, as skrl's wrappers of vector envs
+    do.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """Reads archives with joint rotations of the SMPL skeleton, as AMASS has them (Mahmood et al., 2019).
 
 The body model itself is not here: a skeleton of mean proportions stands in for a person's own, unless offsets are
-given. Limbs are those of Winter, "Biomechanics and Motor Control of Human Movement" (2009), figure 4.1, as shares of
-height.
+given. Limbs are as long as in Winter, "Biomechanics and Motor Control of Human Movement" (2009), figure 4.1, as shares
+of height.
 """
 
 from collections.abc import Mapping

@@ -22,7 +22,7 @@ EVERY = 7
 
 
 class CompiledStep:
-    """`env.step_and_maybe_reset` in few kernels: what torch computes between the launches of physics is compiled.
+    """`env.step_and_maybe_reset` in few kernels: torch's operations between the launches of physics are compiled.
 
     `tensordict` is the policy's output for `root_E`, the EnvState before the step; the step writes the next root into
     the memory of `root_E`. The policy's leaves may lie elsewhere at each call. The constructor steps the env and then

@@ -85,11 +85,11 @@ class RolloutCollector:
     each control step's physics is one Warp graph and torch stays eager. When Python changes, the recording is made
     again; see `Recording`. A FrozenPythonError names Python that cannot be recorded.
 
-    The rollout is the same as that of `EnvBase.rollout(T, policy, break_when_any_done=False, auto_reset=False)`. On
+    The rollout equals `EnvBase.rollout(T, policy, break_when_any_done=False, auto_reset=False)`. On
     CUDA the env's `step_and_maybe_reset` must not synchronize (`ManagerBasedRlEnv`, `MaskedTransformedEnv`); on CPU any
-    TorchRL env of batch size [E] will do. The policy writes the action, and what training needs; one that has a context
-    `steady()` acts within it, where its weights stay. Stored are the leaves at `keys`, None for all: fewer cost fewer
-    bytes and less time.
+    TorchRL env of batch size [E] will do. The policy writes the action, and the tensors that training needs; one that
+    has a context `steady()` acts within it, where its weights stay. Stored are the leaves at `keys`, None for all:
+    fewer cost fewer bytes and less time.
     """
 
     def __init__(

@@ -241,7 +241,7 @@ class _Search:
         self._ahead.append((cls, path))
 
     def _at_network_module(self, module: nn.Module, path: str) -> None:
-        """Look at a transform, an env or a network: all but what its base in a library keeps for itself."""
+        """Look at a transform, an env or a network, but not at attributes of its base in a library."""
         own = lambda: attributes_of(module)  # noqa: E731
         self._hold(module, path, own, _attribute, table=vars(module))
         # Submodules, buffers and parameters: that one is replaced by another is a change.

@@ -61,7 +61,7 @@ class PythonWatch:
         self._held = [_Remembered.of(held) for held in held_by(parts, self._device)]
 
     def changes(self) -> list[Change]:
-        """Return what has changed since the last `look`."""
+        """Return the changes since the last `look`."""
         found: list[Change] = []
         for remembered in self._held:
             if remembered.is_the_same():

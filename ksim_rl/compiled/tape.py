@@ -95,7 +95,7 @@ class _Use:
         self.counted |= other.counted
 
     def allows(self, other: "_Use") -> bool:
-        """Whether `other` may follow in the same kernel: no row sees what another one writes."""
+        """Whether `other` may follow in the same kernel: no row reads memory that another one writes."""
         for place, distances in other.distances.items():
             # One distance means that each row stays with its own numbers. Two distances in one place mean
             # that a thread would read numbers of another row, and threads of a kernel have no order.

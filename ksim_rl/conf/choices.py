@@ -102,8 +102,8 @@ def training_defaults(name: str) -> Tree:
 def objective_defaults(name: str, objective: str) -> Tree:
     """Return a task's settings for one algorithm, as a config tree.
 
-    For an algorithm that it has no settings for, that is what fits of those in `training`: data and networks of the
-    kinds that the algorithm has as well, and the settings that it inherits.
+    For an algorithm that it has no settings for, these are the settings in `training` that fit it: data and networks of
+    the kinds that the algorithm has as well, and the settings that it inherits.
     """
     task = envs.task(name)
     algorithm = algorithms.algorithm(objective)

@@ -54,7 +54,7 @@ def find(
     """Import the class that a `_target_` names, if its package is ours, a plug-in's or one of `besides`.
 
     A ValueError, with the near names, refuses other packages, and a class that is not there or that `accepts` declines.
-    It says where the target stands in the config (`path`), and what `kind` of class was looked for.
+    It says where the target stands in the config (`path`), and the `kind` of class that was looked for.
     """
     module_name, _, class_name = str(target).rpartition(".")
     where = f"{path}.{TARGET}={target!r}"

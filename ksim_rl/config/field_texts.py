@@ -10,7 +10,7 @@ _ENTRY = re.compile(r"    ([A-Za-z_]\w*(?:, [A-Za-z_]\w*)*): (.*)")
 def attribute_texts(owner: type) -> dict[str, str]:
     """Return the text of each attribute under "Attributes:" in the docstrings of a class and its bases, by name.
 
-    What the class says of an attribute counts more than what a base says.
+    A class's text of an attribute counts more than its base's.
     """
     texts: dict[str, str] = {}
     for base in reversed(owner.__mro__):

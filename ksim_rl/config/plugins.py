@@ -15,7 +15,7 @@ Any other package is a plug-in where the user names it: `--plugin my_package` fo
 `KSIM_RL_PLUGINS=my_package,other` for all. One that is not installed is looked for in the folders, absolute paths, of
 `KSIM_RL_PLUGIN_PATH`; `--plugin` takes it from the working directory too, and says so. Its modules are imported at
 once, each `Task` and `Algorithm` at the top level of one is registered, its subpackage `conf`, where there is one,
-holds YAML files, and configs may name its classes as `_target_`. What a run folder or a checkpoint says is never a
+holds YAML files, and configs may name its classes as `_target_`. A name in a run folder or a checkpoint is never a
 reason to import anything.
 """
 

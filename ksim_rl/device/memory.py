@@ -29,7 +29,7 @@ def memory_for(
 ) -> Iterator[None]:
     """Turn an allocation that fails in this block into a TooManyEnvsError: memory of an env, and how many may fit.
 
-    `first_that_fits` tries numbers of envs, half of `num_envs` and so on, after what the block built is given back.
+    `first_that_fits` tries numbers of envs, half of `num_envs` and so on, after the memory of the block is given back.
     """
     # Measured before anything is built, to know later what this block took.
     free = free_bytes(device)

@@ -19,7 +19,8 @@ MAX_RECORDED = 64
 class NativeKernel:
     """A kernel whose only argument, `a`, is a struct; see `QuickLaunch`, which makes one at its first launch.
 
-    `fields` has the struct's types by name, in order. `loadable` is what Warp compiles, and for blocks of which size.
+    `fields` has the struct's types by name, in order. `loadable` is the module that Warp compiles, with the size of its
+    blocks.
     """
 
     def __init__(

@@ -135,8 +135,8 @@ def waiting_allowed(device: torch.device) -> Iterator[None]:
 def beside(aside: wp.Stream | None, *launches: Callable[[], None]) -> Iterator[None]:
     """Run `launches` in parallel with the work of this block on a side stream; without a stream, after it.
 
-    Both follow what precedes the block and precede what follows it, in a graph too. Neither may write what the other
-    reads or writes, or free what the other allocates: memory is given back in the order of one stream.
+    Both follow the work before the block and precede the work after it, in a graph too. Neither may write memory that
+    the other reads or writes, or free memory that the other allocates: memory is given back in the order of one stream.
     """
     if aside is not None:
         # The side stream starts after the work that precedes the block.

@@ -89,7 +89,7 @@ def put_apart(kernels: Collection[wp.Kernel]) -> None:
 def watch_loads(mend: Callable[[Path, Exception, int], None]) -> None:
     """Call `mend(folder, error, attempt)` where files of the cache cannot be read, and load that module once more.
 
-    Warp takes what lies in its cache as it is, and has no setting for another attempt. Replaces `wp.Module.load`,
+    Warp takes the files of its cache as they are, and has no setting for another attempt. Replaces `wp.Module.load`,
     checked with Warp 1.19.
     """
     load = wp.Module.load

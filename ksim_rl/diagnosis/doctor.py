@@ -1,6 +1,6 @@
 """`ksim-rl doctor` looks at the machine: versions, devices, graphs, OpenGL and caches, with a test on each device.
 
-What it prints is meant for a bug report: no names of host and user are in it. A fault is one line, and the exit code 1.
+Its output is meant for a bug report: no names of host and user are in it. A fault is one line, and the exit code 1.
 """
 
 import getpass

@@ -27,8 +27,8 @@ def probed(update: Any, env: EnvBase, rollout_ET: TensorDictBase | None) -> dict
 
     `policy/dead_units` is the share of hidden units whose output is the same in all of its first env states,
     `policy/observation_rms` the root mean square of the normalizers' outputs there, 1 where their statistics fit, and
-    `rollout/saturated_actions` the share of actions on their bounds or beyond. What there is not is left out, as are
-    the networks where one is recurrent. Nothing is drawn or learned; the figures are read on the host.
+    `rollout/saturated_actions` the share of actions on their bounds or beyond. Figures that do not exist are left out,
+    as are the networks where one is recurrent. Nothing is drawn or learned; the figures are read on the host.
     """
     if rollout_ET is None:
         return {}

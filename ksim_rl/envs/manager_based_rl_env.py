@@ -62,7 +62,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     `"next"` the same obs and command of the state reached, `"reward"` float32 and `"done"`, `"terminated"`,
     `"truncated"` bool, [E, 1] each. `next` holds the true observation of the state reached, also where the episode
     ended there. A world whose physics is not finite, or whose action is not, ends with `terminated` and reward 0; its
-    `next` observation is that of the model's default state, since the state reached does not exist.
+    `next` observation shows the model's default state, since the state reached does not exist.
     """
 
     is_vector_env = True

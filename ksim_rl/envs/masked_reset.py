@@ -108,9 +108,10 @@ class MaskedReset(EnvBase):
     ) -> TensorDictBase:
         """Reset all rows, or the rows `env_ids`, or the rows of the mask `tensordict["_reset"]` (bool, [E] or [E, 1]).
 
-        Untouched rows keep their state and come back with their last root values, or with those of `tensordict`, which
-        is updated in place. `seed` is set first, as `env.seed(seed)` does. `env_ids` are checked on the host: inside a
-        hot loop pass a mask. No `options` exist; `kwargs` are TorchRL's own `set_state` and `select_reset_only`.
+        Untouched rows keep their state and come back with their last root values, or with the values of `tensordict`,
+        which is updated in place. `seed` is set first, as `env.seed(seed)` does. `env_ids` are checked on the host:
+        inside a hot loop pass a mask. No `options` exist; `kwargs` are TorchRL's own `set_state` and
+        `select_reset_only`.
         """
         # TorchRL would pass unknown keywords on in silence.
         for keyword in kwargs:
@@ -151,7 +152,7 @@ class MaskedReset(EnvBase):
 
     @functools.cached_property
     def _masks_resets(self) -> bool:
-        """Whether resets go through masks; decided from what never changes, so it costs a dict look-up."""
+        """Whether resets go through masks; decided from properties that never change, so it costs a dict look-up."""
         return upstream.can_reset_nothing(self)
 
     def _masked_reset(

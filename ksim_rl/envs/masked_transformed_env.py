@@ -23,7 +23,7 @@ _ROOT = "last_root."
 class MaskedTransformedEnv(MaskedReset, TransformedEnv):
     """A `TransformedEnv` whose step, reset and rollout never make the host wait for the device.
 
-    Trajectories equal those of `torchrl.envs.TransformedEnv`. Construct, append and insert transforms as there; a
+    Trajectories equal `torchrl.envs.TransformedEnv`'s. Construct, append and insert transforms as there; a
     sequence of transforms will do for a `Compose`. Beyond it: masked resets and `reset(env_ids=...)` (see
     `MaskedReset`), the label "E" on specs and data, `set_seed` and `seed` that reach each transform, and a state dict
     that holds base env, transforms and the last root values.
@@ -83,7 +83,7 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         )
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> None:
-        """Load what `state_dict` returned; a KeyError names an entry that belongs to no part of the env."""
+        """Load a `state_dict` of this env; a KeyError names an entry that belongs to no part of the env."""
         parts: dict[str, OrderedDict[str, Any]] = {p: OrderedDict() for p in (_BASE, _TRANSFORM, _ROOT)}
         for key, value in state_dict.items():
             # The first part of each name says whose entry it is.

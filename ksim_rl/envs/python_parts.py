@@ -43,7 +43,7 @@ _READ_ONCE: tuple[tuple[type, frozenset[str], str], ...] = (
 
 
 def python_parts(env: EnvBase) -> dict[str, Any]:
-    """Return the objects whose Python a step of the env runs: wrappers, transforms, terms, and what calls these.
+    """Return the objects whose Python a step of the env runs: wrappers, transforms, terms and their managers.
 
     Terms have the names of the config, `rewards.alive`, and transforms the number of their place, the outermost first.
     """

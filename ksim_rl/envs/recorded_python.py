@@ -40,8 +40,8 @@ class RecordedPython:
     """The Python that steps of an env run, from the first step on.
 
     A recorded step (kernels, a CUDA graph) runs none of it. So it has to be the same at each step, which the second
-    step shows: `calling` is around each of the first ones. After those, `changes` says what somebody has changed from
-    outside, such as an attribute of a term, or one more transform; then the step has to be recorded again.
+    step shows: `calling` is around each of the first ones. After those, `changes` names the values that somebody has
+    changed from outside, such as an attribute of a term, or one more transform; then the step has to be recorded again.
 
     `others` are objects whose Python becomes part of the recording as well, by name: a policy. A step that puts a
     tensor in the place of another one may still be recorded, if it writes it before it reads it. Where the numbers of
@@ -61,14 +61,14 @@ class RecordedPython:
 
     @property
     def is_known(self) -> bool:
-        """Whether two steps have shown what Python does."""
+        """Whether two steps have shown all that Python does."""
         return self._calls >= 2
 
     @contextmanager
     def calling(self) -> Iterator[None]:
         """Enclose one of the first steps; a FrozenPythonError after the second where it changed or asked the host.
 
-        What the first one changes may be a cache that it fills.
+        The first one's changes may be caches that it fills.
         """
         # The first step may fill caches; only the second one is judged.
         if self._calls != 1:
@@ -87,7 +87,7 @@ class RecordedPython:
         self._watch.look(self._parts())
 
     def forget(self) -> None:
-        """Let the next two steps show again what Python does."""
+        """Let the next two steps show Python's work again."""
         self._calls = 0
 
     def changes(self) -> list[Change]:

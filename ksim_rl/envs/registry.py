@@ -34,7 +34,7 @@ def _tasks() -> dict[str, Task]:
 
 @cache
 def _tasks_with(_named: tuple[str, ...]) -> dict[str, Task]:
-    """Import all task modules once, ours and those of other packages, and collect their `Task`s."""
+    """Import all task modules once, ours and other packages', and collect their `Task`s."""
     found: dict[str, tuple[str, Task]] = {}
     packages = map(importlib.import_module, OWN_TASKS)
     # Ours first, so that a task of another package cannot take the place of one of ours.

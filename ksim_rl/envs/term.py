@@ -1,10 +1,11 @@
 """The kinds of term that an env is made of: small frozen dataclasses that read an `EnvView`.
 
 A term's parameters are its fields, so that the same object is written in Python and as a Hydra `_target_`. Terms hold
-no tensors: names are resolved through the view, which remembers them, and what a term must keep from step to step is
-a named buffer of the view (`view.buffer`), which advances once per env step. A term must not branch on tensor values,
-read a tensor on the host or allocate sizes that depend on data: the step that calls it is captured into a CUDA graph.
-It writes nothing that the view gives it: `term_rules` says what each kind may write, and `term_guard` refuses the rest.
+no tensors: names are resolved through the view, which remembers them, and the state that a term keeps from step to step
+is a named buffer of the view (`view.buffer`), which advances once per env step. A term must not branch on tensor
+values, read a tensor on the host or allocate sizes that depend on data: the step that calls it is captured into a CUDA
+graph. It writes no tensor that the view gives it: `term_rules` says what each kind may write, and `term_guard` refuses
+the rest.
 """
 
 from abc import ABC, abstractmethod
@@ -102,7 +103,7 @@ class EventTerm(Term):
         return ()
 
     def without_effect(self, view: EnvView) -> Sequence[str]:
-        """Return a line for each part of what this event writes that changes nothing in this model; a build warns."""
+        """Return a line for each field that this event writes without effect in this model; a build warns."""
         return ()
 
     @abstractmethod
@@ -178,7 +179,7 @@ class CurriculumTerm(Term):
 
     @property
     def first_level(self) -> float | None:
-        """What `view.level` starts at, if this curriculum drives it; else None."""
+        """The first `view.level`, if this curriculum drives it; else None."""
         return None
 
     @abstractmethod

@@ -61,7 +61,7 @@ class EnvView(WorldView):
         terminated_E: which envs the step found to end by a condition that is no time-out, bool [E].
         truncated_E: which envs the step found to end by a time-out, bool [E], whatever `is_finite_horizon` says.
         level: the difficulty in [0, 1] that a curriculum drives, [] on the device; 1 where none does. It is one tensor
-            for the life of the env, changed in place, so that what scales with difficulty may hold on to it.
+            for the life of the env, changed in place, so that a term that scales with difficulty may keep it.
         command_cache: values that depend on commands only; emptied when these change.
     """
 

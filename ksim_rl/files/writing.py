@@ -1,8 +1,8 @@
 """Writes every file that a command leaves: whole or not at all, and never through links.
 
 A folder may come from a stranger, with links in the place of files: `RUN/export/README.md` may be the user's `.bashrc`.
-So a link, a file that has other names (hard links) and what is no file are refused by name. A file appears under its
-own name once it is whole.
+So a link, a file that has other names (hard links) and anything that is no file are refused by name. A file appears
+under its own name once it is whole.
 """
 
 import fcntl

@@ -1,4 +1,4 @@
-"""The term library holds what observations, rewards, events and the rest of a task are put together from.
+"""The term library: observations, commands, actions, rewards, terminations, events, curricula and metrics of tasks.
 
 Each term of these modules is public. The bases that terms share are not: they do nothing when called, or are abstract,
 or draw a field that they do not name.

@@ -38,7 +38,7 @@ class VectorDistribution(Distribution):
 
     @property
     def deterministic_sample(self) -> Float[Tensor, "*batch L"]:
-        """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mode."""
+        """The mode, which TorchRL takes under `ExplorationType.DETERMINISTIC`."""
         return self.mode
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> "VectorDistribution":
@@ -368,7 +368,7 @@ class Categorical(Distribution):
 
     @property
     def deterministic_sample(self) -> Shaped[Tensor, "*value"]:
-        """What TorchRL takes under `ExplorationType.DETERMINISTIC`: the mode."""
+        """The mode, which TorchRL takes under `ExplorationType.DETERMINISTIC`."""
         return self.mode
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> "Categorical":

@@ -103,7 +103,7 @@ def normalize_rows_back(
     ACTIVATION: tl.constexpr, WEIGHTS: tl.constexpr,
     STEPS: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr, CHUNKS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradient at the features of `STEPS * ROWS` rows, and with WEIGHTS the sums of those of the weights.
+    """Write the gradient at the features of `STEPS * ROWS` rows, and with WEIGHTS the sums of the weights' gradients.
 
     `partials` [3, N, programs, WIDTH] get the sums of bias, gain and offset.
     """

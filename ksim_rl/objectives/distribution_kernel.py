@@ -34,7 +34,7 @@ def compare_rows(
     logits, following, reward, discount, support, loss, mean, slope, num_rows, LEARNS: tl.constexpr,
     LOWEST: tl.constexpr, NETWORKS: tl.constexpr, COUNT: tl.constexpr, ROWS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Write what `Compared` returns for `ROWS` rows of a network, and the gradient of the loss at its logits.
+    """Write the results of `Compared` for `ROWS` rows of a network, and the gradient of the loss at its logits.
 
     Program (i, n) is of network n. `logits`, `following` and `slope` are [N, num_rows, COUNT].
     """

@@ -165,7 +165,7 @@ class OffPolicyLoss(LossModule):
         """There is no value estimator."""
 
     def _predict(self, critic: TensorDictModule, observed: TensorDictBase, action: Tensor) -> Tensor:
-        """Return what N critics predict for an action: values [B, N], or logits [B, N, A] in the layers' dtype."""
+        """Return N critics' predictions for an action: values [B, N], or logits [B, N, A] in the layers' dtype."""
         keys = [key for key in critic.in_keys if key != self.tensor_keys.action]
         # A selection is a new TensorDict, so the minibatch keeps the action of the data.
         inputs = observed.select(*keys).set(self.tensor_keys.action, action)

@@ -36,7 +36,7 @@ def with_precision_of(cfg: PPOCfg, device: torch.device | str) -> PPOCfg:
 def in_precision(loss: Loss, precision: str, *, device: torch.device | str) -> Loss:
     """Return `loss` with its products in `precision`; the loss itself for "float32".
 
-    With "bfloat16" torch's autocast rounds what layers multiply to 8 significant bits, and nothing else.
+    With "bfloat16" torch's autocast rounds the factors of layers to 8 significant bits, and nothing else.
     """
     if precision == "float32":
         return loss
@@ -69,7 +69,7 @@ def make_advantage(
 
 
 def make_loss(cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule) -> ClipPPOLoss:
-    """Build the loss of `cfg`. It uses the modules as they are: what changes in them changes in the loss."""
+    """Build the loss of `cfg`. It uses the modules themselves: a change in them is a change in the loss."""
     return ClipPPOLoss(
         actor,
         critic,

@@ -1,8 +1,8 @@
 """Lets fields that differ between worlds have the effect that they have in a model compiled with them.
 
-C and MuJoCo Warp leave out what a model's own numbers do not ask for, such as adhesion where none is given. A world may
-draw such numbers later. What can be switched on is; fields whose effect hangs on memory or tables that the model does
-not have are refused by name.
+C and MuJoCo Warp leave out effects that a model's own numbers do not ask for, such as adhesion where none is given. A
+world may draw such numbers later. An effect that can be switched on is; fields whose effect hangs on memory or tables
+that the model does not have are refused by name.
 """
 
 import warnings

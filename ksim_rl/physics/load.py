@@ -47,8 +47,8 @@ def load_spec(source: Source) -> mujoco.MjSpec:
 def load_model(source: Source, sim: SimCfg | None = None) -> mujoco.MjModel:
     """Compile the spec of `load_spec`, and check that its numbers make sense and MuJoCo Warp can simulate it.
 
-    Settings of `sim` are laid over its own first, such as a solver that MuJoCo Warp has. What a few words make enormous
-    is refused unless the environment variable KSIM_RL_LARGEST_MODEL allows it.
+    Settings of `sim` are laid over its own first, such as a solver that MuJoCo Warp has. A model that a few words make
+    enormous is refused unless the environment variable KSIM_RL_LARGEST_MODEL allows it.
     """
     spec, text, label, caught = _parsed(source)
     # Before compiling, since the compiler reads options, too.

@@ -166,7 +166,7 @@ def check_motors(mj_model: mujoco.MjModel) -> None:
 def _check_still_tendons(mj_model: mujoco.MjModel) -> None:
     """Refuse constraints of tendons that lie on one rigid body: no joint moves them, so that they weigh nothing.
 
-    Their rows are as hard as numbers allow, on a Jacobian of rounding errors, and what they do is noise, in C too.
+    Their rows are as hard as numbers allow, on a Jacobian of rounding errors, and their forces are noise, in C too.
     """
     # Found once, since an equality may tie two such tendons.
     still = {tendon for tendon in range(mj_model.ntendon) if _is_still(mj_model, tendon)}

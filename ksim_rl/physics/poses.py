@@ -68,8 +68,8 @@ def scatter(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Gen
 def put_in_ground(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, *, depth: float) -> None:
     """Move each free body, with its subtree, so that one of its geoms is `depth` (m) deep in the ground.
 
-    That is the highest plane, the highest of the height field below a geom, and what else is fixed to the world (boxes,
-    meshes) below the body's origin.
+    That is the highest plane, the highest of the height field below a geom, and everything else that is fixed to the
+    world (boxes, meshes) below the body's origin.
     """
     free_joints = np.flatnonzero(mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     is_solid = _solid_geoms(mj_model)

@@ -69,7 +69,7 @@ def empty_contacts(
 def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Callable[[], None]:
     """Return a launcher that puts the worlds of `mask`, bool [E], to `qpos0`, at rest, time 0, without contacts.
 
-    `mjw.reset_data` must have run once: what sleeps or is awake stays as it is, unless the model has more.
+    `mjw.reset_data` must have run once: trees stay asleep or awake, unless the model has more.
     """
     m = warp_model
     d = warp_data_E

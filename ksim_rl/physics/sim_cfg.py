@@ -26,7 +26,7 @@ class SimCfg(Checked):
         ccd_iterations: most iterations of convex collision detection.
         njmax: most constraint rows of one world; `None` probes the model, and a run raises it where its env needs more.
         nconmax: contacts (and candidate pairs) per world. They share one pool of `num_envs * nconmax`; `None` as above.
-            Both are the room of MuJoCo Warp: the C engine takes what it needs.
+            Both are the room of MuJoCo Warp: the C engine takes as much memory as it needs.
         engine: "warp" simulates on MuJoCo Warp, with our kernels, on GPU or CPU. "c" simulates on MuJoCo's C engine, on
             all cores of the CPU, in float64: it judges the first, compiles nothing at the first start, and has no
             limits of contacts and rows. Cameras that see all worlds need "warp". "auto" chooses, and `World.explained`
@@ -47,7 +47,7 @@ class SimCfg(Checked):
             `one_kernel_rows_unavailable` say why. `None` does so on GPUs; on the CPU it gains a tenth of the physics,
             and compiles for 12 s. Either value asks for engine "warp".
         require_graphs: refuse to run where graphs are unavailable, instead of a warning and a slow run.
-        nan_guard: where to save what led to a non-finite state; `None` keeps nothing and costs nothing.
+        nan_guard: where to save the substeps that led to a non-finite state; `None` keeps nothing and costs nothing.
 
     See https://mujoco.readthedocs.io/en/stable/XMLreference.html#option
     """

@@ -16,7 +16,7 @@ class SubstepPlan:
     """Why MuJoCo Warp's own kernels compute a stage of a substep, or None where one kernel of ours does.
 
     Attributes:
-        dynamics: what precedes the constraints: kinematics, inertias, smooth forces.
+        dynamics: all before the constraints: kinematics, inertias, smooth forces.
         broad_phase: which pairs of geoms may touch.
         collisions: the same and the contacts of those pairs, of which MuJoCo Warp may find some.
         rows: the constraint rows.

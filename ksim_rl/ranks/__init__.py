@@ -1,7 +1,7 @@
 """Lets several processes train together: each is a rank with its own envs, started by torchrun, one per GPU.
 
-All numbers are drawn by an env's place among those of all ranks, means are over all ranks, and rank 0 writes. A process
-that was not started so is one of one, for which nothing here does anything.
+All numbers are drawn by an env's place among the envs of all ranks, means are over all ranks, and rank 0 writes. A
+process that was not started so is one of one, for which nothing here does anything.
 """
 
 from ksim_rl.device.group import first_row, rank, size

@@ -27,7 +27,7 @@ _SQUARES = "exact_sum_of_squares"
 
 
 def gathered(own: Mapping[str, Shaped[Tensor, "*?leaf"]]) -> dict[str, Any]:
-    """Return, on rank 0, the number of ranks and the tensors of other ranks that differ from those of rank 0.
+    """Return, on rank 0, the number of ranks and the tensors of other ranks that differ from rank 0's.
 
     All ranks call it with tensors on the host, of the same names and shapes.
     """
@@ -67,7 +67,7 @@ def dealt(
     saved: Mapping[str, Any] | None,
     live: Mapping[str, Shaped[Tensor, "*?leaf"]],
 ) -> Tensors:
-    """Return this rank's tensors of a checkpoint: rank 0's, changed by what `gathered` returned; None is of one rank.
+    """Return this rank's tensors of a checkpoint: rank 0's, changed by the result of `gathered`; None is of one rank.
 
     `live` are those that this run has now, and whose shapes tell where the envs are. A ValueError says how many envs
     fit.

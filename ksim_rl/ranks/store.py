@@ -47,8 +47,8 @@ def of_run(store: dist.Store) -> dist.PrefixStore:
 def attempt(run: dist.Store, *, rank: int, size: int) -> int:
     """Return which attempt at the run this is, from 1 on, as rank 0 counts them; its store is `run`.
 
-    torchrun's own count is that of a node. Each rank asks under a name that no other process has, until rank 0 has
-    answered, and says that it has heard: what dead processes have asked, or were told, does no harm. Raises
+    torchrun's own count is of one node. Each rank asks under a name that no other process has, until rank 0 has
+    answered, and says that it has heard: questions of dead processes, and answers to them, do no harm. Raises
     RuntimeError after `JOIN_S` seconds.
     """
     if rank:

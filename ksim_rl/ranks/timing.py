@@ -41,7 +41,7 @@ class Timing:
     def slowest(self) -> dict[str, float]:
         """Return which rank's last rollout took the longest, and how many seconds; nothing with one rank.
 
-        On CUDA it is called after the work of the iteration is done. What other ranks took comes with their heartbeats.
+        On CUDA it is called after the work of the iteration is done. Other ranks' times come with their heartbeats.
         """
         if size() == 1:
             return {}

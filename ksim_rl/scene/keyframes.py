@@ -72,7 +72,7 @@ def move_keyframe(
 ) -> None:
     """Move a keyframe's poses of free joints and mocap bodies by a rigid transform: m, and a unit quaternion.
 
-    What it leaves out follows from the bodies, which have moved.
+    Fields that it leaves out follow from the bodies, which have moved.
     """
     shift = np.array(pos_3)
     turn = np.array(quat_4)

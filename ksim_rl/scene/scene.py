@@ -81,7 +81,7 @@ class MjcfRobot(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCfg(Checked):
-    """What is in each world, by name; gravity and the other options are the first robot's.
+    """The entities of each world, by name; gravity and the other options are the first robot's.
 
     The elements of an entity (robot or object: a cube, a ball, a door) that is alone keep their names; of several they
     get the prefix "<name>/". Entities without a placement stand where their own models put them. Sensors are for

@@ -1,4 +1,4 @@
-"""A table is data, as a run folder is: what its names and overrides may be, after Hydra's own parsing."""
+"""Rules for the names and overrides of a table, which is data as a run folder is, after Hydra's own parsing."""
 
 import re
 

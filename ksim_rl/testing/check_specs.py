@@ -70,7 +70,7 @@ def check_values(env: EnvBase, num_steps: int) -> None:
 
 
 def check_torchrl(env: EnvBase, num_steps: int) -> None:
-    """What TorchRL's own `check_env_specs` asks for."""
+    """The demands of TorchRL's own `check_env_specs`."""
     check_env_specs(env)
 
 

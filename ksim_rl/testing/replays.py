@@ -40,7 +40,7 @@ class Replays:
         return self.env.reset()
 
     def step(self, root: TensorDictBase, index: int) -> tuple[TensorDictBase, TensorDictBase]:
-        """Step with the action of this index, and reset what ended."""
+        """Step with the action of this index, and reset the envs that ended."""
         return self.env.step_and_maybe_reset(root.set(self.env.action_key, self._actions[index]))
 
     def run(self, *, reset_at: int = -1, rows: Sequence[int] = ()) -> list[TensorDictBase]:

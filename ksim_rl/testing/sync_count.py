@@ -65,7 +65,7 @@ def count_syncs() -> Iterator[SyncCount]:
     """Count the host syncs of the code inside, as they would happen on a GPU.
 
     It sees values read by Python, boolean indexing, results whose size depends on data, copies between devices, and
-    tensors made from Python data. It does not see what C++ reads without the dispatcher: on a GPU,
+    tensors made from Python data. It does not see reads of C++ without the dispatcher: on a GPU,
     `torch.cuda.set_sync_debug_mode("error")` is the last word. Inside compiled code it sees nothing.
     """
     count = SyncCount()

@@ -2,8 +2,8 @@
 
 The centre of mass moves as a pendulum of variable height over the zero-moment point that the feet allow (Kajita et al.,
 "Biped walking pattern generation by using preview control of zero-moment point", 2003; here the whole plan is known, so
-that one linear system gives the motion of the centre). What the pendulum leaves out, limbs that swing, is measured by
-inverse dynamics and put into the plan, until the robot's own zero-moment point is where it should be.
+that one linear system gives the motion of the centre). The part that the pendulum leaves out, limbs that swing, is
+measured by inverse dynamics and put into the plan, until the robot's own zero-moment point is where it should be.
 """
 
 from collections.abc import Mapping, Sequence

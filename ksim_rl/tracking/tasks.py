@@ -1,6 +1,6 @@
 """The tasks in which Unitree G1 follows the motions of `g1_motions` with its whole body.
 
-Observations, noise, rewards, limits, pushes and randomization are those of mjlab's tracking task for G1
+Observations, noise, rewards, limits, pushes and randomization follow mjlab's tracking task for G1
 (src/mjlab/tasks/tracking at its commit 0eda4e7), so that both can be compared on the same work. Four things differ:
 actions move the servos' targets about the motion, where mjlab's move them about the default pose; an episode ends (as a
 truncation) with the motion, where mjlab's goes on at another place of it; self-contact counts in each physics substep,

@@ -81,7 +81,8 @@ class BodiesFromAnchor(ObservationTerm):
 class JointPositionAroundMotion(OfMotion, JointAction):
     """Positions (rad or m): the shaped action, relative to where the motion has the joints at the end of the env step.
 
-    What `RandomizeDefaultJointPos` adds to the default pose is added here too: it stands for joints that read wrongly.
+    The offset that `RandomizeDefaultJointPos` adds to the default pose is added here too: it stands for joints that
+    read wrongly.
     """
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:

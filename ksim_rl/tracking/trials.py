@@ -30,7 +30,7 @@ from ksim_rl.trainers.metrics import losses_of
 
 @dataclass(frozen=True, kw_only=True)
 class Trials:
-    """What came of trials: the share of successes, and errors by metric, means over all steps of all trials."""
+    """The results of trials: the share of successes, and errors by metric, means over all steps of all trials."""
 
     trials: int
     success: float

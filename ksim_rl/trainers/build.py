@@ -143,7 +143,7 @@ def build_evaluator(
 ) -> Evaluator:
     """Build an evaluator with its own envs, without sensor noise and curricula.
 
-    Weights and ranges are those of the config, whatever levels curricula have reached in training. With a `note`, the
+    Weights and ranges are the config's, whatever levels curricula have reached in training. With a `note`, the
     worlds get room by a rehearsal, as in training, and `note` is told; in the process of a run they have it already.
     """
     if seed is None:

@@ -192,7 +192,7 @@ def load_latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> C
     """Read the newest whole checkpoint of a run folder or a checkpoint folder, or the one that `path` is.
 
     A `note` says which damaged ones are passed over, and which one is taken. Where all are damaged, or the newest is of
-    an unknown format, the error is that of the newest.
+    an unknown format, the error is about the newest.
     """
     if (path / MANIFEST).exists():
         return load(path)

@@ -12,7 +12,7 @@ Config = dict[str, Any]
 def _from_1(state: State, config: Config) -> tuple[State, Config]:
     """Version 2 keeps the states of hooks and of recurrent networks, and the config in its own order.
 
-    Version 1 had neither and sorted the config by name. What networks read stands in the order of the observation
+    Version 1 had neither and sorted the config by name. The inputs of networks stand in the order of the observation
     terms, and that is the order of the columns, which version 1 kept.
     """
     state = {**state, "hooks": {}, "update": {**state.get("update", {}), "recurrent_state": {}}}

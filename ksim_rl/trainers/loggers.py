@@ -47,7 +47,7 @@ class WandbCfg(Checked):
 
 
 def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> MetricLogger:
-    """Begin the run with the config of a training run, or continue that of a resumed one."""
+    """Begin the run with the config of a training run, or continue a resumed run's."""
     path = run_folder / "wandb" / "run_id"
     # The id stays in the folder, so that a resumed run goes on in the same place.
     if not path.exists():
@@ -101,7 +101,7 @@ class _Run(MLFlowLogger):
 
 
 def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> MetricLogger:
-    """Begin the run with the config of a training run, or continue that of a resumed one."""
+    """Begin the run with the config of a training run, or continue a resumed run's."""
     import mlflow  # pyright: ignore[reportMissingImports]
 
     folder = run_folder / "mlflow"

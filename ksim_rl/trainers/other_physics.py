@@ -1,4 +1,4 @@
-"""Chooses and describes the physics in which a trained policy is judged, other than that of its training."""
+"""Chooses and describes the physics in which a trained policy is judged, other than the physics of its training."""
 
 import dataclasses
 from collections.abc import Collection, Mapping

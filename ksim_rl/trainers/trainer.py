@@ -1,4 +1,4 @@
-"""The training loop collects and learns in turn; hooks evaluate, save, and do what users add between iterations."""
+"""The training loop collects and learns in turn; hooks evaluate, save, and run users' code between iterations."""
 
 import signal
 from collections.abc import Callable, Mapping, Sequence

@@ -53,7 +53,7 @@ def _launch(
     of the parts of a value: all frames of the first part are returned, then all of the second one, and so on.
 
     With a mask no step is made: its rows begin with these values, and each row's value is returned N times. With a
-    `draw_count_E`, the resets of each row, these rows also draw new lags: those of `ksim_rl.device.random.integers` at
+    `draw_count_E`, the resets of each row, these rows also draw new lags: `ksim_rl.device.random.integers` at
     the counts that they reach. Lags and counts are changed in place.
     """
     # Columns of a wider tensor stay there: each env's value is contiguous.

@@ -1,6 +1,6 @@
 """Lists which of TorchRL's transforms a config may name, and says of each other one why it may not.
 
-The list is that of TorchRL 0.14.1; a test compares it with `torchrl.envs.transforms.__all__`.
+The list is of TorchRL 0.14.1; a test compares it with `torchrl.envs.transforms.__all__`.
 """
 
 from torchrl.envs.transforms import Transform

@@ -73,7 +73,8 @@ class SceneOfEnv:
 class BrowserScene:
     """Shows a `mujoco.MjvScene`: geoms of one shape and transparency are instances of one mesh.
 
-    What did not change since the last frame is not sent again. `unknown` names the kinds that a browser cannot show.
+    Parts that did not change since the last frame are not sent again. `unknown` names the kinds that a browser cannot
+    show.
     """
 
     def __init__(self, scene: viser.SceneApi, mj_model: mujoco.MjModel) -> None:

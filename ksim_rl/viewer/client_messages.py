@@ -1,4 +1,4 @@
-"""What the viewer's page says is checked before viser takes it: a message it sends, with a value that its control has.
+"""Checks messages of the viewer's page before viser takes them: a message it sends, with a value that its control has.
 
 viser lets a client set any property of a widget to anything, open a tunnel to other machines, and upload files.
 """

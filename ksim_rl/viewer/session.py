@@ -73,7 +73,7 @@ class Conditions:
 def showing_motion(cfg: ManagerBasedRlEnvCfg, file: str) -> ManagerBasedRlEnvCfg:
     """Return the config of an env that plays a reference motion, whatever acts: each step is an episode of its own.
 
-    Each root is the motion's exact state; physics runs in between, and what it comes to is thrown away.
+    Each root is the motion's exact state; physics runs in between, and its states are thrown away.
     """
     return dataclasses.replace(
         cfg,

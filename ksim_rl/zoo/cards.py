@@ -28,8 +28,8 @@ MOST_BYTES = 200_000
 class Card(Checked):
     """The record of a policy: its training, its return, and the SHA-256 of its files.
 
-    `curve` has pairs of env states and mean return of training episodes; `sim2sim` what MuJoCo's C engine earned of
-    the recorded return (`return_ratio`), its standard error and the episodes.
+    `curve` has pairs of env states and mean return of training episodes; `sim2sim` the share that MuJoCo's C engine
+    earned of the recorded return (`return_ratio`), its standard error and the episodes.
     """
 
     name: str

@@ -20,7 +20,7 @@ FILES = re.compile(r"(config\.yaml|video\.mp4|policy\.onnx|checkpoint/\d+/[a-z]+
 def upload(cfg: WandbCfg, run: Path, *, note: Callable[[str], None]) -> None:
     """Add a run's newest checkpoint, config, video and ONNX file to its run on Weights & Biases, as one artifact.
 
-    What cannot be sent is said in a line: the training stands without it.
+    A file that cannot be sent is named in a line: the training stands without it.
     """
     # Whatever goes wrong here, the training is done and stays.
     try:

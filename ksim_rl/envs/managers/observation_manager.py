@@ -1,4 +1,4 @@
-"""Reads each observation term once, without noise; transforms add what groups ask for."""
+"""Reads each observation term once, without noise; transforms add noise, delay and history of the groups."""
 
 from collections.abc import Mapping
 from contextlib import nullcontext

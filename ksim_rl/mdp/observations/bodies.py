@@ -100,7 +100,7 @@ class CenterOfMassInertia(ObservationTerm):
     """Inertia of each body about the centre of mass of its whole tree, in the world's axes, [E, 10N]; position stage.
 
     MuJoCo's `cinert`, per body: moments xx, yy, zz, xy, xz, yz (kg m^2), mass times the offset from that centre (kg m),
-    and mass (kg). The body alone counts, without what hangs on it.
+    and mass (kg). The body alone counts, without the bodies below it.
     """
 
     bodies: Patterns

@@ -78,7 +78,7 @@ class JointAcc(OfJoints, ObservationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class JointEffort(OfJoints, ObservationTerm):
-    """What the actuators exert on joints, behind their gears, N m or N, [E, L]; acceleration stage."""
+    """The effort of actuators on joints, behind their gears, N m or N, [E, L]; acceleration stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return view.joints(self.joints).effort_EL
@@ -245,7 +245,7 @@ class ImuReading(OfSensor, ObservationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class CameraImage(OfSensor, ObservationTerm, is_image=True):
-    """What a `CameraSensor` sees of the current state (position stage); the only term of its observation group.
+    """The picture of a `CameraSensor` in the current state (position stage); the only term of its observation group.
 
     "rgb" (uint8 [E, H, W, 3]), "depth" (m, float32 [E, H, W]) or "segmentation" (ids of geoms, -1 for none, int32
     [E, H, W]).

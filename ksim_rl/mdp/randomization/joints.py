@@ -149,7 +149,7 @@ class RandomizeEncoderBias(OfJoints, RandomizeNumber):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeActuator(OfJoints, Randomize, operation="scale"):
-    """What the events of this file share; `joints` are those that are driven."""
+    """The base of the events of actuators; `joints` are driven ones."""
 
     def _draw_explicit(
         self, view: EnvView, mask_E: Tensor, name: str, pair: Pair, finite: bool = False

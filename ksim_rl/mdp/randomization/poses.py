@@ -85,12 +85,12 @@ class OfBodies(RandomizeField):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeBodyPos(OfBodies, RandomizePos, field="body_pos"):
-    """Position of bodies in the frame of their parents, m; columns x, y, z. What hangs on them moves along."""
+    """Position of bodies in the frame of their parents, m; columns x, y, z. The bodies below them move along."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeBodyQuat(OfBodies, RandomizeTurn, field="body_quat"):
-    """Orientation of bodies in their parents, rad by angle, about their own axes. What hangs on them turns along."""
+    """Orientation of bodies in their parents, rad by angle, about their own axes. The bodies below them turn along."""
 
 
 @dataclass(frozen=True, kw_only=True)

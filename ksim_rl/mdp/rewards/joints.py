@@ -101,7 +101,7 @@ class UnreachableTargetL2(OfJoints, RewardTerm):
     """Sum over joints of the square of how far a position target is out of reach, rad^2 or m^2, [E].
 
     In an env step of length t a joint gets `max_velocity` t + `max_acceleration` t^2 / 2 away from where it was when it
-    began (rad/s and rad/s^2, or m). What the target asks for beyond that is counted; 0 in the first step of an episode.
+    began (rad/s and rad/s^2, or m). The part of the target beyond that is counted; 0 in the first step of an episode.
     Both limits are by regular expressions that match each joint once.
     """
 

@@ -23,7 +23,7 @@ def read_observations(
 
     Whether an element of a row is not finite is written to `faults` [D], where given. LISTED, of what follows env
     states only what the next step does not begin with is written, in any order, the rows to `places`, their number to
-    `count`. The value of others is that of `known` a step later.
+    `count`. Other rows take the value of `known` a step later.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     column = tl.arange(0, LANES)[None, :]
@@ -58,9 +58,9 @@ def write_records(
 ):  # fmt: skip
     """Write the records of some steps, or of their images, which begin at row `first`; padding has a std of 1.
 
-    What is not finite takes no part: its record is neutral, its mask 0, its observations are zeros, as a zero times NaN
-    is NaN. `left_out` [programs] counts it, without images. STANDARDIZED advantages have a mean of 0 and a standard
-    deviation of 1, by the `moments` [num_moments, 3] that `estimate_advantages` left.
+    A row that is not finite takes no part: its record is neutral, its mask 0, its observations are zeros, as a zero
+    times NaN is NaN. `left_out` [programs] counts it, without images. STANDARDIZED advantages have a mean of 0 and a
+    standard deviation of 1, by the `moments` [num_moments, 3] that `estimate_advantages` left.
     """
     rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = rows < num_rows

@@ -1,4 +1,4 @@
-"""Lays out the parameters of fused networks, cuts the work into parts, and says what cannot be fused."""
+"""Lays out the parameters of fused networks, cuts the work into parts, and names the networks that cannot be fused."""
 
 import itertools
 import math
@@ -237,7 +237,7 @@ def power_of_two(number: int) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """How work is cut. What `of` gives was the fastest on an H200 for layers of 512, 256 and 128, but for `lower`."""
+    """How work is cut. `of` gives the fastest sizes on an H200 for layers of 512, 256 and 128, but for `lower`."""
 
     block: int = 64  # rows of a minibatch that one program takes through a network, or through one layer
     chunk: int = 32  # columns of the widest layer that exist at a time

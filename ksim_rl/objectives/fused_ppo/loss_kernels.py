@@ -30,7 +30,7 @@ def policy_gradient(
     Writes the sum of the latter to `d_std_at` [OUT], and to `statistics` the sums of mask, policy loss, divergence and
     clipped ratios. With STATE_STD `raw_std` has a row for each of `loc`, and the sum of entropies is written, too; else
     it is [1, OUT]. With NODES, points [NODES, 2] of a quadrature and their weights, actions are squashed to a box with
-    a volume of exp(`log_range`) times that of [-1, 1], and the entropy is that of what comes out.
+    a volume of exp(`log_range`) times the volume of [-1, 1], and the entropy is the bounded action's.
     """
     output = tl.arange(0, OUT)[None, :]
     action_dims = output < ACTIONS
@@ -124,7 +124,7 @@ def value_gradient(
     """Return the gradient of the value loss at `out` [rows, OUT], whose first column is the value.
 
     Writes to `statistics` the sums of mask and value loss (without `critic_coeff`), and of targets and errors their sum
-    and that of squares about their mean, which does not cancel as that about zero does.
+    and the sum of squares about their mean, which does not cancel as a sum about zero does.
     """
     output = tl.arange(0, OUT)[None, :]
     # A tile has no indexing: the first column is picked by a masked sum.

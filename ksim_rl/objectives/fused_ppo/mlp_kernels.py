@@ -56,7 +56,7 @@ def slope_of(value, ACTIVATION: tl.constexpr):
 def read_rows(
     source, row, column, keep, mean, var, eps, like, WIDTH: tl.constexpr, NORMALIZED: tl.constexpr, TF32: tl.constexpr
 ):  # fmt: skip
-    """Return columns of rows of `source` [D, WIDTH], normalized or not, as products with what is `like` take them."""
+    """Return columns of rows of `source` [D, WIDTH], normalized or not, in the dtype of `like`, for products."""
     used = column < WIDTH
     value = tl.load(source + (row * WIDTH + column), mask=keep & used, other=0.0)
     if NORMALIZED:
@@ -135,7 +135,7 @@ def network_outputs(
     H1: tl.constexpr, H2: tl.constexpr, H3: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
     CHUNK: tl.constexpr, STAGES: tl.constexpr, ACTIVATION: tl.constexpr, TF32: tl.constexpr,
 ):  # fmt: skip
-    """Write what a network makes of rows of `obs` [D, WIDTH] to `outputs` [D, COLUMNS]; LISTED, `count` to `places`."""
+    """Write a network's outputs for rows of `obs` [D, WIDTH] to `outputs` [D, COLUMNS]; LISTED, `count` to `places`."""
     rows = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     if LISTED:
         # The number of rows is known on the device only; programs beyond it have nothing to do.
@@ -168,7 +168,7 @@ def minibatch_gradients(
 
     Program (i, n) takes BLOCK rows of the minibatch, the env states `order` [B], through network n (0: actor, 1:
     critic). It leaves what layers read [2, B, INPUTS] and the gradients of the sum of the losses at layer outputs [2,
-    B, GRADIENTS], but not those of the first hidden layer (see `lower_gradients`), and what the block adds to the
+    B, GRADIENTS], but not at the first hidden layer (see `lower_gradients`), and the block's part of the
     gradient of the std and to the statistics of the loss: [blocks, 2, OUT + NUM_STATISTICS]. Weights and biases are in
     padded form, [2, NUM_PADDED].
     """
@@ -248,7 +248,7 @@ def lower_gradients(
 
     Program (i, s, n) has LOWER of its elements, whose weights stay on the chip, over the ROWS of split s, in network n;
     neither they nor the gradients at them are ever in memory. It writes to the places of its split, as
-    `weight_gradients` does, all but the biases of the second layer. All is transposed: what is computed here is the
+    `weight_gradients` does, all but the biases of the second layer. All is transposed: the result here is the
     first factor of the next product, as which it stays in registers. Observations are HEAD columns and REST more, both
     powers of two, which are fewer than OBS.
     """

@@ -92,10 +92,10 @@ def sum_gradients(
     STATE_STD: tl.constexpr, NODES: tl.constexpr, MIRROR: tl.constexpr, ADAPTIVE: tl.constexpr,
     SIZE: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Add up what splits and blocks left, divide by the number of rows of all ranks, and adapt the learning rate.
+    """Add up the sums of splits and blocks, divide by the number of rows of all ranks, and adapt the learning rate.
 
     The first programs take SIZE weights and biases each, and leave their gradients [2, NUM_PADDED] and the sum of their
-    squares; two more take the std and the statistics of the policy's loss, and those of the value's. That gradients are
+    squares; two more take the std and the statistics of the policy's loss, and of the value's. That gradients are
     means of only a SHARE of the rows is left to who reads them, so that no program waits for the count.
     """
     PROGRAMS: tl.constexpr = (NUM_PADDED + SIZE - 1) // SIZE
@@ -179,7 +179,7 @@ def take_means(
     gradients, squares, learning_rate, summary, desired_kl, rate_bounds,
     NUM_GRADIENTS: tl.constexpr, ADAPTIVE: tl.constexpr, SIZE: tl.constexpr,
 ):  # fmt: skip
-    """Take squares and means of what `sum_gradients` left, added up over ranks, and adapt the learning rate."""
+    """Take squares and means of the sums of `sum_gradients`, added up over ranks, and adapt the learning rate."""
     # Gradients and statistics lie end to end, so that one collective adds up both over the ranks.
     sums = gradients + NUM_GRADIENTS
     at = tl.program_id(0) * SIZE + tl.arange(0, SIZE)

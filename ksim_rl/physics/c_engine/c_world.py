@@ -39,8 +39,9 @@ class CWorld(World):
     """Worlds of one model on MuJoCo's C engine; see `World`.
 
     The state is rounded to float32 once per `step(n)`, and never within, so that views have all of it. From equal
-    float32 states `step` reaches, bit for bit, the float32 of what `mujoco.mj_step` reaches, whatever the number of
-    threads. Contacts and constraint rows have no limit but the model's memory; a RuntimeError says where that is full.
+    float32 states `step` reaches, bit for bit, the float32 of the states that `mujoco.mj_step` reaches, whatever the
+    number of threads. Contacts and constraint rows have no limit but the model's memory; a RuntimeError says where that
+    is full.
     """
 
     engine = "c"

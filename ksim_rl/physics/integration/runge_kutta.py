@@ -37,7 +37,7 @@ def mended_runge_kutta(
 
     Rows that tie bodies are made a second time, when the velocities belong to the stage and not to the one before.
     It leaves the readings and the `act_dot` of the last stage, as C does, and not the mean of all four rates. Delayed
-    controls are those of the stage's own time, and exact filters reach the stage by their rate, as in C.
+    controls are read at the stage's own time, and exact filters reach the stage by their rate, as in C.
     """
     d = warp_data_E
     # Whether actuation is on: a disabled one calls no callback of controls.
@@ -110,7 +110,7 @@ def _idle_actuators(warp_model: mjw.Model) -> dict[str, Any]:
 
 
 class _LastReadings:
-    """What the last stage of Runge-Kutta read of velocities and passive forces."""
+    """Velocities and passive forces that the last stage of Runge-Kutta read."""
 
     def __init__(self, warp_data_E: mjw.Data) -> None:
         self._arrays: list[wp.array] = []
@@ -135,7 +135,7 @@ class _LastReadings:
             wp.copy(kept, array)
 
     def put_back(self) -> None:
-        """Launch copies of what was taken last."""
+        """Launch copies of the values that were taken last."""
         for array, kept in zip(self._arrays, self._kept, strict=True):
             wp.copy(array, kept)
 

@@ -33,7 +33,7 @@ _ENUMS = {
 
 
 def one_kernel_rows_unavailable(warp_model: mjw.Model, *, dynamics_unavailable: str | None) -> str | None:
-    """Return why MuJoCo Warp's own kernels make a model's rows, or None where one does, as of what precedes them."""
+    """Return why MuJoCo Warp's own kernels make a model's rows, or None where ours does, given earlier stages."""
     m = warp_model
     reasons = {
         "what precedes them is not one kernel": dynamics_unavailable is not None,

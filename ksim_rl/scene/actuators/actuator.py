@@ -112,7 +112,7 @@ class SubstepRing:
 
 @dataclass(frozen=True, kw_only=True)
 class Actuator(Checked, ABC):
-    """What drives some joints of a robot, one actuator of the model for each of them.
+    """The drive of some joints of a robot: one actuator of the model for each joint.
 
     MuJoCo computes the effort of built-in actuators from `ctrl`, which is their target. Explicit ones are plain motors
     in the model, whose effort `law` computes before each substep: of `is_explicit` entries it must run there.
@@ -151,7 +151,7 @@ class Actuator(Checked, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class JointActuator(Actuator):
-    """What all actuators of joints have; each hinge or slide that `joints` matches gets an actuator of its name.
+    """The base of all actuators of joints; each hinge or slide that `joints` matches gets an actuator of its name.
 
     `effort_limit` (N m or N, symmetric), `armature` (inertia of the motor as the joint feels it, kg m^2 or kg) and
     `frictionloss` (N m or N) take the place of the model's; None keeps those.

@@ -151,7 +151,7 @@ class NetActuator(ExplicitActuator, takes=frozenset({"pos"})):
 class MLPActuator(NetActuator):
     """A feed-forward network of the position errors and velocities at some past substeps.
 
-    The file holds what `nn.Sequential(Linear, activation, Linear, ...).state_dict()` gives: `0.weight` [H, F], `0.bias`
+    The file holds the `state_dict()` of `nn.Sequential(Linear, activation, Linear, ...)`: `0.weight` [H, F], `0.bias`
     [H], `2.weight`, ... The F inputs are the position errors at `input_lags` (physics substeps, 0 is the present), in
     that order, then the velocities; the output is one number. After a reset the first state counts as having been there
     before. A field that is None is read from the file's metadata, such as `input_lags` "[0, 2, 4]".

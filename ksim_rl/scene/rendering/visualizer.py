@@ -12,7 +12,7 @@ Rgba = tuple[float, float, float, float]
 
 
 class DebugVisualizer:
-    """What commands, rewards and sensors draw with: m, world frame; colors in [0, 1].
+    """The pen of commands, rewards and sensors: m, world frame; colors in [0, 1].
 
     It draws into a `mujoco.MjvScene`; marks beyond the scene's capacity are refused, not dropped.
     """

@@ -77,7 +77,7 @@ class JointAnalysis:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotAnalysis:
-    """What `analyse` found: the joints as they are, and `robot`, a `LeggedRobot` of all that is proposed.
+    """The findings of `analyse`: the joints as they are, and `robot`, a `LeggedRobot` of all that is proposed.
 
     Attributes:
         mass, height: kg, and m from the lowest point to the highest in the model's own pose.

@@ -55,7 +55,7 @@ class Leg:
 
     @property
     def geoms(self) -> list[CollisionGeom]:
-        """What treads on the ground."""
+        """The parts that tread on the ground."""
         name = f"{self.foot}_sole"
         foot = self.foot
         if len(self.centres_N3) == 1:
@@ -70,7 +70,7 @@ class Leg:
 
 @dataclass(frozen=True, kw_only=True)
 class Anatomy:
-    """What is known of a robot's build: the root body, legs, hulls of root and limbs, and m from bottom to top."""
+    """A robot's build: the root body, legs, hulls of root and limbs, and m from bottom to top."""
 
     root: str
     legs: tuple[Leg, ...]

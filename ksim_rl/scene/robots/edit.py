@@ -198,7 +198,7 @@ def drop_bodies(spec: mujoco.MjSpec, names: Iterable[str]) -> None:
 def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom]) -> None:
     """Delete all geoms that can collide and add `geoms`; visual geoms, masses and inertias of all bodies stay.
 
-    What a tendon wraps around stays too, and collides no more, as do the geoms of bodies of which one would see nothing
+    Geoms that a tendon wraps around stay too, and collide no more, as do the geoms of bodies that nobody would see
     without them; these lose their names. Explicit pairs of geoms are contacts of the old ones, and go with them, as
     sensors of the old ones do.
     """

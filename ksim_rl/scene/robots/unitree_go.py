@@ -28,7 +28,7 @@ _GO2_SMOOTH: dict[str, Any] = _GO1_SMOOTH | {"priority": 1}
 
 @dataclass(frozen=True, kw_only=True)
 class UnitreeQuadruped(MenagerieRobot, joint_names=JOINTS, foot_sites=LEGS):
-    """What Go1 and Go2 share; fields as of `MenagerieRobot`."""
+    """The base of Go1 and Go2; fields as of `MenagerieRobot`."""
 
     default_joint_pos: Mapping[str, float] = field(default_factory=lambda: spread(STANCE, JOINTS))
 

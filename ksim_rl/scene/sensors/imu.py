@@ -40,7 +40,7 @@ class ImuSensor(MountedSensor):
 
 
 class ImuTracker(SensorTracker):
-    """What one inertial measurement unit reads, float32, in its own axes."""
+    """The readings of one inertial measurement unit, float32, in its own axes."""
 
     def __init__(self, name: str, view: WorldView, site: str) -> None:
         self._name = name

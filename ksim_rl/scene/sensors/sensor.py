@@ -20,7 +20,7 @@ GeomGroup = Annotated[int, Within(low=0, high=mujoco.mjNGROUP - 1)]
 
 
 class SensorTracker(NearNames):
-    """Reads one sensor. What it reads on demand belongs in `view.cache`, so that it is read once per state.
+    """Reads one sensor. Readings on demand belong in `view.cache`, so that it is read once per state.
 
     With `every_substep`, `update_substep` runs after each physics substep, at which the worlds then compute their
     sensors; contact sensors alone with `contacts_only`, if all such trackers have it, which takes less time.

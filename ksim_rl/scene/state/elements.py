@@ -91,7 +91,7 @@ class Joints(_Elements):
 
     @quantity
     def effort_EL(self) -> Float[Tensor, "E L"]:
-        """What actuators exert, N m or N, behind the gears; acceleration stage."""
+        """The effort of actuators, N m or N, behind the gears; acceleration stage."""
         # MuJoCo's sum over all actuators of the joint, after the gears and the joint's own limit.
         return self._state.world.qfrc_actuator_EL[:, self.qvel]
 
@@ -115,7 +115,7 @@ class Joints(_Elements):
 
     @property
     def encoder_bias_EL(self) -> Float[Tensor, "E L"]:
-        """What the encoders read beyond the position, rad or m."""
+        """The encoders' readings less the positions, rad or m."""
         return self._tables.encoder_bias_EL[:, self.index]
 
     def write_pos(self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E L"]) -> None:
@@ -159,7 +159,7 @@ class Bodies(_Elements):
 
     @quantity
     def inertia_EN10(self) -> Float[Tensor, "E N 10"]:
-        """Inertias about the centres of mass of the bodies' trees, as MuJoCo's `cinert` has them."""
+        """Inertias about the centres of mass of the bodies' trees, as MuJoCo's `cinert` has them; position stage."""
         return self._state.derived().view("cinert")[:, self.index]
 
     @quantity

@@ -18,7 +18,7 @@ class Entity(NearNames):
 
     Attributes:
         name: its key in `scene.robots` or `scene.objects`.
-        prefix: what stands before the names of its elements; empty if it is alone in the scene.
+        prefix: the beginning of its elements' names; empty if it is alone in the scene.
         free_root: whether its first joint is free.
         root: the body of its first joint if that is free, else its first body.
         root_qpos, root_qvel: columns of the free joint in MuJoCo's state, empty if the root is fixed.

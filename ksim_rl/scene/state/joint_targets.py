@@ -32,7 +32,7 @@ class JointState(NamedTuple):
 
 
 class JointTarget(NamedTuple):
-    """What N joints are asked for: position, velocity, and effort (N m or N) to add."""
+    """The targets of N joints: position, velocity, and effort (N m or N) to add."""
 
     pos_EN: Float[Tensor, "E N"]
     vel_EN: Float[Tensor, "E N"]

@@ -53,17 +53,17 @@ class WorldView(NearNames):
         default_qpos_L, default_qvel_L: the state at reset, in MuJoCo's layout.
         default_joint_pos_EL: positions of joints in the default pose, rad or m, which events may move.
         soft_joint_pos_limits_L2: ends of `scene.soft_joint_pos_limit_factor` of each joint's range, rad or m.
-        encoder_bias_EL: what the encoders read beyond the positions of joints, rad or m.
+        encoder_bias_EL: the encoders' readings less the positions of joints, rad or m.
         joint_pos_target_EL: positions that joints are asked for, rad or m.
         joint_vel_target_EL: velocities that joints are asked for, rad/s or m/s.
         joint_effort_target_EL: efforts that joints are asked for, N m or N.
         ctrl_limits_L2: ends of the range of each actuator's control, infinite where there is none.
         actuator_params: numbers of explicit actuators: `actuator_param`.
-        targets: what turns the targets of joints into controls.
+        targets: turns the targets of joints into controls.
         write_root_pose, write_root_velocity: methods of `robot`.
         default_state: the state that resets restore.
         world: the worlds themselves: `derived`.
-        resolver: what finds elements of the model by names.
+        resolver: finds elements of the model by names.
         buffers: tensors with a row per env that terms keep: `buffer`.
     """
 

@@ -64,7 +64,7 @@ class TerrainPatch(Checked, ABC):
     """A kind of ground. Pairs are values at difficulty 0 and at difficulty 1, with a straight line between them.
 
     Lengths are in m; `platform_width` is the edge of the even square about the centre, `proportion` the share of envs
-    relative to other kinds, `cell` the distance of points at which heights are given. What costs is the number of
+    relative to other kinds, `cell` the distance of points at which heights are given. The cost is in the number of
     triangles under a foot, so take the coarsest that shows the shape.
     """
 

@@ -109,7 +109,7 @@ class DrawStart(StartRule):
 class StartFromBank(StartRule):
     """Put rows that reset into starts from a bank, drawn by the rule on the host when the env is made.
 
-    So it may do what no CUDA graph can: draw again until nothing touches, and let the model settle.
+    So it may do steps that no CUDA graph can: draw again until nothing touches, and let the model settle.
 
     Attributes:
         without_contacts: starts in which anything touches are drawn again.
