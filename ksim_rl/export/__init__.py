@@ -2,6 +2,6 @@
 
 from ksim_rl.export import describe_tasks
 from ksim_rl.export.describe import NotDescribedError, describe, op, quantity
+from ksim_rl.export.exported_transforms import stage
 from ksim_rl.export.folder import export, export_policy
 from ksim_rl.export.sim2sim import Report, sim2sim
-from ksim_rl.export.task_transforms import stage

@@ -7,7 +7,7 @@ from ksim_rl import mdp
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.view import EnvView
 from ksim_rl.export.describe import NotDescribedError, describe, joint_names, names_of
-from ksim_rl.export.task_transforms import lag
+from ksim_rl.export.exported_transforms import lag
 from ksim_rl.mdp.actions import per_joint
 from ksim_rl.scene.actuators import (
     Actuator,

@@ -14,9 +14,9 @@ from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.contract import part
 from ksim_rl.export import controls, policy
 from ksim_rl.export.describe import NotDescribedError, describe, joint_names
+from ksim_rl.export.exported_transforms import TaskTransforms, check_equal, sort_transforms, with_transforms
 from ksim_rl.export.record import Recording
 from ksim_rl.export.robot import write_robot
-from ksim_rl.export.task_transforms import TaskTransforms, check_equal, sort_transforms, with_transforms
 from ksim_rl.files.writing import check_folder, check_own, whole_folder
 from ksim_rl.physics import prepare_spec
 from ksim_rl.runs import record

@@ -232,3 +232,13 @@ def lacking(meta: dict[str, Any]) -> str:
     names = [str(name) for name in meta.get("left_out", ())]
     rewards = [name.removeprefix("rewards.") for name in names if name.startswith("rewards.")]
     return f"  without {', '.join(rewards)}" if rewards else ""
+
+
+def as_text(figures: list[dict[str, float]], meta: dict[str, Any]) -> str:
+    """Return mean and spread of the figures of episodes, a line each."""
+    lines = []
+    for name in figures[0]:
+        values = [one[name] for one in figures]
+        note = lacking(meta) if name == "return" else ""
+        lines.append(f"{name:<40} {np.mean(values):12.4f} +- {np.std(values):.4f}{note}")
+    return "\n".join(lines)

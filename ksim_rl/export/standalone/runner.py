@@ -21,7 +21,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, check_record, lacking, read_arrays, read_json
+from ksim_rl.export.standalone.files import Array, as_text, check_record, read_arrays, read_json
 from ksim_rl.export.standalone.network import Policy
 from ksim_rl.export.standalone.signals import INTEGRATORS, Lag, Noise, Signals
 
@@ -425,11 +425,7 @@ def main() -> None:
     if options.output:
         Path(options.output).write_text(json.dumps(found))
         return
-    without = lacking(read_json(Path(options.folder) / "export.json"))
-    for name in found[0]:
-        values = [one[name] for one in found]
-        note = without if name == "return" else ""
-        print(f"{name:<40} {np.mean(values):12.4f} +- {np.std(values):.4f}{note}")
+    print(as_text(found, read_json(Path(options.folder) / "export.json")))
 
 
 def _run_all(options: argparse.Namespace) -> list[dict[str, float]]:

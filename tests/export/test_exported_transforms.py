@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl import envs
 from ksim_rl.export import NotDescribedError, stage
-from ksim_rl.export.task_transforms import check_equal, sort_transforms
+from ksim_rl.export.exported_transforms import check_equal, sort_transforms
 from ksim_rl.modules import update_normalizers
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build_env

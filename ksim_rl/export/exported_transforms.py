@@ -6,6 +6,7 @@ from functools import singledispatch
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
@@ -100,7 +101,7 @@ class PerObservation(nn.Module):
         super().__init__()
         self.transform = transform
 
-    def forward(self, *observations: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> tuple[Float[Tensor, "*batch ?M"], ...]:
         """Return the new observations."""
         if isinstance(self.transform, ObservationMap):
             return tuple(self.transform.new_value(*indexed) for indexed in enumerate(observations))
