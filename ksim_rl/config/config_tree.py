@@ -172,11 +172,14 @@ def _build_nested_key(value: Any, path: str) -> NestedKey:
 
 def _build_key(annotation: Any, key: object, path: str) -> Any:
     # YAML and Hydra give keys as text or as numbers.
-    if annotation is not int:
+    kinds = typing.get_args(annotation) or (annotation,)
+    if int not in kinds:
         return str(key)
     try:
         return int(str(key))
     except ValueError:
+        if str in kinds:
+            return str(key)
         raise ValueError(f"{path}: key {key!r}: expected a whole number") from None
 
 

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+from torch import Tensor
+
 from ksim_rl import mdp
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.view import EnvView
@@ -121,7 +123,8 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
     if type(term) is mdp.ActuatorAction:
         names = names_of(view, "actuator", term.actuators)
         limits = view.ctrl_limits_L2[view.resolver.index("actuator", term.actuators)].T.tolist()
-        plain = {"clip": None, "tanh": False, "scale": term.scale, "offset": 0.0, "alpha": None}
+        scale, offset = (_plain(term.numbers(view, field)) for field in ("scale", "offset"))
+        plain = {"clip": None, "tanh": False, "scale": scale, "offset": offset, "alpha": None}
         return {"kind": "ctrl", "names": names, "limits": limits, **plain}
     # Exact types: a subclass may compute something else.
     if type(term) not in kinds:
@@ -160,6 +163,13 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
         # The velocity half has no offset: its rest is 0 rad/s.
         found["velocity"] = {**shared, "scale": _numbers(view, term, "velocity_scale"), "offset": 0.0}
     return found
+
+
+def _plain(numbers: float | Tensor) -> float | list[float]:
+    """Return numbers for JSON."""
+    if isinstance(numbers, Tensor):
+        return numbers.tolist()
+    return numbers
 
 
 def _numbers(view: EnvView, term: Any, field: str) -> list[float]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -166,10 +167,14 @@ class JointPositionVelocityAction(JointPositionAction):
 
 @dataclass(frozen=True, kw_only=True)
 class ActuatorAction(ActionTerm):
-    """Controls of actuators as they are (tendons, muscles, grippers), one column each, inside each control range."""
+    """Controls of actuators as they are (tendons, sites, muscles, grippers): scale * action + offset, one column each.
+
+    They stay inside each control range. Scale and offset are numbers, or by regular expressions on actuators' names.
+    """
 
     actuators: Patterns
-    scale: float = 1.0
+    scale: PerJoint = 1.0
+    offset: PerJoint = 0.0
 
     def size(self, view: EnvView) -> int:
         ids = view.resolver.ids("actuator", self.actuators)
@@ -177,14 +182,24 @@ class ActuatorAction(ActionTerm):
         view.targets.check_no_law(ids)
         return len(ids)
 
+    def numbers(self, view: EnvView, field: Literal["scale", "offset"]) -> float | Float[Tensor, " K"]:
+        """Return the scale or the offset: the number for all actuators, or those by column."""
+        value = getattr(self, field)
+        if not isinstance(value, Mapping):
+            return float(value)
+        names = view.resolver.names("actuator")
+        chosen = [names[i] for i in view.resolver.ids("actuator", self.actuators)]
+        return constant(values_by_name(field, value, chosen), view.device)
+
     def bounds(self, view: EnvView) -> Float[Tensor, "K 2"] | None:
         limits_K2 = view.ctrl_limits_L2[view.resolver.index("actuator", self.actuators)]
-        # A negative scale swaps both ends, hence the sort.
-        return (limits_K2 / self.scale).sort(dim=-1).values
+        # Columns last, to broadcast over actuators; a negative scale swaps both ends, hence the sort.
+        actions_2K = (limits_K2.T - self.numbers(view, "offset")) / self.numbers(view, "scale")
+        return actions_2K.T.sort(dim=-1).values
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         index = view.resolver.index("actuator", self.actuators)
         limits_K2 = view.ctrl_limits_L2[index]
+        asked_EK = action_EK * self.numbers(view, "scale") + self.numbers(view, "offset")
         # Clamped here, so that `ctrl` reads as the control in force.
-        ctrl_EK = torch.clamp(action_EK * self.scale, limits_K2[:, 0], limits_K2[:, 1])
-        view.world.ctrl_EL[:, index] = ctrl_EK
+        view.world.ctrl_EL[:, index] = torch.clamp(asked_EK, limits_K2[:, 0], limits_K2[:, 1])

@@ -241,6 +241,7 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
     * forward: `vx = max(|vx|, forward_min_speed)`, `vy = wz = 0`;
     * heading: wz steers to a drawn world heading, `clip(heading_stiffness * heading error, ang_vel_z)`, at every step,
       also where the env is a forward one;
+    * world: (vx, vy) are in the world's axes, as drawn and not as a forward env has them;
     * standing: all zero, whatever else it is.
 
     Units are m, rad and s; `ang_vel_z` also bounds heading control, and `rel_..._envs` are probabilities.
@@ -254,6 +255,7 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
     rel_standing_envs: Share = 0.0
     rel_heading_envs: Share = 0.0
     rel_forward_envs: Share = 0.0
+    rel_world_envs: Share = 0.0
     forward_min_speed: NonNegative = 0.3
 
     def shared_ranges(self, view: EnvView) -> Float[Tensor, "2 7"]:
@@ -271,6 +273,13 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
         speed_E1 = target_E4[:, :1].abs().clamp(min=self.forward_min_speed)
         forward_E3 = speed_E1 * constant((1.0, 0.0, 0.0), view.device)
         velocity_E3 = torch.where(is_kind_E3[:, 2:], forward_E3, target_E4[:, :3])
+        if self.rel_world_envs > 0.0:
+            # A draw of its own, so that the others are as without it.
+            is_world_E1 = view.uniform(1) < self.rel_world_envs
+            held_E1 = self._is_world(view)
+            held_E1.copy_(torch.where(mask_E[:, None], is_world_E1, held_E1))
+            planar_E2 = torch.where(is_world_E1, target_E4[:, :2], velocity_E3[:, :2])
+            velocity_E3 = torch.cat((planar_E2, velocity_E3[:, 2:]), dim=-1)
 
         # Forward is folded into the velocity; standing and heading control are decided at each step.
         drawn_E4 = torch.cat((velocity_E3, target_E4[:, 3:]), dim=-1)
@@ -287,7 +296,11 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
         # Steering stays inside the present range of wz, column 2.
         steer_E = (self.heading_stiffness * error_E).clamp(*self.shared_ranges(view)[:, 2].unbind())
         wz_E = torch.where(kind_E2[:, 1], steer_E, target_E4[:, 2])
-        command_E3 = torch.cat((target_E4[:, :2], wz_E[:, None]), dim=-1)
+        planar_E2 = target_E4[:, :2]
+        if self.rel_world_envs > 0.0:
+            turned_E2 = quaternion.turn_planar(planar_E2, -view.entity(self.entity).heading_E)
+            planar_E2 = torch.where(self._is_world(view), turned_E2, planar_E2)
+        command_E3 = torch.cat((planar_E2, wz_E[:, None]), dim=-1)
         # Standing comes last: it overrides all other kinds.
         return torch.where(kind_E2[:, :1], 0.0, command_E3)
 
@@ -309,6 +322,10 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
     def _target(self, view: EnvView) -> Tensor:
         """Drawn vx, vy, wz and heading, [E, 4]."""
         return view.buffer("target_E4", 4)
+
+    def _is_world(self, view: EnvView) -> Tensor:
+        """Whether each env's velocity is in the world's axes, bool [E, 1]."""
+        return view.buffer("is_world_E1", 1, dtype=torch.bool)
 
     def _kind(self, view: EnvView) -> Tensor:
         """Whether each env stands and whether it is heading-controlled, bool [E, 2]."""

@@ -75,3 +75,11 @@ def from_euler_xyz(
 def wrap_to_pi(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Return the angle's equivalent in [-pi, pi), rad."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
+
+
+def turn_planar(v: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2"]:
+    """Turn vectors of the xy plane about z by an angle, rad, counterclockwise seen from above."""
+    cos = torch.cos(angle)
+    sin = torch.sin(angle)
+    x, y = v.unbind(-1)
+    return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)

@@ -148,6 +148,50 @@ def test_controls_as_they_are_stay_in_their_ranges(arms):
     assert term.size(arms.view) == 2
 
 
+TENDONS = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 0"/>
+  <worldbody>
+    <body name="slider">
+      <joint name="slide" type="slide" axis="1 0 0"/>
+      <geom type="sphere" size="0.1" mass="2"/>
+      <site name="hook" euler="0 0 90"/>
+    </body>
+  </worldbody>
+  <tendon><fixed name="cord"><joint joint="slide" coef="2"/></fixed></tendon>
+  <actuator>
+    <position name="cord" tendon="cord" kp="10" kv="5"/>
+    <motor name="thrust" site="hook" gear="0 -3 0 0 0 0"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_tendons_and_sites_take_controls_with_scale_and_offset_by_name():
+    bench = Bench(TENDONS, 3, {})
+    term = mdp.ActuatorAction(
+        actuators=("thrust", "cord"), scale={"cord": 0.5, "thrust": 2.0}, offset={"cord": 0.3, "thrust": 0.0}
+    )
+    ctrl = run(bench, term)
+    torch.testing.assert_close(ctrl, torch.stack((0.5 * ACTION[:, 1] + 0.3, 2.0 * ACTION[:, 0]), dim=-1))
+    # The site's y axis points against x: a force of 3 per unit of control, against the gear's sign, on 2 kg.
+    bench.place(qpos=[[0.0]], qvel=[[0.0]])
+    run(bench, mdp.ActuatorAction(actuators="thrust"), ACTION[:, :1])
+    bench.world.ctrl_EL[:, 0] = 0.0
+    bench.step(1)
+    torch.testing.assert_close(
+        bench.world.qvel_EL[:, 0], 3.0 * ACTION[:, 0] / 2.0 * 0.002, atol=1e-5, rtol=1e-2
+    )
+    # Alone, the cord comes to rest where its length, twice the slide's position, is the control.
+    run(bench, mdp.ActuatorAction(actuators="cord", offset=0.4), 0.0 * ACTION[:, :1])
+    bench.world.ctrl_EL[:, 1] = 0.0
+    for _ in range(400):
+        bench.step()
+    torch.testing.assert_close(bench.world.qpos_EL[:, 0], torch.full((3,), 0.2), atol=1e-3, rtol=0)
+    with pytest.raises(ValueError, match="scale: pattern 'thrust' matches nothing"):
+        run(bench, mdp.ActuatorAction(actuators="cord", scale={"thrust": 1.0}))
+
+
 @pytest.mark.parametrize(
     ("term", "message"),
     [
@@ -202,6 +246,7 @@ def test_bounds_are_the_actions_that_reach_the_control_range(arms):
         [-4.0, 6.0],
         [-math.inf, math.inf],
     ]
+    assert bounds(arms, mdp.ActuatorAction(actuators="grip", scale=-1.0, offset=0.5)) == [[-2.5, 2.5]]
     servos = mdp.JointPositionVelocityAction(joints="elbow", clip=(-1.0, 2.0))
     assert bounds(arms, servos) == [[-1.0, 2.0]] * 2
     assert bounds(arms, mdp.JointPositionAction(joints="elbow")) is None

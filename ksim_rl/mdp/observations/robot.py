@@ -283,7 +283,7 @@ class RayHeight(OfSensor, ObservationTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         tracker = view.rays(self.sensor)
         # World z of the sensor minus world z of the hits.
-        below_EN = tracker.origin_E3[:, 2:] - tracker.state.point_EN3[..., 2] - self.offset
+        below_EN = tracker.origin_EN3[..., 2] - tracker.state.point_EN3[..., 2] - self.offset
         return below_EN.clamp(*self.clip)
 
 

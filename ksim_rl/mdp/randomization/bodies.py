@@ -58,7 +58,7 @@ class RandomizeBodyInertia(RandomizeBodyField, field="body_inertia", columns=3, 
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
     operation: Literal["scale"] = "scale"
 
-    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+    def draw_columns(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         ids = self.ids(view)
         pairs = self.ranges_by_column()
         # Factors of 1 stand in for the model's own moments, since the draws are factors themselves.

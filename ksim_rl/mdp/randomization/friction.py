@@ -29,7 +29,7 @@ class RandomizeGeomFriction(
 
     geoms: Patterns
 
-    def without_effect(self, view: EnvView) -> Sequence[str]:
+    def unfelt_columns(self, view: EnvView) -> Sequence[str]:
         model = view.world.mj_model
         rows = self.ids(view)
         lines: list[str] = []
@@ -59,7 +59,7 @@ class RandomizePairFriction(
 
     pairs: Patterns
 
-    def without_effect(self, view: EnvView) -> Sequence[str]:
+    def unfelt_columns(self, view: EnvView) -> Sequence[str]:
         model = view.world.mj_model
         lines: list[str] = []
         for column in self.ranges_by_column():

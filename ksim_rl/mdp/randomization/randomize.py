@@ -3,9 +3,10 @@
 Each draw starts from the model's own values, so that neither the order of resets nor their number matters.
 """
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from ksim_rl.checked import NonNegative, Positive, Range, Within, check_value
 from ksim_rl.checks import check_choice
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.constants import constant, index_constant
+from ksim_rl.mdp.constants import constant, index_constant, values_by_name
 from ksim_rl.mdp.randomization.drawing import draw_entries
 from ksim_rl.scene.names import Patterns
 
@@ -135,10 +136,14 @@ class RandomizeField(Randomize):
         return _KINDS.get(prefix, prefix)
 
     @property
+    def elements_field(self) -> str:
+        """The name of the subclass's field of patterns, in the plural."""
+        return {"body": "bodies"}.get(self.kind, f"{self.kind}s")
+
+    @property
     def elements(self) -> Patterns:
         """Names or patterns of the elements that are randomized."""
-        # The subclass has a field of patterns, named in the plural.
-        return getattr(self, {"body": "bodies"}.get(self.kind, f"{self.kind}s"))
+        return getattr(self, self.elements_field)
 
     @property
     def per_world_fields(self) -> tuple[str, ...]:
@@ -159,10 +164,11 @@ class RandomizeField(Randomize):
 class RandomizeModelField(RandomizeField):
     """Draw entries of a model field per world from `ranges`, by its columns, or one pair for every column.
 
-    Where columns mean different things, `columns_of_one_pair` are those that one pair is for.
+    Where columns mean different things, `columns_of_one_pair` are those that one pair is for. Ranges may also be by
+    names of elements, regular expressions of which each element matches one: `{".*_hip": (0.1, 0.2), ".*_knee": ...}`.
     """
 
-    ranges: Pair | Mapping[int, Pair]
+    ranges: Pair | Mapping[int | str, Pair]
 
     lowest: ClassVar[float | None] = None  # the least value that makes sense
     highest: ClassVar[float | None] = None  # and at most
@@ -173,17 +179,54 @@ class RandomizeModelField(RandomizeField):
         if not isinstance(self.ranges, Mapping):
             self.check_range("ranges", self.ranges)
             return
-        for column, pair in self.ranges.items():
-            check_choice("ranges", column, range(self.columns))
-            self.check_range(f"ranges[{column}]", pair)
+        if len({type(key) for key in self.ranges}) > 1:
+            raise ValueError(f"ranges={self.ranges!r}: keys are either columns or names, not both")
+        for key, pair in self.ranges.items():
+            if not isinstance(key, str):
+                check_choice("ranges", key, range(self.columns))
+            elif not hasattr(self, self.elements_field):
+                raise ValueError(
+                    f"ranges has the key {key!r}: there are no elements to name; use columns, 0 and on"
+                )
+            self.check_range(f"ranges[{key}]", pair)
+
+    def by_name(self, view: EnvView) -> list[Self]:
+        """Return an event for each pattern of `ranges`, with the elements that match it; this one without patterns."""
+        if not isinstance(self.ranges, Mapping):
+            return [self]
+        pairs = {pattern: pair for pattern, pair in self.ranges.items() if isinstance(pattern, str)}
+        if not pairs:
+            return [self]
+        names = view.resolver.names(self.kind)
+        chosen = [names[i] for i in view.resolver.ids(self.kind, self.elements)]
+        # Which pattern each element matches: exactly one.
+        number_of = values_by_name("ranges", {pattern: n for n, pattern in enumerate(pairs)}, chosen)
+        events = []
+        for number, pair in enumerate(pairs.values()):
+            own = [re.escape(name) for name, found in zip(chosen, number_of, strict=True) if found == number]
+            events.append(replace(self, **{self.elements_field: tuple(own), "ranges": pair}))
+        return events
 
     def ranges_by_column(self) -> dict[int, Pair]:
         """Return the ranges by column, in the order of the columns."""
         if isinstance(self.ranges, Mapping):
-            return dict(sorted(self.ranges.items()))
+            # Ranges by name have become events of one range each: see `by_name`.
+            return {int(column): pair for column, pair in sorted(self.ranges.items())}
         return dict.fromkeys(self.columns_of_one_pair or range(self.columns), self.ranges)
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        for event in self.by_name(view):
+            event.draw_columns(view, mask_E)
+
+    def without_effect(self, view: EnvView) -> Sequence[str]:
+        return [line for event in self.by_name(view) for line in event.unfelt_columns(view)]
+
+    def unfelt_columns(self, view: EnvView) -> Sequence[str]:
+        """Return the lines of `without_effect` for ranges that are not by name."""
+        return ()
+
+    def draw_columns(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        """Draw the entries of ranges that are not by name, in the rows of `mask_E`."""
         ids = self.ids(view)
         pairs = self.ranges_by_column()
         nominal = self.nominal(view)

@@ -34,7 +34,7 @@ class Drive:
         self._joints = view.joints().some(joint_ids)
         # Columns of the controls, in the order of the joints.
         self._motors = as_index([view.targets.motor(i) for i in joint_ids], view.device)
-        self._at_reset: list[Callable[[Bool[Tensor, " E"]], None]] = []
+        self._at_reset: list[tuple[str, Callable[[Bool[Tensor, " E"]], None]]] = []
 
     def param(self, name: str) -> Float[Tensor, "E N"]:
         """Return the present values of a number of `Actuator.params`."""
@@ -47,9 +47,12 @@ class Drive:
         full_name = f"{self.name}.{name}"
         return self._view.buffers.get(full_name, *shape, dtype=dtype, keep=keep, owner=self.name)
 
-    def on_reset(self, draw: Callable[[Bool[Tensor, " E"]], None]) -> None:
-        """Call `draw` with the mask of the rows that reset; it may draw by `integers`."""
-        self._at_reset.append(draw)
+    def on_reset(self, draw: Callable[[Bool[Tensor, " E"]], None], *, stream: str = "") -> None:
+        """Call `draw` with the mask of the rows that reset; it may draw by `integers`.
+
+        Laws that draw from the same `stream` get the same numbers; without one they are the law's own.
+        """
+        self._at_reset.append((stream or self.name, draw))
 
     def integers(self, n: int, low: int, high: int) -> Int64[Tensor, "E L"]:
         """Draw from {low, ..., high}; the numbers depend on seed, law, env and count of resets only."""
@@ -57,11 +60,10 @@ class Drive:
 
     def reset(self, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw again for the rows of `mask_E`."""
-        if self._at_reset:
+        for stream, draw in self._at_reset:
             # Keyed by the number of resets, which differs between episodes of an env.
-            with self._simulation.scope(self.name, self._view.reset_count_E, draws="reset"):
-                for draw in self._at_reset:
-                    draw(mask_E)
+            with self._simulation.scope(stream, self._view.reset_count_E, draws="reset"):
+                draw(mask_E)
 
     def state(self) -> JointState:
         """Return where the joints are now, in the middle of an env step too."""

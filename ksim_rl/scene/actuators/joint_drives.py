@@ -7,6 +7,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl.scene.actuators.actuator import Actuator, Drive, Law
+from ksim_rl.scene.actuators.motors import DelayedActuator
 from ksim_rl.scene.keyframes import compile_keyframes, let_new_servos_hold
 from ksim_rl.scene.names import SCALAR_JOINTS, TO_JOINTS, as_patterns, match_names
 from ksim_rl.scene.state.simulation import Simulation
@@ -78,6 +79,7 @@ class JointDrives:
     def __init__(
         self, actuators: Mapping[str, Sequence[Actuator]], simulation: Simulation, view: WorldView
     ) -> None:
+        _check_lag_groups([entry for entries in actuators.values() for entry in entries])
         groups: dict[Hashable, tuple[Actuator, list[int]]] = {}
         names = view.joints().names
         for prefix, entries in actuators.items():
@@ -115,3 +117,18 @@ class JointDrives:
             with self._simulation.scope(drive.name, part=actuator):
                 control_EN = law(drive.state(), drive.target())
             drive.write(control_EN)
+
+
+def _check_lag_groups(entries: Sequence[Actuator]) -> None:
+    """Refuse delayed actuators of one group whose lags have other bounds, by a ValueError."""
+    bounds: dict[str, tuple[int, int]] = {}
+    for entry in entries:
+        if not isinstance(entry, DelayedActuator) or not entry.lag_group:
+            continue
+        own = (entry.min_lag, entry.max_lag)
+        first = bounds.setdefault(entry.lag_group, own)
+        if own != first:
+            raise ValueError(
+                f"lag_group={entry.lag_group!r}: lags from {first[0]} to {first[1]} and from {own[0]} to {own[1]}; "
+                "entries of one group have one lag: give them the same bounds"
+            )

@@ -89,8 +89,9 @@ class DelayedActuator(Actuator):
     """Another actuator, built-in or explicit, that sees its targets some physics substeps late.
 
     The lag is drawn for each env when that env resets, uniformly from {min_lag, ..., max_lag}, one for all joints of
-    this entry. With lag k the first k substeps after a change of the target still see the old one; until an episode's
-    first target arrives, it counts as having been there before.
+    this entry, and of all entries with the same `lag_group`, as on one bus. With lag k the first k substeps after a
+    change of the target still see the old one; until an episode's first target arrives, it counts as having been there
+    before.
     """
 
     is_explicit: ClassVar[bool] = True  # built-in actuators too get their control before each substep
@@ -99,6 +100,8 @@ class DelayedActuator(Actuator):
     actuator: Actuator
     min_lag: WholeNumber = 0
     max_lag: WholeNumber
+    lag_group: str = ""
+    """Entries of a group, of whichever robot, have one lag in each env, and so the same bounds."""
 
     def _check_fields(self) -> None:
         super()._check_fields()
@@ -143,5 +146,9 @@ class DelayedActuator(Actuator):
             # Targets that it does not take pass through unchanged.
             return inner(state, target._replace(**dict(zip(fields, arrived, strict=True))))
 
-        drive.on_reset(draw)
+        # Entries of a group draw the same numbers.
+        if self.lag_group:
+            drive.on_reset(draw, stream=f"actuators/lag of {self.lag_group}")
+        else:
+            drive.on_reset(draw)
         return late_EN

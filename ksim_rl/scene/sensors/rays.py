@@ -8,13 +8,16 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checked import Checked, Count, Filled, Positive, Within
+from ksim_rl.checks import naming
 from ksim_rl.physics.ray_casting import RayBatch
+from ksim_rl.scene.names import match_names
 from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import GeomGroup, MountedSensor, SensorTracker
@@ -146,41 +149,67 @@ class RayCaster(MountedSensor):
 
     They hit whatever is there within `max_distance` (m), moving things too, and cost accordingly: for the shape of the
     terrain alone, `mdp.HeightScan` is much cheaper. The pattern turns with the "site", with its "yaw" only, or not at
-    all ("world"); `exclude_body` leaves out geoms of the body that carries the sensor.
+    all ("world"); `exclude_body` leaves out geoms of the body that carries the sensor. `sites` in place of `site` or
+    `body` cast the pattern from each site that they match, one after the other: N is the number of all rays.
     """
 
     pattern: RayPattern
+    sites: tuple[str, ...] = ()
     alignment: Literal["site", "yaw", "world"] = "site"
     max_distance: Positive = 10.0
     geom_groups: tuple[GeomGroup, ...] = (0, 1)
     exclude_body: bool = True
+
+    def _check_fields(self) -> None:
+        if not self.sites:
+            super()._check_fields()
+            return
+        Checked._check_fields(self)
+        if self.site is not None or self.body is not None or any(self.pos):
+            raise ValueError(
+                f"sites={self.sites!r} with site={self.site!r}, body={self.body!r}, pos={self.pos!r}: "
+                "give the sites alone"
+            )
+
+    def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
+        if not self.sites:
+            super().add_to(spec, name)
+            return
+        with naming(f"scene.sensors.{name}"):
+            match_names("site", self.sites, [site.name for site in spec.sites])
 
     def track(self, name: str, view: WorldView) -> "RayTracker":
         return RayTracker(name, self, view)
 
 
 class RayTracker(SensorTracker):
-    """Casts the rays of one sensor, at most once per state, and only if something reads them."""
+    """Casts the rays of one sensor, at most once per state, and only if something reads them.
+
+    `_sites` are the ids of the sites that the pattern is cast from.
+    """
 
     def __init__(self, name: str, sensor: RayCaster, view: WorldView) -> None:
         self._sensor = sensor
         self._view = view
         self._key = f"rays/{name}"
-        site = view.world.mj_model.site(sensor.mounting_site(name))
-        self._site = int(site.id)
+        model = view.world.mj_model
+        if sensor.sites:
+            self._sites = view.resolver.ids("site", sensor.sites)
+        else:
+            self._sites = (int(model.site(sensor.mounting_site(name)).id),)
         # On the device once, since patterns do not change.
         start_N3, direction_N3 = (
             torch.tensor(table, dtype=torch.float32, device=view.device) for table in sensor.pattern.rays()
         )
         self._start_N3 = start_N3
         self._direction_N3 = direction_N3
-        self._batch = RayBatch(
-            view.world,
-            len(start_N3),
-            geom_groups=sensor.geom_groups,
-            # Body -1 is none.
-            exclude_body=int(site.bodyid[0]) if sensor.exclude_body else -1,
-        )
+        # A batch for each site, as each leaves out another body; -1 is none.
+        self._batches: list[RayBatch] = []
+        for site in self._sites:
+            own = int(model.site_bodyid[site]) if sensor.exclude_body else -1
+            self._batches.append(
+                RayBatch(view.world, len(start_N3), geom_groups=sensor.geom_groups, exclude_body=own)
+            )
 
     @property
     def state(self) -> RayState:
@@ -192,9 +221,13 @@ class RayTracker(SensorTracker):
         return cache[self._key]
 
     @property
-    def origin_E3(self) -> Float[Tensor, "E 3"]:
-        """Place of the sensor, m, world frame; position stage."""
-        return self._view.derived().site_xpos_EL[:, self._site]
+    def origin_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Place of the sensor that each ray belongs to, world frame, m; position stage."""
+        places = [self._origin(site)[:, None].expand(-1, len(self._start_N3), 3) for site in self._sites]
+        return torch.cat(places, dim=1)
+
+    def _origin(self, site: int) -> Float[Tensor, "E 3"]:
+        return self._view.derived().site_xpos_EL[:, site]
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Draw a ball where each ray hits."""
@@ -205,12 +238,18 @@ class RayTracker(SensorTracker):
                 visualizer.sphere(point, radius=0.015, rgba=(0.9, 0.2, 0.2, 1.0))
 
     def _cast(self) -> RayState:
+        """Cast the rays of all sites, one site after the other."""
+        parts = [self._cast_from(site, batch) for site, batch in zip(self._sites, self._batches, strict=True)]
+        if len(parts) == 1:
+            return parts[0]
+        return RayState(*(torch.cat(leaves, dim=1) for leaves in zip(*parts, strict=True)))
+
+    def _cast_from(self, site: int, batch: RayBatch) -> RayState:
         """Cast, and copy the hits: the next cast overwrites them."""
-        batch = self._batch
         most = self._sensor.max_distance
         # Inputs of the batch are written in place, since its kernels are bound to them.
-        batch.start_EN3.copy_(self.origin_E3[:, None] + self._turned(self._start_N3))
-        batch.direction_EN3.copy_(self._turned(self._direction_N3))
+        batch.start_EN3.copy_(self._origin(site)[:, None] + self._turned(site, self._start_N3))
+        batch.direction_EN3.copy_(self._turned(site, self._direction_N3))
         batch.cast()
         # A negative distance means no hit.
         hit_EN = (batch.distance_EN >= 0.0) & (batch.distance_EN <= most)
@@ -223,12 +262,12 @@ class RayTracker(SensorTracker):
             normal_EN3=torch.where(hit_EN[..., None], batch.normal_EN3, 0.0),
         )
 
-    def _turned(self, vectors_N3: Float[Tensor, "N 3"]) -> Tensor:
+    def _turned(self, site: int, vectors_N3: Float[Tensor, "N 3"]) -> Tensor:
         """Turn vectors from the sensor's axes to the world's, [E, N, 3]."""
         if self._sensor.alignment == "world":
             return vectors_N3.expand(self._view.num_envs, -1, -1)
         # Columns are the site's axes in the world.
-        matrix_E33 = self._view.derived().site_xmat_EL[:, self._site].view(-1, 3, 3)
+        matrix_E33 = self._view.derived().site_xmat_EL[:, site].view(-1, 3, 3)
         if self._sensor.alignment == "yaw":
             # The heading of the site's x axis.
             yaw_E1 = torch.atan2(matrix_E33[:, 1, 0], matrix_E33[:, 0, 0])[:, None]

@@ -1,6 +1,15 @@
 """Terrains are the ground of a scene: an endless plane, or a grid of patches of several kinds."""
 
 from ksim_rl.scene.state.ground import Ground
+from ksim_rl.scene.terrains.courses import (
+    NarrowBeams,
+    NestedRings,
+    PerlinNoise,
+    RandomBoxes,
+    RandomGrid,
+    RandomStairs,
+    TiltedGrid,
+)
 from ksim_rl.scene.terrains.grid import PatchedGround, TerrainGrid
 from ksim_rl.scene.terrains.kinds import (
     DiscreteObstacles,

@@ -119,3 +119,25 @@ def test_debug_drawing_shows_command_and_velocity(free_body):
         term.draw_debug(free_body.view, recorder, 1)
     assert recorder.arrows[0] == pytest.approx([0.0, 0.5, 0.0], abs=1e-5)  # ahead, which is world y
     assert recorder.arrows[1] == pytest.approx([0.5, 0.0, 0.0], abs=1e-5)
+
+
+def test_world_commands_turn_against_the_heading(crowd):
+    world = command(rel_world_envs=0.3, rel_forward_envs=0.5)
+    headed(crowd, 0.0)
+    plain = draw(crowd, command(rel_forward_envs=0.5), scope="commands/world")
+    straight = draw(crowd, world, scope="commands/world")
+    headed(crowd, 0.7)
+    with crowd.driver.scope("commands/world"):
+        turned = world(crowd.view)
+    # Rows whose command depends on the heading; the others are those of a command without the kind.
+    is_world = (turned - straight).abs().amax(-1) > 1e-6
+    assert abs(is_world.float().mean() - 0.3) < 4.0 * math.sqrt(0.21 / E)
+    assert torch.equal(straight[~is_world], plain[~is_world])
+    torch.testing.assert_close(turned[:, 2], plain[:, 2])
+    c, s = math.cos(0.7), math.sin(0.7)
+    x, y = straight[is_world, 0], straight[is_world, 1]
+    expected = torch.stack((c * x + s * y, -s * x + c * y), dim=-1)
+    torch.testing.assert_close(turned[is_world, :2], expected)
+    # Those that are forward envs, too, go where they were drawn to, and keep to their heading.
+    both = is_world & (plain[:, 1] == 0.0)
+    assert both.any() and (straight[both, 1] != 0.0).all() and (straight[both, 2] == 0.0).all()

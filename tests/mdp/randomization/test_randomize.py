@@ -41,6 +41,50 @@ def test_unshared_draws_differ_between_elements(crowd):
     assert (slide[:, 0] != slide[:, 1]).float().mean() > 0.99
 
 
+def test_ranges_by_name_are_those_of_each_element(make_bench):
+    bench = make_bench(FREE_BODY, E)
+    event = mdp.RandomizeBodyCom(
+        bodies=("left", "trunk", "right"), ranges={"trunk": (0.01, 0.02), "left|right": (0.1, 0.2)}
+    )
+    bench.fire(event)
+    com = bench.view.field("body_ipos")
+    model = bench.world.mj_model
+    for name, low, high in (("trunk", 0.01, 0.02), ("left", 0.1, 0.2), ("right", 0.1, 0.2)):
+        drawn = com[:, model.body(name).id]
+        assert low <= drawn.min() < low + 0.02 * (high - low) and drawn.max() <= high
+    left, right, trunk = (com[:, model.body(name).id, 0] for name in ("left", "right", "trunk"))
+    assert (left != right).float().mean() > 0.99
+    # Draws of two patterns have nothing to do with each other.
+    assert abs(torch.corrcoef(torch.stack((left, trunk)))[0, 1]) < 5.0 / math.sqrt(E)
+    untouched = model.body_ipos[0]
+    assert (com[:, 0] == torch.tensor(untouched, dtype=torch.float32)).all()
+
+
+@pytest.mark.parametrize(
+    ("ranges", "message"),
+    [
+        ({"trunk": (0.0, 0.1)}, "ranges: 'left' matches no pattern"),
+        ({"trunk|left": (0.0, 0.1), "lef.": (0.0, 0.1)}, "ranges: 'left' matches"),
+        ({"trunk|left": (0.0, 0.1), "arm": (0.0, 0.1)}, "pattern 'arm' matches nothing"),
+    ],
+)
+def test_a_range_by_name_is_for_one_element_each(make_bench, ranges, message):
+    event = mdp.RandomizeBodyCom(bodies=("left", "trunk"), ranges=ranges)
+    with pytest.raises(ValueError, match=message):
+        make_bench(FREE_BODY, 2).fire(event)
+
+
+def test_ranges_by_name_survive_a_config_and_are_checked():
+    event = mdp.RandomizeBodyMass(bodies=".*", ranges={"left": (0.5, 1.0), "right": (1.0, 2.0)})
+    assert from_tree(EventTerm, to_tree(event, EventTerm)) == event
+    with pytest.raises(ValueError, match=r"ranges\[left\]"):
+        mdp.RandomizeBodyMass(bodies=".*", ranges={"left": (1.0, 0.5)})
+    with pytest.raises(ValueError, match="either columns or names"):
+        mdp.RandomizeBodyCom(bodies=".*", ranges={"left": (0.0, 0.5), 0: (0.0, 0.5)})
+    with pytest.raises(ValueError, match="no elements to name"):
+        mdp.RandomizeGravity(ranges={"x": (0.0, 0.5)})
+
+
 def test_log_uniform_spreads_evenly_over_decades(crowd):
     event = mdp.RandomizeGeomFriction(geoms="a", ranges={1: (1e-4, 1e-2)}, distribution="log_uniform")
     crowd.fire(event)

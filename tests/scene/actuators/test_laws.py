@@ -164,6 +164,30 @@ def test_draws_depend_on_row_and_count_of_resets_only(late):
     assert torch.equal(lags(again, 0), first)
 
 
+def test_entries_of_a_group_have_one_lag():
+    pd = {"stiffness": 1.0, "damping": 0.0}
+
+    def chain(*groups, bounds=((0, 5), (0, 5))):
+        joints = ("knee", "neck")
+        return ChainBench(
+            *(
+                DelayedActuator(
+                    actuator=IdealPDActuator(joints=joint, **pd), min_lag=low, max_lag=high, lag_group=group
+                )
+                for joint, group, (low, high) in zip(joints, groups, bounds, strict=True)
+            ),
+            num_envs=64,
+        )
+
+    together, apart = chain("bus", "bus"), chain("left", "right")
+    for _ in range(2):
+        together.reset(*range(64))
+        assert torch.equal(lags(together, 0), lags(together, 1)) and len(set(lags(together, 0).tolist())) == 6
+    assert not torch.equal(lags(apart, 0), lags(apart, 1))
+    with pytest.raises(ValueError, match="lag_group='bus': lags from 0 to 5 and from 1 to 5"):
+        chain("bus", "bus", bounds=((0, 5), (1, 5)))
+
+
 def test_a_robot_that_forgot_to_set_its_actuators_is_told(pd):
     entry = IdealPDActuator(joints="neck", stiffness=1.0, damping=0.0)
     with pytest.raises(ValueError, match="'neck' has 0 actuators.*set_actuators"):

@@ -46,8 +46,8 @@ SCENE = """
 class Bench:
     """Worlds with one ray caster, each on its own patch."""
 
-    def __init__(self, sensor: RayCaster) -> None:
-        spec = mujoco.MjSpec.from_string(SCENE)
+    def __init__(self, sensor: RayCaster, scene: str = SCENE) -> None:
+        spec = mujoco.MjSpec.from_string(scene)
         GRID.add_to(spec)
         sensor.add_to(spec, "scan")
         self.world = World(
@@ -153,6 +153,26 @@ def test_readings_follow_the_state_and_are_the_readers_own():
         height = RayHeight(sensor="scan", offset=1.0, clip=(-5.0, 2.0))(bench.view)
     assert torch.equal(before, held) and torch.allclose(after, before + 1.0, atol=1e-5)
     assert torch.allclose(height, (after - 1.0).clamp(max=2.0), atol=1e-5)
+
+
+def test_rays_over_several_sites_are_those_of_each_site_one_after_the_other():
+    scene = SCENE.replace(
+        '<body name="leg" pos="0.5 0 0">', '<body name="leg" pos="0.5 0 0"><site name="toe"/>'
+    )
+    pattern = RingPattern(num_rays=6, elevations=(-60.0,))
+    both = Bench(RayCaster(pattern=pattern, sites=("eye", "toe"), max_distance=3.0), scene)
+    states = [
+        Bench(RayCaster(pattern=pattern, site=site, max_distance=3.0), scene) for site in ("eye", "toe")
+    ]
+    for leaf, *parts in zip(both.tracker.state, *(one.tracker.state for one in states), strict=True):
+        assert torch.equal(leaf, torch.cat(parts, dim=1))
+    assert both.tracker.state.hit_EN.any() and both.tracker.state.distance_EN.shape == (NUM_ENVS, 12)
+    origins = torch.cat([one.tracker.origin_EN3 for one in states], dim=1)
+    assert torch.equal(both.tracker.origin_EN3, origins) and not torch.equal(origins[:, 0], origins[:, 6])
+    with pytest.raises(ValueError, match="no site matches 'ey'"):
+        RayCaster(pattern=pattern, sites=("ey",)).add_to(mujoco.MjSpec.from_string(SCENE), "scan")
+    with pytest.raises(ValueError, match="give the sites alone"):
+        RayCaster(pattern=pattern, sites=("eye",), body="robot")
 
 
 def test_patterns_are_what_they_say():

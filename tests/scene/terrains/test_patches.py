@@ -10,10 +10,17 @@ from ksim_rl.scene.terrains import (
     FlatPatch,
     Gaps,
     Lattice,
+    NarrowBeams,
+    NestedRings,
+    PerlinNoise,
     PyramidSlope,
     PyramidStairs,
+    RandomBoxes,
+    RandomGrid,
+    RandomStairs,
     RoughGround,
     SteppingStones,
+    TiltedGrid,
     Waves,
 )
 
@@ -27,6 +34,13 @@ KINDS = (
     SteppingStones(),
     Waves(),
     Gaps(),
+    PerlinNoise(),
+    RandomStairs(),
+    RandomGrid(),
+    TiltedGrid(),
+    RandomBoxes(),
+    NestedRings(),
+    NarrowBeams(),
 )
 
 
@@ -143,9 +157,108 @@ def test_gaps_have_their_width_and_depth(difficulty, width):
     assert np.allclose(np.unique(z), [-0.4, 0.0])
 
 
+def test_perlin_noise_has_its_height_and_one_level_where_its_waves_meet():
+    one = PerlinNoise(height=(0.1, 0.5), wave_length=2.0, octaves=1, cell=0.1)
+    for difficulty, height in ((0.0, 0.1), (0.5, 0.3), (1.0, 0.5)):
+        z = heights(one, difficulty)
+        assert np.isclose(z.min(), 0.0) and np.isclose(z.max(), height)
+    # Gradient noise vanishes at the points of its grid, 20 cells apart, wherever the lowest point lies.
+    assert np.ptp(z[::20, ::20]) < 1e-12
+    # Between them it is smooth: no step of one cell is near the whole height.
+    assert np.abs(np.diff(z)).max() < 0.1
+    # A second octave adds half as much, at half of the length.
+    two = heights(dataclasses.replace(one, octaves=2))
+    assert np.ptp(two[::20, ::20]) < 1e-12 and np.abs(two - z).max() > 0.02
+    with pytest.raises(ValueError, match="octaves=4 of wave_length=1.0"):
+        PerlinNoise(wave_length=1.0, octaves=4)
+
+
+def test_random_stairs_rise_by_drawn_steps():
+    patch = RandomStairs(step_height=(0.1, 0.2), least_share=0.5, step_width=0.6, platform_width=2.0)
+    x, z = along_x(patch, 1.0)
+    rises = np.diff(z)
+    risers = np.flatnonzero(rises)
+    assert np.allclose(x[risers], 1.0 + 0.6 * np.arange(5)) and np.allclose(z[x <= 1.0], 0.0)
+    assert rises[risers].min() >= 0.1 and rises[risers].max() <= 0.2 and np.ptp(rises[risers]) > 0.01
+    easy = np.diff(along_x(patch, 0.0)[1])
+    assert np.allclose(easy, 0.5 * rises), "the same shares of half the height"
+
+
+def test_a_random_grid_has_level_squares_within_its_amplitude():
+    patch = RandomGrid(amplitude=(0.02, 0.2), square_width=0.5, platform_width=1.5, cell=0.1)
+    z = heights(patch, 1.0)
+    squares = z[:80, :80].reshape(16, 5, 16, 5).swapaxes(1, 2)
+    outside = Lattice(SIZE, 0.1).ring_RC[2:80:5, 2:80:5] > 1.2
+    assert np.ptp(squares[outside], axis=(-2, -1)).max() == 0.0
+    assert 0.18 < np.abs(z).max() <= 0.2 and len(np.unique(squares[outside])) > 100
+    assert np.all(z[Lattice(SIZE, 0.1).ring_RC <= 0.75] == 0.0)
+
+
+def test_tilted_squares_are_planes_within_their_tilt():
+    patch = TiltedGrid(
+        tilt=(0.0, 15.0), amplitude=(0.0, 0.05), square_width=1.0, platform_width=1.0, cell=0.1
+    )
+    z = heights(patch, 1.0)
+    squares = z[:80, :80].reshape(8, 10, 8, 10).swapaxes(1, 2)[:2].reshape(-1, 10, 10)
+    # Slopes along x and y are the same everywhere in a square.
+    along_x, along_y = np.diff(squares, axis=2) / 0.1, np.diff(squares, axis=1) / 0.1
+    assert np.allclose(along_x, along_x[:, :1, :1]) and np.allclose(along_y, along_y[:, :1, :1])
+    steepest = max(np.abs(along_x).max(), np.abs(along_y).max())
+    assert 0.8 * np.tan(np.radians(15)) < steepest <= np.tan(np.radians(15)) + 1e-9
+    assert np.abs(squares.mean((1, 2))).max() <= 0.05
+    assert np.ptp(heights(patch, 0.0)) == 0.0
+
+
+def test_boxes_stand_on_the_ground_and_are_turned():
+    patch = RandomBoxes(height=(0.1, 0.4), least_share=0.5, width=(0.8, 0.8), num_boxes=1, platform_width=0.0)
+    for seed in range(20):
+        # One that lies wholly inside of the patch has its whole area, whichever way it is turned.
+        z = heights(dataclasses.replace(patch, cell=0.02), 1.0, seed)
+        on = z > 0.0
+        if not (on[0].any() or on[-1].any() or on[:, 0].any() or on[:, -1].any()):
+            break
+    assert np.isclose(on.sum() * 0.02**2, 0.64, rtol=0.03)
+    assert 0.2 <= z.max() <= 0.4 and len(np.unique(z)) == 2
+    # The bounding box of a turned square is wider than the square.
+    assert on.any(0).sum() * 0.02 > 0.85
+    many = heights(RandomBoxes(height=(0.1, 0.4), platform_width=1.5), 1.0)
+    assert (
+        np.all(many[Lattice(SIZE, RandomBoxes().cell).ring_RC <= 0.75] == 0.0) and (many > 0.0).mean() > 0.2
+    )
+
+
+@pytest.mark.parametrize(("difficulty", "ring", "gap"), [(0.0, 0.6, 0.1), (1.0, 0.3, 0.3)])
+def test_rings_and_the_trenches_between_them_have_their_widths(difficulty, ring, gap):
+    patch = NestedRings(ring_width=(0.6, 0.3), gap=(0.1, 0.3), height=0.1, depth=0.4, platform_width=1.5)
+    x, z = along_x(patch, difficulty)
+    holes = runs(z < -0.3)
+    brinks = [(x[start - 1], x[stop]) for start, stop in holes if stop < len(x)]
+    assert np.isclose(brinks[0][0], 0.75)
+    assert np.allclose([far - near for near, far in brinks], gap)
+    assert np.allclose([b[0] - a[1] for a, b in zip(brinks, brinks[1:], strict=False)], ring)
+    assert np.allclose(z[x <= 0.75], 0.0) and np.allclose(np.unique(z), [-0.4, 0.0, 0.1])
+
+
+@pytest.mark.parametrize(("difficulty", "width"), [(0.0, 0.5), (1.0, 0.3)])
+def test_beams_lead_outwards_over_a_pit(difficulty, width):
+    patch = NarrowBeams(beam_width=(0.5, 0.3), num_beams=4, depth=0.4, platform_width=1.5, cell=0.05)
+    z = heights(patch, difficulty)
+    # At the edge of the patch one beam is left, across the x axis; as many on each side.
+    beams = runs(z[:, -1] == 0.0)
+    assert [(stop - 1 - start) * 0.05 for start, stop in beams] == [pytest.approx(width)]
+    assert np.array_equal(z, z.T) and np.array_equal(z, z[::-1]) and set(np.unique(z)) == {-0.4, 0.0}
+    assert np.all(z[Lattice(SIZE, 0.05).ring_RC <= 0.75] == 0.0)
+
+
 @pytest.mark.parametrize(
     ("kind", "field", "value"),
     [
+        (RandomStairs, "step_width", 0.05),
+        (RandomGrid, "square_width", 0.05),
+        (TiltedGrid, "tilt", (0.0, 75.0)),
+        (RandomBoxes, "width", (1.0, 0.3)),
+        (NestedRings, "gap", (0.05, 0.3)),
+        (NarrowBeams, "beam_width", (0.05, 0.5)),
         (FlatPatch, "proportion", 0.0),
         (FlatPatch, "cell", 0.0),
         (PyramidStairs, "step_height", (-0.1, 0.2)),
