@@ -20,6 +20,12 @@ def report(error: Exception, *, about: str = "") -> int:
     # Python's own message is often empty.
     if isinstance(error, MemoryError):
         error = OSError(f"out of memory: {error}" if str(error) else "out of memory")
+    # Imported here, so that mistyped commands answer at once.
+    from ksim_rl.device import compiler_caches
+
+    # Messages of compilers are long, and name no way out.
+    if (line := compiler_caches.explained(error)) is not None:
+        error = RuntimeError(line).with_traceback(error.__traceback__)
     # These kinds are raised with messages for users; any other is a fault of ours.
     explained = isinstance(error, (ValueError, RuntimeError, OSError)) and not isinstance(
         error, NotImplementedError
@@ -64,7 +70,7 @@ def interruption(stopped: KeyboardInterrupt) -> signal.Signals:
 def say(text: str) -> None:
     """Print one line of the program's own on stderr, and which of several ranks says it."""
     # Several ranks share a terminal.
-    if os.environ.get("WORLD_SIZE", "1") != "1":
+    if os.environ.get("WORLD_SIZE", "1") != "1" and "RANK" in os.environ:
         rank = f"rank {os.environ['RANK']}: "
     else:
         rank = ""

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from ksim_rl.cli.errors import REFUSED, interruption, report, say, sigterm_interrupts
+from ksim_rl.cli.process import check_process, open_streams
 from ksim_rl.terminal import show, show_warnings_as_lines
 
 USAGE = """\
@@ -78,6 +79,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         # Libraries start Python too: compilers of kernels, launchers of jobs. As with `-P`, the working directory,
         # which may be a stranger's, is not on the path of these.
         os.environ["PYTHONSAFEPATH"] = "1"
+        open_streams()
         show_warnings_as_lines()
     try:
         # SIGTERM ends a run as Ctrl-C does: it saves and says so.
@@ -109,6 +111,7 @@ def _dispatch(words: list[str]) -> int:
         from ksim_rl.checks import unknown_name
 
         raise unknown_name("command", command, COMMANDS)
+    check_process()
     # Imported here, so that usage and mistyped commands answer at once.
     module, _, function = COMMANDS[command].partition(":")
     with gc_disabled():
@@ -116,7 +119,7 @@ def _dispatch(words: list[str]) -> int:
         # Plug-ins before the command: it may name their tasks.
         importlib.import_module("ksim_rl.config.plugins").load_from_here(names, note=say)
     # torchrun sets the number of ranks.
-    if int(os.environ.get("WORLD_SIZE") or 1) == 1:
+    if os.environ.get("WORLD_SIZE", "") in ("", "1"):
         return run(rest)
     with importlib.import_module("ksim_rl.ranks").joined(command):
         code = run(rest)

@@ -97,8 +97,19 @@ def train(arguments: list[str]) -> int:
     try:
         job()
     except HydraException as error:  # all that is left for Hydra to find, such as another --config-name
-        raise ValueError(str(error)) from error
+        raise ValueError(_with_first_cause(error)) from error
     return max(codes, default=0)
+
+
+def _with_first_cause(error: HydraException) -> str:
+    """Return Hydra's message with what began it, such as a library that a variable of the environment breaks."""
+    text = str(error)
+    cause: BaseException = error
+    while cause.__cause__ is not None:
+        cause = cause.__cause__
+    if str(cause) not in text:
+        text = f"{text}: {type(cause).__name__}: {cause}"
+    return text
 
 
 def _primary_config(flags: argparse.Namespace) -> tuple[str, bool]:

@@ -3,7 +3,6 @@
 Its output is meant for a bug report: no names of host and user are in it. A fault is one line, and the exit code 1.
 """
 
-import getpass
 import os
 import tempfile
 import time
@@ -18,6 +17,7 @@ import warp as wp
 
 from ksim_rl.checks import OneLineParser
 from ksim_rl.config.child_processes import run_python
+from ksim_rl.device.compiler_caches import torch_cache, triton_cache
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.device.streams import start_warp, warp_device
 from ksim_rl.diagnosis.self_test import try_device
@@ -123,17 +123,12 @@ def _caches(*, warp_starts: bool) -> Iterator[tuple[str, str, Path]]:
     # Warp names its folder only after it has started.
     if warp_starts:
         yield "Warp", "WARP_CACHE_PATH", Path(wp.config.kernel_cache_dir or "")
-    # The default of torch, which makes it in the temporary folder by user.
-    default = Path(tempfile.gettempdir()) / f"torchinductor_{_user()}"
-    yield (
-        "torch.compile",
-        "TORCHINDUCTOR_CACHE_DIR",
-        Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or default),
-    )
+    caches = [torch_cache()]
     # Triton compiles for GPUs only.
     if torch.cuda.is_available():
-        default = Path(os.path.expanduser("~")) / ".triton" / "cache"
-        yield "Triton", "TRITON_CACHE_DIR", Path(os.environ.get("TRITON_CACHE_DIR") or default)
+        caches.append(triton_cache())
+    for cache in caches:
+        yield cache.compiler, cache.variable, cache.folder
 
 
 def _bytes_in(folder: Path) -> int:
@@ -237,13 +232,6 @@ def _try_device(report: Report, device: torch.device) -> None:
     report.say(
         f"test on {device}", f"{', '.join(passed) or 'nothing'} passed in {time.monotonic() - began:.0f} s"
     )
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # an id without a name, as in containers
-        return str(os.getuid())
 
 
 def _without_user(text: str) -> str:

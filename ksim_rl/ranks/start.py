@@ -14,6 +14,7 @@ import torch.distributed as dist
 
 from ksim_rl.device import group
 from ksim_rl.ranks import heartbeat, store
+from ksim_rl.ranks.variables import number, world_size
 
 # What torchrun sets; `python -m torch.distributed.run` is the same.
 VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
@@ -22,13 +23,13 @@ COMMANDS = ("train", "resume")
 
 def launched() -> bool:
     """Whether several processes were started together, as torchrun does."""
-    return int(os.environ.get("WORLD_SIZE", "1") or 1) > 1
+    return world_size() > 1
 
 
 def device(name: str) -> str:
     """Return a device's name as this rank's own: "cuda" is the GPU of its local rank."""
     if group.size() > 1 and name.startswith("cuda"):
-        return f"cuda:{os.environ['LOCAL_RANK']}"
+        return f"cuda:{number('LOCAL_RANK')}"
     return name
 
 
@@ -53,8 +54,10 @@ def joined(command: str) -> Iterator[None]:
             f"WORLD_SIZE is set and {missing[0]} is not: start the ranks by torchrun, which sets both"
         )
     backend = _backend()
-    rank = int(os.environ["RANK"])
-    size = int(os.environ["WORLD_SIZE"])
+    rank = number("RANK")
+    size = world_size()
+    if rank >= size:
+        raise ValueError(f"RANK={rank}: expected less than WORLD_SIZE={size}, which torchrun sets")
     # The store first: it tells this attempt from earlier ones, whose keys may still be there.
     _runs[:] = [store.of_run(store.connected(serves=store.is_served_by_rank()))]
     try:
@@ -66,7 +69,7 @@ def joined(command: str) -> Iterator[None]:
         raise RuntimeError(f"the other ranks cannot be reached: {' '.join(str(error).split())}") from error
     # Before the first collective on CUDA, which would run on GPU 0 otherwise.
     if backend != "gloo":
-        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+        torch.cuda.set_device(number("LOCAL_RANK"))
     # A separate connection: its thread must not wait for another's key.
     heart = heartbeat.Heartbeat(_of_attempt(store.of_run(store.connected())))
     # Other versions may have other collectives, and would wait for each other.
@@ -164,7 +167,7 @@ def _on_host() -> Any:
 def _backend() -> str:
     if not torch.cuda.is_available():
         return "gloo"
-    local = int(os.environ["LOCAL_RANK"])
+    local = number("LOCAL_RANK")
     count = torch.cuda.device_count()
     if local >= count:
         raise ValueError(

@@ -11,6 +11,8 @@ from uuid import uuid4
 
 import torch.distributed as dist
 
+from ksim_rl.ranks.variables import number
+
 # For a rank to start: imports take long where many processes share few cores.
 JOIN_S = 300.0
 
@@ -21,7 +23,7 @@ def connected(*, serves: bool = False) -> dist.TCPStore:
     Raises ValueError where the port is in use, RuntimeError where nobody answers.
     """
     host = os.environ["MASTER_ADDR"]
-    port = int(os.environ["MASTER_PORT"])
+    port = number("MASTER_PORT")
     try:
         return dist.TCPStore(
             host, port, is_master=serves, wait_for_workers=False, timeout=timedelta(seconds=JOIN_S)

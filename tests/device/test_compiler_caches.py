@@ -1,0 +1,67 @@
+"""Errors of compilers name the cache and the fix; other errors are left as they are."""
+
+import os
+import types
+from pathlib import Path
+
+import pytest
+
+from ksim_rl.cli.errors import FAILED, report
+from ksim_rl.device.compiler_caches import explained, torch_cache, triton_cache
+
+
+def test_folders_are_those_that_the_compilers_take(monkeypatch, tmp_path):
+    from torch._inductor.runtime.cache_dir_utils import cache_dir
+
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)
+    own = torch_cache().folder
+    assert own == Path(cache_dir())
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    assert torch_cache().folder == tmp_path
+    triton = pytest.importorskip("triton")
+    monkeypatch.delenv("TRITON_CACHE_DIR", raising=False)
+    assert triton_cache().folder == Path(triton.knobs.cache.dir)
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+    assert triton_cache().folder == Path(triton.knobs.cache.dir) == tmp_path
+
+
+@pytest.mark.parametrize(("pattern", "damage"), [("__grp__*.json", "[]"), ("twice.json", "{")])
+def test_a_damaged_cache_of_triton_is_named_in_one_line(pattern, damage, monkeypatch, tmp_path, capsys):
+    pytest.importorskip("triton")
+    from benchmarks.faults.compile_once import by_triton
+
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+    assert by_triton() == 0
+    (file,) = tmp_path.glob(f"*/{pattern}")
+    file.write_text(damage)
+    with pytest.raises(Exception) as raised:
+        by_triton()
+    assert report(raised.value) == FAILED
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and len(said) < 1000
+    assert f"delete Triton's {tmp_path}" in said and "TRITON_CACHE_DIR" in said
+
+
+def test_what_torch_cannot_read_names_both_caches(monkeypatch):
+    """Raise inside of a function of torch's compiler, with a wrapper around, as torch does it."""
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", f"{os.sep}own")
+    read = lambda text: compile(text, "cached.py", "exec")  # noqa: E731
+    of_torch = types.FunctionType(read.__code__, {"__name__": "torch._inductor.codecache"})
+    with pytest.raises(RuntimeError) as raised:
+        try:
+            of_torch("'cut")
+        except SyntaxError as error:
+            raise RuntimeError(f"backend='inductor' raised:\n{error}") from None
+    line = explained(raised.value)
+    assert line is not None and "\n" not in line
+    assert "/own" in line and "TRITON_CACHE_DIR" in line and "unterminated" in line
+
+
+def test_errors_of_others_are_left_alone():
+    def fail():
+        raise RuntimeError("own")
+
+    with pytest.raises(RuntimeError) as raised:
+        fail()
+    assert explained(raised.value) is None
+    assert explained(ValueError("never raised")) is None
