@@ -156,7 +156,7 @@ ROWS = {
         measure=payloads,
         amounts={"families": 20},
         short={"families": 5},
-        files=("ksim_rl/config", "ksim_rl/conf", "ksim_rl/cli", "tests/cli/payloads.py"),
+        files=("ksim_rl/config", "ksim_rl/conf", "ksim_rl/cli", "tests/cli/payloads"),
     ),
     "data_files": Row(
         fault="motions and motor models that are pickles, pipes, devices, or without end",
