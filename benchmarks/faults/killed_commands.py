@@ -126,33 +126,45 @@ COMMANDS = {
 }
 
 
-def _run(words: Sequence[str], *, kill_after: float | None = None) -> children.Ended:
-    """Run a command in a child, as `ksim-rl` does, and kill it after some seconds."""
+def start(words: Sequence[str], *, before: Callable[[], None] | None = None) -> children.Child:
+    """Start a command in a child, as `ksim-rl` does, where `before` has happened."""
 
     def work() -> int:
         # Asking git about a tree with changes would let no zoo take its runs.
         record._code = lambda *_: COMMIT
+        if before is not None:
+            before()
         try:
             main(words)
         except SystemExit as ended:
             return int(ended.code or 0)
         raise AssertionError("a command always exits")
 
-    child = children.start(work, hangs_s=MOST_SILENT_S)
+    return children.start(work, hangs_s=MOST_SILENT_S)
+
+
+def _run(words: Sequence[str], *, kill_after: float | None = None) -> children.Ended:
+    """Run a command, and kill it after some seconds."""
+    child = start(words)
     if kill_after is None:
         return child.wait()
     children.pause(kill_after)
     return child.kill()
 
 
-def killed_commands(folder: Path, *, kills: int, commands: int) -> Figures:
-    """Kill commands at random moments, begin each again, and count what is half, and what does not end well."""
+def train_once(folder: Path) -> Path:
+    """Train the smallest task in `folder`/trained, and return that folder."""
     children.warm()
     trained = folder / "trained"
-    words = ["train", *children.SMALLEST, f"hydra.run.dir={trained / 'run'}"]
-    ended = _run(words)
+    ended = _run(["train", *children.SMALLEST, f"hydra.run.dir={trained / 'run'}"])
     if ended.code not in (0, 1):
         raise RuntimeError(f"training ended with exit code {ended.code}:\n{ended.text}")
+    return trained
+
+
+def killed_commands(folder: Path, *, kills: int, commands: int) -> Figures:
+    """Kill commands at random moments, begin each again, and count what is half, and what does not end well."""
+    trained = train_once(folder)
     choose = random.Random(kills)
     found = {"kills": 0, "corrupt": 0, "do_not_go_on": 0, "stray": 0, "raw_tracebacks": 0}
     names = list(COMMANDS)[:commands]

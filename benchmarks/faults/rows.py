@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from benchmarks.faults import (
     bad_input,
+    crowded_commands,
+    damaged_caches,
     disk,
+    environments,
     exports,
     gpu,
     growth,
@@ -25,6 +28,7 @@ ROWS: dict[str, Row] = {
     **disk.ROWS,
     **interrupts.ROWS,
     **killed_commands.ROWS,
+    **crowded_commands.ROWS,
     **numbers.ROWS,
     **strangers.ROWS,
     **hostile_folder.ROWS,
@@ -32,6 +36,8 @@ ROWS: dict[str, Row] = {
     **exports.ROWS,
     **bad_input.ROWS,
     **machine.ROWS,
+    **environments.ROWS,
+    **damaged_caches.ROWS,
     **growth.ROWS,
     **seen_soak.ROWS,
     **gpu.ROWS,

@@ -14,7 +14,7 @@ import torch
 
 from benchmarks import report
 from benchmarks.faults import __main__ as command
-from benchmarks.faults import children, hostile_folder, machine, page
+from benchmarks.faults import children, damaged_caches, environments, hostile_folder, machine, page
 from benchmarks.faults.row import Row
 from benchmarks.faults.rows import ROWS
 from ksim_rl import terminal
@@ -273,6 +273,34 @@ def errors_as_warp_raises_them(patch):
         "from ksim_rl.cli.main import main; sys.exit(main())"
     )
     patch.setattr(machine, "PROGRAM", ("-c", program))
+
+
+@sabotage("environments")
+def limits_are_not_looked_at(patch):
+    program = (
+        "from ksim_rl.cli import main, process; main.check_process = lambda: None; main.main(sys.argv[1:])"
+    )
+    patch.setattr(environments, "PROGRAM", ("-P", "-c", f"import sys; {program}"))
+
+
+@sabotage("damaged_caches")
+def errors_as_compilers_raise_them(patch):
+    program = (
+        "from ksim_rl.device import compiler_caches; compiler_caches.explained = lambda error: None; "
+        "from benchmarks.faults import compile_once; sys.exit(compile_once.main())"
+    )
+    patch.setattr(damaged_caches, "ONCE", ("-c", f"import sys; {program}"))
+
+
+@sabotage("full_disk_of_commands")
+def errors_end_without_words(patch):
+    patch.setattr("ksim_rl.cli.main.report", lambda error: 3)
+
+
+@sabotage("two_tables")
+def nobody_waits_for_the_others_job(patch):
+    patch.setattr(run_lock, "is_locked", lambda folder: False)
+    patch.setattr(run_lock, "try_lock", lambda file: True)
 
 
 @sabotage("no_gpu")
