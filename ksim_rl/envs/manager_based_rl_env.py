@@ -217,6 +217,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             after=driver.after_substep,
             sensors=driver.substep_sensors,
         )
+        driver.keep_moment_of_contacts()
         # Also false for NaN. Beyond this bound MuJoCo's C engine, too, calls a state bad and resets it.
         finite_E = finite_E & ((world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1)).abs() < mujoco.mjMAXVAL)
         # Failed worlds are cleared before anything is computed from them, so that all of it is finite.

@@ -272,6 +272,11 @@ def foot_velocity(term: Any, view: EnvView) -> Node:
     return op("take", sites("site_lin_vel", term, view), indices=[0, 1], width=3)
 
 
+def slip_velocity(term: Any, view: EnvView) -> Node:
+    """Return the horizontal velocities of feet at the moment that contacts belong to."""
+    return op("take", sites("site_lin_vel_of_contacts", term, view), indices=[0, 1], width=3)
+
+
 def _place(t: Any, v: EnvView) -> Node:
     """Return where the body or site of a term is, in the world."""
     # Terms have a body or a site; the site is asked for first.
@@ -322,7 +327,7 @@ def _clearance(t: mdp.FootClearance, v: EnvView) -> Node:
 
 def _slip(t: mdp.FootSlip, v: EnvView) -> Node:
     # Squared speed along the ground of each foot: blocks of two, x and y.
-    speed2 = op("sum", op("square", foot_velocity(t, v)), width=2)
+    speed2 = op("sum", op("square", slip_velocity(t, v)), width=2)
     return while_commanded(t, total(op("multiply", speed2, contact(t, "found"))))
 
 

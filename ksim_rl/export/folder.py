@@ -347,6 +347,8 @@ def metadata(
         "decimation": cfg.decimation,
         "step_dt": ours.step_dt,
         "episode_steps": ours.max_episode_length if any(t.time_out for t in cfg.terminations.values()) else 0,
+        "encoders": "targets of positions are readings of encoders, as biased observations are: a robot's servos take "
+        "them as they are. Only a simulation, whose servos see true positions, takes the encoders' bias off them",
         "frames": "x forward, y left, z up; quaternions (w, x, y, z); root velocities and gravity in its own axes",
     }  # fmt: skip
 

@@ -103,11 +103,11 @@ class JointPositionAction(JointAction):
 
 @dataclass(frozen=True, kw_only=True)
 class RelativeJointPositionAction(JointAction):
-    """Positions (rad or m): the shaped action, relative to where the joints are when the env step begins."""
+    """Positions (rad or m): the shaped action, relative to what encoders read when the env step begins."""
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         # Measured positions, not the last targets: errors of tracking do not add up.
-        now_EK = view.joints(self.joints).pos_EL
+        now_EK = view.joints(self.joints).encoder_pos_EL
         view.write_joint_pos_target(self.joints, now_EK + self.shaped(view, action_EK))
 
 

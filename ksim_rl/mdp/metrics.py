@@ -58,11 +58,12 @@ class ActionAcceleration(MetricTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class FootSlipSpeed(OfFeet, MetricTerm):
-    """Mean over the feet in contact of their horizontal speed, world frame, m/s; 0 while none touches."""
+    """Mean over the feet in contact of their horizontal speed at that moment, world frame, m/s; 0 without one."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         found_EF = self.contact(view).found_EN
-        speed_EF = torch.linalg.vector_norm(view.sites(self.sites).lin_vel_EN3[..., :2], dim=-1)
+        velocity_EF2 = view.sites(self.sites).lin_vel_of_contacts_EN3[..., :2]
+        speed_EF = torch.linalg.vector_norm(velocity_EF2, dim=-1)
         # The clamp makes a flight without any contact read 0, not NaN.
         return (speed_EF * found_EF).sum(-1) / found_EF.sum(-1).clamp(min=1.0)
 

@@ -1,9 +1,9 @@
 """All velocity tasks share this module: a legged robot follows a planar velocity command.
 
-A task's module holds the figures of its robot and puts the parts together. Weights, noise and pushes are from mjlab
-1.6.0's velocity tasks, so that both can be compared on the same work, and so are the training settings but for two (see
-`training`). Two more things are ours: the actor's joint positions are a term of their own (`joint_pos_biased`), because
-groups share terms by name; and the encoders' bias reaches that observation only, not the servo targets.
+A task's module holds the figures of its robot and puts the parts together. Weights, noise, pushes, contact clocks and
+the stages of the command are from mjlab 1.6.0's velocity tasks, so that both can be compared on the same work, and so
+are the training settings but for two (see `training`). One more thing is ours: the actor's joint positions are a term
+of their own (`joint_pos_biased`), because groups share terms by name.
 """
 
 import dataclasses
@@ -208,6 +208,16 @@ def velocity_command() -> mdp.UniformVelocityCommand:
     )
 
 
+def command_stages() -> mdp.CommandRangesByStage:
+    """Return the curriculum of `velocity_command()`: faster from 120,000 env steps on, and up to 3 m/s from 240,000."""
+    rollout = 24
+    stages = {
+        5_000 * rollout: {"lin_vel_x": (-1.5, 2.0), "ang_vel_z": (-0.7, 0.7)},
+        10_000 * rollout: {"lin_vel_x": (-2.0, 3.0)},
+    }
+    return mdp.CommandRangesByStage(command=COMMAND, stages=stages)
+
+
 def on_plane(robot: LeggedRobot, sensors: Mapping[str, Sensor] | None = None) -> SceneCfg:
     """Return the scene of a robot on a plane, 4096 times."""
     return SceneCfg(
@@ -233,7 +243,8 @@ def velocity_cfg(
 ) -> ManagerBasedRlEnvCfg:
     """Return the config: 50 Hz control; an episode lasts 20 s, or until the root tilts by more than 70 degrees.
 
-    `feet` has one element per foot in the order of `robot.foot_sites`. By default the command is `velocity_command()`.
+    `feet` has one element per foot in the order of `robot.foot_sites`, and reads every substep, whatever it says: a
+    foot may land and bounce off within an env step. By default the command is `velocity_command()`, with its stages.
     The ground is a plane; `on_rough_ground` changes that.
     """
     elements, num_feet = feet.geoms or feet.bodies or feet.subtrees, len(robot.foot_sites)
@@ -245,7 +256,7 @@ def velocity_cfg(
     return ManagerBasedRlEnvCfg(
         decimation=4,
         sim=sim,
-        scene=on_plane(robot, {FEET: feet, **(sensors or {})}),
+        scene=on_plane(robot, {FEET: dataclasses.replace(feet, every_substep=True), **(sensors or {})}),
         observations=observations,
         actions={"joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=robot.action_scale)},
         commands={COMMAND: velocity_command() if command is None else command},
@@ -260,6 +271,8 @@ def velocity_cfg(
             "angular_velocity_error": mdp.AngularVelocityError(command=COMMAND),
             "action_acceleration": mdp.ActionAcceleration(),
         },
+        # Stages fit the ranges of the default command alone.
+        curriculum={"command_ranges": command_stages()} if command is None else {},
         episode_length_s=20.0,
         viewer=viewer,
     )

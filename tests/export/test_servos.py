@@ -56,7 +56,10 @@ def exported(folder, keyframe):
             "turn": mdp.JointVelocityAction(joints="c", scale=0.5),
             "hold": mdp.JointPositionAction(joints=("b", "a"), scale=0.3),
         },
-        events={"joints": mdp.ResetJoints(position_range=(-0.2, 0.2), velocity_range=(-0.1, 0.1))},
+        events={
+            "bias": mdp.RandomizeEncoderBias(ranges=(-0.2, 0.2)),
+            "joints": mdp.ResetJoints(position_range=(-0.2, 0.2), velocity_range=(-0.1, 0.1)),
+        },
         rewards={"effort": mdp.JointEffortL2(weight=-0.01)},
         terminations={"time": mdp.TimeOut()},
         sim=SimCfg(engine="c", timestep=0.005),
@@ -79,6 +82,7 @@ def test_an_export_acts_in_the_c_engine_as_here(tmp_path, keyframe):
     runner = Runner(folder)
     record = read_arrays(folder / "trace.npz")
     replayed = runner.replay(record, 0, 0)
+    assert np.abs(record["start/encoder_bias"]).min() > 1e-3, "servos that know nothing of it show below"
     for name in ("target", "effort", "next_qpos", "next_qvel"):
         ours = record[f"trace/{name}"][0][: len(replayed[name])]
         np.testing.assert_allclose(replayed[name], ours, atol=2e-4, err_msg=name)

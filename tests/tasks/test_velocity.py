@@ -1,5 +1,6 @@
 """Velocity and get-up tasks: a stance that holds without a policy, sizes, and rewards that rank states rightly."""
 
+import dataclasses
 from typing import Any
 
 import pytest
@@ -148,7 +149,24 @@ def test_feet_of_several_geoms_are_refused_before_anything_is_built():
     ):
         velocity.velocity_cfg(robot, feet=ContactSensor(geoms=robot.foot_geoms), **parts)
     for feet in (ContactSensor(bodies=robot.foot_bodies), ContactSensor(geoms=(".*_foot_inner",))):
-        assert velocity.velocity_cfg(robot, feet=feet, **parts).scene.sensors["feet_ground_contact"] is feet
+        sensors = velocity.velocity_cfg(robot, feet=feet, **parts).scene.sensors
+        assert sensors["feet_ground_contact"] == dataclasses.replace(feet, every_substep=True)
+
+
+def test_commands_become_faster_by_stages(env):
+    base = env.base_env
+    env.reset()
+    for steps, expected in (
+        (119_999, ((-1, 1), (-0.5, 0.5))),
+        (120_000, ((-1.5, 2), (-0.7, 0.7))),
+        (240_000, ((-2, 3), (-0.7, 0.7))),
+    ):
+        base.driver.step_count.fill_(steps)
+        env.reset()
+        ranges = base.view.command_ranges["twist"]
+        assert tuple(ranges["lin_vel_x"].tolist()) == pytest.approx(expected[0])
+        assert tuple(ranges["ang_vel_z"].tolist()) == pytest.approx(expected[1])
+        assert ranges["lin_vel_y"].tolist() == [-1.0, 1.0]
 
 
 def test_a_humanoid_that_gets_up_is_not_thrown_about_by_its_first_policy():

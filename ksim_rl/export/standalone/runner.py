@@ -126,7 +126,8 @@ class Runner(Signals):
                 self.targets["vel"].update(zip(names, second(value), strict=True))
             value = shape(given)
             if spec["relative"]:
-                value = value + self.data.qpos[at]
+                # A robot's own encoders tell where it is.
+                value = value + self.data.qpos[at] + self._bias_of(names)
             # The offset has the model's own pose in it; exports of before 0.2.0 do not say so.
             if spec.get("from_default"):
                 value = value + [self.default[name] - self.own_default[name] for name in names]
@@ -172,6 +173,8 @@ class Runner(Signals):
             if lag:
                 late = lag(np.concatenate([target[key] for key in takes]))
                 target |= dict(zip(takes, np.split(late, len(takes)), strict=True))
+            # A robot's servo reads its encoder; the ones of this model see true positions.
+            target["pos"] = target["pos"] - self._bias_of(names)
             # MuJoCo's own servo computes the effort; it only takes a target in the control's units.
             if kind == "builtin":
                 self.data.ctrl[ctrl] = target[takes[0]] * scale + offset
@@ -190,6 +193,9 @@ class Runner(Signals):
             self.data.ctrl[ctrl] = np.clip(effort, low, high)
 
         return law
+
+    def _bias_of(self, names: list[str]) -> Array:
+        return np.array([self.bias[name] for name in names])
 
     # -- episodes ------------------------------------------------------------------------------------------------
 
@@ -267,6 +273,8 @@ class Runner(Signals):
             for tracker in self.contacts.values():
                 if tracker.every:
                     tracker.update(self.data, dt, starts=not substep)
+        for keep in self.of_contacts:
+            keep()
         # mj_step integrates last: derived poses and sensors lag behind qpos by a substep.
         self.refresh()
         self.steps += 1

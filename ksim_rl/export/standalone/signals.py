@@ -183,16 +183,17 @@ class Contacts:
         touches, touched = reading[:, 0] > 0, kept["found"] > 0
         lands, leaves = touches & ~touched, touched & ~touches
         # The time up to and including this update, so that a landing reports the whole flight.
-        flight = kept["air_time"] + dt
+        flight, stance = kept["air_time"] + dt, kept["contact_time"] + dt
         # Elements that stood from the start have flown for no time: that is no flight.
         kept["last_air_time"] = np.where(lands & (kept["air_time"] > 0), flight, kept["last_air_time"])
-        kept["last_contact_time"] = np.where(leaves, kept["contact_time"], kept["last_contact_time"])
+        kept["last_contact_time"] = np.where(leaves, stance, kept["last_contact_time"])
         kept["air_time"] = np.where(touches, 0.0, flight)
-        kept["contact_time"] = np.where(touches, kept["contact_time"] + dt, 0.0)
+        kept["contact_time"] = np.where(touches, stance, 0.0)
         kept["found"] = touches * 1.0
-        # Events of any substep count for the whole env step, else a short touch would be lost.
-        for name, event in (("first_contact", lands), ("first_air", leaves)):
-            kept[name] = event * 1.0 if starts else np.maximum(kept[name], event)
+        # An event of any substep counts for the whole env step, as long as what it began lasts.
+        for name, event, lasts in (("first_contact", lands, touches), ("first_air", leaves, ~touches)):
+            held = 0.0 if starts else kept[name]
+            kept[name] = np.maximum(held, event) * lasts
 
 
 class Signals:
@@ -209,6 +210,8 @@ class Signals:
         self.limit = check_count("episode_steps", meta["episode_steps"])
         # Filled by values that keep memory; `reset` calls them all.
         self.resets: list[Callable[[], None]] = []
+        # Values of the moment of the contacts keep it here, between the last substep and the refresh.
+        self.of_contacts: list[Callable[[], None]] = []
         # Shared lags of this episode by group and age, see `Lag`.
         self.drawn: dict[Any, int] = {}
         self._nodes = 0
@@ -347,6 +350,8 @@ class Signals:
                 kind = "site"
                 where = data.site_xpos
                 ids = [model.site(name).id for name in node["sites"]]
+            if name == "site_lin_vel_of_contacts":
+                return self._kept_velocities(ids)
             return {
                 f"{kind}_pos": lambda: where[ids].ravel(),
                 # Above the ground below each point, not above z = 0.
@@ -390,6 +395,18 @@ class Signals:
             "time": lambda: np.array([self.steps * self.step_dt]),
             "time_left": lambda: np.array([max(self.limit - self.steps, 0) * self.step_dt]),
         }[name]
+
+    def _kept_velocities(self, ids: list[int]) -> Value:
+        """Return a function that gives the velocities of sites at the start of the last substep, 0 after a reset."""
+        kept = np.zeros(3 * len(ids))
+
+        def keep() -> None:
+            # mj_step integrates last, and leaves the velocities of frames as they were before.
+            kept[:] = self._velocities("site", ids)[:, 3:].ravel()
+
+        self.of_contacts.append(keep)
+        self.resets.append(lambda: kept.fill(0.0))
+        return lambda: kept
 
     def _velocities(self, kind: str, ids: list[int], local: bool = False) -> Array:
         """Return angular, then linear velocity of the frames of bodies or sites, [N, 6]."""

@@ -136,7 +136,11 @@ class RandomizeDefaultJointPos(OfJoints, RandomizeNumber, operation="add"):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizeEncoderBias(OfJoints, RandomizeNumber):
-    """Offset between a joint's position and its encoder's reading, rad or m; see `JointPosRel(biased=True)`."""
+    """Offset between a joint's position and its encoder's reading, rad or m.
+
+    Observations show it with `JointPosRel(biased=True)`. A robot's servo closes its loop over the same encoder, so that
+    a joint that is asked for a position stands off it by as much, the other way.
+    """
 
     operation: Literal["abs"] = "abs"
 
@@ -145,6 +149,7 @@ class RandomizeEncoderBias(OfJoints, RandomizeNumber):
         drawn_EN = self.draw(view, len(joints), [self.ranges])[..., 0]
         biased_EN = torch.where(mask_E[:, None], drawn_EN, joints.encoder_bias_EL)
         view.encoder_bias_EL[:, joints.index] = biased_EN
+        view.targets.follow_bias(mask_E)
 
 
 @dataclass(frozen=True, kw_only=True)

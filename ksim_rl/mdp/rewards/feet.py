@@ -126,10 +126,10 @@ class FeetTooClose(OfSites, RewardTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class FootSlip(OfFeet, RewardWhileCommanded):
-    """active * sum_f contact_f * |v_xy,f|^2, (m/s)^2; velocities of the sites in the world frame."""
+    """active * sum_f contact_f * |v_xy,f|^2, (m/s)^2; velocities of the sites, world frame, at that moment."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        speed2_EF = view.sites(self.sites).lin_vel_EN3[..., :2].square().sum(-1)
+        speed2_EF = view.sites(self.sites).lin_vel_of_contacts_EN3[..., :2].square().sum(-1)
         return self.while_commanded(view, (speed2_EF * self.contact(view).found_EN).sum(-1))
 
 

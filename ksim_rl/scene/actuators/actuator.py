@@ -73,10 +73,12 @@ class Drive:
         return JointState(world.qpos_EL[:, joints.qpos], world.qvel_EL[:, joints.qvel])
 
     def target(self) -> JointTarget:
-        """Return the targets of the joints."""
+        """Return the targets of the joints, of true positions as in `state`."""
         targets = self._view.targets
         joints = self._joints.index
-        return JointTarget(targets.pos_EL[:, joints], targets.vel_EL[:, joints], targets.effort_EL[:, joints])
+        return JointTarget(
+            targets.true_positions(joints), targets.vel_EL[:, joints], targets.effort_EL[:, joints]
+        )
 
     def write(self, control_EN: Float[Tensor, "E N"]) -> None:
         """Set the controls of the motors."""

@@ -121,15 +121,15 @@ class ContactState(NamedTuple):
     air_time_EN: Float[Tensor, "E N"]
     """Time since the element left the ground, s, [E, N]; 0 while it touches."""
     last_air_time_EN: Float[Tensor, "E N"]
-    """Time that the last completed flight took, s, [E, N]."""
+    """Time that the last completed flight took up to the reading that saw the landing, s, [E, N]."""
     contact_time_EN: Float[Tensor, "E N"]
     """Time since the element touched down, s, [E, N]; 0 while it is in the air."""
     last_contact_time_EN: Float[Tensor, "E N"]
-    """Time that the last completed contact took, s, [E, N]."""
+    """Time that the last completed contact took up to the reading that saw the take-off, s, [E, N]."""
     first_contact_EN: Float[Tensor, "E N"]
-    """1 in the env step in which the element touched down, else 0, [E, N]."""
+    """1 in the env step in which the element touched down, if it still stands at its end, else 0, [E, N]."""
     first_air_EN: Float[Tensor, "E N"]
-    """1 in the env step in which the element left the ground, else 0, [E, N]."""
+    """1 in the env step in which the element left the ground, if it still flies at its end, else 0, [E, N]."""
     force_history_ESN3: Float[Tensor, "E S N 3"]
     """`force_EN3` of each substep, oldest first, N, world frame, [E, S, N, 3]; S is 1 without `every_substep`."""
 
@@ -222,21 +222,26 @@ class ContactTracker(SensorTracker):
         touched = clock["found"] > 0
         lands = touches & ~touched
         leaves = touched & ~touches
-        # As if it went on flying; used only where it does, or lands just now.
+        # As if it went on flying, or standing; used only where it does, or where that ends just now.
         flight_EN = clock["air_time"] + dt
         # What stands on the ground at the start of an episode has not flown.
         ends_flight = lands & (clock["air_time"] > 0)
         clock["last_air_time"].copy_(torch.where(ends_flight, flight_EN, clock["last_air_time"]))
-        # Read before `contact_time` is set below.
-        stood_EN = torch.where(leaves, clock["contact_time"], clock["last_contact_time"])
-        clock["last_contact_time"].copy_(stood_EN)
+        stance_EN = clock["contact_time"] + dt
+        clock["last_contact_time"].copy_(torch.where(leaves, stance_EN, clock["last_contact_time"]))
         clock["air_time"].copy_(torch.where(touches, 0.0, flight_EN))
-        clock["contact_time"].copy_(torch.where(touches, clock["contact_time"] + dt, 0.0))
+        clock["contact_time"].copy_(torch.where(touches, stance_EN, 0.0))
         # Last, since `touched` is read from it.
         clock["found"].copy_(touches)
-        # Within an env step an event stays set, in whichever substep it happened.
-        for event, happens in (("first_contact", lands), ("first_air", leaves)):
-            clock[event].copy_(happens if starts else torch.where(happens, 1.0, clock[event]))
+        self._keep_event(clock["first_contact"], lands, touches, starts=starts)
+        self._keep_event(clock["first_air"], leaves, ~touches, starts=starts)
+
+    def _keep_event(self, event_EN: Tensor, happens: Tensor, lasts: Tensor, *, starts: bool) -> None:
+        """Note what happens, in whichever substep of the env step, as long as the state that it began lasts."""
+        # What happened in the env step before is over.
+        if not starts:
+            happens = happens | (event_EN > 0)
+        event_EN.copy_(happens & lasts)
 
     def _readings(self) -> Tensor:
         """Return found, force, position and (for the strongest) the contact's first two axes: 7 or 13 numbers."""

@@ -118,6 +118,11 @@ class Joints(_Elements):
         """The encoders' readings less the positions, rad or m."""
         return self._tables.encoder_bias_EL[:, self.index]
 
+    @property
+    def encoder_pos_EL(self) -> Float[Tensor, "E L"]:
+        """What the encoders read, rad or m; position stage."""
+        return self.pos_EL + self.encoder_bias_EL
+
     def write_pos(self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E L"]) -> None:
         """Set the positions in the rows of `mask_E`."""
         self._state.write(self._state.world.qpos_EL, self.qpos, mask_E, pos_EL)
@@ -224,6 +229,16 @@ class Sites(_Elements):
     def lin_vel_EN3(self) -> Float[Tensor, "E N 3"]:
         """Linear velocities, m/s, world frame; velocity stage."""
         return self._state.point_velocity(self.pos_EN3, self._bodies)
+
+    @property
+    def lin_vel_of_contacts_EN3(self) -> Float[Tensor, "E N 3"]:
+        """Linear velocities at the moment that contacts belong to, m/s; acceleration stage; first read in construction.
+
+        A foot that hits the ground has lost its velocity at the end of that substep, and has it here.
+        """
+        return self._state.site_velocity_of_contacts(
+            f"sites {list(self.ids)}", self.index, self._bodies, count=len(self)
+        )
 
 
 class Site(NearNames):

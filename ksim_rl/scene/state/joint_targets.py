@@ -82,6 +82,9 @@ class JointTargets:
     A target of a built-in actuator becomes its control (`JointControl`); a motor model reads it before each substep.
     An actuator takes the kind of target that its gains make of its control, so that a position never ends up as the
     torque of a plain motor. Efforts of the MJCF's motors are their controls, before gear and gain.
+
+    Targets of positions are readings of encoders, over which a robot's servo closes its loop. MuJoCo's servos and our
+    laws see true positions instead, so that they get targets less the encoders' bias.
     """
 
     def __init__(
@@ -91,6 +94,7 @@ class JointTargets:
         buffers: Buffers,
         *,
         default_joint_pos_EL: Float[Tensor, "E L"],
+        encoder_bias_EL: Float[Tensor, "E L"],
         default_state: DefaultState,
     ) -> None:
         model = world.mj_model
@@ -102,6 +106,7 @@ class JointTargets:
         self.vel_EL = buffers.get("joint_vel_target_EL", num_joints)
         self.effort_EL = buffers.get("joint_effort_target_EL", num_joints)
         self._default_joint_pos_EL = default_joint_pos_EL
+        self._encoder_bias_EL = encoder_bias_EL
         self._default_state = default_state
         self._buffers = {"pos": self.pos_EL, "vel": self.vel_EL, "effort": self.effort_EL}
         # Joints whose controls are written by a law before each substep, with the targets that it takes.
@@ -165,7 +170,20 @@ class JointTargets:
         self._buffers[kind][:, route.joints] = value_EK
         # Built-in actuators have their controls written here, in their own columns.
         if route.ctrl is not None:
+            if kind == "pos":
+                value_EK = value_EK - self._encoder_bias_EL[:, route.joints]
             self._world.ctrl_EL[:, route.ctrl] = route.line.of(value_EK[:, route.columns])
+
+    def true_positions(self, joints: Index) -> Float[Tensor, "E K"]:
+        """Return where joints truly are when their encoders read the targets, rad or m."""
+        return self.pos_EL[:, joints] - self._encoder_bias_EL[:, joints]
+
+    def follow_bias(self, mask_E: Bool[Tensor, " E"]) -> None:
+        """Let position servos in the rows of `mask_E` hold their targets, after the bias of encoders has changed."""
+        if self._servo_ctrl is not None:
+            ctrl_EL = self._world.ctrl_EL
+            held_EL = self._servo_line.of(self.true_positions(self._servo_joints))
+            ctrl_EL[:, self._servo_ctrl] = torch.where(mask_E[:, None], held_EL, ctrl_EL[:, self._servo_ctrl])
 
     def limits(self, kind: TargetKind, patterns: Patterns) -> Float[Tensor, "K 2"] | None:
         """Return the limits that targets of joints are clamped to, (low, high); None if nothing limits them."""
@@ -198,10 +216,8 @@ class JointTargets:
         # Controls of all actuators that are not position servos, as the keyframe has them.
         if self._start_ctrl_L is not None:
             ctrl_EL.copy_(torch.where(rows_E1, self._start_ctrl_L, ctrl_EL))
-        if self._servo_ctrl is not None:
-            # Position servos follow the default pose of each env.
-            held_EL = self._servo_line.of(self.pos_EL[:, self._servo_joints])
-            ctrl_EL[:, self._servo_ctrl] = torch.where(rows_E1, held_EL, ctrl_EL[:, self._servo_ctrl])
+        # Position servos follow the default pose of each env.
+        self.follow_bias(mask_E)
 
     def _find_servos(self) -> None:
         """Find the position servos, which follow the default pose, and the targets of the default state beyond it."""

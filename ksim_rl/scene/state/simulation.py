@@ -65,6 +65,8 @@ class Simulation:
         self.is_frozen = False
         self._is_stale = False
         self._caches: list[dict[str, Tensor]] = []
+        # What is kept of the moment of the contacts, and how it is read there.
+        self._of_contacts: dict[str, tuple[Tensor, Callable[[], Tensor]]] = {}
         # The tree of each body; its centre of mass is the reference of `cvel`.
         self._body_root = torch.tensor(world.mj_model.body_rootid, device=self.device, dtype=torch.int64)
         self._counter = self.startup_counter
@@ -133,8 +135,34 @@ class Simulation:
 
     def point_velocity(self, point_EN3: Float[Tensor, "E N 3"], body: Index) -> Float[Tensor, "E N 3"]:
         """Return the velocities of points fixed to bodies, world frame, m/s."""
+        return self._point_velocity(self.derived(), point_EN3, body)
+
+    def site_velocity_of_contacts(
+        self, name: str, site: Index, body: Index, *, count: int
+    ) -> Float[Tensor, "E N 3"]:
+        """Return the velocities of `count` sites on bodies at the moment that contacts and forces belong to, m/s.
+
+        That is the start of the last substep; rows that were just reset read 0. Ask for it in construction first, by a
+        `name` of these sites.
+        """
+        if name not in self._of_contacts:
+            kept_EN3 = self.buffers.get(f"of_contacts/{name}", count, 3, owner=ENV)
+
+            def read() -> Tensor:
+                # Not from `derived`: poses of the last substep are what is asked for here.
+                return self._point_velocity(self.world, self.world.site_xpos_EL[:, site], body)
+
+            self._of_contacts[name] = (kept_EN3, read)
+        return self._of_contacts[name][0]
+
+    def keep_moment_of_contacts(self) -> None:
+        """Keep what terms read of the moment of the contacts; between the last substep and the refresh."""
+        for kept, read in self._of_contacts.values():
+            # A world that fails in this substep must not leave its numbers to the terms that run after it was cleared.
+            kept.copy_(torch.nan_to_num(read(), nan=0.0, posinf=0.0, neginf=0.0))
+
+    def _point_velocity(self, world: World, point_EN3: Tensor, body: Index) -> Tensor:
         # MuJoCo's cvel is (angular, linear) about the centre of mass of the body's kinematic tree.
-        world = self.derived()
         # [E, N, 6]: angular first, then linear.
         cvel_EN6 = world.cvel_EL[:, body]
         lever_EN3 = point_EN3 - world.subtree_com_EL[:, self._body_root[body]]

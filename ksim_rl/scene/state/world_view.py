@@ -111,11 +111,14 @@ class WorldView(NearNames):
         self.default_joint_pos_EL = self.buffers.get(
             "default_joint_pos_EL", self.num_joints, keep=True, initial=default_joint_pos_L
         )
+        # Zero unless an event draws it.
+        self.encoder_bias_EL = self.buffers.get("encoder_bias_EL", self.num_joints, keep=True)
         self.targets = JointTargets(
             self.world,
             self.resolver,
             self.buffers,
             default_joint_pos_EL=self.default_joint_pos_EL,
+            encoder_bias_EL=self.encoder_bias_EL,
             default_state=self.default_state,
         )
         self.joint_pos_target_EL = self.targets.pos_EL
@@ -126,8 +129,6 @@ class WorldView(NearNames):
         # Infinite where the model has no limit.
         self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
         self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
-        # Zero unless an event draws it.
-        self.encoder_bias_EL = self.buffers.get("encoder_bias_EL", self.num_joints, keep=True)
         # One object for all joints; parts share its tables.
         tables = JointTables(self.default_joint_pos_EL, self.soft_joint_pos_limits_L2, self.encoder_bias_EL)
         self._every_joint = Joints(simulation, range(self.num_joints), self.resolver.names("joint"), tables)
@@ -340,7 +341,10 @@ class WorldView(NearNames):
         self._simulation.write(self.world.qvel_EL, slice(None), mask_E, qvel_EL)
 
     def write_joint_pos_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:
-        """Ask joints for positions, rad or m, in all rows: `JointTargets.write`."""
+        """Ask joints for readings of their encoders, rad or m, in all rows: `JointTargets.write`.
+
+        Without a bias of encoders (`encoder_bias_EL`) these are positions.
+        """
         self.targets.write("pos", joints, target_EK)
 
     def write_joint_vel_target(self, joints: Patterns, target_EK: Float[Tensor, "E K"]) -> None:

@@ -47,7 +47,7 @@ class TargetsAtJoints(OfJoints, EventTerm):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         # Rows that go on keep their targets.
         held_EK = JointTarget(joints=self.joints)(view)
-        target_EK = torch.where(mask_E[:, None], view.joints(self.joints).pos_EL, held_EK)
+        target_EK = torch.where(mask_E[:, None], view.joints(self.joints).encoder_pos_EL, held_EK)
         view.write_joint_pos_target(self.joints, target_EK)
 
 

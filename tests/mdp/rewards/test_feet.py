@@ -1,3 +1,5 @@
+import mujoco
+import numpy as np
 import pytest
 import torch
 
@@ -31,13 +33,54 @@ def test_clearance_ignores_vertical_motion(free_body):
     torch.testing.assert_close(free_body.read(term, "rewards/x"), torch.zeros(3), atol=1e-5, rtol=0)
 
 
-def test_slip_counts_feet_in_contact_only(boxes):
-    boxes.place(qpos=boxes_at(0.0, 0.5))
-    boxes.step()
-    boxes.place(qvel=(3, 4, 0, 0, 0, 0, 3, 4, 0, 0, 0, 0))
+def slips_of_c(model, heights, *, steps):
+    """Return, per env step of 10 substeps, sum_f contact_f |v_xy,f|^2 as MuJoCo's C engine leaves the last substep."""
+    data, velocity_6, slips = mujoco.MjData(model), np.zeros(6), []
+    data.qpos[:] = boxes_at(*heights)
+    data.qvel[:] = SLIDING
+    for _ in range(steps):
+        slips.append(0.0)
+        for _ in range(10):
+            mujoco.mj_step(model, data)
+        # `mj_step` integrates last: contacts and velocities of frames are both of the state before that.
+        for name in ("a", "b"):
+            mujoco.mj_objectVelocity(
+                model, data, mujoco.mjtObj.mjOBJ_SITE, model.site(name).id, velocity_6, False
+            )
+            slips[-1] += (data.sensor(f"touch_{name}").data[0] > 0) * float(np.square(velocity_6[3:5]).sum())
+    return slips
+
+
+SLIDING = (3, 4, 0, 0, 0, 0, 3, 4, 0, 0, 0, 0)
+
+
+def test_slip_pairs_contact_and_velocity_of_one_moment(boxes):
+    # Box a is 7 mm up: it lands in the last substep of the second step, whose end has taken much of its speed.
+    heights, term = (0.007, 0.5), mdp.FootSlip(sensor="touch", sites=("a", "b"), **GATE)
     boxes.command([MOVING, IDLE])
-    value = boxes.read(mdp.FootSlip(sensor="touch", sites=("a", "b"), **GATE), "rewards/x")
-    torch.testing.assert_close(value, torch.tensor([25.0, 0.0]), atol=1e-3, rtol=0)
+    boxes.read(term, "rewards/x")
+    boxes.place(qpos=boxes_at(*heights), qvel=SLIDING)
+    found, at_the_end = [], []
+    for _ in range(4):
+        boxes.step()
+        found.append(boxes.read(term, "rewards/x").tolist())
+        at_the_end.append(float(boxes.view.sites("a").lin_vel_EN3[0, 0, :2].square().sum()))
+    expected = slips_of_c(boxes.world.mj_model, heights, steps=4)
+    np.testing.assert_allclose(found, [[slip, 0.0] for slip in expected], rtol=2e-3, atol=1e-5)
+    # The speed at the end of that step would be another number.
+    assert expected[0] == 0.0 and expected[1] > 1.1 * at_the_end[1] > 0.0
+
+
+def test_slip_forgets_at_a_reset(boxes):
+    term = mdp.FootSlip(sensor="touch", sites=("a", "b"), **GATE)
+    boxes.command(MOVING)
+    boxes.read(term, "rewards/x")
+    boxes.place(qpos=boxes_at(-0.001, -0.001), qvel=SLIDING)
+    boxes.step(1)
+    assert boxes.read(term, "rewards/x").gt(0.0).all()
+    boxes.view.buffers.clear(torch.tensor([True, False]))
+    assert boxes.view.sites("a").lin_vel_of_contacts_EN3[0].eq(0.0).all()
+    assert boxes.read(term, "rewards/x")[1] > 0.0
 
 
 @pytest.mark.parametrize(

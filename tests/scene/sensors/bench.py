@@ -60,6 +60,7 @@ class SensorBench:
             after=driver.after_substep,
             sensors=driver.substep_sensors,
         )
+        driver.keep_moment_of_contacts()
         self.refresh()
         self.view.episode_step_E.add_(1)
         for tracker in self.view.sensors.values():

@@ -256,8 +256,68 @@ def test_last_contact_time_and_first_air_mark_the_take_off():
         state = env.view.contact("touch")
         taken_off.append(state.first_air_EN[0, 0].item())
     assert sum(taken_off) == 1.0
-    stood = taken_off.index(1.0) * DT
+    # Up to the env step that sees it in the air, as the flight is counted up to the one that sees the landing.
+    stood = (taken_off.index(1.0) + 1) * DT
     torch.testing.assert_close(state.last_contact_time_EN, torch.full((2, 2), stood))
+
+
+class PlainClock:
+    """The clocks of one foot in plain Python, as mjlab 1.6.0 keeps them per physics step: float32 sums of `dt`."""
+
+    def __init__(self) -> None:
+        zero = np.float32(0.0)
+        self.air_time = self.last_air_time = self.contact_time = self.last_contact_time = zero
+
+    def advance(self, touches: bool, dt: float) -> None:
+        """Let one physics step pass, in which the foot touches or not."""
+        flight = np.float32(self.air_time + np.float32(dt))
+        stance = np.float32(self.contact_time + np.float32(dt))
+        if touches:
+            if self.air_time > 0:
+                self.last_air_time = flight
+            self.air_time, self.contact_time = np.float32(0.0), stance
+        else:
+            if self.contact_time > 0:
+                self.last_contact_time = stance
+            self.air_time, self.contact_time = flight, np.float32(0.0)
+
+    def landed(self, step_dt: float) -> bool:
+        """Whether it stands, and has for no longer than one env step, with mjlab's tolerance of 1e-6 s."""
+        return 0.0 < self.contact_time < step_dt + 1e-6
+
+
+def test_clocks_of_any_sequence_of_substeps_are_those_of_plain_python_to_the_last_bit():
+    # Feet that bounce within env steps, stand, fly, and begin in the air or on the ground.
+    draws = np.random.default_rng(7)
+    touches_TEN = draws.random((40, DECIMATION, 2, 2)) < np.array([[0.9, 0.5], [0.1, 0.97]])
+    touches_TEN[:12, :, 1, 1] = False
+    env = falling_env(every_substep=True)
+    env.reset()
+    tracker = env.view.sensors["touch"]
+    adr = [int(env.world.mj_model.sensor(f"touch_{name}").adr[0]) for name in ("ball", "box")]
+    clocks = [[PlainClock(), PlainClock()] for _ in range(2)]
+    seen = {"landed": 0, "bounced off": 0}
+    for touches_SEN in touches_TEN:
+        before = [[clock.contact_time > 0 for clock in row] for row in clocks]
+        for touches_EN in touches_SEN:
+            env.world.sensordata_EL[:, adr] = torch.from_numpy(touches_EN).float()
+            tracker.update_substep()
+            for row, clocks_N in enumerate(clocks):
+                for foot, clock in enumerate(clocks_N):
+                    clock.advance(bool(touches_EN[row, foot]), SUBSTEP_S)
+        env.driver.changed()
+        env.driver.refreshed()
+        state = env.view.contact("touch")
+        for name in ("air_time", "last_air_time", "contact_time", "last_contact_time"):
+            expected = [[getattr(clock, name) for clock in row] for row in clocks]
+            assert getattr(state, f"{name}_EN").tolist() == expected, name
+        landed = [[clock.landed(DT) for clock in row] for row in clocks]
+        assert (state.first_contact_EN > 0).tolist() == landed
+        seen["landed"] += int(np.sum(landed))
+        touched = touches_SEN.any(0) & ~np.array(before)
+        seen["bounced off"] += int((touched & ~np.array(landed)).sum())
+    # Both occur: landings, and touches within an env step after which the foot is in the air again.
+    assert min(seen.values()) > 10
 
 
 @pytest.mark.parametrize(
