@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.pages.committed import last_run
-from ksim_rl.tasks.velocity import PATCHES
+from ksim_rl.tasks.rough_ground import PATCHES
 
 TASKS = ("go1_velocity_rough", "g1_velocity_rough")
 

@@ -34,7 +34,7 @@ from ksim_rl.trainers.run_folder import Policy, policy_of
 
 STANDALONE = Path(__file__).parent / "standalone"
 # Each needs only those before it, since they become one file.
-PARTS = ("files", "signals", "network", "runner")
+PARTS = ("files", "contacts", "signals", "network", "runner")
 """The modules of `runner.py`, in this order."""
 # Episodes of trace.npz and env steps of each: enough for the causes, and small beside the recorded episodes.
 TRACED = 4

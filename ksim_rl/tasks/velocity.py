@@ -245,7 +245,7 @@ def velocity_cfg(
 
     `feet` has one element per foot in the order of `robot.foot_sites`, and reads every substep, whatever it says: a
     foot may land and bounce off within an env step. By default the command is `velocity_command()`, with its stages.
-    The ground is a plane; `on_rough_ground` changes that.
+    The ground is a plane; `rough_ground.on_rough_ground` changes that.
     """
     elements, num_feet = feet.geoms or feet.bodies or feet.subtrees, len(robot.foot_sites)
     if len(elements) != num_feet and all(re.fullmatch(r"[\w/-]+", element) for element in elements):
@@ -363,43 +363,6 @@ def _proposed_cfg(proposed: ModelRobot, analysis: RobotAnalysis) -> ManagerBased
         foot_height=round(min(0.1, 0.3 * height), 3),
         command=dataclasses.replace(velocity_command(), lin_vel_x=(-speed, speed), lin_vel_y=(-speed, speed)),
         viewer=ViewerCfg(body=robot.root_body, distance=max(1.0, 4.0 * height), elevation=-12.0),
-    )
-
-
-PATCHES: Mapping[str, terrains.TerrainPatch] = {
-    "flat": terrains.FlatPatch(),
-    "stairs_down": terrains.PyramidStairs(proportion=2.0),
-    "stairs_up": terrains.PyramidStairs(proportion=2.0, inverted=True),
-    "slope_down": terrains.PyramidSlope(),
-    "slope_up": terrains.PyramidSlope(inverted=True),
-    "rough": terrains.RoughGround(),
-    "obstacles": terrains.DiscreteObstacles(),
-    "waves": terrains.Waves(),
-}
-"""Up to 20 cm of step and 27 degrees of slope. A pyramid's top is where envs start, so that they walk down."""
-
-
-def on_rough_ground(
-    flat: ManagerBasedRlEnvCfg, *, root_height: float, njmax: int, nconmax: int
-) -> ManagerBasedRlEnvCfg:
-    """Return the config of a flat velocity task on rough ground.
-
-    Actor and critic see the heights around the robot, episodes also end (as truncations) at the edge of the patch, and
-    envs move through the levels by how far their robots walk. Heights are seen relative to the soles of a robot whose
-    root stands at `root_height`, m. `njmax` and `nconmax` make room for edges, where a foot touches in several places.
-    """
-    scan, terrain = mdp.HeightScan(offset=root_height), terrains.TerrainGrid(patches=PATCHES)
-    groups = {}
-    for name, seen in (("actor", noisy(scan, 0.1)), ("critic", ObservationTermCfg(term=scan))):
-        group = flat.observations[name]
-        groups[name] = dataclasses.replace(group, terms={**group.terms, "height_scan": seen})
-    return dataclasses.replace(
-        flat,
-        sim=dataclasses.replace(flat.sim, njmax=njmax, nconmax=nconmax),
-        scene=dataclasses.replace(flat.scene, terrain=terrain, spacing=terrain.size),
-        observations={**flat.observations, **groups},
-        terminations={**flat.terminations, "outside_terrain": mdp.OutsideTerrain()},
-        curriculum={**flat.curriculum, "terrain_level": mdp.TerrainLevels(command=COMMAND)},
     )
 
 

@@ -18,6 +18,7 @@ from ksim_rl.scene.robots.unitree_go import UnitreeGo1, UnitreeGo2
 from ksim_rl.scene.sensors import ContactSensor
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity
+from ksim_rl.tasks.rough_ground import on_rough_ground
 from ksim_rl.trainers import TrainingCfg
 from ksim_rl.transforms import ActionDelay, DelayCfg
 from ksim_rl.transforms.transform_cfg import TransformCfg
@@ -223,14 +224,14 @@ def go1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree Go1."""
     flat = go1_velocity_flat()
     height = GO1_ROBOT.init_pos[2]
-    return velocity.on_rough_ground(flat, root_height=height, njmax=208, nconmax=40)
+    return on_rough_ground(flat, root_height=height, njmax=208, nconmax=40)
 
 
 def g1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree G1."""
     flat = g1_velocity_flat()
     height = G1_ROBOT.init_pos[2]
-    return velocity.on_rough_ground(flat, root_height=height, njmax=840, nconmax=100)
+    return on_rough_ground(flat, root_height=height, njmax=840, nconmax=100)
 
 
 ROUGH = "over stairs, slopes and rough ground"

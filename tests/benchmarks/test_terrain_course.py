@@ -12,7 +12,7 @@ from ksim_rl import envs
 from ksim_rl.envs import EventTerm, mdp
 from ksim_rl.runs.csv_table import CsvTable
 from ksim_rl.scene.terrains import FlatPatch, PyramidSlope, TerrainGrid
-from ksim_rl.tasks.velocity import on_rough_ground
+from ksim_rl.tasks.rough_ground import on_rough_ground
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.run_folder import Policy

@@ -3,7 +3,7 @@
 from typing import Any
 
 from benchmarks.pages.terrain_course import table
-from ksim_rl.tasks.velocity import PATCHES
+from ksim_rl.tasks.rough_ground import PATCHES
 
 
 def test_a_row_shows_the_last_run_on_a_gpu_and_no_other():

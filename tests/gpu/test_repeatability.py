@@ -14,7 +14,7 @@ from ksim_rl.data import PrioritySampler
 from ksim_rl.physics import Captured, SimCfg, World, load_model
 from ksim_rl.physics.nan_guard.guard import NanGuardCfg
 from ksim_rl.ranks.running_moments import RunningMoments
-from ksim_rl.tasks.velocity import on_rough_ground
+from ksim_rl.tasks.rough_ground import on_rough_ground
 from ksim_rl.trainers.build import build_env
 from tests.physics.test_contacts import THINGS, touching
 

@@ -127,7 +127,7 @@ class Runner(Signals):
             value = shape(given)
             if spec["relative"]:
                 # A robot's own encoders tell where it is.
-                value = value + self.data.qpos[at] + self._bias_of(names)
+                value = value + self.data.qpos[at] + self.bias_of(names)
             # The offset has the model's own pose in it; exports of before 0.2.0 do not say so.
             if spec.get("from_default"):
                 value = value + [self.default[name] - self.own_default[name] for name in names]
@@ -174,7 +174,7 @@ class Runner(Signals):
                 late = lag(np.concatenate([target[key] for key in takes]))
                 target |= dict(zip(takes, np.split(late, len(takes)), strict=True))
             # A robot's servo reads its encoder; the ones of this model see true positions.
-            target["pos"] = target["pos"] - self._bias_of(names)
+            target["pos"] = target["pos"] - self.bias_of(names)
             # MuJoCo's own servo computes the effort; it only takes a target in the control's units.
             if kind == "builtin":
                 self.data.ctrl[ctrl] = target[takes[0]] * scale + offset
@@ -193,9 +193,6 @@ class Runner(Signals):
             self.data.ctrl[ctrl] = np.clip(effort, low, high)
 
         return law
-
-    def _bias_of(self, names: list[str]) -> Array:
-        return np.array([self.bias[name] for name in names])
 
     # -- episodes ------------------------------------------------------------------------------------------------
 
@@ -242,14 +239,6 @@ class Runner(Signals):
             for names, numbers in self.numbers:
                 if field in numbers:
                     numbers[field] = np.array([by_joint[n] for n in names])
-
-    def refresh(self) -> None:
-        """Recompute all that follows from position and velocity; contacts and forces stay from the last substep."""
-        model, data = self.model, self.data
-        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
-            compute(model, data)
-        mujoco.mj_sensorPos(model, data)
-        mujoco.mj_sensorVel(model, data)
 
     def act(self) -> Array:
         """Return the policy's action for the newest frame."""

@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from ksim_rl.export.standalone.contacts import Contacts
 from ksim_rl.export.standalone.files import Array, check_count, read_json, read_model
 
 Value = Callable[[], Array]
@@ -143,59 +144,6 @@ class Noise:
         return value
 
 
-class Contacts:
-    """The readings of one contact sensor of the export: values by field, one per element, or three."""
-
-    def __init__(self, spec: dict[str, Any], mj_model: mujoco.MjModel) -> None:
-        self.strongest, self.every = spec["strongest"], spec["every_substep"]
-        # One MuJoCo sensor reads found, force and position (7 numbers); of the strongest
-        # contact also normal and tangent (13).
-        first = [mj_model.sensor(name).adr[0] for name in spec["elements"]]
-        self.index = np.add.outer(first, np.arange(13 if self.strongest else 7))
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin an episode."""
-        count = len(self.index)
-        times = ("air_time", "last_air_time", "contact_time", "last_contact_time")
-        self.fields = {name: np.zeros(count) for name in ("found", "first_contact", "first_air", *times)}
-        self.fields["force"] = np.zeros(3 * count)
-        self.history: list[float] = []
-        self.fields["peak_history"] = np.zeros(1)
-
-    def update(self, data: mujoco.MjData, dt: float, starts: bool) -> None:
-        # "found" is needed at the next update, to tell landing from standing.
-        """Let `dt` seconds pass; `starts` where this begins an env step."""
-        reading, kept = data.sensordata[self.index], self.fields
-        force = reading[:, 1:4]
-        # The force of the strongest contact is in the contact's own axes: turn it into the world's.
-        if self.strongest:
-            normal, tangent = reading[:, 7:10], reading[:, 10:13]
-            axes = np.stack((normal, tangent, np.cross(normal, tangent)), -1)
-            force = np.einsum("nij,nj->ni", axes, force)
-        kept["force"] = force.ravel()
-        # Peaks since this env step began; each entry is the largest norm of one update.
-        self.history = ([] if starts else self.history) + [
-            float(np.linalg.norm(force, axis=1).max(initial=0.0))
-        ]
-        kept["peak_history"] = np.array(self.history)
-        # Rising and falling edges of contact.
-        touches, touched = reading[:, 0] > 0, kept["found"] > 0
-        lands, leaves = touches & ~touched, touched & ~touches
-        # The time up to and including this update, so that a landing reports the whole flight.
-        flight, stance = kept["air_time"] + dt, kept["contact_time"] + dt
-        # Elements that stood from the start have flown for no time: that is no flight.
-        kept["last_air_time"] = np.where(lands & (kept["air_time"] > 0), flight, kept["last_air_time"])
-        kept["last_contact_time"] = np.where(leaves, stance, kept["last_contact_time"])
-        kept["air_time"] = np.where(touches, 0.0, flight)
-        kept["contact_time"] = np.where(touches, stance, 0.0)
-        kept["found"] = touches * 1.0
-        # An event of any substep counts for the whole env step, as long as what it began lasts.
-        for name, event, lasts in (("first_contact", lands, touches), ("first_air", leaves, ~touches)):
-            held = 0.0 if starts else kept[name]
-            kept[name] = np.maximum(held, event) * lasts
-
-
 class Signals:
     """The quantities of a robot's model, and the descriptions that are made of them."""
 
@@ -247,6 +195,18 @@ class Signals:
             option.integrator = int(INTEGRATORS[integrator])
         option.timestep /= refine
         self.decimation *= refine
+
+    def refresh(self) -> None:
+        """Recompute all that follows from position and velocity; contacts and forces stay from the last substep."""
+        model, data = self.model, self.data
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            compute(model, data)
+        mujoco.mj_sensorPos(model, data)
+        mujoco.mj_sensorVel(model, data)
+
+    def bias_of(self, names: list[str]) -> Array:
+        """Return what the encoders of some joints read beyond their positions, rad or m."""
+        return np.array([self.bias[name] for name in names])
 
     def value(self, node: Any, depth: int = 0) -> Value:
         """Return a function that computes a description; a ValueError shows a part that is not one."""
@@ -326,7 +286,7 @@ class Signals:
             # Only measured angles have encoder errors; rewards read true ones.
             biased = bool(node.get("biased"))
             of_joints = {
-                "joint_pos": lambda: data.qpos[pos] + ([self.bias[n] for n in names] if biased else 0.0),
+                "joint_pos": lambda: data.qpos[pos] + (self.bias_of(names) if biased else 0.0),
                 "joint_vel": lambda: data.qvel[vel],
                 "joint_acc": lambda: data.qacc[vel],
                 "joint_effort": lambda: data.qfrc_actuator[vel],

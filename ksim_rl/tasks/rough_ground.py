@@ -1,0 +1,46 @@
+"""Puts velocity tasks on stairs, slopes and rough ground, in levels of difficulty."""
+
+import dataclasses
+from collections.abc import Mapping
+
+from ksim_rl import mdp
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.scene import terrains
+from ksim_rl.tasks import velocity
+from ksim_rl.transforms.groups.group_cfg import ObservationTermCfg
+
+PATCHES: Mapping[str, terrains.TerrainPatch] = {
+    "flat": terrains.FlatPatch(),
+    "stairs_down": terrains.PyramidStairs(proportion=2.0),
+    "stairs_up": terrains.PyramidStairs(proportion=2.0, inverted=True),
+    "slope_down": terrains.PyramidSlope(),
+    "slope_up": terrains.PyramidSlope(inverted=True),
+    "rough": terrains.RoughGround(),
+    "obstacles": terrains.DiscreteObstacles(),
+    "waves": terrains.Waves(),
+}
+"""Up to 20 cm of step and 27 degrees of slope. A pyramid's top is where envs start, so that they walk down."""
+
+
+def on_rough_ground(
+    flat: ManagerBasedRlEnvCfg, *, root_height: float, njmax: int, nconmax: int
+) -> ManagerBasedRlEnvCfg:
+    """Return the config of a flat velocity task on rough ground.
+
+    Actor and critic see the heights around the robot, episodes also end (as truncations) at the edge of the patch, and
+    envs move through the levels by how far their robots walk. Heights are seen relative to the soles of a robot whose
+    root stands at `root_height`, m. `njmax` and `nconmax` make room for edges, where a foot touches in several places.
+    """
+    scan, terrain = mdp.HeightScan(offset=root_height), terrains.TerrainGrid(patches=PATCHES)
+    groups = {}
+    for name, seen in (("actor", velocity.noisy(scan, 0.1)), ("critic", ObservationTermCfg(term=scan))):
+        group = flat.observations[name]
+        groups[name] = dataclasses.replace(group, terms={**group.terms, "height_scan": seen})
+    return dataclasses.replace(
+        flat,
+        sim=dataclasses.replace(flat.sim, njmax=njmax, nconmax=nconmax),
+        scene=dataclasses.replace(flat.scene, terrain=terrain, spacing=terrain.size),
+        observations={**flat.observations, **groups},
+        terminations={**flat.terminations, "outside_terrain": mdp.OutsideTerrain()},
+        curriculum={**flat.curriculum, "terrain_level": mdp.TerrainLevels(command=velocity.COMMAND)},
+    )
