@@ -36,7 +36,9 @@ usage: ksim-rl <command> [arguments]
   envs     list the tasks, or print what one is made of: ksim-rl envs cartpole_swingup
   robot    analyse a robot's model: ksim-rl robot unitree_a1/a1 [--code]
   new      a package around it:     ksim-rl new robot PATH.xml
+           a file with a task:      ksim-rl new task NAME
   motion   a recording as a motion: ksim-rl motion bvh dance.bvh dance.npz --pairs pairs.yaml
+  completion  complete words in a shell:  eval "$(ksim-rl completion bash)"
   reproduce  run a table of results: ksim-rl reproduce dm_control --rows 'ppo/Cart.*'
 
 RUN is a run folder (its newest checkpoint) or one of its checkpoints.
@@ -68,6 +70,7 @@ COMMANDS = {
     "robot": "ksim_rl.cli.run_commands:robot",
     "new": "ksim_rl.cli.new:new",
     "motion": "ksim_rl.clips.command:motion",
+    "completion": "ksim_rl.cli.completion:completion",
     "reproduce": "ksim_rl.tables.reproduce:reproduce",
 }
 

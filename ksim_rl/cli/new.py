@@ -1,8 +1,9 @@
-"""`ksim-rl new robot PATH` writes a package around a robot's model: robot, task, test and README."""
+"""`ksim-rl new` writes a package around a robot's model (robot, task, test and README), or a file with a task."""
 
 import importlib.util
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -26,9 +27,37 @@ MODEL = "@model@"
 
 
 def new(arguments: list[str]) -> int:
+    """Write what `arguments` name: a package around a robot, or a file with a task."""
+    kinds: dict[str, Callable[[list[str]], int]] = {"robot": new_robot, "task": new_task}
+    parser = OneLineParser(
+        prog="ksim-rl new", description="Write a package around a robot's model, or a file with a task."
+    )
+    parser.add_argument("kind", choices=kinds, help="ksim-rl new robot --help and new task --help tell more")
+    # Each kind has its own arguments.
+    options = parser.parse_args(arguments[:1])
+    return kinds[options.kind](arguments[1:])
+
+
+def new_task(arguments: list[str]) -> int:
+    """Write a task with its robot, a term and its settings into one file."""
+    parser = OneLineParser(prog="ksim-rl new task", description="Write a task that trains into one file.")
+    parser.add_argument("name", metavar="NAME", help="of the task, and of the file NAME.py")
+    parser.add_argument("--output", type=Path, help="the folder of the file; default: here")
+    options = parser.parse_args(arguments)
+    _check_name(options.name, options.name, field="NAME")
+    file = (options.output or Path()) / f"{options.name}.py"
+    if file.exists():
+        raise ValueError(f"{file}: exists already; choose another name, or a folder with --output")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(file, _text("task.py", {"name": options.name}))
+    show(shown(file))
+    show(f"next, where the file is: ksim-rl train --plugin {options.name} task={options.name}")
+    return 0
+
+
+def new_robot(arguments: list[str]) -> int:
     """Write the package; the code is 1 for a robot that does not stand."""
-    parser = OneLineParser(prog="ksim-rl new", description="Write a package around a robot's model.")
-    parser.add_argument("kind", choices=["robot"])
+    parser = OneLineParser(prog="ksim-rl new robot", description="Write a package around a robot's model.")
     parser.add_argument(
         "model", metavar="PATH", help="an MJCF or URDF file, or a menagerie name: unitree_a1/a1"
     )
@@ -134,11 +163,11 @@ def _text(name: str, words: dict[str, object], imports: str = "") -> str:
     return Template(template).substitute(words, imports=imports).replace('"""\n\n\n', '"""\n\n')
 
 
-def _check_name(name: str, task: str) -> None:
+def _check_name(name: str, task: str, *, field: str = "--name") -> None:
     if not re.fullmatch(r"[a-z]\w*", name, re.ASCII):
-        raise ValueError(f"--name {name}: expected a name for a Python package: small letters, digits and _")
+        raise ValueError(f"{field} {name}: expected a name for a Python package: small letters, digits and _")
     if task in envs.names():
-        raise ValueError(f"--name {name}: there is a task {task!r} already; choose another name")
+        raise ValueError(f"{field} {name}: there is a task {task!r} already; choose another name")
     # A name that shadows an installed package would import the wrong one.
     if importlib.util.find_spec(name) is not None:
-        raise ValueError(f"--name {name}: Python knows a package of this name already; choose another name")
+        raise ValueError(f"{field} {name}: Python knows a package of this name already; choose another name")

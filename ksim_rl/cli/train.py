@@ -23,6 +23,7 @@ from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.runs.run_lock import is_locked
+from ksim_rl.terminal import show
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.kept_models import with_kept_models
 from ksim_rl.trainers.run_cfg import reaching_outside
@@ -41,7 +42,15 @@ def train(arguments: list[str]) -> int:
     flags, unknown = parse_flags(arguments)
     if unknown:
         raise conf.spelling.of_flag(unknown[0], arguments)
+    if flags.shell_completion:
+        raise ValueError(
+            "--shell-completion is Hydra's, and knows programs of one word: ksim-rl completion bash prints a script "
+            "that completes ksim-rl"
+        )
     name, own_config = _primary_config(flags)
+    if flags.help and name == conf.NAME and not own_config:
+        show(conf.help_page(flags.overrides))
+        return 0
     if name == conf.RUN_AGAIN:
         began = Path(flags.config_dir)
     else:

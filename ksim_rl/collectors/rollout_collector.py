@@ -34,14 +34,18 @@ from ksim_rl.transforms.specs import spell
 class CollectorCfg(Checked):
     """Options of `RolloutCollector` that a config may set.
 
-    `require_graphs` fails where CUDA graphs are unavailable, instead of running slower with a warning.
-    `compile` fuses the operations of terms and transforms into few kernels, which are compared with the env's own steps
-    before they are used, and again after 1, 2, 4, 8 ... rollouts: rollouts take less time, and equal the env's own up
-    to rounding. None does so for envs with a `SimulatedWorld`. `eager` runs the Python of each step instead, without
-    kernels and graphs, which takes much longer: for debugging, and for Python that changes from step to step.
-    `stagger_episodes` spreads the time-outs of the envs over an episode's length at the first reset, if the env can
-    do so. The first `warmup` rollouts on CUDA run eagerly. In the config of a run, `rollout_length` may be given
-    instead of the dataset's size, which then follows from it and the number of envs.
+    Attributes:
+        require_graphs: fail where CUDA graphs are unavailable, instead of running slower with a warning.
+        compile: fuse the operations of terms and transforms into few kernels, which are compared with the env's own
+            steps before they are used, and again after 1, 2, 4, 8 ... rollouts: rollouts take less time, and equal the
+            env's own up to rounding. None does so for envs with a `SimulatedWorld`.
+        eager: run the Python of each step instead, without kernels and graphs, which takes much longer: for debugging,
+            and for Python that changes from step to step.
+        stagger_episodes: spread the time-outs of the envs over an episode's length at the first reset, if the env can.
+            First episodes are then shorter than later ones, and so are their returns: the rise of both within the
+            first episode's length is no learning.
+        warmup: so many first rollouts on CUDA run eagerly.
+        rollout_length: steps of each env, in the config of a run instead of the dataset's size, which then follows.
     """
 
     require_graphs: bool = False

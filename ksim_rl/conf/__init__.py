@@ -2,6 +2,7 @@
 
 from ksim_rl.conf import spelling
 from ksim_rl.conf.command_line import changed, check_command_line, compose, fields_of, without_sweeps
+from ksim_rl.conf.help_page import completions, help_page
 from ksim_rl.conf.registration import (
     MODULE,
     NAME,

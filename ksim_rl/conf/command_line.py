@@ -165,6 +165,13 @@ def _names(name: str, choices: tuple[str, ...], sources: tuple[str, ...]) -> dic
     return {str(key): value for key, value in tree.items()}
 
 
+def listed_groups() -> str:
+    """Return the groups that a user chooses from, a line each, with their choices."""
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_module(MODULE, version_base="1.3"):
+        return _listed_groups()
+
+
 def _listed_groups() -> str:
     loader = GlobalHydra.instance().config_loader()
     names = [group for group in _groups(loader) if group not in CHOSEN_BY_TASK]

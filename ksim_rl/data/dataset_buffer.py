@@ -24,9 +24,14 @@ from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SequenceSample
 class DatasetCfg(Checked):
     """How many env states one RL update uses, and in how many gradient steps an epoch splits them.
 
-    Recurrent networks learn on `sequence_length` successive steps of an env, None for the whole rollout, whose first
-    state is the stored one, or renewed by `burn_in` steps before it. With several ranks all sizes are per rank.
-    With `shards`, one process draws its minibatches from so many equal parts of its envs, as so many ranks would.
+    With several ranks all sizes are per rank.
+
+    Attributes:
+        num_env_states_per_minibatch: env states of a gradient step.
+        num_minibatches: gradient steps of an epoch.
+        sequence_length: successive steps of an env on which recurrent networks learn; None for the whole rollout.
+        burn_in: steps before a sequence that renew its first state; with 0 it is the stored one.
+        shards: one process draws its minibatches from so many equal parts of its envs, as so many ranks would.
     """
 
     num_env_states_per_minibatch: Count

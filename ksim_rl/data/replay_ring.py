@@ -192,7 +192,7 @@ class ReplayCfg(Checked):
     `learning_starts`, so that it is not the same run any more.
     """
 
-    num_env_states_per_minibatch: Count
+    num_env_states_per_minibatch: Count  # env states of a gradient step
     num_minibatches: Count  # per iteration
     num_steps: Count = 1  # of each env per iteration
     capacity: Count = 1024  # env states per env; an episode's end takes one more, for its last observation
@@ -201,7 +201,7 @@ class ReplayCfg(Checked):
     prioritized: bool = False  # by the last temporal-difference error (Schaul et al., arXiv 1511.05952)
     priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
     priority_beta: Share = 0.4  # how far the weights of the losses undo that; 1 is wholly
-    save_replay: bool = True
+    save_replay: bool = True  # in checkpoints, so that a resumed run goes on as it would have
     shards: Count = 1  # equal parts of the envs, of which minibatches have as many each, as with ranks
 
     def _check_fields(self) -> None:

@@ -34,8 +34,8 @@ class ManagerBasedRlEnvCfg(Checked):
 
     decimation: Count  # physics substeps per env step
     scene: SceneCfg
-    observations: Mapping[str, ObservationGroupCfg] = field(default_factory=dict)
-    actions: Mapping[str, ActionTerm] = field(default_factory=dict)
+    observations: Mapping[str, ObservationGroupCfg] = field(default_factory=dict)  # by group
+    actions: Mapping[str, ActionTerm] = field(default_factory=dict)  # what a policy controls
     events: Mapping[str, EventTerm] | None = None  # `ResetToDefault`; {}: the default state
     seed: Seed = None  # None draws one; the env stores the seed that it used in its own `cfg`
     sim: SimCfg = field(default_factory=SimCfg)
@@ -44,11 +44,11 @@ class ManagerBasedRlEnvCfg(Checked):
     rewards: Mapping[str, RewardTerm] = field(default_factory=dict)  # a term of weight 0 is not computed
     terminations: Mapping[str, TerminationTerm] = field(default_factory=dict)  # always: non-finite physics
     commands: Mapping[str, CommandTerm] = field(default_factory=dict)  # emitted as `("command", name)`
-    curriculum: Mapping[str, CurriculumTerm] = field(default_factory=dict)
-    metrics: Mapping[str, MetricTerm] = field(default_factory=dict)
+    curriculum: Mapping[str, CurriculumTerm] = field(default_factory=dict)  # what gets harder
+    metrics: Mapping[str, MetricTerm] = field(default_factory=dict)  # logged, and learned from by nobody
     is_finite_horizon: bool = False  # True: a time-out is `terminated`, else `truncated` and bootstrapped
     scale_rewards_by_dt: bool = True  # rewards are per second and are multiplied by the env step's seconds
-    transforms: Mapping[str, TransformCfg] = field(default_factory=dict)
+    transforms: Mapping[str, TransformCfg] = field(default_factory=dict)  # TorchRL's, after the groups
 
     def _check_fields(self) -> None:
         super()._check_fields()

@@ -23,7 +23,7 @@ from ksim_rl.modules.upstream import TensorModule
 class BoundedActorCfg(OffPolicyNetworkCfg, output_gain=0.01):
     """The fields of policies whose actions lie in a box, within `action_bound` where the env's spec has no bounds."""
 
-    action_bound: Positive = 1.0
+    action_bound: Positive = 1.0  # where the spec has no bounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +38,8 @@ class SquashedActorCfg(BoundedActorCfg):
     `log_std_min` and `log_std_max` bound the log of the standard deviation before squashing.
     """
 
-    log_std_min: float = -5.0
-    log_std_max: float = 2.0
+    log_std_min: float = -5.0  # lower bound of the log of the standard deviation
+    log_std_max: float = 2.0  # upper bound
 
     def _check_fields(self) -> None:
         super()._check_fields()

@@ -23,7 +23,11 @@ from ksim_rl.modules.upstream import TensorModule
 
 @dataclass(frozen=True, kw_only=True)
 class CriticCfg(OnPolicyNetworkCfg, in_keys=("critic",)):
-    """The value network; `output_gain` scales the last layer's weights."""
+    """The value network.
+
+    Attributes:
+        output_gain: scale of the last layer's weights.
+    """
 
     output_gain: NonNegative = 1.0
 
@@ -56,10 +60,10 @@ class QNetworkCfg(OffPolicyNetworkCfg):
     arXiv 1707.06887); 1 predicts the value itself.
     """
 
-    num_networks: Count = 2
-    num_atoms: Count = 1
-    v_min: float = -10.0
-    v_max: float = 10.0
+    num_networks: Count = 2  # critics side by side
+    num_atoms: Count = 1  # values of which each predicts the probability; 1 predicts the value
+    v_min: float = -10.0  # the lowest atom
+    v_max: float = 10.0  # the highest atom
 
     def _check_fields(self) -> None:
         super()._check_fields()

@@ -101,6 +101,11 @@ class NetworkCfg(Checked):
     """The fields of the configs of all networks, which can normalize observations by running statistics inside.
 
     A subclass with a `build` of its own makes any network of it, and configs name it by `_target_`.
+
+    Attributes:
+        hidden_dims: widths of the hidden layers.
+        activation: between the layers.
+        obs_normalization: shift and scale observations by running statistics.
     """
 
     hidden_dims: tuple[Count, ...] = (512, 256, 128)
@@ -160,7 +165,11 @@ def _hashable(key: str | Sequence[str]) -> str | tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicyNetworkCfg(NetworkCfg):
-    """The fields of networks that choose the observation groups they read, side by side; a list names a nested key."""
+    """The fields of networks that choose what they read.
+
+    Attributes:
+        in_keys: observation groups, read side by side; a list of names is a nested key.
+    """
 
     in_keys: ObservationKeys = ("actor",)
 
@@ -178,8 +187,8 @@ class OnPolicyNetworkCfg(NetworkCfg):
 class OffPolicyNetworkCfg(NetworkCfg, hidden_dims=(256, 256), activation="relu"):
     """The fields of the networks of off-policy methods; `output_gain` scales the last layer's weights."""
 
-    layer_norm: bool = False
-    output_gain: NonNegative = 1.0
+    layer_norm: bool = False  # normalize before each activation
+    output_gain: NonNegative = 1.0  # scale of the last layer's weights
 
     def build(self, input_dim: int, output_dim: int | None, **options: Any) -> nn.Module:
         """Return the layers: see `NetworkCfg.build`."""

@@ -42,7 +42,12 @@ class AlgorithmCfg(Checked):
 class GradientCfg(AlgorithmCfg):
     """The settings of gradient steps that all algorithms share, by Adam, or AdamW off policy.
 
-    `max_grad_norm=None` does not clip; so many as `max_skipped_steps` in a row that are not finite end the run.
+    Attributes:
+        betas: decay of Adam's means of gradients and of their squares.
+        adam_eps: what Adam adds to the root of the squares.
+        weight_decay: share of the weights that a step takes away, times the learning rate.
+        max_grad_norm: greatest norm of a gradient, to which longer ones are clipped; None does not clip.
+        max_skipped_steps: so many steps in a row that are not finite end the run.
     """
 
     betas: tuple[float, float] = (0.9, 0.999)
@@ -61,11 +66,17 @@ class GradientCfg(AlgorithmCfg):
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
-    """The settings of algorithms that pass over each rollout `num_epochs` times, with one Adam.
+    """The settings of algorithms that pass over each rollout several times, with one Adam.
 
-    The "adaptive" schedule changes the learning rate before each gradient step, within its bounds, so that the
-    divergence of the policy from the one that collected the rollout stays near `desired_kl` nats.
-    `anneal_learning_rate` multiplies `learning_rate_max`, or the "fixed" rate, by the share of the run that is left.
+    Attributes:
+        num_epochs: passes over each rollout.
+        learning_rate: of Adam; where the adaptive schedule starts.
+        schedule: "fixed", or "adaptive": the learning rate changes before each gradient step, within its bounds, so
+            that the divergence of the policy from the one that collected the rollout stays near `desired_kl`.
+        desired_kl: nats that the adaptive schedule aims at.
+        learning_rate_min: lower bound of the adaptive schedule.
+        learning_rate_max: upper bound of the adaptive schedule.
+        anneal_learning_rate: multiply `learning_rate_max`, or the fixed rate, by the share of the run that is left.
     """
 
     num_epochs: Count = 1
@@ -100,6 +111,15 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
             whose weights follow the policy from epoch to epoch, within `rho_thresh` and `c_thresh`; see `VTrace`.
         value_lmbda: the lambda of value targets, where it is not `lmbda`: 1 makes them Monte Carlo returns, which end
             with the critic's value at the end of a rollout or at a time limit. "vtrace" has no such.
+        gamma: discount of a step.
+        lmbda: lambda of the advantages: 0 trusts the critic's next value, 1 the rewards.
+        rho_thresh: upper bound of V-trace's weights of errors.
+        c_thresh: upper bound of V-trace's weights of traces.
+        clip_epsilon: how far the ratio of probabilities may move from 1 before it stops to count.
+        entropy_coeff: weight of the policy's entropy in the loss.
+        critic_coeff: weight of the critic's loss.
+        normalize_advantage: over the "dataset", each "minibatch", or "none".
+        symmetry_coeff: weight of the mirror loss, with `symmetry="loss"`.
         estimate_each_epoch: estimate advantages and value targets again before each epoch, with the present networks,
             instead of once (Andrychowicz et al., arXiv 2006.05990, section 3.5). "vtrace" always does.
         min_advantage_std: with `normalize_advantage="dataset"` advantages are divided by their standard deviation, at
@@ -229,15 +249,15 @@ class OffPolicyCfg(GradientCfg):
     a minute at the first one. `symmetry="augment"` mirrors every second env state, for robots that are their own image.
     """
 
-    gamma: Share = 0.99
+    gamma: Share = 0.99  # discount of a step
     tau: PositiveShare = 0.005  # share of the new weights in each update of the target networks
-    value_reduction: ValueReduction = "min"
+    value_reduction: ValueReduction = "min"  # of the predictions of several critics
     policy_delay: Count = 1  # gradient steps of the critics for each of the actor
-    critic_learning_rate: Positive = 3e-4
-    actor_learning_rate: Positive = 3e-4
+    critic_learning_rate: Positive = 3e-4  # of AdamW
+    actor_learning_rate: Positive = 3e-4  # of AdamW
     autocast: bool = False  # run the networks in bfloat16, with float32 weights
-    compile: bool = False
-    symmetry: Literal["none", "augment"] = "none"
+    compile: bool = False  # fuse the kernels of the losses on CUDA
+    symmetry: Literal["none", "augment"] = "none"  # "augment" mirrors every second env state
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,9 +269,9 @@ class SACCfg(OffPolicyCfg):
     aims at an entropy of `target_entropy_per_action` nats, of actions scaled to [-1, 1].
     """
 
-    alpha_init: Positive = 1.0
-    alpha_learning_rate: NonNegative = 3e-4
-    target_entropy_per_action: float = -1.0
+    alpha_init: Positive = 1.0  # the first temperature, return per nat
+    alpha_learning_rate: NonNegative = 3e-4  # of the temperature; 0 keeps it
+    target_entropy_per_action: float = -1.0  # nats that the temperature aims at
 
 
 @dataclass(frozen=True, kw_only=True)

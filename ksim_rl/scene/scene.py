@@ -88,12 +88,12 @@ class SceneCfg(Checked):
     `view.contact(name)` and its kin; sensors of the MJCF need no entry here.
     """
 
-    robots: Annotated[Mapping[str, Robot], Filled("name at least one robot")]
-    objects: Mapping[str, Robot] = field(default_factory=dict)
-    placements: Mapping[str, Placement] = field(default_factory=dict)
+    robots: Annotated[Mapping[str, Robot], Filled("name at least one robot")]  # the first is what terms mean
+    objects: Mapping[str, Robot] = field(default_factory=dict)  # cubes, balls, doors
+    placements: Mapping[str, Placement] = field(default_factory=dict)  # of robots and objects, by name
     terrain: Terrain | None = None  # None: the robot's own model has its ground
-    sensors: Mapping[str, Sensor] = field(default_factory=dict)
-    num_envs: Count = 1
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)  # of contacts, rays, cameras, IMUs
+    num_envs: Count = 1  # a run's own number takes its place
     spacing: NonNegative = 2.0  # m between neighbouring envs when several are drawn in one picture
     soft_joint_pos_limit_factor: Share = 1.0  # of each joint's range, about its middle: the soft limits
 

@@ -10,20 +10,21 @@ from ksim_rl.checks import naming
 
 @dataclass(frozen=True, kw_only=True)
 class ViewerCfg(Checked):
-    """A camera that follows a `body`, or looks at a point (`lookat`, m, world frame) where that is None.
+    """The camera of `render()`.
 
-    `draw` has regular expressions that match in full "commands/<name>", "rewards/<name>" and "sensors/<name>" of those
-    that can draw themselves.
+    Attributes:
+        draw: regular expressions that match in full "commands/<name>", "rewards/<name>" and "sensors/<name>" of those
+            that can draw themselves.
     """
 
-    body: str | None = None
-    lookat: tuple[float, float, float] = (0.0, 0.0, 0.5)
+    body: str | None = None  # the body that it follows
+    lookat: tuple[float, float, float] = (0.0, 0.0, 0.5)  # where no body is followed: m, world frame
     distance: Positive = 3.0  # m from the body or point that it looks at
     elevation: Annotated[float, Within(low=-90.0, high=90.0)] = -20.0  # degrees, as in MuJoCo's free camera
-    azimuth: Annotated[float, Within(low=-360.0, high=360.0)] = 120.0
+    azimuth: Annotated[float, Within(low=-360.0, high=360.0)] = 120.0  # degrees
     width: Count = 640  # pixels
-    height: Count = 480
-    env_index: WholeNumber = 0
+    height: Count = 480  # pixels
+    env_index: WholeNumber = 0  # the env that is drawn
     num_envs: Count = 1  # drawn in one picture, `scene.spacing` apart, from `env_index` on
     draw: tuple[str, ...] = (".*",)
 

@@ -46,20 +46,19 @@ VOUCHED_BY = {"logger.mlflow.tracking_uri": "MLFLOW_TRACKING_URI"}
 class TrainerCfg(Checked):
     """Options of `Trainer`. Intervals are in iterations, of one rollout and one update each; 0 means never.
 
-    With `stop_at`, such as `{"reward/track_linear_velocity": 1.39}`, the run ends as soon as each of these metrics
-    reaches its value in one and the same iteration; figures of evaluations count as well.
-
-    With `overlap` the metrics of an iteration are read while the next one runs; None does so on CUDA. Where nothing
-    else asks for them earlier, `stop_at` and the guards then act one iteration later; nothing else changes.
-
-    `num_threads` are torch's on the CPU. None takes one for a run on the CPU, so that the same seed gives the same bits
-    on every machine: torch's sums depend on how many threads share them, so another number stands for other bits, as
-    another seed does. For a run on CUDA None leaves one core free, and takes eight at most. A thread that has to wait
-    for a core that is busy elsewhere stalls all others.
+    Attributes:
+        stop_at: with values by metric, such as `{"reward/track_linear_velocity": 1.39}`, the run ends as soon as each
+            reaches its value in one and the same iteration; figures of evaluations count as well.
+        overlap: read the metrics of an iteration while the next one runs; None does so on CUDA. Where nothing else
+            asks for them earlier, `stop_at` and the guards then act one iteration later; nothing else changes.
+        num_threads: torch's threads on the CPU. None takes one for a run on the CPU, so that the same seed gives the
+            same bits on every machine: torch's sums depend on how many threads share them, so another number stands for
+            other bits, as another seed does. For a run on CUDA None leaves one core free, and takes eight at most. A
+            thread that has to wait for a core that is busy elsewhere stalls all others.
     """
 
-    num_iterations: Count = 100
-    eval_interval: WholeNumber = 20
+    num_iterations: Count = 100  # of one rollout and one update each
+    eval_interval: WholeNumber = 20  # between evaluations in fresh envs
     eval_episodes: WholeNumber = 100  # one env each; 0 means no evaluation at all
     stop_when_solved: bool = True  # as soon as an evaluation reaches the task's threshold
     stop_at: Mapping[str, float] | None = None
@@ -72,14 +71,17 @@ class TrainerCfg(Checked):
     num_threads: Annotated[int, Within(low=1, high=1024)] | None = None
     matmul_precision: Literal["highest", "high", "medium"] = "high"  # of float32 on CUDA; "high" is TF32
     video: bool = True  # of the final policy
-    video_s: Positive = 10.0
+    video_s: Positive = 10.0  # its length, s
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModulesCfg(Checked):
-    """Settings of the networks. Where there is a trunk, actor and critic both read its "features".
+    """Settings of the networks.
 
-    Their other inputs are separate, and so are the recurrent layers of each.
+    Attributes:
+        trunk: layers that actor and critic share, whose "features" both read then; their other inputs are separate.
+        recurrent_actor: a recurrent layer in front of the actor.
+        recurrent_critic: a recurrent layer in front of the critic, with a state of its own.
     """
 
     actor: ActorCfg | DeterministicActorCfg | SquashedActorCfg = field(default_factory=ActorCfg)
@@ -130,7 +132,13 @@ class ModulesCfg(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class BrowserCfg(Checked):
-    """The viewer that `ksim-rl train` opens on a running training; `host` None is this machine only."""
+    """The viewer that `ksim-rl train` opens on a running training.
+
+    Attributes:
+        browser: open it.
+        host: the address that it listens on; None is this machine only.
+        port: the port that it listens on.
+    """
 
     browser: bool = False
     host: str | None = None
@@ -146,7 +154,7 @@ class BrowserCfg(Checked):
 class TrainingCfg(Checked):
     """Settings of training without the env: recommended by a task, and the larger part of a run's config."""
 
-    num_envs: Count
+    num_envs: Count  # parallel envs
     seed: WholeNumber = 1  # of all draws
     objective: AlgorithmCfg  # its class says which algorithm learns
     data: DatasetCfg | ReplayCfg

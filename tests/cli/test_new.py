@@ -1,6 +1,7 @@
 """`ksim-rl new robot` writes a package around a model, whose task trains and whose own test passes."""
 
 import ast
+import sys
 import tomllib
 
 import mujoco
@@ -119,3 +120,30 @@ def test_it_trains_at_once_and_its_own_test_passes(work, model, name):
     assert trained.returncode == 0 and "2 iterations" in trained.stdout, trained.stdout + trained.stderr
     tested = guide.run("-m", "pytest", "-q", "tests", site=work / "site", cwd=work / name)
     assert tested.returncode == 0 and "2 passed" in tested.stdout, tested.stdout
+
+
+def test_a_task_in_one_file_trains(work, monkeypatch, capsys):
+    assert run("new", "task", "push_it") == 0
+    assert "ksim-rl train --plugin push_it task=push_it" in capsys.readouterr().out
+    text = (work / "push_it.py").read_text()
+    ast.parse(text)
+    assert "$" not in text
+    monkeypatch.setattr(sys, "argv", ["ksim-rl"])
+    settings = (
+        "num_envs=16 data.num_env_states_per_minibatch=64 data.num_minibatches=2 trainer.num_iterations=1"
+    )
+    words = f"{settings} trainer.video=false trainer.eval_episodes=0 hydra.run.dir=run".split()
+    assert run("train", "--plugin", "push_it", "task=push_it", *words) == 0
+    assert (work / "run" / "metrics.csv").exists()
+
+
+def test_a_task_needs_a_name_that_is_free(work, capsys):
+    (work / "mine.py").write_text("")
+    for name, message in (
+        ("mine", "mine.py: exists already"),
+        ("walker_walk", "there is a task 'walker_walk'"),
+    ):
+        assert run("new", "task", name) == 2
+        assert message in capsys.readouterr().err
+    assert run("new", "task", "Bad-Name") == 2
+    assert "NAME Bad-Name: expected a name for a Python package" in capsys.readouterr().err

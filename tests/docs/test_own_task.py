@@ -1,7 +1,9 @@
 """The guide to a task of one's own, followed to the letter: its package is installed and its task trained."""
 
+import re
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -93,3 +95,13 @@ def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
     done = rival.ksim_rl("envs")
     assert done.returncode == 2
     assert "two tasks are called 'cartpole_balance'" in done.stderr and "rename one" in done.stderr
+
+
+def test_its_env_is_made_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    guide.write_files("own_task.md", tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    text = (guide.DOCS / "own_task.md").read_text()
+    (example,) = re.findall(r"<!-- example: env_in_python -->\n```python\n(.*?)```", text, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(compile(example, "docs/own_task.md", "exec"), names)  # noqa: S102
+    assert names["env"].batch_size[0] == 256
