@@ -18,8 +18,7 @@ DEPTH_CEILINGS = {
     "ellipsoid": 2e-3,
     "cylinder": 2e-3,
     "mesh": 2e-3,
-    # Without a margin C's own depth of flat shapes in a field of heights is off by centimetres (docs/upstream.md).
-    "hfield": 2e-2,
+    "hfield": 2e-3,
 }
 # `efc_D` from which on a row has no weight: MuJoCo bounds it by 1e15.
 WITHOUT_WEIGHT = 1e12
@@ -40,6 +39,22 @@ def ceiling_of(first: int, second: int) -> float | None:
         return None
     names = [_GEOM(kind).name.removeprefix("mjGEOM_").lower() for kind in by_iteration]
     return max(DEPTH_CEILINGS.get(name, 0.0) for name in names)
+
+
+def depth_limit(
+    mj_model: mujoco.MjModel, pair: tuple[int, int], wanted: float, actual: float
+) -> float | None:
+    """Return how much the distances of a pair of geoms may differ, in m; None where they are too deep to compare."""
+    kinds = mj_model.geom_type[list(pair)]
+    ceiling = ceiling_of(*kinds)
+    assert ceiling is not None  # these pairs alone have depths to compare
+    on_field = _GEOM.mjGEOM_HFIELD in kinds
+    # A ball is as deep in a field of heights as its centre, by formula.
+    is_ball_in_field = on_field and _GEOM.mjGEOM_SPHERE in kinds
+    if min(wanted, actual) < -DEEP and not is_ball_in_field:
+        return None
+    # Of what is tilted above a field, C's distances are off by the margin.
+    return ceiling + (float(mj_model.geom_margin[list(pair)].max()) if on_field else 0.0)
 
 
 def depths(geoms: np.ndarray, dist: np.ndarray, geom_type: np.ndarray) -> dict[tuple[int, int], float]:

@@ -12,6 +12,7 @@ GEOMS = ("sphere", "capsule", "box", "ellipsoid", "cylinder", "mesh")
 # Which of them collide by formulas of their own; contacts of the others, found by iterations, are few.
 EXACT = ("sphere", "capsule", "box")
 MOST_DOFS = 14
+HFIELD_MARGIN = "1e-6"
 _MESH = "0.08 0 0 -0.05 0.07 0 -0.06 -0.06 0.01 0 0.01 0.09 0.02 -0.01 -0.07 0.03 0.05 0.04"
 _GROUND = "0 0.3 0.1 0.4 0.2 0.9 0.6 0.1 0.3 0.5 1 0.2 0.1 0.4 0.3 0"
 
@@ -47,7 +48,8 @@ def _add_fixed(scene: Scene, draw: Draw) -> None:
         ET.SubElement(
             scene.asset, "hfield", name="ground", nrow="4", ncol="4", size="1 1 0.1 0.1", elevation=_GROUND
         )
-        attributes = {"type": "hfield", "hfield": "ground", "pos": "0 0 -0.05"}
+        # With a margin of 0, depths of C itself are off by centimetres (docs/upstream.md).
+        attributes = {"type": "hfield", "hfield": "ground", "pos": "0 0 -0.05", "margin": HFIELD_MARGIN}
     else:
         attributes = {}
     if attributes:

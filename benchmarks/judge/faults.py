@@ -106,6 +106,33 @@ def is_small_and_branches(mj_model: mujoco.MjModel) -> bool:
     return mj_model.nv <= 5 and np.unique(parents).size < parents.size
 
 
+def touching(mj_model: mujoco.MjModel) -> list[set[int]]:
+    """Return the geoms of each contact soon after a model begins to fall; none of trees that may sleep."""
+    # MuJoCo ends programs in which trees that may sleep are tied.
+    if mj_model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        return []
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_step(mj_model, mj_data, 30)
+    return [{int(geom) for geom in pair} for pair in mj_data.contact.geom]
+
+
+def touches_twice(mj_model: mujoco.MjModel) -> bool:
+    """Say whether two pairs of the same geoms make contacts."""
+    signatures = mj_model.pair_signature
+    if signatures.size == np.unique(signatures).size:
+        return False
+    return {int(mj_model.pair_geom1[0]), int(mj_model.pair_geom2[0])} in touching(mj_model)
+
+
+def of_one_body(mj_model: mujoco.MjModel) -> bool:
+    """Say whether a pair is of two geoms of one rigid body, which touch."""
+    first, second = mj_model.pair_geom1, mj_model.pair_geom2
+    owners = mj_model.body_weldid[mj_model.geom_bodyid]
+    contacts = touching(mj_model)
+    rigid = np.flatnonzero(owners[first] == owners[second])
+    return any({int(first[pair]), int(second[pair])} in contacts for pair in rigid)
+
+
 def without_priority(corrections: dict[Any, Any]) -> dict[Any, Any]:
     """Leave out what gives contacts the law of the geom with priority."""
     return {
@@ -210,7 +237,8 @@ FAULTS = {
         what="two pairs of the same geoms count as one",
         place=("upstream", "take_pairs_as_written"),
         instead=gives(nothing),
-        needs=("pair_twice", "tree.free"),
+        needs=("pair_twice", "ground.plane"),
+        suits=touches_twice,
     ),
     "bounds of touch": Fault(
         number="11",
@@ -248,6 +276,7 @@ FAULTS = {
         place=("contacts", "rows_left_out"),
         instead=gives(nothing),
         needs=("pair",),
+        suits=of_one_body,
     ),
     "derivatives that are left": Fault(
         number="11",
@@ -285,7 +314,7 @@ FAULTS = {
         what="contacts with height fields are fewer, and some in other directions",
         place=("contacts", "take_over_height_fields"),
         instead=gives(nothing),
-        needs=("ground.hfield",),
+        needs=("ground.hfield", "geom.sphere"),
     ),
     "overflow": Fault(
         number="13",

@@ -135,6 +135,9 @@ def add_pairs(scene: Scene, draw: Draw) -> None:
             _add_pair(scene, draw, own, other)
             if draw.takes("pair_twice", 0.3):
                 _add_pair(scene, draw, own, other)
+                # Which most things reach, so that both pairs make contacts.
+                for pair in scene.contact if scene.geoms.get("plane") else ():
+                    pair.set("geom2", "ground")
     if len(scene.bodies) > 1 and draw.takes("exclude", 0.15):
         ET.SubElement(scene.contact, "exclude", body1=scene.bodies[0], body2=scene.bodies[-1])
 

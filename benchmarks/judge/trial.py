@@ -258,9 +258,8 @@ class _Trial:
             return True
         for pair in wanted.keys() & actual.keys():
             error = abs(wanted[pair] - actual[pair])
-            limit = accepted.ceiling_of(*geom_type[list(pair)]) or 0.0
-            is_deep = min(wanted[pair], actual[pair]) < -accepted.DEEP
-            if not is_deep and not error <= limit:
+            limit = accepted.depth_limit(mj_data.model, pair, wanted[pair], actual[pair])
+            if limit is not None and not error <= limit:
                 kinds = " ".join(mujoco.mjtGeom(kind).name[7:].lower() for kind in geom_type[list(pair)])
                 self._find(f"depth {kinds}", error, limit, row, when)
         return True
