@@ -145,14 +145,14 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.event_manager = EventManager(self._events_cfg, driver)
         driver.refreshed()
         self.command_manager = CommandManager(cfg.commands, driver)
+        self.event_manager.rehearse_starts()
+        driver.refreshed()
         self.action_manager = ActionManager(cfg.actions, driver)
         self.observation_manager = ObservationManager(cfg.observations, driver)
-        adapted = frozenset(name for term in cfg.curriculum.values() for name in term.adapted_rewards)
-        self.reward_manager = RewardManager(
-            cfg.rewards, driver, scale=self.step_dt if cfg.scale_rewards_by_dt else 1.0, adapted=adapted
-        )
+        scale = self.step_dt if cfg.scale_rewards_by_dt else 1.0
+        self.reward_manager = RewardManager(cfg.rewards, driver, scale=scale, curriculum=cfg.curriculum)
         self.termination_manager = TerminationManager(
-            cfg.terminations, driver, is_finite_horizon=cfg.is_finite_horizon
+            cfg.terminations, driver, is_finite_horizon=cfg.is_finite_horizon, curriculum=cfg.curriculum
         )
         self.metric_manager = MetricManager(cfg.metrics, driver)
         self.curriculum_manager = CurriculumManager(cfg.curriculum, driver)
@@ -265,6 +265,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.world.refresh(mask_E)
         driver.refreshed()
         self.command_manager.refresh(mask_E)  # vectors need refreshed poses
+        self.event_manager.start(mask_E)  # may read commands, and refreshes what it writes
         no_E1 = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         flags = {"done": no_E1, "terminated": no_E1.clone(), "truncated": no_E1.clone()}
         return self._env_state(reset_E=mask_E, **flags)

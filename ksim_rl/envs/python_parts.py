@@ -37,7 +37,7 @@ _OF_DRIVER = ("ground", "before_substep", "after_substep", "substep_sensors", "s
 _READ_ONCE: tuple[tuple[type, frozenset[str], str], ...] = (
     (RewardTerm, frozenset({"weight"}), "write env.view.reward_weights[name] in place (`fill_`)"),
     (TerminationTerm, frozenset({"time_out"}), "build another env"),
-    (MetricTerm, frozenset({"reduce"}), "build another env"),
+    (MetricTerm, frozenset({"reduce", "per_substep"}), "build another env"),
     (EventTerm, frozenset({"mode"}), "build another env"),
 )
 

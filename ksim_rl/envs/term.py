@@ -20,6 +20,9 @@ from ksim_rl.checked import Checked, NonNegativeRange, Within
 from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 
+Fields = Mapping[str, bool | float | str | tuple[float, ...]]
+"""Values of some fields of a term."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Term(Checked, ABC):
@@ -69,9 +72,14 @@ class TerminationTerm(Term):
 
 @dataclass(frozen=True, kw_only=True)
 class MetricTerm(Term):
-    """A value per step that is reduced over the episode and reported when it ends."""
+    """A value per step that is reduced over the episode and reported when it ends.
+
+    With `per_substep` it is the mean over the physics substeps of the env step. There the state, efforts and contact
+    sensors with `every_substep` are current; what has to be derived, such as poses of bodies, is refused.
+    """
 
     reduce: Literal["mean", "last", "max", "sum"] = "mean"
+    per_substep: bool = False
 
     @abstractmethod
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
@@ -82,11 +90,14 @@ class MetricTerm(Term):
 class EventTerm(Term):
     """A write to the simulation: `startup` once, `reset` for rows that reset, `interval` by per-env clocks, `step`.
 
+    `start` is for rows that reset, too, once all is set for their episode, commands included, which these events may
+    read; it costs a second refresh of these rows.
+
     An event must not read a derived quantity (a body or site pose, a sensor) after state was written, as it is before
     all reset events: derived quantities are refreshed after all events of the moment have run.
     """
 
-    mode: Literal["startup", "reset", "interval", "step"] = "reset"
+    mode: Literal["startup", "reset", "start", "interval", "step"] = "reset"
     interval_range_s: NonNegativeRange | None = None
 
     def _check_fields(self) -> None:
@@ -176,6 +187,15 @@ class CurriculumTerm(Term):
     def adapted_rewards(self) -> tuple[str, ...]:
         """The reward terms whose weights this curriculum changes."""
         return ()
+
+    @property
+    def adapted_fields(self) -> Mapping[str, Sequence[Fields]]:
+        """Other values of fields, stage by stage, by the term that has them, such as "rewards/upright".
+
+        The term is built and computed for each stage, and `view.stages` says which one's value holds: 0 for the term
+        as the config has it, 1 for the first of these.
+        """
+        return {}
 
     @property
     def first_level(self) -> float | None:

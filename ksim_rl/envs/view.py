@@ -33,6 +33,7 @@ class Readings:
         self.commands: dict[str, Float[Tensor, "E ?K"]] = {}
         self.command_ranges: dict[str, dict[str, Float[Tensor, " 2"]]] = {}
         self.reward_weights: dict[str, Float[Tensor, ""]] = {}
+        self.stages: dict[str, Float[Tensor, ""]] = {}
         self.episode_rewards: dict[str, Float[Tensor, " E"]] = {}
         self.terminations: dict[str, Bool[Tensor, " E"]] = {}
         # The termination manager writes both in place at each step.
@@ -56,6 +57,7 @@ class EnvView(WorldView):
         commands: by name, [E, K] each, as the policy saw them before this step.
         command_ranges: by command and field, (low, high) [2] each; a curriculum may change these in place.
         reward_weights: by term, [] each; a curriculum may change these in place.
+        stages: by term ("rewards/upright"), which of its stages holds, [] each; as above.
         episode_rewards: by term, the weighted sum over the episode so far, [E] each.
         terminations: by term, and "non_finite": which envs end, bool [E], as the step found it.
         terminated_E: which envs the step found to end by a condition that is no time-out, bool [E].
@@ -75,6 +77,7 @@ class EnvView(WorldView):
             readings.command_ranges
         )
         self.reward_weights: Mapping[str, Float[Tensor, ""]] = MappingProxyType(readings.reward_weights)
+        self.stages: Mapping[str, Float[Tensor, ""]] = MappingProxyType(readings.stages)
         self.episode_rewards: Mapping[str, Float[Tensor, " E"]] = MappingProxyType(readings.episode_rewards)
         self.terminations: Mapping[str, Bool[Tensor, " E"]] = MappingProxyType(readings.terminations)
         self.terminated_E = readings.terminated_E

@@ -6,7 +6,7 @@ ranges of commands and weights of rewards by stages of env steps, or move envs o
 """
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from ksim_rl import ranks
 from ksim_rl.checked import Count, Filled, NonNegative, Range, Share, WholeNumber, Within
 from ksim_rl.checks import check_in_range, check_known
-from ksim_rl.envs.term import CurriculumTerm
+from ksim_rl.envs.term import CurriculumTerm, Fields
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import OfCommand, OfEntity, distance_from_origin
@@ -218,6 +218,58 @@ class RewardWeightByStage(RewardWeight):
         for step, value in sorted(self.stages.items()):
             held = torch.where(view.step_count >= step, float(value), held)
         return held
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldsByStage(CurriculumTerm):
+    """A curriculum of fields of a term, whose number of the stages that have begun is the reported level."""
+
+    stages: Annotated[Mapping[WholeNumber, Fields], SOME_STAGE]
+
+    @property
+    @abstractmethod
+    def adapted(self) -> str:
+        """The term, such as "rewards/upright"."""
+
+    @property
+    def adapted_fields(self) -> Mapping[str, Sequence[Fields]]:
+        return {self.adapted: [fields for _, fields in sorted(self.stages.items())]}
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
+        stage = (view.step_count >= constant(sorted(self.stages), view.device)).sum().to(torch.float32)
+        held = view.stages[self.adapted]
+        # At resets only, so that an episode is rated by one rule.
+        held.copy_(torch.where(ranks.any_of(mask_E), stage, held))
+        return held.clone()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardFieldsByStage(FieldsByStage):
+    """Gives fields of a reward, such as `std`, other values from certain env steps (since the env was seeded) on.
+
+    A field that a stage leaves out stays as it is. The reward is computed for each stage, so that it costs as much as
+    that many terms. Its weight is the business of `RewardWeightByStage`.
+    """
+
+    reward: str
+
+    @property
+    def adapted(self) -> str:
+        return f"rewards/{self.reward}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerminationFieldsByStage(FieldsByStage):
+    """Gives fields of a termination, such as a limit, other values from certain env steps on.
+
+    Stages are as in `RewardFieldsByStage`; `time_out` stays as it is.
+    """
+
+    termination: str
+
+    @property
+    def adapted(self) -> str:
+        return f"terminations/{self.termination}"
 
 
 @dataclass(frozen=True, kw_only=True)

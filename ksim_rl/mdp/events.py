@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checked import NonNegativeRange, Range
+from ksim_rl.checked import NonNegativeRange, Range, Share
 from ksim_rl.checks import check_in_range, check_pair
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
-from ksim_rl.mdp.fields import OfEntity, OfJoints, root_height
+from ksim_rl.mdp.fields import OfCommand, OfEntity, OfJoints, root_height
 from ksim_rl.scene import quaternion
 
 Axis = Literal["x", "y", "z", "roll", "pitch", "yaw"]
@@ -147,6 +147,35 @@ class ResetHeight(OfEntity, EventTerm):
         rise_E1 = view.uniform(1, *self.height_range) - root_height(view, self.entity)[:, None]
         pos_E3 = torch.cat((body.root_pos_EL[:, :2], body.root_pos_EL[:, 2:] + rise_E1), dim=-1)
         body.write_root_pose(mask_E, pos_E3, body.root_quat_EL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartAtCommand(OfCommand, OfEntity, EventTerm, mode="start"):
+    """Start some episodes at the speed that a velocity command (vx, vy, wz) asks for, all else of the root's at rest.
+
+    `share` is the probability. So a fast gait is met before the policy can reach it by itself.
+    """
+
+    share: Share = 0.5
+
+    def _check_fields(self) -> None:
+        super()._check_fields()
+        # Where events of resets run, the command of the episode is not drawn yet.
+        if self.mode != "start":
+            raise ValueError(f"mode={self.mode!r}: expected 'start', when the command is there")
+
+    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        body = view.entity(self.entity)
+        command_E3 = view.command(self.command)
+        nothing_E1 = torch.zeros_like(command_E3[:, :1])
+        planar_E3 = torch.cat((command_E3[:, :2], nothing_E1), dim=-1)
+        turn_E3 = torch.cat((nothing_E1, nothing_E1, command_E3[:, 2:]), dim=-1)
+        # The command is in the root's frame, velocities are written in the world's.
+        quat_E4 = body.root_quat_EL
+        starts_E = mask_E & (view.uniform(1)[:, 0] < self.share)
+        body.write_root_velocity(
+            starts_E, quaternion.rotate(quat_E4, planar_E3), quaternion.rotate(quat_E4, turn_E3)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

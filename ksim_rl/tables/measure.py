@@ -39,7 +39,8 @@ SMOKE = "num_envs=8 data.num_env_states_per_minibatch=32 data.num_minibatches=2 
 # Fields that came after the first tables, with values that change nothing, as a fingerprint's text has them.
 LATER = re.compile(
     '"min_advantage_std": 0.0001, |"min_std": 0.001, |"engine": "auto", |"eager": false, '
-    r'|"about": "both", |"value_lmbda": null, |"dropped": \[\], |"rel_world_envs": 0.0, |"lag_group": "", '
+    r'|"about": "both", |"value_lmbda": null, '
+    r'|"dropped": \[\], |"rel_world_envs": 0.0, |"lag_group": "", |"per_substep": false, '
     r'|"free_root": false, |"root_turn": \[1.0, 0.0, 0.0, 0.0\], '
 )
 

@@ -1,11 +1,15 @@
 """Curricula that change ranges of commands and weights of rewards."""
 
+from dataclasses import dataclass
+
 import pytest
 import torch
+from torch import Tensor
 
 from ksim_rl import mdp
+from ksim_rl.envs import EnvView, RewardTerm
 from ksim_rl.testing import count_syncs
-from tests.envs.probe_env import DT, Position, puck_env
+from tests.envs.probe_env import DT, Beyond, Position, puck_env
 
 HEIGHT = mdp.BaseHeightCommand(resampling_time_range_s=(DT, DT), height=(0.2, 0.4))
 
@@ -161,3 +165,68 @@ def test_they_never_make_the_host_wait_and_are_part_of_the_state():
 def test_what_does_not_fit_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Travelled(RewardTerm):
+    """`factor` times the way since the last step, m, from a buffer of its own, plus `offset`."""
+
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def __call__(self, view: EnvView) -> Tensor:
+        last_E1 = view.buffer("last_E1", 1)
+        way_E1 = view.joint_pos_EL - last_E1
+        last_E1.copy_(view.joint_pos_EL)
+        return self.factor * way_E1[:, 0] + self.offset
+
+
+def test_fields_of_a_reward_follow_their_stages_and_each_keeps_its_own_memory():
+    stages = {3: {"factor": 10.0}, 5: {"offset": 1.0}}
+    env = puck_env(
+        limit=None,
+        episode_length_s=2 * DT,
+        rewards={"way": Travelled(weight=2.0)},
+        curriculum={"way": mdp.RewardFieldsByStage(reward="way", stages=stages)},
+    )
+    root_E, rewards = env.reset(), []
+    with count_syncs() as syncs:
+        for _ in range(8):
+            step_E, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(3, 1)))
+            rewards.append(step_E["next", "reward"][:, 0].clone())
+    assert syncs.total == 0, syncs.report()
+    # Env e goes 0.02 (e + 1) m in each step. Stages change at resets: after the steps 4 and 6.
+    way_E = 0.02 * torch.arange(1, 4)
+    expected = [way_E] * 4 + [10 * way_E] * 2 + [10 * way_E + 1.0] * 2
+    torch.testing.assert_close(torch.stack(rewards), 2.0 * DT * torch.stack(expected))
+    assert env.curriculum_levels()["way"] == 2.0
+
+
+def test_fields_of_a_termination_follow_their_stages():
+    env = puck_env(
+        limit=None,
+        terminations={"beyond": Beyond(limit=0.05)},
+        curriculum={"limit": mdp.TerminationFieldsByStage(termination="beyond", stages={4: {"limit": 0.09}})},
+    )
+    root_E, lengths = env.reset(), [[], [], []]
+    for _ in range(12):
+        before = env.episode_step_E.clone()
+        step_E, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(3, 1)))
+        for row in torch.nonzero(step_E["next", "done"][:, 0]).flatten().tolist():
+            lengths[row].append(int(before[row]) + 1)
+    # Beyond 0.05 m after 3, 2 and 1 steps; beyond 0.09 m after 5, 3 and 2: from the first reset after step 4 on.
+    assert lengths == [[3, 5], [2, 2, 3, 3], [1, 1, 1, 1, 2, 2, 2, 2]]
+
+
+@pytest.mark.parametrize(
+    ("term", "message"),
+    [
+        (mdp.RewardFieldsByStage(reward="wai", stages={1: {"factor": 2.0}}), "unknown reward.*'wai'.*'way'"),
+        (mdp.RewardFieldsByStage(reward="way", stages={1: {"facto": 2.0}}), "'facto'.*'factor'"),
+        (mdp.RewardFieldsByStage(reward="way", stages={1: {"weight": 2.0}}), "'weight'"),
+        (mdp.RewardFieldsByStage(reward="way", stages={1: {"factor": "much"}}), "factor='much'"),
+    ],
+)
+def test_stages_of_fields_that_do_not_exist_are_refused(term, message):
+    with pytest.raises(ValueError, match=message):
+        puck_env(limit=None, rewards={"way": Travelled()}, curriculum={"way": term})

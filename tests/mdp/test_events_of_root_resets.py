@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from ksim_rl import mdp
+from ksim_rl.envs import ManagerBasedRlEnv, MjcfRobot, ObservationGroupCfg, ObservationTermCfg, SceneCfg
 from ksim_rl.scene.quaternion import yaw
 from ksim_rl.scene.state.ground import Ground
+from tests.envs.probe_env import puck_cfg
 from tests.mdp.bench import FREE_BODY, Plateau
 
 E = 500
@@ -135,3 +137,53 @@ def test_they_may_follow_one_another_in_one_reset(crowd):
 def test_what_does_not_fit_is_refused(make, field):
     with pytest.raises(ValueError, match=field):
         make()
+
+
+def moving_env(share, **events):
+    velocity = {
+        "v": ObservationTermCfg(term=mdp.RootLinVel()),
+        "w": ObservationTermCfg(term=mdp.RootAngVel()),
+    }
+    command = mdp.UniformVelocityCommand(
+        lin_vel_x=(0.5, 1.0), lin_vel_y=(-0.5, 0.5), ang_vel_z=(-1.0, 1.0), resampling_time_range_s=None
+    )
+    return ManagerBasedRlEnv(
+        puck_cfg(
+            scene=SceneCfg(robots={"body": MjcfRobot(source=FREE_BODY)}, num_envs=200),
+            observations={"actor": ObservationGroupCfg(terms=velocity)},
+            actions={"legs": mdp.JointEffortAction(joints="left_hip")},
+            commands={"twist": command},
+            events={
+                "root": mdp.ResetRootUniform(pose_range={"yaw": (-3.0, 3.0), "roll": (-0.5, 0.5)}),
+                "start": mdp.StartAtCommand(command="twist", share=share),
+                **events,
+            },
+            rewards={},
+            limit=None,
+        )
+    )
+
+
+def test_some_episodes_start_at_the_commanded_speed():
+    env = moving_env(0.3)
+    root_E = env.reset()
+    command_E3, v_E3, w_E3 = root_E["command", "twist"], root_E["obs", "v"], root_E["obs", "w"]
+    moves_E = v_E3.abs().sum(-1) > 0.0
+    assert abs(moves_E.float().mean() - 0.3) < 4.0 * math.sqrt(0.21 / 200)
+    # In the root's own frame, however it lies: what the observation of the new episode shows.
+    torch.testing.assert_close(v_E3[moves_E, :2], command_E3[moves_E, :2], atol=1e-5, rtol=0)
+    torch.testing.assert_close(w_E3[moves_E, 2], command_E3[moves_E, 2], atol=1e-5, rtol=0)
+    rest = torch.cat((v_E3[:, 2:], w_E3[:, :2]), dim=-1)
+    torch.testing.assert_close(rest, torch.zeros(200, 3), atol=1e-5, rtol=0)
+    assert (w_E3[~moves_E] == 0.0).all()
+    # Rows that do not reset stay as they are.
+    before = env.world.qvel_EL.clone()
+    env.reset(env_ids=[0, 1])
+    assert torch.equal(env.world.qvel_EL[2:], before[2:]) and not torch.equal(
+        env.world.qvel_EL[:2], before[:2]
+    )
+
+
+def test_a_start_at_the_command_has_its_mode():
+    with pytest.raises(ValueError, match="mode='reset': expected 'start'"):
+        mdp.StartAtCommand(command="twist", mode="reset")

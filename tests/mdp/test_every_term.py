@@ -65,7 +65,8 @@ def test_a_term_survives_yaml(name):
 
 # What terms share.
 BASES = """
-    BodyObservation EncodedJoints FramedObservation GaussianReward HeldCommand JointAction JointLimitReward JointReset
+    BodyObservation EncodedJoints FieldsByStage
+    FramedObservation GaussianReward HeldCommand JointAction JointLimitReward JointReset
     LevelCurriculum OfBodies OfSwing Randomize RandomizeActuator RandomizeBodyField RandomizeField RandomizeJointField
     RandomizeModelField RandomizeNumber RandomizePos RandomizeTendonField RandomizeTurn RewardWeight
     RewardWhileCommanded SteeredAction SteppedLevel Symmetry

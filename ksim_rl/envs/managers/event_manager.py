@@ -1,7 +1,7 @@
 """Runs events: at startup, for rows that reset, by per-env clocks, and at every step."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import torch
 from jaxtyping import Bool
@@ -34,16 +34,24 @@ class EventManager:
         clocked = self._by_mode.get("interval", [])
         self._clocks = {scope: view.buffers.get(f"{scope}.time_left_E", owner=ENV) for scope, _ in clocked}
         # Names that match nothing are errors now, and all buffers exist before the first step.
-        self.rehearse()
+        # Events that may read commands wait for these: see `rehearse_starts`.
+        self._rehearse(name for name, term in terms.items() if term.mode != "start")
         for name, term in terms.items():
             for line in term.without_effect(view):
                 warnings.warn(f"events.{name}: {line}", UserWarning, stacklevel=2)
 
     def rehearse(self) -> None:
         """Run each event for no row, which changes nothing."""
+        self._rehearse(self.terms)
+
+    def rehearse_starts(self) -> None:
+        """Run the events that may read commands for no row, once there are commands."""
+        self._rehearse(name for name, term in self.terms.items() if term.mode == "start")
+
+    def _rehearse(self, names: Iterable[str]) -> None:
         nobody_E = torch.zeros(self._view.num_envs, dtype=torch.bool, device=self._view.device)
-        for name, term in self.terms.items():
-            self._run(f"events/{name}", term, nobody_E)
+        for name in names:
+            self._run(f"events/{name}", self.terms[name], nobody_E)
 
     def startup(self) -> None:
         """Run the startup events for all rows; their numbers depend on the seed only."""
@@ -63,6 +71,17 @@ class EventManager:
         for scope, term in self._by_mode.get("interval", []):
             with self._driver.scope(f"{scope}/clock", view.reset_count_E):
                 self._restart(scope, term, mask_E)
+
+    def start(self, mask_E: Bool[Tensor, " E"]) -> None:
+        """Run the events that begin the episodes of the rows of `mask_E`, and refresh what derives from the state."""
+        view = self._view
+        if "start" not in self._by_mode:
+            return
+        for scope, term in self._by_mode["start"]:
+            self._run(scope, term, mask_E, view.reset_count_E)
+        view.world.set_const(self._fields["start"], mask_E)
+        view.world.refresh(mask_E)
+        self._driver.refreshed()
 
     def step(self) -> None:
         """Run the interval events whose clocks have run out, and the step events."""

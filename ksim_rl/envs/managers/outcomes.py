@@ -1,15 +1,16 @@
 """The managers of a step's outcomes: rewards, terminations, metrics and levels, and their sums over episodes."""
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checks import near
+from ksim_rl.checks import check_known, near
 from ksim_rl.envs.driver import EnvDriver
-from ksim_rl.envs.term import CurriculumTerm, MetricTerm, RewardTerm, TerminationTerm
+from ksim_rl.envs.term import CurriculumTerm, Fields, MetricTerm, RewardTerm, TerminationTerm
 from ksim_rl.scene.state.buffers import ENV
 
 
@@ -18,62 +19,107 @@ class _OutcomeManager:
 
     kind: ClassVar[str]
 
-    def __init__(self, terms: Mapping[str, Any], driver: EnvDriver) -> None:
+    def __init__(
+        self,
+        terms: Mapping[str, Any],
+        driver: EnvDriver,
+        curriculum: Mapping[str, CurriculumTerm] | None = None,
+    ) -> None:
         self._driver = driver
         self._view = driver.view
         self._terms = dict(terms)
         self.names = tuple(terms)
+        # The terms of later stages, by the name of the term that they take the place of.
+        self._later: dict[str, list[Any]] = {}
+        for term in (curriculum or {}).values():
+            for scope, stages in term.adapted_fields.items():
+                kind, _, name = scope.partition("/")
+                if kind == f"{self.kind}s":
+                    self._later[name] = _staged(self.kind, name, self._terms, stages)
+                    # Without an owner, as curricula write it.
+                    driver.readings.stages[scope] = driver.shared_values.get(f"{scope}.stage", 0.0)
 
     def _everybody_E(self) -> Tensor:
         return torch.ones(self._view.num_envs, dtype=torch.bool, device=self._view.device)
 
     def _values(self, dtype: torch.dtype | None = None) -> list[Tensor]:
         """Return each term's value of the current state, [E] each, in any real dtype unless one is asked for."""
-        values = []
+        return [self._value(name, term, dtype) for name, term in self._terms.items()]
+
+    def _value(self, name: str, term: Any, dtype: torch.dtype | None) -> Tensor:
+        """Return the value of a term, of the stage that holds."""
+        scope = f"{self.kind}s/{name}"
+        value_E = self._called(name, term, scope, dtype)
+        # All stages are computed, since a captured step cannot branch; each has buffers of its own.
+        for number, later in enumerate(self._later.get(name, ()), start=1):
+            other_E = self._called(name, later, f"{scope}/stage {number}", dtype)
+            value_E = torch.where(self._driver.readings.stages[scope] >= number, other_E, value_E)
+        return value_E
+
+    def _called(self, name: str, term: Any, scope: str, dtype: torch.dtype | None) -> Tensor:
+        """Return the value of a term that runs in a scope, checked."""
         shape = (self._view.num_envs,)
         device = torch.device(self._view.device)
-        for name, term in self._terms.items():
-            with self._driver.scope(f"{self.kind}s/{name}", part=term):
-                value_E = term(self._view)
-            if not isinstance(value_E, Tensor):
-                raise ValueError(
-                    f"{self.kind} term {name!r} returns {type(value_E).__name__}: expected a tensor {shape}, one value "
-                    "per env"
-                )
-            if dtype is None:
-                fits = not value_E.is_complex()
-            else:
-                fits = value_E.dtype == dtype
-            if value_E.shape != shape or not fits:
-                raise ValueError(
-                    f"{self.kind} term {name!r} returns {value_E.dtype} {tuple(value_E.shape)}: expected "
-                    f"{dtype or 'any real dtype'} {shape}, one value per env"
-                )
-            # A tensor of the host would be copied over in each step, which waits for the device.
-            if value_E.device.type != device.type:
-                raise ValueError(
-                    f"{self.kind} term {name!r} returns a tensor on {value_E.device}: expected {device}"
-                )
-            values.append(value_E)
-        return values
+        with self._driver.scope(scope, part=term):
+            value_E = term(self._view)
+        if not isinstance(value_E, Tensor):
+            raise ValueError(
+                f"{self.kind} term {name!r} returns {type(value_E).__name__}: expected a tensor {shape}, one value "
+                "per env"
+            )
+        if dtype is None:
+            fits = not value_E.is_complex()
+        else:
+            fits = value_E.dtype == dtype
+        if value_E.shape != shape or not fits:
+            raise ValueError(
+                f"{self.kind} term {name!r} returns {value_E.dtype} {tuple(value_E.shape)}: expected "
+                f"{dtype or 'any real dtype'} {shape}, one value per env"
+            )
+        # A tensor of the host would be copied over in each step, which waits for the device.
+        if value_E.device.type != device.type:
+            raise ValueError(
+                f"{self.kind} term {name!r} returns a tensor on {value_E.device}: expected {device}"
+            )
+        return value_E
 
     def rehearse(self) -> None:
         """Run each term once more; the caller puts back what changes."""
         self._values()
 
 
+def _staged(kind: str, name: str, terms: Mapping[str, Any], stages: Sequence[Fields]) -> list[Any]:
+    """Return a term's later stages: each has the fields of all stages up to it."""
+    check_known(f"{kind} that a curriculum adapts", name, terms)
+    term = terms[name]
+    known = {field.name for field in dataclasses.fields(term)} - {"weight", "time_out"}
+    later = []
+    for fields in stages:
+        for field in fields:
+            check_known(f"field of {kind} {name!r} that stages can change", field, known)
+        term = dataclasses.replace(term, **fields)
+        later.append(term)
+    return later
+
+
 class RewardManager(_OutcomeManager):
     """Computes the weighted terms and their sums over the episode.
 
     Weights live on the device, so that a curriculum can change them inside a captured step. A term of weight 0 is not
-    computed, unless a curriculum names it in `adapted`.
+    computed, unless a term of the curriculum adapts it.
     """
 
     kind = "reward"
 
     def __init__(
-        self, terms: Mapping[str, RewardTerm], driver: EnvDriver, *, scale: float, adapted: frozenset[str]
+        self,
+        terms: Mapping[str, RewardTerm],
+        driver: EnvDriver,
+        *,
+        scale: float,
+        curriculum: Mapping[str, CurriculumTerm],
     ) -> None:
+        adapted = {name for term in curriculum.values() for name in term.adapted_rewards}
         unknown = sorted(adapted - terms.keys())
         if unknown:
             raise ValueError(
@@ -81,7 +127,7 @@ class RewardManager(_OutcomeManager):
             )
         # Left out here, so that a term of weight 0 costs nothing and may even be invalid.
         computed = {name: term for name, term in terms.items() if term.weight != 0.0 or name in adapted}
-        super().__init__(computed, driver)
+        super().__init__(computed, driver, curriculum)
         self._scale = scale
         # One tensor, of whose elements curricula get windows below.
         self.weights_R = torch.tensor([term.weight for term in computed.values()], device=driver.view.device)
@@ -112,9 +158,14 @@ class TerminationManager(_OutcomeManager):
     kind = "termination"
 
     def __init__(
-        self, terms: Mapping[str, TerminationTerm], driver: EnvDriver, *, is_finite_horizon: bool
+        self,
+        terms: Mapping[str, TerminationTerm],
+        driver: EnvDriver,
+        *,
+        is_finite_horizon: bool,
+        curriculum: Mapping[str, CurriculumTerm],
     ) -> None:
-        super().__init__(terms, driver)
+        super().__init__(terms, driver, curriculum)
         num_envs = driver.view.num_envs
         device = driver.view.device
         self._is_finite_horizon = is_finite_horizon
@@ -161,7 +212,33 @@ class MetricManager(_OutcomeManager):
             torch.tensor([given == kind for given in reductions], dtype=torch.bool, device=driver.view.device)
             for kind in ("mean", "last", "max")
         )
+        # Sums over the substeps of an env step, of the terms that are read there.
+        self._sums = {
+            name: driver.view.buffers.get(f"metrics/{name}.substeps_E", owner=ENV)
+            for name, term in terms.items()
+            if term.per_substep
+        }
+        self._substeps = round(driver.step_dt / driver.physics_dt)
+        if self._sums:
+            driver.after_substep.append(self.substep)
+            # Once as within an env step, so that what cannot be read there is an error now.
+            self.substep()
+            driver.refreshed()
         self.step(self._everybody_E())
+
+    def substep(self) -> None:
+        """Take in the values after a physics substep."""
+        # The state is another one; what derives from it follows at the end of the env step.
+        self._driver.changed()
+        for name, sum_E in self._sums.items():
+            sum_E.add_(self._called(name, self._terms[name], f"metrics/{name}", None))
+
+    def _value(self, name: str, term: MetricTerm, dtype: torch.dtype | None) -> Tensor:
+        if not term.per_substep:
+            return super()._value(name, term, dtype)
+        mean_E = self._sums[name] / self._substeps
+        self._sums[name].zero_()
+        return mean_E
 
     def step(self, finite_E: Bool[Tensor, " E"]) -> None:
         """Take in the values of the current state; rows whose physics failed add nothing."""

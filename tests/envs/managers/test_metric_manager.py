@@ -100,3 +100,43 @@ def test_a_shape_other_than_one_per_env_is_refused_at_construction():
 def test_an_unknown_reduction_is_refused():
     with pytest.raises(ValueError, match="reduce='median'"):
         Speed(reduce="median")  # pyright: ignore[reportArgumentType]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SquaredPlace(MetricTerm):
+    """x^2 of the puck."""
+
+    def __call__(self, view: EnvView) -> Tensor:
+        return view.joint_pos_EL[:, 0].square()
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyPlace(MetricTerm):
+    """x of the puck's body, which is derived from the joint."""
+
+    def __call__(self, view: EnvView) -> Tensor:
+        return view.body("puck").pos_EL[:, 0]
+
+
+def test_a_metric_of_substeps_is_their_mean():
+    metrics = {
+        "step": SquaredPlace(reduce="last"),
+        "substep": SquaredPlace(reduce="last", per_substep=True),
+        "peak": SquaredPlace(reduce="max", per_substep=True),
+    }
+    env = puck_env(limit=None, episode_length_s=2 * DT, metrics=metrics)
+    log = finished(env, 2)
+    # Env e is at 0.005 (e + 1) k m after k substeps; the second step has the substeps 5 to 8.
+    factor = 0.005**2 * (1 + 4 + 9)
+    torch.testing.assert_close(log["metric/step"], torch.tensor(factor * 8**2))
+    torch.testing.assert_close(log["metric/substep"], torch.tensor(factor * (25 + 36 + 49 + 64) / 4))
+    torch.testing.assert_close(log["metric/peak"], log["metric/substep"])
+    # And so again in the next episode.
+    env.episode_log_reset_()
+    again = finished(env, 2)
+    torch.testing.assert_close(again["metric/substep"], log["metric/substep"])
+
+
+def test_a_metric_of_substeps_cannot_read_what_has_to_be_derived():
+    with pytest.raises(RuntimeError, match=r"metrics/body.*derived quantity"):
+        puck_env(limit=None, metrics={"body": BodyPlace(per_substep=True)})
