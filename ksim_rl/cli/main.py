@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from ksim_rl.cli.errors import REFUSED, interruption, report, say, sigterm_interrupts
-from ksim_rl.cli.process import check_process, open_streams
+from ksim_rl.cli.process import check_process
+from ksim_rl.files.writing import open_streams
 from ksim_rl.terminal import show, show_warnings_as_lines
 
 USAGE = """\

@@ -1,4 +1,4 @@
-"""Puts the process of a command in order before libraries are loaded, and refuses one in which they would crash."""
+"""Refuses, before libraries are loaded, a process in which they would crash."""
 
 import os
 import resource
@@ -11,23 +11,6 @@ _LEAST = (
     (resource.RLIMIT_DATA, "memory", "ulimit -d", 2**30),
     (resource.RLIMIT_STACK, "stack", "ulimit -s", 2**20),
 )
-
-
-def open_streams() -> None:
-    """Open those of the three standard streams that are closed, on nothing.
-
-    Else the next file that is opened takes the place of one, such as a checkpoint into which a library in C prints its
-    errors; and libraries in Python call methods of `sys.stderr`.
-    """
-    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
-        try:
-            os.fstat(number)
-        except OSError:
-            # The lowest number that is free, which is this one.
-            os.open(os.devnull, os.O_RDWR)
-            os.set_inheritable(number, True)
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115
 
 
 def check_process() -> None:

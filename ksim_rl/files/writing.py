@@ -10,6 +10,7 @@ import os
 import secrets
 import shutil
 import stat
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,6 +18,23 @@ from typing import IO
 
 # A name begins with this until its file is whole; who writes there next deletes leftovers of a crash.
 WRITING = ".writing-"
+
+
+def open_streams() -> None:
+    """Open those of the three standard streams that are closed, on nothing.
+
+    Else the next file that is opened takes the place of one, such as a checkpoint into which a library in C prints its
+    errors; and libraries in Python call methods of `sys.stderr`.
+    """
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            # The lowest number that is free, which is this one.
+            os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(number, True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
 def check_own(path: Path) -> None:

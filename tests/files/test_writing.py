@@ -4,6 +4,8 @@ import ast
 import errno
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -235,3 +237,34 @@ def test_torch_writes_into_memory_only():
     found = [call for path in PACKAGE.rglob("*.py") for call in savers(ast.parse(path.read_text()))]
     assert found == []
     assert savers(ast.parse("torch.save(state, path)"))
+
+
+# Prints which files the first three descriptors are, and then the next one that is opened.
+LOOK = """\
+import os, sys
+from ksim_rl.files import writing
+writing.open_streams()
+opened = open(sys.argv[1], "w")
+opened.write(f"{opened.fileno()} {[os.readlink(f'/proc/self/fd/{n}') for n in (0, 1, 2)].count(os.devnull)} ")
+opened.write(f"{None in (sys.stdin, sys.stdout, sys.stderr)}")
+sys.stderr.flush()
+"""
+
+
+@pytest.mark.parametrize("closed", [(2,), (0, 1, 2)])
+def test_no_file_takes_the_place_of_a_stream_that_is_closed(closed, tmp_path):
+    def close():
+        for number in closed:
+            os.close(number)
+
+    out = tmp_path / "out"
+    ended = subprocess.run([sys.executable, "-c", LOOK, str(out)], preexec_fn=close, timeout=120)
+    assert ended.returncode == 0
+    number, on_nothing, is_none = out.read_text().split()
+    assert int(number) > 2 and int(on_nothing) >= len(closed) and is_none == "False"
+
+
+def test_streams_that_are_open_stay(capfd):
+    writing.open_streams()
+    os.write(1, b"seen")
+    assert capfd.readouterr().out == "seen"
