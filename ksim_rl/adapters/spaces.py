@@ -28,3 +28,12 @@ def space_of(spec: TensorSpec, *, batch_dims: int = 1) -> Any:
         bound.expand(spec.shape).reshape(-1, *shape)[0].cpu().numpy() for bound in (limits.low, limits.high)
     )
     return spaces.Box(low, high, dtype=dtype.type)
+
+
+def finite(space: Any, limit: float) -> Any:
+    """Return the space of actions with -limit and limit where a box has no bounds."""
+    if not isinstance(space, spaces.Box):
+        return space
+    low = np.where(np.isfinite(space.low), space.low, -limit)
+    high = np.where(np.isfinite(space.high), space.high, limit)
+    return spaces.Box(low, high, dtype=np.float32)

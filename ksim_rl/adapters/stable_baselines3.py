@@ -14,7 +14,7 @@ try:
     from gymnasium import spaces
     from stable_baselines3.common.vec_env import VecEnv
 
-    from ksim_rl.adapters.spaces import space_of
+    from ksim_rl.adapters.spaces import finite, space_of
 except ImportError as error:
     raise ImportError(
         'stable-baselines3 is not installed: pip install "ksim_rl[stable_baselines3]"'
@@ -46,12 +46,8 @@ class StableBaselines3VecEnv(VecEnv):
             self._single = next(iter(boxes))
         else:
             self._single = None
-        action = space_of(self._stepper.action_spec, batch_dims=dims)
         # Infinite bounds cannot be rescaled, which some of its algorithms do.
-        if isinstance(action, spaces.Box):
-            low = np.where(np.isfinite(action.low), action.low, -action_limit)
-            high = np.where(np.isfinite(action.high), action.high, action_limit)
-            action = spaces.Box(low, high, dtype=np.float32)
+        action = finite(space_of(self._stepper.action_spec, batch_dims=dims), action_limit)
         super().__init__(
             num_envs=self._stepper.num_envs,
             observation_space=spaces.Dict(dict(boxes)) if self._single is None else boxes[self._single],

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -11,8 +11,9 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import OneHot
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import step_mdp
 
-from ksim_rl.checks import near
+from ksim_rl.checks import check_choice, near
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.contract import Pictures, part
 from ksim_rl.envs.masked_reset import MaskedReset
@@ -20,14 +21,17 @@ from ksim_rl.envs.recorded_python import FollowedGraph
 from ksim_rl.envs.signal_keys import signal_keys
 
 Keys = Mapping[str, NestedKey] | Sequence[NestedKey] | None
+Autoreset = Literal["same_step", "next_step", "disabled"]
+AUTORESETS: tuple[Autoreset, ...] = ("same_step", "next_step", "disabled")
 Observations = dict[str, Shaped[Tensor, "E *?leaf"]]
 """Observations by name, each with its own leaf dims (most often one, L)."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One env step of E envs; rows that ended have been reset already, and `obs` is of their new episode.
+    """One env step of E envs.
 
+    `obs` is what a policy acts on next: where envs reset in the same step, of the new episode in rows that ended.
     `final_obs` has the observations of the states reached.
     """
 
@@ -53,9 +57,14 @@ class Stepper:
 
     It returns the observations at `keys`, by the name to return them under, or as a list of keys. None is every leaf
     that is not nested (`"actor"`, `"critic"`), or all leaves where there is no such.
+
+    `autoreset` says when rows that ended are reset: in the "same_step"; in the "next_step", whose action and reward do
+    not count for them; or by whoever calls `reset_rows` ("disabled").
     """
 
-    def __init__(self, env: EnvBase, keys: Keys = None) -> None:
+    def __init__(self, env: EnvBase, keys: Keys = None, *, autoreset: Autoreset = "same_step") -> None:
+        check_choice("autoreset", autoreset, AUTORESETS)
+        self.autoreset = autoreset
         if len(env.batch_size) > 1:
             raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E], or none")
         self.env = env
@@ -75,6 +84,8 @@ class Stepper:
             self.render_mode = self.pictures.render_mode
         else:
             self.render_mode = None
+        # Rows that the next step resets, where it does so.
+        self._ended_E = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._root: TensorDictBase | None = None
         self._out: dict[str, TensorDictBase] = {}
         self.action_spec = env.full_action_spec[env.action_key]
@@ -104,12 +115,22 @@ class Stepper:
             if seed is not None:
                 self.env.set_seed(seed)
             root_E = self.env.reset()
+        self._ended_E.zero_()
         # In place after the first time, as the graph reads these very tensors.
         if self._root is None:
             self._root = root_E.clone()
         else:
             self._root.update_(root_E)
         return self.read(self._root)
+
+    @torch.no_grad()
+    def reset_rows(self, mask_E: Bool[Tensor, " E"]) -> Observations:
+        """Reset the rows of a mask, and return the observations of all."""
+        self._followed.follow()
+        root = self.root
+        root.update_(self._reset_where(root.clone(), mask_E.to(self.device)).select(*root.keys(True, True)))
+        self._ended_E.masked_fill_(mask_E.to(self.device), 0)
+        return self.read(root)
 
     def as_action(self, values: Any) -> Shaped[Tensor, "*batch"]:
         """Return a foreign policy's choices for E rows as an action of the env: numbers, or the index of a choice."""
@@ -156,7 +177,19 @@ class Stepper:
             cut_E = done_E & ~terminated_E
         else:
             cut_E = next_E.get(keys.truncated).flatten().clone()
-        return Step(self.read(root), self.read(next_E), reward_E.float(), terminated_E, cut_E)
+        step = Step(self.read(root), self.read(next_E), reward_E.float(), terminated_E, cut_E)
+        if self.autoreset != "next_step":
+            return step
+        # Rows that were reset in this step have only begun.
+        fresh_E = self._ended_E.clone()
+        self._ended_E.copy_(step.done_E & ~fresh_E)
+        return Step(
+            step.obs,
+            step.final_obs,
+            step.reward_E.masked_fill(fresh_E, 0.0),
+            step.terminated_E & ~fresh_E,
+            step.truncated_E & ~fresh_E,
+        )
 
     def read(self, tensordict: TensorDictBase) -> Observations:
         """Return copies of the observations by name."""
@@ -176,9 +209,27 @@ class Stepper:
         # A shallow copy: the env writes new entries, but the root's stay where they are.
         td = self._root.copy().set(self.env.action_key, self._action)
         with self._followed.calling():
-            env_state_E, root_E = self.env.step_and_maybe_reset(td)
+            if self.autoreset == "same_step":
+                env_state_E, root_E = self.env.step_and_maybe_reset(td)
+            else:
+                env_state_E = self.env.step(td)
+                root_E = step_mdp(env_state_E, keep_other=True)
+                # Rows that ended one step ago took a step that nobody sees.
+                if self.autoreset == "next_step":
+                    root_E = self._reset_where(root_E, self._ended_E)
         # Outputs of a replay stay where they were recorded.
         self._out = {"next": env_state_E.get("next"), "root": root_E.select(*self._root.keys(True, True))}
+
+    def _reset_where(self, root_E: TensorDictBase, mask_E: Bool[Tensor, " E"]) -> TensorDictBase:
+        """Reset the rows of a mask, by the flags that `maybe_reset` reads."""
+        signals = self._signals
+        for key in (signals.done, signals.terminated, signals.truncated):
+            if key is not None:
+                flag = root_E.get(key)
+                root_E.set(
+                    key, mask_E.view(flag.shape) if key != signals.truncated else torch.zeros_like(flag)
+                )
+        return self.env.maybe_reset(root_E)
 
 
 def _named(env: EnvBase, keys: Keys) -> dict[str, NestedKey]:

@@ -170,11 +170,12 @@ def with_transforms(actor: TensorDictModuleBase, sorted_: TaskTransforms) -> Ten
     """Return a policy that runs the transforms of observations itself."""
     if not sorted_.in_policy:
         return actor
-    parts: list[TensorDictModule] = []
+    parts: list[Any] = []
     for transform in sorted_.in_policy.values():
-        keys = {"in_keys": list(transform.in_keys), "out_keys": list(transform.out_keys)}
+        keys: dict[str, Any] = {"in_keys": list(transform.in_keys), "out_keys": list(transform.out_keys)}
         parts.append(TensorModule(PerObservation(transform).eval(), **keys))
-    return TensorDictSequential(*parts, actor)
+    parts.append(actor)
+    return TensorDictSequential(*parts)
 
 
 @torch.no_grad()

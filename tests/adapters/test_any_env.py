@@ -32,7 +32,8 @@ def test_gymnasiums_interface(make):
     obs, _ = env.reset(seed=3)
     again, _ = env.reset(seed=3)
     assert obs in env.observation_space
-    assert all(np.array_equal(obs[name], again[name]) for name in obs)
+    leaves = zip(torch.utils._pytree.tree_leaves(obs), torch.utils._pytree.tree_leaves(again), strict=True)
+    assert all(np.array_equal(one, other) for one, other in leaves)
     for _ in range(12):
         obs, reward, terminated, truncated, infos = env.step(env.action_space.sample())
         assert obs in env.observation_space
@@ -66,13 +67,11 @@ def test_steps_of_a_gym_env_are_gymnasiums_own():
     first, _ = ours.reset(seed=1)
     theirs.unwrapped.state = None
     theirs.reset(seed=0)
-    theirs.unwrapped.state = np.array(
-        [np.arctan2(first["observation"][0, 1], first["observation"][0, 0]), first["observation"][0, 2]]
-    )
+    theirs.unwrapped.state = np.array([np.arctan2(first[0, 1], first[0, 0]), first[0, 2]])
     for torque in (1.5, -2.0, 0.3):
         expected, reward, *_ = theirs.step(np.array([torque], np.float32))
         obs, got, *_ = ours.step(np.array([[torque]], np.float32))
-        np.testing.assert_allclose(obs["observation"][0], expected, atol=1e-5)
+        np.testing.assert_allclose(obs[0], expected, atol=1e-5)
         np.testing.assert_allclose(got, reward, atol=1e-5)
 
 
@@ -81,14 +80,14 @@ def test_spaces_are_those_of_the_env():
     pendulum = GymnasiumVectorEnv(SerialEnv(2, lambda: GymEnv("Pendulum-v1")))
     reference = gym.make("Pendulum-v1")
     assert pendulum.single_action_space == reference.action_space
-    assert pendulum.single_observation_space["observation"] == reference.observation_space
+    assert pendulum.single_observation_space == reference.observation_space
 
 
 def test_a_list_of_seeds_is_one_per_env():
     env = GymnasiumVectorEnv(CounterEnv(LENGTHS), keys=["drawn"])
 
     def drawn(seed):
-        return env.reset(seed=seed)[0]["drawn"].tolist()
+        return env.reset(seed=seed)[0].tolist()
 
     assert drawn([5, 6, 7]) == drawn(5) != drawn([5, 6, 8])
     assert drawn([5, 6, 8]) == drawn([5, 6, 8]) != drawn([8, 6, 5])
@@ -113,6 +112,6 @@ def test_rewards_and_ends_are_read_where_the_env_has_them():
     action = np.full((3, 2), 0.5, np.float32)
     for _ in range(8):
         one, other = plain.step(action), nested.step(action)
-        assert np.array_equal(one[0]["count"], other[0]["count"])
+        assert np.array_equal(one[0], other[0])
         assert all(np.array_equal(a, b) for a, b in zip(one[1:4], other[1:4], strict=True))
     assert torch.is_tensor(nested._stepper.root["agent", "done"])

@@ -101,8 +101,8 @@ def test_the_last_observation_is_where_gymnasium_puts_it() -> None:
                     assert infos["final_obs"][row] is None
                     continue
                 seen += 1
-                assert infos["final_obs"][row]["count"][0] == LENGTHS[row]
-                assert obs["count"][row, 0] == 0
+                assert infos["final_obs"][row][0] == LENGTHS[row]
+                assert obs[row, 0] == 0
     assert seen == 15 // 3 + 15 // 5 + 15 // 4
 
 
@@ -122,10 +122,10 @@ def test_tensors_stay_tensors_for_all_rows() -> None:
     env.reset(seed=0)
     for _ in range(3):
         obs, reward, terminated, truncated, infos = env.step(torch.zeros(env.action_space.shape))
-    assert all(isinstance(value, torch.Tensor) for value in (obs["count"], reward, terminated, truncated))
+    assert all(isinstance(value, torch.Tensor) for value in (obs, reward, terminated, truncated))
     assert infos["_final_obs"].tolist() == [True, False, False]
-    assert infos["final_obs"]["count"].flatten().tolist() == [3.0, 3.0, 3.0]
-    assert obs["count"].flatten().tolist() == [0.0, 3.0, 3.0]
+    assert infos["final_obs"].flatten().tolist() == [3.0, 3.0, 3.0]
+    assert obs.flatten().tolist() == [0.0, 3.0, 3.0]
 
 
 def test_wrong_input_is_refused(cartpole: GymnasiumVectorEnv) -> None:

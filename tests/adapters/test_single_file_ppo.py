@@ -17,7 +17,7 @@ GAMMA, LAMBDA, CLIP, RATE = 0.98, 0.95, 0.2, 2e-3
 class Agent(nn.Module):
     def __init__(self, envs_):
         super().__init__()
-        obs = int(np.prod(envs_.single_observation_space["actor"].shape))
+        obs = int(np.prod(envs_.single_observation_space.shape))
         actions = int(np.prod(envs_.single_action_space.shape))
         self.critic = nn.Sequential(
             nn.Linear(obs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)
@@ -40,7 +40,7 @@ def train(envs_, *, iterations):
     agent = Agent(envs_)
     optimizer = torch.optim.Adam(agent.parameters(), lr=RATE, eps=1e-5)
     obs, _ = envs_.reset(seed=0)
-    obs, lengths = torch.as_tensor(obs["actor"]), []
+    obs, lengths = torch.as_tensor(obs), []
     for _ in range(iterations):
         rows = []
         for _ in range(NUM_STEPS):
@@ -49,14 +49,14 @@ def train(envs_, *, iterations):
             following, reward, terminated, truncated, infos = envs_.step(action.numpy())
             reward = torch.as_tensor(reward)
             if truncated.any():
-                last = torch.as_tensor(np.stack([row["actor"] for row in infos["final_obs"][truncated]]))
+                last = torch.as_tensor(np.stack([*infos["final_obs"][truncated]]))
                 with torch.no_grad():
                     reward[truncated] += GAMMA * agent.critic(last).flatten()
             if "episode" in infos:
                 lengths += infos["episode"]["l"][infos["_episode"]].tolist()
             done = torch.as_tensor(terminated | truncated).float()
             rows.append((obs, action, log_prob, value, reward, done))
-            obs = torch.as_tensor(following["actor"])
+            obs = torch.as_tensor(following)
         obs_T, action_T, log_prob_T, value_T, reward_T, done_T = (
             torch.stack(part) for part in zip(*rows, strict=True)
         )
