@@ -9,7 +9,14 @@ from benchmarks.pages.table import table
 from ksim_rl.config.field_texts import attribute_texts
 from ksim_rl.envs import EnvView
 from ksim_rl.scene.motions.motion import ReferenceMotion
-from ksim_rl.scene.sensors import CameraTracker, ContactState, ImuTracker, RayTracker, SensorTracker
+from ksim_rl.scene.sensors import (
+    CameraTracker,
+    ContactPointsState,
+    ContactState,
+    ImuTracker,
+    RayTracker,
+    SensorTracker,
+)
 from ksim_rl.scene.sensors.rays import RayState
 from ksim_rl.scene.state.elements import Bodies, Body, Joints, Site, Sites
 from ksim_rl.scene.state.entity import Entity
@@ -56,6 +63,7 @@ PARTS = (
         "A robot or object of the scene; `view.robot` is the first.",
     ),
     Part('view.contact("feet")', ContactState, "A `ContactSensor` of `scene.sensors`."),
+    Part('view.contact_points("hand")', ContactPointsState, "A `ContactPoints` of `scene.sensors`."),
     Part('view.imu("imu")', ImuTracker, "An `ImuSensor` of `scene.sensors`."),
     Part('view.rays("scan")', RayTracker, "A `RayCaster` of `scene.sensors`."),
     Part('view.rays("scan").state', RayState, "Its hits."),

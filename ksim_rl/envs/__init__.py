@@ -22,6 +22,7 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.scene import MjcfRobot, Placement, Robot, SceneCfg
 from ksim_rl.scene.sensors import (
     CameraSensor,
+    ContactPoints,
     ContactSensor,
     GridPattern,
     ImuSensor,

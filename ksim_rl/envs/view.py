@@ -11,6 +11,8 @@ from torch import Tensor
 from ksim_rl.checks import near
 from ksim_rl.scene.sensors import (
     CameraTracker,
+    ContactPointsState,
+    ContactPointsTracker,
     ContactState,
     ContactTracker,
     ImuTracker,
@@ -99,6 +101,10 @@ class EnvView(WorldView):
     def contact(self, name: str) -> ContactState:
         """Return the state of a contact sensor of `cfg.scene.sensors`."""
         return self.tracker(name, ContactTracker, "contact sensor").state
+
+    def contact_points(self, name: str) -> ContactPointsState:
+        """Return the contacts that a `ContactPoints` of `cfg.scene.sensors` sees, one by one."""
+        return self.tracker(name, ContactPointsTracker, "ContactPoints").state
 
     def imu(self, name: str) -> ImuTracker:
         """Return an `ImuSensor` of `cfg.scene.sensors`, which has its readings."""

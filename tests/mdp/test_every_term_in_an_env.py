@@ -15,7 +15,14 @@ def env():
 
 
 # They need other scenes: cameras, terrains, an IMU.
-OF_OTHER_SCENES = {mdp.CameraImage, mdp.HeightScan, mdp.ImuReading, mdp.RayDistance, mdp.RayHeight}
+OF_OTHER_SCENES = {
+    mdp.CameraImage,
+    mdp.ContactReading,
+    mdp.HeightScan,
+    mdp.ImuReading,
+    mdp.RayDistance,
+    mdp.RayHeight,
+}
 
 
 def test_no_term_is_left_out():

@@ -5,6 +5,7 @@ elements; poses and velocities are of the current state.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -186,3 +187,20 @@ class FootContactForces(OfSensor, ObservationTerm):
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         force_EL = view.contact(self.sensor).force_EN3.flatten(start_dim=1)
         return torch.sign(force_EL) * torch.log1p(torch.abs(force_EL))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactReading(OfSensor, ObservationTerm):
+    """One quantity of the contacts of a `ContactPoints` of `scene.sensors`, world frame, [E, N] or flat [E, 3N].
+
+    "found" (1 or 0), "force" (N) and "torque" (N m) of the element on its partner, "distance" (m, negative inside),
+    "position" (m) or "normal"; acceleration stage.
+    """
+
+    quantity: Literal["found", "force", "torque", "distance", "position", "normal"] = "force"
+
+    def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
+        contacts = view.contact_points(self.sensor)
+        if self.quantity in ("found", "distance"):
+            return getattr(contacts, f"{self.quantity}_EN")
+        return getattr(contacts, f"{self.quantity}_EN3").flatten(start_dim=1)

@@ -19,53 +19,34 @@ from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker, check_present
 from ksim_rl.scene.small_matrices import product
 from ksim_rl.scene.state.world_view import WorldView
 
-_TABLES = {"geom": "geom", "body": "body", "subtree": "body"}
+ELEMENT_TABLES = {"geom": "geom", "body": "body", "subtree": "body"}
+"""The kinds of element of a model that elements of a sensor are, by how a sensor calls them."""
 _RGBA = (1.0, 0.55, 0.1, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ContactSensor(Sensor):
-    """Contact of N elements of the scene with another element, or with anything.
+class ContactElements(Sensor):
+    """A sensor of the contacts of elements of the scene.
 
     Exactly one of `geoms`, `bodies` (with all their geoms) and `subtrees` (bodies with all their descendants: a limb,
     or a whole robot) gives the elements: names, or regular expressions that must match in full. Each pattern's
-    matches come in the model's order, and give the N dim.
+    matches come in the model's order.
 
     Attributes:
-        against: the name of the element that they touch; None for anything, also for parts of their own robot.
-        reduce: of several contacts, their "net" force, or the force of the "strongest" one. Within one subtree, as in
-            self-collisions, each contact's direction is arbitrary, so only "strongest" has a meaning.
-        every_substep: read at each physics substep, not only at the last one of an env step: the clocks run in physics
-            steps, and `ContactState.force_history_ESN3` holds the force of each substep.
+        against_kind: what `against` names: a geom, a body or a subtree.
     """
 
     geoms: tuple[str, ...] = ()
     bodies: tuple[str, ...] = ()
     subtrees: tuple[str, ...] = ()
-    against: str | None = "terrain"
     against_kind: Literal["geom", "body", "subtree"] = "body"
-    reduce: Literal["net", "strongest"] = "net"
-    every_substep: bool = False
 
-    def __post_init__(self) -> None:
-        # A tuple of names would fail only deep inside of MuJoCo.
-        if isinstance(self.against, (list, tuple)):
-            raise ValueError(
-                f"against={self.against!r}: a contact sensor takes one {self.against_kind} there, not several: name a "
-                "body or subtree that holds them (against_kind), None for anything, or give one sensor each"
-            )
-        super().__post_init__()
+    def _check_fields(self) -> None:
+        super()._check_fields()
         given = [field for field in ("geoms", "bodies", "subtrees") if getattr(self, field)]
         if len(given) != 1:
             raise ValueError(
                 f"geoms={self.geoms!r}, bodies={self.bodies!r}, subtrees={self.subtrees!r}: give exactly one of them"
-            )
-        # Within one subtree each contact's direction is arbitrary, so that a sum means nothing.
-        within_one = self.against_kind == "subtree" and self.against in self.subtrees
-        if within_one and self.reduce == "net":
-            raise ValueError(
-                f"reduce='net' with against={self.against!r}, one of the subtrees: forces within one subtree have no "
-                "common direction; use reduce='strongest'"
             )
 
     @property
@@ -80,29 +61,88 @@ class ContactSensor(Sensor):
     def elements(self, present: Sequence[str]) -> list[str]:
         """Return the elements among the `present` ones of their kind, in the order of the N dim."""
         patterns = self.geoms or self.bodies or self.subtrees
-        return [present[i] for i in match_names(_TABLES[self.kind], patterns, present)]
+        return [present[i] for i in match_names(ELEMENT_TABLES[self.kind], patterns, present)]
+
+    def add_contacts(
+        self,
+        spec: mujoco.MjSpec,
+        name: str,
+        *,
+        of: str,
+        against: str | None,
+        intprm: Sequence[int],
+        called: str,
+    ) -> None:
+        """Add the MJCF contact sensor `called`, of one element against another, or anything, for the sensor `name`."""
+        # Without `against` MuJoCo takes any other geom.
+        other = {}
+        if against is not None:
+            table = ELEMENT_TABLES[self.against_kind]
+            check_present(name, table, against, {"geom": spec.geoms, "body": spec.bodies}[table])
+            other = {"reftype": MATCHED[self.against_kind], "refname": against}
+        spec.add_sensor(
+            name=called,
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=MATCHED[self.kind],
+            objname=of,
+            intprm=[*intprm],
+            **other,
+        )
+
+    def elements_of(self, spec: mujoco.MjSpec, name: str) -> list[str]:
+        """Return the elements in a spec, for the sensor `name`."""
+        parts = {"geom": spec.geoms, "body": spec.bodies}
+        with naming(f"scene.sensors.{name}"):
+            return self.elements([part.name for part in parts[ELEMENT_TABLES[self.kind]]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactSensor(ContactElements):
+    """Contact of N elements of the scene with another element, or with anything; see `ContactPoints` for details.
+
+    Exactly one of `geoms`, `bodies` (with all their geoms) and `subtrees` (bodies with all their descendants: a limb,
+    or a whole robot) gives the elements: names, or regular expressions that must match in full. Each pattern's
+    matches come in the model's order, and give the N dim.
+
+    Attributes:
+        against: the name of the element that they touch; None for anything, also for parts of their own robot.
+        reduce: of several contacts, their "net" force, or the force of the "strongest" one. Within one subtree, as in
+            self-collisions, each contact's direction is arbitrary, so only "strongest" has a meaning.
+        every_substep: read at each physics substep, not only at the last one of an env step: the clocks run in physics
+            steps, and `ContactState.force_history_ESN3` holds the force of each substep.
+    """
+
+    against: str | None = "terrain"
+    reduce: Literal["net", "strongest"] = "net"
+    every_substep: bool = False
+
+    def __post_init__(self) -> None:
+        # A tuple of names would fail only deep inside of MuJoCo.
+        if isinstance(self.against, (list, tuple)):
+            raise ValueError(
+                f"against={self.against!r}: a contact sensor takes one {self.against_kind} there, not several: name a "
+                "body or subtree that holds them (against_kind), None for anything, or give one sensor each, or "
+                "ContactPoints"
+            )
+        super().__post_init__()
+        # Within one subtree each contact's direction is arbitrary, so that a sum means nothing.
+        within_one = self.against_kind == "subtree" and self.against in self.subtrees
+        if within_one and self.reduce == "net":
+            raise ValueError(
+                f"reduce='net' with against={self.against!r}, one of the subtrees: forces within one subtree have no "
+                "common direction; use reduce='strongest'"
+            )
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
         """Add one MJCF contact sensor `<name>_<element>` per element."""
-        parts = {"geom": spec.geoms, "body": spec.bodies}
-        with naming(f"scene.sensors.{name}"):
-            elements = self.elements([part.name for part in parts[_TABLES[self.kind]]])
-        # Without `against` MuJoCo takes any other geom.
-        other = {}
-        if self.against is not None:
-            table = _TABLES[self.against_kind]
-            check_present(name, table, self.against, parts[table])
-            other = {"reftype": MATCHED[self.against_kind], "refname": self.against}
-        for element in elements:
-            # One per element: MuJoCo's sensor reports one element's contacts.
-            spec.add_sensor(
-                name=f"{name}_{element}",
-                type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=MATCHED[self.kind],
-                objname=element,
-                intprm=[*(NET if self.reduce == "net" else STRONGEST)],
-                **other,
-            )
+        if self.reduce == "net":
+            intprm = NET
+        else:
+            intprm = STRONGEST
+        # One per element: MuJoCo's sensor reports one element's contacts.
+        for element in self.elements_of(spec, name):
+            called = f"{name}_{element}"
+            self.add_contacts(spec, name, of=element, against=self.against, intprm=intprm, called=called)
 
     def track(self, name: str, view: WorldView) -> "ContactTracker":
         return ContactTracker(name, self, view)
@@ -151,7 +191,7 @@ class ContactTracker(SensorTracker):
         self._world = view.world
         self._view = view
         self._strongest = sensor.reduce == "strongest"
-        elements = sensor.elements(view.resolver.names(_TABLES[sensor.kind]))
+        elements = sensor.elements(view.resolver.names(ELEMENT_TABLES[sensor.kind]))
         self._count = len(elements)
         found = [self._world.mj_model.sensor(f"{name}_{element}") for element in elements]
         # All numbers of all elements, in one index, so that one gather reads them.
@@ -251,8 +291,16 @@ class ContactTracker(SensorTracker):
         if not self._strongest:
             return readings[..., 1:4]
         # The strongest contact's force is in the contact's frame.
-        normal = readings[..., 7:10]
-        tangent = readings[..., 10:13]
-        # Columns are the contact's axes in the world; the third one follows from the first two.
-        axes = torch.stack((normal, tangent, torch.linalg.cross(normal, tangent)), dim=-1)
-        return product(axes, readings[..., 1:4, None])[..., 0]
+        return from_contact(readings[..., 1:4], normal=readings[..., 7:10], tangent=readings[..., 10:13])
+
+
+def from_contact(
+    vector: Float[Tensor, "*batch 3"],
+    *,
+    normal: Float[Tensor, "*batch 3"],
+    tangent: Float[Tensor, "*batch 3"],
+) -> Float[Tensor, "*batch 3"]:
+    """Return vectors of contacts' own axes, of which the first two are given, in the world's."""
+    # Columns are the contact's axes in the world; the third one follows from the first two.
+    axes = torch.stack((normal, tangent, torch.linalg.cross(normal, tangent)), dim=-1)
+    return product(axes, vector[..., None])[..., 0]
