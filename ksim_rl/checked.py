@@ -11,9 +11,12 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 from ksim_rl.checks import check_choice, check_count, check_in_range, check_pair
+
+# A type hint. Python has no type of these before `TypeForm`.
+Annotation: TypeAlias = Any
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class Within:
     low_open: bool = False
     ordered: bool = False
 
-    def check(self, field: str, value: Any) -> None:
+    def check(self, field: str, value: object) -> None:
         """Refuse a value outside, by a ValueError that names the field and the bounds; None passes."""
         # Whether None is allowed is said by the union around.
         if value is None:
@@ -93,11 +96,11 @@ class Checked:
 
 @cache
 # Resolving texts of annotations is slow, and classes do not change.
-def _hints(cls: type) -> dict[str, Any]:
+def _hints(cls: type) -> dict[str, Annotation]:
     return typing.get_type_hints(cls, include_extras=True)
 
 
-def check_value(field: str, value: object, annotation: Any) -> None:
+def check_value(field: str, value: object, annotation: Annotation) -> None:
     """Refuse a value that does not fit an annotation, as `checks` do; protocols, callables and `Any` take all."""
     origin = typing.get_origin(annotation)
     arguments = typing.get_args(annotation)
@@ -148,7 +151,7 @@ def _check_instance(field: str, value: object, kind: type) -> None:
         raise ValueError(f"{field}={value!r}: expected {expected}")
 
 
-def _check_union(field: str, value: object, options: Sequence[Any]) -> None:
+def _check_union(field: str, value: object, options: Sequence[Annotation]) -> None:
     # None is no error where the union names it.
     if value is None and type(None) in options:
         return
@@ -165,13 +168,13 @@ def _check_union(field: str, value: object, options: Sequence[Any]) -> None:
     raise ValueError("; or ".join(errors))
 
 
-def _check_sequence(field: str, value: object, annotation: Any) -> None:
+def _check_sequence(field: str, value: object, annotation: Annotation) -> None:
     arguments = typing.get_args(annotation)
     if not isinstance(value, (list, tuple)):
         raise ValueError(f"{field}={value!r}: expected a list")
     # A homogeneous tuple or sequence of any length, or a tuple with a type for each place.
     if typing.get_origin(annotation) is Sequence or arguments[1:] == (...,):
-        kinds: Sequence[Any] = [arguments[0]] * len(value)
+        kinds: Sequence[Annotation] = [arguments[0]] * len(value)
     elif len(value) == len(arguments):
         kinds = arguments
     else:

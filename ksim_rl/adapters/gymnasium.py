@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl import envs
 from ksim_rl.adapters.spaces import finite, space_of
-from ksim_rl.adapters.stepper import Autoreset, Keys, Observations, Stepper, to_numpy
+from ksim_rl.adapters.stepper import Autoreset, Infos, Keys, Observations, Stepper, to_numpy
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.contract import EpisodeClock, part
 
@@ -69,7 +69,7 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    ) -> tuple[Any, Infos]:
         """Reset all envs, whose draws follow from one seed; a list of one per env, as Gymnasium takes, makes one.
 
         The one option is "reset_mask", bool [E], for the rows to reset where `autoreset_mode` is DISABLED; the draws of
@@ -90,11 +90,11 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def step(
         self, actions_E: Shaped[np.ndarray, " E *leaf"] | Shaped[Tensor, " E *leaf"]
-    ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    ) -> tuple[Any, Any, Any, Any, Infos]:
         """Step all envs."""
         step = self._stepper.step(self._stepper.as_action(actions_E))
         done_E = step.done_E
-        infos: dict[str, Any] = {}
+        infos: Infos = {}
         # In the other modes `obs` itself is the last of its episode.
         if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP:
             # Without asking the device whether an episode ended, since that would wait for it.
@@ -134,7 +134,7 @@ class GymnasiumVectorEnv(VectorEnv):
             )
         return self._out(self._stepper.reset_rows(mask))
 
-    def _final_obs(self, obs: dict[str, np.ndarray], done_E: np.ndarray) -> dict[str, Any]:
+    def _final_obs(self, obs: dict[str, np.ndarray], done_E: np.ndarray) -> Infos:
         """Return the last observations in Gymnasium's layout: an object per env, and who has one."""
         # Gymnasium's layout: None where no episode ended.
         final = np.full(done_E.shape, fill_value=None, dtype=object)
@@ -168,9 +168,7 @@ class GymnasiumEnv(gymnasium.Env):
         space = space_of(self._stepper.action_spec, batch_dims=self._stepper.batch_dims)
         self.action_space = finite(space, action_limit)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Infos]:
         """Begin an episode, whose draws follow from the seed; there are no options."""
         if options:
             raise ValueError(f"options={options!r}: this env has no reset options; use seed=")
@@ -182,7 +180,7 @@ class GymnasiumEnv(gymnasium.Env):
             obs = self._stepper.reset(seed)
         return self._first(obs), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Infos]:
         """Step the env."""
         step = self._stepper.step(self._stepper.as_action(np.asarray(action)[None]))
         flags = bool(step.terminated_E[0]), bool(step.truncated_E[0])
@@ -217,7 +215,7 @@ class _Names:
         return obs if self._single is None else obs[self._single]
 
 
-def _rendering(stepper: Stepper) -> dict[str, Any]:
+def _rendering(stepper: Stepper) -> dict[str, list[str] | int]:
     clock = part(stepper.env, EpisodeClock)
     return {
         "render_modes": [mode for mode in (stepper.render_mode,) if mode],

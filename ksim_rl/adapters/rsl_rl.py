@@ -1,13 +1,11 @@
 """Shows an env as rsl_rl's `VecEnv`, so that rsl_rl's runners train on it."""
 
-from typing import Any
-
 from jaxtyping import Float, Int64
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.adapters.stepper import Keys, Observations, Stepper
+from ksim_rl.adapters.stepper import Infos, Keys, Observations, Stepper
 from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.transforms.innermost import innermost
@@ -62,17 +60,17 @@ class RslRlVecEnv(VecEnv):
         """Return the observations that the next action answers to, [E]."""
         return self._tensordict(self._stepper.read(self._stepper.root))
 
-    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
+    def reset(self) -> tuple[TensorDict, Infos]:
         """Reset all envs."""
         return self._tensordict(self._stepper.reset()), {}
 
     def step(
         self, action_EL: Float[Tensor, "E L"]
-    ) -> tuple[TensorDict, Float[Tensor, " E"], Int64[Tensor, " E"], dict[str, Any]]:
+    ) -> tuple[TensorDict, Float[Tensor, " E"], Int64[Tensor, " E"], Infos]:
         """Step all envs; rows that ended come back with the first observation of their next episode."""
         step = self._stepper.step(action_EL)
         # A row that also failed has no value to bootstrap.
-        extras: dict[str, Any] = {"time_outs": step.truncated_E & ~step.terminated_E}
+        extras: dict[str, Tensor | dict[str, Tensor]] = {"time_outs": step.truncated_E & ~step.terminated_E}
         self._steps += 1
         # Rarely, as figures are read back from the device.
         if self._steps % self._log_interval == 0:

@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.adapters.stepper import Observations, Stepper
+from ksim_rl.adapters.stepper import Infos, Observations, Stepper
 
 try:
     from gymnasium import spaces
@@ -76,7 +76,7 @@ class SkrlWrapper(Wrapper):
         """The space of one row's action."""
         return self._action_space
 
-    def reset(self) -> tuple[Float[Tensor, "E L"], dict[str, Any]]:
+    def reset(self) -> tuple[Float[Tensor, "E L"], Infos]:
         """Return the observations that the next actions answer to; the first call resets all envs."""
         # skrl resets before each training; going on is what its wrappers of vector envs do.
         self._current = self._current or self._stepper.reset()
@@ -84,7 +84,7 @@ class SkrlWrapper(Wrapper):
 
     def step(
         self, actions: Shaped[Tensor, " E *leaf"]
-    ) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E 1"], Bool[Tensor, "E 1"], Bool[Tensor, "E 1"], Any]:
+    ) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E 1"], Bool[Tensor, "E 1"], Bool[Tensor, "E 1"], Infos]:
         """Step all envs."""
         step = self._stepper.step(self._stepper.as_action(actions))
         self._current = step.obs

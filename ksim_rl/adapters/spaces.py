@@ -9,7 +9,7 @@ from torchrl.data import Categorical, OneHot, TensorSpec, Unbounded
 from torchrl.data.tensor_specs import ContinuousBox
 
 
-def space_of(spec: TensorSpec, *, batch_dims: int = 1) -> Any:
+def space_of(spec: TensorSpec, *, batch_dims: int = 1) -> spaces.Space:
     """Return the space of one row: a `Discrete` of choices, else a `Box`, which is infinite without bounds.
 
     Raises ValueError for kinds of choices that Gymnasium has no space for.

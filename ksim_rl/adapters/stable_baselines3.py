@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -68,7 +69,7 @@ class StableBaselines3VecEnv(VecEnv):
         """Take the actions of the next `step_wait`."""
         self._action = self._stepper.as_action(actions_E)
 
-    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> VecEnvStepReturn:
         """Step all envs."""
         if self._action is None:
             raise RuntimeError("step_wait without actions: call step_async first")
@@ -97,25 +98,25 @@ class StableBaselines3VecEnv(VecEnv):
         """Return the picture of the envs that `cfg.viewer` shows."""
         return [self._stepper.picture()]
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the env, or one that stable-baselines3 asks for, once per index: all are one env."""
         value = getattr(self if attr_name in _OF_ROWS else self.env, attr_name)
         return [value for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Refuse: all rows are one env, whose attributes are its config."""
         raise NotImplementedError(
             f"set_attr({attr_name!r}): the rows are one env; change its config and build it"
         )
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of the env once, and return its result once per index."""
         result = getattr(self.env, method_name)(*method_args, **method_kwargs)
         return [result for _ in self._get_indices(indices)]
 
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
         """Return False for each index: there are no Gymnasium wrappers inside."""
         return [False for _ in self._get_indices(indices)]
 

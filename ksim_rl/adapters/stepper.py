@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -25,6 +25,8 @@ Autoreset = Literal["same_step", "next_step", "disabled"]
 AUTORESETS: tuple[Autoreset, ...] = ("same_step", "next_step", "disabled")
 Observations = dict[str, Shaped[Tensor, "E *?leaf"]]
 """Observations by name, each with its own leaf dims (most often one, L)."""
+Infos: TypeAlias = dict[str, Any]
+"""What is told of a step beyond its observations, rewards and ends: for each library something else."""
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from ksim_rl.compiled.python_states import PLAIN
-from ksim_rl.compiled.python_values import Listed
+from ksim_rl.compiled.python_values import Listed, Part
 from ksim_rl.compiled.watched_graphs import WatchedGraphs
 from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
+from ksim_rl.device.state_tree import State
 from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import burnt_in, recurrent_modules
 from ksim_rl.objectives import NonFiniteStepsError, StepGuard, anneal_learning_rate_, make_optimizer, ppo_step
@@ -31,7 +32,7 @@ def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[
     return columns
 
 
-def public_objects(owner: Any) -> dict[str, Any]:
+def public_objects(owner: Part) -> dict[str, Part]:
     """Return the attributes of an object that are no numbers or texts, and that its name does not keep private."""
     named = vars(owner).items()
     return {name: value for name, value in named if name[0] != "_" and not isinstance(value, PLAIN)}
@@ -156,12 +157,12 @@ class RolloutUpdate(ABC):
         networks = {name: network.state_dict() for name, network in self.networks.items()}
         return {**networks, "guard": self.guard.state_dict()}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken, at the same addresses; a ValueError names what does not fit."""
         self.load_weights(state)
         state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
 
-    def load_weights(self, state: Mapping[str, Any]) -> None:
+    def load_weights(self, state: State) -> None:
         """Take only the networks of a `state_dict`; a ValueError names the tensor that does not fit."""
         for name, network in self.networks.items():
             state_tree.copy_into(network.state_dict(), state[name], what=name.replace("_", " "))
@@ -232,7 +233,7 @@ class DatasetUpdate(RolloutUpdate):
             "non_finite_env_states": self.dataset.non_finite_count,
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         super().load_state_dict(state)
         load_optimizer_state(self.optimizer, state["optimizer"], what="optimizer")
@@ -248,7 +249,7 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> state_tree.State:
     return rates | {"moments": moments}
 
 
-def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], *, what: str) -> None:
+def load_optimizer_state(optimizer: torch.optim.Optimizer, state: State, *, what: str) -> None:
     """Continue where `optimizer_state` was taken, at the same addresses; a ValueError names what does not fit."""
     group = optimizer.param_groups[0]
     parameters = optimizer.param_groups[0]["params"]

@@ -1,7 +1,7 @@
 """Collects rollouts of fixed length from all envs, on a GPU as one CUDA graph."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +23,7 @@ from ksim_rl.collectors.recording import Policy, Recording
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.copying import copy_rows
 from ksim_rl.device.eager import eagerly
-from ksim_rl.device.state_tree import copy_into
+from ksim_rl.device.state_tree import State, copy_into
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.transforms.row_transform import held_transforms
@@ -245,7 +245,7 @@ class RolloutCollector:
         return self._root.clone().flatten_keys(".").to_dict()
 
     @torch.no_grad()
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue from a `state_dict` of such a collector; the env's own state is loaded apart."""
         if self._root is None:
             self.reset()

@@ -4,23 +4,24 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from jaxtyping import Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torch.utils._pytree import PyTree
 from torchrl.envs import EnvBase
 
 from ksim_rl.compiled.differences import NamedLeaves, differences
 from ksim_rl.compiled.rounding import Nudging, nudged
+from ksim_rl.device.state_tree import State
 
 # `last_root` is not state, and a recorded step returns it in other memory. The peak contact counts under `overflow`
 # change with the smallest difference in one world.
 _LEFT_OUT = ("last_root.", "overflow/")
 
 
-def _unchanged(value: Any) -> Any:
+def _unchanged(value: PyTree) -> PyTree:
     return value
 
 
@@ -28,7 +29,7 @@ def _unchanged(value: Any) -> Any:
 class _State:
     """The start of a step: the state of the env, the root, and the policy's leaves."""
 
-    env: dict[str, Any]
+    env: State
     root_E: TensorDictBase
     given: dict[NestedKey, Tensor]
 
@@ -119,7 +120,7 @@ class StepCheck:
         given = {key: value.clone() for key, value in self.given.items()}
         return _State(self._env.state_dict(), self._root_E.clone(), given)
 
-    def _return_to(self, start: _State, change: Callable[[Any], Any] = _unchanged) -> None:
+    def _return_to(self, start: _State, change: Callable[[PyTree], PyTree] = _unchanged) -> None:
         """Restore a state, with `change` applied to each of its tensors."""
         self._env.load_state_dict({name: change(value) for name, value in start.env.items()})
         for key in self._root_keys:
@@ -141,7 +142,7 @@ class StepCheck:
         return results
 
 
-def _nudged(value: Any, generator: torch.Generator) -> Any:
+def _nudged(value: PyTree, generator: torch.Generator) -> PyTree:
     if isinstance(value, Tensor):
         return nudged(value, generator)
     return value

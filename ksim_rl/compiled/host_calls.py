@@ -10,16 +10,16 @@ import os
 import random
 import sys
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ksim_rl.compiled.packages import OURS, is_library, package_of, packages_of
 from ksim_rl.compiled.python_states import state_of
+from ksim_rl.compiled.python_values import Parts
 
 CLOCKS = frozenset(
     {
@@ -63,7 +63,7 @@ class HostCall:
 
 
 @contextmanager
-def host_calls(parts: Mapping[str, Any]) -> Iterator[list[HostCall]]:
+def host_calls(parts: Parts) -> Iterator[list[HostCall]]:
     """Collect the calls of this block; `parts` are the objects to which they are ascribed, by name.
 
     Draws from NumPy's global generator are found by its state, since the profiler does not see calls of its functions.
@@ -81,7 +81,7 @@ def host_calls(parts: Mapping[str, Any]) -> Iterator[list[HostCall]]:
 
 
 class _Tracer:
-    def __init__(self, parts: Mapping[str, Any]) -> None:
+    def __init__(self, parts: Parts) -> None:
         self.found: list[HostCall] = []
         self._names = {id(part): name for name, part in parts.items()}
         self._packages = packages_of(parts.values())
@@ -97,7 +97,7 @@ class _Tracer:
         self._running: list[tuple[types.FrameType, str]] = []
         self._numpy = _numpy_state()
 
-    def notice(self, frame: types.FrameType, event: str, function: Any) -> None:
+    def notice(self, frame: types.FrameType, event: str, function: Callable) -> None:
         """Look at one event of Python's profiler."""
         if event == "c_call":
             asked = _asked(function)
@@ -167,7 +167,7 @@ class _Tracer:
             self.found.append(call)
 
 
-def _asked(function: Any) -> str | None:
+def _asked(function: Callable) -> str | None:
     """Return the kind of answer that a C function gets from the host, or None."""
     name = getattr(function, "__name__", "")
     owner = getattr(function, "__self__", None)
@@ -195,7 +195,7 @@ def _asked(function: Any) -> str | None:
     return None
 
 
-def _spelled(function: Any) -> str:
+def _spelled(function: Callable) -> str:
     owner = getattr(function, "__self__", None)
     if isinstance(owner, types.ModuleType):
         return f"{owner.__name__}.{function.__name__}"
@@ -206,7 +206,7 @@ def _spelled(function: Any) -> str:
     return f"{kind.__name__}.{function.__name__}"
 
 
-def _numpy_state() -> Any:
+def _numpy_state() -> int:
     return state_of(np.random.mtrand._rand)
 
 

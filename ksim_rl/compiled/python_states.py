@@ -6,10 +6,10 @@ import zlib
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from pathlib import PurePath
-from typing import Any
 
 import numpy as np
 import torch
+from torch.utils._pytree import PyTree
 
 PLAIN = (
     type(None),
@@ -30,7 +30,7 @@ PLAIN = (
 """Types whose objects never change, so that an equal one is as good."""
 
 
-def state_of(source: Any) -> int:
+def state_of(source: random.Random | np.random.Generator | np.random.RandomState) -> int:
     """Return a number that identifies the state of a random generator of Python or NumPy."""
     if isinstance(source, random.Random):
         return hash(source.getstate())
@@ -40,7 +40,7 @@ def state_of(source: Any) -> int:
     return hash(_hashable(source.get_state(legacy=False)))
 
 
-def _hashable(tree: Any) -> Any:
+def _hashable(tree: PyTree) -> PyTree:
     """Return a tree of plain values in which checksums stand for arrays."""
     if isinstance(tree, np.ndarray):
         return checksum(tree)
@@ -54,7 +54,7 @@ def checksum(array: np.ndarray) -> int:
     return zlib.crc32(array.tobytes())
 
 
-def place_of(iterator: Any) -> str | None:
+def place_of(iterator: Iterator) -> str | None:
     """Return the position of one of Python's own iterators, or None where it does not tell."""
     # Copying iterators of itertools is deprecated since Python 3.12.
     with warnings.catch_warnings():

@@ -10,9 +10,9 @@ import random
 import types
 import weakref
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, is_dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -30,6 +30,9 @@ _CHANGES_BY_ITSELF = frozenset({"last_root"})
 _ITERATORS = ("builtins", "itertools")
 
 Values = Mapping[Any, Any]
+# An object whose Python a step runs: a term, a transform, a network. All kinds are looked into.
+Part: TypeAlias = Any
+Parts: TypeAlias = Mapping[str, Part]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +57,13 @@ class Held:
 
     owner: Any
     read: Callable[[], Values]
-    spell: Callable[[str, Any], str]
+    spell: Callable[[str, Hashable], str]
     paths: list[str]
     table: Values | None = None
     pick: Callable[[Values], tuple[Any, ...]] | None = None
 
 
-def held_by(parts: Mapping[str, Any], device: torch.device) -> list[Held]:
+def held_by(parts: Parts, device: torch.device) -> list[Held]:
     """Return all values that the parts depend on, each part by its name.
 
     A part is not entered from another one. Tensors that do not lie on `device`, where recordings read, are values.
@@ -74,7 +77,7 @@ def held_by(parts: Mapping[str, Any], device: torch.device) -> list[Held]:
 class _Search:
     """Goes from object to object; an object that several parts reach is found once, with a path from each."""
 
-    def __init__(self, parts: Mapping[str, Any], device: torch.device) -> None:
+    def __init__(self, parts: Parts, device: torch.device) -> None:
         self.found: dict[tuple[int, str], Held] = {}
         self._device = device
         self._parts = set()
@@ -91,7 +94,7 @@ class _Search:
         # While the search lasts, no object may take the place of another one.
         self._alive: list[Any] = []
 
-    def of_part(self, name: str, part: Any) -> None:
+    def of_part(self, name: str, part: Part) -> None:
         # By part, so that a shared object gets a path from each part that reaches it.
         self._seen = set()
         self._reads_code = not isinstance(part, Listed) or part.reads_code
@@ -152,7 +155,7 @@ class _Search:
         owner: Any,
         path: str,
         read: Callable[[], Values],
-        spell: Callable[[str, Any], str],
+        spell: Callable[[str, Hashable], str],
         what: str = "",
         table: Values | None = None,
     ) -> None:
@@ -185,7 +188,7 @@ class _Search:
         if array.dtype != object:
             self._hold(array, path, lambda: {"content": checksum(array)}, _attribute)
 
-    def _at_mapping(self, mapping: Mapping[Any, Any], path: str) -> None:
+    def _at_mapping(self, mapping: Values, path: str) -> None:
         if len(mapping) <= MOST_ITEMS:
             self._hold(mapping, path, lambda: mapping, _item, table=mapping)
         else:
@@ -265,7 +268,7 @@ class _Search:
             named = vars(cls).items()
             return {name: value for name, value in named if name == "__call__" or name[:2] != "__"}
 
-        def spell(path: str, name: str) -> str:
+        def spell(path: str, name: Hashable) -> str:
             return f"{path}: {cls.__qualname__}.{name}"
 
         self._hold(cls, path, read, spell, table=vars(cls))
@@ -292,7 +295,7 @@ class _Search:
         scope = function.__globals__
         known = [name for name in names if name in scope]
 
-        def spell(path: str, name: str) -> str:
+        def spell(path: str, name: Hashable) -> str:
             return f"{path}: global {function.__module__}.{name}"
 
         def read() -> Values:
@@ -309,7 +312,7 @@ class _Search:
             return
         names = function.__code__.co_freevars
 
-        def spell(path: str, name: str) -> str:
+        def spell(path: str, name: Hashable) -> str:
             return f"{path}: {name} in the closure of {function.__qualname__}"
 
         def read() -> Values:
@@ -321,7 +324,7 @@ class _Search:
         """Look at those attributes of a module that some code names, and so may read."""
         own = [name for name in names if name in vars(module)]
 
-        def spell(path: str, name: str) -> str:
+        def spell(path: str, name: Hashable) -> str:
             return f"{path}: global {module.__name__}.{name}"
 
         def read() -> Values:
@@ -364,7 +367,7 @@ def _own_attributes(value: Any) -> Mapping[str, Any]:
         return {}
 
 
-def _picking(keys: tuple[Any, ...]) -> Callable[[Values], tuple[Any, ...]]:
+def _picking(keys: tuple[Hashable, ...]) -> Callable[[Values], tuple[Any, ...]]:
     """Return a function that takes the values of some keys from a table, faster than a loop; it may raise KeyError."""
     if not keys:
         return lambda _table: ()
@@ -426,9 +429,9 @@ def _names_of_bases(cls: type) -> frozenset[str]:
     return frozenset(name for name in names if name.startswith("_")) | _CHANGES_BY_ITSELF
 
 
-def _attribute(path: str, key: Any) -> str:
+def _attribute(path: str, key: Hashable) -> str:
     return f"{path}.{key}"
 
 
-def _item(path: str, key: Any) -> str:
+def _item(path: str, key: Hashable) -> str:
     return f"{path}[{key!r}]"

@@ -1,6 +1,6 @@
 """Notices when Python values change that a recorded step was made from, and names them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from operator import is_
 from typing import Any
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ksim_rl.compiled.python_states import PLAIN
-from ksim_rl.compiled.python_values import ABSENT, Held, held_by
+from ksim_rl.compiled.python_values import ABSENT, Held, Parts, held_by
 
 LONGEST = 60
 """Characters of a value in a text."""
@@ -24,7 +24,7 @@ class Change:
 
     names: tuple[str, ...]
     owner: Any
-    key: Any
+    key: Hashable
     before: Any
     now: Any
 
@@ -56,7 +56,7 @@ class PythonWatch:
         self._device = device
         self._held: list[_Remembered] = []
 
-    def look(self, parts: Mapping[str, Any]) -> None:
+    def look(self, parts: Parts) -> None:
         """Look for all values that the parts depend on now, and remember them."""
         self._held = [_Remembered.of(held) for held in held_by(parts, self._device)]
 
@@ -85,7 +85,7 @@ class _Remembered:
     """Values in one place as they were: by key, and in order. `size` is the length of the table that they are from."""
 
     held: Held
-    before: dict[Any, Any]
+    before: dict[Hashable, Any]
     values: list[Any]
     size: int
 

@@ -5,13 +5,15 @@ which another library may round otherwise. This is the random arithmetic of Vign
 reliable scientific computation" (1993), for torch's operators.
 """
 
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_map_only
+from torch.utils._pytree import PyTree, tree_map_only
+
+from ksim_rl.device.recording import OpArgs, OpKwargs, OpOverload
 
 _NAMES = """
     _softmax acos acosh add addcdiv addcmul addmm addmv asin asinh atan atan2 atanh baddbmm bmm cos cosh cumprod cumsum
@@ -40,7 +42,9 @@ class Nudging(TorchDispatchMode):
         super().__init__()
         self._generator = generator
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, func: OpOverload, types: Sequence[type], args: OpArgs = (), kwargs: OpKwargs | None = None
+    ) -> PyTree:
         result = func(*args, **(kwargs or {}))
         name = func.overloadpacket.__name__
         # `add_` is rounded as `add` is; `_softmax` has its underscore in front.

@@ -7,13 +7,13 @@ numbers that are not finite.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import PyTree
 
 from ksim_rl.compiled.cells import CTYPES, Cells, NotARowError, literal, names_of
-from ksim_rl.device.recording import Operation
+from ksim_rl.device.recording import OpArgs, Operation, OpKwargs, OpOverload
 
 # Operands are a, b, c in the order of the schema, in the type that torch computes in.
 _POINTWISE = {
@@ -164,7 +164,7 @@ def _inner(tensor: Tensor, cells: Cells) -> list[int]:
     return list(tensor.shape)
 
 
-def _fill(out: Tensor, value: Any, cells: Cells) -> None:
+def _fill(out: Tensor, value: PyTree, cells: Cells) -> None:
     if isinstance(value, Tensor):
         raise NotARowError("fill by a tensor")
     shape = _inner(out, cells)
@@ -172,9 +172,7 @@ def _fill(out: Tensor, value: Any, cells: Cells) -> None:
     cells.loop(shape, [f"{cells.at(out, names_of(len(shape)))} = {number};"])
 
 
-def _pointwise(
-    name: str, expression: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
-) -> None:
+def _pointwise(name: str, expression: str, args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
     if kwargs.get("rounding_mode") is not None:
         raise NotARowError("division that rounds")
     operands = list(args)
@@ -232,7 +230,7 @@ def _pointwise(
     cells.loop(shape, body)
 
 
-def _pow(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _pow(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
     base, exponent = args[:2]
     if isinstance(base, Tensor) and isinstance(exponent, (int, float)):
         expression = {2: "a * a", 1: "a", 0.5: "sqrt(a)", 3: "a * a * a", -1: "1 / a"}.get(
@@ -243,7 +241,7 @@ def _pow(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells)
     return _pointwise("", expression, args, kwargs, out, cells)
 
 
-def _dims(function: Any, args: Sequence[Any], kwargs: dict[str, Any], ndim: int) -> tuple[list[int], bool]:
+def _dims(function: OpOverload, args: OpArgs, kwargs: OpKwargs, ndim: int) -> tuple[list[int], bool]:
     given = dict(zip([a.name for a in function._schema.arguments], args, strict=False)) | kwargs
     if given.get("dtype") is not None and given["dtype"] != args[0].dtype and args[0].is_floating_point():
         raise NotARowError("a sum of another type")
@@ -258,7 +256,7 @@ def _dims(function: Any, args: Sequence[Any], kwargs: dict[str, Any], ndim: int)
 
 
 def _reduce(
-    function: Any, name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
+    function: OpOverload, name: str, args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells
 ) -> None:
     source = args[0]
     if source.ndim == 0:
@@ -291,7 +289,7 @@ def _reduce(
     cells.loop([source.shape[k] for k in kept], [body])
 
 
-def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _join(name: str, args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
     tensors = [t for t in args[0] if t.numel() or t.ndim > 1]
     dim = (args[1] if len(args) > 1 else kwargs.get("dim", 0)) % out.ndim
     first = int(bool(cells.rows))
@@ -310,7 +308,7 @@ def _join(name: str, args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, c
         cells.loop(shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"])
 
 
-def _one_index(indices: Sequence[Any]) -> int:
+def _one_index(indices: Sequence[PyTree]) -> int:
     """Return the dim that is indexed; only one may be, by numbers."""
     places = [k for k, index in enumerate(indices) if index is not None]
     if len(places) != 1 or indices[places[0]].dtype != torch.int64:
@@ -323,7 +321,7 @@ def _picked(index: Tensor, names: Sequence[str], size: int, cells: Cells) -> str
     return f"({cell} < 0 ? {cell} + {size} : {cell})"
 
 
-def _index(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _index(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
     source, indices = args[:2]
     dim = _one_index(indices)
     index = indices[dim]
@@ -341,12 +339,12 @@ def _index(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
     cells.loop(shape, [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
 
-def _index_select(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _index_select(args: tuple[Tensor, int, Tensor], kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
     source, dim, index = args
     _index((source, [*[None] * (dim % source.ndim), index]), kwargs, out, cells)
 
 
-def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _index_put(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
     target, indices, values = args[:3]
     if len(args) > 3 and args[3]:
         raise NotARowError("index_put that adds")
@@ -363,7 +361,7 @@ def _index_put(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: 
     cells.loop(shape, [f"{cells.at(out, place)} = {cells.at(values, names)};"])
 
 
-def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _gather(args: tuple[Tensor, int, Tensor], kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
     source, dim, index = args[:3]
     dim = dim % source.ndim
     first = int(bool(cells.rows))
@@ -375,7 +373,7 @@ def _gather(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cel
     cells.loop(_inner(out, cells), [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
 
-def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _cross(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
     dim = kwargs.get("dim", args[2] if len(args) > 2 else -1) % out.ndim - int(bool(cells.rows))
     if dim < 0:
         raise NotARowError("a cross product of rows")
@@ -395,7 +393,7 @@ def _cross(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cell
     cells.loop(shape, body)
 
 
-def _bmm(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _bmm(args: tuple[Tensor, Tensor], kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
     if not cells.rows:
         raise NotARowError("matrices without rows")
     left, right = args
@@ -404,7 +402,12 @@ def _bmm(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells)
     cells.loop(out.shape[1:], [body, f"{cells.at(out, ['i0', 'i1'])} = s;"])
 
 
-def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _draw(
+    args: tuple[Tensor, int, Tensor, int, int, int, int, float, float, int, int],
+    kwargs: OpKwargs,
+    out: Tensor,
+    cells: Cells,
+) -> None:
     seed, stream, counter, _, first_row, n, kind, low, high, start, span = args
     plain = cells.uniform
     if counter.ndim:
@@ -421,7 +424,9 @@ def _draw(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells
     cells.loop([n], [key, body])
 
 
-def _count_non_finite(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, cells: Cells) -> None:
+def _count_non_finite(
+    args: tuple[Tensor, Tensor, Tensor, Tensor, Tensor], kwargs: OpKwargs, out: Tensor, cells: Cells
+) -> None:
     table, term, step, first, count = args
     plain = cells.uniform
     at = f"{plain.at(term, ['i0'])}"
@@ -431,7 +436,7 @@ def _count_non_finite(args: Sequence[Any], kwargs: dict[str, Any], out: Tensor, 
     cells.loop(table.shape[1:], body)
 
 
-_SPECIAL: dict[str, Callable[[Sequence[Any], dict[str, Any], Tensor, Cells], None]] = {
+_SPECIAL: dict[str, Callable[..., None]] = {
     "bmm": _bmm,
     "count_non_finite": _count_non_finite,
     "draw": _draw,

@@ -1,12 +1,12 @@
 """Records CUDA graphs again when Python values have changed that they were recorded from."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 
+from ksim_rl.compiled.python_values import Parts
 from ksim_rl.compiled.python_watch import PythonWatch, listed
 from ksim_rl.device.capture import Captured
 
@@ -20,7 +20,7 @@ class WatchedGraphs:
     `watched` is around each call of one of the graphs, a list that may grow.
     """
 
-    def __init__(self, graphs: Sequence[Captured], parts: Mapping[str, Any], device: torch.device) -> None:
+    def __init__(self, graphs: Sequence[Captured], parts: Parts, device: torch.device) -> None:
         self._graphs = graphs
         self._parts = parts
         self._watch = PythonWatch(device)

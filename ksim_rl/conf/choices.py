@@ -10,8 +10,10 @@ from ksim_rl import algorithms, envs
 from ksim_rl.algorithms.off_policy import FEW_ENVS, MANY_ENVS
 from ksim_rl.algorithms.ppo import DATA
 from ksim_rl.algorithms.registry import serving
+from ksim_rl.checked import Checked
 from ksim_rl.config import upstream
 from ksim_rl.config.config_tree import default_tree, to_tree
+from ksim_rl.config.trees import Tree
 from ksim_rl.envs import Task
 from ksim_rl.modules import ActorCfg, CriticCfg, RecurrentCfg, SharedTrunkCfg
 from ksim_rl.trainers import Algorithm, ModulesCfg, RunCfg, TrainingCfg
@@ -23,7 +25,6 @@ HINTS = get_type_hints(RunCfg)
 DEFAULTS = default_tree(RunCfg)
 # Groups that change with the algorithm; the others belong to the task or the machine.
 OF_AN_ALGORITHM = ("objective", "data", "modules")
-Tree = dict[str, Any]
 
 
 def _recurrent(cfg: RecurrentCfg) -> ModulesCfg:
@@ -31,7 +32,7 @@ def _recurrent(cfg: RecurrentCfg) -> ModulesCfg:
 
 
 # By group and name. The data and networks of an algorithm that are none of these go by its own name.
-CHOICES: dict[str, dict[str, Any]] = {
+CHOICES: dict[str, dict[str, Checked]] = {
     "data": {"on_policy": DATA, "off_policy": MANY_ENVS, "off_policy_small": FEW_ENVS},
     "modules": {
         "mlp": ModulesCfg(),
@@ -78,7 +79,7 @@ def store_choices() -> None:
             upstream.store_config(group, name, partial(to_tree, cfg, HINTS[group]))
 
 
-def _objective(algorithm: Algorithm, chosen: Mapping[str, str]) -> dict[str, Any]:
+def _objective(algorithm: Algorithm, chosen: Mapping[str, str]) -> Tree:
     # An algorithm chooses its data and networks, which the command line may override.
     overrides = [{f"override /{group}@_global_.{group}": name} for group, name in chosen.items()]
     return {"defaults": ["_self_", *overrides], **default_tree(algorithm.cfg, HINTS["objective"])}
@@ -145,7 +146,7 @@ def _of_all(training: TrainingCfg) -> Tree:
     return {key: value for key, value in tree.items() if key not in OF_AN_ALGORITHM}
 
 
-def _changes(tree: Mapping[str, Any], base: Mapping[str, Any]) -> Tree:
+def _changes(tree: Tree, base: Tree) -> Tree:
     """Return the part of a tree in which it differs from another; where classes differ, that is all of it."""
     changes = {}
     for key, value in tree.items():

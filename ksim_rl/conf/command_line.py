@@ -1,10 +1,9 @@
 """Checks and composes a `ksim-rl train` command line as a whole, before anything is built or written."""
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import hydra
 from hydra.core.config_loader import ConfigLoader
@@ -19,6 +18,7 @@ from ksim_rl.checks import check_known
 from ksim_rl.conf import spelling
 from ksim_rl.conf.registration import CHOSEN_BY_TASK, MODULE, NAME, RUN_AGAIN, register, store_run
 from ksim_rl.config.overrides import check_parsed, quoting
+from ksim_rl.config.trees import Tree
 from ksim_rl.trainers import RunCfg
 
 # A sweep over more combinations than this is checked in part here; each job checks its own config again.
@@ -33,7 +33,7 @@ def compose(overrides: Sequence[str] = ()) -> RunCfg:
     return check_command_line(overrides, name=NAME, multirun=False, values=True)[0]
 
 
-def changed(tree: Mapping[str, Any], path: Path, overrides: Sequence[str]) -> RunCfg:
+def changed(tree: Tree, path: Path, overrides: Sequence[str]) -> RunCfg:
     """Return a run's config, the `tree` of its file at `path`, with overrides; a ValueError names a bad one."""
     register()
     store_run(tree, path)
@@ -157,7 +157,7 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
 
 
 @cache
-def _names(name: str, choices: tuple[str, ...], sources: tuple[str, ...]) -> dict[str, Any]:
+def _names(name: str, choices: tuple[str, ...], sources: tuple[str, ...]) -> Tree:
     """Compose the tree that overrides are checked against: choices of groups from sources that stay in a process."""
     # Without overrides of fields, which are checked against this tree.
     tree = OmegaConf.to_container(hydra.compose(name, overrides=list(choices)))

@@ -2,10 +2,9 @@
 
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import yaml
 from hydra.core.config_search_path import ConfigSearchPath
@@ -18,6 +17,7 @@ from omegaconf import OmegaConf
 from ksim_rl import algorithms, envs
 from ksim_rl.conf import choices
 from ksim_rl.config import plain_data, plugins, upstream
+from ksim_rl.config.trees import Tree
 from ksim_rl.files.reading import read_bytes
 from ksim_rl.runs.listing import CONFIG
 from ksim_rl.trainers.run_cfg import check_run_tree, up_to_date, without_env_size
@@ -91,7 +91,7 @@ def register_run(folder: Path, given: Collection[str] = ()) -> None:
     store_run(tree, path)
 
 
-def store_run(tree: Mapping[str, Any], path: Path) -> None:
+def store_run(tree: Tree, path: Path) -> None:
     """Store the config of a run, which `check_run_tree` has seen, as the primary config `RUN_AGAIN`."""
     task = tree.get("task")
     if not isinstance(task, dict) or not isinstance(task.get("scene"), dict):

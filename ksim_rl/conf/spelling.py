@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from ksim_rl import envs
 from ksim_rl.checks import near
 from ksim_rl.conf.choices import DEFAULTS
 from ksim_rl.conf.registration import RUN_CONFIG
+from ksim_rl.config.trees import Plain
 
 GROUPS = ("task", "objective", "data", "modules", "collector", "trainer", "logger")
 
@@ -56,7 +56,7 @@ def of_word(word: str) -> ValueError | None:
     )
 
 
-def _fields(tree: Mapping[str, Any], path: str = "") -> Iterator[str]:
+def _fields(tree: Mapping[str, Plain], path: str = "") -> Iterator[str]:
     for name, value in tree.items():
         yield f"{path}{name}"
         if isinstance(value, Mapping):

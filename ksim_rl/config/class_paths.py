@@ -7,6 +7,7 @@ from typing import Any
 
 from ksim_rl.checks import near
 from ksim_rl.config import plugins
+from ksim_rl.config.trees import Plain
 
 TARGET = "_target_"
 OWN = "ksim_rl"
@@ -48,9 +49,9 @@ def find(
     path: str,
     *,
     kind: str,
-    accepts: Callable[[Any], bool],
+    accepts: Callable[[type], bool],
     besides: frozenset[str] = frozenset(),
-) -> Any:
+) -> type:
     """Import the class that a `_target_` names, if its package is ours, a plug-in's or one of `besides`.
 
     A ValueError, with the near names, refuses other packages, and a class that is not there or that `accepts` declines.
@@ -110,7 +111,7 @@ def _modules(name: str) -> list[str]:
     return list(dict.fromkeys([name, *(".".join(parts[:end]) for end in range(len(parts), 1, -1))]))
 
 
-def foreign(tree: Any) -> Iterator[str]:
+def foreign(tree: Plain) -> Iterator[str]:
     """Yield the `_target_`s in a tree that are neither ours nor TorchRL's."""
     if isinstance(tree, dict) and str(tree.get(TARGET, OWN)).split(".")[0] not in (OWN, "torchrl"):
         yield str(tree[TARGET])
@@ -118,7 +119,7 @@ def foreign(tree: Any) -> Iterator[str]:
         yield from foreign(entry)
 
 
-def loading_notes(tree: Any) -> list[str]:
+def loading_notes(tree: Plain) -> list[str]:
     """Return one line for each foreign package of a tree whose classes a later command does not find by itself."""
     notes: dict[str, str] = {}
     # Plug-ins that are declared or named are found by any later command.

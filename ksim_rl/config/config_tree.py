@@ -17,9 +17,11 @@ from typing import Any, Literal, Self, TypeVar, Union
 
 from tensordict import NestedKey
 
+from ksim_rl.checked import Annotation
 from ksim_rl.checks import check_choice, near
 from ksim_rl.config import class_paths
 from ksim_rl.config.class_paths import TARGET
+from ksim_rl.config.trees import Plain, Tree
 
 Config = TypeVar("Config")
 
@@ -28,23 +30,23 @@ class OwnTree(ABC):
     """Base of configs that are no dataclasses, and write and read their own trees."""
 
     @abstractmethod
-    def to_tree(self) -> dict[str, Any]:
+    def to_tree(self) -> Tree:
         """Return the plain tree, with its `_target_`."""
 
     @classmethod
     @abstractmethod
-    def from_tree(cls, tree: Any, path: str) -> Self:
+    def from_tree(cls, tree: Plain, path: str) -> Self:
         """Build the config that stands at `path`; a ValueError names the full path of a wrong entry."""
 
 
-def to_tree(value: Any, annotation: Any = None) -> Any:
+def to_tree(value: Any, annotation: Annotation = None) -> Any:
     """Return the plain tree of a dataclass, mapping, sequence or scalar."""
     if isinstance(value, OwnTree):
         return value.to_tree()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         # Resolved, since annotations may be texts.
         hints = typing.get_type_hints(type(value))
-        tree: dict[str, Any] = {}
+        tree: Tree = {}
         # The class is named only where the annotation does not say it: configs stay short.
         if type(value) is not _default_class(annotation):
             tree[TARGET] = class_paths.public_path(type(value))
@@ -60,7 +62,7 @@ def to_tree(value: Any, annotation: Any = None) -> Any:
     return value
 
 
-def default_tree(cls: type, annotation: Any = None) -> dict[str, Any]:
+def default_tree(cls: type, annotation: Annotation = None) -> Tree:
     """Return the plain tree of a dataclass's defaults, with Hydra's "???" for fields that have none."""
     hints = typing.get_type_hints(cls)
     tree = {}
@@ -77,12 +79,12 @@ def default_tree(cls: type, annotation: Any = None) -> dict[str, Any]:
     return tree
 
 
-def from_tree(annotation: type[Config], tree: Any, path: str = "") -> Config:
+def from_tree(annotation: type[Config], tree: Plain, path: str = "") -> Config:
     """Build the dataclass that a tree describes; `path` precedes the fields in errors, which name the valid values."""
     return build_value(annotation, tree, path)
 
 
-def build_value(annotation: Any, value: Any, path: str) -> Any:
+def build_value(annotation: Annotation, value: Plain, path: str) -> Any:
     """Build the value that an annotation describes from a tree, as `from_tree` does; `Any` takes it as it is."""
     if annotation is Any:
         return value
@@ -116,7 +118,7 @@ _SCALARS = (bool, int, float, str, NestedKey)
 _MAPPINGS = (collections.abc.Mapping, dict)
 
 
-def _match(option: Any, value: Any, path: str) -> Any:
+def _match(option: Annotation, value: Plain, path: str) -> Any:
     origin = typing.get_origin(option)
     arguments = typing.get_args(option)
     if origin is Literal:
@@ -170,7 +172,7 @@ def _build_nested_key(value: Any, path: str) -> NestedKey:
     raise ValueError(f"{path}={value!r}: expected a key, or a list of the parts of a nested key")
 
 
-def _build_key(annotation: Any, key: object, path: str) -> Any:
+def _build_key(annotation: Annotation, key: object, path: str) -> str | int:
     # YAML and Hydra give keys as text or as numbers.
     kinds = typing.get_args(annotation) or (annotation,)
     if int not in kinds:
@@ -183,8 +185,8 @@ def _build_key(annotation: Any, key: object, path: str) -> Any:
         raise ValueError(f"{path}: key {key!r}: expected a whole number") from None
 
 
-def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> Any:
-    cls: Any
+def _build_dataclass(classes: list[type], tree: Tree, path: str) -> Any:
+    cls: type
     # A class of a package that may be built, and of the kind that the field asks for.
     if TARGET in tree:
         cls = class_paths.find(tree[TARGET], path, kind="dataclass", accepts=dataclasses.is_dataclass)
@@ -220,18 +222,18 @@ def _build_dataclass(classes: list[Any], tree: Mapping[str, Any], path: str) -> 
         raise ValueError(_join(path, error)) from None
 
 
-def _alternatives(annotation: Any) -> list[Any]:
+def _alternatives(annotation: Annotation) -> list[Annotation]:
     if typing.get_origin(annotation) in (Union, types.UnionType):
         return list(typing.get_args(annotation))
     return [annotation]
 
 
-def _default_class(annotation: Any) -> Any:
+def _default_class(annotation: Annotation) -> Any:
     """Return the dataclass that a tree without `_target_` means: the first that the annotation names."""
     return next((option for option in _alternatives(annotation) if dataclasses.is_dataclass(option)), None)
 
 
-def _describe(annotation: Any) -> str:
+def _describe(annotation: Annotation) -> str:
     origin = typing.get_origin(annotation)
     arguments = typing.get_args(annotation)
     if origin in (Union, types.UnionType):

@@ -12,12 +12,13 @@ from omegaconf import OmegaConf
 
 from ksim_rl.checks import near
 from ksim_rl.config.class_paths import TARGET
+from ksim_rl.config.trees import Plain, Tree
 
 # Letters that a value of one word may hold without quotes.
 UNQUOTED = frozenset(string.ascii_letters + string.digits + "_/.:+-%*@?")
 
 
-def check_overrides(tree: Mapping[str, Any], overrides: Sequence[str]) -> None:
+def check_overrides(tree: Tree, overrides: Sequence[str]) -> None:
     """Refuse overrides that do not parse, or change a field which the tree does not have, with the near names there."""
     parsed = []
     for text in overrides:
@@ -43,7 +44,7 @@ def quoting(text: str) -> str:
     return f"; a name or text with such signs is quoted, for the shell too: '{field}=\"{escaped}\"'"
 
 
-def check_parsed(tree: Mapping[str, Any], overrides: Iterable[Override]) -> None:
+def check_parsed(tree: Tree, overrides: Iterable[Override]) -> None:
     """Do the same with parsed overrides: each sees fields that the ones before it have added and dropped."""
     # A copy, since later overrides are checked against added and dropped fields.
     tree = copy.deepcopy(dict(tree))
@@ -64,13 +65,13 @@ def check_parsed(tree: Mapping[str, Any], overrides: Iterable[Override]) -> None
             _node(tree, key.split("."), make=True).update(value)
 
 
-def _plain(override: Override) -> Any:
+def _plain(override: Override) -> Plain:
     # Through OmegaConf, which reads the value as it will later.
     tree: Any = OmegaConf.to_container(OmegaConf.create({"value": override.value()}))
     return tree["value"]
 
 
-def _node(tree: dict[str, Any], path: Sequence[str], *, make: bool = False) -> dict[str, Any]:
+def _node(tree: Tree, path: Sequence[str], *, make: bool = False) -> Tree:
     """Return the mapping at a path, or an empty one where there is none: made in the tree with `make`."""
     for name in path:
         inside = tree.get(name)
@@ -82,9 +83,9 @@ def _node(tree: dict[str, Any], path: Sequence[str], *, make: bool = False) -> d
     return tree
 
 
-def check_key(tree: Mapping[str, Any], key: str) -> None:
+def check_key(tree: Tree, key: str) -> None:
     """Refuse a dotted key that the tree does not have; the error names the near keys."""
-    level: Any = tree
+    level: Plain = tree
     parts = key.split(".")
     for depth, part in enumerate(parts):
         if isinstance(level, Mapping) and part in level:

@@ -2,12 +2,13 @@
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from ksim_rl.config.trees import Plain, Tree
 from ksim_rl.config.upstream import yaml_resolvers
 from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
 from ksim_rl.files.writing import check_name, check_own
@@ -27,7 +28,7 @@ class _Loader(_FastLoader):
 
     yaml_implicit_resolvers = yaml_resolvers()
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Plain]:
         """Refuse keys that are there twice, of which one would win in silence."""
         # By their written form, as 1 and "1" are different keys.
         seen: set[str] = set()
@@ -41,7 +42,7 @@ class _Loader(_FastLoader):
         return super().construct_mapping(node, deep)
 
 
-def read_yaml(path: Path) -> Any:
+def read_yaml(path: Path) -> Tree:
     """Return the tree of a YAML file that holds scalars, lists and mappings, and no anchors, tags or interpolations."""
     try:
         text = read_bytes(path, limit=MOST_CONFIG_BYTES).decode()
@@ -89,7 +90,7 @@ def check_plain(tree: Any, where: str) -> None:
         raise ValueError(f"{where}={tree[:80]!r}: an interpolation, and a run's config holds values only")
 
 
-def check_references(tree: Any, where: str) -> None:
+def check_references(tree: Plain, where: str) -> None:
     """Refuse interpolations that do more than name another field of the config, such as `${num_envs}`."""
     # What is left after taking off plain references must be plain.
     check_plain(_without_references(tree), where)
@@ -106,7 +107,7 @@ def _without_references(tree: Any) -> Any:
     return tree
 
 
-def flat(tree: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def flat(tree: Mapping[str, Plain], path: str = "") -> Iterator[tuple[str, Plain]]:
     """Yield the values of a tree by dotted path; of mappings with entries the entries."""
     for key, value in tree.items():
         # An empty mapping is a value, too.

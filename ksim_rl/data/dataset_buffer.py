@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Int64
@@ -17,7 +16,7 @@ from ksim_rl import dims
 from ksim_rl.checked import Checked, Count, WholeNumber
 from ksim_rl.checks import check_count
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
-from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SequenceSampler
+from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SampleInfo, SequenceSampler
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +168,9 @@ class DatasetBuffer(ReplayBuffer):
             self.sampler.begin(data.batch_size, batch_size=self.cfg.num_env_states_per_minibatch)
         return super().extend(data, update_priority=update_priority)
 
-    def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
+    def sample(
+        self, batch_size: int | None = None, return_info: bool = False
+    ) -> TensorDictBase | tuple[TensorDictBase, SampleInfo]:
         """Return the next minibatch `["B"]` of the present epoch, with the info dict if `return_info`.
 
         With a `SequenceSampler` it is `["B","T"]`: whole sequences, which begin with their burn-in if there is one.
@@ -200,7 +201,7 @@ class DatasetBuffer(ReplayBuffer):
         return dims.name(self._dataset.get(slice(None)), dims.D)
 
 
-def _labelled(data: TensorDictBase, info: dict[Any, Any]) -> TensorDictBase:
+def _labelled(data: TensorDictBase, info: SampleInfo) -> TensorDictBase:
     """Name the dims of a sample `["B"]` or `["B","T"]`, and write into it the burn-in flags of its sampler."""
     if BURN_IN_KEY in info:
         data.set(BURN_IN_KEY, info[BURN_IN_KEY])

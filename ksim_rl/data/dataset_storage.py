@@ -1,29 +1,32 @@
 """Stores one dataset in place, and lets no non-finite number in."""
 
 from collections.abc import Iterable
+from os import PathLike
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Int64
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data.replay_buffers import Writer
 from torchrl.data.replay_buffers.storages import TensorStorage
 
 from ksim_rl import dims
+from ksim_rl.device.state_tree import State
 
 
 class Stateless:
     """The part of TorchRL writers and samplers that have no state: all that they know is in the storage."""
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Return nothing."""
         return {}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: State) -> None:
         """Read nothing."""
 
-    def dumps(self, path: Any) -> None:
+    def dumps(self, path: str | PathLike[str]) -> None:
         """Write nothing, as `loads` reads nothing."""
 
     loads = dumps
@@ -65,7 +68,7 @@ class DatasetStorage(TensorStorage):
                 f"{tuple(data.batch_size)}"
             )
         # The mask is kept apart: it is computed below, from the data's own and from the finite rows.
-        leaves: dict[Any, Tensor] = dict(data.items(include_nested=True, leaves_only=True))
+        leaves: dict[NestedKey, Tensor] = dict(data.items(include_nested=True, leaves_only=True))
         mask = leaves.pop(MASK_KEY, None)
         if not self.initialized:
             self._allocate(data.exclude(MASK_KEY))
@@ -87,11 +90,11 @@ class DatasetStorage(TensorStorage):
         self._bump_mutation_revision()
         return torch.arange(self.max_size, device=self.device)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Return the content and the counter of removed rows."""
         return super().state_dict() | {"non_finite_count": self.non_finite_count.clone()}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: State) -> None:
         """Continue where `state_dict` was taken."""
         super().load_state_dict(state_dict)
         # The counter follows the content, whose device is known now.
@@ -110,8 +113,8 @@ class DatasetStorage(TensorStorage):
         self._storage = dims.name(content, dims.D)
         self.initialized = True
 
-    def _stored_leaves(self, leaves: dict[Any, Tensor], batch_dims: int) -> dict[Any, Tensor]:
-        stored: dict[Any, Tensor] = dict(self._storage.items(include_nested=True, leaves_only=True))
+    def _stored_leaves(self, leaves: dict[NestedKey, Tensor], batch_dims: int) -> dict[NestedKey, Tensor]:
+        stored: dict[NestedKey, Tensor] = dict(self._storage.items(include_nested=True, leaves_only=True))
         del stored[MASK_KEY]
         if stored.keys() != leaves.keys():
             missing = list(stored.keys() - leaves.keys())
@@ -131,16 +134,16 @@ class DatasetStorage(TensorStorage):
 class DatasetWriter(Stateless, Writer):
     """Hands data to the `write` of its storage, which takes a whole dataset or rollout."""
 
-    _storage: Any
+    _storage: DatasetStorage
     refusal: ClassVar[str] = (
         "a dataset is written as a whole: use extend() with all its env states instead of add()"
     )
 
-    def add(self, data: Any) -> int:
+    def add(self, data: TensorDictBase) -> int:
         """Refuse single elements."""
         raise ValueError(self.refusal)
 
-    def extend(self, data: Any) -> Int64[Tensor, " N"]:
+    def extend(self, data: TensorDictBase) -> Int64[Tensor, " N"]:
         """Write, and return the indices of the env states written."""
         if not isinstance(data, TensorDictBase):
             raise ValueError(f"extend() got {type(data).__name__}: expected a TensorDict, e.g. a rollout")

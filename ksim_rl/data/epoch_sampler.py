@@ -2,22 +2,30 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Int64, Shaped
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data.replay_buffers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl.data.dataset_storage import MASK_KEY
 from ksim_rl.device import random
+from ksim_rl.device.state_tree import State
 from ksim_rl.files.reading import read_bytes
 from ksim_rl.files.writing import write_whole
 
 _STREAM = random.stream_id("data.epoch_sampler")
 
 MOST_STATE_BYTES = 10_000
+
+
+# Which entries of a storage are meant: their numbers, or one tensor of numbers per dim.
+Entries: TypeAlias = Int64[Tensor, "*entries"] | tuple[Int64[Tensor, "*?entries"], ...] | int
+# What a sampler tells about a sample, by key.
+SampleInfo: TypeAlias = dict[NestedKey, Shaped[Tensor, "*?leaf"]]
 
 
 class EpochSampler(Sampler):
@@ -61,7 +69,7 @@ class EpochSampler(Sampler):
         if self._epoch is not None:
             self._epoch.zero_()
 
-    def extend(self, index: Any) -> None:
+    def extend(self, index: Entries) -> None:
         """Start a new epoch, because the data is new."""
         self.restart()
 
@@ -70,7 +78,7 @@ class EpochSampler(Sampler):
         self._position = 0
         self.ran_out = False
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Entries, SampleInfo]:
         """Return the indices of the next minibatch [B] and an empty info dict."""
         size = stored(storage)
         if self.drop_last and batch_size > size:
@@ -139,7 +147,7 @@ class EpochSampler(Sampler):
             epoch = int(self._epoch)
         return {"seed": self.seed, "epoch": epoch, "size": self._size, "position": self._position}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: State) -> None:
         """Continue where `state_dict` was taken."""
         self.seed = int(state_dict["seed"])
         self._first_epoch = int(state_dict["epoch"])
@@ -232,7 +240,7 @@ class SequenceSampler(EpochSampler):
             self.rollout_length, self.sequence_length, batch_size=batch_size, burn_in=self.burn_in
         )
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Entries, SampleInfo]:
         """Return the indices [S, k + L] of the next minibatch, and the info dict, which is empty without burn-in."""
         size = stored(storage)
         if storage.ndim > 1:
@@ -255,7 +263,7 @@ class SequenceSampler(EpochSampler):
         rollout_S1 = (sequence_S * length // steps)[:, None]
         # Before the first step there is nothing to read: it stands there instead, and is masked.
         clamped_ST = step_ST.clamp_min(0)
-        index: Any = rollout_S1 * steps + clamped_ST
+        index: Entries = rollout_S1 * steps + clamped_ST
         if storage.ndim > 1:
             # A storage of two dims is indexed by step and env.
             index = (clamped_ST, rollout_S1.expand_as(clamped_ST))

@@ -16,8 +16,9 @@ from ksim_rl import dims, ranks
 from ksim_rl.checked import Checked, Count, NonNegative, Share
 from ksim_rl.checks import check_count, check_in_range
 from ksim_rl.data.dataset_storage import Stateless
-from ksim_rl.data.epoch_sampler import stored
+from ksim_rl.data.epoch_sampler import Entries, SampleInfo, stored
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter, SavedByStateDict
+from ksim_rl.device.state_tree import State
 
 
 class ReplaySampler(Stateless, Sampler):
@@ -36,7 +37,7 @@ class ReplaySampler(Stateless, Sampler):
         self.shards = shards
         self.minibatch = minibatch
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Entries, SampleInfo]:
         """Return indices [B] and an empty info dict."""
         assert isinstance(storage, ReplayStorage)
         # All tries are drawn together: to draw again where a place is empty would need the host.
@@ -97,7 +98,7 @@ class PrioritySampler(SavedByStateDict, Sampler):
         self._highest = torch.zeros((), device=device)
 
     @torch.no_grad()
-    def extend(self, index: Any, **_: Any) -> None:
+    def extend(self, index: Entries, **_: Any) -> None:
         """Give new entries the default priority."""
         default = self._default()
         index_N = torch.as_tensor(index, device=self._priority_N.device).reshape(-1)
@@ -108,7 +109,7 @@ class PrioritySampler(SavedByStateDict, Sampler):
     @torch.no_grad()
     def update_priority(
         self,
-        index: Any,
+        index: Entries,
         priority: float | Shaped[Tensor, "#*batch"],
         *,
         storage: Storage | None = None,
@@ -130,7 +131,7 @@ class PrioritySampler(SavedByStateDict, Sampler):
         self._priority_N.scatter_reduce_(0, index_B, priority_B, "amax", include_self=False)
 
     @torch.no_grad()
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict]:
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Entries, SampleInfo]:
         """Return indices [B] and their weights."""
         if getattr(storage, "ndim", 1) > 1:
             raise ValueError(
@@ -160,12 +161,12 @@ class PrioritySampler(SavedByStateDict, Sampler):
         weight_B = (score_N[index_B] / lowest).pow(-self.beta).clamp_max(1.0).to(torch.float32)
         return index_B, {"priority_weight": weight_B}
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Return the priorities."""
         return {"priority": self._priority_N, "highest": self._highest}
 
     @torch.no_grad()
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: State) -> None:
         """Continue where `state_dict` was taken; tensors keep their addresses."""
         self._priority_N.copy_(state_dict["priority"])
         self._highest.copy_(state_dict["highest"])
@@ -241,7 +242,7 @@ class ReplayRing(ReplayBuffer):
 
     def __init__(self, cfg: ReplayCfg, **of_storage: Any) -> None:
         self._ring = ReplayStorage(capacity=cfg.capacity, n_step=cfg.n_step, **of_storage)
-        sampler: Any = ReplaySampler(shards=cfg.shards, minibatch=cfg.num_env_states_per_minibatch)
+        sampler: Sampler = ReplaySampler(shards=cfg.shards, minibatch=cfg.num_env_states_per_minibatch)
         if cfg.prioritized:
             exponents = {"alpha": cfg.priority_alpha, "beta": cfg.priority_beta}
             sampler = PrioritySampler(self._ring.max_size, device=self._ring.device, **exponents)
@@ -285,13 +286,13 @@ class ReplayRing(ReplayBuffer):
             minibatch_B = read(index_B).set("index", index_B)
             yield minibatch_B.set("priority_weight", info["priority_weight"][:, None])
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Return the ring, and the priorities where there are any; without `save_replay` nothing."""
         if not self.cfg.save_replay:
             return {}
         return {"ring": self._ring.state_dict(), "sampler": self.sampler.state_dict()}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: State) -> None:
         """Continue where `state_dict` was taken; an empty one empties the ring."""
         if not state_dict:
             self.empty()

@@ -1,5 +1,6 @@
 """Keeps the last env states of each env in a ring, which stores each observation once."""
 
+from os import PathLike
 from typing import Any
 
 import torch
@@ -11,7 +12,8 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl import dims
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetWriter
-from ksim_rl.device.state_tree import copy_into
+from ksim_rl.data.epoch_sampler import Entries
+from ksim_rl.device.state_tree import State, copy_into
 
 REWARD: NestedKey = ("next", "reward")
 DONE: NestedKey = ("next", "done")
@@ -23,7 +25,7 @@ _LEAVES = (REWARD, DONE, TERMINATED)
 class SavedByStateDict:
     """The part of TorchRL storages and samplers that are saved by their `state_dict` alone, as checkpoints do."""
 
-    def dumps(self, path: Any) -> None:
+    def dumps(self, path: str | PathLike[str]) -> None:
         """Refuse, as does `loads`."""
         raise NotImplementedError(
             f"a {type(self).__name__} is saved by its state_dict() and restored by load_state_dict()"
@@ -130,7 +132,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         return index_N
 
     @torch.no_grad()
-    def get(self, index: Any) -> TensorDict:
+    def get(self, index: Entries) -> TensorDict:
         """Return env states with their successors, `["B"]`, for their indices int64 [B]."""
         if self.content is None:
             raise RuntimeError("the replay is empty: extend it before sampling")
@@ -152,7 +154,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         sample.set(MASK_KEY, self.available[index_B][:, None])
         return dims.name(sample, dims.B)
 
-    def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
+    def set(self, cursor: Entries, data: TensorDictBase, *, set_cursor: bool = True) -> None:
         """Refuse: a ring is written by whole rollouts."""
         raise ValueError(ReplayWriter.refusal)
 
@@ -160,11 +162,11 @@ class ReplayStorage(SavedByStateDict, Storage):
         """Return the number of places; those that hold no env state are masked."""
         return 0 if self.content is None else self.max_size
 
-    def contains(self, item: Any) -> bool:
+    def contains(self, item: Entries) -> bool:
         """Return whether an index holds an env state; reads the device."""
         return bool(self.available[item].all())
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Return the ring and where its newest places are."""
         return {
             "content": {} if self.content is None else self.content.flatten_keys("/").to_dict(),
@@ -175,7 +177,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         }
 
     @torch.no_grad()
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: State) -> None:
         """Continue where `state_dict` was taken, with as many envs and places; tensors keep their addresses."""
         if state_dict["available"].shape != self.available.shape:
             raise ValueError(
@@ -272,5 +274,5 @@ class ReplayWriter(DatasetWriter):
     refusal = "a replay is written by rollouts: use extend() with one of batch_size [E, T]"
 
 
-def _next(key: NestedKey) -> Any:
+def _next(key: NestedKey) -> NestedKey:
     return unravel_key(("next", key))

@@ -10,11 +10,10 @@ first line of a burst to stderr; a program with its own display sets another:
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
 
 import torch
 import warp as wp
@@ -106,7 +105,7 @@ def loaded_together(device: torch.device) -> Iterator[None]:
     """
     found: dict[tuple[wp.Kernel, int | None], None] = {}
 
-    def note(kernel: wp.Kernel, dim: Any, block_dim: int | None) -> None:
+    def note(kernel: wp.Kernel, dim: int | Sequence[int], block_dim: int | None) -> None:
         # A dim may be a single number.
         if isinstance(dim, (tuple, list)):
             size = dim

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
 from importlib.resources import files
 from inspect import signature
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from weakref import WeakSet
 
 import torch
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from ksim_rl.device.native_kernel import NativeKernel
 
+R = TypeVar("R")
 ADDRESS = "uint64"
 """The type of a tensor's address among arguments, as wrapping a tensor takes longer than the launch."""
 
@@ -107,12 +108,12 @@ def has_warp() -> bool:
 
 def as_operator(
     name: str,
-    launch: Callable[..., Any],
-    fake: Callable[..., Any],
+    launch: Callable[..., R],
+    fake: Callable[..., R],
     *,
     mutates: Sequence[str] = (),
-    in_torch: Callable[..., Any] | None = None,
-) -> Callable[..., Any]:
+    in_torch: Callable[..., R] | None = None,
+) -> Callable[..., R]:
     """Return `launch` as a function that is a torch operator where code is traced.
 
     Eager code goes past torch's dispatcher, which takes longer than the launch. `fake` returns an empty result for the
@@ -130,17 +131,17 @@ def as_operator(
     operator = torch.library.custom_op(f"ksim_rl::{name}", chosen, mutates_args=mutates)
     operator.register_fake(fake)
 
-    def run(*arguments: object) -> Any:
+    def run(*arguments: object) -> R:
         is_traced = torch.compiler.is_compiling() or recording.is_recording()
         return (operator if is_traced else chosen)(*arguments)
 
     return run
 
 
-def _by_kernel_or_torch(launch: Callable[..., Any], in_torch: Callable[..., Any]) -> Callable[..., Any]:
+def _by_kernel_or_torch(launch: Callable[..., R], in_torch: Callable[..., R]) -> Callable[..., R]:
     # It keeps the signature of `launch`, which torch reads.
     @wraps(launch)
-    def run(*arguments: Any) -> Any:
+    def run(*arguments: Any) -> R:
         work = launch if has_warp() else in_torch
         return work(*arguments)
 

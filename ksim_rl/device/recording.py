@@ -2,21 +2,25 @@
 
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 from jaxtyping import Shaped
 from torch import Tensor
+from torch._ops import OpOverload as OpOverload
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import PyTree, tree_leaves
 
 _HOST_READS = frozenset({"_local_scalar_dense", "equal", "item", "masked_select", "nonzero"})
 # On the CPU these never reach the dispatcher.
 _HOST_METHODS = frozenset({Tensor.numpy, Tensor.tolist, Tensor.__array__, Tensor.__dlpack__})
+# What torch's operators are called with; what they return is a tree, too.
+OpArgs: TypeAlias = tuple[PyTree, ...]
+OpKwargs: TypeAlias = dict[str, PyTree]
 _INTERNAL = ("/torch/", "/tensordict/", "/contextlib.py", __file__)
 
 
@@ -56,9 +60,9 @@ def launched(launch: Callable[[], None]) -> bool:
 class Operation:
     """One call of an operator, the tensors that it made, and those that it wrote."""
 
-    function: Any
-    args: tuple[Any, ...]
-    kwargs: dict[str, Any]
+    function: OpOverload
+    args: OpArgs
+    kwargs: OpKwargs
     made: list[Tensor]
     written: list[Tensor]
 
@@ -82,7 +86,7 @@ class Operation:
                 old.copy_(new)
 
 
-def _tensors(tree: Any) -> list[Tensor]:
+def _tensors(tree: PyTree) -> list[Tensor]:
     return [leaf for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
 
 
@@ -104,7 +108,9 @@ class Recorder(TorchDispatchMode):
         finally:
             _recording.recorder = self
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, func: OpOverload, types: Sequence[type], args: OpArgs = (), kwargs: OpKwargs | None = None
+    ) -> PyTree:
         kwargs = kwargs or {}
         # A number that Python reads would be a constant in the recording.
         if func.overloadpacket.__name__ in _HOST_READS:
@@ -128,7 +134,13 @@ class Recorder(TorchDispatchMode):
 class _HostMethods(TorchFunctionMode):
     """Refuses methods of tensors by which Python reads numbers, which would become constants of the recording."""
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_function__(
+        self,
+        func: Callable[..., PyTree],
+        types: Sequence[type],
+        args: OpArgs = (),
+        kwargs: OpKwargs | None = None,
+    ) -> PyTree:
         # Methods that bypass the dispatcher are seen here alone.
         if func in _HOST_METHODS and is_recording():
             raise RuntimeError(f"{func.__name__} reads the device on the host, at {_place()}")
@@ -144,7 +156,7 @@ def _place() -> str:
     return f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
 
 
-def written_by(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Shaped[Tensor, "*?shape"]]:
+def written_by(func: OpOverload, args: OpArgs, kwargs: OpKwargs) -> list[Shaped[Tensor, "*?shape"]]:
     """Return the tensors among the arguments of an operator that it writes."""
     written: list[Tensor] = []
     # The schema of an operator says which arguments it writes.

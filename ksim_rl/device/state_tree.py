@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
+from torch.utils._pytree import PyTree
 
 State = dict[str, Any]
 
@@ -18,7 +19,7 @@ def split(state: Mapping[str, Any]) -> tuple[dict[str, Shaped[Tensor, "*?leaf"]]
     tensors: dict[str, Tensor] = {}
     values: dict[str, Any] = {}
 
-    def visit(path: str, node: Any) -> None:
+    def visit(path: str, node: PyTree) -> None:
         # Keys may contain the separator.
         if isinstance(node, Mapping) and node:
             for key, child in node.items():
@@ -81,13 +82,13 @@ def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: Mapping[str, 
             tensor.copy_(saved[name])
 
 
-def _describe(value: Any) -> str:
+def _describe(value: PyTree) -> str:
     if isinstance(value, Tensor):
         return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
     return type(value).__name__
 
 
-def _is_plain(node: Any) -> bool:
+def _is_plain(node: PyTree) -> bool:
     if isinstance(node, (list, tuple)):
         return all(_is_plain(item) for item in node)
     return node is None or isinstance(node, (bool, int, float, str))

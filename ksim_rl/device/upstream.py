@@ -9,7 +9,7 @@ import functools
 import itertools
 import re
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -119,7 +119,9 @@ _diversion = threading.Lock()
 
 
 @contextmanager
-def launches_diverted(instead: Callable[[wp.Kernel, Any, int | None], None]) -> Iterator[None]:
+def launches_diverted(
+    instead: Callable[[wp.Kernel, int | Sequence[int], int | None], None],
+) -> Iterator[None]:
     """Call `instead(kernel, dim, block_dim)` for each launch that this thread issues in this block.
 
     Loops of Warp go through their body once. Warp can only load modules that it is given, and which kernels a library
@@ -127,13 +129,15 @@ def launches_diverted(instead: Callable[[wp.Kernel, Any, int | None], None]) -> 
     """
     thread = threading.get_ident()
 
-    def note(kernel: wp.Kernel, dim: Any, *args: Any, **kwargs: Any) -> None:
+    def note(kernel: wp.Kernel, dim: int | Sequence[int], *args: Any, **kwargs: Any) -> None:
         instead(kernel, dim, kwargs.get("block_dim"))
 
-    def loop_once(condition: Any, while_body: Any, *args: Any, **kwargs: Any) -> None:
+    def loop_once(condition: wp.array, while_body: Callable[..., None], *args: Any, **kwargs: Any) -> None:
         while_body(**kwargs)
 
-    def for_this_thread(original: Callable[..., Any], replacement: Callable[..., None]) -> Callable[..., Any]:
+    def for_this_thread(
+        original: Callable[..., None], replacement: Callable[..., None]
+    ) -> Callable[..., None]:
         # Other threads go on launching.
         return lambda *args, **kwargs: (replacement if threading.get_ident() == thread else original)(
             *args, **kwargs

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ksim_rl.config import plain_data
+from ksim_rl.config.trees import Tree
 from ksim_rl.runs.csv_table import read_table
 from ksim_rl.runs.listing import CONFIG, METRICS
 
@@ -22,7 +23,7 @@ class Curves:
     """The logged metrics of a run, each a column with None where a row has no such metric, and its config as a tree."""
 
     columns: Mapping[str, Sequence[float | None]]
-    config: Mapping[str, Any] = field(default_factory=dict)
+    config: Tree = field(default_factory=dict)
 
     @property
     def num_rows(self) -> int:

@@ -11,10 +11,11 @@ from omegaconf import OmegaConf
 
 from ksim_rl.config import upstream
 from ksim_rl.config.overrides import check_overrides
+from ksim_rl.config.trees import Tree
 
 _CONFIG = "ksim_rl_env"
 
-MakeTree = Callable[[str], dict[str, Any]]
+MakeTree = Callable[[str], Tree]
 
 
 @cache

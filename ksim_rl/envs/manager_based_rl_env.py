@@ -16,7 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ksim_rl import dims
-from ksim_rl.device.state_tree import copy_into
+from ksim_rl.device.state_tree import State, copy_into
 from ksim_rl.device.streams import checked_device
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeClock, EpisodeSums, Pictures, SimulatedWorld
 from ksim_rl.envs.drawing import Drawing, draw, drawings
@@ -349,15 +349,13 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             for end, value in zip(("low", "high"), pair_2.unbind(), strict=True)
         }
 
-    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+    def state_dict(self, *args: Any, **kwargs: Any) -> State:
         """Return all that the env needs to continue bit-exactly: physics, clocks, commands, counters, buffers."""
         state = {f"world.{name}": value for name, value in self.world.state_dict().items()}
         state |= {f"env.{name}": tensor.clone() for name, tensor in self._buffers_to_save().items()}
         return state
 
-    def load_state_dict(
-        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
-    ) -> None:
+    def load_state_dict(self, state_dict: State, strict: bool = True, assign: bool = False) -> None:
         """Continue from a `state_dict`; a ValueError says how the state of another env differs.
 
         Without `strict`, entries that are missing stay as they are, and unknown ones are left out.

@@ -3,7 +3,7 @@
 import copy
 import functools
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from tensordict import TensorDict
@@ -12,6 +12,7 @@ from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
+from ksim_rl.device.state_tree import State
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.transforms.row_transform import seed_transforms
 
@@ -82,7 +83,7 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
             for key, value in part.items()
         )
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> None:
+    def load_state_dict(self, state_dict: State, strict: bool = True, **kwargs: Any) -> None:
         """Load a `state_dict` of this env; a KeyError names an entry that belongs to no part of the env."""
         parts: dict[str, OrderedDict[str, Any]] = {p: OrderedDict() for p in (_BASE, _TRANSFORM, _ROOT)}
         for key, value in state_dict.items():

@@ -9,7 +9,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
 from ksim_rl.compiled.python_states import PLAIN
-from ksim_rl.compiled.python_values import Listed, attributes_of
+from ksim_rl.compiled.python_values import Listed, Part, attributes_of
 from ksim_rl.compiled.python_watch import Change
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
@@ -42,14 +42,14 @@ _READ_ONCE: tuple[tuple[type, frozenset[str], str], ...] = (
 )
 
 
-def python_parts(env: EnvBase) -> dict[str, Any]:
+def python_parts(env: EnvBase) -> dict[str, Part]:
     """Return the objects whose Python a step of the env runs: wrappers, transforms, terms and their managers.
 
     Terms have the names of the config, `rewards.alive`, and transforms the number of their place, the outermost first.
     """
-    parts: dict[str, Any] = {}
+    parts: dict[str, Part] = {}
     transforms: list[Transform] = []
-    inner: Any = env
+    inner: EnvBase = env
     # From the outermost wrapper inwards.
     while isinstance(inner, TransformedEnv):
         parts[f"wrapper {len(parts)}"] = Listed(inner, partial(_of_wrapper, inner))
@@ -66,7 +66,7 @@ def python_parts(env: EnvBase) -> dict[str, Any]:
     return parts
 
 
-def terms(cfg: ManagerBasedRlEnvCfg) -> Iterator[tuple[str, Any]]:
+def terms(cfg: ManagerBasedRlEnvCfg) -> Iterator[tuple[str, Part]]:
     """Yield the terms of a config by their names in it."""
     for group in cfg.observations.values():
         for name, observation in group.terms.items():
@@ -95,12 +95,12 @@ def _leaves(transform: Any) -> list[Transform]:
     return [leaf for part in transform.transforms for leaf in _leaves(part)]
 
 
-def _of_wrapper(wrapper: TransformedEnv) -> dict[str, Any]:
+def _of_wrapper(wrapper: TransformedEnv) -> dict[str, Part]:
     own = {name: value for name, value in attributes_of(wrapper).items() if name != _KEYS_OF_SPECS}
     return own | {"transform": wrapper.transform}
 
 
-def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Any]:
+def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Part]:
     """Return the objects that call the terms of an env, and the values other than tensors that they read."""
     driver = env.driver
     parts = {
@@ -119,7 +119,7 @@ def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Any]:
     return parts
 
 
-def _of_env(env: ManagerBasedRlEnv) -> dict[str, Any]:
+def _of_env(env: ManagerBasedRlEnv) -> dict[str, Part]:
     # The config is a separate part, since most of its fields are read once.
     left_out = ("cfg", _KEYS_OF_SPECS)
     own = {name: value for name, value in attributes_of(env).items() if name not in left_out}
@@ -127,19 +127,19 @@ def _of_env(env: ManagerBasedRlEnv) -> dict[str, Any]:
     return own | {"cfg.decimation": env.cfg.decimation}
 
 
-def _read_once(env: ManagerBasedRlEnv) -> dict[str, Any]:
+def _read_once(env: ManagerBasedRlEnv) -> dict[str, Part]:
     """Return the fields of the config that are read while the env is built; seeds are given it later, too."""
     names = {field.name for field in fields(env.cfg)} - {"decimation", "seed", "viewer"}
     return {name: getattr(env.cfg, name) for name in sorted(names)}
 
 
-def _public(owner: Any) -> dict[str, Any]:
+def _public(owner: Part) -> dict[str, Part]:
     return {name: value for name, value in _without_caches(owner).items() if name[0] != "_"}
 
 
-def _without_caches(owner: Any) -> dict[str, Any]:
+def _without_caches(owner: Part) -> dict[str, Part]:
     return {name: value for name, value in vars(owner).items() if name not in _CACHES}
 
 
-def _plain(owner: Any) -> dict[str, Any]:
+def _plain(owner: Part) -> dict[str, Part]:
     return {name: value for name, value in vars(owner).items() if issubclass(type(value), PLAIN)}

@@ -1,13 +1,13 @@
 """Keeps a recorded step true to the Python that it was recorded from: changes are noticed and named."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any
 
 import torch
 from torchrl.envs import EnvBase
 
 from ksim_rl.compiled.host_calls import CLOCK, ENVIRONMENT, FILE, RANDOM, HostCall, host_calls
+from ksim_rl.compiled.python_values import Part, Parts
 from ksim_rl.compiled.python_watch import Change, PythonWatch, listed
 from ksim_rl.device.capture import Captured
 from ksim_rl.envs.python_parts import python_parts, why_not
@@ -48,16 +48,14 @@ class RecordedPython:
     the recording are compared with Python's, `is_compared`, the comparison decides; else it is refused as well.
     """
 
-    def __init__(
-        self, env: EnvBase, others: Mapping[str, Any] | None = None, *, is_compared: bool = False
-    ) -> None:
+    def __init__(self, env: EnvBase, others: Parts | None = None, *, is_compared: bool = False) -> None:
         self._env = env
         self._others = dict(others or {})
         self._is_compared = is_compared
         self._watch = PythonWatch(env.device or torch.device("cpu"))
         self._calls = 0
         # Places in which each step puts another tensor.
-        self._replaced: set[tuple[int, Any]] = set()
+        self._replaced: set[tuple[int, Hashable]] = set()
 
     @property
     def is_known(self) -> bool:
@@ -100,7 +98,7 @@ class RecordedPython:
                 raise FrozenPythonError(f"{change}, without effect: {instead}")
         return found
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> dict[str, Part]:
         return python_parts(self._env) | self._others
 
     def _refuse(self, calls: Sequence[HostCall], changes: Sequence[Change]) -> None:
@@ -119,7 +117,7 @@ class RecordedPython:
             )
 
 
-def _place(change: Change) -> tuple[int, Any]:
+def _place(change: Change) -> tuple[int, Hashable]:
     return id(change.owner), change.key
 
 
@@ -130,7 +128,7 @@ class FollowedGraph:
     see `RecordedPython`.
     """
 
-    def __init__(self, env: EnvBase, graph: Captured, others: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, env: EnvBase, graph: Captured, others: Parts | None = None) -> None:
         self._graph = graph
         self._python = RecordedPython(env, others)
         self._records = graph.device.type == "cuda" and not graph.is_eager

@@ -5,7 +5,6 @@ import importlib
 import pkgutil
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -15,6 +14,7 @@ from torchrl.envs.transforms import Transform
 from ksim_rl.checks import check_known, naming, near
 from ksim_rl.config import plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
+from ksim_rl.config.trees import Tree
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
@@ -78,7 +78,7 @@ def register_configs() -> None:
     composed.register(tuple(names()), _tree)
 
 
-def _tree(name: str) -> dict[str, Any]:
+def _tree(name: str) -> Tree:
     return to_tree(cfg_of(name), ManagerBasedRlEnvCfg)
 
 

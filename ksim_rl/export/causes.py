@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from ksim_rl.export.standalone.files import Json
+
 Arrays = Mapping[str, np.ndarray]
 SAME = 2e-3
 LIKE = 2e-2
@@ -32,7 +34,7 @@ class Cause:
         return f"{self.name}: {self.about}: {self.evidence}"
 
 
-def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[Cause]:
+def find_causes(meta: Json, trace: Arrays, replay: Arrays) -> list[Cause]:
     """Return the likely causes of differences, the first in the chain first.
 
     `trace` holds recorded steps, `trace/<signal>` [N, T, ...]; `replay` the same from elsewhere, `<lag>/<n>/<signal>`.
@@ -84,7 +86,7 @@ def find_causes(meta: Mapping[str, Any], trace: Arrays, replay: Arrays) -> list[
     return found
 
 
-def _of_motion(meta: Mapping[str, Any], signal: Any, *, rates: bool) -> Cause | None:
+def _of_motion(meta: Json, signal: Any, *, rates: bool) -> Cause | None:
     """Return the first difference on the way from the action to the next state."""
     joints = meta["joints"]["names"]
     # Targets come straight from the action: no physics is in them yet.
@@ -196,7 +198,7 @@ def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.nda
     return np.concatenate(ours), np.concatenate(theirs), np.concatenate(episode)
 
 
-def _newest(meta: Mapping[str, Any], obs: np.ndarray) -> np.ndarray:
+def _newest(meta: Json, obs: np.ndarray) -> np.ndarray:
     """Return the newest frame [..., L] of vectors that hold histories."""
     columns = []
     stop = 0

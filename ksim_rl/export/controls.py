@@ -10,6 +10,7 @@ from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.view import EnvView
 from ksim_rl.export.describe import NotDescribedError, describe, joint_names, names_of
 from ksim_rl.export.exported_transforms import lag
+from ksim_rl.export.standalone.files import Json
 from ksim_rl.mdp.actions import per_joint
 from ksim_rl.scene.actuators import (
     Actuator,
@@ -25,7 +26,7 @@ from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, history_cfg
 from ksim_rl.transforms.low_pass import smoothing
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
 
-Plain = dict[str, Any]
+Plain = Json
 # For readers of export.json, by quantity; a term that is computed from several says "see value".
 UNITS = {
     "joint_pos": "rad or m", "joint_pos_rel": "rad or m", "joint_vel": "rad/s or m/s", "root_lin_vel": "m/s",

@@ -12,11 +12,14 @@ from typing import Any
 from ksim_rl import mdp
 from ksim_rl.envs.term import Term
 from ksim_rl.envs.view import EnvView
+from ksim_rl.export.standalone.files import Json
 from ksim_rl.mdp.constants import values_by_name
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.sensors.rays import grid_points
 
-Node = dict[str, Any] | float | list[float]
+Node = Json | float | list[float]
+# What describes the terms of one class; each reads the fields of its own.
+Maker = Callable[[Any, EnvView], Node]
 
 
 class NotDescribedError(ValueError):
@@ -62,7 +65,7 @@ def root(term: Any, view: EnvView) -> str:
     return view.entity(getattr(term, "entity", "")).root.name
 
 
-def _add(kind: type[Term], make: Callable[[Any, EnvView], Node]) -> None:
+def _add(kind: type[Term], make: Maker) -> None:
     describe.register(kind)(make)
 
 
@@ -81,7 +84,7 @@ def points(term: Any, view: EnvView, positions: Node) -> Node:
     return into_root(term, view, positions)
 
 
-def joints(name: str, *fields: str) -> Callable[[Any, EnvView], Node]:
+def joints(name: str, *fields: str) -> Maker:
     """Return the description of a quantity of joints, with some fields of the term."""
 
     def described(term: Any, view: EnvView) -> Node:
@@ -102,7 +105,7 @@ def force(term: Any) -> Node:
     return op("norm", contact(term, "force"), width=3)
 
 
-def bodies(name: str) -> Callable[[Any, EnvView], Node]:
+def bodies(name: str) -> Maker:
     """Return the description of a quantity of bodies."""
     # Later, when a term is described: patterns match names of the model at hand.
     return lambda t, v: quantity(name, bodies=names_of(v, "body", t.bodies))
@@ -113,7 +116,7 @@ def sites(name: str, term: Any, view: EnvView) -> Node:
     return quantity(name, sites=names_of(view, "site", term.sites))
 
 
-def _framed(name: str) -> Callable[[Any, EnvView], Node]:
+def _framed(name: str) -> Maker:
     """Describe a velocity of the root, in its own axes or the world's."""
     return lambda t, v: quantity(name, body=root(t, v), frame=t.frame)
 
@@ -362,7 +365,7 @@ def _beyond_limits(t: mdp.JointPosLimits, v: EnvView) -> Node:
     return total(beyond(joints("joint_pos")(t, v), low, high))
 
 
-def _action_rate(*_: Any) -> Node:
+def _action_rate(*_: Term | EnvView) -> Node:
     return difference(quantity("action"), quantity("last_action"))
 
 

@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+from ksim_rl.envs.term import Term
 from ksim_rl.envs.view import EnvView
 from ksim_rl.export.describe import (
     Node,
@@ -51,13 +52,13 @@ def mean(one: Node, other: Node, weight: float = 1.0) -> Node:
 
 
 @describe.register(control.CartpolePosition)
-def _position(*_: Any) -> Node:
+def _position(*_: Term | EnvView) -> Node:
     # Cosine and sine, since an angle jumps after a turn.
     return op("concat", CART, op("cos", HINGE), op("sin", HINGE))
 
 
 @describe.register(control.CartpoleReward)
-def _reward(*_: Any) -> Node:
+def _reward(*_: Term | EnvView) -> Node:
     # The clip is the actuator's: commands beyond it cost no more.
     force = op("clip", op("take", quantity("action"), indices=[0]), low=-1.0, high=1.0)
     small_control = mean(1.0, difference(1.0, op("square", force)), weight=4.0)
@@ -75,7 +76,7 @@ def _fallen(term: control.PoleFallen, view: EnvView) -> Node:
 
 
 @describe.register(control.ReacherPose)
-def _pose(*_: Any) -> Node:
+def _pose(*_: Term | EnvView) -> Node:
     shoulder, wrist = (quantity("joint_pos", joints=[name]) for name in ("shoulder", "wrist"))
     # The wrist is limited, so it needs no cosine and sine.
     return op("concat", op("cos", shoulder), op("sin", shoulder), wrist)
@@ -121,12 +122,12 @@ def upright(body: str) -> Node:
 
 
 @describe.register(planar.ForwardSpeed)
-def _forward_speed(*_: Any) -> Node:
+def _forward_speed(*_: Term | EnvView) -> Node:
     return FORWARD
 
 
 @describe.register(planar.CheetahReward)
-def _runs(*_: Any) -> Node:
+def _runs(*_: Term | EnvView) -> Node:
     return linear(FORWARD, planar.CHEETAH_SPEED, planar.CHEETAH_SPEED)
 
 

@@ -15,11 +15,12 @@ from torchrl.envs.transforms import Transform
 
 from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.export.describe import NotDescribedError
+from ksim_rl.export.standalone.files import Json
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.transforms import ActionClip, ActionDelay, ActionLowPass, ActionScale, DelayCfg, ObservationNoise
 from ksim_rl.transforms.elementwise import ObservationMap
 
-Plain = dict[str, Any]
+Plain = Json
 # Steps over which an env is compared with one whose transforms are parts of the policy.
 COMPARED_STEPS = 20
 

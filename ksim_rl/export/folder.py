@@ -4,7 +4,7 @@ import dataclasses
 import importlib.util
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from ksim_rl.export.describe import NotDescribedError, describe, joint_names
 from ksim_rl.export.exported_transforms import TaskTransforms, check_equal, sort_transforms, with_transforms
 from ksim_rl.export.record import Recording
 from ksim_rl.export.robot import write_robot
+from ksim_rl.export.standalone.files import Json
 from ksim_rl.files.writing import check_folder, check_own, whole_folder
 from ksim_rl.physics import prepare_spec
 from ksim_rl.runs import record
@@ -97,7 +98,7 @@ def export_policy(
     *,
     below: Path | None = None,
     run_path: str = "",
-    trained_with: Mapping[str, Any] | None = None,
+    trained_with: Json | None = None,
     episodes: int = 100,
     seed: int | None = None,
     noise: bool = True,
@@ -135,7 +136,7 @@ def _fill(
     folder: Path,
     *,
     run_path: str,
-    trained_with: Mapping[str, Any],
+    trained_with: Json,
     episodes: int,
     seed: int | None,
     noise: bool,
@@ -210,7 +211,7 @@ def _fill(
     env.train(noise)
     if episodes:
         note(f"recording {episodes} episodes for sim2sim")
-        shared: dict[str, Any] = {"groups": groups, "order": order, "seed": seed}
+        shared: Json = {"groups": groups, "order": order, "seed": seed}
         shared["joints"] = meta["joints"]["names"]
         shared["params"] = sorted({name for law in meta["actuators"] for name in law["numbers"]})
         steps = ours.max_episode_length or UNLIMITED_EPISODE_STEPS
@@ -265,10 +266,10 @@ def runner_source() -> str:
 
 def metadata(
     ours: ManagerBasedRlEnv,
-    terms: list[dict[str, Any]],
+    terms: list[Json],
     transforms: TaskTransforms,
     note: Callable[[str], None],
-) -> dict[str, Any]:
+) -> Json:
     """Return the description of the env; rewards, metrics and terminations without a description are left out.
 
     `terms` are those that the policy observes. Raises NotDescribedError, naming the term, for an action or actuator.
@@ -282,7 +283,7 @@ def metadata(
     names = [*asked, *(n for n in joint_names(view, None) if n not in asked)]
     left_out: list[str] = []
 
-    def described(kind: str, some: Any) -> dict[str, Any]:
+    def described(kind: str, some: Any) -> Json:
         found = {}
         for name, term in some.items():
             try:
@@ -374,7 +375,7 @@ def _gains(
     return stiffness_of, damping_of
 
 
-def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> dict[str, Any]:
+def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> Json:
     """Return soft limits of position, and of effort at the joint, behind the gear; null where there is none."""
     model = ours.world.mj_model
     if names:
@@ -401,7 +402,7 @@ def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> dict[str, Any]:
     return {"position": finite, "effort": [effort.get(name) for name in names]}
 
 
-def _attach(path: Path, meta: dict[str, Any]) -> None:
+def _attach(path: Path, meta: Json) -> None:
     """Put the entries that controllers look for into the ONNX file: numbers as text, lists with commas."""
     import onnx  # an extra
 

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -69,7 +70,7 @@ class ExportedPolicy(nn.Module):
     reads. Raises ValueError where the actor has a part that has no such form.
     """
 
-    def __init__(self, actor: TensorDictModuleBase, groups: Mapping[Any, Sequence[Column]]) -> None:
+    def __init__(self, actor: TensorDictModuleBase, groups: Mapping[NestedKey, Sequence[Column]]) -> None:
         super().__init__()
         self.actor = actor
         # The sequence of modules is run by hand in `forward`: exporters know no TensorDict.
@@ -78,7 +79,7 @@ class ExportedPolicy(nn.Module):
         # A mixed head has one action per distribution, under keys of its own.
         mixed = _mixed_head(self.parts[-1])
         if mixed:
-            self.action_keys: list[Any] = mixed.action_keys
+            self.action_keys: list[NestedKey] = mixed.action_keys
         else:
             self.action_keys = ["action"]
         self.states = []
@@ -119,7 +120,7 @@ class ExportedPolicy(nn.Module):
         # Consumed from the front, in the order of `states`: histories first, then recurrent ones.
         given = list(states)
         after = []
-        values: dict[Any, Tensor] = {}
+        values: dict[NestedKey, Tensor] = {}
         start = 0
         for group, columns in self.groups.items():
             terms = []
@@ -159,7 +160,7 @@ class ExportedPolicy(nn.Module):
         return torch.cat([_row(action) for action in actions], -1), *after
 
 
-def _parts(module: Any) -> Iterator[Any]:
+def _parts(module: nn.Module) -> Iterator[Any]:
     """Return the parts of nested sequences in the order in which they run."""
     inner = getattr(module, "module", None)
     # Before the general case: both are TensorDictModules, too.
@@ -177,7 +178,7 @@ def _parts(module: Any) -> Iterator[Any]:
         )
 
 
-def _best(part: Any, values: dict[Any, Tensor]) -> list[Tensor]:
+def _best(part: Any, values: dict[NestedKey, Tensor]) -> list[Tensor]:
     """Return the deterministic action of each distribution, as `ExplorationType.DETERMINISTIC` does."""
     if mixed := _mixed_head(part):
         # Each head finds its parameters under the key of its action.
@@ -195,7 +196,7 @@ def _best(part: Any, values: dict[Any, Tensor]) -> list[Tensor]:
     return [part.distribution_class(**parameters, **part.distribution_kwargs).deterministic_sample]
 
 
-def _mixed_head(part: Any) -> MixedHead | None:
+def _mixed_head(part: nn.Module) -> MixedHead | None:
     owner = getattr(getattr(part, "distribution_class", None), "__self__", None)
     if isinstance(owner, MixedHead):
         return owner
@@ -208,7 +209,7 @@ def _row(action: Tensor) -> Tensor:
 
 
 def _recurrent(
-    part: RecurrentModule, values: dict[Any, Tensor], state: list[Tensor]
+    part: RecurrentModule, values: dict[NestedKey, Tensor], state: list[Tensor]
 ) -> tuple[Tensor, list[Tensor]]:
     """Return the features and the state [B, N, H] after one step, by the formulas of `torch.nn.LSTM` and `GRU`."""
     network = part.module
@@ -304,7 +305,7 @@ def greatest_difference(policy: ExportedPolicy, path: Path) -> float:
     draws = np.random.default_rng(0)
     worst = 0.0
     mean, std = _statistics(policy)
-    carried: dict[Any, Tensor] = {}
+    carried: dict[NestedKey, Tensor] = {}
     states: list[np.ndarray] = []
     frames: list[np.ndarray] = []
     # Batches of ROWS make CHECKED observations; each batch is one step of all episodes.

@@ -1,6 +1,6 @@
 """Records episodes of a policy in our own physics, so that another simulator can run the same ones."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -100,7 +100,7 @@ class Recording:
         columns = {name: sum_E.tolist() for name, sum_E in self._sums.items()}
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
-    def _watch(self, run_events: Any) -> None:
+    def _watch(self, run_events: Callable[[], None]) -> None:
         before_EL = self._ours.world.qvel_EL.clone()
         run_events()
         change_EL = (self._ours.world.qvel_EL - before_EL).cpu().numpy()
@@ -108,7 +108,7 @@ class Recording:
         for row in np.flatnonzero(np.abs(change_EL).max(-1) > 0):
             self._pushes.append(np.concatenate(([row, self._now], change_EL[row])))
 
-    def _keep(self, kind: str, values: Any) -> None:
+    def _keep(self, kind: str, values: Mapping[str, Tensor]) -> None:
         for name, value in values.items():
             # Copied, since the env writes the next step into the same memory.
             self._seen.setdefault(f"{kind}/{name}", []).append(value.detach().float().cpu().numpy().copy())

@@ -14,7 +14,7 @@ from ksim_rl.checks import MISFITS, OneLineParser
 from ksim_rl.config.child_processes import run_python
 from ksim_rl.export.causes import Cause, find_causes
 from ksim_rl.export.folder import export, runner_source
-from ksim_rl.export.standalone.files import check_closed, lacking, read_arrays, read_json
+from ksim_rl.export.standalone.files import Json, check_closed, lacking, read_arrays, read_json
 from ksim_rl.physics import load_spec
 from ksim_rl.terminal import printable, show
 from ksim_rl.trainers.other_physics import half_time_step, other_integrator, same_time_step
@@ -139,7 +139,7 @@ def sim2sim(
     )
 
 
-def _other_physics(meta: Mapping[str, Any], option: mujoco.MjOption) -> tuple[list[str], str]:
+def _other_physics(meta: Json, option: mujoco.MjOption) -> tuple[list[str], str]:
     """Return the runner's arguments by which the C engine judges an export, and the words for them."""
     # Warp is other physics already.
     if meta.get("engine") != "c":
@@ -155,7 +155,7 @@ def _other_physics(meta: Mapping[str, Any], option: mujoco.MjOption) -> tuple[li
     return arguments, f"{words}, {half_time_step(option.timestep)}"
 
 
-def _recorded(meta: Mapping[str, Any], folder: Path) -> dict[str, np.ndarray]:
+def _recorded(meta: Json, folder: Path) -> dict[str, np.ndarray]:
     """Return the figures of the recorded episodes [N] by name; a ValueError names a figure that no export writes."""
     ours = meta.get("ours")
     if not isinstance(ours, dict) or not ours.get("return"):

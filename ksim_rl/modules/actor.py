@@ -241,7 +241,7 @@ class MixedHead(nn.Module):
     def distribution(self, params: TensorDictBase) -> CompositeDistribution:
         """Return the distribution of all actions; `params` is the entry at "params"."""
         # Each head makes its own distribution from its part of the parameters.
-        parts: dict[Any, Any] = {}
+        parts: dict[NestedKey, Distribution] = {}
         for key, head in zip(self.action_keys, self.heads, strict=True):
             parameters = {name: params.get((*path_of(key), name)) for name in head.parameter_names}  # type: ignore[union-attr]
             parts[key] = head.distribution(**parameters)  # type: ignore[operator]

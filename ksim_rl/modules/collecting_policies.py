@@ -1,12 +1,12 @@
 """Policies that collect: with noise for off-policy learning, or with a teacher's help."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Shaped
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
@@ -37,8 +37,8 @@ class ExploringPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.actor = actor
-        self.in_keys: Any = list(actor.in_keys)
-        self.out_keys: Any = ["action"]
+        self.in_keys: list[NestedKey] = list(actor.in_keys)
+        self.out_keys: list[NestedKey] = ["action"]
         self.noise_min = noise_min
         self.noise_max = noise_max
         self._low_L = low_L
@@ -94,7 +94,7 @@ class MixedPolicy(TensorDictModuleBase):
         teacher: TensorDictModuleBase | None = None,
         *,
         share: Float[Tensor, ""],
-        teacher_keys: Sequence[Any] = (),
+        teacher_keys: Sequence[NestedKey] = (),
         explores: bool = True,
     ) -> None:
         super().__init__()
@@ -102,8 +102,8 @@ class MixedPolicy(TensorDictModuleBase):
         self.teacher = teacher
         self.explores = explores
         self._teacher_keys = list(teacher_keys)
-        self.in_keys: Any = list(dict.fromkeys((*student.in_keys, *self._teacher_keys)))
-        self.out_keys: Any = list(student.out_keys)
+        self.in_keys: list[NestedKey] = list(dict.fromkeys((*student.in_keys, *self._teacher_keys)))
+        self.out_keys: list[NestedKey] = list(student.out_keys)
         self.register_buffer("share", share)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import reduce
 from operator import add
-from typing import Any
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Float, Shaped
@@ -20,6 +20,9 @@ _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 # Below it exp() underflows in float32, and the inverse of the distribution function is found in another way.
 _LOG_TINY = -80.0
 
+# One bound for all components, or one for each.
+Bound: TypeAlias = Tensor | float
+
 
 class VectorDistribution(Distribution):
     """The base of distributions over vectors that never read a value on the host, so that they can be captured.
@@ -29,7 +32,7 @@ class VectorDistribution(Distribution):
 
     arg_constraints = {"loc": constraints.real_vector, "scale": constraints.positive}  # type: ignore[assignment]
     has_rsample = True
-    _bounds: tuple[Any, ...] = ()
+    _bounds: tuple[Bound, ...] = ()
 
     def __init__(self, loc: Float[Tensor, "#*batch #L"], scale: Float[Tensor, "#*batch #L"]) -> None:
         self.loc, self.scale = torch.broadcast_tensors(loc, scale)
@@ -41,7 +44,9 @@ class VectorDistribution(Distribution):
         """The mode, which TorchRL takes under `ExplorationType.DETERMINISTIC`."""
         return self.mode
 
-    def expand(self, batch_shape: Any, _instance: Any = None) -> "VectorDistribution":
+    def expand(
+        self, batch_shape: Sequence[int], _instance: Distribution | None = None
+    ) -> "VectorDistribution":
         """Return the distribution with a larger batch shape."""
         shape = torch.Size(batch_shape) + self.event_shape
         return type(self)(self.loc.expand(shape), self.scale.expand(shape), *self._bounds)
@@ -67,7 +72,7 @@ class BoundedDistribution(VectorDistribution, ABC):
         return constraints.independent(constraints.interval(self.low, self.high), 1)
 
     @abstractmethod
-    def _prepare(self, low: Any, high: Any) -> None:
+    def _prepare(self, low: Bound, high: Bound) -> None:
         """Compute quantities that several methods share, once."""
 
     def _clamp(self, value: Tensor) -> Tensor:
@@ -95,7 +100,7 @@ class DiagonalGaussian(VectorDistribution):
         """The variance."""
         return self.scale.square()
 
-    def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape L"]:
         """Draw by reparametrization: gradients reach `loc` and `scale`."""
         # Ranks draw for their own rows, so that a run does not depend on how envs are spread.
         shape = torch.Size(sample_shape) + self.loc.shape
@@ -134,7 +139,7 @@ class TanhGaussian(BoundedDistribution):
     an unbiased estimate whose gradient is reparametrized.
     """
 
-    def _prepare(self, low: Any, high: Any) -> None:
+    def _prepare(self, low: Bound, high: Bound) -> None:
         self.base = DiagonalGaussian(self.loc, self.scale)
         self._center = (high + low) / 2
         self._half_range = (high - low) / 2
@@ -149,12 +154,12 @@ class TanhGaussian(BoundedDistribution):
         """The median; the mode would lie on a bound as soon as `scale` is large."""
         return self.median
 
-    def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape L"]:
         """Draw by reparametrization: gradients reach `loc` and `scale`."""
         return self._squash(self.base.rsample(sample_shape))
 
     def rsample_and_log_prob(
-        self, sample_shape: Any = ()
+        self, sample_shape: torch.Size | tuple[int, ...] = ()
     ) -> tuple[Float[Tensor, "*shape L"], Float[Tensor, "*shape"]]:
         """Draw as `rsample`, and return the log density without inverting the squashing."""
         # The density is computed from u: inverting the tanh would lose digits near the bounds.
@@ -162,7 +167,7 @@ class TanhGaussian(BoundedDistribution):
         return self._squash(latent), self._log_density(latent)
 
     def sample_and_log_prob(
-        self, sample_shape: Any = ()
+        self, sample_shape: torch.Size | tuple[int, ...] = ()
     ) -> tuple[Float[Tensor, "*shape L"], Float[Tensor, "*shape"]]:
         """Do the same without gradients through the sample; the log density has gradients."""
         latent = self.base.sample(sample_shape)
@@ -213,7 +218,7 @@ class TruncatedGaussian(BoundedDistribution):
     Kotz and Balakrishnan, "Continuous univariate distributions", vol. 1, 1994, ch. 13.10.1).
     """
 
-    def _prepare(self, low: Any, high: Any) -> None:
+    def _prepare(self, low: Bound, high: Bound) -> None:
         left = (low - self.loc) / self.scale
         right = (high - self.loc) / self.scale
         # Left of loc both distribution functions are small, and their difference keeps its digits.
@@ -241,7 +246,7 @@ class TruncatedGaussian(BoundedDistribution):
         first, second = self._moments()
         return self.scale.square() * (second - first.square())
 
-    def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*shape L"]:
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape L"]:
         """Draw; gradients are of the value at a fixed probability (Figurnov et al., arXiv 1805.08498)."""
         shape = torch.Size(sample_shape) + self.loc.shape
         with torch.no_grad():
@@ -371,12 +376,12 @@ class Categorical(Distribution):
         """The mode, which TorchRL takes under `ExplorationType.DETERMINISTIC`."""
         return self.mode
 
-    def expand(self, batch_shape: Any, _instance: Any = None) -> "Categorical":
+    def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> "Categorical":
         """Return the distribution with a larger batch shape."""
         logits = self.logits.expand(torch.Size(batch_shape) + self.logits.shape[-1:])
         return Categorical(logits, self.sizes, self.one_hot, self.dtype)
 
-    def sample(self, sample_shape: Any = ()) -> Shaped[Tensor, "*value"]:
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Shaped[Tensor, "*value"]:
         """Draw the options, sample_shape + batch shape + event shape."""
         chosen = []
         with torch.no_grad():

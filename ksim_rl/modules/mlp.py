@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from ksim_rl.checked import Count, check_value
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.device.gradient_context import GradientContext
 
 Device = torch.device | str | None
 SPLITS, OUTPUTS = 4, 2**16  # see `_Product`
@@ -150,7 +151,7 @@ class Layers(nn.Sequential):
             out = features.reshape(1, -1, features.shape[-1])
         else:
             out = features
-        parts: list[Any] = list(self)
+        parts: list[nn.Module] = list(self)
         weights = [part.weight for part in parts if isinstance(part, nn.Linear | EnsembleLinear)]
         rounded = _rounded(weights)
         if alone:
@@ -185,6 +186,13 @@ def rounds(features: Float[Tensor, "*batch L"]) -> bool:
     return features.is_cuda and torch.is_autocast_enabled("cuda")
 
 
+class _MatmulContext(GradientContext, Protocol):
+    alone: bool
+    is_shared: bool
+    sizes: torch.Size
+    dtype: torch.dtype
+
+
 class _Product(Function):
     """The products [N, B, M] of features [N, B, K] and weights [N, K, M], which are there `rounded` as well.
 
@@ -194,7 +202,7 @@ class _Product(Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, features_NBK: Tensor, weight: Tensor, rounded: Tensor) -> Tensor:
+    def forward(ctx: _MatmulContext, features_NBK: Tensor, weight: Tensor, rounded: Tensor) -> Tensor:
         ctx.alone = weight.dim() == 2
         fan_in, fan_out = ctx.sizes = weight.mT.shape if ctx.alone else weight.shape[1:]
         networks = len(rounded)
@@ -207,7 +215,7 @@ class _Product(Function):
         return torch.bmm(features, rounded)[..., :fan_out]
 
     @staticmethod
-    def backward(ctx: Any, d_out: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: _MatmulContext, d_out: Tensor) -> tuple[Tensor | None, ...]:
         features, rounded = ctx.saved_tensors
         fan_in, fan_out = ctx.sizes
         d_out = _padded(d_out, -fan_out % 8)

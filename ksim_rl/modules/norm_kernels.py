@@ -5,7 +5,7 @@ for no other. A row is two or three chunks of a power of two, as layers are that
 parts, one of each program, and added up in one order: the same numbers each time.
 """
 
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 import triton
@@ -13,6 +13,8 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd import Function
+
+from ksim_rl.device.gradient_context import GradientContext
 
 # In the order in which the kernels number them, from 1; 0 is none.
 FUSED = (nn.ReLU, nn.SiLU)
@@ -173,6 +175,10 @@ def sum_parts(parts, sums, count, width, ROWS: tl.constexpr, COLUMNS: tl.constex
     tl.store(sums + tl.program_id(1) * width + column, tl.sum(total, 0), mask=inside)
 
 
+class _NormContext(GradientContext, Protocol):
+    activation: int
+
+
 class Normalized(Function):
     """Rows of N networks with a bias added, normalized (Ba et al., arXiv 1607.06450), scaled, offset and activated.
 
@@ -182,7 +188,7 @@ class Normalized(Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
+        ctx: _NormContext,
         features_NBL: Float[Tensor, "N B L"],
         bias: Float[Tensor, "*bias"],
         gain: Float[Tensor, "*gain"],
@@ -202,7 +208,9 @@ class Normalized(Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, d_out_NBL: Float[Tensor, "N B L"]) -> tuple[Any, ...]:
+    def backward(
+        ctx: _NormContext, d_out_NBL: Float[Tensor, "N B L"]
+    ) -> tuple[Float[Tensor, "*?weight"] | None, ...]:
         """Return the gradients, for the weights only where they learn."""
         features, *weights, _ = ctx.saved_tensors
         learns = any(ctx.needs_input_grad[1:4])

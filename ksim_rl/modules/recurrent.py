@@ -35,9 +35,11 @@ class RecurrentStatePrimer(TensorDictPrimer):
 
     def __init__(self, primers: Composite) -> None:
         super().__init__(primers, expand_specs=True)
-        self.state_keys: list[Any] = list(primers.keys(True, True))
+        self.state_keys: list[NestedKey] = list(primers.keys(True, True))
 
-    def _reset_func(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> Any:
+    def _reset_func(
+        self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         if tensordict is None:
             mask = None
         else:

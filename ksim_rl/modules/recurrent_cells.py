@@ -6,14 +6,13 @@ product and one pointwise kernel; and the backward pass forms the gradient of th
 over all steps. No size depends on data and nothing is read on the host, so it can be captured in a CUDA graph.
 """
 
-from typing import Any
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from ksim_rl.device.gradient_context import GradientContext
 from ksim_rl.modules import upstream
 
 
@@ -26,7 +25,7 @@ class LSTM(Function):
 
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any,
+        ctx: GradientContext,
         gates_TBG: Float[Tensor, "T B G"],
         weight_hh_GH: Float[Tensor, "G H"],
         h_BH: Float[Tensor, "B H"],
@@ -52,8 +51,10 @@ class LSTM(Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, grad_h_TBH: Float[Tensor, "T B H"] | None, grad_c_TBH: Float[Tensor, "T B H"] | None
-    ) -> tuple[Any, ...]:
+        ctx: GradientContext,
+        grad_h_TBH: Float[Tensor, "T B H"] | None,
+        grad_c_TBH: Float[Tensor, "T B H"] | None,
+    ) -> tuple[Float[Tensor, "*?weight"] | None, ...]:
         """Return the gradients."""
         weight_hh_GH, h0_BH, c0_BH, h_TBH, c_TBH, activations_TBG, reset_TB1 = ctx.saved_tensors
         c_before_TBH = _before(c0_BH, c_TBH, reset_TB1)
@@ -86,7 +87,7 @@ class GRU(Function):
 
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any,
+        ctx: GradientContext,
         gates_TBG: Float[Tensor, "T B G"],
         weight_hh_GH: Float[Tensor, "G H"],
         bias_hh_G: Float[Tensor, " G"],
@@ -106,7 +107,9 @@ class GRU(Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_h_TBH: Float[Tensor, "T B H"]) -> tuple[Any, ...]:
+    def backward(
+        ctx: GradientContext, grad_h_TBH: Float[Tensor, "T B H"]
+    ) -> tuple[Float[Tensor, "*?weight"] | None, ...]:
         """Return the gradients."""
         weight_hh_GH, h0_BH, h_TBH, workspace_TBG, reset_TB1 = ctx.saved_tensors
         dh_BH = torch.zeros_like(h0_BH)

@@ -3,10 +3,13 @@
 `tests/modules/test_upstream.py` names the part that a new version moved.
 """
 
-from typing import Any
+from collections.abc import Sequence
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor
 
 _ATEN = torch.ops.aten
 
@@ -23,8 +26,12 @@ class TensorModule(TensorDictModule):
     """A `TensorDictModule` of tensors; the one of tensordict 0.14 imports pandas to look for data frames."""
 
     def _write_to_tensordict(
-        self, tensordict: Any, tensors: Any, tensordict_out: Any = None, out_keys: Any = None
-    ) -> Any:
+        self,
+        tensordict: TensorDictBase,
+        tensors: Sequence[Tensor],
+        tensordict_out: TensorDictBase | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> TensorDictBase:
         assert self.inplace is True, "networks write into what they read"
         if tensordict_out is None:
             into = tensordict

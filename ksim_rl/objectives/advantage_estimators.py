@@ -236,7 +236,7 @@ def carries_state(network: TensorDictModuleBase) -> bool:
     return any(isinstance(key, tuple) and key[0] == "next" for key in network.out_keys)
 
 
-def steps_of(network: TensorDictModuleBase) -> AbstractContextManager[Any]:
+def steps_of(network: TensorDictModuleBase) -> AbstractContextManager[None]:
     """Let a recurrent network take each element of a batch as one step, even inside a loss."""
     # Not for others: the compiler cannot follow it.
     if carries_state(network):

@@ -1,6 +1,6 @@
 """Compares distributions of returns with their targets by one Triton kernel, gradients included."""
 
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 import triton
@@ -8,6 +8,8 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import Function
+
+from ksim_rl.device.gradient_context import GradientContext
 
 # Lanes that a warp takes, of two rows or more at a time: one row computes while another waits.
 LANES = 256
@@ -91,6 +93,10 @@ def compare_rows(
     tl.store(slope + own * COUNT + atom, change.to(slope.dtype.element_ty), mask=keep)
 
 
+class _ComparingContext(GradientContext, Protocol):
+    others: tuple[None, ...]
+
+
 class Compared(Function):
     """The cross entropies [B, N] of N distributions to their targets, and their means; means twice without targets.
 
@@ -100,7 +106,10 @@ class Compared(Function):
 
     @staticmethod
     def forward(
-        ctx: Any, logits_BNA: Float[Tensor, "B N A"], support_A: Float[Tensor, " A"], *targets: Any
+        ctx: _ComparingContext,
+        logits_BNA: Float[Tensor, "B N A"],
+        support_A: Float[Tensor, " A"],
+        *targets: Any,
     ) -> tuple[Float[Tensor, "B N"], Float[Tensor, "B N"]]:
         """Return both, and keep the gradient."""
         # Network by network: the kernel reads the logits of one network as rows that follow each other.
@@ -125,7 +134,9 @@ class Compared(Function):
         return loss_NB.T, mean_NB.T
 
     @staticmethod
-    def backward(ctx: Any, d_loss_BN: Float[Tensor, "B N"], _: Any) -> tuple[Any, ...]:
+    def backward(
+        ctx: _ComparingContext, d_loss_BN: Float[Tensor, "B N"], d_mean_BN: Float[Tensor, "B N"]
+    ) -> tuple[Float[Tensor, "*?logits"] | None, ...]:
         """Return the gradient at the logits."""
         (slope_NBA,) = ctx.saved_tensors
         d_logits_NBA = (slope_NBA * d_loss_BN.T[..., None]).to(slope_NBA.dtype)

@@ -1,7 +1,5 @@
 """Projects the targets of critics that predict a distribution of returns, and compares them."""
 
-from typing import Any
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -48,7 +46,7 @@ def mean_returns(logits_BNA: Float[Tensor, "B N A"], support_A: Float[Tensor, " 
     return mean_of(_exact(logits_BNA).softmax(-1), support_A)
 
 
-def _by_kernel(*given: Any) -> Any:
+def _by_kernel(*given: Tensor | bool) -> tuple[Tensor, Tensor]:
     # Not above: Triton comes with torch for CUDA only.
     from ksim_rl.objectives.distribution_kernel import Compared
 

@@ -69,7 +69,7 @@ class OffPolicyLoss(LossModule):
     _written: ClassVar[tuple[str, ...]] = ("loss_qvalue", "loss_actor", "value", "td_error")
     tensor_keys: _AcceptedKeys  # type: ignore[assignment]
     actor_network: Any
-    critic_network: Any
+    critic_network: TensorDictModule
     support_A: Tensor | None
 
     def __init__(
@@ -87,14 +87,16 @@ class OffPolicyLoss(LossModule):
         self.actor_network = actor_network
         self.critic_network = critic_network
         # Running statistics are shared: both networks see observations on the same scale at any time.
-        shared: Any = {id(own): own for own in critic_network.modules() if isinstance(own, RunningMoments)}
+        shared: dict[int, RunningMoments] = {
+            id(own): own for own in critic_network.modules() if isinstance(own, RunningMoments)
+        }
         # Under a name that `parameters()` leaves out.
         self._target_critic = copy.deepcopy(critic_network, memo=shared).requires_grad_(False)
         # A buffer, which moves with the networks; it follows from the config, so it is no part of a checkpoint.
         self.register_buffer("support_A", support_A, persistent=False)
         self.gamma = gamma
         self.value_reduction: ValueReduction = value_reduction
-        self.reduction, self._selected = "mean", list[Any](self._written)
+        self.reduction, self._selected = "mean", list[NestedKey](self._written)
 
     @property
     def functional(self) -> bool:

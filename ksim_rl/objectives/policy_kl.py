@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from tensordict import TensorDictBase
-from tensordict.nn import CompositeDistribution
+from tensordict.nn import CompositeDistribution, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, distributions
 from torch.distributions import Distribution, TransformedDistribution
@@ -61,7 +61,7 @@ def distribution_keys(actor: Any) -> list[NestedKey]:
     ]
 
 
-def observation_keys(actor: Any) -> list[NestedKey]:
+def observation_keys(actor: TensorDictModuleBase) -> list[NestedKey]:
     """Return the leaves of an EnvState that a policy reads: its `in_keys` without the parameters that it writes."""
     written = getattr(actor, "dist_params_keys", ())
     return [key for key in actor.in_keys if key not in written]

@@ -1,7 +1,6 @@
 """Tells the callbacks that a program sets in MuJoCo Warp apart from our own."""
 
 from collections.abc import Callable
-from typing import Any
 
 import mujoco_warp as mjw
 
@@ -40,7 +39,7 @@ class Callbacks:
 
 
 def _in_turn(first: Callable[..., None], second: Callable[..., None]) -> Callable[..., None]:
-    def both(*args: Any) -> None:
+    def both(*args: mjw.Model | mjw.Data) -> None:
         first(*args)
         second(*args)
 

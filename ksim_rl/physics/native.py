@@ -12,7 +12,8 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.device import quick_launch
-from ksim_rl.physics.structs import filled, values_of
+from ksim_rl.physics.structs import Field, filled, values_of
+from ksim_rl.physics.upstream import Struct
 
 FEW_WORLDS = 8192  # more fill a GPU with fewer lanes each
 _ARRAYS = {1: wp.array, 2: wp.array2d, 3: wp.array3d}
@@ -31,7 +32,7 @@ def names_of(*enums: Any) -> dict[str, int]:
 def launcher(
     source: str,
     constants: Mapping[str, int],
-    own: Mapping[str, Any],
+    own: Mapping[str, Field],
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
     *,
@@ -59,7 +60,7 @@ def launcher(
     device = warp_data_E.qpos.device
 
     # The struct is filled once: only scalars change from launch to launch.
-    def launch(**changes: Any) -> None:
+    def launch(**changes: Field) -> None:
         for name, value in changes.items():
             setattr(problem, name, value)
         wp.launch(kernel, dim=dim, inputs=[problem], block_dim=threads, device=device)
@@ -67,7 +68,7 @@ def launcher(
     return launch
 
 
-def _type_of(value: Any) -> Any:
+def _type_of(value: Any) -> type:
     if isinstance(value, wp.array):
         return _ARRAYS[value.ndim][value.dtype]
     return type(value)
@@ -77,11 +78,11 @@ def _type_of(value: Any) -> Any:
 def _kernel(
     source: str,
     constants: tuple[tuple[str, int], ...],
-    types: tuple[tuple[str, Any], ...],
+    types: tuple[tuple[str, type], ...],
     threads: int,
     fast_math: bool,
     max_registers: int | None,
-) -> tuple[wp.Kernel, Any]:
+) -> tuple[wp.Kernel, Struct]:
     """Return the kernel, and the struct that it takes."""
 
     # A struct of the arrays that this source reads.

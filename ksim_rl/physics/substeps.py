@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import mujoco
 import mujoco_warp as mjw
@@ -130,7 +130,7 @@ class Substeps:
         """The names of arrays that `refresh` computes because something reads them, to add to."""
         return self._refresh.on_demand
 
-    def _alter(self, **fields: Any) -> None:
+    def _alter(self, **fields: wp.array | mjw.Option) -> None:
         """Change fields of the models of substeps, which share all else with `warp_model`."""
         self._models = {which: dataclasses.replace(m, **fields) for which, m in self._models.items()}
 

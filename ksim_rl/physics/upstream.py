@@ -66,6 +66,9 @@ from mujoco_warp._src.types import vec5 as vec5
 from mujoco_warp._src.types import vec10 as vec10
 from torch import Tensor
 
+# The type that `wp.struct` makes, which annotations need.
+from warp._src.codegen import Struct as Struct
+
 GEOM_TYPES = {kind.name: int(kind) for kind in mjw.GeomType}
 FIXED = int(mjw.SetConstGroup.FIXED)
 # The two columns of `nxn_pairid` for a pair that never makes a contact, and for one that no sensor measures; and the

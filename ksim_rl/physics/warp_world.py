@@ -1,8 +1,8 @@
 """A world batch simulates many copies of one model on MuJoCo Warp, and shows their data as zero-copy torch views."""
 
 import copy
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
-from typing import Any, Literal, get_args
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from typing import Literal, get_args
 
 import mujoco
 import mujoco_warp as mjw
@@ -33,7 +33,7 @@ from ksim_rl.physics.rows.second_limits import room_for_nonzeros
 from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.substep_plan import SubstepPlan, substep_plan, with_callbacks
 from ksim_rl.physics.substeps import Sensors, Substeps
-from ksim_rl.physics.world import ENGINES, World
+from ksim_rl.physics.world import ENGINES, RecordedPython, World
 
 
 class WarpWorld(World):
@@ -272,7 +272,7 @@ class WarpWorld(World):
         """Return a line for each stage of a substep, which says what computes it, and why."""
         return (*self.plan.lines(), self._chosen_line())
 
-    def recorded_python(self) -> Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]:
+    def recorded_python(self) -> RecordedPython:
         """Return the callbacks and options of the model, each with a reader of its values, by name."""
         callback = self.warp_model.callback
         opt = self.warp_model.opt

@@ -4,7 +4,7 @@ import copy
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self, cast
+from typing import Any, ClassVar, Literal, Self, TypeAlias, cast
 
 import mujoco
 import torch
@@ -26,6 +26,10 @@ from ksim_rl.physics.sim_cfg import SimCfg
 
 ENGINES: dict[str, type["World"]] = {}
 """The worlds of each engine, by the names that `SimCfg.engine` knows; their modules enter them here."""
+
+
+# Objects whose Python a step depends on, each with a reader of its values, by name.
+RecordedPython: TypeAlias = Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]
 
 
 class World(views.DataViews):
@@ -242,7 +246,7 @@ class World(views.DataViews):
         """Return a line for each stage of a substep, which says what computes it, and why."""
 
     @abstractmethod
-    def recorded_python(self) -> Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]:
+    def recorded_python(self) -> RecordedPython:
         """Return the objects whose Python a recorded step depends on, each with a reader of its values, by name."""
 
     @abstractmethod
@@ -259,11 +263,11 @@ class World(views.DataViews):
 
 
 def _choice(
-    mj_model: Any = None,
+    mj_model: mujoco.MjModel | None = None,
     *,
-    num_envs: Any = None,
+    num_envs: int | None = None,
     device: str | torch.device = "cpu",
-    sim: Any = None,
+    sim: SimCfg | None = None,
     warp_alone: Sequence[str] = (),
     **_: Any,
 ) -> tuple[str, str]:

@@ -6,7 +6,7 @@ the dim `dim`; `options` are torch's dtype and device.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TypedDict, Unpack
 
 import torch
 from jaxtyping import Shaped
@@ -15,27 +15,40 @@ from torch import Tensor
 from ksim_rl.device.group import first_row, size
 
 
-def rand(shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped[Tensor, "*shape"]:
+class TensorOptions(TypedDict, total=False):
+    """What torch's functions take that make a tensor."""
+
+    dtype: torch.dtype
+    device: torch.device | str
+
+
+def rand(shape: Sequence[int], *, dim: int = 0, **options: Unpack[TensorOptions]) -> Shaped[Tensor, "*shape"]:
     """Draw from the uniform distribution on [0, 1)."""
     return _own(torch.rand, shape, dim, options)
 
 
-def randn(shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped[Tensor, "*shape"]:
+def randn(
+    shape: Sequence[int], *, dim: int = 0, **options: Unpack[TensorOptions]
+) -> Shaped[Tensor, "*shape"]:
     """Draw from the standard normal distribution."""
     return _own(torch.randn, shape, dim, options)
 
 
-def randint(high: int, shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped[Tensor, "*shape"]:
+def randint(
+    high: int, shape: Sequence[int], *, dim: int = 0, **options: Unpack[TensorOptions]
+) -> Shaped[Tensor, "*shape"]:
     """Draw integers from {0, ..., high - 1}, each with the same probability."""
     return _own(lambda whole, **options: torch.randint(high, whole, **options), shape, dim, options)
 
 
-def exponential(shape: Sequence[int], *, dim: int = 0, **options: Any) -> Shaped[Tensor, "*shape"]:
+def exponential(
+    shape: Sequence[int], *, dim: int = 0, **options: Unpack[TensorOptions]
+) -> Shaped[Tensor, "*shape"]:
     """Draw from the exponential distribution of mean 1."""
     return _own(lambda whole, **options: torch.empty(whole, **options).exponential_(), shape, dim, options)
 
 
-def _own(draw: Callable[..., Tensor], shape: Sequence[int], dim: int, options: dict[str, Any]) -> Tensor:
+def _own(draw: Callable[..., Tensor], shape: Sequence[int], dim: int, options: TensorOptions) -> Tensor:
     if size() == 1:
         return draw(shape, **options)
     # As many rows as all ranks have together.

@@ -14,6 +14,7 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from ksim_rl.device.group import rank, size
+from ksim_rl.device.state_tree import State
 
 Tensors = dict[str, Shaped[Tensor, "*?leaf"]]
 # Below it, `ReplayRing` keeps rows in the order of places and, in each place, of envs.
@@ -64,7 +65,7 @@ def gathered(own: Mapping[str, Shaped[Tensor, "*?leaf"]]) -> dict[str, Any]:
 
 def dealt(
     first: Mapping[str, Shaped[Tensor, "*?leaf"]],
-    saved: Mapping[str, Any] | None,
+    saved: State | None,
     live: Mapping[str, Shaped[Tensor, "*?leaf"]],
 ) -> Tensors:
     """Return this rank's tensors of a checkpoint: rank 0's, changed by the result of `gathered`; None is of one rank.

@@ -155,7 +155,7 @@ _attempts: list[int] = []
 _host_groups: list[Any] = []
 
 
-def _on_host() -> Any:
+def _on_host() -> dist.ProcessGroup | None:
     """Return a group of all ranks whose collectives need no GPU."""
     if dist.get_backend() == "gloo":
         return None

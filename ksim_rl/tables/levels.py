@@ -3,12 +3,14 @@
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
+from ksim_rl.config.trees import Tree
 from ksim_rl.tables.table import Row
 
 HELD_STATES = 1e6
 Point = Mapping[str, float]
+# What `measure` found for a seed of a row, as plain data.
+Result = Tree
 
 
 def means_of(points: Sequence[Point], names: Iterable[str]) -> dict[str, float]:
@@ -35,7 +37,7 @@ def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | Non
     return None
 
 
-def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:
+def value_of(row: Row, results: Sequence[Result]) -> float | None:
     """Return the figure of all seeds: a mean return, a median of seconds (None is infinite), or a lowest share."""
     if row.measure == "return":
         return statistics.fmean(result["evaluation"]["return_mean"] for result in results)
@@ -51,7 +53,7 @@ def value_of(row: Row, results: Sequence[Mapping[str, Any]]) -> float | None:
     return middle if math.isfinite(middle) else None
 
 
-def is_reached(row: Row, results: Sequence[Mapping[str, Any]]) -> bool | None:
+def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
     """Return whether a row reaches all its goals; None where it has none."""
     value = value_of(row, results)
     found = []

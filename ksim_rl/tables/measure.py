@@ -13,7 +13,6 @@ import sys
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 from ksim_rl import conf
 from ksim_rl.config import plugins
@@ -24,7 +23,7 @@ from ksim_rl.files.writing import write_whole
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.runs.listing import METRICS
-from ksim_rl.tables.levels import HELD_STATES, means_of, reached
+from ksim_rl.tables.levels import HELD_STATES, Result, means_of, reached
 from ksim_rl.tables.table import Row, load
 from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
@@ -98,7 +97,7 @@ class _Judge(Hook):
             self._trials = trials
         else:
             self._trials = 0
-        self.found: dict[str, Any] = {"trials": None, "means": {}}
+        self.found: Result = {"trials": None, "means": {}}
         self.seconds_in_all = 0.0
         self.ended = 0.0
 
@@ -122,7 +121,7 @@ class _Judge(Hook):
             self.found["trials"] = asdict(run_trials(self._cfg, trainer.update.actor, **how))
 
 
-def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) -> dict[str, Any]:
+def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) -> Result:
     """Train and judge; return plain data. An interrupted run raises, so that it leaves no result."""
     cfg = run_cfg(row, seed, device=device, smoke=smoke)
     judge = _Judge(cfg, row, trials=8 if smoke else row.episodes)

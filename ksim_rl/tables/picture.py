@@ -3,18 +3,17 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import wrap
-from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ksim_rl.tables.levels import value_of
+from ksim_rl.tables.levels import Result, value_of
 from ksim_rl.tables.table import Table
 
 OURS, OTHERS = "#3465a4", (("D", "#cc5500"), ("s", "#75507b"), ("^", "#4e9a06"), ("v", "#c4a000"))
 
 
-def draw(table: Table, rows: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -> None:
+def draw(table: Table, rows: Mapping[str, Sequence[Result]], path: Path) -> None:
     """Draw one panel per group; `rows` has the results of those rows that are complete."""
     groups = []
     for group, names in table.groups().items():

@@ -4,13 +4,13 @@ import json
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+from ksim_rl.config.trees import Tree
 from ksim_rl.files.writing import whole_file, write_whole
-from ksim_rl.tables.levels import is_reached, value_of
+from ksim_rl.tables.levels import Result, is_reached, value_of
 from ksim_rl.tables.table import Row, Table
 
-Results = Sequence[Mapping[str, Any]]
+Results = Sequence[Result]
 PROTOCOL = (
     "Settings were fixed before these seeds were run. The final policy is judged, not the best one: deterministic "
     "actions in fresh envs. Seconds are of training, its first iteration included; what is compiled before is apart. A "
@@ -85,7 +85,7 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
     return path
 
 
-def _markdown(table: Table, rows: Mapping[str, Results], tree: Mapping[str, Any]) -> str:
+def _markdown(table: Table, rows: Mapping[str, Results], tree: Tree) -> str:
     lines = [f"# {table.title}", ""]
     for group, names in table.groups().items():
         # One column for each publication that any row of the group has.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from subprocess import STDOUT, Popen
-from typing import IO, Any
+from typing import IO
 
 import torch
 
@@ -15,6 +15,7 @@ from ksim_rl.config.child_processes import start_python
 from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 from ksim_rl.files.writing import make_folder, open_own
 from ksim_rl.runs import run_lock
+from ksim_rl.tables.levels import Result
 from ksim_rl.tables.measure import run_cfg, settings
 from ksim_rl.tables.table import Table
 
@@ -35,9 +36,9 @@ class Runs:
         # Composing a config is slow, and each row is asked for many times.
         self._of = cache(lambda name: run_cfg(table.rows[name], 1, smoke=smoke))
 
-    def results(self) -> dict[str, dict[int, dict[str, Any]]]:
+    def results(self) -> dict[str, dict[int, Result]]:
         """Return the results that count, by row and seed: results of the settings that the row has now."""
-        found: dict[str, dict[int, dict[str, Any]]] = {}
+        found: dict[str, dict[int, Result]] = {}
         for name, row in self.table.rows.items():
             paths = {seed: self.folder / name / f"seed_{seed}.json" for seed in row.seeds}
             present = {seed: _result(path) for seed, path in paths.items() if path.exists()}
@@ -50,7 +51,7 @@ class Runs:
             found[name] = {seed: result for seed, result in present.items() if result["settings"] == own}
         return found
 
-    def complete(self, seeds: Sequence[int]) -> dict[str, list[dict[str, Any]]]:
+    def complete(self, seeds: Sequence[int]) -> dict[str, list[Result]]:
         """Return the results of the rows of which each of `seeds` (none: all of the row) is there."""
         rows = self.table.rows
         found = {}
@@ -183,7 +184,7 @@ class Runs:
         return self.run_folder / job[0] / f"seed_{job[1]}.log"
 
 
-def _result(path: Path) -> dict[str, Any]:
+def _result(path: Path) -> Result:
     return json.loads(read_bytes(path, limit=MOST_RESULT_BYTES))
 
 

@@ -13,6 +13,7 @@ from ksim_rl.checked import Checked, Count, Positive, Share, WholeNumber
 from ksim_rl.checks import naming, unknown_name
 from ksim_rl.config import plain_data
 from ksim_rl.config.config_tree import from_tree
+from ksim_rl.config.trees import Tree
 from ksim_rl.tables.rules import check_name, check_override
 
 SUFFIX = ".yaml"
@@ -130,7 +131,7 @@ def load(name: str) -> Table:
     return table
 
 
-def _rows(groups: Any) -> dict[str, Any]:
+def _rows(groups: Any) -> Tree:
     """Return the fields of each row by `<group>/<name>`, with the fields of its group."""
     if isinstance(groups, dict):
         found = groups

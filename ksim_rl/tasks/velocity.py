@@ -293,7 +293,7 @@ def flat_cfg(
 
     Bipeds are calmer, and keep their limbs apart.
     """
-    calm: dict[str, Any] = {"body_ang_vel": -0.05, "angular_momentum": -0.02} if is_biped else {}
+    calm: dict[str, float] = {"body_ang_vel": -0.05, "angular_momentum": -0.02} if is_biped else {}
     earned = rewards(robot, pose=pose, torso=torso, foot_height=foot_height, **calm)
     if is_biped:
         earned["self_collisions"] = mdp.SelfCollision(weight=-1.0, sensor=SELF)

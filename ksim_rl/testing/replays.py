@@ -1,12 +1,12 @@
 """Replays the same actions from the same start, as often as a check needs them."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torch.utils._pytree import PyTree
 from torchrl.envs import EnvBase
 
 from ksim_rl.envs.contract import part
@@ -72,7 +72,7 @@ def end_episodes_at_next_step(env: EnvBase) -> None:
         view.time_out_offset_E.copy_(base_env.max_episode_length - view.episode_step_E - 1)
 
 
-def copy_of(value: Any) -> Any:
+def copy_of(value: PyTree) -> PyTree:
     """Return a copy of a tensor; anything else as it is."""
     if isinstance(value, Tensor):
         return value.clone()

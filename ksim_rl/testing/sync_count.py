@@ -1,15 +1,17 @@
 """Counts the operations that make the host wait for the device, on any machine."""
 
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import PyTree
+
+from ksim_rl.device.recording import OpArgs, OpKwargs, OpOverload
 
 _ALWAYS = {
     "aten::_local_scalar_dense": "a tensor's value read by Python (item, bool, float, int)",
@@ -85,19 +87,27 @@ class _Counting:
 
 
 class _Methods(_Counting, TorchFunctionMode):
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_function__(
+        self,
+        func: Callable[..., PyTree],
+        types: Sequence[type],
+        args: OpArgs = (),
+        kwargs: OpKwargs | None = None,
+    ) -> PyTree:
         self.note(_METHODS.get(func))
         return func(*args, **(kwargs or {}))
 
 
 class _Operations(_Counting, TorchDispatchMode):
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, func: OpOverload, types: Sequence[type], args: OpArgs = (), kwargs: OpKwargs | None = None
+    ) -> PyTree:
         kwargs = kwargs or {}
         self.note(_why_it_syncs(func, args, kwargs))
         return func(*args, **kwargs)
 
 
-def _why_it_syncs(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> str | None:
+def _why_it_syncs(func: OpOverload, args: OpArgs, kwargs: OpKwargs) -> str | None:
     # The name without the overload, such as "aten::index".
     name = func._schema.name
     if name in _ALWAYS:

@@ -4,12 +4,13 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Num
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -45,7 +46,7 @@ class Update(Protocol):
         ...
 
     @property
-    def rollout_keys(self) -> list[Any]:
+    def rollout_keys(self) -> list[NestedKey]:
         """The leaves of an env state that an update reads."""
         ...
 
@@ -63,10 +64,10 @@ class Update(Protocol):
         """Return everything that the next update depends on."""
         ...
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; tensors keep their addresses."""
 
-    def load_weights(self, state: Mapping[str, Any]) -> None:
+    def load_weights(self, state: State) -> None:
         """Take only the networks of a `state_dict`: a new run that starts from them."""
 
 
@@ -115,7 +116,7 @@ class Algorithm:
 
     name: str  # as in `objective=<name>`
     cfg: type[AlgorithmCfg]  # a run whose objective is one of these, or of a subclass, is trained by it
-    update: Callable[[RunCfg, EnvBase, Mapping[str, Any] | None], Update]
+    update: Callable[[RunCfg, EnvBase, State | None], Update]
     policy: Callable[[RunCfg, EnvBase], TensorDictModuleBase]  # its weights: `update/actor` of a checkpoint
     data: DatasetCfg | ReplayCfg  # chosen by `objective=<name>` along with its settings, as are the modules
     modules: ModulesCfg = field(default_factory=ModulesCfg)
@@ -139,7 +140,7 @@ def algorithm_of(cfg: RunCfg) -> Algorithm:
     return importlib.import_module(REGISTRY).serving(type(cfg.objective))
 
 
-def make_update(cfg: RunCfg, env: EnvBase, *, resumed: Mapping[str, Any] | None = None) -> Update:
+def make_update(cfg: RunCfg, env: EnvBase, *, resumed: State | None = None) -> Update:
     """Build everything that learns in a run, with all its memory allocated; see `Algorithm.update`."""
     algorithm = algorithm_of(cfg)
     # Without means over ranks each would train a different policy, unnoticed.

@@ -15,14 +15,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import safetensors.torch
 from safetensors import SafetensorError
 
 from ksim_rl import ranks
 from ksim_rl.checks import MISFITS
+from ksim_rl.config.trees import Plain, Tree
 from ksim_rl.device import state_tree
+from ksim_rl.device.state_tree import State
 from ksim_rl.files.reading import MOST_TENSOR_BYTES, read_bytes
 from ksim_rl.files.writing import WRITING
 from ksim_rl.trainers import checkpoint_formats
@@ -49,7 +50,7 @@ class Checkpoint:
 
     path: Path
     iteration: int
-    config: dict[str, Any]
+    config: Tree
     state: state_tree.State
 
     @property
@@ -60,10 +61,10 @@ class Checkpoint:
 
 def save(
     folder: Path,
-    state: Mapping[str, Any],
+    state: State,
     *,
     iteration: int,
-    config: Mapping[str, Any],
+    config: Tree,
     keep: int = 3,
     trusted: int | None = None,
 ) -> Path:
@@ -121,7 +122,7 @@ def save(
     return folder / name
 
 
-def own_part(state: Mapping[str, Any], live: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+def own_part(state: State, live: Callable[[], State]) -> State:
     """Return this rank's part of a checkpoint's state; `live` returns the state of the run that loads it."""
     if RANKS not in state and ranks.size() == 1:
         return state
@@ -246,13 +247,13 @@ def check_columns(saved: Columns, own: Columns) -> None:
         raise ValueError(f"the checkpoint is of other observations: {'; '.join(faults)}")
 
 
-def _seal(manifest: dict[str, Any]) -> bytes:
+def _seal(manifest: Tree) -> bytes:
     # Not sorted: the order of observation terms in the config is the order of the networks' inputs.
     body = json.dumps(manifest, allow_nan=False, separators=(",", ":"))
     return f'{{"manifest_sha256":"{_sha256(body.encode())}",\n"manifest":{body}}}\n'.encode()
 
 
-def _read_manifest(path: Path) -> dict[str, Any]:
+def _read_manifest(path: Path) -> Tree:
     if not path.is_dir():
         raise CheckpointError(f"{path}: no such checkpoint folder")
     raw = _read_regular_file(path / MANIFEST, limit=_MAX_MANIFEST_BYTES)
@@ -285,7 +286,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     return manifest
 
 
-def _has(tree: Any, **kinds: type) -> bool:
+def _has(tree: Plain, **kinds: type) -> bool:
     return isinstance(tree, dict) and all(isinstance(tree.get(name), kind) for name, kind in kinds.items())
 
 

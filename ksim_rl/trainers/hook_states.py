@@ -1,14 +1,14 @@
 """Pairs the hooks of a resumed run with the states that its checkpoint has for them."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from ksim_rl.device.state_tree import State
 
 H = TypeVar("H")
 
 
-def paired(
-    hooks: Sequence[H], saved: Mapping[str, Any], *, keeps: Callable[[H], bool]
-) -> list[tuple[H, Mapping[str, Any]]]:
+def paired(hooks: Sequence[H], saved: State, *, keeps: Callable[[H], bool]) -> list[tuple[H, State]]:
     """Pair hooks, in their order, with the states saved by number; a ValueError where they are of another run.
 
     Hooks that keep nothing, such as a viewer's, may come and go between the sessions of a run; `keeps` knows others.

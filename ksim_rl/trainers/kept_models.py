@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ksim_rl.config.plain_data import check_links
+from ksim_rl.config.trees import Plain
 from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
 from ksim_rl.files.writing import whole_folder, write_whole
 from ksim_rl.physics.model_files.packing import ModelFiles, files_of_model
@@ -197,14 +198,14 @@ def _sources(cfg: RunCfg) -> Iterator[tuple[str, str]]:
                 yield f"{kind}/{name}", entity.model
 
 
-def _with_source(entity: Any, source: str) -> Any:
+def _with_source(entity: MjcfRobot | MenagerieRobot, source: str) -> MjcfRobot | ModelRobot:
     if isinstance(entity, MjcfRobot):
         return dataclasses.replace(entity, source=source)
     assert isinstance(entity, ModelRobot)  # others name a model of the menagerie, of which no copy is kept
     return dataclasses.replace(entity, model=source)
 
 
-def _dictionary(plain: Any) -> dict[str, Any]:
+def _dictionary(plain: Plain) -> dict[str, Plain]:
     if not isinstance(plain, dict):
         raise ValueError("expected a mapping")
     return plain

@@ -4,7 +4,7 @@ import importlib.util
 import os
 import re
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,6 +15,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 
 from ksim_rl.checked import Checked, Name
 from ksim_rl.config import plain_data
+from ksim_rl.config.trees import Tree
 from ksim_rl.files.reading import read_bytes
 from ksim_rl.files.writing import make_folder, write_whole
 from ksim_rl.runs.csv_table import CsvTable
@@ -46,7 +47,7 @@ class WandbCfg(Checked):
     offline: bool = False  # write into the run folder only; `wandb sync RUN/wandb/offline-*` sends it later
 
 
-def open_wandb(cfg: WandbCfg, run_folder: Path, config: Mapping[str, Any]) -> MetricLogger:
+def open_wandb(cfg: WandbCfg, run_folder: Path, config: Tree) -> MetricLogger:
     """Begin the run with the config of a training run, or continue a resumed run's."""
     path = run_folder / "wandb" / "run_id"
     # The id stays in the folder, so that a resumed run goes on in the same place.
@@ -100,7 +101,7 @@ class _Run(MLFlowLogger):
         super().close(timeout)
 
 
-def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Mapping[str, Any]) -> MetricLogger:
+def open_mlflow(cfg: MLflowCfg, run_folder: Path, config: Tree) -> MetricLogger:
     """Begin the run with the config of a training run, or continue a resumed run's."""
     import mlflow  # pyright: ignore[reportMissingImports]
 
@@ -146,9 +147,7 @@ def check_installed(cfg: LoggerCfg) -> None:
             raise ValueError(f"logger.{name}: the package {name} is missing: pip install 'ksim_rl[{name}]'")
 
 
-def make_loggers(
-    cfg: LoggerCfg, run_folder: Path, *, config: Mapping[str, Any] | None = None
-) -> list[MetricLogger]:
+def make_loggers(cfg: LoggerCfg, run_folder: Path, *, config: Tree | None = None) -> list[MetricLogger]:
     """Open the loggers of a run, some of which show its `config`; a RuntimeError names a service that refuses."""
     loggers: list[MetricLogger] = []
     if cfg.csv:

@@ -1,11 +1,12 @@
 """Chooses and describes the physics in which a trained policy is judged, other than the physics of its training."""
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from typing import Any, Literal
 
 import mujoco
 
+from ksim_rl.config.trees import Tree
 from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.scene.scene import build_spec
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -17,9 +18,9 @@ ENGINE = f"{PREFIX}engine"
 _OTHER_INTEGRATOR = {"euler": "implicitfast", "discrete": "implicitfast"}
 
 
-def trained_with(tree: Mapping[str, Any]) -> Literal["auto", "warp", "c"]:
+def trained_with(tree: Tree) -> Literal["auto", "warp", "c"]:
     """Return the engine that made a run, from its tree of config; those that name none were made by Warp."""
-    sim: Any = tree.get("task", {}).get("sim", {})
+    sim: Tree = tree.get("task", {}).get("sim", {})
     return sim.get("engine", "warp")
 
 

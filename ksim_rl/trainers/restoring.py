@@ -7,10 +7,11 @@ from typing import Any
 import torch
 from torchrl.envs import EnvBase
 
+from ksim_rl.device.state_tree import State
 from ksim_rl.trainers.algorithm import Update
 
 
-def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
+def load_env_state(env: EnvBase, state: State) -> None:
     """Continue an env where its state was taken.
 
     Raises:
@@ -27,7 +28,7 @@ def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
         ) from error
 
 
-def load_networks(update: Update, state: Mapping[str, Any], path: Path) -> None:
+def load_networks(update: Update, state: State, path: Path) -> None:
     """Start from the networks and normalizers of a checkpoint; optimizers and counts stay new.
 
     Raises:

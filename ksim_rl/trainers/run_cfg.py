@@ -5,7 +5,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 
@@ -16,6 +16,7 @@ from ksim_rl.collectors import CollectorCfg
 from ksim_rl.config import class_paths, plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.config.plain_data import check_plain
+from ksim_rl.config.trees import Plain, Tree
 from ksim_rl.data import DatasetCfg, ReplayCfg, sequence_length
 from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.modules import (
@@ -239,7 +240,7 @@ class RunCfg(TrainingCfg):
         )
 
     @classmethod
-    def from_tree(cls, tree: Mapping[str, Any]) -> "RunCfg":
+    def from_tree(cls, tree: Tree) -> "RunCfg":
         """Build the config from plain data, also of an earlier version; a ValueError has the full path of a fault."""
         # Plain data and known packages first: the tree may be of somebody else's run.
         check_plain(tree, "config")
@@ -247,7 +248,7 @@ class RunCfg(TrainingCfg):
         tree = up_to_date({key: value for key, value in tree.items() if key != PLUGINS})
         return from_tree(cls, without_env_size(tree))
 
-    def to_tree(self) -> dict[str, Any]:
+    def to_tree(self) -> Tree:
         """Return the config as plain data, from which `from_tree` builds an equal one.
 
         Beside the fields it names the plug-ins of this process and of the classes in the config.
@@ -273,7 +274,7 @@ def with_engine(cfg: RunCfg, engine: Literal["auto", "warp", "c"]) -> RunCfg:
     return replace(cfg, task=replace(cfg.task, sim=sim))
 
 
-def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[str] = ()) -> None:
+def check_run_tree(tree: Tree, where: Path, *, given: Collection[str] = ()) -> None:
     """Refuse the config of a run folder if it holds more than a run's fields, or says what to write elsewhere.
 
     `given` are the fields, by dotted path, that the user sets himself.
@@ -291,13 +292,13 @@ def check_run_tree(tree: Mapping[str, Any], where: Path, *, given: Collection[st
         )
 
 
-def reaching_outside(tree: Mapping[str, Any], *, given: Collection[str] = ()) -> Iterator[tuple[str, Any]]:
+def reaching_outside(tree: Tree, *, given: Collection[str] = ()) -> Iterator[tuple[str, Plain]]:
     """Yield the fields of a run's tree, by dotted path, by which a run writes or listens elsewhere.
 
     Those that are `given` are left out, with all that is below them.
     """
     for path in WRITTEN:
-        value: Any = tree
+        value: Plain = tree
         for name in path.split("."):
             if isinstance(value, Mapping):
                 value = value.get(name)
@@ -311,7 +312,7 @@ def reaching_outside(tree: Mapping[str, Any], *, given: Collection[str] = ()) ->
             yield path, value
 
 
-def without_env_size(tree: Mapping[str, Any]) -> dict[str, Any]:
+def without_env_size(tree: Tree) -> Tree:
     """Return a run's tree without the env's own number of envs and seed, which must be the run's if given."""
     task = tree.get("task")
     if not isinstance(task, Mapping) or not isinstance(task.get("scene"), Mapping):
@@ -328,7 +329,7 @@ def without_env_size(tree: Mapping[str, Any]) -> dict[str, Any]:
     return {**tree, "task": task}
 
 
-def up_to_date(tree: Mapping[str, Any]) -> dict[str, Any]:
+def up_to_date(tree: Tree) -> Tree:
     """Return the config tree of a run as this version writes it."""
     tree = dict(tree)
     objective = tree.get("objective")

@@ -16,7 +16,7 @@ from ksim_rl.diagnosis.probes import probed
 from ksim_rl.envs.contract import EpisodeClock, EpisodeSums, missing_parts, part
 from ksim_rl.envs.recorded_python import FrozenPythonError
 from ksim_rl.trainers import checkpoint
-from ksim_rl.trainers.algorithm import HasProgress, Update, notes_of
+from ksim_rl.trainers.algorithm import HasProgress, State, Update, notes_of
 from ksim_rl.trainers.evaluation import Evaluation, Evaluator
 from ksim_rl.trainers.hook_states import paired
 from ksim_rl.trainers.interrupt import InterruptRequest
@@ -70,11 +70,11 @@ class Hook:
     def at_end(self, trainer: "Trainer") -> None:
         """Act once after the last iteration, also of an interrupted run."""
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Return the state that later calls depend on: tensors and plain data, nested; a checkpoint keeps it."""
         return {}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken."""
 
 
@@ -353,10 +353,10 @@ class Trainer:
             seconds_left=self.clock.seconds_left(self.cfg.num_iterations - iteration),
         )
 
-    def _ask(self, logger: MetricLogger, call: Callable[..., Any], *arguments: Any) -> None:
+    def _ask(self, logger: MetricLogger, call: Callable[..., None], *given: dict[str, float] | int) -> None:
         """Call a logger; a full disk or a server that is gone loses its records, but does not end the run."""
         try:
-            call(*arguments)
+            call(*given)
         except Exception as error:
             name = type(logger).__name__
             reason = " ".join(f"{type(error).__name__}: {error}".split())
@@ -416,7 +416,7 @@ class Trainer:
         checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
         load_networks(self.update, state["update"], path)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Return everything that the next iteration depends on: tensors and plain data, nested."""
         return {
             "iteration": self.iteration,
@@ -429,7 +429,7 @@ class Trainer:
             "hooks": {str(index): hook.state_dict() for index, hook in enumerate(self._own_hooks)},
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; a ValueError where networks, observations or env are others."""
         checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
         hooks = paired(self._own_hooks, state["hooks"], keeps=_keeps)

@@ -15,6 +15,7 @@ from torchrl.envs.transforms import Transform
 
 from ksim_rl import checks
 from ksim_rl.device import random
+from ksim_rl.device.state_tree import State
 from ksim_rl.transforms import upstream
 from ksim_rl.transforms.specs import Device, drop_leaf, leaf_spec, set_leaf_spec, spell
 
@@ -217,7 +218,7 @@ class RowTransform(CheckedKeys, ABC):
             copy._buffers[name] = None if buffer is None else buffer.clone()
         return copy
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state_dict: State, prefix: str, *args: Any) -> None:
         # Buffers that the env has not sized yet take the size of the loaded ones.
         for name, present in self._buffers.items():
             loaded = state_dict.get(prefix + name)
@@ -293,7 +294,7 @@ class KeyedTransform(RowTransform):
         if not self._is_seeded:
             self.seed_(upstream.fresh_seed())
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state_dict: State, prefix: str, *args: Any) -> None:
         super()._load_from_state_dict(state_dict, prefix, *args)
         # The one value that no seed has stands for a state that was saved before any draw.
         self._is_seeded = bool(self.seed_value != _NO_SEED)

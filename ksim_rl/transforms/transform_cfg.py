@@ -12,10 +12,12 @@ from typing import Any, Literal, Self
 from tensordict import NestedKey
 from torchrl.envs.transforms import Transform
 
+from ksim_rl.checked import Annotation
 from ksim_rl.checks import naming, near
 from ksim_rl.config import class_paths
 from ksim_rl.config.class_paths import TARGET
 from ksim_rl.config.config_tree import OwnTree, build_value, to_tree
+from ksim_rl.config.trees import Plain, Tree
 from ksim_rl.transforms import stock
 
 _PLAIN = (bool, int, float, str, types.NoneType)
@@ -66,14 +68,14 @@ class TransformCfg(OwnTree):
         with naming(self.transform.__name__, TypeError, KeyError, RuntimeError, ImportError):
             return self.transform(**arguments)
 
-    def to_tree(self) -> dict[str, Any]:
+    def to_tree(self) -> Tree:
         """Return the plain tree: the path of the class, and all arguments."""
         parameters = _parameters(self.transform)
         arguments = {name: to_tree(value, parameters[name][0]) for name, value in self.arguments.items()}
         return {TARGET: class_paths.public_path(self.transform), **arguments}
 
     @classmethod
-    def from_tree(cls, tree: Any, path: str) -> Self:
+    def from_tree(cls, tree: Plain, path: str) -> Self:
         """Build the description of a node; a ValueError names the full path of the fault."""
         if isinstance(tree, cls):
             return tree
@@ -110,12 +112,12 @@ class TransformCfg(OwnTree):
         return f"{self.transform.__name__}({shown})"
 
 
-def _is_transform(value: Any) -> bool:
+def _is_transform(value: type) -> bool:
     return isinstance(value, type) and issubclass(value, Transform)
 
 
 @functools.cache
-def _parameters(transform: type[Transform]) -> dict[str, tuple[Any, Any]]:
+def _parameters(transform: type[Transform]) -> dict[str, tuple[Annotation, Any]]:
     """Return annotation and default of each argument that can be given by name."""
     # Not the class's signature, which for some of TorchRL's classes comes from `__new__`.
     _self, *parameters = inspect.signature(transform.__init__).parameters.values()
@@ -130,14 +132,14 @@ def _parameters(transform: type[Transform]) -> dict[str, tuple[Any, Any]]:
     }
 
 
-def _annotation(transform: type[Transform], name: str, where: str) -> Any:
+def _annotation(transform: type[Transform], name: str, where: str) -> Annotation:
     parameters = _parameters(transform)
     if name not in parameters:
         raise ValueError(f"unknown field {where!r} of {transform.__name__}: {near(str(name), parameters)}")
     return parameters[name][0]
 
 
-def _as_data(annotation: Any) -> Any:
+def _as_data(annotation: Annotation) -> Annotation:
     """Return the part of an annotation that a config can give: no tensors, functions and the like; else `Any`."""
     # Both spellings of a union, `Union[A, B]` and `A | B`.
     is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
@@ -149,7 +151,7 @@ def _as_data(annotation: Any) -> Any:
     return Any
 
 
-def _listed(value: Any, annotation: Any) -> Any:
+def _listed(value: Any, annotation: Annotation) -> Any:
     """Return a nested key, which is a tuple, as a list of that one where several keys may stand."""
     options = typing.get_args(annotation)
     takes_keys = any(
@@ -162,7 +164,7 @@ def _listed(value: Any, annotation: Any) -> Any:
     return value
 
 
-def _is_data(option: Any) -> bool:
+def _is_data(option: Annotation) -> bool:
     origin = typing.get_origin(option)
     if origin in (tuple, list, Sequence, Mapping, dict):
         return all(_is_data(entry) or entry is Ellipsis for entry in typing.get_args(option))

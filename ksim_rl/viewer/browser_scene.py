@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Collection
-from typing import Any
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -28,6 +28,8 @@ _GROUND: dict[str, Any] = {
 }  # fmt: skip
 # Vertices [V, 3] in m, and triangles [F, 3] of their indices.
 Mesh = tuple[np.ndarray, np.ndarray]
+# What geoms of one mesh share: kind, number in the model, sizes that cannot be scaled, transparency.
+Key: TypeAlias = tuple[Any, ...]
 
 
 class SceneOfEnv:
@@ -82,7 +84,7 @@ class BrowserScene:
         self._mj_model = mj_model
         self._root = scene.add_frame("/env", show_axes=False)
         # By key: the handle of the mesh, and the arrays that the browser has now.
-        self._batches: dict[tuple[Any, ...], tuple[viser.BatchedMeshHandle, dict[str, np.ndarray]]] = {}
+        self._batches: dict[Key, tuple[viser.BatchedMeshHandle, dict[str, np.ndarray]]] = {}
         self._labels: list[viser.LabelHandle] = []
         self._planes: dict[int, viser.GridHandle] = {}
         self.unknown: set[str] = set()
@@ -90,7 +92,7 @@ class BrowserScene:
     def show(self, mjv: mujoco.MjvScene, *, center: np.ndarray) -> None:
         """Show the scene, moved so that `center` (m) is above the origin, at which cameras look."""
         # One message for each mesh is far cheaper than one for each geom.
-        batches: dict[tuple[Any, ...], list[mujoco.MjvGeom]] = {}
+        batches: dict[Key, list[mujoco.MjvGeom]] = {}
         labels = []
         for index in range(mjv.ngeom):
             geom = mjv.geoms[index]
@@ -108,7 +110,7 @@ class BrowserScene:
             self._batch(key, batches.get(key, []))
         self._write_labels(labels)
 
-    def _key(self, geom: mujoco.MjvGeom) -> tuple[Any, ...] | None:
+    def _key(self, geom: mujoco.MjvGeom) -> Key | None:
         """Return the key that geoms of one mesh share: kind, data, sizes that cannot be scaled, transparency."""
         # Two digits, so that fading geoms do not open a mesh for each shade.
         alpha = round(float(geom.rgba[3]), 2)
@@ -126,7 +128,7 @@ class BrowserScene:
         self.unknown.add(mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower())
         return None
 
-    def _batch(self, key: tuple[Any, ...], geoms: list[mujoco.MjvGeom]) -> None:
+    def _batch(self, key: Key, geoms: list[mujoco.MjvGeom]) -> None:
         """Show these geoms as instances of one mesh; those that it had more of before shrink to nothing."""
         known = self._batches.get(key)
         # Batches only grow: another number of instances means a new mesh in the browser.
@@ -174,7 +176,7 @@ class BrowserScene:
                     setattr(handle, name, value)
         self._batches[key] = (handle, values)
 
-    def _mesh(self, key: tuple[Any, ...]) -> Mesh:
+    def _mesh(self, key: Key) -> Mesh:
         # Height fields count by their own number.
         if key[0] == _KIND.mjGEOM_HFIELD:
             return height_field_mesh(self._mj_model, key[1])
@@ -259,7 +261,7 @@ def height_field_mesh(mj_model: mujoco.MjModel, field: int) -> Mesh:
     return np.stack([x.ravel(), y.ravel(), height], axis=1), np.concatenate([lower, upper])
 
 
-def _of_trimesh(*bodies: Any) -> Mesh:
+def _of_trimesh(*bodies: trimesh.Trimesh) -> Mesh:
     whole: Any = trimesh.util.concatenate(bodies)
     return np.asarray(whole.vertices), np.asarray(whole.faces)
 

@@ -66,7 +66,7 @@ class _Clients:
         class Connection(ServerConnection):
             _free_at = 0.0
 
-            async def recv(self, decode: bool | None = None) -> Any:
+            async def recv(self, decode: bool | None = None) -> bytes:
                 while True:
                     # Messages that are refused are counted, and the next one is waited for.
                     raw = await super().recv(decode)

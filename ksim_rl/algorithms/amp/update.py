@@ -1,13 +1,12 @@
 """AMP scores a rollout's style, lets PPO learn from it, and teaches the discriminator; one CUDA graph on CUDA."""
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 from jaxtyping import Float32, Num
 from tensordict import TensorDictBase
-from tensordict.utils import unravel_key
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -17,6 +16,7 @@ from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.algorithms.ppo.wiring import make_ppo_update
 from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
+from ksim_rl.device.state_tree import State
 from ksim_rl.envs.signal_keys import STANDARD
 from ksim_rl.mdp.motion_observations import observe_motion
 from ksim_rl.modules import Discriminator
@@ -34,7 +34,7 @@ LOGGED = {
 }
 
 
-def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "AMPUpdate":
+def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: State | None = None) -> "AMPUpdate":
     """Build PPO and the discriminator of a run, and observe its reference motions."""
     objective: Any = cfg.objective
     ppo = make_ppo_update(cfg, env)
@@ -97,12 +97,12 @@ class AMPUpdate(RolloutUpdate):
         self._style = torch.zeros((), device=self.device)
 
     @property
-    def rollout_keys(self) -> list[Any]:
+    def rollout_keys(self) -> list[NestedKey]:
         """The leaves of an env state that an update reads."""
         return list(dict.fromkeys([*self.ppo.rollout_keys, *self._features]))
 
     @property
-    def _features(self) -> tuple[Any, Any]:
+    def _features(self) -> tuple[NestedKey, NestedKey]:
         """Where the features before and after a step lie."""
         return self.cfg.style_group, unravel_key(("next", self.cfg.style_group))
 
@@ -178,7 +178,7 @@ class AMPUpdate(RolloutUpdate):
             "replay": self.replay.state_dict(),
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         self.ppo.load_state_dict(state)
         super().load_weights(state)
@@ -187,13 +187,13 @@ class AMPUpdate(RolloutUpdate):
         state_tree.copy_into(self.guard.state_dict(), guard, what="guard of the discriminator")
         self.replay.load_state_dict(state["replay"])
 
-    def load_weights(self, state: Mapping[str, Any]) -> None:
+    def load_weights(self, state: State) -> None:
         """Take only the networks of a `state_dict`; from a run of plain PPO, the networks of the policy."""
         self.ppo.load_weights(state)
         if "discriminator" in state:
             super().load_weights(state)
 
 
-def _transitions(env_states: TensorDictBase, before: Any, after: Any) -> Tensor:
+def _transitions(env_states: TensorDictBase, before: NestedKey, after: NestedKey) -> Tensor:
     """Return the features before and after each step, [*batch, 2, L]."""
     return torch.stack((env_states.get(before), env_states.get(after)), -2)

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
 from ksim_rl.checks import naming
 from ksim_rl.device import state_tree
+from ksim_rl.device.state_tree import State
 from ksim_rl.modules import recurrent_modules
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import make_policy
@@ -30,7 +32,7 @@ class Teacher:
         """Return weights and description: `restored_teacher` builds the same one, without the folder of its run."""
         return {"actor": self.policy.state_dict(), **self.description}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Take the weights of a `state_dict`; tensors keep their addresses."""
         state_tree.copy_into(self.policy.state_dict(), state["actor"], what="teacher")
 
@@ -50,14 +52,14 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
         return restored_teacher(state, env, cfg=cfg)
 
 
-def restored_teacher(state: Mapping[str, Any], env: EnvBase, *, cfg: RunCfg) -> Teacher:
+def restored_teacher(state: State, env: EnvBase, *, cfg: RunCfg) -> Teacher:
     """Build the teacher of a `Teacher.state_dict`; see `load_teacher`."""
     # Built by the config of its own run, on the device of this one.
     teacher_cfg = RunCfg.from_tree({**json.loads(state["config"]), "device": str(cfg.resolved_device())})
     read = teacher_cfg.modules.observation_keys("actor")
     theirs: Any = json.loads(state["columns"])
     ours: Any = observation_columns(env)
-    shown: Any = env.observation_spec
+    shown: Composite = env.observation_spec
     # The groups that it reads have to exist here, and to have the same columns.
     for key in read:
         if key not in shown.keys(True):

@@ -1,12 +1,12 @@
 """An iteration of distillation labels a rollout and makes gradient steps on it; it is one CUDA graph on CUDA."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Num
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -15,6 +15,7 @@ from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.wiring import make_ppo_policy
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
+from ksim_rl.device.state_tree import State
 from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.modules import MixedPolicy, update_normalizers
 from ksim_rl.objectives import DistillationCfg, DistillationLoss, distribution_keys, observation_keys
@@ -25,9 +26,7 @@ from ksim_rl.trainers.run_cfg import RunCfg
 LOGGED = {"loss_distillation": "loss/distillation", "kl": "update/kl", "grad_norm": "update/grad_norm"}
 
 
-def make_distillation_update(
-    cfg: RunCfg, env: EnvBase, resumed: Mapping[str, Any] | None = None
-) -> "DistillationUpdate":
+def make_distillation_update(cfg: RunCfg, env: EnvBase, resumed: State | None = None) -> "DistillationUpdate":
     """Build the distillation of a run; the teacher is in `resumed`, or else the policy of `objective.teacher`."""
     objective: Any = cfg.objective
     data = part_of(cfg, "data", DatasetCfg)
@@ -84,7 +83,7 @@ class DistillationUpdate(DatasetUpdate):
         self._action_error = torch.zeros((), device=self.device)
 
     @property
-    def rollout_keys(self) -> list[Any]:
+    def rollout_keys(self) -> list[NestedKey]:
         """The leaves of an env state that an update reads."""
         read = [*observation_keys(self.actor), *self._teacher_keys, *distribution_keys(self.actor)]
         return list(dict.fromkeys([*read, *self.signals.following]))
@@ -101,7 +100,7 @@ class DistillationUpdate(DatasetUpdate):
         }
 
     @property
-    def _teacher_keys(self) -> list[Any]:
+    def _teacher_keys(self) -> list[NestedKey]:
         return observation_keys(self.teacher.policy)
 
     def _update(self) -> None:
@@ -121,7 +120,7 @@ class DistillationUpdate(DatasetUpdate):
         own = {"teacher": self.teacher.state_dict(), "teacher_share": self.teacher_share}
         return super().state_dict() | own
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         super().load_state_dict(state)
         self.teacher.load_state_dict(state["teacher"])

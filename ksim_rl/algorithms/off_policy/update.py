@@ -1,7 +1,7 @@
 """An off-policy iteration puts a rollout into the replay and makes gradient steps; it is one CUDA graph on CUDA."""
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -18,6 +18,7 @@ from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.compiling import compiled
+from ksim_rl.device.state_tree import State
 from ksim_rl.modules import ExploringPolicy, update_normalizers
 from ksim_rl.objectives import (
     FlatAdamW,
@@ -82,7 +83,7 @@ class OffPolicyUpdate(RolloutUpdate):
         self.critic = loss.critic_network
         self.behavior = behavior
         self.num_env_states = num_envs * data.num_steps
-        self._observations: list[Any] = loss.observation_keys
+        self._observations: list[NestedKey] = loss.observation_keys
         # Each part by itself: backward passes and optimizer steps lie between them.
         fast: Any = partial(compiled, device=self.device, wanted=cfg.compile)
         self._images = None
@@ -114,7 +115,7 @@ class OffPolicyUpdate(RolloutUpdate):
         self._work.insert(0, self._store_only)
 
     @property
-    def rollout_keys(self) -> list[Any]:
+    def rollout_keys(self) -> list[NestedKey]:
         """The leaves of an env state that an update reads."""
         following = [unravel_key(("next", key)) for key in self._observations]
         return [*self._observations, "action", *following, *self.signals.following]
@@ -208,7 +209,7 @@ class OffPolicyUpdate(RolloutUpdate):
         go_back(losses, self.optimizers, mask=minibatch_B.get(MASK_KEY))
         return {name: self.optimizers[name].step(loss) for name, loss in losses.items()}
 
-    def _precision(self) -> AbstractContextManager[Any]:
+    def _precision(self) -> torch.autocast | nullcontext[None]:
         # The cache of casted weights would outlive the steps that change them in a captured graph.
         return torch.autocast(
             self.device.type, torch.bfloat16, enabled=self.cfg.autocast, cache_enabled=False
@@ -226,7 +227,7 @@ class OffPolicyUpdate(RolloutUpdate):
             state["log_alpha"] = self.loss.log_alpha
         return state
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; where it has no replay, with random actions until there is one."""
         super().load_state_dict(state)
         for name, optimizer in self.optimizers.items():
@@ -240,7 +241,7 @@ class OffPolicyUpdate(RolloutUpdate):
             self.steps_made = 0
         self.behavior.random.fill_(self.steps_made < self.data.learning_starts)
 
-    def load_weights(self, state: Mapping[str, Any]) -> None:
+    def load_weights(self, state: State) -> None:
         """Take networks and temperature of a `state_dict`; a ValueError names a tensor or action bound that differs."""
         # Before any weight is copied.
         self._check_action_bounds(state["actor"])
@@ -249,7 +250,7 @@ class OffPolicyUpdate(RolloutUpdate):
             with torch.no_grad():
                 self.loss.log_alpha.copy_(state["log_alpha"])
 
-    def _check_action_bounds(self, saved: Mapping[str, Any]) -> None:
+    def _check_action_bounds(self, saved: State) -> None:
         """Refuse an actor that was trained for other actions: its bounds are not weights, and come from the config."""
         for name, bound in self.actor.state_dict().items():
             own = bound.cpu()

@@ -1,6 +1,5 @@
 """Builds SAC, TD3 and their fast variants for a run: networks, loss, exploration and update."""
 
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -9,6 +8,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl.algorithms.off_policy.update import OffPolicyUpdate
 from ksim_rl.data import ReplayCfg
+from ksim_rl.device.state_tree import State
 from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.mdp.mirror_maps import mirror_maps
 from ksim_rl.modules import (
@@ -26,9 +26,7 @@ from ksim_rl.trainers.algorithm import Algorithm, part_of
 from ksim_rl.trainers.run_cfg import RunCfg
 
 
-def make_off_policy_update(
-    cfg: RunCfg, env: EnvBase, resumed: Mapping[str, Any] | None = None
-) -> OffPolicyUpdate:
+def make_off_policy_update(cfg: RunCfg, env: EnvBase, resumed: State | None = None) -> OffPolicyUpdate:
     """Build the update of a run; one that is resumed is built like a new one."""
     objective: Any = cfg.objective
     actor: Any = make_off_policy_policy(cfg, env)

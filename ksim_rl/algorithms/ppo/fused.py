@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate
@@ -31,7 +32,7 @@ class NotFused:
 
 
 def make_fused_ppo(
-    update: DatasetUpdate, mirror: Mapping[Any, MirrorMap] | None = None
+    update: DatasetUpdate, mirror: Mapping[NestedKey, MirrorMap] | None = None
 ) -> "FusedPPO | NotFused":
     """Build the fused gradient steps of a PPO update, or say why torch has to make them."""
     # The cheap reasons first: device, and the way in which minibatches are drawn.
@@ -112,7 +113,7 @@ def fused_networks(
     # Exact types: a subclass may compute something else.
     if type(policy) is not PolicyNetwork or type(value) is not ValueNetwork:
         return NotFused("the networks are not those of make_actor and make_critic")
-    if any(type(layers) is not nn.Sequential for layers in (policy.trunk, value.layers)):
+    if type(policy.trunk) is not nn.Sequential or type(value.layers) is not nn.Sequential:
         return NotFused("the networks are of layers of their own")
     head: Any = policy.head
     if type(head) not in (GaussianHead, TanhGaussianHead):

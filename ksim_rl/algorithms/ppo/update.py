@@ -7,12 +7,13 @@ import torch
 from jaxtyping import Num
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from tensordict.utils import unravel_key
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.fused import FusedBehavior, NotFused, make_fused_ppo
 from ksim_rl.device import state_tree
+from ksim_rl.device.state_tree import State
 from ksim_rl.modules import CarriedState, update_normalizers
 from ksim_rl.objectives import (
     PPOCfg,
@@ -54,7 +55,7 @@ class PPOUpdate(DatasetUpdate):
         actor: ProbabilisticTensorDictSequential,
         critic: TensorDictModule,
         device: torch.device | str = "cpu",
-        mirror: Mapping[Any, MirrorMap] | None = None,
+        mirror: Mapping[NestedKey, MirrorMap] | None = None,
         **shared: Any,
     ) -> None:
         cfg = with_precision_of(cfg, device)
@@ -83,7 +84,7 @@ class PPOUpdate(DatasetUpdate):
         return FusedBehavior(self.actor, self.fused)
 
     @property
-    def rollout_keys(self) -> list[Any]:
+    def rollout_keys(self) -> list[NestedKey]:
         """The leaves of an env state that an update reads."""
         actor = self.actor
         written = [*actor.dist_sample_keys, *actor.log_prob_keys, *distribution_keys(actor)]
@@ -150,7 +151,7 @@ class PPOUpdate(DatasetUpdate):
         """Return networks, optimizer, sampler and counters."""
         return super().state_dict() | {"recurrent_state": self._carried.state_dict()}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         super().load_state_dict(state)
         self._carried.load_state_dict(state["recurrent_state"], device=self.device)

@@ -1,9 +1,9 @@
 """Builds PPO for a run: actor and critic for the observations and actions of its env, and their update."""
 
 from functools import partial
-from typing import Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torchrl.data import Composite
 from torchrl.envs import EnvBase
 from torchrl.modules import ActorValueOperator
 
@@ -57,7 +57,7 @@ def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSe
     modules = cfg.modules
     actor_cfg = part_of(cfg, "modules.actor", ActorCfg)
     critic_cfg = part_of(cfg, "modules.critic", CriticCfg)
-    spec: Any = env.observation_spec
+    spec: Composite = env.observation_spec
 
     # A trunk adds the width of its features to the inputs of both networks.
     trunk = None

@@ -1,15 +1,17 @@
 """Refuses terms that write memory that is not theirs, by name: such as a reward that moves the robot."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Shaped
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import PyTree
 
 from ksim_rl.device import recording
+from ksim_rl.device.recording import OpArgs, OpKwargs, OpOverload
 from ksim_rl.envs.term_checks.term_memory import INPUT, MOCAP, STATE, Piece, TermMemory, bits_of
 from ksim_rl.envs.term_checks.term_rules import may_write, refusal
 from ksim_rl.envs.view import EnvView, Readings
@@ -27,7 +29,9 @@ class _Writes(TorchDispatchMode):
         super().__init__()
         self._look = look
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, func: OpOverload, types: Sequence[type], args: OpArgs = (), kwargs: OpKwargs | None = None
+    ) -> PyTree:
         kwargs = kwargs or {}
         for tensor in recording.written_by(func, args, kwargs):
             self._look(func.overloadpacket.__name__, tensor)

@@ -1,15 +1,15 @@
 """Reads contact sensors from MuJoCo's data, and runs their clocks."""
 
-from typing import Any
-
 import mujoco
 import numpy as np
+
+from ksim_rl.export.standalone.files import Json
 
 
 class Contacts:
     """The readings of one contact sensor of the export: values by field, one per element, or three."""
 
-    def __init__(self, spec: dict[str, Any], mj_model: mujoco.MjModel) -> None:
+    def __init__(self, spec: Json, mj_model: mujoco.MjModel) -> None:
         self.strongest, self.every = spec["strongest"], spec["every_substep"]
         # One MuJoCo sensor reads found, force and position (7 numbers); of the strongest
         # contact also normal and tangent (13).

@@ -8,7 +8,7 @@ import stat
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -45,6 +45,9 @@ FIELDS = frozenset(f"{kind}_{name}" for kind, names in _FIELDS.items() for name 
 # Which mesh or height field a geom has; each that the model has may stand in the place of another of its kind.
 CHOICE = "geom_dataid"
 
+# A JSON object. Its entries have no type of their own, as readers go on from one to the next.
+Json: TypeAlias = dict[str, Any]
+
 
 def read(path: Path, most: int = MOST_BYTES) -> bytes:
     """Return the bytes of a regular file of limited size; links, pipes and devices are refused."""
@@ -60,7 +63,7 @@ def read(path: Path, most: int = MOST_BYTES) -> bytes:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> Json:
     """Return an export's metadata; a ValueError names the fault of the file."""
     # 64 MiB, far more than the largest description.
     content = read(path, 2**26)
@@ -137,7 +140,7 @@ def check_closed(path: Path) -> None:
             read(named)
 
 
-def check_count(what: str, value: Any) -> int:
+def check_count(what: str, value: float) -> int:
     """Return a whole number of 0 to a million, or refuse it."""
     # bool is a subclass of int in Python.
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MOST:
@@ -145,9 +148,7 @@ def check_count(what: str, value: Any) -> int:
     return value
 
 
-def check_record(
-    path: Path, record: Mapping[str, Array], meta: Mapping[str, Any], mj_model: mujoco.MjModel
-) -> int:
+def check_record(path: Path, record: Mapping[str, Array], meta: Json, mj_model: mujoco.MjModel) -> int:
     """Return how many episodes a record has, or refuse it: everything that it writes into the model has to fit.
 
     A model's field is one of `FIELDS`, of finite numbers and the model's own shape.
@@ -227,14 +228,14 @@ def _check_shape(path: Path, name: str, value: Array, shape: tuple[int, ...]) ->
         raise ValueError(f"{path}: {name!r} holds numbers that are not finite")
 
 
-def lacking(meta: dict[str, Any]) -> str:
+def lacking(meta: Json) -> str:
     """Return the end of a return's line, which names the rewards that are not in it; nothing where all are."""
     names = [str(name) for name in meta.get("left_out", ())]
     rewards = [name.removeprefix("rewards.") for name in names if name.startswith("rewards.")]
     return f"  without {', '.join(rewards)}" if rewards else ""
 
 
-def as_text(figures: list[dict[str, float]], meta: dict[str, Any]) -> str:
+def as_text(figures: list[dict[str, float]], meta: Json) -> str:
     """Return mean and spread of the figures of episodes, a line each."""
     lines = []
     for name in figures[0]:

@@ -1,17 +1,16 @@
 """Runs the network of an exported policy, with the states that it carries from step to step."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, read
+from ksim_rl.export.standalone.files import Array, Json, read
 
 
 class Policy:
     """The policy in `policy.onnx`, with the states that it carries from step to step."""
 
-    def __init__(self, folder: Path, meta: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, meta: Json) -> None:
         # Here, so that a program that only reads signals needs no onnxruntime.
         import onnxruntime
 

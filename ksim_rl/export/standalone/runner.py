@@ -21,7 +21,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, as_text, check_record, read_arrays, read_json
+from ksim_rl.export.standalone.files import Array, Json, as_text, check_record, read_arrays, read_json
 from ksim_rl.export.standalone.network import Policy
 from ksim_rl.export.standalone.signals import INTEGRATORS, Lag, Noise, Signals
 
@@ -54,7 +54,7 @@ class Runner(Signals):
 
     # -- observations --------------------------------------------------------------------------------------------
 
-    def _term(self, spec: dict[str, Any]) -> Callable[[bool], Array]:
+    def _term(self, spec: Json) -> Callable[[bool], Array]:
         read_it = self.value(spec["value"])
         low, high = spec["clip"]
         # JSON has no infinity: None is a side without a bound.
@@ -84,7 +84,7 @@ class Runner(Signals):
 
     # -- actions and actuators -----------------------------------------------------------------------------------
 
-    def _stage(self, spec: dict[str, Any]) -> Callable[[Array], Array]:
+    def _stage(self, spec: Json) -> Callable[[Array], Array]:
         if spec["kind"] == "delay":
             lag = Lag(spec, self)
             self.lags.append(lag)
@@ -104,7 +104,7 @@ class Runner(Signals):
 
         return low_pass
 
-    def _action(self, spec: dict[str, Any]) -> Callable[[Array], None]:
+    def _action(self, spec: Json) -> Callable[[Array], None]:
         columns, kind, names = slice(*spec["columns"]), spec["kind"], spec["names"]
         shape = self._shaping(spec)
         # The model's own actuator, driven without a law in between.
@@ -135,7 +135,7 @@ class Runner(Signals):
 
         return joints
 
-    def _shaping(self, spec: dict[str, Any]) -> Callable[[Array], Array]:
+    def _shaping(self, spec: Json) -> Callable[[Array], Array]:
         low, high = spec["clip"] or (-np.inf, np.inf)
         scale, offset, alpha = np.asarray(spec["scale"]), np.asarray(spec["offset"]), spec["alpha"]
         kept: list[Any] = [0.0]
@@ -151,7 +151,7 @@ class Runner(Signals):
 
         return shaped
 
-    def _law(self, spec: dict[str, Any]) -> Callable[[], None]:
+    def _law(self, spec: Json) -> Callable[[], None]:
         """Return a function that sets some actuators' controls from their joints' targets before each substep."""
         names, takes, kind = spec["joints"], spec["takes"], spec["kind"]
         pos = np.array([self.joints[name][0] for name in names], int)
@@ -244,9 +244,7 @@ class Runner(Signals):
         """Return the policy's action for the newest frame."""
         return self.policy(self.frame)
 
-    def step(
-        self, action: Array, command: dict[str, Array] | None = None, *, observes: bool = True
-    ) -> dict[str, Any]:
+    def step(self, action: Array, command: dict[str, Array] | None = None, *, observes: bool = True) -> Json:
         """Run one env step; return rewards by term, metrics and the ending. `command` holds from the next frame on."""
         # Stages of the chain hold memory: run each of them once per env step.
         for stage in self.chain:
@@ -308,7 +306,7 @@ class Runner(Signals):
         self._begin(record, number)
         sums: dict[str, float] = {}
         joints = [at for _, at in self.joints.values()]
-        result: dict[str, Any] = {"done": False}
+        result: Json = {"done": False}
         while not result["done"] and self.steps < (self.limit or 1000):
             action = self.act()
             self._push(record, number, self.steps)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from ksim_rl.export.standalone.contacts import Contacts
-from ksim_rl.export.standalone.files import Array, check_count, read_json, read_model
+from ksim_rl.export.standalone.files import Array, Json, check_count, read_json, read_model
 
 Value = Callable[[], Array]
 # An export is a stranger's file: deeper nesting would exhaust Python's stack, more parts its memory.
@@ -67,7 +67,7 @@ def rotated(quat: Array, vector: Array) -> Array:
 class Lag:
     """A value as it was some steps ago; before an episode's first value lies that value, or `initial`."""
 
-    def __init__(self, spec: dict[str, Any], signals: "Signals") -> None:
+    def __init__(self, spec: Json, signals: "Signals") -> None:
         self.spec, self.signals = spec, signals
         self.most = check_count("steps of a delay", spec["max"])
         self.reset()
@@ -104,10 +104,10 @@ class Lag:
 class Noise:
     """A sensor's errors: bias, walk, noise, resolution, dropout, in this order."""
 
-    def __init__(self, spec: dict[str, Any], signals: "Signals") -> None:
+    def __init__(self, spec: Json, signals: "Signals") -> None:
         self.spec, self.signals, self.bias, self.walk, self.last = spec, signals, None, 0.0, None
 
-    def _sample(self, spec: dict[str, Any], size: int) -> Array:
+    def _sample(self, spec: Json, size: int) -> Array:
         # Uniform draws lie in [0, 1), gaussian ones have std 1; offset and spread map them to the range.
         draws = self.signals.draws
         unit = {"uniform": draws.random, "gaussian": draws.standard_normal, "none": np.zeros}[spec["draw"]](
@@ -225,7 +225,7 @@ class Signals:
         except (KeyError, TypeError) as error:
             raise ValueError(f"export.json: {str(node)[:200]}: {error}") from None
 
-    def _op(self, name: str, node: dict[str, Any], parts: list[Value]) -> Value:
+    def _op(self, name: str, node: Json, parts: list[Value]) -> Value:
         # Values are flat; `width` says how many numbers belong to one item, such as 3 for a vector.
         width = node.get("width")
         if name in ("sum", "norm"):
@@ -250,7 +250,7 @@ class Signals:
 
         return applied
 
-    def _remembering(self, name: str, node: dict[str, Any], parts: list[Value]) -> Value:
+    def _remembering(self, name: str, node: Json, parts: list[Value]) -> Value:
         # None until the first call of an episode.
         kept: list[Any] = [None]
         self.resets.append(lambda: kept.__setitem__(0, None))
@@ -276,7 +276,7 @@ class Signals:
 
         return {"previous": previous, "peak": peak, "low_pass": low_pass}[name]
 
-    def _quantity(self, name: str, node: dict[str, Any]) -> Value:
+    def _quantity(self, name: str, node: Json) -> Value:
         data, model = self.data, self.model
         # Readings of joints, rad and rad/s (m and m/s for slides), in the order of the names.
         if "joints" in node:

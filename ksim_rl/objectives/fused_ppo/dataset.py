@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from functools import reduce
 from operator import add
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int32
@@ -14,7 +13,14 @@ from ksim_rl import ranks
 from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
 from ksim_rl.objectives.fused_ppo.dataset_kernels import read_observations, write_records
-from ksim_rl.objectives.fused_ppo.layout import FusedLayout, FusedNetworks, launch, parts, power_of_two
+from ksim_rl.objectives.fused_ppo.layout import (
+    Argument,
+    FusedLayout,
+    FusedNetworks,
+    launch,
+    parts,
+    power_of_two,
+)
 from ksim_rl.objectives.fused_ppo.loss_kernels import estimate_advantages
 from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
@@ -51,7 +57,7 @@ class FusedDataset:
         self.records = torch.zeros(rows, 3 * layout.out + 8, device=device)
         self._signals = torch.zeros(4, size, device=device)
         # The arguments of kernels, by the names of their parameters.
-        self._arguments: dict[str, Any] = {
+        self._arguments: dict[str, Argument] = {
             **dict(zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)),
             **{name.upper(): getattr(layout, name) for name in ("actions", "out", "stored")},
             "obs": self.obs,
@@ -130,7 +136,9 @@ class FusedDataset:
         launch(write_records, (len(left_out),), given, MOMENTS=power_of_two(len(moments)))
         return left_out
 
-    def _take_observations(self, network: int, part_ET: TensorDictBase, obs: Tensor, **changes: Any) -> None:
+    def _take_observations(
+        self, network: int, part_ET: TensorDictBase, obs: Tensor, **changes: Argument
+    ) -> None:
         observer = self._networks.observers[network]
         # Inputs of the network side by side, in the order of the rows of `obs`.
         source = _time_major(observer.read(part_ET))

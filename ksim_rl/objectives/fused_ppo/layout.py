@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Float, Int32
@@ -32,6 +32,10 @@ MAX_PLACES = 2**31
 only_compiles = ContextVar("only_compiles", default=False)
 
 
+# What a Triton kernel takes under a name: an array, a number of the launch, or a constant that it is compiled for.
+Argument: TypeAlias = Any
+
+
 @dataclass(frozen=True, kw_only=True)
 class Observer:
     """The inputs of a network's first layer: the result of `read`, [..., L], normalized by the `moments`, if any."""
@@ -41,7 +45,7 @@ class Observer:
     eps: float = 0.0
 
     @property
-    def moments_given(self) -> dict[str, Any]:
+    def moments_given(self) -> dict[str, Argument]:
         """The arguments by which kernels normalize, by the names of their parameters."""
         if self.moments is None:
             mean = None
@@ -260,7 +264,7 @@ class Tuning:
         """Return sizes that suit a layout: chained, the first and the third width must be whole numbers of chunks."""
         # An element of float32 takes twice the registers and shared memory: so two programs share a multiprocessor.
         if dtype is torch.float32:
-            wide: Any = {"stages": 2, "tile": 64, "tile_warps": 4}
+            wide: dict[str, int] = {"stages": 2, "tile": 64, "tile_warps": 4}
         else:
             wide = {}
         # Layers that run one at a time have no chunks.
@@ -322,7 +326,12 @@ def why_not_fused(
 
 
 def launch(
-    kernel: Any, grid: tuple[int, ...], arguments: Mapping[str, Any], *, num_warps: int = 4, **changes: Any
+    kernel: Any,
+    grid: tuple[int, ...],
+    arguments: Mapping[str, Argument],
+    *,
+    num_warps: int = 4,
+    **changes: Argument,
 ) -> None:
     """Run `grid` programs of a Triton kernel, whose signature type checkers cannot read, on the current stream.
 

@@ -1,9 +1,9 @@
 """Worlds on MuJoCo's C engine: `mujoco.batch` steps many simulations on all cores, in float64."""
 
 import copy
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Literal
 
 import mujoco
 import mujoco.batch
@@ -22,7 +22,7 @@ from ksim_rl.physics.load import caught_warnings
 from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.overflow import BIT_NAMES, OverflowReport
 from ksim_rl.physics.sim_cfg import SimCfg
-from ksim_rl.physics.world import ENGINES, World
+from ksim_rl.physics.world import ENGINES, RecordedPython, World
 
 _STAGE_NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
 _STAGE_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -299,7 +299,7 @@ class CWorld(World):
             self._chosen_line(),
         )
 
-    def recorded_python(self) -> Mapping[str, tuple[Any, Callable[[], Mapping[str, Any]]]]:
+    def recorded_python(self) -> RecordedPython:
         """Return nothing: a step depends on no Python of the engine."""
         return {}
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import mujoco_warp as mjw
 import numpy as np
@@ -92,7 +91,7 @@ def mended_runge_kutta(
     return launch
 
 
-def _idle_actuators(warp_model: mjw.Model) -> dict[str, Any]:
+def _idle_actuators(warp_model: mjw.Model) -> dict[str, wp.array | mjw.Option]:
     """Return the fields of a model whose actuators may act, and do nothing."""
     m = warp_model
     return {
@@ -192,7 +191,7 @@ class _ExactFilters:
         wp.launch(kernels.rate_exact_filters, dim=dim, inputs=inputs, outputs=[d.act])
 
 
-def _with_hooks(callback: Any, hooks: dict[str, list[Callable[[], None]]]) -> Any:
+def _with_hooks(callback: mjw.Callback, hooks: dict[str, list[Callable[[], None]]]) -> mjw.Callback:
     """Return a copy of the callbacks in which hooks precede the program's own callback of that name."""
     hooked: dict[str, Callable[..., None]] = {}
     # The program's own callback still runs, after ours.
@@ -202,7 +201,7 @@ def _with_hooks(callback: Any, hooks: dict[str, list[Callable[[], None]]]) -> An
 
 
 def _in_turn(launches: list[Callable[[], None]], own: Callable[..., None] | None) -> Callable[..., None]:
-    def all_of_them(*model_and_data: Any) -> None:
+    def all_of_them(*model_and_data: mjw.Model | mjw.Data) -> None:
         for launch in launches:
             launch()
         if own is not None:

@@ -1,12 +1,11 @@
 """Finds the legs, soles and limbs of an unknown robot, and fits them with lean hulls."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
 
-from ksim_rl.scene.robots.edit import CollisionGeom, capsule, sphere
+from ksim_rl.scene.robots.edit import CollisionGeom, GeomAttributes, capsule, sphere
 
 SLAB = 0.01
 """m: a point so near to a foot's lowest point belongs to its sole."""
@@ -27,7 +26,7 @@ ALIKE = 0.05
 """Legs that are built alike differ by less than this share in mass and length."""
 ROUND = 0.1
 """A wheel is round, and its axle in its middle, up to this share of its radius."""
-_HULL: dict[str, Any] = {"condim": 1, "priority": 1}
+_HULL: GeomAttributes = {"condim": 1, "priority": 1}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,10 +7,10 @@ gains here are chosen per group: legs and waist stiff enough to stand on, arms a
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from ksim_rl.scene.actuators import Actuator, PositionActuator
-from ksim_rl.scene.robots.edit import CollisionGeom, Site, capsule, sphere, spread
+from ksim_rl.scene.robots.edit import CollisionGeom, GeomAttributes, Site, capsule, sphere, spread
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 
 # The model's order: head, arms, waist, legs, left before right.
@@ -52,7 +52,7 @@ STANCE = {
 }
 
 # Without friction, on the ground as well, where the priority decides: such contacts cost a quarter.
-_SMOOTH: dict[str, Any] = {"condim": 1, "priority": 1}
+_SMOOTH: GeomAttributes = {"condim": 1, "priority": 1}
 
 
 def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import mujoco
 import numpy as np
@@ -19,6 +19,19 @@ Vector = tuple[float, ...]
 BALL_AT_REST = (1.0, 0.0, 0.0, 0.0)
 VISIBLE = 2
 """The group of robots' visual geoms; those up to it are shown by custom."""
+
+
+class GeomAttributes(TypedDict, total=False):
+    """Fields of `CollisionGeom` that several geoms may share."""
+
+    quat: Vector
+    friction: Vector
+    condim: int
+    priority: int
+    solref: Vector
+    solimp: Vector
+    margin: float
+    group: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,19 +71,23 @@ class CollisionGeom:
             )
 
 
-def capsule(name: str, body: str, radius: float, fromto: Vector, **attributes: Any) -> CollisionGeom:
+def capsule(
+    name: str, body: str, radius: float, fromto: Vector, **attributes: Unpack[GeomAttributes]
+) -> CollisionGeom:
     """Return a capsule between two points; `attributes` are fields of `CollisionGeom`."""
     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
     return CollisionGeom(name=name, body=body, type=kind, size=(radius,), fromto=fromto, **attributes)
 
 
-def sphere(name: str, body: str, radius: float, pos: Vector, **attributes: Any) -> CollisionGeom:
+def sphere(
+    name: str, body: str, radius: float, pos: Vector, **attributes: Unpack[GeomAttributes]
+) -> CollisionGeom:
     """Return a sphere; `attributes` are fields of `CollisionGeom`."""
     kind = mujoco.mjtGeom.mjGEOM_SPHERE
     return CollisionGeom(name=name, body=body, type=kind, size=(radius,), pos=pos, **attributes)
 
 
-def box(name: str, body: str, half_edges: Vector, **attributes: Any) -> CollisionGeom:
+def box(name: str, body: str, half_edges: Vector, **attributes: Unpack[GeomAttributes]) -> CollisionGeom:
     """Return a box about the body's origin; `attributes` are fields of `CollisionGeom`."""
     return CollisionGeom(name=name, body=body, type=mujoco.mjtGeom.mjGEOM_BOX, size=half_edges, **attributes)
 

@@ -7,12 +7,12 @@ and Go2's torque limits are from mujoco_menagerie; friction and damping of the j
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 
 from ksim_rl.scene.actuators import Actuator, IdealPDActuator, PositionActuator
-from ksim_rl.scene.robots.edit import CollisionGeom, Site, box, capsule, sphere, spread
+from ksim_rl.scene.robots.edit import CollisionGeom, GeomAttributes, Site, box, capsule, sphere, spread
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 
 LEGS = ("FR", "FL", "RR", "RL")
@@ -22,8 +22,8 @@ _LIGHT_JOINTS = (".*_hip_joint", ".*_thigh_joint")
 _CALF_JOINTS = (".*_calf_joint",)
 # Contacts with other parts of the robot are frictionless: fewer dimensions cost less. Go2's priority makes those with
 # the ground frictionless too, which cost a quarter then.
-_GO1_SMOOTH: dict[str, Any] = {"condim": 1, "solref": (0.01, 1.0)}
-_GO2_SMOOTH: dict[str, Any] = _GO1_SMOOTH | {"priority": 1}
+_GO1_SMOOTH: GeomAttributes = {"condim": 1, "solref": (0.01, 1.0)}
+_GO2_SMOOTH: GeomAttributes = _GO1_SMOOTH | {"priority": 1}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,12 @@ GO1_SERVOS = (
 # Keys match all four legs.
 GO1_ACTION_SCALE = {".*_(hip|thigh)_joint": 0.37275, ".*_calf_joint": 0.2485}
 # Six dimensions: feet also resist spinning and rolling; their priority decides on any ground.
-_GO1_FOOT: Any = {"condim": 6, "solref": (0.01, 1.0), "priority": 1, "friction": (1.0, 0.005, 0.0005)}
+_GO1_FOOT: GeomAttributes = {
+    "condim": 6,
+    "solref": (0.01, 1.0),
+    "priority": 1,
+    "friction": (1.0, 0.005, 0.0005),
+}
 
 
 def _go1_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
@@ -96,12 +101,12 @@ class UnitreeGo1(UnitreeQuadruped, name="go1", root_body="trunk", model="unitree
 
 
 # The gains that the robot's own low-level interface is commonly run with.
-_GO2_GAINS: dict[str, Any] = {"armature": 0.01, "stiffness": 30.0, "damping": 1.0}
+_GO2_GAINS: dict[str, float] = {"armature": 0.01, "stiffness": 30.0, "damping": 1.0}
 GO2_MOTORS = (
     IdealPDActuator(joints=_LIGHT_JOINTS, effort_limit=23.7, **_GO2_GAINS),
     IdealPDActuator(joints=_CALF_JOINTS, effort_limit=45.43, **_GO2_GAINS),
 )
-_GO2_TREAD: dict[str, Any] = {"friction": (0.8, 0.02, 0.01), "priority": 1, "solref": (0.01, 1.0)}
+_GO2_TREAD: GeomAttributes = {"friction": (0.8, 0.02, 0.01), "priority": 1, "solref": (0.01, 1.0)}
 _GO2_FOOT = (-0.002, 0.0, -0.213)
 """The centre of a foot's ball in the calf's frame, m; its radius is 0.022 m."""
 

@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 
@@ -49,7 +48,9 @@ def add_look(spec: mujoco.MjSpec, *, repeat: float) -> None:
     spec.worldbody.add_light(pos=[0, 0, 4], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
-def add_ground(spec: mujoco.MjSpec, *, friction: Sequence[float], **shape: Any) -> None:
+def add_ground(
+    spec: mujoco.MjSpec, *, friction: Sequence[float], **shape: mujoco.mjtGeom | Sequence[float] | str
+) -> None:
     """Add a terrain's body with its one geom; `shape` holds the geom's attributes of type and size."""
     spec.worldbody.add_body(name=BODY).add_geom(
         name=BODY,

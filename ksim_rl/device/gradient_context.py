@@ -1,0 +1,19 @@
+"""Describes what autograd hands to functions with gradients of their own."""
+
+from typing import Protocol
+
+from jaxtyping import Shaped
+from torch import Tensor
+
+
+class GradientContext(Protocol):
+    """What autograd hands to the `forward` and `backward` of a `Function`, as far as ours use it."""
+
+    saved_tensors: tuple[Tensor, ...]
+    needs_input_grad: tuple[bool, ...]
+
+    def save_for_backward(self, *tensors: Shaped[Tensor, "*?saved"] | None) -> None:
+        """Keep tensors for `backward`, which finds them in `saved_tensors`."""
+
+    def set_materialize_grads(self, value: bool) -> None:
+        """Say whether `backward` gets zeros, and not None, for outputs that the loss does not depend on."""
