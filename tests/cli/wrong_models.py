@@ -1,9 +1,11 @@
 """Models of users that are none, or none of a robot."""
 
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 
 BODY = '<body name="b" pos="0 0 1"><joint name="j" type="free"/><geom name="g" size="0.1"/></body>'
+QUADRUPED = files("ksim_rl.scene.robots").joinpath("quadruped.xml").read_text()
 
 MODELS: dict[str, tuple[str | bytes, str]] = {
     "empty": ("", "empty.xml"),
@@ -28,9 +30,10 @@ MODELS: dict[str, tuple[str | bytes, str]] = {
         "m.stl",
     ),
     "an include that is missing": ('<mujoco><include file="other.xml"/></mujoco>', "other.xml"),
+    # Works: a task steps by a time of its own.
     "a negative time step": (
-        f'<mujoco><option timestep="-1"/><worldbody>{BODY}</worldbody></mujoco>',
-        "feet",
+        QUADRUPED.replace("<worldbody>", '<option timestep="-1"/><worldbody>', 1),
+        "timestep",
     ),
     "a URDF without links": ('<robot name="r"/>', "free joint"),
     "a URDF whose joint has no child": (
