@@ -21,6 +21,7 @@ from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.physics.c_engine.c_world import CWorld
 from ksim_rl.physics.fields import prepare_spec
 from ksim_rl.physics.load import load_model, load_spec
+from ksim_rl.physics.mujoco_warnings import show_warnings
 from ksim_rl.physics.nan_guard.guard import NanGuardCfg, NanReport
 from ksim_rl.physics.overflow import OverflowReport
 from ksim_rl.physics.ray_casting import BatchCamera, RayBatch
@@ -46,3 +47,6 @@ __all__ = [
     "load_spec",
     "prepare_spec",
 ]
+
+# Before any model is stepped, in whatever process.
+show_warnings()

@@ -3,13 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
 from ksim_rl.config.plain_data import flat, read_yaml
 from ksim_rl.runs import curves
 from ksim_rl.runs.csv_table import STEP
 from ksim_rl.runs.listing import CONFIG, HEADS, METRICS, line, metric_rows, numbers, summarize, written
+from ksim_rl.runs.plotting import Figure, FigureCanvasAgg, plain_style
 from ksim_rl.terminal import printable
 
 RETURN = ("evaluation/return_mean", "episode/return")
@@ -63,6 +61,7 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
     return rows
 
 
+@plain_style()
 def draw(folders: Sequence[Path], picture: Path) -> None:
     """Draw the curves of runs over each other, into a PNG; a ValueError where none has any."""
     tables = [metric_rows(folder) for folder in folders]

@@ -2,12 +2,8 @@
 
 from pathlib import Path
 
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
-
 from ksim_rl.runs.csv_table import STEP, read_table
+from ksim_rl.runs.plotting import Axes, EngFormatter, Figure, FigureCanvasAgg, plain_style
 
 # Panels in reading order: title, the metrics drawn in it with their labels.
 PANELS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
@@ -27,6 +23,7 @@ PANELS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
 _COLORS = ("#3465a4", "#cc5500")
 
 
+@plain_style()
 def draw(table: Path, picture: Path, *, title: str, solved_at: float | None = None) -> None:
     """Draw the learning curves of a `metrics.csv` into a PNG, with a line at `solved_at`; ValueError without rows."""
     _, rows = read_table(table)

@@ -4,15 +4,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import wrap
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
+from ksim_rl.runs.plotting import Figure, FigureCanvasAgg, plain_style
 from ksim_rl.tables.levels import Result, value_of
 from ksim_rl.tables.table import Table
 
 OURS, OTHERS = "#3465a4", (("D", "#cc5500"), ("s", "#75507b"), ("^", "#4e9a06"), ("v", "#c4a000"))
 
 
+@plain_style()
 def draw(table: Table, rows: Mapping[str, Sequence[Result]], path: Path) -> None:
     """Draw one panel per group; `rows` has the results of those rows that are complete."""
     groups = []
