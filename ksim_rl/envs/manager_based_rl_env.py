@@ -146,7 +146,6 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         driver.refreshed()
         self.command_manager = CommandManager(cfg.commands, driver)
         self.event_manager.rehearse_starts()
-        driver.refreshed()
         self.action_manager = ActionManager(cfg.actions, driver)
         self.observation_manager = ObservationManager(cfg.observations, driver)
         scale = self.step_dt if cfg.scale_rewards_by_dt else 1.0

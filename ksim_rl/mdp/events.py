@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ksim_rl.checked import NonNegativeRange, Range, Share
+from ksim_rl.checked import Count, NonNegative, NonNegativeRange, Positive, Range, Share
 from ksim_rl.checks import check_in_range, check_pair
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
@@ -111,11 +111,38 @@ class ResetRootUniform(OfEntity, EventTerm):
         # The turn is on the right: its axes are the default pose's, not the world's.
         quat_E4 = quaternion.multiply(body.default_root_quat_L.expand(view.num_envs, 4), turn_E4)
         pos_E3 = body.default_root_pos_L + offset_E6[:, :3]
-        # On flat ground all envs start at the world's origin.
-        if not view.terrain.is_flat:
-            pos_E3 = pos_E3 + view.terrain.origins_E3
+        start_E3 = self.start(view)
+        if start_E3 is not None:
+            pos_E3 = pos_E3 + start_E3
         body.write_root_pose(mask_E, pos_E3, quat_E4)
         body.write_root_velocity(mask_E, velocity_E6[:, :3], velocity_E6[:, 3:])
+
+    def start(self, view: EnvView) -> Float[Tensor, "E 3"] | None:
+        """Return the point on the ground that each env starts from, m, world frame; None for the world's origin."""
+        # On flat ground all envs start at the world's origin.
+        if view.terrain.is_flat:
+            return None
+        return view.terrain.origins_E3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetRootOnEvenGround(ResetRootUniform):
+    """Do as `ResetRootUniform`, but from places all over the patch of a `TerrainGrid` where the ground is even.
+
+    A square of the given `edge` (m) about each place has heights that differ by `max_difference` (m) at most. Each
+    patch has `num_places` of them, drawn once, and an env starts at one of its own patch's.
+    """
+
+    edge: Positive = 1.0
+    max_difference: NonNegative = 0.05
+    num_places: Count = 16
+
+    def start(self, view: EnvView) -> Float[Tensor, "E 3"]:
+        places_EK3 = view.terrain.places_on_even_ground(
+            edge=self.edge, max_difference=self.max_difference, count=self.num_places
+        )
+        chosen_E1 = view.integers(1, 0, self.num_places - 1)
+        return places_EK3.gather(1, chosen_E1[..., None].expand(-1, -1, 3))[:, 0]
 
 
 @dataclass(frozen=True, kw_only=True)

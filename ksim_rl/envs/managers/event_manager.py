@@ -47,6 +47,8 @@ class EventManager:
     def rehearse_starts(self) -> None:
         """Run the events that may read commands for no row, once there are commands."""
         self._rehearse(name for name, term in self.terms.items() if term.mode == "start")
+        # Nothing has changed.
+        self._driver.refreshed()
 
     def _rehearse(self, names: Iterable[str]) -> None:
         nobody_E = torch.zeros(self._view.num_envs, dtype=torch.bool, device=self._view.device)

@@ -48,6 +48,17 @@ class Ground(NearNames):
             return height_EN
         return height_EN - self.heights(points_EN3[..., :2])
 
+    def places_on_even_ground(
+        self, *, edge: float, max_difference: float, count: int
+    ) -> Float[Tensor, "E count 3"]:
+        """Return places of each env's ground, m, world frame, in the middle of even squares; see `PatchedGround`.
+
+        Raises ValueError where the ground has no such, and for ground without patches.
+        """
+        raise ValueError(
+            "the scene's terrain is even everywhere: use ResetRootUniform, or a TerrainGrid in scene.terrain"
+        )
+
     def set_levels(self, mask_E: Bool[Tensor, " E"], levels_E: Int64[Tensor, " E"]) -> None:
         """Move the rows of `mask_E` to other levels, before their reset; a ValueError where the terrain has none."""
         raise ValueError("the scene's terrain has no levels: use a TerrainGrid in scene.terrain")

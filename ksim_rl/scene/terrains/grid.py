@@ -155,6 +155,9 @@ class PatchedGround(Ground):
 
     def __init__(self, view: WorldView, grid: TerrainGrid) -> None:
         super().__init__(view.num_envs, view.device)
+        self._grid = grid
+        # Tables of even places, by their settings; made while the env is constructed.
+        self._even: dict[tuple[float, float, int], Tensor] = {}
         mj_model = view.world.mj_model
         device = view.device
         self.num_levels = grid.num_levels
@@ -235,6 +238,52 @@ class PatchedGround(Ground):
         steep_EN = torch.maximum(x_EN, y_EN)
         flat_EN = torch.minimum(x_EN, y_EN)
         return low_EN + steep_EN * (mid_EN - low_EN) + flat_EN * (high_EN - mid_EN)
+
+    def places_on_even_ground(
+        self, *, edge: float, max_difference: float, count: int
+    ) -> Float[Tensor, "E count 3"]:
+        """Return places of each env's patch, m, world frame, around which a square is even; z is its highest point.
+
+        Heights within a square of the given edge, m, differ by `max_difference` at most. The places are drawn from all
+        points of the patch's lattice that are so, by the seed of the terrain. A ValueError names a patch without any.
+        """
+        key = (edge, max_difference, count)
+        if key not in self._even:
+            tables = [
+                self._even_places(level, column, *key)
+                for level in range(self.num_levels)
+                for column in range(self._num_columns)
+            ]
+            self._even[key] = torch.tensor(np.stack(tables), dtype=torch.float32, device=self._heights.device)
+        return self._even[key][self.patches_E]
+
+    def _even_places(
+        self, level: int, column: int, edge: float, max_difference: float, count: int
+    ) -> np.ndarray:
+        """Return the places of one patch, float64 [count, 3]."""
+        grid = self._grid
+        heights_RC = grid.heights(level, column)
+        lattice = Lattice(grid.size, grid.size / (len(heights_RC) - 1))
+        # All points of the cells that the square reaches into.
+        reach = math.ceil(edge / 2 / lattice.spacing - TIE)
+        width = 2 * reach + 1
+        if width > len(heights_RC):
+            raise ValueError(f"edge={edge}: the patches of the terrain have edges of {grid.size} m")
+        windows = np.lib.stride_tricks.sliding_window_view(heights_RC, (width, width))
+        highest_RC = windows.max((-2, -1))
+        is_even_RC = highest_RC - windows.min((-2, -1)) <= max_difference
+        row_N, column_N = np.nonzero(is_even_RC)
+        if not len(row_N):
+            raise ValueError(
+                f"no square of {edge} m of level {level} of the ground {grid.columns[column]!r} is even within "
+                f"max_difference={max_difference}: ask for a smaller edge, or allow more"
+            )
+        chosen = np.random.default_rng((grid.seed, level, column, count)).integers(0, len(row_N), count)
+        row_N, column_N = row_N[chosen], column_N[chosen]
+        # A window begins `reach` points before its middle.
+        x_N = lattice.x_RC[0, column_N + reach]
+        y_N = lattice.y_RC[row_N + reach, 0]
+        return np.stack((x_N, y_N, highest_RC[row_N, column_N]), axis=-1)
 
     def set_levels(self, mask_E: Bool[Tensor, " E"], levels_E: Int64[Tensor, " E"]) -> None:
         self._moved_E.copy_(torch.where(mask_E, levels_E - self._first_level_E, self._moved_E))

@@ -20,6 +20,7 @@ from ksim_rl.mdp import (
     HeightScan,
     JointEffortAction,
     OutsideTerrain,
+    ResetRootOnEvenGround,
     ResetRootUniform,
     RootPos,
     TerrainLevels,
@@ -27,6 +28,8 @@ from ksim_rl.mdp import (
 )
 from ksim_rl.physics import SimCfg
 from ksim_rl.scene.rendering import rendering
+from ksim_rl.scene.state.ground import Ground
+from ksim_rl.scene.terrains import PyramidSlope, PyramidStairs
 from ksim_rl.testing import check_env
 from tests.scene.terrains.ground_bench import GRID
 
@@ -169,3 +172,47 @@ def test_pictures_show_the_patch_that_the_env_stands_on():
     for row in (4, 9):  # on a slope, and on stones
         assert np.abs(pictures[0] - pictures[row]).mean() > 5
     assert np.abs(pictures[4] - pictures[9]).mean() > 5
+
+
+def even_env(num_envs=NUM_ENVS, **fields):
+    patches = {
+        "slope": PyramidSlope(gradient=(0.3, 0.3), platform_width=1.0),
+        "stairs": PyramidStairs(step_width=0.6),
+    }
+    grid = dataclasses.replace(
+        GRID, patches=patches, num_levels=2, num_columns=2, size=6.0, max_initial_level=1
+    )
+    event = ResetRootOnEvenGround(**({"edge": 0.4, "max_difference": 0.02, "num_places": 8} | fields))
+    scene = SceneCfg(
+        robots={"walker": MjcfRobot(source=WALKER)}, terrain=grid, num_envs=num_envs, spacing=6.0
+    )
+    return walker_env(events={"start": event}, scene=scene)
+
+
+def test_envs_start_all_over_their_patch_where_it_is_even():
+    env = even_env(40)
+    env.reset()
+    pos_E3 = env.view.root_pos_EL.clone()
+    # The highest and the lowest ground in a square about each start, point by point.
+    line = torch.linspace(-0.2, 0.2, 21)
+    around_N2 = torch.stack(torch.meshgrid(line, line, indexing="ij"), dim=-1).view(-1, 2)
+    heights_EN = env.view.terrain.heights(pos_E3[:, None, :2] + around_N2)
+    assert (heights_EN.amax(-1) - heights_EN.amin(-1) <= 0.02 + 1e-5).all()
+    torch.testing.assert_close(pos_E3[:, 2], heights_EN.amax(-1) + 0.1, atol=0.02, rtol=0)
+    # The slope is even on its platform alone; stairs are even on their treads, too.
+    on_slope = torch.arange(40) < 20
+    assert pos_E3[on_slope, :2].abs().max() <= 0.5 and pos_E3[~on_slope, :2].abs().max() > 1.2
+    assert len({tuple(place) for place in pos_E3[~on_slope].tolist()}) > 8
+    env.reset()
+    assert not torch.equal(env.view.root_pos_EL, pos_E3)
+
+
+def test_ground_without_an_even_square_is_named():
+    with pytest.raises(
+        ValueError, match=r"no square of 1\.5 m of level 0 of the ground 'slope' is even within"
+    ):
+        even_env(edge=1.5)
+    with pytest.raises(ValueError, match="edge=7.0: the patches of the terrain have edges of 6.0 m"):
+        even_env(edge=7.0)
+    with pytest.raises(ValueError, match="even everywhere: use ResetRootUniform"):
+        Ground(2, torch.device("cpu")).places_on_even_ground(edge=1.0, max_difference=0.1, count=2)
