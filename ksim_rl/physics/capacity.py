@@ -37,6 +37,7 @@ FALL_SPEED = 1.0
 PRESSURE = 3.0
 # Degrees of freedom, geoms and vertices of flexes, times steps of all falls: about a second.
 MOST_WORK = 1_200_000
+MOST_ROWS = 2**31 - 1  # of an array of Warp
 
 _cache: dict[bytes, tuple[int, int]] = {}
 
@@ -60,6 +61,16 @@ def capacities(
         # MuJoCo Warp regularizes rows up to the end of their last tile, and reads arrays there that end at njmax.
         njmax = TILE * math.ceil(njmax / TILE)
     return njmax, nconmax
+
+
+def check_countable(njmax: int, nconmax: int, *, num_envs: int) -> None:
+    """Refuse arrays longer than Warp can count: contacts of all worlds share one."""
+    for name, number, worlds in (("njmax", njmax, 1), ("nconmax", nconmax, num_envs)):
+        if number * worlds > MOST_ROWS:
+            raise ValueError(
+                f"sim.{name}={number}: expected at most {MOST_ROWS // worlds} for num_envs={num_envs}, as Warp counts "
+                "the rows of an array in 32 bits; lower it, or num_envs"
+            )
 
 
 def is_certain(mj_model: mujoco.MjModel, sim: SimCfg, *, njmax: int) -> bool:

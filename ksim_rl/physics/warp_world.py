@@ -70,6 +70,7 @@ class WarpWorld(World):
         super().__init__(mj_model, per_world_fields=per_world_fields, **given)
         expanded = self._expanded
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
+        capacity.check_countable(self.njmax, self.nconmax, num_envs=num_envs)
         self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
         # Our solver takes sparse rows only, and `mj_model` keeps the user's settings.
         stored_model = copy.copy(self.mj_model)

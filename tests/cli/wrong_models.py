@@ -35,6 +35,29 @@ MODELS: dict[str, tuple[str | bytes, str]] = {
         QUADRUPED.replace("<worldbody>", '<option timestep="-1"/><worldbody>', 1),
         "timestep",
     ),
+    "a mesh of 10^15 numbers": (
+        '<mujoco><asset><mesh name="m" builtin="supersphere" params="100000 1 1"/></asset></mujoco>',
+        "numbers",
+    ),
+    "a texture of 10^10 pixels": (
+        '<mujoco><asset><texture name="t" type="2d" builtin="flat" width="100000" height="100000"/></asset></mujoco>',
+        "numbers",
+    ),
+    "two billion numbers of a user": ('<mujoco><size nuserdata="2000000000"/></mujoco>', "numbers"),
+    "frames in frames": (
+        f"<mujoco><worldbody>{'<frame>' * 50000}{'</frame>' * 50000}</worldbody></mujoco>",
+        "elements",
+    ),
+    "an include of itself": (
+        '<mujoco><include file="an include of itself.xml"/></mujoco>',
+        "takes in itself",
+    ),
+    "a URDF whose links turn in a circle": (
+        '<robot name="r"><link name="a"/><link name="b"/>'
+        '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>'
+        '<joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint></robot>',
+        "circle.xml",
+    ),
     "a URDF without links": ('<robot name="r"/>', "free joint"),
     "a URDF whose joint has no child": (
         '<robot name="r"><link name="a"/><joint name="j" type="revolute"><parent link="a"/></joint></robot>',

@@ -157,6 +157,16 @@ def test_the_settings_win_over_the_probe():
     assert (njmax, nconmax) == (capacity.probe(quadruped())[0], 11)
 
 
+@pytest.mark.parametrize(
+    ("field", "number", "most"), [("njmax", 2**31, 2**31 - 1), ("nconmax", 10**9, (2**31 - 1) // 4)]
+)
+def test_more_than_warp_can_count_is_refused_by_name(field, number, most):
+    capacity.check_countable(**{"njmax": 1, "nconmax": 1, field: most}, num_envs=4)
+    sim = SimCfg(**{"njmax": 1, "nconmax": 1, field: number}, engine="warp")
+    with pytest.raises(ValueError, match=f"sim.{field}={number}: expected at most {most} for num_envs=4"):
+        World(cartpole(), num_envs=4, device="cpu", sim=sim)
+
+
 def test_put_in_ground_lets_the_lowest_geom_touch():
     mj_model = quadruped()
     mj_data = mujoco.MjData(mj_model)
