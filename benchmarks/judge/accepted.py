@@ -1,11 +1,7 @@
-"""The one table of what may differ from MuJoCo's C engine: contacts found by iterations, and rows without weight.
+"""The one table of what may differ from MuJoCo's C engine: contacts that both engines find by iterations.
 
-Contacts that both engines find by iterations differ in depth and number, and all forces with them. A state in which
-such a pair is within its margin is judged by the depth of its contacts alone.
-
-Rows without weight are of bodies that turn about their centre of mass and touch what is fixed: that centre cannot
-move, so that MuJoCo takes their contacts for as hard as its numbers allow. C's forces there are rounding errors, of up
-to 1e17 N, and its solvers differ by any factor (docs/upstream.md). Such a state is judged by its positions alone.
+Their depths and numbers differ, and all forces with them. A state in which such a pair is within its margin is judged
+by the depth of its contacts alone.
 """
 
 import mujoco
@@ -20,10 +16,6 @@ DEPTH_CEILINGS = {
     "mesh": 2e-3,
     "hfield": 2e-3,
 }
-# `efc_D` from which on a row has no weight: MuJoCo bounds it by 1e15.
-WITHOUT_WEIGHT = 1e12
-# Most that positions may differ after one substep, in m and rad.
-POSITION_CEILING = 1e-3
 # Of what is deeper, in m, the direction in which it is least deep is often one of many.
 DEEP = 0.02
 
@@ -66,8 +58,3 @@ def depths(geoms: np.ndarray, dist: np.ndarray, geom_type: np.ndarray) -> dict[t
             continue
         found[first, second] = min(float(value), found.get((first, second), np.inf))
     return found
-
-
-def has_weightless_rows(mj_data: mujoco.MjData) -> bool:
-    """Whether a constraint of the last substep is of bodies that have no weight."""
-    return bool((mj_data.efc_D >= WITHOUT_WEIGHT).any())

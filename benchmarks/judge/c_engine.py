@@ -71,10 +71,12 @@ def run(
     mujoco.mj_copyData(before, mj_model, mj_data)
     mujoco.mj_step(mj_model, mj_data)
     found = {name: np.array(getattr(mj_data, name), dtype=np.float64) for name in (*REACHED, *LAST)}
+    last = mj_data.sensordata.copy()
+    if mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_NATIVECCD:
+        _measure_by_native_search(mj_model, before, last)
     mujoco.mj_forward(mj_model, before)
     mujoco.mj_rnePostConstraint(mj_model, before)
     found |= {name: np.array(getattr(before, name)) for name in OF_BODIES}
-    last = mj_data.sensordata.copy()
     after = mujoco.MjData(mj_model)
     mujoco.mj_copyData(after, mj_model, mj_data)
     refresh(mj_model, after)
@@ -88,13 +90,11 @@ def run(
 
 
 def touched_accepted(mj_model: mujoco.MjModel, state: Mapping[str, np.ndarray], substeps: int) -> bool:
-    """Return whether what may differ is there in a substep before the last one: contacts, or rows without weight."""
+    """Return whether contacts that may differ are there in a substep before the last one."""
     mj_data = put(state, mj_model)
     for _ in range(substeps - 1):
         mujoco.mj_step(mj_model, mj_data)
         contact = mj_data.contact
-        if accepted.has_weightless_rows(mj_data):
-            return True
         if accepted.depths(np.array(contact.geom), np.array(contact.dist), mj_model.geom_type):
             return True
     return False
@@ -107,7 +107,27 @@ def refresh(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
     mujoco.mj_fwdVelocity(mj_model, mj_data)
     mujoco.mj_sensorVel(mj_model, mj_data)
     mujoco.mj_subtreeVel(mj_model, mj_data)
-    mujoco.mj_camlight(mj_model, mj_data)
+    # Where trees may sleep, C leaves what tracks them from a body that never moves (docs/upstream.md).
+    awake = copy.copy(mj_model)
+    awake.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    mujoco.mj_camlight(awake, mj_data)
+
+
+def _measure_by_native_search(
+    mj_model: mujoco.MjModel, mj_data: mujoco.MjData, sensordata: np.ndarray
+) -> None:
+    """Write what distance sensors read with C's own search: without it they are off by centimetres, or find nothing."""
+    native = copy.copy(mj_model)
+    native.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+    measured = mujoco.MjData(native)
+    mujoco.mj_copyData(measured, native, mj_data)
+    mujoco.mj_fwdPosition(native, measured)
+    mujoco.mj_sensorPos(native, measured)
+    for sensor in np.flatnonzero(np.isin(mj_model.sensor_type, COLLISION_SENSORS)):
+        columns = columns_of(mj_model, int(sensor))
+        # A reading that is delayed is of another state.
+        if not np.any(mj_model.sensor_history[sensor] > 0):
+            sensordata[columns] = measured.sensordata[columns]
 
 
 def is_kept(mj_model: mujoco.MjModel, sensor: int) -> bool:

@@ -186,7 +186,6 @@ def figures(outcomes: Sequence[Outcome]) -> dict[str, float]:
         "least_of_a_feature": min(features[name] for name in FEATURES),
         "touching_share": sum(outcome.verdict.touching for outcome in ran) / max(1, len(ran)),
         "accepted_states": sum(outcome.verdict.accepted for outcome in ran),
-        "weightless_states": sum(outcome.verdict.weightless for outcome in ran),
         "unsteady_states": sum(outcome.verdict.unsteady for outcome in ran),
         "by_our_kernels": by["ours"],
         "by_our_solver": by["our solver"],

@@ -193,7 +193,6 @@ def figures(outcomes: Mapping[str, RegisteredOutcome]) -> dict[str, float]:
         "worse": sum(outcome.fails for outcome in outcomes.values()),
         "touching": sum(verdict.touching for verdict in ran),
         "accepted_states": sum(verdict.accepted for verdict in ran),
-        "weightless_states": sum(verdict.weightless for verdict in ran),
         "unsteady_states": sum(verdict.unsteady for verdict in ran),
         "by_our_kernels": sum(verdict.kernels == "ours" for verdict in ran),
     }

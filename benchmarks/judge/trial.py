@@ -51,7 +51,6 @@ class Verdict:
         kernels: "ours" where one kernel computed the dynamics, "our solver" or "theirs".
         states: how many states of worlds were compared.
         accepted: how many of them had contacts that may differ, and were judged by their depths.
-        weightless: how many of them had constraints without weight, and were judged by positions alone.
         unsteady: how many of them C itself did not come through.
         touching: whether any world had a contact.
         reset: whether worlds that were reset were compared with new ones.
@@ -65,7 +64,6 @@ class Verdict:
     kernels: str = ""
     states: int = 0
     accepted: int = 0
-    weightless: int = 0
     unsteady: int = 0
     touching: bool = False
     reset: bool = False
@@ -224,10 +222,8 @@ class _Trial:
             ):
                 self._add(unsteady=self.verdict.unsteady + 1)
                 continue
-            actual = {name: value[row] for name, value in found.items()}
-            if accepted.has_weightless_rows(mj_data):
-                self._judge_positions(actual["qpos"], quantities["qpos"], row, when)
-            elif report.ok and not self._has_accepted(row, mj_data, contacts[row], when):
+            if report.ok and not self._has_accepted(row, mj_data, contacts[row], when):
+                actual = {name: value[row] for name, value in found.items()}
                 actual |= _sensors(mj_model, sensed[row], sensed_later[row], all_of_them=sensors == "every")
                 differing = differences(
                     *(mj_model, state, substeps, actual, quantities),
@@ -263,15 +259,6 @@ class _Trial:
                 kinds = " ".join(mujoco.mjtGeom(kind).name[7:].lower() for kind in geom_type[list(pair)])
                 self._find(f"depth {kinds}", error, limit, row, when)
         return True
-
-    def _judge_positions(self, actual: np.ndarray, wanted: np.ndarray, row: int, when: str) -> None:
-        """Compare the positions alone of a state with constraints that have no weight, after one substep."""
-        self._add(weightless=self.verdict.weightless + 1)
-        if not when.startswith("step(1,"):
-            return
-        error = float(np.abs(actual - wanted).max(initial=0.0))
-        if not error <= accepted.POSITION_CEILING:
-            self._find("qpos without weight", error, accepted.POSITION_CEILING, row, when)
 
     def compare_reset(self) -> None:
         """Compare worlds that were reset, beside others that were not, with new ones; the bits must be equal."""

@@ -9,6 +9,7 @@ import torch
 
 from benchmarks.judge.compiled import compiled_with
 from ksim_rl.physics import SimCfg, World, poses
+from ksim_rl.physics.constants.least_weights import least_weights
 from ksim_rl.physics.fields import GRAVITY, write_fields
 from ksim_rl.physics.load import caught_warnings
 
@@ -136,7 +137,12 @@ def give_fields(
 
 
 def solved_well(mj_model: mujoco.MjModel) -> mujoco.MjModel:
-    """Let C solve the constraints of a model as well as it can, and return the model."""
+    """Let C solve the constraints of a model as well as it can, and return the model.
+
+    Bodies that C gives no weight have that of our worlds: without it, C's forces are rounding errors.
+    """
+    weights = mj_model.body_invweight0[:, 0]
+    weights[:] = np.maximum(weights, least_weights(mj_model))
     mj_model.opt.tolerance = 0.0
     mj_model.opt.iterations = 100
     mj_model.opt.ls_iterations = 100
@@ -194,6 +200,27 @@ def perturbed(state: Mapping[str, np.ndarray], rng: np.random.Generator) -> Arra
         sign = rng.choice((-1.0, 1.0), size=value.shape)
         found[name] = value + ROUNDING * sign * np.maximum(1.0, np.abs(value))
     return found
+
+
+def rounded(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a model whose numbers are those that float32 has."""
+    found = copy.copy(mj_model)
+    for name in dir(found):
+        value = None if name.startswith("_") else getattr(found, name)
+        if isinstance(value, np.ndarray) and value.dtype == np.float64:
+            value[:] = value.astype(np.float32)
+    return found
+
+
+def jacobian_rounding(mj_model: mujoco.MjModel, state: Mapping[str, np.ndarray]) -> float:
+    """Return by how much rounding of the constraints' Jacobian changes a force on a joint, in N or N m.
+
+    Deep contacts press with up to 1e5 N where no joint gives way, and a part of that in a rounded Jacobian does.
+    """
+    mj_data = put(state, mj_model)
+    mujoco.mj_forward(mj_model, mj_data)
+    lever = float(mj_model.stat.meansize)
+    return ROUNDING * lever * float(np.abs(mj_data.efc_force).sum())
 
 
 def put(state: Mapping[str, np.ndarray], mj_model: mujoco.MjModel) -> mujoco.MjData:

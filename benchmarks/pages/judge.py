@@ -15,7 +15,6 @@ ROWS = {
     "generated/least_of_a_feature": "least models of a feature, among those that ran",
     "generated/touching_share": "share of them with contacts",
     "generated/accepted_states": "states judged by the depths of contacts alone",
-    "generated/weightless_states": "states with constraints without weight, judged by positions alone",
     "generated/unsteady_states": "states that C itself does not come through",
     "generated/by_our_kernels": "models that ran by our kernels alone",
     "generated/by_our_solver": "models that ran by our solver, and MuJoCo Warp's kernels",

@@ -7,6 +7,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 
+from ksim_rl.physics.constants.least_weights import ROUNDING, SHARE
 from ksim_rl.physics.sensors.sensor_checks import check_sensors
 
 # Where a field's prefix is not the name of MuJoCo's type of object.
@@ -25,8 +26,6 @@ ENUM_FIELDS = {
     "sensor_type": mujoco.mjtSensor,
 }
 MOST_TIMESTEP = 0.1
-# Below this, in 1/kg, a weight is rounding error.
-WEIGHTLESS = 1e-12
 # Numbers that nobody means to be negative.
 _OPTIONS = (
     "iterations ls_iterations ccd_iterations noslip_iterations sdf_iterations sdf_initpoints density viscosity "
@@ -229,7 +228,7 @@ def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) 
 def warn_of_weightless(mj_model: mujoco.MjModel, pairs: np.ndarray) -> None:
     """Warn of a geom on a body that turns about its centre of mass where it may touch what is fixed.
 
-    No joint moves that centre, so that MuJoCo gives the contact no weight, and takes it for as hard as numbers allow.
+    MuJoCo gives the contact no weight, and worlds a little; `least_weights` has both.
 
     Args:
         mj_model: the model.
@@ -237,14 +236,14 @@ def warn_of_weightless(mj_model: mujoco.MjModel, pairs: np.ndarray) -> None:
     """
     bodies = mj_model.geom_bodyid[pairs]
     moves = (mj_model.body_treeid[bodies] >= 0).any(-1)
-    weightless = mj_model.body_invweight0[bodies, 0].sum(-1) < WEIGHTLESS
+    weightless = mj_model.body_invweight0[bodies, 0].sum(-1) < ROUNDING
     found = np.flatnonzero(moves & weightless)
     if found.size:
         first, second = (_element(mj_model, "geom", int(geom)) for geom in pairs[found[0]])
         warnings.warn(
             f"{first} and {second} may touch, of which one is fixed and the other turns about its centre of mass: "
-            "MuJoCo gives their contact no weight, and its forces are rounding error, in C too. Move the joint away "
-            "from the centre of mass, or keep the two apart by contype, conaffinity or <exclude/>",
+            f"MuJoCo gives their contact no weight, so that C's forces are rounding errors; here it has {SHARE:g} of "
+            "the body's. Move the joint away from the centre of mass, or keep the two apart by contype or <exclude/>",
             stacklevel=3,
         )
 

@@ -20,6 +20,7 @@ from ksim_rl.physics import capacity, upstream, views
 from ksim_rl.physics.actuators.actuators_of_joints import let_actuators_add
 from ksim_rl.physics.actuators.disabled_actuators import switch_off
 from ksim_rl.physics.callbacks import Callbacks
+from ksim_rl.physics.constants.least_weights import raising_of_weights
 from ksim_rl.physics.constants.masked_constants import MaskedConstants
 from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.field_effects import as_if_drawn
@@ -83,6 +84,7 @@ class WarpWorld(World):
         with memory_for(num_envs, self.device), warp_scope(self.device):
             self.warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
             warn_of_weightless(self.mj_model, self.warp_model.nxn_geom_pair_filtered.numpy())
+            raising_of_weights(self.mj_model, self.warp_model)()
             with as_if_drawn(self.warp_model, expanded):
                 follow_the_c_engine(self.warp_model)
             switch_off(self.mj_model, self.warp_model)

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from ksim_rl.physics.constants import constant_kernels as kernels
+from ksim_rl.physics.constants.least_weights import raising_of_weights
 from ksim_rl.physics.fields import FIXED, INERT0, KIN0, const_groups
 from ksim_rl.physics.rows.tie_weights import BODY_EQUALITIES
 from ksim_rl.physics.structs import filled
@@ -55,6 +56,7 @@ class MaskedConstants:
         # Frames at qpos0 are shared unless a field that moves them differs between worlds.
         num_frames = num_envs if self._moves else 1
         self._mask = mask
+        self._raise_weights = raising_of_weights(mj_model, warp_model)
         # The mask of `place_frames`, which runs for all frames.
         self._everywhere = wp.full(num_frames, True, dtype=bool)
         own = {
@@ -89,6 +91,7 @@ class MaskedConstants:
         """Launch the kernel that gives all worlds the inverse weights of C after `mujoco_warp.set_const`."""
         self.place_frames()
         wp.launch(kernels.mend_weights, dim=self._constants.xipos.shape, inputs=[self._constants])
+        self._raise_weights()
 
     def covers(self, fields: Iterable[str]) -> bool:
         """Return whether the constants that follow from `fields` can be recomputed here, as `World.set_const` says."""
@@ -111,6 +114,8 @@ class MaskedConstants:
         dim = (self._num_envs, self._lanes)
         inputs = [self._constants, groups]
         wp.launch(self._kernel, dim=dim, inputs=inputs, block_dim=self._lanes)
+        if groups & INERT0:
+            self._raise_weights()
 
 
 def _drives_scalar_joints(mj_model: mujoco.MjModel) -> bool:
