@@ -40,6 +40,8 @@ LATER = re.compile(
     '"min_advantage_std": 0.0001, |"min_std": 0.001, |"engine": "auto", |"eager": false, '
     r'|"about": "both", |"value_lmbda": null, '
     r'|"dropped": \[\], |"rel_world_envs": 0.0, |"lag_group": "", |"per_substep": false, '
+    # Of an ActuatorAction, whose last field is its scale.
+    r'|"offset": 0.0, (?="scale": [^,{}]*\})'
     r'|"free_root": false, |"root_turn": \[1.0, 0.0, 0.0, 0.0\], '
 )
 
