@@ -217,7 +217,7 @@ def _solve_as_they_do(
 def _mending(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
-    """Return a launcher of the corrections of MuJoCo Warp's rows and transmissions, or None where they are right."""
+    """Return a launcher of what MuJoCo Warp's solver needs corrected before it; None where all is right."""
     # The first two change rows of MuJoCo Warp's; the last one appends rows.
     of_rows = (
         weighing_of_ties(mj_model, warp_model, warp_data_E),
@@ -227,6 +227,9 @@ def _mending(
     launches = [launch for launch in of_rows if launch is not None]
     if miscounts_contacts(warp_model):
         launches.append(transmissions_of_contacts(warp_model, warp_data_E))
+    if upstream.may_sleep(warp_model.opt):
+        # Its solver leaves forces of worlds without rows as they were, which at first is whatever the memory held.
+        launches.append(warp_data_E.cqfrc_constraint.zero_)
     if not launches:
         return None
 

@@ -29,6 +29,21 @@ def test_a_substep_is_read_as_in_c(integrator: str) -> None:
     step_and_check(XML.format(integrator=integrator), KERNELS["theirs"], substeps=3, names=READ)
 
 
+def test_worlds_without_rows_start_from_no_force() -> None:
+    xml = XML.format(integrator="Euler").replace("<option", '<option jacobian="sparse"')
+    mj_model = mujoco.MjModel.from_xml_string(xml)
+    world = WarpWorld(mj_model, num_envs=1, sim=SimCfg(engine="warp"))
+    world.qvel_EL[:] = 1.0
+    # What the memory may have held when MuJoCo Warp took it, unwritten.
+    world.warp_data_E.cqfrc_constraint.fill_(float("nan"))
+    world.step(1)
+    mj_data = mujoco.MjData(mj_model)
+    mj_data.qvel[:] = 1.0
+    mujoco.mj_step(mj_model, mj_data)
+    assert world.qvel_EL.item() == pytest.approx(mj_data.qvel[0], rel=1e-5)
+    assert world.view("qfrc_constraint").item() == 0.0
+
+
 @pytest.mark.parametrize("engine", ("warp", "c"))
 def test_equalities_of_tendons_are_refused_where_trees_may_sleep(engine: Literal["warp", "c"]):
     xml = """
