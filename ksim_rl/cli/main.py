@@ -104,7 +104,9 @@ def _dispatch(words: list[str]) -> int:
     arguments, names = _without_plugins(words)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         show(USAGE)
-        return 0 if arguments else REFUSED
+        if arguments:
+            return 0
+        return REFUSED
     command, *rest = arguments
     if command == "--version":
         from ksim_rl import __version__
@@ -141,7 +143,8 @@ def _without_plugins(arguments: list[str]) -> tuple[list[str], list[str]]:
         if flag != "--plugin":
             left.append(argument)
             continue
-        name = name if equals else next(following, "")
+        if not equals:
+            name = next(following, "")
         if not name or name.startswith("-"):
             raise ValueError("--plugin: expected the name of a package after it")
         names.append(name)

@@ -139,7 +139,10 @@ def copy_model(source: Path, target: Path) -> None:
         asset = source.resolve().parent / folder / entry.file
         if asset not in names:
             # Two folders may have a file of one name each.
-            names[asset] = asset.name if asset.name not in names.values() else f"{len(names)}_{asset.name}"
+            if asset.name not in names.values():
+                names[asset] = asset.name
+            else:
+                names[asset] = f"{len(names)}_{asset.name}"
         entry.file = names[asset]
         shutil.copy(asset, target.parent / "assets" / entry.file)
     # A model without files is copied as it is; written by MuJoCo it would lose its comments.

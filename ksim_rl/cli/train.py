@@ -182,7 +182,8 @@ def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str],
     folder = Path(launched.runtime.output_dir)
     # Where the user named the folder of a run that is under way, that run's lock says so.
     named = any(text.startswith("hydra.run.dir=") for text in launched.overrides.hydra) and is_locked(folder)
-    folder = folder if named else _unused(folder)
+    if not named:
+        folder = _unused(folder)
     if folder.is_dir():
         check_links(folder, below=FOLDERS)
     return run_and_report(cfg, folder)

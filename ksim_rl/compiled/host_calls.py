@@ -177,7 +177,9 @@ def _asked(function: Callable) -> str | None:
         if module == "time" and name in CLOCKS:
             return CLOCK
         if module in ("posix", "nt", "io", "_io") and name in FILES:
-            return RANDOM if name == "urandom" else FILE
+            if name == "urandom":
+                return RANDOM
+            return FILE
         if module == "builtins" and name == "input":
             return FILE
         return None

@@ -61,7 +61,8 @@ class _Memory:
         end = 0
         # Sorted by address, so one pass merges all extents that overlap.
         for first, last in sorted({extent(tensor) for tensor in used if _storage(tensor) not in made}):
-            start = first if first >= end else start
+            if first >= end:
+                start = first
             end = max(end, last)
             starts[first, last] = start
         return cls(made=made, starts=starts)
@@ -245,7 +246,9 @@ class Tape:
         distances = kernel.use.distances.get(place, {0})
         # Without rows each thread keeps a copy of the whole storage.
         if distances == {0}:
-            return width if width <= MOST_SHARED else 0
+            if width <= MOST_SHARED:
+                return width
+            return 0
         # With rows, only where rows lie one behind the other and fill the storage.
         width, rest = divmod(width, self._num_rows)
         if distances == {width} and not rest:

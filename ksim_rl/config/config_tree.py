@@ -122,7 +122,9 @@ def _match(option: Annotation, value: Plain, path: str) -> Any:
     origin = typing.get_origin(option)
     arguments = typing.get_args(option)
     if origin is Literal:
-        return value if value in arguments else _NO_MATCH
+        if value in arguments:
+            return value
+        return _NO_MATCH
     if origin in (tuple, collections.abc.Sequence, list):
         if not isinstance(value, (list, tuple)):
             return _NO_MATCH
@@ -161,7 +163,9 @@ def _match(option: Annotation, value: Plain, path: str) -> Any:
 
 
 def _join(path: str, name: object) -> str:
-    return f"{path}.{name}" if path else str(name)
+    if path:
+        return f"{path}.{name}"
+    return str(name)
 
 
 def _build_nested_key(value: Any, path: str) -> NestedKey:

@@ -53,7 +53,10 @@ def check_parsed(tree: Tree, overrides: Iterable[Override]) -> None:
         # "+" makes a field, so that it may be set below.
         if override.is_add() or override.is_force_add():
             above = _node(tree, key.split(".")[:-1], make=True)
-            above[key.split(".")[-1]] = None if override.is_sweep_override() else _plain(override)
+            if override.is_sweep_override():
+                above[key.split(".")[-1]] = None
+            else:
+                above[key.split(".")[-1]] = _plain(override)
             continue
         # "~" and plain overrides need a field that is there.
         check_key(tree, key)

@@ -52,7 +52,8 @@ def read_yaml(path: Path) -> Tree:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
     # An empty file is an empty config.
-    tree = {} if tree is None else tree
+    if tree is None:
+        tree = {}
     check_plain(tree, str(path))
     return tree
 

@@ -178,7 +178,9 @@ class DatasetBuffer(ReplayBuffer):
         # The info has the burn-in flags, whether the caller wants it or not.
         data, info = super().sample(batch_size, return_info=True)
         data = _labelled(data, info)
-        return (data, info) if return_info else data
+        if return_info:
+            return (data, info)
+        return data
 
     def epoch(self) -> Iterator[TensorDictBase]:
         """Yield `num_minibatches` minibatches, as of `sample`, that cover the dataset exactly once, in a new order."""

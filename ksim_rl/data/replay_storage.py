@@ -160,7 +160,9 @@ class ReplayStorage(SavedByStateDict, Storage):
 
     def __len__(self) -> int:
         """Return the number of places; those that hold no env state are masked."""
-        return 0 if self.content is None else self.max_size
+        if self.content is None:
+            return 0
+        return self.max_size
 
     def contains(self, item: Entries) -> bool:
         """Return whether an index holds an env state; reads the device."""

@@ -150,4 +150,6 @@ def _by_kernel_or_torch(launch: Callable[..., R], in_torch: Callable[..., R]) ->
 
 def address(tensor: Shaped[Tensor, "*shape"] | None) -> int:
     """Return where a tensor lies; 0 for None."""
-    return 0 if tensor is None else tensor.data_ptr()
+    if tensor is None:
+        return 0
+    return tensor.data_ptr()

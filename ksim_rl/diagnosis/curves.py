@@ -60,7 +60,9 @@ class Curves:
             else:
                 value = None
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        return float(value) if is_number else default
+        if is_number:
+            return float(value)
+        return default
 
     @property
     # At least three values, so that the median ignores one that is off.
@@ -96,7 +98,9 @@ def read_run(folder: Path) -> Curves:
 
 def _number(text: str | None) -> float | None:
     """Return the number in a cell of a table, and None for a cell that is empty."""
-    return float(text) if text else None
+    if text:
+        return float(text)
+    return None
 
 
 def _columns(path: Path) -> dict[str, list[float | None]]:

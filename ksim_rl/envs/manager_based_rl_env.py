@@ -291,7 +291,8 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
     def _set_seed(self, seed: int | None) -> None:
         """Seed all draws and redo the startup events. The levels of curricula stay."""
-        seed = secrets.randbelow(2**31) if seed is None else seed
+        if seed is None:
+            seed = secrets.randbelow(2**31)
         self.cfg = dataclasses.replace(self.cfg, seed=seed)
         self.driver.seed.fill_(seed)
         self.driver.step_count.zero_()

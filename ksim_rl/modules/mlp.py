@@ -235,7 +235,8 @@ class _Product(Function):
             sums = torch.bmm(parts[0].mT, parts[1]).unflatten(0, (networks, splits))
             # Parts are added up in float32: their sum would lose digits in bfloat16.
             d_weight = sums[..., :fan_in, :fan_out].sum(1, dtype=torch.float32)
-            d_weight = d_weight[0] if ctx.alone else d_weight
+            if ctx.alone:
+                d_weight = d_weight[0]
         return d_features, d_weight, None
 
 

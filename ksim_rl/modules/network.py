@@ -160,7 +160,9 @@ def _hashable(key: str | Sequence[str]) -> str | tuple[str, ...]:
         return key
     # A list of one name is that name, as TensorDict would have it.
     parts = tuple(key)
-    return parts[0] if len(parts) == 1 else parts
+    if len(parts) == 1:
+        return parts[0]
+    return parts
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -161,7 +161,8 @@ class RolloutEstimator(ValueEstimatorBase):
         places = [keys.value, *(("next", key) for key in signals)]
         read: list[Any] = [tensordict.get(place, None) for place in places]
         # An env without "terminated" ends all its episodes by "done".
-        read[-1] = read[-2] if read[-1] is None else read[-1]
+        if read[-1] is None:
+            read[-1] = read[-2]
         # All signals must agree: shapes that differ by a dim could broadcast without an error.
         shapes: list[tuple[int, ...] | None] = []
         for signal in read:
@@ -365,7 +366,8 @@ class VTrace(RolloutEstimator, value.VTrace):
         actor_network: ProbabilisticTensorDictSequential | None = None,
         **options: Any,
     ) -> None:
-        actor = actor_network if actor is None else actor
+        if actor is None:
+            actor = actor_network
         if actor is None:
             raise ValueError(
                 "actor=None: V-trace needs the present policy, whose log-probabilities it compares"

@@ -128,7 +128,10 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             else:
                 exact_B = policy_kl(dist_old, dist)
             # The adaptive learning rate reads this: the exact divergence has less noise than the estimate.
-            logged["kl"] = estimated_kl(log_behavior_weight_B) if exact_B is None else exact_B.unsqueeze(-1)
+            if exact_B is None:
+                logged["kl"] = estimated_kl(log_behavior_weight_B)
+            else:
+                logged["kl"] = exact_B.unsqueeze(-1)
         out = TensorDict({})
         if self.entropy_bonus:
             entropy_B = self._get_entropy(dist, adv_shape=adv_B.shape[:-1])
@@ -207,7 +210,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         masks = [self._expand_loss_mask(mask, column_B) for mask in masks if mask is not None]
         # One mask is used as it is, without the copy of a stack.
         if len(masks) < 2:
-            return masks[0] if masks else None
+            if masks:
+                return masks[0]
+            return None
         return torch.stack(masks).all(0)
 
     def _standardize_advantage(self, advantage: Tensor, tensordict: TensorDictBase) -> Tensor:

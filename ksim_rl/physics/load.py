@@ -135,7 +135,9 @@ def _readable(message: str, label: str, text: str) -> str:
 def _at_line(text: str, number: int) -> str:
     lines = text.splitlines()
     if not 1 <= number <= len(lines):
-        return f", line {number}" if number else ""
+        if number:
+            return f", line {number}"
+        return ""
     return f", line {number}: {lines[number - 1].strip()[:120]}"
 
 

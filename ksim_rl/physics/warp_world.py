@@ -434,7 +434,9 @@ class WarpWorld(World):
     @staticmethod
     def _sensors_of(substep: int, n: int, sensors: str) -> Sensors:
         amid: dict[str, Sensors] = {"last": "none", "contacts": "contacts", "every": "all"}
-        return "kept" if substep == n - 1 and sensors != "every" else amid[sensors]
+        if substep == n - 1 and sensors != "every":
+            return "kept"
+        return amid[sensors]
 
     def _launch_substep(self, sensors: Sensors, *, is_last: bool = True) -> None:
         if self._nan_guard is not None:

@@ -272,7 +272,8 @@ def _choice(
     **_: Any,
 ) -> tuple[str, str]:
     """Choose the engine by arguments that nobody has checked yet; either engine says which of them is wrong."""
-    sim = sim if isinstance(sim, SimCfg) else SimCfg()
+    if not isinstance(sim, SimCfg):
+        sim = SimCfg()
     if not isinstance(mj_model, mujoco.MjModel) or not isinstance(num_envs, int):
         return "warp", ""
     where = checked_device(device)

@@ -102,7 +102,9 @@ def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
     # Added up later by metrics, so one rank has the total and the others have nothing.
     if name.endswith(_COUNTERS):
         total = torch.stack(tensors).sum(0)
-        return torch.zeros_like(total) if rank() else total
+        if rank():
+            return torch.zeros_like(total)
+        return total
     # A replay keeps [places * E, ...]: envs are joined and cut within each place.
     update, found, leaf = name.partition(_RING)
     if found and leaf.startswith(("available", "content/")):

@@ -174,7 +174,10 @@ def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
             # A large diff is most often data; the commit alone is kept then.
             if len(changes) <= MOST_DIFF_BYTES:
                 write_whole(folder / kept, changes)
-            found[name]["changed"] = kept if len(changes) <= MOST_DIFF_BYTES else "too much to keep"
+            if len(changes) <= MOST_DIFF_BYTES:
+                found[name]["changed"] = kept
+            else:
+                found[name]["changed"] = "too much to keep"
         # Files that git does not know are named, not copied.
         if new := ask_git(top, "ls-files", "--others", "--exclude-standard", "--exclude=__pycache__"):
             found[name]["not in git"] = ", ".join(new.decode(errors="replace").splitlines()[:20])

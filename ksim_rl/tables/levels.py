@@ -50,7 +50,9 @@ def value_of(row: Row, results: Sequence[Result]) -> float | None:
         # A seed that never came there is slower than all others.
         seconds.append(math.inf if value is None else value)
     middle = statistics.median(seconds)
-    return middle if math.isfinite(middle) else None
+    if math.isfinite(middle):
+        return middle
+    return None
 
 
 def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
@@ -66,4 +68,6 @@ def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
         found += [result["means"].get(name, -math.inf) >= level for result in results]
     if row.most_falls is not None:
         found.append(max(result["falls"] for result in results) < row.most_falls)
-    return all(found) if found else None
+    if found:
+        return all(found)
+    return None

@@ -196,4 +196,6 @@ def gpus_for(device: str, *, per_gpu: int) -> list[str]:
         named = [""]
     else:
         named = (os.environ.get("CUDA_VISIBLE_DEVICES") or every).split(",")
-    return named * per_gpu if named != [""] else named
+    if named != [""]:
+        return named * per_gpu
+    return named

@@ -186,7 +186,9 @@ def saved(folder: Path) -> list[Path]:
 def newest_until(folder: Path, iteration: int) -> Path | None:
     """Return the newest checkpoint in `folder` of this iteration or an earlier one, None without such."""
     found = [entry for entry in saved(folder) if (_order(entry.name) or (0, 0))[0] <= iteration]
-    return found[-1] if found else None
+    if found:
+        return found[-1]
+    return None
 
 
 def load_latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> Checkpoint:

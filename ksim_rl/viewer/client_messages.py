@@ -35,7 +35,9 @@ def checked(raw: str | bytes, widgets: Mapping[str, Any]) -> bytes | None:
     # The camera of the page has numbers only.
     if kind == CAMERA:
         entries = [entry for name, entry in message.items() if name != "type"]
-        return raw if all(map(_is_pose, entries)) else None
+        if all(map(_is_pose, entries)):
+            return raw
+        return None
     # Exactly these fields: others would reach code of viser that nobody has checked.
     if kind != UPDATE or message.keys() != {"type", "uuid", "updates"}:
         return None
@@ -53,8 +55,11 @@ def checked(raw: str | bytes, widgets: Mapping[str, Any]) -> bytes | None:
 
 def clamped(value: float, low: float | None, high: float | None) -> float:
     """Return the number of a range that is nearest to `value`; None is no bound."""
-    value = value if low is None else max(low, value)
-    return value if high is None else min(high, value)
+    if low is not None:
+        value = max(low, value)
+    if high is None:
+        return value
+    return min(high, value)
 
 
 def is_number(value: object) -> bool:
@@ -77,7 +82,9 @@ def _allowed(value: Any, widget: Any) -> Any:
     """Return the value that a widget may take for the one that a page has sent, or None."""
     # The widgets that the panel has; all others are refused.
     if isinstance(widget, viser.GuiButtonHandle | viser.GuiCheckboxHandle):
-        return value if isinstance(value, bool) else None
+        if isinstance(value, bool):
+            return value
+        return None
     if isinstance(widget, viser.GuiDropdownHandle | viser.GuiButtonGroupHandle):
         if isinstance(value, str) and value in widget.options:
             return value

@@ -43,7 +43,9 @@ FUNCTIONS |= {
 
 def _in_blocks(values: Array, width: int | None) -> Array:
     """Return values in rows of a width; without one they are a single row."""
-    return values.reshape(-1, width) if width else values[None]
+    if width:
+        return values.reshape(-1, width)
+    return values[None]
 
 
 def _sum(blocks: Array) -> Array:
@@ -95,7 +97,10 @@ class Lag:
         every = self.spec["resample_every"]
         if advances and every and self.age % every == 0:
             self.lag = self._draw()
-        first = value if self.spec["initial"] is None else np.full_like(value, self.spec["initial"])
+        if self.spec["initial"] is None:
+            first = value
+        else:
+            first = np.full_like(value, self.spec["initial"])
         # Newest first. The list is filled up at the first call, so that every lag finds a value.
         self.kept = [value, *(self.kept or [first] * self.most)][: self.most + 1]
         return self.kept[self.lag]
@@ -125,8 +130,12 @@ class Noise:
         spec, first = self.spec, self.last is None
         # A constant error of the episode, such as of calibration: drawn once, then kept.
         if spec["bias"]:
-            self.bias = self._sample(spec["bias"], len(value)) if self.bias is None else self.bias
-            value = value * self.bias if spec["bias"]["operation"] == "multiply" else value + self.bias
+            if self.bias is None:
+                self.bias = self._sample(spec["bias"], len(value))
+            if spec["bias"]["operation"] == "multiply":
+                value = value * self.bias
+            else:
+                value = value + self.bias
         # A random walk: it begins at 0 and grows by one draw per reading.
         if not first:
             self.walk = self.walk + np.asarray(spec["walk_std"]) * self.signals.draws.standard_normal(
@@ -139,7 +148,10 @@ class Noise:
         value = np.where(grain > 0, np.round(value / np.where(grain > 0, grain, 1.0)) * grain, value)
         # A lost reading repeats the last one or reads 0; the first has nothing to repeat.
         if not first and spec["dropout"] and self.signals.draws.random() < spec["dropout"]:
-            value = np.asarray(self.last) if spec["lost"] == "last" else np.zeros_like(value)
+            if spec["lost"] == "last":
+                value = np.asarray(self.last)
+            else:
+                value = np.zeros_like(value)
         self.last = value
         return value
 
@@ -271,7 +283,10 @@ class Signals:
         def low_pass() -> Array:
             # Exact for a first-order filter at any step length.
             gain = 1.0 - math.exp(-self.step_dt / node["time_constant"])
-            kept[0] = parts[0]() if kept[0] is None else kept[0] + gain * (parts[0]() - kept[0])
+            if kept[0] is None:
+                kept[0] = parts[0]()
+            else:
+                kept[0] = kept[0] + gain * (parts[0]() - kept[0])
             return kept[0]
 
         return {"previous": previous, "peak": peak, "low_pass": low_pass}[name]
@@ -371,7 +386,10 @@ class Signals:
     def _velocities(self, kind: str, ids: list[int], local: bool = False) -> Array:
         """Return angular, then linear velocity of the frames of bodies or sites, [N, 6]."""
         # mjOBJ_XBODY is the body's own frame; mjOBJ_BODY would be the frame of its inertia.
-        of_kind = mujoco.mjtObj.mjOBJ_XBODY if kind == "body" else mujoco.mjtObj.mjOBJ_SITE
+        if kind == "body":
+            of_kind = mujoco.mjtObj.mjOBJ_XBODY
+        else:
+            of_kind = mujoco.mjtObj.mjOBJ_SITE
         found = np.zeros((len(ids), 6))
         for row, number in zip(found, ids, strict=True):
             mujoco.mj_objectVelocity(self.model, self.data, of_kind, number, row, local)

@@ -25,7 +25,9 @@ class ModelText:
     @property
     def folder(self) -> Path:
         """Where the files that it names are looked for."""
-        return self.path.parent if self.path else Path()
+        if self.path:
+            return self.path.parent
+        return Path()
 
 
 def is_xml(source: str | Path) -> bool:

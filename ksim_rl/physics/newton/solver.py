@@ -80,7 +80,9 @@ def most_registers(floats: int, num_worlds: int) -> int | None:
     # Blocks per multiprocessor by shared memory, of one warp each, then registers by the warps of a quarter, in eights.
     at_once = SHARED_BYTES // (4 * floats + 1024)
     most = max(LEAST_REGISTERS[num_worlds > FEW_WORLDS], 512 // -(-at_once // 4) // 8 * 8)
-    return most if most <= MOST_REGISTERS else None
+    if most <= MOST_REGISTERS:
+        return most
+    return None
 
 
 def solver(

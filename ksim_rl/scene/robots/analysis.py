@@ -114,7 +114,10 @@ class RobotAnalysis:
         values = dict.fromkeys(self.robot.default_joint_pos, others) | dict.fromkeys(self.leg_joints, legs)
         by_pattern = {}
         for joint, value in values.items():
-            by_pattern[re.escape(joint)] = pitch if joint in self.pitch_joints else value
+            if joint in self.pitch_joints:
+                by_pattern[re.escape(joint)] = pitch
+            else:
+                by_pattern[re.escape(joint)] = value
         return by_pattern
 
     def table(self) -> str:

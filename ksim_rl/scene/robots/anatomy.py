@@ -176,7 +176,9 @@ def _foot_of(mj_model: mujoco.MjModel, points: dict[int, np.ndarray], toes: int,
     if above in (0, root) or above not in points:
         return toes
     treads = points[above][:, 2].min() < points[toes][:, 2].min() + SLAB
-    return above if treads else toes
+    if treads:
+        return above
+    return toes
 
 
 def _build_of(mj_model: mujoco.MjModel, end: int, root: int) -> np.ndarray:

@@ -40,7 +40,9 @@ def mirror_name(name: str, names: Sequence[str]) -> str:
         arms = "".join(
             word[0] + "LR"["RL".index(word[1])] if _ARM.fullmatch(word) else word for word in words
         )
-        return arms if arms in names else name
+        if arms in names:
+            return arms
+        return name
     found = [image for image in images if image in names]
     if len(found) != 1:
         if found:
@@ -128,7 +130,9 @@ def _sign(mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: 
             f"joints {mj_model.joint(joint).name!r} and {mj_model.joint(other).name!r} are no mirror images of each "
             f"other in the plane y = 0: axes {data.xaxis[joint]} and {data.xaxis[other]}, anchors {apart:.3g} m apart"
         )
-    return 1.0 if agreement > 0 else -1.0
+    if agreement > 0:
+        return 1.0
+    return -1.0
 
 
 def mirror_group(group: GroupSpec, terms: Mapping[NestedKey, MirrorMap]) -> MirrorMap:
