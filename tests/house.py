@@ -21,6 +21,10 @@ ROOM_SHARE = 0.25
 FILE_LINES = 450
 FOLDER_FILES = 30
 CONTRACT_LINES = 120
+PUBLIC_PARAMETERS = 8
+PARAMETERS = 12
+# Compilers that read a kernel's source: a launch hands it each array and number by itself. So do operators of torch.
+KERNELS = re.compile(r"^(wp|warp)\.(kernel|func|func_native)\b|^triton\.jit\b")
 VAGUE_NAMES = {"utils", "util", "helpers", "helper", "misc", "common"}
 # The groups of docs/architecture.md, from what people use down to what computes; "" is the modules beside the rooms.
 OTHERS = "of no group"
@@ -288,6 +292,30 @@ def crammed(house: House) -> list[str]:
     return [f"{house.name(path)}:{line}" for path, line in density.crammed(house.texts)]
 
 
+def long_signatures(house: House) -> list[str]:
+    """Return functions with more parameters than a caller can keep in mind."""
+    found = []
+    for path, text in house.texts.items():
+        operators = _operators(text)
+        for function in signatures.functions(path, house.root):
+            if function.name in operators:
+                continue
+            if any(KERNELS.match(ast.unparse(decorator)) for decorator in function.decorators):
+                continue
+            most = PUBLIC_PARAMETERS if function.public else PARAMETERS
+            if function.arguments > most:
+                found.append(f"{function.place} {function.name} has {function.arguments}: {most} at most")
+    return found
+
+
+def _operators(text: str) -> set[str]:
+    """Return the names of functions that a module makes operators of torch, whose schemas are flat."""
+    calls = [node for node in ast.walk(signatures.parse(text)) if isinstance(node, ast.Call)]
+    made = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id == "as_operator"]
+    given = [part for call in made for part in (*call.args, *(keyword.value for keyword in call.keywords))]
+    return {part.id for part in given if isinstance(part, ast.Name)}
+
+
 def means(house: House) -> list[str]:
     """Return the means over the package that rose above what they have been."""
     found = []
@@ -312,6 +340,7 @@ LIMITS: dict[str, Callable[[House], list[str]]] = {
     "rooms ask the contract what an env has": probes,
     "tests lie where their modules do": tests_in_place,
     "no statement holds two comprehensions, ternaries or lambdas": crammed,
+    f"functions have at most {PARAMETERS} parameters, public ones {PUBLIC_PARAMETERS}": long_signatures,
     "code gets no denser, and no less typed": means,
 }
 

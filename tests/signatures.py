@@ -14,6 +14,7 @@ DTYPES = {
     for name, kind in vars(jaxtyping).items()
     if isinstance(kind, type) and issubclass(kind, jaxtyping.AbstractDtype)
 }
+_RECEIVERS = {"self", "cls", "ctx"}
 _PUBLIC_MAGIC = {"__call__", "__init__"}
 _TIMESTAMP = re.compile(r"_t(_plus_1|_minus_1|_0|_f)?$")
 _SUFFIX = re.compile(r"_([A-Z0-9]+)$")
@@ -46,6 +47,8 @@ class Function:
     is_nested: bool = False
     """Inside of a function: it exists while that one runs."""
     decorators: tuple[ast.expr, ...] = ()
+    arguments: int = 0
+    """How many it takes, without `self`, `cls` and `ctx`; gathered ones (`*a`, `**b`) count once each."""
 
 
 def parse(text: str) -> ast.Module:
@@ -115,6 +118,7 @@ def _functions(
                 is_property=any(d in ("property", "cached_property", "quantity") for d in decorators),
                 is_nested=nested,
                 decorators=tuple(node.decorator_list),
+                arguments=sum(part is not None and part.arg not in _RECEIVERS for part in parts),
             )
             yield from _functions(node.body, path, [*scope, node.name], False, True)
 

@@ -50,6 +50,13 @@ BREAKS = {
         {"ksim_rl/scene/a.py": "x = [a if a else 0 for a in (1, 2)]\n"},
         "scene/a.py:1",
     ),
+    "long_signatures": (
+        {
+            "ksim_rl/scene/a.py": "def shown(a, b, c, d, e, f, g, h, *, i): ...\n",
+            "ksim_rl/scene/b.py": "def _own(" + ", ".join(f"a{n}" for n in range(13)) + "): ...\n",
+        },
+        "shown has 9: 8 at most",
+    ),
     "means": (
         {"ksim_rl/scene/a.py": "x = ((1, 2, 3), (4, 5, 6), (7, 8, 9), (1, 2, 3), (4, 5, 6))\n" * 200},
         "tokens in a line",

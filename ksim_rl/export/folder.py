@@ -15,7 +15,7 @@ from ksim_rl.envs.contract import part
 from ksim_rl.export import controls, policy
 from ksim_rl.export.describe import NotDescribedError, describe, joint_names
 from ksim_rl.export.exported_transforms import TaskTransforms, check_equal, sort_transforms, with_transforms
-from ksim_rl.export.record import Recording
+from ksim_rl.export.record import Kept, Recording
 from ksim_rl.export.robot import write_robot
 from ksim_rl.export.standalone.files import Json
 from ksim_rl.files.writing import check_folder, check_own, whole_folder
@@ -71,11 +71,13 @@ def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **opti
     """Write the policy of a run into `folder`, `<run>/export` by default, and return it; see `export_policy`."""
     saved = checkpoint.load_latest(run)
     run_folder = saved.run_folder
+    # Relative to the folder of runs, so that the export names no folder of this machine.
+    origin: Json = {"run_path": str(saved.path.absolute().relative_to(run_folder.parent))}
     # Commit and versions that trained the policy, not those that export it.
     sessions = record.read(run_folder)
     if sessions:
         commit = sessions[-1].code.get("ksim_rl", {}).get("commit")
-        options["trained_with"] = {"commit": commit, "versions": dict(sessions[-1].versions)}
+        origin |= {"commit": commit, "versions": dict(sessions[-1].versions)}
     below = run_folder if folder is None else folder
     if folder is None:
         folder = run_folder / "export"
@@ -86,8 +88,7 @@ def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **opti
         policy_of(saved, device=device),
         folder,
         below=below,
-        # Relative to the folder of runs, so that the export names no folder of this machine.
-        run_path=str(saved.path.absolute().relative_to(saved.run_folder.parent)),
+        origin=origin,
         **options,
     )
 
@@ -97,14 +98,13 @@ def export_policy(
     folder: Path,
     *,
     below: Path | None = None,
-    run_path: str = "",
-    trained_with: Json | None = None,
+    origin: Json | None = None,
     episodes: int = 100,
     seed: int | None = None,
     noise: bool = True,
     note: Callable[[str], None] = show,
 ) -> Path:
-    """Write a policy into a folder, and return it; `trained_with` holds commit and versions.
+    """Write a policy into a folder, and return it; `origin` holds the run's path, commit and versions.
 
     `episodes` are recorded from `seed` for `sim2sim` to compare with, with or without `noise` of the sensors; 0 leaves
     them out. The files appear at the end, all or none; links are refused in their places, and in folders from `below`
@@ -121,8 +121,7 @@ def export_policy(
         _fill(
             trained,
             unfinished,
-            run_path=run_path,
-            trained_with=trained_with or {},
+            origin={"run_path": "", "commit": None, "versions": {}, **(origin or {})},
             episodes=episodes,
             seed=seed,
             noise=noise,
@@ -135,8 +134,7 @@ def _fill(
     trained: Policy,
     folder: Path,
     *,
-    run_path: str,
-    trained_with: Json,
+    origin: Json,
     episodes: int,
     seed: int | None,
     noise: bool,
@@ -204,18 +202,16 @@ def _fill(
     states = [dataclasses.asdict(state) for state in exported.states]
     own = {"inputs": exported.input_names, "outputs": exported.output_names, "states": states}
     own |= {"num_actions": ours.action_manager.size, "obs_dim": exported.obs_dim, "difference": difference}
-    meta |= {"policy": own, "task": cfg.task_name, "iteration": trained.iteration, "run_path": run_path}
-    meta |= {"commit": None, "versions": {}, **trained_with}
+    meta |= {"policy": own, "task": cfg.task_name, "iteration": trained.iteration, **origin}
     meta |= {"seed": seed, "ours": None, "noisy": noise}
     # In training mode the sensors have noise, in evaluation mode they have none.
     env.train(noise)
     if episodes:
         note(f"recording {episodes} episodes for sim2sim")
-        shared: Json = {"groups": groups, "order": order, "seed": seed}
-        shared["joints"] = meta["joints"]["names"]
-        shared["params"] = sorted({name for law in meta["actuators"] for name in law["numbers"]})
+        params = sorted({name for law in meta["actuators"] for name in law["numbers"]})
+        kept = Kept(groups=groups, joints=meta["joints"]["names"], params=params, order=order)
         steps = ours.max_episode_length or UNLIMITED_EPISODE_STEPS
-        recorded = Recording(env, ours, actor, steps=steps, **shared)
+        recorded = Recording(env, ours, actor, kept, steps=steps, seed=seed)
         figures = recorded.figures[:episodes]
         # The runner's figures are compared with these, episode by episode.
         meta["ours"] = {}
@@ -224,7 +220,7 @@ def _fill(
         np.savez_compressed(folder / "episodes.npz", **recorded.arrays)  # pyright: ignore
         # Traces have no noise: single steps have to agree to the digit.
         env.eval()
-        traced = Recording(env, ours, actor, steps=min(steps, TRACED_STEPS), traces=TRACED, **shared)
+        traced = Recording(env, ours, actor, kept, steps=min(steps, TRACED_STEPS), seed=seed, traces=TRACED)
         rates = {"trace/dt": np.array(ours.physics_dt), "trace/decimation": np.array(ours.cfg.decimation)}
         np.savez_compressed(folder / "trace.npz", **traced.arrays, **rates)  # pyright: ignore
     env.close(raise_if_closed=False)

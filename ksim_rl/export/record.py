@@ -1,11 +1,13 @@
 """Records episodes of a policy in our own physics, so that another simulator can run the same ones."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
@@ -18,13 +20,29 @@ from ksim_rl.scene.sensors import ContactSensor
 Arrays = dict[str, np.ndarray]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Kept:
+    """What a recording keeps, in the order of the export.
+
+    Attributes:
+        groups: of observations, which the policy reads.
+        joints: by name.
+        params: the numbers of motor models, by name.
+        order: of actuators, as places in the env's own order.
+    """
+
+    groups: Sequence[NestedKey]
+    joints: Sequence[str]
+    params: Sequence[str]
+    order: Sequence[int]
+
+
 class Recording:
     """Episodes of the envs `["E"]`, one in each, with deterministic actions.
 
     `arrays` replay them: `start/...` [E, ...], `command/...` [E, T + 1, K], which go on after an episode's end, and
     `pushes` [N, 2 + nv] (env, step, change of velocity); with `traces`, `trace/...` [E, steps, ...] too. `figures` hold
-    return, length, falls, terms of reward, metrics, mean torques and shares of contact of each episode. Joints and
-    actuators stand in the order of `joints` and `order`; `params` name the numbers of motor models.
+    return, length, falls, terms of reward, metrics, mean torques and shares of contact of each episode.
     """
 
     def __init__(
@@ -32,21 +50,18 @@ class Recording:
         env: EnvBase,
         ours: ManagerBasedRlEnv,
         actor: TensorDictModuleBase,
+        kept: Kept,
         *,
         steps: int,
-        groups: Sequence[Any],
-        joints: Sequence[str],
-        params: Sequence[str],
-        order: Sequence[int],
         seed: int,
         traces: int = 0,
     ) -> None:
         self._ours = ours
         self._pushes = []
         self._now = 0
-        self._joints = list(joints)
+        self._joints = list(kept.joints)
         every = list(ours.view.joints().names)
-        self._columns = [every.index(name) for name in joints]
+        self._columns = [every.index(name) for name in kept.joints]
         # From MuJoCo's order of joints to the export's.
         sensors = ours.cfg.scene.sensors.items()
         self._sensors = [name for name, sensor in sensors if isinstance(sensor, ContactSensor)]
@@ -61,15 +76,15 @@ class Recording:
             env.set_seed(seed)
             # Seeded before the reset, which draws the starts.
             current = env.reset()
-            self.arrays = self._start(order, params)
+            self.arrays = self._start(kept.order, kept.params)
             # The command at the first frame; one more is kept after each step, T + 1 in all.
             self._keep("command", ours.command_manager.values)
             with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
                 for self._now in range(steps):
                     # State and observation before the step, from which the replay starts this step by itself.
                     if traces:
-                        obs = torch.cat([current[group] for group in groups], -1)
-                        self._keep("trace", {"obs": obs, **self._state(order)})
+                        obs = torch.cat([current[group] for group in kept.groups], -1)
+                        self._keep("trace", {"obs": obs, **self._state(kept.order)})
                     stepped = env.step(actor(current.copy()))
                     # Figures before the reset, which clears the sums of episodes.
                     self._add(stepped["next", "done"][:, 0])

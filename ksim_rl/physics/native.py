@@ -6,6 +6,7 @@
 import functools
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco_warp as mjw
@@ -29,6 +30,14 @@ def names_of(*enums: Any) -> dict[str, int]:
     return {name.partition("_")[2]: int(kind) for enum in enums for name, kind in enum.__members__.items()}
 
 
+@dataclass(frozen=True, kw_only=True)
+class Build:
+    """How a kernel is compiled: with fast arithmetic, and with at most so many registers for each thread."""
+
+    fast_math: bool = False
+    max_registers: int | None = None
+
+
 def launcher(
     source: str,
     constants: Mapping[str, int],
@@ -38,8 +47,7 @@ def launcher(
     *,
     lanes: int,
     threads: int,
-    fast_math: bool = False,
-    max_registers: int | None = None,
+    build: Build = Build(),
 ) -> Callable[..., None]:
     """Return a launcher of C++ over (worlds, lanes) in blocks of `threads`, with arrays in their final place.
 
@@ -54,7 +62,7 @@ def launcher(
     # Constants are whole numbers, so that kernels of equal sizes are one in the cache.
     values = {name.upper(): int(value) for name, value in constants.items()}
     values |= {"LANES": lanes, "THREADS": threads}
-    kernel, struct = _kernel(source, tuple(values.items()), types, threads, fast_math, max_registers)
+    kernel, struct = _kernel(source, tuple(values.items()), types, threads, build)
     problem = filled(struct, *owners)
     dim = (warp_data_E.nworld, lanes)
     device = warp_data_E.qpos.device
@@ -80,8 +88,7 @@ def _kernel(
     constants: tuple[tuple[str, int], ...],
     types: tuple[tuple[str, type], ...],
     threads: int,
-    fast_math: bool,
-    max_registers: int | None,
+    build: Build,
 ) -> tuple[wp.Kernel, Struct]:
     """Return the kernel, and the struct that it takes."""
 
@@ -101,8 +108,8 @@ def _kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
-        cuda_max_registers=max_registers,
-        module_options={"block_dim": threads, "fast_math": fast_math},
+        cuda_max_registers=build.max_registers,
+        module_options={"block_dim": threads, "fast_math": build.fast_math},
     )
     def kernel(problem: struct):
         world, lane = wp.tid()

@@ -1,6 +1,7 @@
 """Casts rays in all worlds: for a sensor, or for the picture of a camera."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import mujoco
@@ -72,6 +73,20 @@ class RayBatch:
         mjw.rays(m, d, self._start, self._direction, self._groups, True, self._exclude, *found)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """What a camera draws: width and height in pixels, which kinds of picture, and what is seen in them."""
+
+    width: int
+    height: int
+    rgb: bool = True
+    depth: bool = False
+    segmentation: bool = False
+    geom_groups: Sequence[int] = (0, 1, 2)
+    textures: bool = True
+    shadows: bool = False
+
+
 class BatchCamera:
     """Pictures of a camera in each world, as MuJoCo Warp's ray-casting renderer drew them last.
 
@@ -82,15 +97,7 @@ class BatchCamera:
         self,
         world: World,
         camera: str,
-        *,
-        width: int,
-        height: int,
-        rgb: bool = True,
-        depth: bool = False,
-        segmentation: bool = False,
-        geom_groups: Sequence[int] = (0, 1, 2),
-        textures: bool = True,
-        shadows: bool = False,
+        picture: Picture,
     ) -> None:
         if not isinstance(world, WarpWorld):
             raise ValueError(
@@ -105,14 +112,14 @@ class BatchCamera:
             self._context = mjw.create_render_context(
                 model,
                 nworld=world.num_envs,
-                cam_res=(width, height),
-                render_rgb=rgb,
-                render_depth=depth,
-                render_seg=segmentation,
-                use_textures=textures,
-                use_shadows=shadows,
-                render_skybox=textures,
-                enabled_geom_groups=list(geom_groups),
+                cam_res=(picture.width, picture.height),
+                render_rgb=picture.rgb,
+                render_depth=picture.depth,
+                render_seg=picture.segmentation,
+                use_textures=picture.textures,
+                use_shadows=picture.shadows,
+                render_skybox=picture.textures,
+                enabled_geom_groups=list(picture.geom_groups),
                 cam_active=[camera],
                 # Rays may be computed once only if no world has a lens of its own.
                 use_precomputed_rays=not {"cam_fovy", "cam_intrinsic"} & fields.keys(),
@@ -120,7 +127,7 @@ class BatchCamera:
             # The renderer has height fields of the model's own geoms only.
             if "geom_dataid" in fields:
                 add_height_fields(self._context, model)
-        self._shape = (world.num_envs, height, width)
+        self._shape = (world.num_envs, picture.height, picture.width)
 
     def render(self) -> None:
         """Draw the present state of all worlds."""

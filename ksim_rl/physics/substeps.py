@@ -26,6 +26,7 @@ from ksim_rl.physics.sensors.contact_sensors import ContactReadings
 from ksim_rl.physics.sensors.limit_sensors import LimitSensors
 from ksim_rl.physics.sensors.sensor_mending import mend_sensors
 from ksim_rl.physics.smooth.stages import calls_back, integration, smooth_dynamics
+from ksim_rl.physics.substep_plan import SubstepPlan
 from ksim_rl.physics.views import FORCES_OF_BODIES
 
 Sensors = Literal["none", "contacts", "kept", "all"]
@@ -35,12 +36,10 @@ Sensors = Literal["none", "contacts", "kept", "all"]
 class Substeps:
     """Shallow variants of one Warp model, so that a stage is left out without touching the model itself.
 
-    The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. With
-    `one_kernel_solver`, `newton` solves, which must suit the model, instead of MuJoCo Warp's own solver. Then, with
-    `one_kernel_dynamics`, which must suit it too, one kernel precedes the constraints. Then, with `one_kernel_rows`,
-    one makes their rows, and `contact_lists` besides, from which contact sensors are read, with `own_broad_phase` one
-    finds contacts, and with `one_kernel_integration` one kernel integrates and keeps a `record` of overflow. Work
-    that can run in parallel with the rest of a substep does so on the stream `aside`.
+    The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. The `plan`
+    says which stages are ours. Our rows come with `contact_lists`, from which contact sensors are read; our
+    integration keeps a `record` of overflow. Work that can run in parallel with the rest of a substep does so on the
+    stream `aside`.
     """
 
     def __init__(
@@ -49,11 +48,7 @@ class Substeps:
         warp_model: mjw.Model,
         warp_data_E: mjw.Data,
         *,
-        one_kernel_solver: bool = False,
-        one_kernel_dynamics: bool = False,
-        one_kernel_rows: bool = False,
-        own_broad_phase: bool = False,
-        one_kernel_integration: bool = False,
+        plan: SubstepPlan,
         aside: wp.Stream | None = None,
         mask: wp.array | None = None,
         record: Mapping[str, wp.array] | None = None,
@@ -66,7 +61,7 @@ class Substeps:
         self._place_fixed_geoms = placing_of_fixed_geoms(warp_model, warp_data_E, expanded)
         self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any())
         limits = LimitSensors(mj_model, warp_model, warp_data_E)
-        if one_kernel_dynamics:
+        if plan.dynamics is None:
             dynamics = smooth_dynamics(warp_model, warp_data_E, mask=mask)
         else:
             dynamics = None
@@ -83,7 +78,7 @@ class Substeps:
         if not self._refresh.needs_cameras:
             # Cameras are placed on refresh where something reads them, see `Refresh`.
             self._alter(ncam=0, nlight=0)
-        if one_kernel_solver:
+        if plan.solver is None:
             # A world without constraints reaches that acceleration in one step.
             self._alter(opt=dataclasses.replace(warp_model.opt, run_qacc_smooth=False))
             solve = newton.solver(self._models["all"], warp_data_E)
@@ -91,11 +86,11 @@ class Substeps:
             solve = partial(_solve_as_they_do, warp_model, warp_data_E)
         self.contact_lists: ContactLists | None = None
         make_rows = contacts = collide = None
-        if one_kernel_rows and one_kernel_solver:
+        if plan.rows is None and plan.solver is None:
             self.contact_lists = ContactLists(warp_model, warp_data_E)
             make_rows = constraint_rows(warp_model, warp_data_E, self.contact_lists)
             contacts = ContactReadings(mj_model, warp_model, warp_data_E, self.contact_lists)
-            if own_broad_phase:
+            if plan.broad_phase is None:
                 collide = collisions(warp_model, warp_data_E, self.contact_lists)
         # Sensors that our kernels read, and those that are mended, must not be computed again by MuJoCo Warp's.
         ours = [] if contacts is None else contacts.sensors
@@ -108,8 +103,8 @@ class Substeps:
             self._refresh.on_demand |= FORCES_OF_BODIES
         # Corrections of rows are made after MuJoCo Warp's; our own rows need none.
         mend = _mending(mj_model, warp_model, warp_data_E, expanded)
-        self._integrates = one_kernel_integration
-        if one_kernel_integration:
+        self._integrates = plan.integration is None
+        if self._integrates:
             integrate = partial(_integrate, integration(warp_model, warp_data_E, record=record))
         else:
             integrate = integrator(mj_model, warp_model, warp_data_E, mend=mend)

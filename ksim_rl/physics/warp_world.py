@@ -117,11 +117,7 @@ class WarpWorld(World):
             with as_if_drawn(m, expanded):
                 self._substeps = Substeps(
                     *(self.mj_model, m, d),
-                    one_kernel_solver=plan.solver is None,
-                    one_kernel_dynamics=plan.dynamics is None,
-                    one_kernel_rows=plan.rows is None,
-                    own_broad_phase=plan.broad_phase is None,
-                    one_kernel_integration=plan.integration is None,
+                    plan=plan,
                     aside=aside,
                     mask=self._reset_mask,
                     record=self._overflow.arrays,

@@ -238,14 +238,13 @@ def velocity_cfg(
     events: Mapping[str, EventTerm],
     viewer: ViewerCfg,
     observations: Mapping[str, ObservationGroupCfg],
-    command: mdp.UniformVelocityCommand | None = None,
     sensors: Mapping[str, Sensor] | None = None,
 ) -> ManagerBasedRlEnvCfg:
     """Return the config: 50 Hz control; an episode lasts 20 s, or until the root tilts by more than 70 degrees.
 
     `feet` has one element per foot in the order of `robot.foot_sites`, and reads every substep, whatever it says: a
-    foot may land and bounce off within an env step. By default the command is `velocity_command()`, with its stages.
-    The ground is a plane; `rough_ground.on_rough_ground` changes that.
+    foot may land and bounce off within an env step. The command is `velocity_command()`, with its stages:
+    `with_command` gives another one. The ground is a plane; `rough_ground.on_rough_ground` changes that.
     """
     elements, num_feet = feet.geoms or feet.bodies or feet.subtrees, len(robot.foot_sites)
     if len(elements) != num_feet and all(re.fullmatch(r"[\w/-]+", element) for element in elements):
@@ -259,7 +258,7 @@ def velocity_cfg(
         scene=on_plane(robot, {FEET: dataclasses.replace(feet, every_substep=True), **(sensors or {})}),
         observations=observations,
         actions={"joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=robot.action_scale)},
-        commands={COMMAND: velocity_command() if command is None else command},
+        commands={COMMAND: velocity_command()},
         rewards=rewards,
         events=events,
         terminations={
@@ -271,11 +270,15 @@ def velocity_cfg(
             "angular_velocity_error": mdp.AngularVelocityError(command=COMMAND),
             "action_acceleration": mdp.ActionAcceleration(),
         },
-        # Stages fit the ranges of the default command alone.
-        curriculum={"command_ranges": command_stages()} if command is None else {},
+        curriculum={"command_ranges": command_stages()},
         episode_length_s=20.0,
         viewer=viewer,
     )
+
+
+def with_command(cfg: ManagerBasedRlEnvCfg, command: mdp.UniformVelocityCommand) -> ManagerBasedRlEnvCfg:
+    """Return a velocity task's config with another command, without stages, which fit the default's ranges alone."""
+    return dataclasses.replace(cfg, commands={COMMAND: command}, curriculum={})
 
 
 def flat_cfg(
@@ -355,15 +358,16 @@ def _proposed_cfg(proposed: ModelRobot, analysis: RobotAnalysis) -> ManagerBased
     pose = PoseStd(standing={".*": 0.05}, walking=moving, running=analysis.by_joint(0.6, 0.3, 0.4))
     # A leg's natural speed grows with the root of its length: 1 m/s is much for a leg of 0.25 m.
     speed = round(min(1.0, 0.5 * math.sqrt(9.81 * height)), 2) if biped else 1.0
-    return flat_cfg(
+    slow = dataclasses.replace(velocity_command(), lin_vel_x=(-speed, speed), lin_vel_y=(-speed, speed))
+    cfg = flat_cfg(
         robot,
         pose,
         feet=ContactSensor(bodies=analysis.foot_bodies),
         is_biped=biped,
         foot_height=round(min(0.1, 0.3 * height), 3),
-        command=dataclasses.replace(velocity_command(), lin_vel_x=(-speed, speed), lin_vel_y=(-speed, speed)),
         viewer=ViewerCfg(body=robot.root_body, distance=max(1.0, 4.0 * height), elevation=-12.0),
     )
+    return with_command(cfg, slow)
 
 
 def training(*, num_iterations: int, actor: ActorCfg = ACTOR, **ppo: Any) -> TrainingCfg:

@@ -84,8 +84,8 @@ def build(
         hooks=hooks,
         folder=run_folder / "checkpoint" if run_folder else None,
         config=cfg.to_tree(),
-        notes=said,
     )
+    trainer.notes = said
     # Before anything is loaded: a replay need not be kept apart meanwhile.
     began = time.monotonic()
     collector.warm_up()

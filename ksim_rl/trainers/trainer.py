@@ -143,7 +143,7 @@ class Trainer:
 
     Without an `evaluator` nothing is evaluated; `solved_at` is of its mean return. The `hooks` run after an evaluation
     and before a checkpoint. A checkpoint in `folder` (None saves none) holds `config`, plain data, as the run's.
-    Training begins by saying the `notes` of how things were built.
+    Set `loggers` to record the metrics, and `notes` to texts of how things were built, which training begins by saying.
     """
 
     def __init__(
@@ -154,18 +154,16 @@ class Trainer:
         update: Update,
         evaluator: Evaluator | None = None,
         solved_at: float | None = None,
-        loggers: Sequence[MetricLogger] = (),
         hooks: Sequence[Hook] = (),
         folder: Path | None = None,
         config: Mapping[str, Any] | None = None,
-        notes: Sequence[str] = (),
     ) -> None:
         self.cfg = cfg
         self.collector = collector
         self.update = update
         self.evaluator = evaluator
         self.solved_at = solved_at
-        self.loggers = loggers
+        self.loggers: Sequence[MetricLogger] = ()
         self.folder = folder
         self.config = dict(config or {})
         self.iteration = 0
@@ -178,7 +176,7 @@ class Trainer:
         self.clock = RunClock()
         self.progress = RunProgress(cfg.num_iterations, enabled=False)
         self.watch: Callable[[], None] = lambda: None  # called in each iteration, before anything is written
-        self._notes = tuple(notes)
+        self.notes: Sequence[str] = ()
         self._own_hooks = tuple(hooks)
         self._hooks: list[Hook] = [*hooks, CheckpointHook(interval=cfg.checkpoint_interval)]
         if evaluator is not None:
@@ -226,7 +224,7 @@ class Trainer:
         """
         self.progress = progress or self.progress
         with self.interrupt, self.progress:
-            notes = (*self._notes, *notes_of(self.update, warm_up=self.cfg.warm_up))
+            notes = (*self.notes, *notes_of(self.update, warm_up=self.cfg.warm_up))
             for text in (*missing_parts(self.collector.env), *notes):  # what this env cannot do
                 self.progress.note(text)
             if self.warm_up_s:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ksim_rl.physics import World, load_model
-from ksim_rl.physics.ray_casting import BatchCamera
+from ksim_rl.physics.ray_casting import BatchCamera, Picture
 
 CAMERA_HEIGHT = 2.0
 FIELDS = """
@@ -25,7 +25,7 @@ FIELDS = """
 
 def test_each_world_shows_the_height_field_that_it_collides_with():
     world = World(load_model(FIELDS), num_envs=2, per_world_fields=("geom_dataid",))
-    camera = BatchCamera(world, "down", width=3, height=3, rgb=False, depth=True)
+    camera = BatchCamera(world, "down", Picture(width=3, height=3, rgb=False, depth=True))
     world.field("geom_dataid")[:, 0] = torch.tensor([0, 1], dtype=torch.int32)
     camera.render()
     middle_E = camera.depth_EHW[:, 1, 1]
@@ -42,7 +42,7 @@ def test_each_world_has_its_own_sizes_and_fields_of_view():
     world = World(model, num_envs=3, per_world_fields=("geom_size", "cam_fovy"))
     world.field("geom_size")[1, 0, 0] = 0.4
     world.field("cam_fovy")[2] = 53.13  # half of the height of the picture at 1 m
-    camera = BatchCamera(world, "down", width=64, height=64, rgb=False, segmentation=True)
+    camera = BatchCamera(world, "down", Picture(width=64, height=64, rgb=False, segmentation=True))
     camera.render()
     seen_E = (camera.segmentation_EHW2[..., 0] == 0).float().mean((1, 2))
     # The picture is 2 m wide at 1 m (1 m in world 2), the disc is pi r^2.
@@ -52,4 +52,4 @@ def test_each_world_has_its_own_sizes_and_fields_of_view():
 
 def test_a_camera_that_is_not_there_is_refused():
     with pytest.raises(ValueError, match="Camera 'up' not found"):
-        BatchCamera(World(load_model(FIELDS), num_envs=1), "up", width=2, height=2)
+        BatchCamera(World(load_model(FIELDS), num_envs=1), "up", Picture(width=2, height=2))

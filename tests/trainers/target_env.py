@@ -147,17 +147,18 @@ def make_trainer(
     evaluation_env = make_env(10, noise=noise)
     evaluation_env.eval()
     fields = {"num_iterations": iterations, "eval_interval": 0, "checkpoint_interval": 0, **cfg}
-    return Trainer(
+    trainer = Trainer(
         TrainerCfg(**fields),
         collector=RolloutCollector(env, actor, rollout_length=rollout_length, keys=update.rollout_keys),
         update=update,
         evaluator=Evaluator(evaluation_env, actor, max_steps=LENGTH, seed=7),
         solved_at=solved_at,
-        loggers=loggers,
         hooks=hooks,
         folder=folder,
         config=config,
     )
+    trainer.loggers = loggers
+    return trainer
 
 
 class MemoryLogger:

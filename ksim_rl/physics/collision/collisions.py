@@ -98,12 +98,12 @@ def collisions(
     if device.is_cuda:
         lanes = lanes or LANES
         threads = CUDA_THREADS
-        most = REGISTERS
+        build = native.Build(max_registers=REGISTERS)
     # The CPU compiles the same source for one lane.
     else:
         lanes = 1
         threads = 1
-        most = None
+        build = native.Build()
     margins = m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap
     constants = {
         **upstream.GEOM_TYPES,
@@ -114,7 +114,7 @@ def collisions(
         "others": others.size > 0,
         "has_rows": HAS_ROWS,
     }
-    collide = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)
+    collide = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, build=build)
     # MuJoCo Warp's narrow phase launches kernels by these counts: only of the pairs that are left.
     theirs = dataclasses.replace(m, geom_pair_type_count=upstream.pair_type_counts(m, others))
     their_ids = wp.array(m.nxn_pairid_filtered.numpy()[are_theirs], dtype=wp.vec2i, device=device)

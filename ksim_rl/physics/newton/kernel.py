@@ -134,7 +134,8 @@ def launcher(
         **{str(invariant.name): invariant for invariant in Invariant},
     }
     given = _SOURCE, constants, own, warp_model, warp_data_E
-    return native.launcher(*given, lanes=lanes, threads=lanes, fast_math=True, max_registers=max_registers)
+    build = native.Build(fast_math=True, max_registers=max_registers)
+    return native.launcher(*given, lanes=lanes, threads=lanes, build=build)
 
 
 @wp.func_native("""

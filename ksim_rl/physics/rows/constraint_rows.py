@@ -90,9 +90,9 @@ def constraint_rows(
     threads = lists.threads
     # Fewer registers pay only where not all threads are on the GPU at the same time.
     waits = device.is_cuda and d.nworld * lanes > THREADS_AT_ONCE * device.sm_count
-    most = REGISTERS if waits else None
+    build = native.Build(max_registers=REGISTERS if waits else None)
     source = native.source_of("rows", PARTS)
-    launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)
+    launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, build=build)
 
     def make_rows() -> None:
         # First, since rows of contacts follow the order of the lists.

@@ -180,8 +180,8 @@ def _launcher(
     # Without a record of overflow, its part is not compiled.
     parts += ("record",) if "sticky" in given else ()
     source = f"constexpr int PARENTS[] = {{{parents}}};\n" + native.source_of("smooth", parts)
-    most = REGISTERS if is_small else None
-    return native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, max_registers=most)
+    build = native.Build(max_registers=REGISTERS if is_small else None)
+    return native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, build=build)
 
 
 def _sizes(warp_model: mjw.Model) -> dict[str, int]:

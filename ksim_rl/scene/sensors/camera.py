@@ -9,7 +9,7 @@ from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
 from ksim_rl.checked import Count, Positive, Within
-from ksim_rl.physics.ray_casting import BatchCamera
+from ksim_rl.physics.ray_casting import BatchCamera, Picture
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import GeomGroup, Sensor, SensorTracker, check_present
 from ksim_rl.scene.state.world_view import WorldView
@@ -77,7 +77,7 @@ class CameraTracker(SensorTracker):
         # The sensor's fields by the renderer's names.
         drawn = ("width", "height", "rgb", "depth", "segmentation", "geom_groups", "textures", "shadows")
         settings = {field: getattr(sensor, field) for field in drawn}
-        self._camera = BatchCamera(view.world, sensor.camera or name, **settings)
+        self._camera = BatchCamera(view.world, sensor.camera or name, Picture(**settings))
 
     @property
     def rgb_EHW3(self) -> UInt8[Tensor, "E H W 3"]:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ksim_rl.physics import World
-from ksim_rl.physics.ray_casting import BatchCamera
+from ksim_rl.physics.ray_casting import BatchCamera, Picture
 from tests.mdp.randomization.randomize_bench import RICH_FIELDS, Runners
 from tests.mdp.randomization.test_randomize_physics import SEEN_EVENTS
 
@@ -30,7 +30,7 @@ def runners():
 
 def picture(world: World, camera: str) -> torch.Tensor:
     world.refresh()
-    renderer = BatchCamera(world, camera, width=24, height=18)
+    renderer = BatchCamera(world, camera, Picture(width=24, height=18))
     renderer.render()
     return renderer.rgb_EHW3.int()
 

@@ -11,7 +11,7 @@ import torch
 from benchmarks.agreement_models import QUADRUPED
 from ksim_rl.physics import NanGuardCfg, SimCfg, World, load_model, views
 from ksim_rl.physics.c_engine.c_world import CWorld
-from ksim_rl.physics.ray_casting import BatchCamera, RayBatch
+from ksim_rl.physics.ray_casting import BatchCamera, Picture, RayBatch
 from tests.physics.models import SUBSTEPS, quadruped
 
 IN_C = SimCfg(engine="c")
@@ -264,7 +264,7 @@ def test_settings_of_our_kernels_are_refused_and_those_of_room_mean_nothing():
 def test_what_the_engine_has_not_is_refused_by_name():
     world = World(load_model(TABLE), num_envs=1, sim=IN_C)
     with pytest.raises(ValueError, match=r"camera 'eye' .* choose sim.engine='warp'"):
-        BatchCamera(world, "eye", width=8, height=8)
+        BatchCamera(world, "eye", Picture(width=8, height=8))
     with pytest.raises(ValueError, match="no Warp arrays"):
         world.launch("mine", lambda: None)
 
