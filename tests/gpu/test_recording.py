@@ -12,7 +12,9 @@ from ksim_rl.adapters.stepper import Stepper
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
 from ksim_rl.envs.recorded_python import FrozenPythonError
 from ksim_rl.trainers.evaluation import Evaluator
-from tests.collectors.test_recording import Calling, Constant, Counter, Hidden, PythonRandom, WallClock
+from tests.collectors.recorded_puck import Calling, Constant
+from tests.collectors.test_recording import Hidden
+from tests.collectors.test_refused_python import Counter, PythonRandom, WallClock
 from tests.envs.probe_env import puck_cfg
 from tests.gpu.no_syncs import no_syncs
 
