@@ -1,15 +1,13 @@
 """Config dataclasses that inherit `Checked` hold, once built, values that fit the annotations of their fields.
 
 Bounds stand in the annotation: `stiffness: Positive`, `share: Share = 0.5`, `x: Annotated[float, Within(high=3.0)]`.
-Only rules that relate several fields need code: a method `_check_fields`. Constants of a class, which its
-bases declare, and other defaults for their fields may stand in its statement: `class Jump(EventTerm, mode="interval")`.
+Only rules that relate several fields need code: a method `_check_fields`.
 """
 
-import inspect
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -68,20 +66,6 @@ class Checked:
 
     A ValueError names the field, the value and the valid ones.
     """
-
-    def __init_subclass__(cls, **given: Any) -> None:
-        """Take the constants and defaults of the class's statement, each declared by a base."""
-        super().__init_subclass__()
-        # The base that is nearest wins, as in Python.
-        bases = filter(is_dataclass, reversed(cls.__mro__[1:]))
-        inherited = {field.name: field.type for base in bases for field in fields(base)}
-        for name, value in given.items():
-            # A misspelt constant would be ignored in silence.
-            if not any(name in inspect.get_annotations(base) for base in cls.__mro__):
-                raise TypeError(f"class {cls.__name__}: no base of it declares {name!r}")
-            if name in inherited:  # declared again, so that `dataclass` takes the value as its default
-                cls.__annotations__[name] = inherited[name]
-            setattr(cls, name, value)
 
     def __post_init__(self) -> None:
         """Check every field, and then the rules about several fields of each class, bases first."""

@@ -23,6 +23,11 @@ from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 Fields = Mapping[str, bool | float | str | tuple[float, ...]]
 """Values of some fields of a term."""
 
+EventMode = Literal["startup", "reset", "start", "interval", "step"]
+"""When an event happens: as the env is made, at a reset, at an episode's start, after drawn times, at each step."""
+Reduction = Literal["mean", "last", "max", "sum"]
+"""What an episode keeps of a metric."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Term(Checked, ABC):
@@ -78,7 +83,7 @@ class MetricTerm(Term):
     sensors with `every_substep` are current; what has to be derived, such as poses of bodies, is refused.
     """
 
-    reduce: Literal["mean", "last", "max", "sum"] = "mean"
+    reduce: Reduction = "mean"
     per_substep: bool = False
 
     @abstractmethod
@@ -97,7 +102,7 @@ class EventTerm(Term):
     all reset events: derived quantities are refreshed after all events of the moment have run.
     """
 
-    mode: Literal["startup", "reset", "start", "interval", "step"] = "reset"
+    mode: EventMode = "reset"
     interval_range_s: NonNegativeRange | None = None
 
     def _check_fields(self) -> None:

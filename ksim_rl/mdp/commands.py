@@ -103,8 +103,10 @@ class HeldCommand(CommandTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaseHeightCommand(OfEntity, HeldCommand, drawn=("height",)):
+class BaseHeightCommand(OfEntity, HeldCommand):
     """A height of the root body's frame above the ground, m, [E, 1], drawn uniformly."""
+
+    drawn = ("height",)
 
     height: Range
 
@@ -125,8 +127,10 @@ class BaseHeightCommand(OfEntity, HeldCommand, drawn=("height",)):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointPositionCommand(HeldCommand, drawn=("offset",)):
+class JointPositionCommand(HeldCommand):
     """Positions of joints, rad or m, [E, N]: the default pose plus a uniform offset, kept inside the soft limits."""
+
+    drawn = ("offset",)
 
     joints: Patterns
     offset: Range
@@ -233,7 +237,7 @@ _REACHED: Rgba = (0.2, 0.3, 0.8, 0.8)
 
 
 @dataclass(frozen=True, kw_only=True)
-class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
+class UniformVelocityCommand(OfEntity, CommandTerm):
     """A planar velocity (vx, vy, wz) in the root's frame, m/s and rad/s, [E, 3], drawn uniformly.
 
     Each resampling makes some envs special, independently of each other:
@@ -246,6 +250,8 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
 
     Units are m, rad and s; `ang_vel_z` also bounds heading control, and `rel_..._envs` are probabilities.
     """
+
+    drawn = VELOCITY
 
     lin_vel_x: Range
     lin_vel_y: Range
@@ -333,7 +339,7 @@ class UniformVelocityCommand(OfEntity, CommandTerm, drawn=VELOCITY):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SinusoidalGaitCommand(CommandTerm, drawn=("frequency",)):
+class SinusoidalGaitCommand(CommandTerm):
     """sin and cos of each foot's phase angle: all sines, then all cosines, [E, 2F].
 
     The angle of foot f is 2 pi (the integral of the frequency since the start of the episode + offset_f); a foot whose
@@ -341,6 +347,8 @@ class SinusoidalGaitCommand(CommandTerm, drawn=("frequency",)):
 
     The frequency is in Hz, offsets in cycles, one per foot: (0.0, 0.5) is a biped's walk, (0.0, 0.5, 0.5, 0.0) a trot.
     """
+
+    drawn = ("frequency",)
 
     frequency: NonNegativeRange
     offsets: Annotated[tuple[float, ...], Filled("give one per foot, such as (0.0, 0.5)")]

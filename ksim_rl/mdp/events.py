@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ksim_rl.checked import Count, NonNegative, NonNegativeRange, Positive, Range, Share
 from ksim_rl.checks import check_in_range, check_pair
-from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.term import EventMode, EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import OfCommand, OfEntity, OfJoints, root_height
@@ -177,12 +177,13 @@ class ResetHeight(OfEntity, EventTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StartAtCommand(OfCommand, OfEntity, EventTerm, mode="start"):
+class StartAtCommand(OfCommand, OfEntity, EventTerm):
     """Start some episodes at the speed that a velocity command (vx, vy, wz) asks for, all else of the root's at rest.
 
     `share` is the probability. So a fast gait is met before the policy can reach it by itself.
     """
 
+    mode: EventMode = "start"
     share: Share = 0.5
 
     def _check_fields(self) -> None:
@@ -206,9 +207,10 @@ class StartAtCommand(OfCommand, OfEntity, EventTerm, mode="start"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PushByVelocity(OfEntity, EventTerm, mode="interval"):
+class PushByVelocity(OfEntity, EventTerm):
     """Kick the free root body: add a uniform draw to its velocity (m/s and rad/s, world frame), whatever its mass."""
 
+    mode: EventMode = "interval"
     velocity_range: Ranges
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
@@ -220,13 +222,14 @@ class PushByVelocity(OfEntity, EventTerm, mode="interval"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PushByForce(EventTerm, mode="interval"):
+class PushByForce(EventTerm):
     """Press on a body for a while with a constant wrench at its centre of mass; both are drawn when the interval ends.
 
     A push that is due while another lasts replaces it. Several of these events on one body add up. `wrench_range` is by
     axis: x, y, z (N), roll, pitch, yaw (N m), world frame; `duration_s` is rounded to env steps, at least one.
     """
 
+    mode: EventMode = "interval"
     body: str
     wrench_range: Ranges
     duration_s: NonNegativeRange
@@ -255,9 +258,10 @@ class PushByForce(EventTerm, mode="interval"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Jump(OfEntity, EventTerm, mode="interval"):
+class Jump(OfEntity, EventTerm):
     """Throw the free root body up: add the velocity sqrt(2 g h) that carries it a drawn height h (m) in free flight."""
 
+    mode: EventMode = "interval"
     height_range: NonNegativeRange
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ksim_rl.checked import Filled, Positive
 from ksim_rl.checks import check_known
-from ksim_rl.envs.term import MetricTerm
+from ksim_rl.envs.term import MetricTerm, Reduction
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands import OfTarget
 from ksim_rl.mdp.fields import (
@@ -69,16 +69,20 @@ class FootSlipSpeed(OfFeet, MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeakFootHeight(OfSites, MetricTerm, reduce="max"):
+class PeakFootHeight(OfSites, MetricTerm):
     """Height of the highest foot above the ground below it, m, [E]; by default its greatest value in the episode."""
+
+    reduce: Reduction = "max"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return view.sites(self.sites).height_EN.amax(-1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeakContactForce(OfSensor, MetricTerm, reduce="max"):
+class PeakContactForce(OfSensor, MetricTerm):
     """Greatest net contact force, N, [E], sampled at each env step's last substep; by default its peak so far."""
+
+    reduce: Reduction = "max"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         return contact_force(view, self.sensor).amax(-1)
@@ -93,7 +97,7 @@ class Power(OfJoints, MetricTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CostOfTransport(OfJoints, OfEntity, MetricTerm, reduce="last"):
+class CostOfTransport(OfJoints, OfEntity, MetricTerm):
     """Energy / (weight * distance) since the start of the episode, no unit; it needs gravity.
 
     Energy is the integral of `Power`; distance is the length of the root's path over the ground; the weight is of
@@ -101,6 +105,7 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm, reduce="last"):
     that standing still gives a finite value.
     """
 
+    reduce: Reduction = "last"
     min_distance: Positive = 0.1
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
@@ -120,12 +125,13 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm, reduce="last"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Success(MetricTerm, reduce="last"):
+class Success(MetricTerm):
     """1 where the episode ends by one of the named `terminations` of the env and by no other, else 0, [E].
 
     With the time-out it is the share of episodes that survived. Envs that are not made of terms have `SuccessTracker`.
     """
 
+    reduce: Reduction = "last"
     terminations: Annotated[tuple[str, ...], Filled("name at least one, such as ('time_out',)")]
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
@@ -142,13 +148,14 @@ class Success(MetricTerm, reduce="last"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TargetReached(OfTarget, MetricTerm, reduce="last"):
+class TargetReached(OfTarget, MetricTerm):
     """1 while a body or site is within `tolerance` (m) of the position that a `CartesianCommand` asks for, else 0.
 
     Position stage, with the command that the policy saw. `reduce="last"` (the default) asks whether it is there in the
     end, "max" whether it ever was, "mean" for which share of the time.
     """
 
+    reduce: Reduction = "last"
     tolerance: Positive
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

@@ -131,8 +131,10 @@ class FarFromMotion(OfMotionBodies, TerminationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionFinished(OfMotion, TerminationTerm, time_out=True):
+class MotionFinished(OfMotion, TerminationTerm):
     """The motion's last frame is reached: there is nothing more to follow."""
+
+    time_out: bool = True
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         # Half a step early: sums of float32 steps may fall short of the end by some rounding.

@@ -22,8 +22,10 @@ from ksim_rl.mdp.fields import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class TimeOut(TerminationTerm, time_out=True):
+class TimeOut(TerminationTerm):
     """The episode has lasted `episode_length_s`: a truncation, not a failure."""
+
+    time_out: bool = True
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         # `time_out_offset_E` staggers the first episodes, so that not all envs reset in the same step.
@@ -63,12 +65,13 @@ class FarFromOrigin(OfEntity, TerminationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OutsideTerrain(OfEntity, TerminationTerm, time_out=True):
+class OutsideTerrain(OfEntity, TerminationTerm):
     """The root is beyond the edge of its env's ground, if it has one, or closer to it than a margin (m): a truncation.
 
     Robots whose feet must not step over the edge need a margin of about their own reach.
     """
 
+    time_out: bool = True
     margin: NonNegative = 0.5
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:

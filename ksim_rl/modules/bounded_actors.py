@@ -11,7 +11,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 
-from ksim_rl.checked import Positive
+from ksim_rl.checked import Count, NonNegative, Positive
 from ksim_rl.modules.actor import action_range
 from ksim_rl.modules.distributions import TanhGaussian
 from ksim_rl.modules.mlp import Device
@@ -20,15 +20,18 @@ from ksim_rl.modules.upstream import TensorModule
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoundedActorCfg(OffPolicyNetworkCfg, output_gain=0.01):
+class BoundedActorCfg(OffPolicyNetworkCfg):
     """The fields of policies whose actions lie in a box, within `action_bound` where the env's spec has no bounds."""
 
+    output_gain: NonNegative = 0.01
     action_bound: Positive = 1.0  # where the spec has no bounds
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeterministicActorCfg(BoundedActorCfg, hidden_dims=(512, 256, 128)):
+class DeterministicActorCfg(BoundedActorCfg):
     """The policy of TD3: one action for each observation."""
+
+    hidden_dims: tuple[Count, ...] = (512, 256, 128)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from ksim_rl.checked import Count, NonNegative
 from ksim_rl.modules.mlp import Device, mlp
 from ksim_rl.modules.network import (
     LayeredNetwork,
+    ObservationKeys,
     ObservationNormalizer,
     ObservingNetwork,
     OffPolicyNetworkCfg,
@@ -22,13 +23,14 @@ from ksim_rl.modules.upstream import TensorModule
 
 
 @dataclass(frozen=True, kw_only=True)
-class CriticCfg(OnPolicyNetworkCfg, in_keys=("critic",)):
+class CriticCfg(OnPolicyNetworkCfg):
     """The value network.
 
     Attributes:
         output_gain: scale of the last layer's weights.
     """
 
+    in_keys: ObservationKeys = ("critic",)
     output_gain: NonNegative = 1.0
 
 

@@ -186,9 +186,11 @@ class OnPolicyNetworkCfg(NetworkCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OffPolicyNetworkCfg(NetworkCfg, hidden_dims=(256, 256), activation="relu"):
+class OffPolicyNetworkCfg(NetworkCfg):
     """The fields of the networks of off-policy methods; `output_gain` scales the last layer's weights."""
 
+    hidden_dims: tuple[Count, ...] = (256, 256)
+    activation: str = "relu"
     layer_norm: bool = False  # normalize before each activation
     output_gain: NonNegative = 1.0  # scale of the last layer's weights
 

@@ -65,7 +65,7 @@ class GradientCfg(AlgorithmCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
+class OnPolicyCfg(GradientCfg):
     """The settings of algorithms that pass over each rollout several times, with one Adam.
 
     Attributes:
@@ -79,6 +79,9 @@ class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
         anneal_learning_rate: multiply `learning_rate_max`, or the fixed rate, by the share of the run that is left.
     """
 
+    learns_on_sequences = True
+
+    max_grad_norm: Positive | None = 1.0
     num_epochs: Count = 1
     learning_rate: Positive = 1e-3
     schedule: Schedule = "fixed"
@@ -103,7 +106,7 @@ class OnPolicyCfg(GradientCfg, learns_on_sequences=True, max_grad_norm=1.0):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
+class PPOCfg(OnPolicyCfg):
     """Proximal policy optimization (Schulman et al., arXiv 1707.06347); the defaults suit legged locomotion.
 
     Attributes:
@@ -134,6 +137,8 @@ class PPOCfg(OnPolicyCfg, num_epochs=5, schedule="adaptive"):
             "torch" never does. They differ by the order of sums. The metric `update/fused` says which it is.
     """
 
+    num_epochs: Count = 5
+    schedule: Schedule = "adaptive"
     advantage: Literal["gae", "td_lambda", "vtrace"] = "gae"
     gamma: Share = 0.99
     lmbda: Share = 0.95
@@ -220,7 +225,7 @@ class AMPCfg(PPOCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistillationCfg(OnPolicyCfg, num_epochs=2, checkpoint_fields=("teacher",)):
+class DistillationCfg(OnPolicyCfg):
     """A student learns to act as a teacher (a run folder or a checkpoint) does, in the states that the student visits.
 
     That is DAgger (Ross et al., arXiv 1011.0686) without its aggregate of all data: the newest rollout of thousands of
@@ -231,6 +236,9 @@ class DistillationCfg(OnPolicyCfg, num_epochs=2, checkpoint_fields=("teacher",))
     by a factor. With 0 a student that sees its own last action may drive it up without end before it has learned
     anything, and a normalizer never forgets such numbers.
     """
+
+    num_epochs: Count = 2
+    checkpoint_fields = ("teacher",)
 
     teacher: Annotated[str, Filled("name a run folder or a checkpoint, objective.teacher=RUN")] = ""
     loss: DistillationKind = "kl"
@@ -275,7 +283,7 @@ class SACCfg(OffPolicyCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TD3Cfg(OffPolicyCfg, policy_delay=2):
+class TD3Cfg(OffPolicyCfg):
     """Twin delayed deterministic policy gradients (Fujimoto et al., arXiv 1802.09477).
 
     Targets take the present policy, not a slow copy of it, as FastTD3 does (Seo et al., arXiv 2505.22642). Each env has
@@ -283,6 +291,7 @@ class TD3Cfg(OffPolicyCfg, policy_delay=2):
     noise on the actions of targets has `target_noise`, clipped. All are in units of half the range of an action.
     """
 
+    policy_delay: Count = 2
     exploration_noise_min: NonNegative = 0.1
     exploration_noise_max: float = 0.1
     target_noise: NonNegative = 0.2

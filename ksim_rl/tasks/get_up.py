@@ -18,7 +18,7 @@ from ksim_rl import mdp
 from ksim_rl.checked import Positive
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
-from ksim_rl.envs.term import MetricTerm, RewardTerm
+from ksim_rl.envs.term import MetricTerm, Reduction, RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import root_height
 from ksim_rl.modules import ActorCfg
@@ -69,12 +69,13 @@ class Standing(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stands(MetricTerm, reduce="last"):
+class Stands(MetricTerm):
     """1 where the root is at 85 % of the standing height at least and tilted by at most 0.35 rad, else 0, [E].
 
     `reduce="last"` (the default) asks whether it stands in the end.
     """
 
+    reduce: Reduction = "last"
     standing_height: float
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

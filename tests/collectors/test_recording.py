@@ -10,7 +10,7 @@ import torch
 from torchrl.envs import RewardScaling, RewardSum
 
 from ksim_rl.envs.recorded_python import FrozenPythonError
-from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.term import EventMode, EventTerm
 from tests.collectors.recorded_puck import Calling, Constant, collector_of, rewards_of
 
 SCALE = 1.0
@@ -259,9 +259,10 @@ class Hidden:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wind(EventTerm, mode="step"):
+class Wind(EventTerm):
     """Pushes by what `ask` says."""
 
+    mode: EventMode = "step"
     ask: object = None
 
     def __call__(self, view, mask_E):

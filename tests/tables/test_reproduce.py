@@ -12,6 +12,7 @@ from benchmarks.report import RESULTS
 from ksim_rl.cli.main import main
 from ksim_rl.config import plugins
 from ksim_rl.envs import MetricTerm
+from ksim_rl.envs.term import Reduction
 from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import reproduce as reproduce_command
 from ksim_rl.tables import runner
@@ -279,8 +280,10 @@ def test_a_seed_is_trained_and_its_final_policy_judged(tmp_path):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steps(MetricTerm, reduce="last"):
+class Steps(MetricTerm):
     """How many steps the episode has made."""
+
+    reduce: Reduction = "last"
 
     def __call__(self, view):
         return view.episode_step_E.to(torch.float32)

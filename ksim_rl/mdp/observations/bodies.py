@@ -137,8 +137,10 @@ class Contact(OfContacts, ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ContactForce(OfSensor, FramedObservation, frame="world"):
+class ContactForce(OfSensor, FramedObservation):
     """Net contact forces, N, [E, 3N]; acceleration stage. MuJoCo's sign: weight on the ground reads negative z."""
+
+    frame: Literal["root", "world"] = "world"
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         return self.vectors(view, view.contact(self.sensor).force_EN3)

@@ -244,12 +244,14 @@ class ImuReading(OfSensor, ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraImage(OfSensor, ObservationTerm, is_image=True):
+class CameraImage(OfSensor, ObservationTerm):
     """The picture of a `CameraSensor` in the current state (position stage); the only term of its observation group.
 
     "rgb" (uint8 [E, H, W, 3]), "depth" (m, float32 [E, H, W]) or "segmentation" (ids of geoms, -1 for none, int32
     [E, H, W]).
     """
+
+    is_image = True
 
     output: Literal["rgb", "depth", "segmentation"] = "rgb"
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant, index_constant
-from ksim_rl.mdp.randomization.randomize import Pair, Randomize, RandomizeModelField, write_entries
+from ksim_rl.mdp.randomization.randomize import Operation, Pair, Randomize, RandomizeModelField, write_entries
 from ksim_rl.physics.constants.principal_axes import principal_axes
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
@@ -29,9 +29,13 @@ class RandomizeBodyField(RandomizeModelField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyMass(RandomizeBodyField, field="body_mass", lowest=_LEAST_MASS, operation="scale"):
+class RandomizeBodyMass(RandomizeBodyField):
     """Mass of bodies, kg, at constant shape: the inertia about the centre of mass grows in proportion."""
 
+    field = "body_mass"
+    lowest = _LEAST_MASS
+
+    operation: Operation = "scale"
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
 
     def _follower(self, view: EnvView) -> tuple[Tensor, Sequence[float]]:
@@ -42,18 +46,25 @@ class RandomizeBodyMass(RandomizeBodyField, field="body_mass", lowest=_LEAST_MAS
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyCom(RandomizeBodyField, field="body_ipos", columns=3):
+class RandomizeBodyCom(RandomizeBodyField):
     """Centre of mass of bodies in the body's frame, m; columns x, y, z. The inertia about it does not change."""
+
+    field = "body_ipos"
+    columns = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyInertia(RandomizeBodyField, field="body_inertia", columns=3, lowest=0.0):
+class RandomizeBodyInertia(RandomizeBodyField):
     """Inertia of bodies at constant mass: how far the mass spreads along each principal axis (columns x, y, z).
 
     Drawn are factors on the second moments of mass, whose sums by pairs are the principal moments, so that these
     always meet the triangle inequality. The range (f, f) for all axes scales the inertia by f. It starts from the
     body's present mass: let `RandomizeBodyMass` of the same bodies run before it, in the same mode.
     """
+
+    field = "body_inertia"
+    columns = 3
+    lowest = 0.0
 
     per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_inertia")
     operation: Literal["scale"] = "scale"
@@ -99,7 +110,7 @@ _NOTHING = (0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shift")):
+class RandomizePseudoInertia(Randomize):
     """Mass, centre of mass and inertia of bodies, drawn together, each body one that can exist.
 
     The body's mass distribution is deformed: J = U J0 U^T for its pseudo-inertia matrix J0 [4, 4] in the frame of
@@ -107,6 +118,8 @@ class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shi
     [0, 0, 0, 1]]. J stays positive definite for any parameters, which makes an inertia physical (Rucker and
     Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE RA-L 7(2), 2022). All zero changes nothing.
     """
+
+    drawn = ("alpha", "stretch", "shear", "shift")
 
     bodies: Patterns
     alpha: Pair = _NOTHING  # half the logarithm of the mass's factor
@@ -157,8 +170,13 @@ class RandomizePseudoInertia(Randomize, drawn=("alpha", "stretch", "shear", "shi
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGravity(RandomizeModelField, field="gravity", columns=3, operation="add"):
+class RandomizeGravity(RandomizeModelField):
     """Gravity of each world, m/s^2, by axis x, y, z. Projected gravity, a direction, stays the -z axis."""
+
+    field = "gravity"
+    columns = 3
+
+    operation: Operation = "add"
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
         # The options have one row for the whole model.
@@ -179,8 +197,11 @@ NUM_SIZES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomSize(RandomizeModelField, field="geom_size", columns=3):
+class RandomizeGeomSize(RandomizeModelField):
     """Sizes of primitive geoms by MuJoCo's columns, m; bounding boxes and spheres follow, mass and inertia do not."""
+
+    field = "geom_size"
+    columns = 3
 
     geoms: Patterns
 

@@ -18,15 +18,17 @@ _KIND_OF_PAIR_COLUMN = (0, 0, 1, 2, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomFriction(
-    RandomizeModelField, field="geom_friction", columns=3, lowest=0.0, columns_of_one_pair=(0,)
-):
+class RandomizeGeomFriction(RandomizeModelField):
     """Friction of geoms; columns: 0 sliding, 1 torsional (m), 2 rolling (m). One pair for all is for sliding.
 
     In a contact the geom of higher `priority` says it, and of equal ones that with the larger number, for each column:
     values below the ground's friction do nothing unless the geom's priority is higher.
     """
 
+    field = "geom_friction"
+    columns = 3
+    lowest = 0.0
+    columns_of_one_pair = (0,)
     geoms: Patterns
 
     def unfelt_columns(self, view: EnvView) -> Sequence[str]:
@@ -49,14 +51,16 @@ class RandomizeGeomFriction(
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizePairFriction(
-    RandomizeModelField, field="pair_friction", columns=5, lowest=0.0, columns_of_one_pair=(0, 1)
-):
+class RandomizePairFriction(RandomizeModelField):
     """Friction of contact pairs (`<pair name=...>`); columns: 0, 1 sliding, 2 torsional (m), 3, 4 rolling (m).
 
     One pair of numbers for all columns is for both of sliding.
     """
 
+    field = "pair_friction"
+    columns = 5
+    lowest = 0.0
+    columns_of_one_pair = (0, 1)
     pairs: Patterns
 
     def unfelt_columns(self, view: EnvView) -> Sequence[str]:

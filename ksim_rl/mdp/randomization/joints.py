@@ -14,6 +14,7 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant, index_constant
 from ksim_rl.mdp.fields import OfJoints
 from ksim_rl.mdp.randomization.randomize import (
+    Operation,
     Pair,
     Randomize,
     RandomizeModelField,
@@ -25,8 +26,10 @@ from ksim_rl.scene.state.joint_control import joint_control
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointField(OfJoints, RandomizeModelField, lowest=0.0):
+class RandomizeJointField(OfJoints, RandomizeModelField):
     """Draw entries of a field of hinges and slides per world."""
+
+    lowest = 0.0
 
     def ids(self, view: EnvView) -> tuple[int, ...]:
         """Return rows by joint, degree of freedom or generalized position, as the field's name says."""
@@ -40,28 +43,41 @@ class RandomizeJointField(OfJoints, RandomizeModelField, lowest=0.0):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointDamping(RandomizeJointField, field="dof_damping"):
+class RandomizeJointDamping(RandomizeJointField):
     """Viscous damping of joints, N m s / rad or N s / m."""
 
+    field = "dof_damping"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointArmature(RandomizeJointField, field="dof_armature"):
+class RandomizeJointArmature(RandomizeJointField):
     """Inertia that joints feel of their motors, kg m^2 or kg."""
 
+    field = "dof_armature"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointFrictionLoss(RandomizeJointField, field="dof_frictionloss"):
+class RandomizeJointFrictionLoss(RandomizeJointField):
     """Dry friction of joints, N m or N."""
 
+    field = "dof_frictionloss"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointStiffness(RandomizeJointField, field="jnt_stiffness"):
+class RandomizeJointStiffness(RandomizeJointField):
     """Stiffness of the springs in joints, N m / rad or N / m; they pull towards the model's `springref`."""
 
+    field = "jnt_stiffness"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointRange(RandomizeJointField, field="jnt_range", columns=2, operation="add"):
+class RandomizeJointRange(RandomizeJointField):
     """Limits of joints that have any, rad or m; columns: 0 lower, 1 upper. Soft limits stay as in the model."""
+
+    field = "jnt_range"
+    columns = 2
+
+    operation: Operation = "add"
 
     def _check_reach(self, view: EnvView, nominal: np.ndarray, pairs: Mapping[int, Pair]) -> None:
         # The worst case of each end: the highest lower limit and the lowest upper limit must not cross.
@@ -85,44 +101,61 @@ class RandomizeJointRange(RandomizeJointField, field="jnt_range", columns=2, ope
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeJointZero(RandomizeJointField, field="qpos0", lowest=None, operation="add"):
+class RandomizeJointZero(RandomizeJointField):
     """Where joints read zero (MuJoCo's `qpos0`), rad or m, by errors of assembly; bodies move by minus the change."""
+
+    field = "qpos0"
+    lowest = None
+
+    operation: Operation = "add"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonField(RandomizeModelField, lowest=0.0):
+class RandomizeTendonField(RandomizeModelField):
     """Draw a field of tendons (names or patterns) per world."""
+
+    lowest = 0.0
 
     tendons: Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonStiffness(RandomizeTendonField, field="tendon_stiffness"):
+class RandomizeTendonStiffness(RandomizeTendonField):
     """Stiffness of tendons, N / m, or N m / rad of fixed tendons of hinges; they pull to the model's spring length."""
 
+    field = "tendon_stiffness"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonDamping(RandomizeTendonField, field="tendon_damping"):
+class RandomizeTendonDamping(RandomizeTendonField):
     """Viscous damping of tendons, N s / m or N m s / rad."""
 
+    field = "tendon_damping"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonFrictionLoss(RandomizeTendonField, field="tendon_frictionloss"):
+class RandomizeTendonFrictionLoss(RandomizeTendonField):
     """Dry friction of tendons, N or N m."""
 
+    field = "tendon_frictionloss"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTendonArmature(RandomizeTendonField, field="tendon_armature"):
+class RandomizeTendonArmature(RandomizeTendonField):
     """Inertia against a change of tendons' lengths, kg or kg m^2."""
 
+    field = "tendon_armature"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeDefaultJointPos(OfJoints, RandomizeNumber, operation="add"):
+class RandomizeDefaultJointPos(OfJoints, RandomizeNumber):
     """The default pose, rad or m, from which resets, position actions and relative joint positions start.
 
     The model's own value is from its first keyframe or, without one, `qpos0`. In mode "reset" let it run before the
     event that resets the joints.
     """
+
+    operation: Operation = "add"
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         joints = view.joints(self.joints)
@@ -153,8 +186,10 @@ class RandomizeEncoderBias(OfJoints, RandomizeNumber):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeActuator(OfJoints, Randomize, operation="scale"):
+class RandomizeActuator(OfJoints, Randomize):
     """The base of the events of actuators; `joints` are driven ones."""
+
+    operation: Operation = "scale"
 
     def _draw_explicit(
         self, view: EnvView, mask_E: Tensor, name: str, pair: Pair, finite: bool = False
@@ -189,13 +224,15 @@ class RandomizeActuator(OfJoints, Randomize, operation="scale"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeActuatorGains(RandomizeActuator, drawn=("stiffness", "damping")):
+class RandomizeActuatorGains(RandomizeActuator):
     """Gains of the servos that drive joints: stiffness, N m / rad or N / m; damping, N m s / rad or N s / m.
 
     Gains are meant at the joint, behind the gear. MuJoCo's position servo keeps its stiffness in its gain and its bias,
     its velocity servo the damping; all places are written, so that targets keep their meaning. Explicit actuators keep
     theirs in `EnvView.actuator_param`, never below 0. None leaves a gain alone.
     """
+
+    drawn = ("stiffness", "damping")
 
     stiffness: Pair | None = None
     damping: Pair | None = None

@@ -12,7 +12,13 @@ from torch import Tensor
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant
 from ksim_rl.mdp.fields import OfSites
-from ksim_rl.mdp.randomization.randomize import Pair, RandomizeField, RandomizeModelField, write_entries
+from ksim_rl.mdp.randomization.randomize import (
+    Operation,
+    Pair,
+    RandomizeField,
+    RandomizeModelField,
+    write_entries,
+)
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 
@@ -20,16 +26,22 @@ Angle = Literal["roll", "pitch", "yaw"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizePos(RandomizeModelField, columns=3, operation="add"):
+class RandomizePos(RandomizeModelField):
     """Position of elements in the frame of their body, m; columns x, y, z."""
+
+    columns = 3
+
+    operation: Operation = "add"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeTurn(RandomizeField, columns=4):
+class RandomizeTurn(RandomizeField):
     """Orientation of elements in the frame of their body: turned about their own axes by `ranges`, rad.
 
     The turn is Rz(yaw) Ry(pitch) Rx(roll), after the model's own orientation ("add"), or in its place ("abs").
     """
+
+    columns = 4
 
     ranges: Mapping[Angle, Pair] = default(default_factory=dict)
     operation: Literal["abs", "add"] = "add"
@@ -84,63 +96,84 @@ class OfBodies(RandomizeField):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyPos(OfBodies, RandomizePos, field="body_pos"):
+class RandomizeBodyPos(OfBodies, RandomizePos):
     """Position of bodies in the frame of their parents, m; columns x, y, z. The bodies below them move along."""
 
+    field = "body_pos"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeBodyQuat(OfBodies, RandomizeTurn, field="body_quat"):
+class RandomizeBodyQuat(OfBodies, RandomizeTurn):
     """Orientation of bodies in their parents, rad by angle, about their own axes. The bodies below them turn along."""
 
+    field = "body_quat"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomPos(RandomizePos, field="geom_pos"):
+class RandomizeGeomPos(RandomizePos):
     """Position of geoms in the frame of their body, m; columns x, y, z. The body's inertia does not change."""
 
+    field = "geom_pos"
+
     geoms: Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeGeomQuat(RandomizeTurn, field="geom_quat"):
+class RandomizeGeomQuat(RandomizeTurn):
     """Orientation of geoms in their body, rad by angle, about their own axes. The body's inertia does not change."""
 
+    field = "geom_quat"
+
     geoms: Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeSitePos(OfSites, RandomizePos, field="site_pos"):
+class RandomizeSitePos(OfSites, RandomizePos):
     """Position of sites in the frame of their body, m; columns x, y, z. Their sensors and forces move along."""
 
+    field = "site_pos"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeSiteQuat(OfSites, RandomizeTurn, field="site_quat"):
+class RandomizeSiteQuat(OfSites, RandomizeTurn):
     """Orientation of sites in their body, rad by angle, about their own axes: an IMU that is mounted askew, say."""
 
+    field = "site_quat"
+
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeCameraPos(RandomizePos, field="cam_pos"):
+class RandomizeCameraPos(RandomizePos):
     """Position of the model's cameras in the frame of their body, m; columns x, y, z."""
 
+    field = "cam_pos"
+
     cameras: Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeCameraQuat(RandomizeTurn, field="cam_quat"):
+class RandomizeCameraQuat(RandomizeTurn):
     """Orientation of the model's cameras in their body, rad by angle, about their own axes; they look along -z."""
 
+    field = "cam_quat"
+
     cameras: Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeLightPos(RandomizePos, field="light_pos"):
+class RandomizeLightPos(RandomizePos):
     """Position of lights in the frame of their body, m; columns x, y, z."""
+
+    field = "light_pos"
 
     lights: Patterns
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeLightDir(RandomizeTurn, field="light_dir", columns=3):
+class RandomizeLightDir(RandomizeTurn):
     """Direction of lights in the frame of their body, turned about its axes, rad by angle."""
+
+    field = "light_dir"
+    columns = 3
 
     lights: Patterns
     operation: Literal["add"] = "add"

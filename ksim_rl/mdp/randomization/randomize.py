@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ksim_rl.checked import NonNegative, Positive, Range, Within, check_value
 from ksim_rl.checks import check_choice
-from ksim_rl.envs.term import EventTerm
+from ksim_rl.envs.term import EventMode, EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant, index_constant, values_by_name
 from ksim_rl.mdp.randomization.drawing import draw_entries
@@ -35,7 +35,7 @@ _KINDS = {"cam": "camera", "mat": "material", **dict.fromkeys(("jnt", "dof", "qp
 
 
 @dataclass(frozen=True, kw_only=True)
-class Randomize(EventTerm, mode="startup"):
+class Randomize(EventTerm):
     """Draw values per world: once at startup, for the rows that reset, or at intervals.
 
     Attributes:
@@ -45,6 +45,7 @@ class Randomize(EventTerm, mode="startup"):
         shared: one draw for all elements of a world, instead of one for each.
     """
 
+    mode: EventMode = "startup"
     operation: Operation = "abs"
     distribution: Distribution = "uniform"
     shared: bool = False
@@ -115,8 +116,10 @@ class Randomize(EventTerm, mode="startup"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizeNumber(Randomize, drawn=("ranges",)):
+class RandomizeNumber(Randomize):
     """Draw one number per element and world from `ranges`."""
+
+    drawn = ("ranges",)
 
     ranges: Pair
 

@@ -188,12 +188,14 @@ class JointActuator(Actuator):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExplicitActuator(JointActuator, is_explicit=True):
+class ExplicitActuator(JointActuator):
     """A plain motor whose effort a law of ours computes before each substep, and keeps inside `effort_limit`.
 
     The law sees the state of the substep's start, so its damping is integrated explicitly: keep
     `damping * timestep` well below the inertia that the joint feels, or use a built-in actuator.
     """
+
+    is_explicit = True
 
     @property
     def params(self) -> Mapping[str, float]:

@@ -27,12 +27,14 @@ class BuiltinActuator(JointActuator):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PositionActuator(BuiltinActuator, takes=frozenset({"pos"})):
+class PositionActuator(BuiltinActuator):
     """MuJoCo's position servo: effort = stiffness * (target - position) - damping * velocity; SI units.
 
     The control range that it writes is where it can change the effort at a joint limit, and does not clip: a clipped
     target would hide the policy's own target from it.
     """
+
+    takes = frozenset({"pos"})
 
     stiffness: Positive
     damping: NonNegative = 0.0
@@ -79,8 +81,10 @@ def _range(joint: mujoco.MjsJoint) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VelocityActuator(BuiltinActuator, takes=frozenset({"vel"})):
+class VelocityActuator(BuiltinActuator):
     """MuJoCo's velocity servo: effort = damping * (target - velocity), with damping in N m s / rad or N s / m."""
+
+    takes = frozenset({"vel"})
 
     damping: Positive
 
@@ -90,8 +94,10 @@ class VelocityActuator(BuiltinActuator, takes=frozenset({"vel"})):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotorActuator(BuiltinActuator, takes=frozenset({"effort"})):
+class MotorActuator(BuiltinActuator):
     """MuJoCo's motor: effort = target; its control range is its effort limit."""
+
+    takes = frozenset({"effort"})
 
     def configure(self, actuator: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
         super().configure(actuator, joint)

@@ -17,11 +17,13 @@ from ksim_rl.scene.state.joint_targets import JointState, JointTarget
 
 
 @dataclass(frozen=True, kw_only=True)
-class IdealPDActuator(ExplicitActuator, takes=frozenset({"pos", "vel", "effort"})):
+class IdealPDActuator(ExplicitActuator):
     """Effort = stiffness * (position error) + damping * (velocity error) + effort target, within the effort limit.
 
     `stiffness` is in N m / rad or N / m, `damping` in N m s / rad or N s / m.
     """
+
+    takes = frozenset({"pos", "vel", "effort"})
 
     stiffness: NonNegative
     damping: NonNegative

@@ -83,7 +83,7 @@ class NetFile:
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetActuator(ExplicitActuator, takes=frozenset({"pos"})):
+class NetActuator(ExplicitActuator):
     """A motor whose effort a small network predicts from position errors and velocities, joint by joint.
 
     One network serves all joints of the entry, as in Hwangbo et al., "Learning agile and dynamic motor skills for
@@ -95,6 +95,8 @@ class NetActuator(ExplicitActuator, takes=frozenset({"pos"})):
         position_scale, velocity_scale: multiply position errors (target - position, rad or m) and velocities (rad/s or
             m/s) on their way in, `effort_scale` the output, which gives N m or N. None: the file's metadata, else 1.
     """
+
+    takes = frozenset({"pos"})
 
     counts_substeps: ClassVar[bool] = True
 

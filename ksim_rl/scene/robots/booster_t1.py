@@ -86,8 +86,13 @@ def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoosterT1(MenagerieRobot, name="t1", root_body="Trunk", joint_names=JOINTS, model="booster_t1/t1"):
+class BoosterT1(MenagerieRobot):
     """The facts of the robot, and `spec()`, the model that they describe, with bent knees and hanging arms."""
+
+    name: ClassVar[str] = "t1"
+    root_body: ClassVar[str] = "Trunk"
+    joint_names: ClassVar[tuple[str, ...]] = JOINTS
+    model: ClassVar[str] = "booster_t1/t1"
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.665)
     default_joint_pos: Mapping[str, float] = field(

@@ -27,42 +27,52 @@ class ShippedModel(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cartpole(ShippedModel, name="cartpole"):
+class Cartpole(ShippedModel):
     """A 1 kg cart on a 3.6 m rail with a 0.1 kg pole of 1 m, and one motor "slide" of 10 N.
 
     Its joints are "slider" (m) and "hinge" (rad from upright).
     """
 
+    name: ClassVar[str] = "cartpole"
+
 
 @dataclass(frozen=True, kw_only=True)
-class Pendulum(ShippedModel, name="pendulum"):
+class Pendulum(ShippedModel):
     """A 0.5 m rod with 0.9 kg at its end, on a fixed axle: joint "hinge" (rad from upright), motor "torque" of 1.5 N m.
 
     Gravity's torque on the rod when it lies is 4.7 N m, so that swinging it up takes several swings.
     """
 
+    name: ClassVar[str] = "pendulum"
+
 
 @dataclass(frozen=True, kw_only=True)
-class Reacher(ShippedModel, name="reacher"):
+class Reacher(ShippedModel):
     """Two links, 0.13 m and 0.12 m, that turn in a horizontal plane.
 
     Joints "shoulder" and "wrist" about z, a motor of 0.06 N m each. The site "finger" moves at z = `plane_height` (m)
     and reaches up to 0.25 m from the hub.
     """
 
+    name: ClassVar[str] = "reacher"
+
     plane_height: ClassVar[float] = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hopper(ShippedModel, name="hopper"):
+class Hopper(ShippedModel):
     """7.8 kg on one leg with motors at `joints`; the torso is 0.93 m up when it stands with a bent knee."""
+
+    name: ClassVar[str] = "hopper"
 
     joints: ClassVar[str] = "waist|hip|knee|ankle"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cheetah(ShippedModel, name="cheetah"):
+class Cheetah(ShippedModel):
     """14 kg, 1.3 m long, with a hind and a fore leg; springs hold the legs in the standing pose."""
+
+    name: ClassVar[str] = "cheetah"
 
     joints: ClassVar[str] = "(hind|fore)_(hip|knee|ankle)"
 
@@ -75,8 +85,10 @@ WALKER_SERVOS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Walker(ShippedModel, name="walker"):
+class Walker(ShippedModel):
     """22 kg on two legs, 1.7 m tall, torso at 1.23 m; `actuators`, such as `WALKER_SERVOS`, replace the motors."""
+
+    name: ClassVar[str] = "walker"
 
     actuators: tuple[Actuator, ...] = ()
 
@@ -91,12 +103,14 @@ class Walker(ShippedModel, name="walker"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arm(ShippedModel, name="arm"):
+class Arm(ShippedModel):
     """Four joints on a fixed base at the origin, with position servos, and a rod as pusher with the site "tip".
 
     Its weight is compensated, as in many small arms. The tip reaches 0.6 m from the shoulder, 0.16 m above the
     table, and points straight down in the ready pose. Only the pusher collides, with whatever has `contype` 1.
     """
+
+    name: ClassVar[str] = "arm"
 
     joints: ClassVar[tuple[str, ...]] = ("yaw", "shoulder", "elbow", "wrist")
     tip: ClassVar[str] = "tip"

@@ -19,8 +19,10 @@ _LEG = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quadruped(ShippedModel, name="quadruped"):
+class Quadruped(ShippedModel):
     """12 kg on four legs with three joints each, called `<front|rear>_<left|right>_<roll|hip|knee>`."""
+
+    name: ClassVar[str] = "quadruped"
 
     action_scale: Mapping[str, float] = field(default_factory=lambda: {".*_roll": 0.2, ".*_(hip|knee)": 0.3})
     soft_joint_pos_limit_factor: Share = 0.9
@@ -35,8 +37,10 @@ class Quadruped(ShippedModel, name="quadruped"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Humanoid(ShippedModel, name="humanoid"):
+class Humanoid(ShippedModel):
     """0.95 m, 19 kg, 19 joints, called `<left|right>_<kind>`, but for `waist_yaw`; fields as of `LeggedRobot`."""
+
+    name: ClassVar[str] = "humanoid"
 
     action_scale: Mapping[str, float] = field(default_factory=lambda: {".*": 0.3})
     soft_joint_pos_limit_factor: Share = 0.9

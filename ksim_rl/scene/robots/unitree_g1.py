@@ -116,11 +116,16 @@ def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitreeG1(MenagerieRobot, name="g1", root_body="pelvis", joint_names=JOINTS, model="unitree_g1/g1"):
+class UnitreeG1(MenagerieRobot):
     """The facts of the robot, and `spec()`, the model that they describe; it stands with bent knees.
 
     Contacts of the robot with itself are frictionless: fewer dimensions cost less.
     """
+
+    name: ClassVar[str] = "g1"
+    root_body: ClassVar[str] = "pelvis"
+    joint_names: ClassVar[tuple[str, ...]] = JOINTS
+    model: ClassVar[str] = "unitree_g1/g1"
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.76)
     default_joint_pos: Mapping[str, float] = field(

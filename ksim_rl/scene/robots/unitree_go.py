@@ -27,8 +27,11 @@ _GO2_SMOOTH: GeomAttributes = _GO1_SMOOTH | {"priority": 1}
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitreeQuadruped(MenagerieRobot, joint_names=JOINTS, foot_sites=LEGS):
+class UnitreeQuadruped(MenagerieRobot):
     """The base of Go1 and Go2; fields as of `MenagerieRobot`."""
+
+    joint_names: ClassVar[tuple[str, ...]] = JOINTS
+    foot_sites: ClassVar[tuple[str, ...]] = LEGS
 
     default_joint_pos: Mapping[str, float] = field(default_factory=lambda: spread(STANCE, JOINTS))
 
@@ -76,8 +79,12 @@ def _go1_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitreeGo1(UnitreeQuadruped, name="go1", root_body="trunk", model="unitree_go1/go1"):
+class UnitreeGo1(UnitreeQuadruped):
     """Go1's facts, with reflected motor inertia and position servos, and `spec()`, the model that they describe."""
+
+    name: ClassVar[str] = "go1"
+    root_body: ClassVar[str] = "trunk"
+    model: ClassVar[str] = "unitree_go1/go1"
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.278)
     action_scale: Mapping[str, float] = field(default_factory=lambda: spread(GO1_ACTION_SCALE, JOINTS))
@@ -124,8 +131,12 @@ def _go2_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitreeGo2(UnitreeQuadruped, name="go2", root_body="base", model="unitree_go2/go2"):
+class UnitreeGo2(UnitreeQuadruped):
     """Go2's facts, with plain torque motors under PD control, and `spec()`, the model that they describe."""
+
+    name: ClassVar[str] = "go2"
+    root_body: ClassVar[str] = "base"
+    model: ClassVar[str] = "unitree_go2/go2"
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.29)
     action_scale: Mapping[str, float] = field(default_factory=lambda: spread({".*": 0.25}, JOINTS))

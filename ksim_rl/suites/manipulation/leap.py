@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from ksim_rl import mdp
 from ksim_rl.checked import NonNegativeRange, Positive, Range, Share
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-from ksim_rl.envs.term import CommandTerm, MetricTerm, ObservationTerm, RewardTerm
+from ksim_rl.envs.term import CommandTerm, MetricTerm, ObservationTerm, Reduction, RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant
 from ksim_rl.mdp.fields import OfCommand, OfSensor
@@ -130,9 +130,10 @@ class GoalTurn(OfGoal, ObservationTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GoalsReached(OfGoal, MetricTerm, reduce="sum"):
+class GoalsReached(OfGoal, MetricTerm):
     """How often in an episode an object was within `reached` (rad) of its goal, [E]; position stage."""
 
+    reduce: Reduction = "sum"
     reached: Positive = REACHED_RAD
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

@@ -78,8 +78,10 @@ class UniformNoise(NoiseCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussianNoise(NoiseCfg, is_gaussian=True):
+class GaussianNoise(NoiseCfg):
     """Normal noise."""
+
+    is_gaussian = True
 
     std: NonNegativePerDim
     mean: PerDim = 0.0
