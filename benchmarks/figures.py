@@ -40,6 +40,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "num_envs": (*STEP, *LEARN),
     "off_policy_update": (*LEARN, "ksim_rl/device"),
     "peer_settings": (*STEP, *LEARN, *TASK),
+    "peer_terms": (*STEP, *TASK),
     "peers": (*STEP, *LEARN, *TASK),
     "profile": (*STEP, *LEARN),
     "randomization": STEP,
