@@ -104,7 +104,8 @@ def main() -> None:
     found["encoder_bias"] = env.scene["robot"].data.encoder_bias.numpy()
     for name in FIELDS:
         found[f"field/{name}"] = getattr(env.sim.model, name)[:].cpu().numpy()
-    np.savez_compressed(output, **found, **_names(env.sim.mj_model))
+    found |= _names(env.sim.mj_model)
+    np.savez_compressed(output, **found)  # pyright: ignore[reportArgumentType]
 
 
 def _terms(env: ManagerBasedRlEnv, group: str) -> Any:

@@ -136,7 +136,7 @@ class Replay:
         decimation = env.cfg.decimation
         for substep in range(step * decimation, (step + 1) * decimation):
             self._put("substep", substep)
-            world.ctrl_EL.copy_(torch.from_numpy(record["substep/ctrl"][substep][:, self._ctrl]))
+            world.ctrl_EL.copy_(torch.from_numpy(record["substep/ctrl"][substep][:, self.ctrl]))
             warm = torch.from_numpy(record["substep/qacc_warmstart"][substep])
             world.view("qacc_warmstart").copy_(warm)
             world.step(1, before=driver.before_substep, after=driver.after_substep, sensors="every")
@@ -222,7 +222,7 @@ def differences(
 def same_states(record: Record, ours: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the states [T, E] in which some terms mean the same, bool; the reasons are in `ON_PURPOSE`."""
     return {
-        "reward/foot_swing_height": np.cumsum(record["reset"], 0) == record["reset"],
+        "reward/foot_swing_height": np.asarray(np.cumsum(record["reset"], 0) == record["reset"]),
         "reward/foot_clearance": (ours["moment/foot_height"] >= 0.0).all(-1),
         "obs/critic/foot_height": (ours["obs/critic/foot_height"] >= 0.0).all(-1),
         "reward/soft_landing": equal_forces(record, ours),
