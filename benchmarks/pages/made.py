@@ -11,6 +11,7 @@ from benchmarks.pages import (
     learned,
     memory,
     peer_settings,
+    peer_terms,
     speed,
     tasks,
     terms,
@@ -23,6 +24,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 WHOLE: dict[str, Callable[[], str]] = {"terms.md": terms.page, "tasks.md": tasks.page, "view.md": view.page}
 # By page and name: a part stands between two comments, `<!-- made: NAME -->` and `<!-- end: NAME -->`.
 PARTS: dict[str, dict[str, Callable[[], str]]] = {
+    "coming_from.md": {"peer terms": lambda: peer_terms.table(results("peer_terms"))},
     "learning.md": {
         "algorithms": algorithms.algorithms,
         "walking": learned.walking,
