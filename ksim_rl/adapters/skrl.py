@@ -1,5 +1,6 @@
 """Shows an env as one that skrl has wrapped, so that skrl's agents and trainers run on it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.adapters.stepper import Infos, Observations, Stepper
+from ksim_rl.adapters.stepper import Infos, Observations, Stepper, listed
 
 try:
     from gymnasium import spaces
@@ -33,11 +34,13 @@ class SkrlWrapper(Wrapper):
         self,
         env: EnvBase,
         *,
-        keys: tuple[NestedKey, ...] = ("actor",),
-        state_keys: tuple[NestedKey, ...] = (),
+        keys: Sequence[NestedKey] | str = ("actor",),
+        state_keys: Sequence[NestedKey] | str = (),
     ) -> None:
         super().__init__(env)
         # Each leaf once, also where actor and critic read it both.
+        keys = listed(keys)
+        state_keys = listed(state_keys)
         self._stepper = Stepper(env, list(dict.fromkeys((*keys, *state_keys))))
         names = {key: name for name, key in self._stepper.keys.items()}
         self._observed = [names[key] for key in keys]

@@ -20,7 +20,7 @@ from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.envs.recorded_python import FollowedGraph
 from ksim_rl.envs.signal_keys import signal_keys
 
-Keys = Mapping[str, NestedKey] | Sequence[NestedKey] | None
+Keys = Mapping[str, NestedKey] | Sequence[NestedKey] | str | None
 Autoreset = Literal["same_step", "next_step", "disabled"]
 AUTORESETS: tuple[Autoreset, ...] = ("same_step", "next_step", "disabled")
 Observations = dict[str, Shaped[Tensor, "E *?leaf"]]
@@ -57,8 +57,8 @@ def to_numpy(obs: Observations) -> dict[str, np.ndarray]:
 class Stepper:
     """Drives an env of batch size [E], or [] as one row, and returns copies, which later steps do not change.
 
-    It returns the observations at `keys`, by the name to return them under, or as a list of keys. None is every leaf
-    that is not nested (`"actor"`, `"critic"`), or all leaves where there is no such.
+    It returns the observations at `keys`, by the name to return them under, as a list of keys, or as one name. None is
+    every leaf that is not nested (`"actor"`, `"critic"`), or all leaves where there is no such.
 
     `autoreset` says when rows that ended are reset: in the "same_step"; in the "next_step", whose action and reward do
     not count for them; or by whoever calls `reset_rows` ("disabled").
@@ -244,13 +244,18 @@ def _named(env: EnvBase, keys: Keys) -> dict[str, NestedKey]:
     if isinstance(keys, Mapping):
         named = dict(keys)
     else:
-        named = {_flat(key): key for key in keys}
+        named = {_flat(key): key for key in listed(keys)}
     for key in named.values():
         if key not in present:
             raise ValueError(
                 f"keys: the env has no observation {key!r}: {near(_flat(key), map(_flat, present))}"
             )
     return named
+
+
+def listed(keys: Sequence[NestedKey] | str) -> list[NestedKey]:
+    """Return keys as a list; a text is one key, and no sequence of letters."""
+    return [keys] if isinstance(keys, str) else list(keys)
 
 
 def _flat(key: NestedKey) -> str:

@@ -85,6 +85,17 @@ class MaskedReset(EnvBase):
         self._remember(next_td)
         return next_td
 
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Step all rows by the action in `tensordict`, as TorchRL's envs do."""
+        # Envs of other libraries take the action itself.
+        if not isinstance(tensordict, TensorDictBase):
+            raise ValueError(
+                f"env.step({type(tensordict).__name__}): TorchRL's envs take the TensorDict of the last step or reset, "
+                'with the action in it: env.step(td.set("action", action)), or env.step_and_maybe_reset; for '
+                "obs, reward, ... = env.step(action) wrap the env in one of ksim_rl.adapters"
+            )
+        return super().step(tensordict)
+
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Reset the rows that are done, without asking the host whether there are any."""
         # A foreign simulator: TorchRL's own way, which reads the mask on the host.

@@ -23,6 +23,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import value
 from torchrl.objectives.value import ValueEstimatorBase
 
+from ksim_rl.objectives.estimator_options import check_options, normalizes
 from ksim_rl.objectives.masked import standardized
 
 
@@ -60,7 +61,9 @@ class RolloutEstimator(ValueEstimatorBase):
     recursion starts again before it: the steps that led there keep finite advantages, which bootstrap from the value at
     that step. A non-finite value after a termination does not matter. `normalize_advantage` shifts and scales the
     finite ones to mean 0 and standard deviation 1 over all env states, or divides by `min_advantage_std` where that is
-    more (the default is TorchRL's). Time is the batch dim `time_dim`, whatever the names say.
+    more (the default is TorchRL's). Time is the batch dim `time_dim`, whatever the names say; with None it is the dim
+    named "time", or the last one. With `skip_existing` values that the data has are not computed again. Other options
+    of TorchRL's are refused where they ask for something else than what is done here.
     """
 
     time_dim: int | None
@@ -72,13 +75,21 @@ class RolloutEstimator(ValueEstimatorBase):
         critic: TensorDictModule | None = None,
         normalize_advantage: bool = False,
         min_advantage_std: float = 1e-4,
-        time_dim: int = -1,
+        time_dim: int | None = -1,
+        skip_existing: bool | None = None,
         device: torch.device | str | None = None,
         value_network: TensorDictModule | None = None,
         **options: Any,
     ) -> None:
         if critic is None:
             critic = value_network
+        kind = str(type(self).__name__)
+        check_options(kind, options)
+        if skip_existing and critic is not None and carries_state(critic):
+            raise ValueError(
+                f"{kind}: skip_existing=True with a recurrent critic, whose states come along with its values: leave "
+                "it out"
+            )
         # The constants, such as gamma, are buffers that should lie where the critic does.
         if device is None and critic is not None:
             device = next((parameter.device for parameter in critic.parameters()), None)
@@ -89,6 +100,7 @@ class RolloutEstimator(ValueEstimatorBase):
             device=None if device is None else torch.device(device),
             **options,
         )
+        self._skips = bool(skip_existing)
         self.normalize_advantage = normalize_advantage
         self.min_advantage_std = min_advantage_std
 
@@ -126,8 +138,10 @@ class RolloutEstimator(ValueEstimatorBase):
     def _resolved(self, time_dim: int | None, tensordict: TensorDictBase) -> int:
         # The argument of a call goes before the dim given at construction.
         if time_dim is None:
-            assert self.time_dim is not None
             time_dim = self.time_dim
+        if time_dim is None:
+            names = list(tensordict.names) if tensordict.names is not None else []
+            time_dim = names.index("time") if "time" in names else -1
         if not -tensordict.batch_dims <= time_dim < tensordict.batch_dims:
             raise ValueError(
                 f"time_dim={time_dim}: the data has {tensordict.batch_dims} batch dims {tuple(tensordict.batch_size)}"
@@ -154,9 +168,10 @@ class RolloutEstimator(ValueEstimatorBase):
             # A recurrent critic runs through the rollout first: the values after each step need its states there.
             if carries_state(critic):
                 tensordict.set(keys.value, self._unrolled_values(tensordict, params))
-            else:
+            elif not self._has_values(tensordict):
                 tensordict.set(keys.value, self._state_values(tensordict, params, time_dim))
-            following.set(keys.value, self._state_values(following, next_params, time_dim))
+            if not self._has_values(following):
+                following.set(keys.value, self._state_values(following, next_params, time_dim))
         signals = (keys.value, keys.reward, keys.done, keys.terminated)
         places = [keys.value, *(("next", key) for key in signals)]
         read: list[Any] = [tensordict.get(place, None) for place in places]
@@ -174,6 +189,9 @@ class RolloutEstimator(ValueEstimatorBase):
             )
         names = ("value_ET_t", "value_ET_t_plus_1", "reward_ET", "done_ET", "terminated_ET")
         return Signals(**dict(zip(names, read, strict=True)), time_dim=time_dim)
+
+    def _has_values(self, tensordict: TensorDictBase) -> bool:
+        return self._skips and tensordict.get(self.tensor_keys.value, None) is not None
 
     def _state_values(
         self, tensordict: TensorDictBase, params: TensorDictBase | None, time_dim: int
@@ -301,13 +319,7 @@ class GAE(RolloutEstimator, value.GAE):
         normalize_advantage: bool = False,
         **options: Any,
     ) -> None:
-        super().__init__(
-            lmbda=lmbda,
-            normalize_advantage=normalize_advantage,
-            average_gae=normalize_advantage,
-            vectorized=False,
-            **options,
-        )
+        super().__init__(lmbda=lmbda, normalize_advantage=normalizes(normalize_advantage, options), **options)
         self._value_lmbda = value_lmbda
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -327,7 +339,7 @@ class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
     """
 
     def __init__(self, *, lmbda: float, value_lmbda: float | None = None, **options: Any) -> None:
-        super().__init__(lmbda=lmbda, vectorized=False, **options)
+        super().__init__(lmbda=lmbda, **options)
         self._value_lmbda = value_lmbda
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -373,10 +385,7 @@ class VTrace(RolloutEstimator, value.VTrace):
                 "actor=None: V-trace needs the present policy, whose log-probabilities it compares"
             )
         super().__init__(
-            actor_network=actor,
-            normalize_advantage=normalize_advantage,
-            average_adv=normalize_advantage,
-            **options,
+            actor_network=actor, normalize_advantage=normalizes(normalize_advantage, options), **options
         )
         self.register_buffer("lmbda", torch.tensor(lmbda, device=self.gamma.device))
 

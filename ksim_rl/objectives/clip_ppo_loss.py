@@ -64,6 +64,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             self.clip_value = float(clip_value)
         else:
             self.clip_value = None
+        # TorchRL names heads by their log-probabilities where it samples entropies; here one name serves.
+        if self._entropy_coeff_map is not None:
+            self._entropy_coeff_map = {_head(key): coeff for key, coeff in self._entropy_coeff_map.items()}
         self.log_ratio_statistics = log_ratio_statistics
 
     @property
@@ -99,10 +102,12 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         log_weight_B, dist, kl_approx_B, log_is_weight_B = self._log_weight(
             tensordict, adv_shape=adv_B.shape[:-1]
         )
+        values_shape = adv_B.shape
+        adv_B = _for_each_part(adv_B, log_weight_B)
         if adv_B.shape != log_weight_B.shape:
             raise ValueError(
                 f"the advantage has shape {tuple(adv_B.shape)}, the log-probability ratio "
-                f"{tuple(log_weight_B.shape)}: both must be batch shape + (1,)"
+                f"{tuple(log_weight_B.shape)}: both must be batch shape + (1,), or the objective were an outer product"
             )
         if (mask_B := self._mask(tensordict, log_weight_B)) is not None:
             # The ratio of a row that is left out may be infinite, and zero times that is a gradient of NaN.
@@ -143,10 +148,16 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             logged["entropy"] = entropy_B
         if self._has_critic:
             loss_critic_B, value_clip_fraction, explained_variance = self.loss_critic(tensordict)
-            losses["loss_critic"] = loss_critic_B.view_as(adv_B)
+            if is_tensor_collection(loss_critic_B):
+                # Several values have a loss each, which TorchRL leaves as it is, by env state.
+                out.set("loss_critic", loss_critic_B)
+            else:
+                losses["loss_critic"] = loss_critic_B.view(values_shape)
             if value_clip_fraction is not None:
                 out.set("value_clip_fraction", value_clip_fraction)
-            if explained_variance is not None:
+            if is_tensor_collection(explained_variance):
+                out.set("explained_variance", explained_variance)
+            elif explained_variance is not None:
                 # TorchRL keeps the last dim of size one here; all other logged values are scalars.
                 out.set("explained_variance", explained_variance.squeeze(-1))
         if self.log_ratio_statistics:
@@ -172,6 +183,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     def _critic_loss_inputs(
         self, target_return: Tensor, state_value: Tensor, old_state_value: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
+        # Several values in a TensorDict have no trailing dim of one in its batch.
+        if is_tensor_collection(state_value):
+            return super()._critic_loss_inputs(target_return, state_value, old_state_value)
         # TorchRL's explained variance is over the first dim: rows of sequences [B, T] come one below the other.
         return super()._critic_loss_inputs(
             target_return.flatten(0, -2),
@@ -194,16 +208,24 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
 
     def _means(self, columns: dict[str, Tensor], tensordict: TensorDictBase) -> dict[str, Tensor]:
         """Return the means over all env states that take part; one reduction for all columns."""
-        # One row per quantity, [K, B, 1].
-        table = torch.stack(list(columns.values()))
-        mask = self._mask(tensordict, table[0])
-        if mask is None:
-            means = table.flatten(1).mean(1)
-        else:
-            # A where instead of a product: values left out may be anything, and zero times infinity is NaN.
-            table = torch.where(mask, table, torch.zeros_like(table))
-            means = table.flatten(1).sum(1) / mask.sum().clamp_min(1)
-        return dict(zip(columns, means.unbind(0), strict=True))
+        # One table for all quantities, but where parts of an action have columns of their own.
+        by_shape: dict[torch.Size, list[str]] = {}
+        for name, column in columns.items():
+            by_shape.setdefault(column.shape, []).append(name)
+        found = {}
+        for names in by_shape.values():
+            # One row per quantity, [K, B, 1].
+            table = torch.stack([columns[name] for name in names])
+            mask = self._mask(tensordict, table[0])
+            if mask is None:
+                means = table.flatten(1).mean(1)
+            else:
+                # A where instead of a product: values left out may be anything, and zero times infinity is NaN.
+                table = torch.where(mask, table, torch.zeros_like(table))
+                means = table.flatten(1).sum(1) / mask.sum().clamp_min(1)
+            found.update(zip(names, means.unbind(0), strict=True))
+        # In the order of the columns, whatever their shapes.
+        return {name: found[name] for name in columns}
 
     def _mask(self, tensordict: TensorDictBase, column_B: Tensor) -> Tensor | None:
         masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
@@ -227,8 +249,11 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor | TensorDictBase:
         # TorchRL falls back on samples where the entropy is not finite, and asks the host for it.
         if isinstance(dist, CompositeDistribution):
-            entropies = {_entropy_key(key): self._entropy(part) for key, part in dist.dists.items()}
-            return TensorDict(entropies, batch_size=adv_shape).unsqueeze(-1)
+            entropies = TensorDict(batch_size=adv_shape)
+            # One by one, which keeps the order of the distribution.
+            for key, part in dist.dists.items():
+                entropies.set(_entropy_key(key), self._entropy(part))
+            return entropies.unsqueeze(-1)
         return self._entropy(dist).unsqueeze(-1)
 
     def _entropy(self, dist: Distribution) -> Tensor:
@@ -241,10 +266,27 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         return -log_prob.mean(0)
 
 
+def _for_each_part(adv_B: Tensor, log_weight_B: Tensor) -> Tensor:
+    """Return the advantages [*batch, 1] for each part of an action where ratios are of parts: [*batch, *parts, 1]."""
+    batch = adv_B.shape[:-1]
+    parts = log_weight_B.ndim - adv_B.ndim
+    fits = adv_B.ndim > 1 and adv_B.shape[-1] == log_weight_B.shape[-1] == 1
+    if parts < 1 or not fits or log_weight_B.shape[: len(batch)] != batch:
+        return adv_B
+    return adv_B.view(*batch, *(1,) * parts, 1).expand_as(log_weight_B)
+
+
 def _entropy_key(key: NestedKey) -> NestedKey:
     if isinstance(key, str):
         return f"{key}_entropy"
     return (*key[:-1], f"{key[-1]}_entropy")
+
+
+def _head(key: NestedKey) -> NestedKey:
+    """Return the name of a head's entropy, given that or the name of its log-probability."""
+    if isinstance(key, str):
+        return key.removesuffix("_log_prob") + "_entropy" if key.endswith("_log_prob") else key
+    return (*key[:-1], _head(key[-1]))
 
 
 def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:

@@ -49,8 +49,13 @@ def gaussian_parameters(
 
 
 def distribution_keys(actor: Any) -> list[NestedKey]:
-    """Return the leaves from which a `ProbabilisticTensorDictSequential` builds its distribution, e.g. `loc`."""
-    roots = {path_of(key) for key in actor.dist_params_keys}
+    """Return the leaves from which a `ProbabilisticTensorDictSequential` builds its distribution, e.g. `loc`.
+
+    Other policies, which only have a `get_dist`, name none.
+    """
+    roots = {path_of(key) for key in getattr(actor, "dist_params_keys", ())}
+    if not roots:
+        return []
     written = {path_of(key): key for key in actor.out_keys}
     # Mixed actions write a nested entry, whose leaves are wanted and not the node above them.
     parents = {path[:depth] for path in written for depth in range(1, len(path))}
@@ -69,7 +74,8 @@ def observation_keys(actor: TensorDictModuleBase) -> list[NestedKey]:
 
 def stored_distribution(actor: Any, tensordict: TensorDictBase) -> Distribution | None:
     """Return the distribution whose parameters the data has, or None where it lacks one."""
-    if any(tensordict.get(key, None) is None for key in distribution_keys(actor)):
+    keys = distribution_keys(actor)
+    if not keys or any(tensordict.get(key, None) is None for key in keys):
         return None
     return actor.build_dist_from_params(tensordict)
 

@@ -9,6 +9,7 @@ from torchrl.envs import GymEnv, SerialEnv
 
 from ksim_rl.adapters.gymnasium import GymnasiumVectorEnv
 from ksim_rl.adapters.stable_baselines3 import StableBaselines3VecEnv
+from ksim_rl.envs import MaskedTransformedEnv
 from ksim_rl.testing import CounterEnv
 from tests.envs.nested_signals import NestedSignals
 
@@ -115,3 +116,19 @@ def test_rewards_and_ends_are_read_where_the_env_has_them():
         assert np.array_equal(one[0], other[0])
         assert all(np.array_equal(a, b) for a, b in zip(one[1:4], other[1:4], strict=True))
     assert torch.is_tensor(nested._stepper.root["agent", "done"])
+
+
+@pytest.mark.parametrize("adapter", [GymnasiumVectorEnv, StableBaselines3VecEnv])
+def test_one_key_may_be_given_as_it_is(adapter):
+    one = adapter(CounterEnv(LENGTHS), keys="count")
+    listed = adapter(CounterEnv(LENGTHS), keys=["count"])
+    assert one.observation_space == listed.observation_space
+    with pytest.raises(ValueError, match="no observation 'cont': did you mean 'count'"):
+        adapter(CounterEnv(LENGTHS), keys="cont")
+
+
+def test_a_step_by_an_action_alone_says_how_envs_of_torchrl_are_stepped():
+    env = MaskedTransformedEnv(CounterEnv(LENGTHS))
+    for action in (torch.zeros(3, 2), np.zeros((3, 2))):
+        with pytest.raises(ValueError, match=r'env.step\(td.set\("action", action\)\).*ksim_rl.adapters'):
+            env.step(action)

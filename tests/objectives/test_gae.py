@@ -245,3 +245,72 @@ def test_refusals_name_the_signal():
             gae(data.set(("next", "terminated"), terminated))
     with pytest.raises(ValueError, match="time_dim=2.*2 batch dims"):
         gae(rollout(actor), time_dim=2)
+
+
+# -- options of TorchRL's estimators -----------------------------------------------------------------------------
+
+
+def test_the_estimator_of_torchrls_tutorial_is_made_as_it_stands():
+    actor, critic = networks()
+    data = rollout(actor, num_envs=16, length=12, end_probability=0.15)
+    expected = _stock(critic, data, average_gae=True)
+    out = GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic, average_gae=True, device=torch.device("cpu"))(
+        data
+    )
+    torch.testing.assert_close(out["advantage"], expected["advantage"], atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("names", [None, ("time", "E")])
+def test_without_a_time_dim_it_is_the_one_of_that_name_or_the_last(names):
+    actor, critic = networks()
+    data = rollout(actor, num_envs=5, length=7, end_probability=0.2)
+    data.names = names
+    stock = value.GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic, vectorized=False)
+    with torch.no_grad():
+        expected = stock(data.clone())
+    out = GAE(gamma=GAMMA, lmbda=LMBDA, critic=critic, time_dim=None)(data.clone())
+    torch.testing.assert_close(out["advantage"], expected["advantage"], atol=1e-6, rtol=1e-6)
+    other = GAE(gamma=GAMMA, lmbda=LMBDA, critic=critic, time_dim=1 if names else 0)(data.clone())
+    assert not torch.allclose(out["advantage"], other["advantage"])
+
+
+def test_values_that_are_there_are_kept_if_asked():
+    actor, critic = networks()
+    data = rollout(actor)
+    data.set("state_value", torch.full((*data.batch_size, 1), 2.0))
+    kept = GAE(gamma=GAMMA, lmbda=LMBDA, critic=critic, skip_existing=True)(data.clone())
+    assert (kept["state_value"] == 2.0).all()
+    fresh = GAE(gamma=GAMMA, lmbda=LMBDA, critic=critic)(data.clone())
+    assert not (fresh["state_value"] == 2.0).any()
+    torch.testing.assert_close(kept["next", "state_value"], fresh["next", "state_value"])
+    delta = data["next", "reward"] + GAMMA * kept["next", "state_value"] - 2.0
+    short = GAE(gamma=GAMMA, lmbda=0.0, critic=critic, skip_existing=True)(data.clone())
+    alive = ~data["next", "terminated"]
+    torch.testing.assert_close(short["advantage"][alive], delta[alive])
+
+
+@pytest.mark.parametrize("kind", [GAE, TDLambda])
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"shifted": True},
+        {"differentiable": True},
+        {"vectorized": True},
+        {"auto_reset_env": True},
+        {"average_rewards": True},
+        {"group_key": "task"},
+        {"num_chunks": 2},
+        {"value_chunk_size": 8},
+        {"shifted_budget": 3},
+    ],
+    ids=str,
+)
+def test_options_that_ask_for_something_else_are_refused_by_name(kind, option):
+    ((name, given),) = option.items()
+    with pytest.raises(ValueError, match=f"{kind.__name__}: {name}={given!r} is not taken: .*; leave it out"):
+        kind(gamma=GAMMA, lmbda=LMBDA, **option)
+
+
+def test_options_that_ask_for_nothing_else_are_taken():
+    GAE(gamma=GAMMA, lmbda=LMBDA, shifted=False, differentiable=False, vectorized=False, skip_existing=False)
+    TDLambda(gamma=GAMMA, lmbda=LMBDA, vectorized=None, deactivate_vmap=True, value_chunk_dim=0)
