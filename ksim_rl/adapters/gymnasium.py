@@ -1,7 +1,7 @@
 """Shows an env as Gymnasium's `VectorEnv` or `Env`, with NumPy arrays or with tensors that stay on the device."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -29,6 +29,11 @@ MODES: dict[AutoresetMode, Autoreset] = {
     AutoresetMode.NEXT_STEP: "next_step",
     AutoresetMode.DISABLED: "disabled",
 }
+
+Shown: TypeAlias = Any
+"""One array of observations, or a dict of them by name; NumPy's, or torch's on the env's device."""
+Signal: TypeAlias = Shaped[np.ndarray, " E"] | Shaped[Tensor, " E"]
+"""A reward or a flag of each env."""
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -69,7 +74,7 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, Infos]:
+    ) -> tuple[Shown, Infos]:
         """Reset all envs, whose draws follow from one seed; a list of one per env, as Gymnasium takes, makes one.
 
         The one option is "reset_mask", bool [E], for the rows to reset where `autoreset_mode` is DISABLED; the draws of
@@ -90,7 +95,7 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def step(
         self, actions_E: Shaped[np.ndarray, " E *leaf"] | Shaped[Tensor, " E *leaf"]
-    ) -> tuple[Any, Any, Any, Any, Infos]:
+    ) -> tuple[Shown, Signal, Signal, Signal, Infos]:
         """Step all envs."""
         step = self._stepper.step(self._stepper.as_action(actions_E))
         done_E = step.done_E
@@ -119,10 +124,10 @@ class GymnasiumVectorEnv(VectorEnv):
         """Free the env's memory."""
         self.env.close()
 
-    def _out(self, obs: Observations) -> Any:
+    def _out(self, obs: Observations) -> Shown:
         return self._names.out(obs if self.tensors else to_numpy(obs))
 
-    def _reset_rows(self, seed: Any, options: dict[str, Any]) -> Any:
+    def _reset_rows(self, seed: Any, options: dict[str, Any]) -> Shown:
         mask = torch.as_tensor(options.pop("reset_mask"))
         if seed is not None or options:
             raise ValueError(
@@ -168,7 +173,7 @@ class GymnasiumEnv(gymnasium.Env):
         space = space_of(self._stepper.action_spec, batch_dims=self._stepper.batch_dims)
         self.action_space = finite(space, action_limit)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Infos]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Shown, Infos]:
         """Begin an episode, whose draws follow from the seed; there are no options."""
         if options:
             raise ValueError(f"options={options!r}: this env has no reset options; use seed=")
@@ -180,7 +185,7 @@ class GymnasiumEnv(gymnasium.Env):
             obs = self._stepper.reset(seed)
         return self._first(obs), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, Infos]:
+    def step(self, action: Any) -> tuple[Shown, float, bool, bool, Infos]:
         """Step the env."""
         step = self._stepper.step(self._stepper.as_action(np.asarray(action)[None]))
         flags = bool(step.terminated_E[0]), bool(step.truncated_E[0])
@@ -195,7 +200,7 @@ class GymnasiumEnv(gymnasium.Env):
         if not self.env.is_closed:
             self.env.close()
 
-    def _first(self, obs: Observations) -> Any:
+    def _first(self, obs: Observations) -> Shown:
         return self._names.out({name: value[0] for name, value in to_numpy(obs).items()})
 
 
@@ -210,7 +215,7 @@ class _Names:
         self._single = next(iter(boxes)) if len(boxes) == 1 else None
         self.space = spaces.Dict(boxes) if self._single is None else boxes[self._single]
 
-    def out(self, obs: Mapping[str, Any]) -> Any:
+    def out(self, obs: Mapping[str, Shown]) -> Shown:
         """Return the one observation, or all by name."""
         return obs if self._single is None else obs[self._single]
 
