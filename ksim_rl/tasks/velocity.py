@@ -1,9 +1,10 @@
 """All velocity tasks share this module: a legged robot follows a planar velocity command.
 
-A task's module holds the figures of its robot and puts the parts together. Weights, noise, pushes, contact clocks and
-the stages of the command are from mjlab 1.6.0's velocity tasks, so that both can be compared on the same work, and so
-are the training settings but for two (see `training`). One more thing is ours: the actor's joint positions are a term
-of their own (`joint_pos_biased`), because groups share terms by name.
+A task's module holds the figures of its robot and puts the parts together. Weights, noise and pushes are from mjlab
+1.6.0's velocity tasks, so that both can be compared on the same work, and so are the training settings but for two (see
+`training`). Contact clocks run once per env step, and commands keep their ranges: `with_memory_of_mjlab` changes both.
+One more thing is ours: the actor's joint positions are a term of their own (`joint_pos_biased`), because groups share
+terms by name.
 """
 
 import dataclasses
@@ -242,8 +243,7 @@ def velocity_cfg(
 ) -> ManagerBasedRlEnvCfg:
     """Return the config: 50 Hz control; an episode lasts 20 s, or until the root tilts by more than 70 degrees.
 
-    `feet` has one element per foot in the order of `robot.foot_sites`, and reads every substep, whatever it says: a
-    foot may land and bounce off within an env step. The command is `velocity_command()`, with its stages:
+    `feet` has one element per foot in the order of `robot.foot_sites`. The command is `velocity_command()`;
     `with_command` gives another one. The ground is a plane; `rough_ground.on_rough_ground` changes that.
     """
     elements, num_feet = feet.geoms or feet.bodies or feet.subtrees, len(robot.foot_sites)
@@ -255,7 +255,7 @@ def velocity_cfg(
     return ManagerBasedRlEnvCfg(
         decimation=4,
         sim=sim,
-        scene=on_plane(robot, {FEET: dataclasses.replace(feet, every_substep=True), **(sensors or {})}),
+        scene=on_plane(robot, {FEET: feet, **(sensors or {})}),
         observations=observations,
         actions={"joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=robot.action_scale)},
         commands={COMMAND: velocity_command()},
@@ -270,15 +270,26 @@ def velocity_cfg(
             "angular_velocity_error": mdp.AngularVelocityError(command=COMMAND),
             "action_acceleration": mdp.ActionAcceleration(),
         },
-        curriculum={"command_ranges": command_stages()},
         episode_length_s=20.0,
         viewer=viewer,
     )
 
 
 def with_command(cfg: ManagerBasedRlEnvCfg, command: mdp.UniformVelocityCommand) -> ManagerBasedRlEnvCfg:
-    """Return a velocity task's config with another command, without stages, which fit the default's ranges alone."""
-    return dataclasses.replace(cfg, commands={COMMAND: command}, curriculum={})
+    """Return a velocity task's config with another command."""
+    return dataclasses.replace(cfg, commands={COMMAND: command})
+
+
+def with_memory_of_mjlab(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
+    """Return a velocity task's config with mjlab's contact clocks, of each substep, and its stages of the command.
+
+    A foot that lands and bounces off within an env step is seen then. Results of the registered tasks were learned
+    without both. The stages fit the ranges of `velocity_command()` alone.
+    """
+    feet = dataclasses.replace(cast(ContactSensor, cfg.scene.sensors[FEET]), every_substep=True)
+    scene = dataclasses.replace(cfg.scene, sensors={**cfg.scene.sensors, FEET: feet})
+    curriculum = {"command_ranges": command_stages(), **cfg.curriculum}
+    return dataclasses.replace(cfg, scene=scene, curriculum=curriculum)
 
 
 def flat_cfg(
