@@ -78,9 +78,9 @@ class RolloutEstimator(ValueEstimatorBase):
         time_dim: int | None = -1,
         skip_existing: bool | None = None,
         device: torch.device | str | None = None,
-        value_network: TensorDictModule | None = None,
         **options: Any,
     ) -> None:
+        value_network: TensorDictModule | None = options.pop("value_network", None)
         if critic is None:
             critic = value_network
         kind = str(type(self).__name__)

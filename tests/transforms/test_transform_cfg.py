@@ -61,7 +61,7 @@ DELAY = "ksim_rl.envs.transforms.ActionDelay"
         ({"delay": {"max_lag": 1}}, "^t: needs _target_"),
         ({"_target_": "os.path.join"}, "only classes of these packages.*--plugin os"),
         ({"_target_": DELAY + "ed"}, "no transform 'ActionDelayed' there: did you mean 'ActionDelay'"),
-        ({"_target_": "ksim_rl.mdp.JointPos"}, "no module 'ksim_rl.mdp' with a transform"),
+        ({"_target_": "ksim_rl.mdp.JointPos"}, "JointPos is a class, and no transform"),
         ({"_target_": DELAY, "delya": {"max_lag": 1}}, "unknown field 't.delya' of ActionDelay: did you mean 'delay'"),
         ({"_target_": DELAY}, "t: ActionDelay needs the argument 'delay'"),
         ({"_target_": DELAY, "delay": {"max_lga": 1}}, "unknown field 't.delay.max_lga' of DelayCfg"),

@@ -160,11 +160,10 @@ class RayCaster(MountedSensor):
     geom_groups: tuple[GeomGroup, ...] = (0, 1)
     exclude_body: bool = True
 
-    def _check_fields(self) -> None:
+    def _check_mount(self) -> None:
         if not self.sites:
-            super()._check_fields()
+            super()._check_mount()
             return
-        Checked._check_fields(self)
         if self.site is not None or self.body is not None or any(self.pos):
             raise ValueError(
                 f"sites={self.sites!r} with site={self.site!r}, body={self.body!r}, pos={self.pos!r}: "

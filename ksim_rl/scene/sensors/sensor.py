@@ -83,6 +83,10 @@ class MountedSensor(Sensor, ABC):
 
     def _check_fields(self) -> None:
         super()._check_fields()
+        self._check_mount()
+
+    def _check_mount(self) -> None:
+        """Raise ValueError where it is not clear what the sensor sits on."""
         # With both, or none, the place would be unclear.
         if (self.site is None) == (self.body is None):
             raise ValueError(f"site={self.site!r}, body={self.body!r}: give exactly one of them")
