@@ -89,8 +89,8 @@ def find(
         names += [name for name, value in vars(module).items() if isinstance(value, type) and accepts(value)]
     if isinstance(declined, type) and not accepts(declined):
         raise ValueError(
-            f"{where}: {class_name} is a class, and no {kind}: name the {kind} that makes one, as docs/learning.md does "
-            "for networks"
+            f"{where}: {class_name} is a class, and no {kind}: name the {kind} that makes one, as docs/learning.md "
+            "does for networks"
         )
     if not names:
         raise ValueError(f"{where}: no module {module_name!r} with a {kind}")

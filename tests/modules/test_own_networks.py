@@ -142,7 +142,7 @@ def test_critics_and_off_policy_networks_are_built_too():
         ),
         (
             "+modules.actor._target_=my_nets.residual.Residual",
-            "a class, and no dataclass: a config names the data",
+            "Residual is a class, and no dataclass: name the data",
         ),
         ("+modules.actor._target_=my_nets.residual.ResidualActor", "did you mean 'ResidualActorCfg'"),
         ("+modules.critic._target_=my_nets.residual.ResidualActorCfg", "expected a kind of CriticCfg"),
