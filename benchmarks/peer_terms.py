@@ -224,8 +224,8 @@ def same_states(record: Record, ours: Mapping[str, np.ndarray]) -> dict[str, np.
     """Return the states [T, E] in which some terms mean the same, bool; the reasons are in `ON_PURPOSE`."""
     return {
         "reward/foot_swing_height": np.asarray(np.cumsum(record["reset"], 0) == record["reset"]),
-        "reward/foot_clearance": (ours["moment/foot_height"] >= 0.0).all(-1),
-        "obs/critic/foot_height": (ours["obs/critic/foot_height"] >= 0.0).all(-1),
+        "reward/foot_clearance": np.asarray((ours["moment/foot_height"] >= 0.0).all(-1)),
+        "obs/critic/foot_height": np.asarray((ours["obs/critic/foot_height"] >= 0.0).all(-1)),
         "reward/soft_landing": equal_forces(record, ours),
     }
 

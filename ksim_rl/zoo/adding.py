@@ -48,7 +48,7 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
         checkpoint.save(entry / CHECKPOINT, state, iteration=saved.iteration, config=saved.config)
         # Of the training, not of this command.
         made = {"commit": card.commit, "versions": dict(record.read(run)[-1].versions)}
-        export(entry, exported, episodes=episodes, note=show, trained_with=made)
+        export(entry, exported, episodes=episodes, note=show, origin=made)
         # The rounded policy is compared, as that is what users get.
         report = sim2sim(exported, episodes=episodes, note=show)
         if not math.isfinite(report.return_ratio):

@@ -62,7 +62,7 @@ def test_a_run_folder_alone_is_answered_with_what_can_be_done_with_it(work, caps
 
 @pytest.mark.parametrize("command", sorted({*COMMANDS} - {"train", "warmup"}))
 def test_flags_that_do_not_exist_are_one_line_of_any_command(capsys, command):
-    kind = {"new": ["robot"], "motion": ["csv", "source"]}.get(command, [])
+    kind = {"new": ["robot"], "motion": ["csv", "source"], "completion": ["bash"]}.get(command, [])
     code, output = run(capsys, command, *kind, "x", "--no-such-flag")
     assert code == 2 and output.err.count("\n") == 1 and "--no-such-flag" in output.err
 

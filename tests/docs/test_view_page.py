@@ -8,11 +8,19 @@ import torch
 
 from benchmarks.pages import view
 from ksim_rl.scene.motions.motion import load_motion
-from ksim_rl.scene.sensors import CameraSensor, ContactSensor, ImuSensor, RayCaster, RingPattern
+from ksim_rl.scene.sensors import (
+    CameraSensor,
+    ContactPoints,
+    ContactSensor,
+    ImuSensor,
+    RayCaster,
+    RingPattern,
+)
 from tests.mdp.bench import FREE_BODY, Bench
 
 SENSORS = {
     "feet": ContactSensor(geoms=("hull",), against=None),
+    "hand": ContactPoints(geoms=("hull",), against=()),
     "imu": ImuSensor(site="imu"),
     "scan": RayCaster(site="imu", pattern=RingPattern()),
     "front": CameraSensor(body="trunk", width=4, height=3, depth=True, segmentation=True),
@@ -38,6 +46,7 @@ def parts(tmp_path_factory):
         'view.site("finger")': seen.site("imu"),
         'view.entity("cube")': seen.entity(),
         'view.contact("feet")': seen.contact("feet"),
+        'view.contact_points("hand")': seen.contact_points("hand"),
         'view.imu("imu")': seen.imu("imu"),
         'view.rays("scan")': seen.rays("scan"),
         'view.rays("scan").state': seen.rays("scan").state,

@@ -42,6 +42,8 @@ def my_nets(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
         patch.setattr(sys, "argv", ["ksim-rl"])
+        # Loading a policy remembers the plug-in there, for processes that this one starts.
+        patch.setenv("KSIM_RL_PLUGINS", "")
         envs.allow_package("my_nets")
         yield folder
 

@@ -232,7 +232,9 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
     deleted = {geom.name for geom in colliding if geom.name not in wrapped}
     # Geoms without names have no references.
     drop_references(spec, mujoco.mjtObj.mjOBJ_GEOM, deleted - {""})
-    looks = {geom.parent.name for geom in spec.geoms if geom not in colliding and geom.group <= VISIBLE}
+    # The world counts as seen: its colliding geoms are ground and props, which a scene has of its own.
+    looks = {spec.worldbody.name}
+    looks |= {geom.parent.name for geom in spec.geoms if geom not in colliding and geom.group <= VISIBLE}
     for geom in colliding:
         if geom.name in wrapped:
             geom.contype = geom.conaffinity = 0
