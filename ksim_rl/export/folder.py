@@ -67,17 +67,27 @@ The policy's actions equal the trained network's within {difference:.1e} on {che
 """
 
 
-def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **options: Any) -> Path:
-    """Write the policy of a run into `folder`, `<run>/export` by default, and return it; see `export_policy`."""
+def export(
+    run: Path,
+    folder: Path | None = None,
+    *,
+    device: str = "cpu",
+    origin: Json | None = None,
+    **options: Any,
+) -> Path:
+    """Write the policy of a run into `folder`, `<run>/export` by default, and return it; see `export_policy`.
+
+    `origin` may hold another path, commit or versions than the record of the run.
+    """
     saved = checkpoint.load_latest(run)
     run_folder = saved.run_folder
     # Relative to the folder of runs, so that the export names no folder of this machine.
-    origin: Json = {"run_path": str(saved.path.absolute().relative_to(run_folder.parent))}
+    found: Json = {"run_path": str(saved.path.absolute().relative_to(run_folder.parent))}
     # Commit and versions that trained the policy, not those that export it.
     sessions = record.read(run_folder)
     if sessions:
         commit = sessions[-1].code.get("ksim_rl", {}).get("commit")
-        origin |= {"commit": commit, "versions": dict(sessions[-1].versions)}
+        found |= {"commit": commit, "versions": dict(sessions[-1].versions)}
     below = run_folder if folder is None else folder
     if folder is None:
         folder = run_folder / "export"
@@ -88,7 +98,7 @@ def export(run: Path, folder: Path | None = None, *, device: str = "cpu", **opti
         policy_of(saved, device=device),
         folder,
         below=below,
-        origin=origin,
+        origin={**found, **(origin or {})},
         **options,
     )
 
