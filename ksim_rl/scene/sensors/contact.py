@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ksim_rl.checks import naming
 from ksim_rl.physics.sensors.contact_sensors import MATCHED, NET, STRONGEST
-from ksim_rl.scene.names import as_index, match_names
+from ksim_rl.scene.names import Index, as_index, match_names
 from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.sensors.sensor import Sensor, SensorTracker, check_present
@@ -193,10 +193,9 @@ class ContactTracker(SensorTracker):
         self._strongest = sensor.reduce == "strongest"
         elements = sensor.elements(view.resolver.names(ELEMENT_TABLES[sensor.kind]))
         self._count = len(elements)
-        found = [self._world.mj_model.sensor(f"{name}_{element}") for element in elements]
+        names = [f"{name}_{element}" for element in elements]
         # All numbers of all elements, in one index, so that one gather reads them.
-        columns = [int(one.adr[0]) + place for one in found for place in range(int(one.dim[0]))]
-        self._columns = as_index(columns, view.device)
+        self._columns = columns_of(view, names)
         self._clocks = {clock: view.buffers.get(f"{self._key}.{clock}", self._count) for clock in _CLOCKS}
         self._history_ESN3: Tensor | None = None
         self._substep = 0
@@ -292,6 +291,13 @@ class ContactTracker(SensorTracker):
             return readings[..., 1:4]
         # The strongest contact's force is in the contact's frame.
         return from_contact(readings[..., 1:4], normal=readings[..., 7:10], tangent=readings[..., 10:13])
+
+
+def columns_of(view: WorldView, names: Sequence[str]) -> Index:
+    """Return the columns of `sensordata` [E, L] that hold all numbers of the model's sensors of these names."""
+    found = [view.world.mj_model.sensor(name) for name in names]
+    columns = [int(one.adr[0]) + place for one in found for place in range(int(one.dim[0]))]
+    return as_index(columns, view.device)
 
 
 def from_contact(

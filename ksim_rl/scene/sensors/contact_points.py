@@ -10,9 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ksim_rl.checked import Count
-from ksim_rl.scene.names import as_index
 from ksim_rl.scene.near_names import NearNames
-from ksim_rl.scene.sensors.contact import ELEMENT_TABLES, ContactElements, from_contact
+from ksim_rl.scene.sensors.contact import ELEMENT_TABLES, ContactElements, columns_of, from_contact
 from ksim_rl.scene.sensors.sensor import SensorTracker
 from ksim_rl.scene.state.world_view import WorldView
 
@@ -94,10 +93,8 @@ class ContactPointsTracker(SensorTracker):
         self._view = view
         elements = sensor.elements(view.resolver.names(ELEMENT_TABLES[sensor.kind]))
         names = [_pair_name(name, *pair) for pair in pairs_of(elements, sensor.against or (None,))]
-        found = [view.world.mj_model.sensor(one) for one in names]
-        columns = [int(one.adr[0]) + place for one in found for place in range(int(one.dim[0]))]
-        self._columns = as_index(columns, view.device)
-        self._num_contacts = len(found) * sensor.num_slots
+        self._columns = columns_of(view, names)
+        self._num_contacts = len(names) * sensor.num_slots
         self.every_substep = sensor.history > 1
         # By substep, the newest last; zeroed at resets, as no substep of the episode was before.
         self._histories: dict[str, Tensor] = {}

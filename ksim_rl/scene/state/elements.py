@@ -120,7 +120,7 @@ class Joints(_Elements):
 
     @property
     def encoder_pos_EL(self) -> Float[Tensor, "E L"]:
-        """What the encoders read, rad or m; position stage."""
+        """The readings of the encoders, rad or m; position stage."""
         return self.pos_EL + self.encoder_bias_EL
 
     def write_pos(self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E L"]) -> None:
