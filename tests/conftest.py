@@ -52,6 +52,21 @@ def _small_heap():
     gc.freeze()
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _own_plugins():
+    """Forget the plug-ins that a file's tests name: the next file's child processes would look for them in vain."""
+    # Imported here, after the shapes are enforced.
+    from ksim_rl.config import plugins
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plugins, "_named", [*plugins._named])
+        patch.setattr(plugins, "_allowed", {*plugins._allowed})
+        for variable in (plugins.VARIABLE, plugins.PATH_VARIABLE):
+            # The patch takes back what tests assign from here on.
+            patch.setenv(variable, os.environ.get(variable, ""))
+        yield
+
+
 def pytest_collection_modifyitems(items):
     """Skip tests that need a GPU where there is none."""
     if torch.cuda.is_available():
