@@ -15,6 +15,7 @@ from benchmarks.faults.row import AT_LEAST, EXACTLY, Figures, Row
 from ksim_rl.cli.main import main
 from ksim_rl.files.writing import WRITING
 from ksim_rl.runs import record
+from ksim_rl.runs.run_lock import LOCK
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.checkpoint import CheckpointError
 from ksim_rl.zoo.cards import hashes, read_card
@@ -199,13 +200,24 @@ def _kill(name: str, trained: Path, folder: Path, *, kills: int, choose: random.
             found["do_not_go_on"] += 1
         found["raw_tracebacks"] += after.raw_traceback
         found["corrupt"] += command.halves(folder)
-        left = list(folder.rglob(f"{WRITING}*"))
-        left += folder.rglob(".lock")
+        left = _stray(folder)
         found["stray"] += len(left)
         for path in left:
             print(f"{name}: left after a kill: {path.relative_to(folder)}", flush=True)
     shutil.rmtree(folder)
     return found
+
+
+def _stray(folder: Path) -> list[Path]:
+    """Return the files that a command which went on should have removed."""
+    left = list(folder.rglob(f"{WRITING}*"))
+    for lock in folder.rglob(LOCK):
+        run = lock.parent
+        # A run that was killed before its first checkpoint begins again beside its folder, into which nobody writes
+        # any more.
+        if not run.with_name(f"{run.name}_2").exists():
+            left.append(lock)
+    return left
 
 
 def _copy(trained: Path, folder: Path, *, of: str) -> None:
