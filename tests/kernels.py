@@ -107,6 +107,7 @@ TESTS = {
     },
     "physics/rows/idle_ties.py": {"still_ties": SINGLE_MODELS},
     "physics/rows/second_limits.py": {"add_second_limits": SINGLE_MODELS},
+    "physics/rows/tie_counts.py": {"count_fitting_ties": SINGLE_MODELS},
     "physics/rows/tie_weights.py": {"weigh_ties": SINGLE_MODELS},
     "physics/rows/contact_lists.py": {"__init__": EQUAL_WORLDS},
     "physics/sensors/sensor_mending.py": {"_reading_of": SINGLE_MODELS, "bound_touch": SINGLE_MODELS},

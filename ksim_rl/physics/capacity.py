@@ -8,10 +8,13 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from ksim_rl.physics.candidate_pairs import CandidatePairs
 from ksim_rl.physics.load import caught_warnings
 from ksim_rl.physics.model_checks import model_bytes
 from ksim_rl.physics.overflow import OF_POOL, OF_ROWS, OverflowReport
 from ksim_rl.physics.poses import extreme_ctrl, put_in_ground, random_ctrl, random_qpos, scatter
+from ksim_rl.physics.rows.idle_ties import FIXED_TIE, kinds_of_ties
+from ksim_rl.physics.rows.tie_weights import rows_of_equalities
 from ksim_rl.physics.sim_cfg import SimCfg
 
 # On what poses of the probe needed: half as much again for rows and contacts, less for candidate pairs, which all
@@ -144,7 +147,7 @@ def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
             PAIR_MARGIN * posed.pairs,
             fallen.pairs,
         )
-        _cache[key] = (_round_up(rows + _inactive_equality_rows(mj_model)), _round_up(nconmax))
+        _cache[key] = (_round_up(rows + _unseen_rows(mj_model)), _round_up(nconmax))
     return _cache[key]
 
 
@@ -166,12 +169,13 @@ def _most_limits(mj_model: mujoco.MjModel) -> int:
     return int(joints.sum() + is_narrow.sum() + mj_model.tendon_limited.sum())
 
 
-def _inactive_equality_rows(mj_model: mujoco.MjModel) -> int:
-    """Return how many rows the equality constraints have that are off at first, and may be switched on."""
-    is_off = mj_model.eq_active0 == 0
-    # Connect ties a point (3 rows), weld a frame (6); others tie a scalar.
-    rows = {mujoco.mjtEq.mjEQ_CONNECT: 3, mujoco.mjtEq.mjEQ_WELD: 6}
-    return sum(rows.get(mujoco.mjtEq(kind), 1) for kind in mj_model.eq_type[is_off])
+def _unseen_rows(mj_model: mujoco.MjModel) -> int:
+    """Return how many rows of equality constraints worlds may have that C makes none of, so that no probe sees them.
+
+    These are off at first, and may be switched on, or tie what no joint moves, of which MuJoCo Warp makes rows.
+    """
+    is_unseen = (mj_model.eq_active0 == 0) | (kinds_of_ties(mj_model) == FIXED_TIE)
+    return int(rows_of_equalities(mj_model)[is_unseen].sum())
 
 
 class Need:
@@ -266,52 +270,3 @@ def _put_to_key(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, key: int) -> N
     mujoco.mj_resetData(mj_model, mj_data)
     if key >= 0:
         mujoco.mj_resetDataKeyframe(mj_model, mj_data, key)
-
-
-class CandidatePairs:
-    """Counts the geom pairs whose bounding spheres touch: Warp keeps a place in the contact pool for each of them.
-
-    MuJoCo's filters leave the pairs that may collide at all: contype and conaffinity, not the same rigid body,
-    not parent and child, not excluded.
-    """
-
-    def __init__(self, mj_model: mujoco.MjModel) -> None:
-        self.mj_model = mj_model
-        # All pairs of geoms, each once, [N].
-        first, second = np.triu_indices(mj_model.ngeom, k=1)
-        body_1 = mj_model.geom_bodyid[first]
-        body_2 = mj_model.geom_bodyid[second]
-        # Bodies that are welded together are one rigid body, which does not collide with itself.
-        weld_1 = mj_model.body_weldid[body_1]
-        weld_2 = mj_model.body_weldid[body_2]
-        parent_1 = mj_model.body_weldid[mj_model.body_parentid[weld_1]]
-        parent_2 = mj_model.body_weldid[mj_model.body_parentid[weld_2]]
-        affine = (mj_model.geom_contype[first] & mj_model.geom_conaffinity[second]) | (
-            mj_model.geom_contype[second] & mj_model.geom_conaffinity[first]
-        )
-        # Pairs collide if one's contype meets the other's conaffinity; see MuJoCo's filters.
-        keep = (affine != 0) & (weld_1 != weld_2)
-        if not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
-            # The world (0) is nobody's parent for this filter, so that robots collide with what is fixed to it.
-            keep &= ~((weld_1 != 0) & (weld_2 != 0) & ((weld_1 == parent_2) | (weld_2 == parent_1)))
-        keep &= ~np.isin((body_1 << 16) + body_2, mj_model.exclude_signature)
-        # Explicit <pair>s come on top, whatever the filters say.
-        self.first = np.concatenate([first[keep], mj_model.pair_geom1])
-        self.second = np.concatenate([second[keep], mj_model.pair_geom2])
-        self.margin = np.maximum(mj_model.geom_margin[self.first], mj_model.geom_margin[self.second])
-        is_plane = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        self.plane_1, self.plane_2 = is_plane[self.first], is_plane[self.second]
-        # A plane has a radius of 0; its distance is measured along the normal below.
-        self.reach = mj_model.geom_rbound[self.first] + mj_model.geom_rbound[self.second] + self.margin
-
-    def count(self, mj_data: mujoco.MjData) -> int:
-        """Return the number of pairs that may touch in the present pose."""
-        if self.first.size == 0:
-            return 0
-        offset = mj_data.geom_xpos[self.second] - mj_data.geom_xpos[self.first]
-        distance = np.linalg.norm(offset, axis=1)
-        # The third columns of the rotation matrices: z axes, which are the normals of planes.
-        normals = mj_data.geom_xmat[:, [2, 5, 8]]
-        distance = np.where(self.plane_1, (offset * normals[self.first]).sum(1), distance)
-        distance = np.where(self.plane_2, -(offset * normals[self.second]).sum(1), distance)
-        return int(np.count_nonzero(distance <= self.reach))

@@ -21,6 +21,7 @@ from ksim_rl.physics.rows.constraint_rows import constraint_rows
 from ksim_rl.physics.rows.contact_lists import ContactLists
 from ksim_rl.physics.rows.idle_ties import stilling_of_ties
 from ksim_rl.physics.rows.second_limits import adding_of_second_limits
+from ksim_rl.physics.rows.tie_counts import counting_of_ties
 from ksim_rl.physics.rows.tie_weights import BODY_EQUALITIES, weighing_of_ties
 from ksim_rl.physics.sensors.contact_sensors import ContactReadings
 from ksim_rl.physics.sensors.limit_sensors import LimitSensors
@@ -213,8 +214,9 @@ def _mending(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
     """Return a launcher of what MuJoCo Warp's solver needs corrected before it; None where all is right."""
-    # The first two change rows of MuJoCo Warp's; the last one appends rows.
+    # The first ones change rows of MuJoCo Warp's; the last one appends rows.
     of_rows = (
+        counting_of_ties(mj_model, warp_data_E),
         weighing_of_ties(mj_model, warp_model, warp_data_E),
         stilling_of_ties(mj_model, warp_model, warp_data_E),
         adding_of_second_limits(warp_model, warp_data_E, expanded),

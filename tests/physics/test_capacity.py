@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ksim_rl.physics import SimCfg, World, capacity, load_model, poses
+from ksim_rl.physics.candidate_pairs import CandidatePairs
 from tests.physics.models import cartpole, quadruped
 
 GROUNDS = ('<geom type="plane" size="9 9 1"/>', '<geom type="box" size="9 9 0.5" pos="0 0 -0.5"/>')
@@ -29,7 +30,7 @@ def test_probed_capacities_hold_for_robots_thrown_about():
 def test_candidate_pairs_cover_warps_broadphase():
     mj_model = quadruped()
     rng = np.random.default_rng(3)
-    pairs = capacity.CandidatePairs(mj_model)
+    pairs = CandidatePairs(mj_model)
     world = World(mj_model, num_envs=1, sim=SimCfg(njmax=200, nconmax=100))
     mj_data = mujoco.MjData(mj_model)
     for qpos in poses.random_qpos(mj_model, 20, rng):

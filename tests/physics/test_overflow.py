@@ -6,7 +6,7 @@ import mujoco_warp as mjw
 import pytest
 import torch
 
-from ksim_rl.physics import OverflowReport, SimCfg, World
+from ksim_rl.physics import OverflowReport, SimCfg, World, load_model
 from ksim_rl.physics.overflow import METRIC_BITS
 from ksim_rl.physics.warp_world import WarpWorld
 from tests.physics.models import quadruped, standing_quadrupeds
@@ -39,6 +39,24 @@ def test_too_few_rows_names_the_need():
     assert f"set sim.njmax >= {report.nefc}" in report.messages[0]
     assert "has 10" in report.messages[0]
     assert world.overflow_report().nefc == 0, "a report starts a new period"
+
+
+@pytest.mark.parametrize("solver", ("Newton", "CG"))
+def test_rows_of_ties_without_room_are_not_read_from_the_next_world(solver: str):
+    mj_model = load_model(
+        f"""<mujoco>
+          <option solver="{solver}" jacobian="dense"/>
+          <worldbody><body name="ball"><freejoint/><geom size="0.1"/></body></worldbody>
+          <equality><weld body1="ball" relpose="0.1 0 0 1 0 0 0"/></equality>
+        </mujoco>"""
+    )
+    world = World(mj_model, num_envs=2, sim=SimCfg(njmax=2, nconmax=2, one_kernel_solver=False))
+    world.qvel_EL[1] = torch.nan
+    world.step(1)
+    assert world.overflow_report().worlds["NEFC"] == 2
+    # Two rows of the tie pull along x and y, and gravity along z.
+    assert world.view("qacc")[0, 2].item() == pytest.approx(-9.81, rel=1e-4)
+    assert world.view("qacc")[0, 0].abs() > 1.0
 
 
 def test_discrete_steps_have_room_for_whole_tiles_of_rows():

@@ -18,6 +18,14 @@ import warp as wp
 EQUALITY = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
 MINVAL = wp.constant(float(mujoco.mjMINVAL))
 BODY_EQUALITIES = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+# Connect ties a point, weld a frame; others tie a scalar.
+ROWS = {mujoco.mjtEq.mjEQ_CONNECT: 3, mujoco.mjtEq.mjEQ_WELD: 6}
+
+
+def rows_of_equalities(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Return how many constraint rows each equality constraint has, int [neq]; 1 of those of flexes, which vary."""
+    rows = [ROWS.get(mujoco.mjtEq(kind), 1) for kind in mj_model.eq_type]
+    return np.array(rows, dtype=np.int64)
 
 
 def tied_bodies(mj_model: mujoco.MjModel) -> np.ndarray:
