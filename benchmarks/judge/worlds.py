@@ -30,6 +30,16 @@ STATE = (
 )
 # By how much numbers are rounded on the way into float32.
 ROUNDING = 1.2e-7
+# Constraints whose rows are of points of bodies.
+WITH_LEVERS = [
+    int(kind)
+    for kind in (
+        mujoco.mjtConstraint.mjCNSTR_EQUALITY,
+        mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS,
+        mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL,
+        mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC,
+    )
+]
 _TURNED = ("body_quat", "geom_quat", "site_quat", "cam_quat")
 _MOVED = ("body_pos", "body_ipos", "geom_pos", "site_pos", "jnt_pos", "qpos_spring")
 _ADDED = {
@@ -212,15 +222,24 @@ def rounded(mj_model: mujoco.MjModel) -> mujoco.MjModel:
     return found
 
 
-def jacobian_rounding(mj_model: mujoco.MjModel, state: Mapping[str, np.ndarray]) -> float:
-    """Return by how much rounding of the constraints' Jacobian changes a force on a joint, in N or N m.
+def jacobian_rounding(mj_model: mujoco.MjModel, state: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return by how much rounding of the Jacobian changes the constraints' force on each joint, in N or N m, [nv].
 
-    Deep contacts press with up to 1e5 N where no joint gives way, and a part of that in a rounded Jacobian does.
+    Deep contacts press with up to 1e5 N where no joint gives way, and a part of that in a rounded Jacobian does, on the
+    joints that the two bodies hang from. Rows of limits and dry friction have no levers that are rounded.
     """
+    # Sparse rows say which joints those are.
+    mj_model = copy.copy(mj_model)
+    mj_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     mj_data = put(state, mj_model)
     mujoco.mj_forward(mj_model, mj_data)
+    pressing = np.zeros(mj_model.nv)
+    for row in np.flatnonzero(np.isin(mj_data.efc_type, WITH_LEVERS)):
+        start = mj_data.efc_J_rowadr[row]
+        joints = mj_data.efc_J_colind[start : start + mj_data.efc_J_rownnz[row]]
+        pressing[joints] += abs(mj_data.efc_force[row])
     lever = float(mj_model.stat.meansize)
-    return ROUNDING * lever * float(np.abs(mj_data.efc_force).sum())
+    return ROUNDING * lever * pressing
 
 
 def put(state: Mapping[str, np.ndarray], mj_model: mujoco.MjModel) -> mujoco.MjData:

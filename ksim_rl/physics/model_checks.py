@@ -7,7 +7,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 
-from ksim_rl.physics.constants.least_weights import ROUNDING, SHARE
+from ksim_rl.physics.constants.least_weights import SHARE, weightless_pairs
 from ksim_rl.physics.sensors.sensor_checks import check_sensors
 
 # Where a field's prefix is not the name of MuJoCo's type of object.
@@ -225,25 +225,19 @@ def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) 
         )
 
 
-def warn_of_weightless(mj_model: mujoco.MjModel, pairs: np.ndarray) -> None:
+def warn_of_weightless(mj_model: mujoco.MjModel) -> None:
     """Warn of a geom on a body that turns about its centre of mass where it may touch what is fixed.
 
     MuJoCo gives the contact no weight, and worlds a little; `least_weights` has both.
-
-    Args:
-        mj_model: the model.
-        pairs: the geoms that may touch, [N, 2].
     """
-    bodies = mj_model.geom_bodyid[pairs]
-    moves = (mj_model.body_treeid[bodies] >= 0).any(-1)
-    weightless = mj_model.body_invweight0[bodies, 0].sum(-1) < ROUNDING
-    found = np.flatnonzero(moves & weightless)
+    found = weightless_pairs(mj_model)
     if found.size:
-        first, second = (_element(mj_model, "geom", int(geom)) for geom in pairs[found[0]])
+        first, second = (_element(mj_model, "geom", int(geom)) for geom in found[0])
         warnings.warn(
             f"{first} and {second} may touch, of which one is fixed and the other turns about its centre of mass: "
-            f"MuJoCo gives their contact no weight, so that C's forces are rounding errors; here it has {SHARE:g} of "
-            "the body's. Move the joint away from the centre of mass, or keep the two apart by contype or <exclude/>",
+            "MuJoCo gives their contact no weight, so that C's forces are rounding errors; here the body has "
+            f"{SHARE:g} of its mass's inverse weight in all contacts. Move the joint away from the centre of mass, or "
+            "keep the two apart by contype or <exclude/>",
             stacklevel=3,
         )
 

@@ -83,7 +83,7 @@ class WarpWorld(World):
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
         with memory_for(num_envs, self.device), warp_scope(self.device):
             self.warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
-            warn_of_weightless(self.mj_model, self.warp_model.nxn_geom_pair_filtered.numpy())
+            warn_of_weightless(self.mj_model)
             raising_of_weights(self.mj_model, self.warp_model)()
             with as_if_drawn(self.warp_model, expanded):
                 follow_the_c_engine(self.warp_model)

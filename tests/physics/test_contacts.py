@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from ksim_rl.physics import SimCfg, World, load_model
+from ksim_rl.physics.warp_world import WarpWorld
 from tests.physics.beside_c import KERNELS, step_and_check
 
 NUM_ENVS = 64
@@ -239,16 +240,38 @@ BEAM = (
 HINGE = '<joint axis="0 1 0"/>'
 
 
+BALL = '<body pos="0 0 2"><freejoint/><geom name="ball" size="0.1" conaffinity="2"/></body>'
+# A ball may touch the beam, and the ground may not.
+APART = BEAM.replace('name="ground"', 'name="ground" contype="0" conaffinity="2"').replace(
+    "</worldbody>", BALL + "</worldbody>"
+)
+
+
 @pytest.mark.parametrize(
-    ("joint", "off", "warns"), ((HINGE, 0.0, True), (HINGE, 0.02, False), ("<freejoint/>", 0.0, False))
+    ("xml", "joint", "off", "warns"),
+    (
+        (BEAM, HINGE, 0.0, True),
+        (BEAM, HINGE, 0.02, False),
+        (BEAM, "<freejoint/>", 0.0, False),
+        (APART, HINGE, 0.0, False),
+        (
+            BEAM.replace("<worldbody>", '<option><flag contact="disable"/></option><worldbody>'),
+            HINGE,
+            0.0,
+            False,
+        ),
+    ),
 )
 def test_what_turns_about_its_centre_of_mass_and_may_touch_the_ground_is_warned_of(
-    joint: str, off: float, warns: bool
+    xml: str, joint: str, off: float, warns: bool
 ) -> None:
-    mj_model = load_model(BEAM.format(joint=joint, off=off))
+    mj_model = load_model(xml.format(joint=joint, off=off))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        World(mj_model, num_envs=1, sim=SimCfg(engine="warp"))
+        world = WarpWorld(mj_model, num_envs=1, sim=SimCfg(engine="warp"))
     told = [str(warning.message) for warning in caught if "no weight" in str(warning.message)]
     assert len(told) == warns
     assert all("geom 'ground' and geom 'beam' may touch" in text for text in told)
+    # Whoever is not warned of has C's weights to the last bit.
+    weights = world.warp_model.body_invweight0.numpy()[0]
+    assert (weights != mj_model.body_invweight0.astype(np.float32)).any() == warns

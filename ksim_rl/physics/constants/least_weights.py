@@ -2,7 +2,7 @@
 
 No joint moves that centre, so that MuJoCo gives the body the inverse weight 0, and a contact with what is fixed the
 largest `efc_D` that there is, 1e15. C's own forces there are rounding errors (docs/upstream.md); in float32 bodies fly
-off. With a little weight both engines compute the same.
+off. With a little weight both engines compute the same. Bodies that may touch only what has a weight keep C's.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
@@ -16,6 +16,8 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
+from ksim_rl.physics.candidate_pairs import CandidatePairs
+
 # Below this, in 1/kg, an inverse weight is rounding error.
 ROUNDING = 1e-12
 # The least inverse weight of such a body, in that of the mass that it carries: its contacts are still harder than those
@@ -23,9 +25,29 @@ ROUNDING = 1e-12
 SHARE = 1e-2
 
 
+def weightless_pairs(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Return the geoms that may touch, and of whose contact neither side has a weight though one moves, [N, 2]."""
+    contacts_are_off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    if mj_model.opt.disableflags & contacts_are_off or not _weightless(mj_model).any():
+        return np.zeros((0, 2), dtype=np.int64)
+    candidates = CandidatePairs(mj_model)
+    pairs = np.stack([candidates.first, candidates.second], axis=-1)
+    bodies = mj_model.geom_bodyid[pairs]
+    moves = (mj_model.body_treeid[bodies] >= 0).any(-1)
+    have_none = mj_model.body_invweight0[bodies, 0].sum(-1) < ROUNDING
+    return pairs[moves & have_none]
+
+
+def _weightless(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Return which bodies move, and have no weight for translation, bool [nbody]."""
+    return (mj_model.body_treeid >= 0) & (mj_model.body_invweight0[:, 0] < ROUNDING)
+
+
 def least_weights(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return the least inverse weight of each body, 1/kg, [nbody]: 0 of all but those that have none, and move."""
-    has_none = (mj_model.body_treeid >= 0) & (mj_model.body_invweight0[:, 0] < ROUNDING)
+    """Return the least inverse weight of each body, 1/kg, [nbody]: 0 of all but those with `weightless_pairs`."""
+    has_none = np.zeros(mj_model.nbody, dtype=bool)
+    has_none[mj_model.geom_bodyid[weightless_pairs(mj_model)]] = True
+    has_none &= _weightless(mj_model)
     found = np.zeros(mj_model.nbody)
     found[has_none] = SHARE / mj_model.body_subtreemass[has_none]
     return found

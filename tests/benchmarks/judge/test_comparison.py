@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.judge import c_engine
 from benchmarks.judge.comparison import DIRECT, SOLVED, differences, limit_of, scales_of
-from benchmarks.judge.worlds import Arrays, state_of
+from benchmarks.judge.worlds import ROUNDING, Arrays, jacobian_rounding, state_of
 
 XML = """
 <mujoco>
@@ -51,6 +51,33 @@ def test_what_is_beyond_the_limit_fails(quantity: str, limit: float):
 
 def test_nan_fails():
     assert found_with(np.nan, "qpos") == ["qpos"]
+
+
+PRESSED = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="0 0 0.05"><joint axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/></body>
+    <body pos="3 0 3"><joint axis="0 1 0" limited="true" range="1 2"/><geom size="0.1" pos="0.2 0 0"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("jacobian", ("dense", "sparse"))
+def test_rounding_of_the_jacobian_counts_on_joints_of_what_touches(jacobian: str):
+    mj_model = mujoco.MjModel.from_xml_string(
+        PRESSED.replace("<worldbody>", f'<option jacobian="{jacobian}"/><worldbody>')
+    )
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_forward(mj_model, mj_data)
+    # One body touches the ground, and the other is at its limit.
+    assert mj_data.ncon == 1 and mj_data.nl == 1
+    noise = jacobian_rounding(mj_model, state_of(mj_data))
+    of_contact = mj_data.efc_type == mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL
+    pressing = np.abs(mj_data.efc_force[of_contact]).sum()
+    assert noise == pytest.approx([ROUNDING * mj_model.stat.meansize * pressing, 0.0], rel=1e-3)
+    assert pressing > 1.0
 
 
 def test_limits_do_not_grow_with_substeps():
