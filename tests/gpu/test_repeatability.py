@@ -1,11 +1,13 @@
 """Equal runs on a GPU have equal bits, whatever the order in which its threads come."""
 
 import dataclasses
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
@@ -16,6 +18,8 @@ from ksim_rl.physics.nan_guard.guard import NanGuardCfg
 from ksim_rl.ranks.running_moments import RunningMoments
 from ksim_rl.tasks.rough_ground import on_rough_ground
 from ksim_rl.trainers.build import build_env
+from tests import kernels
+from tests.docs.guide import REPOSITORY
 from tests.physics.test_contacts import THINGS, touching
 
 LOOKS = ("qpos", "qvel", "qacc", "qacc_warmstart", "sensordata", "cfrc_ext", "cacc", "xpos", "time")
@@ -149,7 +153,7 @@ def mended(device: str, *, one_kernel: bool) -> list[torch.Tensor]:
 
 
 # Limits, and sensors of them, a disabled actuator with an activation, a gain that depends
-# on velocity, adhesion beside a measured pair, and a delayed control.
+# on velocity, adhesion beside a measured pair, a delayed control, and an exact filter.
 DRIVEN = """
 <mujoco>
   <option integrator="{integrator}" actuatorgroupdisable="1"/>
@@ -165,11 +169,12 @@ DRIVEN = """
     <position joint="drone" kp="2" kv="1" gear="1 0 1 0 0.5 0"/>
     <intvelocity joint="arm" group="1" kp="5" actrange="-1 1"/>
     <general joint="arm" gaintype="affine" gainprm="1 0 -0.1" ctrllimited="true" ctrlrange="-0.1 0.1"/>
-    <position joint="arm" kp="2" delay="0.004" nsample="3"/><adhesion body="ball" ctrlrange="0 1"/>
+    <position name="servo" joint="arm" kp="2" delay="0.004" nsample="3"/><adhesion body="ball" ctrlrange="0 1"/>
+    <general joint="arm" dyntype="filterexact" dynprm="0.05" gainprm="0.3"/>
   </actuator>
   <sensor>
     <jointlimitpos joint="arm"/><jointlimitvel joint="arm"/><jointlimitfrc joint="arm"/>
-    <distance geom1="ball" geom2="post" cutoff="2"/>
+    <distance geom1="ball" geom2="post" cutoff="2"/><actuatorpos actuator="servo"/>
   </sensor>
 </mujoco>
 """
@@ -187,7 +192,8 @@ def driven(device: str, integrator: str) -> list[torch.Tensor]:
     ]
 
 
-# A table that worlds have elsewhere, a tool without joints that is tied, and a body that only slides beside a tendon.
+# A table that worlds have elsewhere, a tool without joints that is tied, a body that only slides beside a tendon, and a
+# beam that turns about its middle.
 VARIED = """
 <mujoco>
   <worldbody>
@@ -196,6 +202,8 @@ VARIED = """
       <body name="tool" pos="0.1 0 0"><geom size="0.02"/></body></body>
     <body name="arm" pos="1 0 1"><joint name="a" axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/></body>
     <body name="lift" pos="2 0 1"><joint name="b" type="slide" axis="0 0 1"/><geom size="0.1"/></body>
+    <body pos="0.9 0 0.4"><joint axis="0 1 0"/>
+      <geom type="capsule" size="0.05 0.5" mass="1" euler="0 90 0"/></body>
   </worldbody>
   <tendon><fixed><joint joint="a" coef="1"/><joint joint="b" coef="-1"/></fixed></tendon>
   <equality><connect body1="tool" body2="arm" anchor="0 0 0"/><weld body1="lift"/></equality>
@@ -219,6 +227,13 @@ def varied(device: str) -> list[torch.Tensor]:
     return [*of_fields, *(world.view(name).cpu().clone() for name in ("qpos", "qvel", "geom_xpos"))]
 
 
+def cramped(device: str) -> list[torch.Tensor]:
+    """What kernels leave of worlds that have too little room for their ties."""
+    world = World(load_model(VARIED), num_envs=8, device=device, sim=SimCfg(njmax=2, one_kernel_solver=False))
+    world.step(2)
+    return [world.view(name).cpu().clone() for name in ("qpos", "qvel")]
+
+
 def single(device: str) -> list[torch.Tensor]:
     """What kernels leave that few models have: contacts of steep rods, in an order of their own, and tendons."""
     mj_model = load_model(THINGS.format(turned=""))
@@ -235,12 +250,35 @@ def single(device: str) -> list[torch.Tensor]:
     rows = np.concatenate([field.reshape(count, -1) for field in fields], axis=1)
     found = [torch.tensor(sorted(map(tuple, rows))), tendons.view("ten_velocity").cpu().clone()]
     found += driven(device, "implicitfast") + driven(device, "RK4") + varied(device)
+    found += cramped(device)
     return [*found, *mended(device, one_kernel=True), *mended(device, one_kernel=False)]
 
 
 @pytest.mark.gpu
 def test_kernels_of_single_models_give_the_same_bits_again():
     assert all(torch.equal(one, other) for one, other in zip(single("cuda"), single("cuda"), strict=True))
+
+
+@pytest.mark.full
+def test_single_models_launch_each_kernel_that_is_said_to_be_tested_with_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    launched: set[str] = set()
+    launch = wp.launch
+
+    def noted(kernel: wp.Kernel, *given: Any, **named: Any) -> None:
+        launched.update(kernel.key.split("__locals__"))
+        launch(kernel, *given, **named)
+
+    monkeypatch.setattr(wp, "launch", noted)
+    single("cpu")
+    said = set()
+    for file, tests in kernels.TESTS.items():
+        # Kernels of C++ are launched elsewhere.
+        of_warp = re.findall(r"@wp\.kernel.*\ndef (\w+)", (REPOSITORY / "ksim_rl" / file).read_text())
+        said |= {name for name in of_warp if tests.get(name) == kernels.SINGLE_MODELS}
+    assert len(said) > 20
+    assert said <= launched, said - launched
 
 
 @pytest.mark.gpu
