@@ -32,6 +32,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "diagnosis": ("ksim_rl/diagnosis", *LEARN),
     "g1_ppo": (*STEP, *LEARN, *TASK),
     "humanoids": (*STEP, *LEARN, *TASK),
+    "identification": ("ksim_rl/identification",),
     "imports": (*LEARN[1:4], "ksim_rl/transforms", "ksim_rl/device", "ksim_rl/physics"),
     "learning": (*STEP, *LEARN, *TASK),
     "manipulation": (*STEP, *LEARN, "ksim_rl/suites"),

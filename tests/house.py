@@ -44,7 +44,17 @@ GROUPS = {
         "files",
     ),
     "engine": ("physics", "compiled", "device", ""),
-    "tools": ("tables", "viewer", "zoo", "export", "diagnosis", "clips", "testing", "adapters"),
+    "tools": (
+        "tables",
+        "viewer",
+        "zoo",
+        "export",
+        "diagnosis",
+        "identification",
+        "clips",
+        "testing",
+        "adapters",
+    ),
 }
 # Rooms that use envs through envs/contract.py only.
 ROOMS_WITHOUT_PROBES = (

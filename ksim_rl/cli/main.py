@@ -31,6 +31,8 @@ usage: ksim-rl <command> [arguments]
   compare  a table and a picture:   ksim-rl compare RUN1 RUN2
   export   a folder that runs elsewhere:  ksim-rl export RUN
   sim2sim  run it on MuJoCo's C engine:   ksim-rl sim2sim RUN/export --episodes 100
+  identify the numbers of a robot's joints, from a log:  ksim-rl identify LOG.csv --robot go2
+           what to log:             ksim-rl identify --propose go2
   diagnose what goes wrong in learning:   ksim-rl diagnose RUN
   doctor   check this machine, for bug reports: ksim-rl doctor
   warmup   compile ahead of time:   ksim-rl warmup task=go1_velocity_flat device=cuda
@@ -64,6 +66,7 @@ COMMANDS = {
     "compare": "ksim_rl.cli.runs:compare",
     "export": "ksim_rl.export.sim2sim:run_export",
     "sim2sim": "ksim_rl.export.sim2sim:run_sim2sim",
+    "identify": "ksim_rl.identification.command:identify",
     "diagnose": "ksim_rl.diagnosis.diagnose:command",
     "doctor": "ksim_rl.diagnosis.doctor:command",
     "warmup": "ksim_rl.cli.warmup:warmup",

@@ -1,0 +1,115 @@
+"""Says what was found of a robot in the words of `ksim-rl train`: a delay, and ranges to draw from."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ksim_rl.config.config_tree import to_tree
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.term import EventTerm
+from ksim_rl.identification.findings import Estimate, Findings
+from ksim_rl.mdp.randomization.joints import (
+    RandomizeActuatorGains,
+    RandomizeJointArmature,
+    RandomizeJointDamping,
+    RandomizeJointField,
+    RandomizeJointFrictionLoss,
+)
+from ksim_rl.scene.actuators import Actuator, DelayedActuator
+
+EVENTS: Mapping[str, type[RandomizeJointField]] = {
+    "armature": RandomizeJointArmature,
+    "damping": RandomizeJointDamping,
+    "frictionloss": RandomizeJointFrictionLoss,
+}
+GAINS = {"stiffness": "stiffness", "servo_damping": "damping"}
+"""What `RandomizeActuatorGains` calls the numbers of a servo."""
+
+
+def overrides(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> list[str]:
+    """Return the overrides for a task in whose scene the robot stands.
+
+    One lets the robot's actuators get their targets late, the others draw each joint's numbers from their intervals. A
+    ValueError says that the robot is not in the scene.
+    """
+    key = _robot_of(findings, cfg)
+    found = []
+    actuators: Sequence[Actuator] = getattr(cfg.scene.robots[key], "actuators", ())
+    # Servos of a model's own file have no entry that could be late.
+    if actuators and findings.delay_s.is_told:
+        late = _late(actuators, findings.delay_s, cfg.sim.timestep)
+        found.append(f"task.scene.robots.{key}.actuators={_value(to_tree(late, Sequence[Actuator]))}")
+    # Of several robots each has its name before those of its joints.
+    prefix = "" if len(cfg.scene.robots) == 1 else f"{key}/"
+    for name, event in _events(findings, prefix).items():
+        found.append(f"+task.events.identified_{name}={_value(to_tree(event, EventTerm))}")
+    return found
+
+
+def _robot_of(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> str:
+    for key, robot in cfg.scene.robots.items():
+        if findings.robot in (key, getattr(robot, "name", None)):
+            return key
+    raise ValueError(
+        f"--task: its robots are {', '.join(cfg.scene.robots)}, and none is {findings.robot!r}: give another task"
+    )
+
+
+def _late(actuators: Sequence[Actuator], delay_s: Estimate, timestep: float | None) -> list[Actuator]:
+    """Return actuators whose targets arrive late by what was found, in whole physics steps from below to above."""
+    if timestep is None:
+        raise ValueError(
+            "--task: it leaves its time step to the model, and delays count in these: choose a task that sets one"
+        )
+    lags = {"min_lag": math.floor(delay_s.low / timestep), "max_lag": math.ceil(delay_s.high / timestep)}
+    late: list[Actuator] = []
+    for entry in actuators:
+        # A delay that the robot had before is replaced.
+        inner = entry.actuator if isinstance(entry, DelayedActuator) else entry
+        late.append(DelayedActuator(actuator=inner, lag_group="bus", **lags))
+    return late
+
+
+def _events(findings: Findings, prefix: str) -> dict[str, EventTerm]:
+    """Return an event for each kind of number that draws each joint's from its interval."""
+    found: dict[str, EventTerm] = {}
+    for kind, event in EVENTS.items():
+        ranges: dict[int | str, tuple[float, float]] = {}
+        for name, numbers in findings.joints.items():
+            if numbers[kind].is_told:
+                ranges[f"{prefix}{name}"] = _interval(numbers[kind])
+        if ranges:
+            found[kind] = event(joints=tuple(map(str, ranges)), ranges=ranges)
+    for name, numbers in findings.joints.items():
+        told = {GAINS[kind]: _interval(numbers[kind]) for kind in GAINS if numbers[kind].is_told}
+        if told:
+            found[f"gains_{name}"] = RandomizeActuatorGains(
+                joints=(f"{prefix}{name}",),
+                operation="abs",
+                stiffness=told.get("stiffness"),
+                damping=told.get("damping"),
+            )
+    return found
+
+
+def _interval(number: Estimate) -> tuple[float, float]:
+    return _rounded(number.low), _rounded(number.high)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def _value(tree: Any) -> str:
+    """Return a tree in Hydra's grammar, without blanks, at which a shell would cut it."""
+    if isinstance(tree, Mapping):
+        return "{" + ",".join(f"{key}:{_value(value)}" for key, value in tree.items()) + "}"
+    if isinstance(tree, (list, tuple)):
+        return "[" + ",".join(map(_value, tree)) + "]"
+    if tree is None:
+        return "null"
+    if isinstance(tree, bool):
+        return str(tree).lower()
+    if tree == "":
+        return "''"
+    return str(tree)

@@ -1,0 +1,69 @@
+"""What was found goes into a training: as a delay of the actuators, and as ranges to draw from."""
+
+import pytest
+
+from ksim_rl import conf, envs
+from ksim_rl.identification.findings import Estimate, Findings
+from ksim_rl.identification.training_overrides import overrides
+from ksim_rl.scene.actuators import DelayedActuator
+from ksim_rl.scene.robots import UnitreeGo2
+
+
+def found(robot, names, **left_out):
+    numbers = {
+        "armature": Estimate(value=0.012, half_width=0.001),
+        "damping": Estimate(value=0.002, half_width=0.004),
+        "frictionloss": Estimate(value=0.3, half_width=0.02),
+        "stiffness": Estimate(value=27.0, half_width=0.5),
+        "servo_damping": Estimate(value=1.1, half_width=0.1),
+        "torque_constant": Estimate(remark="no efforts were commanded"),
+    }
+    joints = {name: {**numbers, **left_out} for name in names}
+    delay_s = Estimate(value=0.0082, half_width=0.0005)
+    return Findings(robot=robot, joints=joints, delay_s=delay_s, unexplained=dict.fromkeys(names, 1e-3))
+
+
+def test_a_training_takes_them():
+    names = UnitreeGo2.joint_names
+    lines = overrides(found("go2", names), envs.task("go2_velocity_flat").cfg())
+    # Words of a shell: `$(cat FILE)` cuts at blanks.
+    assert not any(set(line) & set(" \t'\"$") for line in lines)
+    cfg = conf.compose(["task=go2_velocity_flat", *lines]).task
+    late = cfg.scene.robots["go2"].actuators
+    assert [entry.actuator for entry in late] == list(UnitreeGo2().actuators)
+    # 8.2 ms are between one and two steps of 5 ms, one delay for the whole bus.
+    assert {(type(entry), entry.min_lag, entry.max_lag, entry.lag_group) for entry in late} == {
+        (DelayedActuator, 1, 2, "bus")
+    }
+    events = cfg.events
+    assert events["identified_armature"].ranges == dict.fromkeys(names, (0.011, 0.013))
+    # No number of a joint is negative.
+    assert events["identified_damping"].ranges["FL_calf_joint"] == (0.0, 0.006)
+    assert events["identified_gains_FL_calf_joint"].stiffness == (26.5, 27.5)
+    assert "push_robot" in events
+
+
+@pytest.mark.full
+def test_an_env_draws_them():
+    lines = overrides(found("go2", UnitreeGo2.joint_names), envs.task("go2_velocity_flat").cfg())
+    # `envs.make` takes the overrides of a task without its prefix.
+    own = [line.replace("task.", "", 1) for line in lines]
+    env = envs.make("go2_velocity_flat", num_envs=4, device="cpu", overrides=own)
+    drawn = env.view.field("dof_armature")[:, 6:]
+    assert 0.011 <= drawn.min() < drawn.max() <= 0.013
+    stiffness = env.view.actuator_param("stiffness")
+    assert 26.5 <= stiffness.min() < stiffness.max() <= 27.5
+    env.rollout(3)
+
+
+def test_what_was_not_told_is_left_as_it_was():
+    nothing = {"stiffness": Estimate(remark="no positions"), "damping": Estimate(remark="within the servo")}
+    lines = overrides(found("go2", UnitreeGo2.joint_names, **nothing), envs.task("go2_velocity_flat").cfg())
+    assert not any("identified_damping" in line for line in lines)
+    gains = [line for line in lines if "identified_gains" in line]
+    assert len(gains) == 12 and all("stiffness:null" in line for line in gains)
+
+
+def test_another_robots_task_is_refused():
+    with pytest.raises(ValueError, match="--task: its robots are go1, and none is 'go2'"):
+        overrides(found("go2", UnitreeGo2.joint_names), envs.task("go1_velocity_flat").cfg())
