@@ -12,6 +12,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 import pytest
 import torch
+import warp as wp
 
 from tests import shapes
 
@@ -65,6 +66,24 @@ def _own_plugins():
             # The patch takes back what tests assign from here on.
             patch.setenv(variable, os.environ.get(variable, ""))
         yield
+
+
+@pytest.fixture(scope="module")
+def optimized_kernels():
+    """Optimize the kernels that a file's tests compile: their envs take so many steps that this saves time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wp.config, "optimization_level", None)
+        yield
+
+
+def pytest_configure(config):
+    """Compile the CPU's kernels without optimization, in half of the time, where the long tests do not run.
+
+    `make test-full` runs with the optimized kernels that users get.
+    """
+    long_tests_run = "full" in config.option.markexpr.replace("not full", "")
+    if not long_tests_run and not torch.cuda.is_available():
+        wp.config.optimization_level = 0
 
 
 def pytest_collection_modifyitems(items):

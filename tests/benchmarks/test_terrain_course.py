@@ -19,6 +19,7 @@ from ksim_rl.trainers.run_folder import Policy
 
 KINDS = {"flat": FlatPatch(cell=1.0), "slope_down": PyramidSlope(proportion=5.0, cell=0.5)}
 NUM_ENVS = 14
+pytestmark = pytest.mark.usefixtures("optimized_kernels")
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +100,7 @@ def test_robots_are_spread_evenly_and_an_untrained_policy_gets_nowhere(untrained
         walk(untrained, course, num_envs=5)
 
 
+@pytest.mark.full
 def test_what_is_drawn_does_not_depend_on_the_seed_of_the_run(untrained):
     one, other = (
         throw(dataclasses.replace(untrained, cfg=dataclasses.replace(untrained.cfg, seed=seed)), SOME, SOME)
@@ -109,6 +111,7 @@ def test_what_is_drawn_does_not_depend_on_the_seed_of_the_run(untrained):
         assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
+@pytest.mark.full
 def test_who_flies_across_arrives_and_who_turns_over_on_the_way_has_fallen(untrained):
     """What counts is the first episode; many more of the other kind follow."""
     upright = throw(untrained, UPRIGHT, TURNING)

@@ -106,10 +106,11 @@ def test_a_world_that_does_not_fit_says_so(monkeypatch):
         standing_quadrupeds(4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("room", "fits"),
     # With 16 envs Warp's arrays take 66,027 bytes, with 8 of them 34,787; a tenth of the room has to be left.
-    [(80_000, 16), pytest.param(71_000, 8, marks=pytest.mark.full)],
+    [(80_000, 16), (71_000, 8)],
 )
 def test_a_run_whose_envs_do_not_fit_names_a_number_that_trained_elsewhere(tmp_path, monkeypatch, room, fits):
     smaller = f"from tests.device.small_machine import hold_at_most; hold_at_most({room}); "

@@ -101,6 +101,7 @@ def test_what_the_c_engine_trained_is_judged_in_other_physics(tmp_path):
     assert report.return_ratio != pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.full
 def test_default_poses_that_differ_between_worlds_are_recorded_and_are_not_the_robots(tmp_path):
     def change(cfg):
         drawn = {"default_pose": mdp.RandomizeDefaultJointPos(ranges=(-0.2, 0.2))}

@@ -30,7 +30,7 @@ def _gradients(function, inputs, weights):
         ((3, 5, 64), 0),
         ((2, 19, 128), 2),
         ((1, 3, 300), 2),
-        ((2, 41, 520), 2),
+        pytest.param((2, 41, 520), 2, marks=pytest.mark.full),
         ((1, 9, 1000), 2),
     ],
 )

@@ -172,6 +172,7 @@ def test_commands_become_faster_by_stages():
     base.close()
 
 
+@pytest.mark.full
 def test_a_humanoid_that_gets_up_is_not_thrown_about_by_its_first_policy():
     """Its joints move at up to 24 rad/s in 99 % of what they do; with an output gain of 1 that were 72."""
     words = (

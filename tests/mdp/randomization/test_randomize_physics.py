@@ -13,6 +13,7 @@ from tests.mdp.randomization.randomize_bench import Runners
 
 E = 3
 SUBSTEPS = 60
+pytestmark = pytest.mark.usefixtures("optimized_kernels")
 
 EVENTS = {
     "friction": mdp.RandomizeGeomFriction(geoms=".*_foot", ranges={0: (0.3, 1.5), 1: (0.005, 0.05)}),
