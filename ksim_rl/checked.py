@@ -1,7 +1,8 @@
 """Config dataclasses that inherit `Checked` hold, once built, values that fit the annotations of their fields.
 
 Bounds stand in the annotation: `stiffness: Positive`, `share: Share = 0.5`, `x: Annotated[float, Within(high=3.0)]`.
-Only rules that relate several fields need code: a method `_check_fields`.
+Whole numbers without an upper one end at 32 bits. Only rules that relate several fields need code: a method
+`_check_fields`.
 """
 
 import types
@@ -11,7 +12,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from typing import Annotated, Any, Literal, TypeAlias
 
-from ksim_rl.checks import check_choice, check_count, check_in_range, check_pair
+from ksim_rl.checks import MOST_COUNT, check_choice, check_count, check_in_range, check_pair
 
 # A type hint. Python has no type of these before `TypeForm`.
 Annotation: TypeAlias = Any
@@ -56,6 +57,12 @@ NonNegative = Annotated[float, Within(low=0.0)]
 Share = Annotated[float, Within(low=0.0, high=1.0)]
 Count = Annotated[int, Within(low=1)]
 WholeNumber = Annotated[int, Within(low=0)]
+# What is repeated within one step or iteration: with more of them nothing would be heard of a run for hours.
+Repeats = Annotated[int, Within(low=1, high=10_000)]
+# Seeds of evaluations lie above a run's own, and must fit 64 bits as well.
+Seed = Annotated[int, Within(low=0, high=2**62)]
+# Of all envs over a whole training: 32 bits are too few.
+Total = Annotated[int, Within(low=0, high=2**62)]
 Range = Annotated[tuple[float, float], Within(ordered=True)]
 NonNegativeRange = Annotated[tuple[float, float], Within(low=0.0, ordered=True)]
 Name = Annotated[str, Filled("expected a name")]
@@ -77,6 +84,13 @@ class Checked:
     def _check_fields(self) -> None:
         """Refuse fields that contradict each other. Whoever overrides it calls `super()._check_fields()` first."""
 
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return how many numbers of four bytes must lie in memory at least, by the names of the fields that say so.
+
+        Those of configs in its fields are left out. `ksim_rl.device.memory.check_room` compares them with a machine.
+        """
+        return {}
+
 
 @cache
 # Resolving texts of annotations is slow, and classes do not change.
@@ -93,8 +107,9 @@ def check_value(field: str, value: object, annotation: Annotation) -> None:
     if origin is Annotated:
         # Numbers have their bounds checked by one message, pairs and unions by theirs.
         for bound in (extra for extra in arguments[1:] if isinstance(extra, Within)):
-            if arguments[0] is int and bound.high is None and bound.low is not None:
-                check_count(field, value, low=int(bound.low))
+            if arguments[0] is int and bound.low is not None:
+                high = MOST_COUNT if bound.high is None else int(bound.high)
+                check_count(field, value, low=int(bound.low), high=high)
             elif arguments[0] in (int, float):
                 check_in_range(field, value, low=bound.low, high=bound.high, low_open=bound.low_open)
             elif value is None or not bound.ordered:

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from numbers import Real
 from typing import NoReturn
 
+# Warp, MuJoCo and torch's kernels count in 32 bits.
+MOST_COUNT = 2**31 - 1
 # What is raised where data of a file is well formed, and lacks a part or has one of another kind.
 MISFITS = (LookupError, TypeError, AttributeError, ArithmeticError)
 
@@ -73,10 +75,12 @@ def check_in_range(
         raise ValueError(f"{field}={value!r}: expected a finite number in {bounds}")
 
 
-def check_count(field: str, value: object, *, low: int = 1) -> None:
-    """Refuse a value that is no whole number, or one below `low`."""
+def check_count(field: str, value: object, *, low: int = 1, high: int = MOST_COUNT) -> None:
+    """Refuse a value that is no whole number, or one outside `[low, high]`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < low:
         raise ValueError(f"{field}={value!r}: expected a whole number >= {low}")
+    if value > high:
+        raise ValueError(f"{field}={value!r}: expected a whole number of at most {high}")
 
 
 def check_choice(field: str, value: object, choices: Iterable[object]) -> None:

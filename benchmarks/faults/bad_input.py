@@ -23,19 +23,21 @@ def wrong_inputs(folder: Path, *, inputs: int) -> Figures:
 
 ROWS = {
     "wrong_inputs": Row(
-        fault="words of the command line, terms, transforms and models that cannot be, each tried alone",
+        fault="words of the command line, any whole number of a config, terms, transforms and models that cannot be",
         must="one line names what is wrong, exit code 2 or 3, without a traceback unless a user's own code raised; or "
         "it works",
         limits={"inputs": (AT_LEAST, "inputs"), "neither": (EXACTLY, 0)},
         measure=wrong_inputs,
-        amounts={"inputs": 200},
+        amounts={"inputs": 400},
         short={"inputs": 8},
         files=(
             "ksim_rl/checked.py",
             "ksim_rl/cli/errors.py",
+            "ksim_rl/device/memory.py",
             "ksim_rl/envs/registry.py",
             "tests/cli/wrong_inputs.py",
             "tests/cli/wrong_models.py",
+            "tests/cli/wrong_sizes.py",
             "tests/cli/wrong_terms.py",
         ),
     ),

@@ -15,6 +15,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
 from ksim_rl import algorithms, envs
+from ksim_rl.checks import naming
 from ksim_rl.conf import choices
 from ksim_rl.config import plain_data, plugins, upstream
 from ksim_rl.config.trees import Tree
@@ -133,7 +134,10 @@ def check_groups(folder: Path) -> None:
         text = read_bytes(folder / path, limit=MOST_GROUP_BYTES).decode(errors="replace")
         try:
             plain_data.check_events(folder / path, text)
-            tree = yaml.safe_load(text)  # as well as the text, in which a name may be spelled with escapes
+            with naming(f"{folder / path}: cannot be read"):  # numbers of more digits than Python reads
+                tree = yaml.safe_load(
+                    text
+                )  # as well as the text, in which a name may be spelled with escapes
         except yaml.YAMLError as error:
             raise ValueError(f"{folder / path}: cannot be read: {' '.join(str(error).split())}") from error
         plain_data.check_references(tree, str(folder / path))

@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from ksim_rl.checks import naming
 from ksim_rl.config.trees import Plain, Tree
 from ksim_rl.config.upstream import yaml_resolvers
 from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
@@ -15,6 +16,7 @@ from ksim_rl.files.writing import check_name, check_own
 
 # Deeper trees would exhaust Python's stack.
 MOST_DEPTH = 50
+MOST_BITS = 64
 # In C where PyYAML was built with it: a hundred times as fast.
 _FastLoader: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader
 
@@ -48,7 +50,8 @@ def read_yaml(path: Path) -> Tree:
         text = read_bytes(path, limit=MOST_CONFIG_BYTES).decode()
         # On the events, before any object is made of them.
         check_events(path, text)
-        tree: Any = yaml.load(text, Loader=_Loader)
+        with naming(f"{path}: cannot be read"):  # numbers of more digits than Python reads
+            tree: Any = yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
     # An empty file is an empty config.
@@ -77,7 +80,10 @@ def check_events(path: Path, text: str) -> None:
 
 
 def check_plain(tree: Any, where: str) -> None:
-    """Refuse interpolations, such as `${oc.env:HOME}`, anywhere in a tree: a run's config has values in their place."""
+    """Refuse interpolations, such as `${oc.env:HOME}`, anywhere in a tree: a run's config has values in their place.
+
+    Whole numbers of more than 64 bits are refused too: no message could show one of a million digits.
+    """
     if isinstance(tree, Mapping):
         for key, entry in tree.items():
             check_plain(key, where)
@@ -89,6 +95,8 @@ def check_plain(tree: Any, where: str) -> None:
     # Resolvers may read the environment, or run code of a plug-in.
     elif isinstance(tree, str) and "${" in tree:
         raise ValueError(f"{where}={tree[:80]!r}: an interpolation, and a run's config holds values only")
+    elif isinstance(tree, int) and tree.bit_length() > MOST_BITS:
+        raise ValueError(f"{where}: a whole number of {tree.bit_length()} bits: expected {MOST_BITS} at most")
 
 
 def check_references(tree: Plain, where: str) -> None:

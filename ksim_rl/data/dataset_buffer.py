@@ -1,7 +1,7 @@
 """The dataset of one RL update, and the arithmetic between its size, minibatches and rollouts."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +14,7 @@ from torchrl.data.replay_buffers import Sampler
 
 from ksim_rl import dims
 from ksim_rl.checked import Checked, Count, WholeNumber
-from ksim_rl.checks import check_count
+from ksim_rl.checks import check_count, naming
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
 from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SampleInfo, SequenceSampler
 
@@ -44,6 +44,10 @@ class DatasetCfg(Checked):
         """D, the size of the dataset."""
         return self.num_env_states_per_minibatch * self.num_minibatches
 
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of a dataset: observation, action and reward."""
+        return {("num_env_states_per_minibatch", "num_minibatches"): 3 * self.num_env_states}
+
     def rollout_length(self, num_envs: int) -> int:
         """Return T for so many parallel environments; see `rollout_length`. Envs and minibatches have equal shards."""
         size = self.num_env_states_per_minibatch
@@ -66,7 +70,8 @@ class DatasetCfg(Checked):
                 f"data.num_minibatches={self.num_minibatches} equal parts: "
                 f"collector.rollout_length={_near_multiples(length, step)} are"
             )
-        return replace(self, num_env_states_per_minibatch=size)
+        with naming(f"collector.rollout_length={length}"):
+            return replace(self, num_env_states_per_minibatch=size)
 
 
 def rollout_length(num_env_states_per_minibatch: int, num_minibatches: int, num_envs: int) -> int:
@@ -85,7 +90,7 @@ def rollout_length(num_env_states_per_minibatch: int, num_minibatches: int, num_
     minibatches = _near_multiples(
         num_minibatches, num_envs // math.gcd(num_envs, num_env_states_per_minibatch)
     )
-    envs = _near_divisors(num_env_states, num_envs)
+    envs = _near_divisors(num_env_states_per_minibatch, num_minibatches, num_envs)
     raise ValueError(
         f"num_env_states_per_minibatch={num_env_states_per_minibatch} * num_minibatches={num_minibatches} = "
         f"{num_env_states} env states cannot be shared equally by num_envs={num_envs}: each env would take "
@@ -100,13 +105,18 @@ def _near_multiples(value: int, factor: int) -> str:
     return " or ".join(str(number) for number in (below, below + factor) if number > 0)
 
 
-def _near_divisors(number: int, value: int) -> str:
-    # Divisors come in pairs around the square root.
+def _near_divisors(first: int, second: int, value: int) -> str:
+    # A divisor of a product is one of a divisor of each factor: far fewer are tried than for the product.
+    divisors = {one * other for one in _divisors(first) for other in _divisors(second)}
+    below = max((divisor for divisor in divisors if divisor < value), default=None)
+    above = min((divisor for divisor in divisors if divisor > value), default=None)
+    return " or ".join(str(divisor) for divisor in (below, above) if divisor is not None)
+
+
+def _divisors(number: int) -> set[int]:
+    # They come in pairs around the square root.
     small = [divisor for divisor in range(1, math.isqrt(number) + 1) if number % divisor == 0]
-    divisors = sorted({*small, *(number // divisor for divisor in small)})
-    near = [divisor for divisor in divisors if divisor < value][-1:]
-    near += [divisor for divisor in divisors if divisor > value][:1]
-    return " or ".join(str(divisor) for divisor in near)
+    return {*small, *(number // divisor for divisor in small)}
 
 
 class DatasetBuffer(ReplayBuffer):

@@ -1,6 +1,6 @@
 """The replay of off-policy learning: it holds the last env states of each env, and draws of them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,8 +13,8 @@ from torchrl.data.replay_buffers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl import dims, ranks
-from ksim_rl.checked import Checked, Count, NonNegative, Share
-from ksim_rl.checks import check_count, check_in_range
+from ksim_rl.checked import Checked, Count, NonNegative, Repeats, Share
+from ksim_rl.checks import check_count, check_in_range, naming
 from ksim_rl.data.dataset_storage import Stateless
 from ksim_rl.data.epoch_sampler import Entries, SampleInfo, stored
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter, SavedByStateDict
@@ -194,10 +194,10 @@ class ReplayCfg(Checked):
     """
 
     num_env_states_per_minibatch: Count  # env states of a gradient step
-    num_minibatches: Count  # per iteration
+    num_minibatches: Repeats  # per iteration
     num_steps: Count = 1  # of each env per iteration
     capacity: Count = 1024  # env states per env; an episode's end takes one more, for its last observation
-    n_step: Count = 1  # rewards that a target sums before it bootstraps
+    n_step: Repeats = 1  # rewards that a target sums before it bootstraps
     learning_starts: Count = 10  # steps of each env with random actions before the first gradient step
     prioritized: bool = False  # by the last temporal-difference error (Schaul et al., arXiv 1511.05952)
     priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
@@ -216,6 +216,14 @@ class ReplayCfg(Checked):
                 "one rollout would overwrite itself; raise capacity"
             )
 
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of observation, action and reward in the ring, in a rollout and in all minibatches."""
+        return {
+            ("capacity",): 3 * num_envs * self.capacity,
+            ("num_steps",): 3 * num_envs * self.num_steps,
+            ("num_env_states_per_minibatch",): 3 * self.num_env_states_per_minibatch,
+        }
+
     def rollout_length(self, num_envs: int) -> int:
         """Return T, which does not depend on the number of envs; these and minibatches have equal shards."""
         size = self.num_env_states_per_minibatch
@@ -229,7 +237,8 @@ class ReplayCfg(Checked):
 
     def with_rollout_length(self, length: int, num_envs: int) -> "ReplayCfg":
         """Return the same with rollouts of `length` steps."""
-        return replace(self, num_steps=length)
+        with naming(f"collector.rollout_length={length}"):
+            return replace(self, num_steps=length)
 
 
 class ReplayRing(ReplayBuffer):

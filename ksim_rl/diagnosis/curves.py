@@ -14,7 +14,7 @@ from ksim_rl.runs.listing import CONFIG, METRICS
 
 # Fewer rows say nothing about where a run is going.
 LEAST_ROWS = 10
-# "Early" is this share of the rows at the beginning, "late" the same at the end.
+# "Early" is this share of a metric's values at the beginning, "late" the same at the end.
 SHARE = 0.2
 
 
@@ -35,12 +35,14 @@ class Curves:
         return [value for value in self.columns.get(name, ()) if value is not None and math.isfinite(value)]
 
     def early(self, name: str) -> float | None:
-        """Return the median of a metric's first values, or None where there are too few of them."""
-        return _median(self.values(name)[: self._span])
+        """Return the median of the first fifth of a metric's values, or None where there are too few of them."""
+        values = self.values(name)
+        return _median(values[: _span(values)])
 
     def late(self, name: str) -> float | None:
-        """Return the median of a metric's last values, or None where there are too few of them."""
-        return _median(self.values(name)[-self._span :])
+        """Return the median of the last fifth of a metric's values, or None where there are too few of them."""
+        values = self.values(name)
+        return _median(values[-_span(values) :])
 
     def last(self, name: str) -> float | None:
         """Return a metric's last value, which is all there may be of one that evaluations log."""
@@ -64,10 +66,11 @@ class Curves:
             return float(value)
         return default
 
-    @property
-    # At least three values, so that the median ignores one that is off.
-    def _span(self) -> int:
-        return max(3, round(SHARE * self.num_rows))
+
+def _span(values: Sequence[float]) -> int:
+    # At least three, so that the median ignores one that is off. Of the values and not of the rows: what few rows have,
+    # such as figures of evaluations, would be early and late at once.
+    return max(3, round(SHARE * len(values)))
 
 
 def _median(values: Sequence[float]) -> float | None:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from ksim_rl.checked import Checked, Count, NonNegative, Within
+from ksim_rl.checked import Checked, NonNegative, Repeats, Within
 from ksim_rl.envs.term import (
     ActionTerm,
     CommandTerm,
@@ -32,7 +32,7 @@ class ManagerBasedRlEnvCfg(Checked):
     outputs of the env pass them from the first to the last, and actions from the last to the first.
     """
 
-    decimation: Count  # physics substeps per env step
+    decimation: Repeats  # physics substeps per env step
     scene: SceneCfg
     observations: Mapping[str, ObservationGroupCfg] = field(default_factory=dict)  # by group
     actions: Mapping[str, ActionTerm] = field(default_factory=dict)  # what a policy controls

@@ -32,8 +32,11 @@ def read_arrays(
             if sum(entry.file_size for entry in entries) > limit:
                 raise ValueError(f"its arrays are larger than {limit} bytes")
             return {entry.filename.removesuffix(SUFFIX): _read_array(archive, entry) for entry in entries}
-    except (zipfile.BadZipFile, OSError, EOFError, NotImplementedError, RuntimeError) as error:
-        raise ValueError(f"no archive of arrays: {' '.join(str(error).split())}") from error
+    except ValueError:
+        raise
+    except Exception as error:  # zipfile, its compressions and numpy's parser of headers raise a dozen kinds
+        what = f"{type(error).__name__} {error}"
+        raise ValueError(f"no archive of arrays: {' '.join(what.split())}") from error
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Builds networks that judge: values of states and of actions, and how much transitions look like a motion."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.modules import ValueOperator
 
 from ksim_rl.checked import Count, NonNegative
+from ksim_rl.device.memory import numbers_of_layers
 from ksim_rl.modules.mlp import Device, mlp
 from ksim_rl.modules.network import (
     LayeredNetwork,
@@ -72,6 +73,11 @@ class QNetworkCfg(OffPolicyNetworkCfg):
         # Checked without atoms as well, where the range is not used yet.
         if self.v_min >= self.v_max:
             raise ValueError(f"v_min={self.v_min!r} is not below v_max={self.v_max!r}")
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return what the layers of all networks need."""
+        of_one = numbers_of_layers((*self.hidden_dims, self.num_atoms))
+        return {("num_networks", "hidden_dims", "num_atoms"): self.num_networks * of_one}
 
 
 class QNetwork(ObservingNetwork):

@@ -1,6 +1,6 @@
 """The parts that networks share: observations, their normalization, fields of configs, a trunk."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -13,6 +13,7 @@ from torchrl.data import Composite
 
 from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.device.memory import numbers_of_layers
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.ranks.running_moments import RunningMoments, publish
@@ -117,6 +118,10 @@ class NetworkCfg(Checked):
         # The class is frozen; a config file gives a list.
         object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
         check_choice("activation", self.activation, ACTIVATIONS)
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return what the hidden layers need."""
+        return {("hidden_dims",): numbers_of_layers(self.hidden_dims)}
 
     def build(self, input_dim: int, output_dim: int | None, **options: Any) -> nn.Module:
         """Return the layers, which map [..., input_dim] to [..., output_dim]: here an `mlp` of these fields.

@@ -22,6 +22,7 @@ from torchrl.envs.transforms import TensorDictPrimer, Transform
 from torchrl.modules import SafeProbabilisticTensorDictSequential, recurrent_mode, set_recurrent_mode
 
 from ksim_rl.checked import Checked, Count
+from ksim_rl.device.memory import NUMBERS_PER_WEIGHT
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.modules.actor import ActorCfg, make_actor
 from ksim_rl.modules.critic import CriticCfg, make_critic
@@ -85,6 +86,12 @@ class RecurrentCfg(Checked):
     kind: Literal["lstm", "gru"] = "lstm"
     hidden_dim: Count = 256
     num_layers: Count = 1
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return what the layers need, with a state per env."""
+        weights = _NUM_GATES[self.kind] * self.hidden_dim**2
+        per_layer = NUMBERS_PER_WEIGHT * weights + num_envs * self.hidden_dim
+        return {("hidden_dim", "num_layers"): self.num_layers * per_layer}
 
 
 class RecurrentNetwork(nn.Module):

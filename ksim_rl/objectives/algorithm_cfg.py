@@ -1,11 +1,13 @@
 """The settings of all algorithms: of gradient steps, of PPO, AMP and distillation, of SAC and TD3."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
-from ksim_rl.checked import Checked, Count, Filled, NonNegative, Positive, Share, Within
+from ksim_rl.checked import Checked, Count, Filled, NonNegative, Positive, Repeats, Share, Within
 from ksim_rl.checks import check_in_range
+from ksim_rl.device.memory import numbers_of_layers
 
 PositiveShare = Annotated[float, Within(low=0.0, high=1.0, low_open=True)]
 Schedule = Literal["adaptive", "fixed"]
@@ -82,7 +84,7 @@ class OnPolicyCfg(GradientCfg):
     learns_on_sequences = True
 
     max_grad_norm: Positive | None = 1.0
-    num_epochs: Count = 1
+    num_epochs: Repeats = 1
     learning_rate: Positive = 1e-3
     schedule: Schedule = "fixed"
     desired_kl: Positive = 0.01
@@ -137,7 +139,7 @@ class PPOCfg(OnPolicyCfg):
             "torch" never does. They differ by the order of sums. The metric `update/fused` says which it is.
     """
 
-    num_epochs: Count = 5
+    num_epochs: Repeats = 5
     schedule: Schedule = "adaptive"
     advantage: Literal["gae", "td_lambda", "vtrace"] = "gae"
     gamma: Share = 0.99
@@ -207,7 +209,7 @@ class AMPCfg(PPOCfg):
     discriminator_weight_decay: NonNegative = 1e-4
     gradient_penalty: NonNegative = 10.0  # of the discriminator's squared gradient at reference transitions
     logit_decay: NonNegative = 0.05  # of the squares of its last layer's weights
-    num_discriminator_steps: Count = 10  # per rollout
+    num_discriminator_steps: Repeats = 10  # per rollout
     num_transitions_per_step: Count = 4096
     # A rollout whose episodes all end at the same time takes two places per env state, and must not overwrite itself.
     replay_rollouts: Annotated[int, Within(low=3)] = 10
@@ -216,6 +218,14 @@ class AMPCfg(PPOCfg):
     def observation_groups(self) -> tuple[str, ...]:
         """The group that is compared."""
         return (self.style_group,)
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return what the discriminator needs, its transitions, and its replay of rollouts."""
+        return {
+            ("discriminator_hidden_dims",): numbers_of_layers(self.discriminator_hidden_dims),
+            ("num_transitions_per_step",): 2 * self.num_transitions_per_step,
+            ("replay_rollouts",): num_envs * self.replay_rollouts,
+        }
 
     def _check_fields(self) -> None:
         super()._check_fields()
@@ -237,7 +247,7 @@ class DistillationCfg(OnPolicyCfg):
     anything, and a normalizer never forgets such numbers.
     """
 
-    num_epochs: Count = 2
+    num_epochs: Repeats = 2
     checkpoint_fields = ("teacher",)
 
     teacher: Annotated[str, Filled("name a run folder or a checkpoint, objective.teacher=RUN")] = ""

@@ -114,6 +114,8 @@ def as_if_drawn(warp_model: mjw.Model, expanded: Collection[str]) -> Iterator[No
     present = {name: wp.clone(array) for name, array in fields.items()}
     for name, array in fields.items():
         array.fill_(_LOOKED_AT[name])
-    yield
-    for name, array in fields.items():
-        wp.copy(array, present[name])
+    try:
+        yield
+    finally:
+        for name, array in fields.items():
+            wp.copy(array, present[name])

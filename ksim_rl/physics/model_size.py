@@ -92,6 +92,12 @@ def check_text(text: str, folder: Path, label: str) -> dict[str, bytes]:
     read = _Files(label=label, folder=folder)
     elements, numbers = _count(text, folder, read, ())
     read.check_assets()
+    check_size(elements, numbers, label)
+    return read.recoded
+
+
+def check_size(elements: int, numbers: float, label: str) -> None:
+    """Refuse a model of so many elements, which beside themselves have so many numbers; `label` says where it is."""
     given = os.environ.get(VARIABLE, str(LARGEST))
     if not given.isdecimal():
         raise ValueError(f"{VARIABLE}={given!r}: expected a whole number")
@@ -102,7 +108,6 @@ def check_text(text: str, folder: Path, label: str) -> dict[str, bytes]:
             "would spend minutes or all memory on: make it smaller, or raise the environment variable "
             f"{VARIABLE} to {most}, the larger of the elements squared and the numbers (now {given})"
         )
-    return read.recoded
 
 
 def files_named(text: str, folder: Path, label: str) -> list[Path]:

@@ -16,6 +16,9 @@ from ksim_rl.scene.keyframes import complete_keyframes, move_keyframe
 from ksim_rl.scene.sensors import Sensor
 from ksim_rl.scene.terrains import Terrain
 
+# What a world of one moving body takes at least: state, kinematics, inertias and forces.
+NUMBERS_PER_WORLD = 250
+
 
 @dataclass(frozen=True, kw_only=True)
 class Placement(Checked):
@@ -96,6 +99,10 @@ class SceneCfg(Checked):
     num_envs: Count = 1  # a run's own number takes its place
     spacing: NonNegative = 2.0  # m between neighbouring envs when several are drawn in one picture
     soft_joint_pos_limit_factor: Share = 1.0  # of each joint's range, about its middle: the soft limits
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of the smallest worlds."""
+        return {("num_envs",): NUMBERS_PER_WORLD * self.num_envs}
 
     def _check_fields(self) -> None:
         super()._check_fields()

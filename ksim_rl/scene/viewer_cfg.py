@@ -1,6 +1,7 @@
 """Configures the camera of `render()`."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -27,6 +28,10 @@ class ViewerCfg(Checked):
     env_index: WholeNumber = 0  # the env that is drawn
     num_envs: Count = 1  # drawn in one picture, `scene.spacing` apart, from `env_index` on
     draw: tuple[str, ...] = (".*",)
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the pixels of a picture."""
+        return {("width", "height"): self.width * self.height}
 
     def _check_fields(self) -> None:
         super()._check_fields()

@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
-from ksim_rl.checked import Checked, Count, Positive, Share, WholeNumber
+from ksim_rl.checked import Checked, Count, Positive, Seed, Share
 from ksim_rl.checks import naming, unknown_name
 from ksim_rl.config import plain_data
 from ksim_rl.config.config_tree import from_tree
@@ -43,7 +43,7 @@ class Row(Checked):
     task: str
     objective: str
     env_states: Positive
-    seeds: tuple[WholeNumber, ...]
+    seeds: tuple[Seed, ...]
     overrides: tuple[str, ...] = ()
     measure: Literal["return", "seconds", "success"] = "return"
     episodes: Count = 128

@@ -8,12 +8,14 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl import envs, ranks
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.device.eager import eagerly
+from ksim_rl.device.memory import check_bytes, check_room
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
 from ksim_rl.trainers.algorithm import HasWarmUp, make_update
@@ -48,6 +50,7 @@ def build(
     """
     # Before anything is built, which takes long.
     check_installed(cfg.logger)
+    check_room(cfg, num_envs=cfg.num_envs, device=cfg.resolved_device())
     # Before any network is made, as the weights are drawn from it.
     torch.manual_seed(cfg.seed)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
@@ -67,6 +70,7 @@ def build(
         update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
     if cfg.trainer.stop_at and not hooks:  # which may log figures of their own
         check_targets(cfg, update.metrics())
+    _check_rollout(cfg, env, update.rollout_keys)
     # It stores only the leaves that the update reads.
     collector = RolloutCollector(
         env,
@@ -104,6 +108,20 @@ def build(
         # Last, because a run that cannot be built must not show up anywhere.
         trainer.loggers = make_loggers(cfg.logger, run_folder, config=trainer.config)
     return trainer
+
+
+def _check_rollout(cfg: RunCfg, env: EnvBase, keys: Sequence[NestedKey]) -> None:
+    """Refuse rollouts whose observations alone no memory holds, before the first of their steps."""
+    observations = env.observation_spec.items(include_nested=True, leaves_only=True)
+    # Of one step of all envs.
+    stored = sum(leaf.shape.numel() * leaf.dtype.itemsize for key, leaf in observations if key in keys)
+    length = cfg.data.rollout_length(cfg.num_envs)
+    check_bytes(
+        f"rollouts of {length} steps, by {cfg.data}",
+        length * stored,
+        num_envs=cfg.num_envs,
+        device=cfg.resolved_device(),
+    )
 
 
 def default_threads(device: torch.device) -> int:

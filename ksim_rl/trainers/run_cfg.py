@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import torch
 
 from ksim_rl import ranks
-from ksim_rl.checked import Checked, Count, Positive, WholeNumber, Within
+from ksim_rl.checked import Checked, Count, Seed, WholeNumber, Within
 from ksim_rl.checks import near
 from ksim_rl.collectors import CollectorCfg
 from ksim_rl.config import class_paths, plugins
@@ -31,10 +31,9 @@ from ksim_rl.modules import (
     SquashedActorCfg,
 )
 from ksim_rl.objectives import AlgorithmCfg
+from ksim_rl.scene.scene import NUMBERS_PER_WORLD
 from ksim_rl.trainers.loggers import LoggerCfg
 
-# Seeds of evaluations lie above a run's own, and must fit 64 bits as well.
-MOST_SEED = 2**62
 PLUGINS = "plugins"
 # It becomes part of the path of the run folder.
 TASK_NAME = re.compile(r"\w[\w.+-]*")
@@ -72,7 +71,11 @@ class TrainerCfg(Checked):
     num_threads: Annotated[int, Within(low=1, high=1024)] | None = None
     matmul_precision: Literal["highest", "high", "medium"] = "high"  # of float32 on CUDA; "high" is TF32
     video: bool = True  # of the final policy
-    video_s: Positive = 10.0  # its length, s
+    video_s: Annotated[float, Within(low=0.0, high=3600.0, low_open=True)] = 10.0  # its length, s
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of the smallest worlds of an evaluation."""
+        return {("eval_episodes",): NUMBERS_PER_WORLD * self.eval_episodes}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +159,7 @@ class TrainingCfg(Checked):
     """Settings of training without the env: recommended by a task, and the larger part of a run's config."""
 
     num_envs: Count  # parallel envs
-    seed: WholeNumber = 1  # of all draws
+    seed: Seed = 1  # of all draws
     objective: AlgorithmCfg  # its class says which algorithm learns
     data: DatasetCfg | ReplayCfg
     modules: ModulesCfg = field(default_factory=ModulesCfg)
@@ -190,8 +193,6 @@ class RunCfg(TrainingCfg):
             raise ValueError(
                 f"task_name={self.task_name!r}: expected letters, digits and _.+-, as it names a folder"
             )
-        if self.seed > MOST_SEED:
-            raise ValueError(f"seed={self.seed}: expected at most {MOST_SEED}")
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"device={self.device!r}: expected 'auto', 'cpu', 'cuda' or 'cuda:<index>'")
         # "auto" passes, as it falls back to the CPU.

@@ -15,7 +15,7 @@ from ksim_rl import ranks
 from ksim_rl.config.class_paths import loading_notes
 from ksim_rl.config.plugins import load as load_plugins
 from ksim_rl.device import state_tree
-from ksim_rl.device.memory import memory_for
+from ksim_rl.device.memory import check_room, memory_for
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.files.writing import whole_file, write_whole
 from ksim_rl.runs.listing import CONFIG, METRICS
@@ -165,6 +165,7 @@ def policy_of(saved: checkpoint.Checkpoint, *, device: str = "auto", cfg: RunCfg
     if cfg is None:
         cfg = RunCfg.from_tree({**saved.config, "device": device})
     cfg = without_nan_guard(kept_models.with_kept_models(cfg, saved.run_folder))
+    check_room(cfg.modules, num_envs=1, device=cfg.resolved_device(), path="modules")
     # One env is enough: the networks' shapes follow from its specs.
     env = build_env(cfg, num_envs=1, seed=cfg.seed)
     actor = make_policy(cfg, env)

@@ -1,5 +1,6 @@
 """Observations and actions arrive some env steps late by the transforms of this module."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -40,6 +41,10 @@ class DelayCfg(Checked):
             raise ValueError(
                 f"hold_probability={self.hold_probability} without resample_every: there is no draw to hold"
             )
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of the newest value and those before it."""
+        return {("max_lag",): num_envs * (self.max_lag + 1)}
 
 
 class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):

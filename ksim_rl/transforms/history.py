@@ -1,6 +1,6 @@
 """The base of transforms that remember the last values of signals, and histories of observations."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,6 +120,15 @@ class HistoryCfg(Checked):
     flat: bool = True
     """True puts frame after frame into one vector [E, N * L]; False stacks them to [E, N, ...]."""
 
+    @property
+    def num_slots(self) -> int:
+        """Frames that are kept: from the newest back to the oldest, with those between."""
+        return (self.length - 1) * self.stride + 1
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of the frames that are kept."""
+        return {("length", "stride"): num_envs * self.num_slots}
+
 
 class ObservationHistory(RingTransform):
     """The last frames of observations (see `HistoryCfg`); frames from before a reset are the reset observation.
@@ -131,14 +140,13 @@ class ObservationHistory(RingTransform):
     def __init__(
         self, in_keys: Keys, out_keys: Keys | None = None, *, length: int, stride: int = 1, flat: bool = True
     ) -> None:
-        HistoryCfg(length=length, stride=stride, flat=flat)
+        cfg = HistoryCfg(length=length, stride=stride, flat=flat)
         super().__init__(in_keys, out_keys)
         self._register_rings()
         self.num_frames = self.length = length
         self.stride = stride
         self.flat = flat
-        # From the newest frame back to the oldest, with the values between.
-        self.num_slots = (length - 1) * stride + 1
+        self.num_slots = cfg.num_slots
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         leaves = self._replace_leaves(

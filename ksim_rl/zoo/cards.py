@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ksim_rl.checked import Checked, WholeNumber
+from ksim_rl.checked import Checked, Seed, Total, WholeNumber
 from ksim_rl.checks import near
 from ksim_rl.files.reading import read_bytes
 from ksim_rl.terminal import printable
@@ -35,10 +35,10 @@ class Card(Checked):
     name: str
     task: str
     commit: str
-    seed: WholeNumber
+    seed: Seed
     num_envs: WholeNumber
     iteration: WholeNumber
-    env_states: WholeNumber
+    env_states: Total
     return_mean: float | None = None
     curve: Sequence[tuple[int, float]] = ()
     sim2sim: Mapping[str, float] = field(default_factory=dict)

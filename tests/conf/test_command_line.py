@@ -44,7 +44,7 @@ WRONG = [
     ("just_a_word", "does not parse"),
     ("task_name=cartpole_swingup", "the name comes with the task; choose that with task=name"),
     ("~logger", "a run needs each group; choose another with logger=name: local, "),
-    ("trainer.num_threads=100000", "trainer.num_threads=100000: expected a finite number in [1, 1024]"),
+    ("trainer.num_threads=100000", "trainer.num_threads=100000: expected a whole number of at most 1024"),
 ]
 
 

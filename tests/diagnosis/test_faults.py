@@ -75,3 +75,12 @@ def test_every_check_says_what_to_change():
     for fault in faults.FAULTS:
         reason, _, change = (fault.__doc__ or "").partition("\n\n")
         assert reason.strip() and change.strip(), fault.__name__
+
+
+def test_values_that_few_rows_have_are_early_and_late_by_themselves():
+    every_tenth = [float(row) if row % 10 == 0 else None for row in range(100)]
+    curves = Curves(
+        columns={"evaluation/return": every_tenth, "iteration": [float(row) for row in range(100)]}
+    )
+    assert (curves.early("evaluation/return"), curves.late("evaluation/return")) == (10.0, 80.0)
+    assert (curves.early("iteration"), curves.late("iteration")) == (9.5, 89.5)

@@ -109,6 +109,21 @@ def test_the_term_is_named_with_env_and_step(kind, value):
     assert line in env.explain(width=200)
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_sums_of_episodes_keep_the_finite_rewards(value):
+    env = puck_env(num_envs=4, limit=None, **FAULTS["reward"](env=2, step=3, value=value))
+    root_E = env.reset()
+    rewards_TE = []
+    for _ in range(5):
+        root_E = push(env, root_E)["next"]
+        rewards_TE.append(root_E["reward"].flatten())
+    # The reward itself is not mended in silence.
+    assert [row.isfinite().all().item() for row in rewards_TE] == [True, True, False, True, True]
+    sums_E = env.reward_manager.episode_sums_ER[:, env.reward_manager.names.index("odd")]
+    assert sums_E.isfinite().all()
+    assert sums_E[2].item() == pytest.approx(0.8 * sums_E[0].item())
+
+
 def test_watching_makes_no_host_sync_and_finite_terms_are_not_named():
     env = puck_env(num_envs=4, **FAULTS["reward"](step=-1))
     root_E = push(env, env.reset())["next"]

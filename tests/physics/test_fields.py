@@ -10,6 +10,7 @@ import warp as wp
 
 from ksim_rl.physics import SimCfg, World, load_model, prepare_spec
 from ksim_rl.physics.constants.least_weights import SHARE
+from ksim_rl.physics.field_effects import as_if_drawn
 from ksim_rl.physics.fields import const_groups
 from tests.physics.models import cartpole, quadruped, standing_quadrupeds
 
@@ -297,3 +298,12 @@ def test_rows_are_recomputed_in_one_launch(monkeypatch):
     monkeypatch.setattr(wp, "launch", lambda kernel, **_: launched.append(kernel.func.__name__))
     world._masked_constants.launch(const_groups(INERTIAL, world.mj_model))
     assert launched == ["constants_at_qpos0"]
+
+
+def test_a_field_gets_its_numbers_back_where_building_kernels_fails():
+    world = World(quadruped(), num_envs=2, sim=SIM, per_world_fields=["geom_margin"])
+    own = world.warp_model.geom_margin.numpy().copy()
+    with pytest.raises(RuntimeError), as_if_drawn(world.warp_model, ["geom_margin"]):
+        assert (world.warp_model.geom_margin.numpy() != own).all()
+        raise RuntimeError
+    assert (world.warp_model.geom_margin.numpy() == own).all()

@@ -41,7 +41,11 @@ def test_a_run_names_its_engine_and_one_that_does_not_was_made_by_warp(cfg):
         ("num_envs", 0, r"num_envs=0: expected a whole number >= 1"),
         ("num_envs", "many", r"num_envs='many': expected int"),
         ("seed", -1, r"seed=-1: expected a whole number >= 0"),
-        ("seed", 2**63 - 1, r"seed=9223372036854775807: expected at most 4611686018427387904"),
+        (
+            "seed",
+            2**63 - 1,
+            r"seed=9223372036854775807: expected a whole number of at most 4611686018427387904",
+        ),
         ("device", "gpu", r"device='gpu': expected 'auto', 'cpu', 'cuda' or"),
         ("trainer.num_iterations", 0, r"trainer.num_iterations=0: expected a whole number >= 1"),
         ("trainer.matmul_precision", "hig", r"trainer.matmul_precision='hig': did you mean 'high'"),

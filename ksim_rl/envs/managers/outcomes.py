@@ -148,7 +148,8 @@ class RewardManager(_OutcomeManager):
         weighted_ER = value_ER * (self.weights_R * self._scale)
         # Failed rows give 0 before the sums, where a NaN would stay until the log is cleared.
         weighted_ER = torch.where(finite_E[:, None], weighted_ER, 0.0)
-        self.episode_sums_ER.add_(weighted_ER)
+        # A number that is not finite stays in the reward and is named; in the sums it would hide all others.
+        self.episode_sums_ER.add_(torch.nan_to_num(weighted_ER, nan=0.0, posinf=0.0, neginf=0.0))
         return weighted_ER.sum(-1)
 
 

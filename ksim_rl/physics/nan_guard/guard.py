@@ -38,6 +38,10 @@ class NanGuardCfg(Checked):
     history: Count = 20
     max_files: Count = 4
 
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of the substeps that are kept."""
+        return {("history",): num_envs * self.history}
+
 
 @dataclass(frozen=True, kw_only=True)
 class NanReport:

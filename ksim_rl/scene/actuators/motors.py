@@ -105,6 +105,10 @@ class DelayedActuator(Actuator):
     lag_group: str = ""
     """Entries of a group, of whichever robot, have one lag in each env, and so the same bounds."""
 
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of the targets that are kept."""
+        return {("max_lag",): num_envs * (self.max_lag + 1)}
+
     def _check_fields(self) -> None:
         super()._check_fields()
         # Equal bounds mean a fixed lag.

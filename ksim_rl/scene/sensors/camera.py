@@ -1,5 +1,6 @@
 """Renders the cameras of all worlds on the device."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -52,6 +53,10 @@ class CameraSensor(Sensor):
         # A camera that draws nothing would fail where it is read.
         if not (self.rgb or self.depth or self.segmentation):
             raise ValueError("rgb=False, depth=False, segmentation=False: draw at least one of them")
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the pixels of all worlds."""
+        return {("width", "height"): num_envs * self.width * self.height}
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
         """Add the camera `<name>` to its body, unless the model has it."""

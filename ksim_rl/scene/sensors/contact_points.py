@@ -1,5 +1,6 @@
 """Senses contacts one by one: where each is, how deep, in which direction, and with which force and torque."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product as pairs_of
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -40,6 +41,10 @@ class ContactPoints(ContactElements):
     num_slots: Count = 1
     order: Literal["deepest", "strongest"] = "strongest"
     history: Count = 1
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of the forces that are kept, of one pair."""
+        return {("num_slots", "history"): 3 * num_envs * self.num_slots * self.history}
 
     def add_to(self, spec: mujoco.MjSpec, name: str) -> None:
         """Add one MJCF contact sensor `<name>_<element>_<partner>` per pair."""

@@ -5,6 +5,7 @@ Patterns are in the sensor's own axes: x forward, y left, z up.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
@@ -59,6 +60,10 @@ class GridPattern(RayPattern):
         direction = np.asarray(self.direction) / np.linalg.norm(self.direction)
         return start_N3, np.broadcast_to(direction, start_N3.shape)
 
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the distances that all rays measure."""
+        return {("size", "resolution"): num_envs * math.prod(edge / self.resolution for edge in self.size)}
+
 
 @dataclass(frozen=True, kw_only=True)
 class PinholePattern(RayPattern):
@@ -70,6 +75,10 @@ class PinholePattern(RayPattern):
     width: Count = 16
     height: Count = 12
     fovy: Annotated[float, Within(low=0.0, high=179.0, low_open=True)] = 60.0
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the distances that all rays measure."""
+        return {("width", "height"): num_envs * self.width * self.height}
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         # The edge of a pixel at a distance of 1.
@@ -94,6 +103,10 @@ class RingPattern(RayPattern):
 
     num_rays: Count = 36
     elevations: Annotated[tuple[Elevation, ...], Filled("give at least one ring, such as (0.0,)")] = (0.0,)
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the distances that all rays measure."""
+        return {("num_rays",): num_envs * self.num_rays}
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         # Without 2 pi itself, which is the direction of 0.

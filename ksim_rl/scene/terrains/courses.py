@@ -6,9 +6,9 @@ from typing import Annotated
 
 import numpy as np
 
-from ksim_rl.checked import Count, NonNegative, NonNegativeRange, Positive, Share, WholeNumber, Within
+from ksim_rl.checked import Count, NonNegative, NonNegativeRange, Positive, Repeats, Share, Within
 from ksim_rl.checks import check_in_range
-from ksim_rl.scene.terrains.patch import TIE, Cell, EasyToHard, Lattice, TerrainPatch, between
+from ksim_rl.scene.terrains.patch import TIE, Cell, EasyToHard, Lattice, Pieces, TerrainPatch, between
 
 
 def in_cells(length: float, lattice: Lattice, *, least: int) -> int:
@@ -33,7 +33,7 @@ class PerlinNoise(TerrainPatch):
     def _check_fields(self) -> None:
         super()._check_fields()
         # Less than two cells per wave of the last octave would be noise without a shape.
-        finest = self.wave_length / 2 ** (self.octaves - 1)
+        finest = self.wave_length * 0.5 ** (self.octaves - 1)
         if finest < 2 * self.cell:
             raise ValueError(
                 f"octaves={self.octaves} of wave_length={self.wave_length}: the last one's waves of {finest:g} m need "
@@ -179,7 +179,7 @@ class RandomBoxes(TerrainPatch):
     height: EasyToHard = (0.05, 0.3)
     least_share: Share = 0.2
     width: NonNegativeRange = (0.3, 1.0)
-    num_boxes: WholeNumber = 60
+    num_boxes: Pieces = 60
     platform_width: NonNegative = 1.5
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
@@ -237,7 +237,7 @@ class NarrowBeams(TerrainPatch):
     """Beams that lead from an even platform outwards, like spokes, evenly spaced, over a pit."""
 
     beam_width: EasyToHard = (0.5, 0.25)
-    num_beams: Count = 8
+    num_beams: Repeats = 8
     depth: NonNegative = 0.5
     platform_width: Positive = 1.5
     cell: Cell = 0.05

@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from ksim_rl import ranks
-from ksim_rl.checked import Count, Filled, Positive, WholeNumber
+from ksim_rl.checked import Count, Filled, Positive, Seed, WholeNumber
 from ksim_rl.checks import check_count, check_in_range
+from ksim_rl.physics.model_size import check_size
 from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.state.world_view import WorldView
 from ksim_rl.scene.terrains.patch import TIE, Lattice, TerrainPatch
@@ -57,12 +58,20 @@ class TerrainGrid(Terrain):
     size: Positive = 8.0
     max_initial_level: WholeNumber = 5
     spawn_width: float = 1.4
-    seed: WholeNumber = 0
+    seed: Seed = 0
     friction: Friction = (1.0, 0.005, 0.0001)
 
     def _check_fields(self) -> None:
         super()._check_fields()
         check_count("num_columns", self.num_columns, low=len(self.patches))
+        # Before the height of each point is worked out.
+        finest = min(patch.cell for patch in self.patches.values())
+        patches = self.num_levels * self.num_columns
+        check_size(
+            elements=patches,
+            numbers=patches * math.ceil((self.size / finest) ** 2),
+            label=f"num_levels={self.num_levels}, num_columns={self.num_columns}, size={self.size}, cell={finest}",
+        )
         check_in_range("spawn_width", self.spawn_width, low=0.0, high=self.size)
 
     @property

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ksim_rl.checked import NonNegative, NonNegativeRange, Positive, WholeNumber, Within
+from ksim_rl.checked import NonNegative, NonNegativeRange, Positive, Within
 from ksim_rl.checks import check_in_range
-from ksim_rl.scene.terrains.patch import TIE, Cell, EasyToHard, Lattice, TerrainPatch, between
+from ksim_rl.scene.terrains.patch import TIE, Cell, EasyToHard, Lattice, Pieces, TerrainPatch, between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +106,7 @@ class DiscreteObstacles(TerrainPatch):
 
     height: EasyToHard = (0.02, 0.2)
     width: NonNegativeRange = (0.3, 1.0)
-    num_obstacles: WholeNumber = 60
+    num_obstacles: Pieces = 60
     platform_width: NonNegative = 1.5
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:

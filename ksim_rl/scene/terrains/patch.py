@@ -13,6 +13,8 @@ TIE = 1e-6
 """m. Lattice points that lie on an edge of a pattern belong to its inside, whatever the coordinates round to."""
 
 
+Pieces = Annotated[int, Within(low=0, high=10_000)]
+"""How many things are laid on a patch, one after the other."""
 Cell = Annotated[float, Within(low=0.01)]
 """m between the points at which heights are given."""
 EasyToHard = Annotated[tuple[float, float], Within(low=0.0)]

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from mujoco import rollout
 from torch import Tensor
 
-from ksim_rl.checked import NonNegative, Range, WholeNumber, Within
+from ksim_rl.checked import NonNegative, Range, Seed, WholeNumber, Within
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant
@@ -121,7 +121,7 @@ class StartFromBank(StartRule):
     without_contacts: bool = False
     settle_steps: WholeNumber = 0
     size: Annotated[int, Within(low=4096)] = 4096
-    bank_seed: WholeNumber = 0
+    bank_seed: Seed = 0
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         known = _BANKS.setdefault(view.world, {})

@@ -53,6 +53,10 @@ class ObservationTermCfg(Checked):
                 "history.flat=False: frames in a vector are flat; stack those of the whole group"
             )
 
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of a history that is given by its length."""
+        return _numbers_of_frames(self.history, num_envs)
+
     @property
     def is_image(self) -> bool:
         """Whether the term reads an image, which is not put into a vector."""
@@ -86,6 +90,10 @@ class ObservationGroupCfg(Checked):
                 "give it a group of its own"
             )
 
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return the numbers of a history that is given by its length."""
+        return _numbers_of_frames(self.history, num_envs)
+
     def num_frames(self, term: str) -> int:
         """Return how many frames of a term the vector holds side by side."""
         for history in (self.terms[term].history, self.history):
@@ -95,6 +103,13 @@ class ObservationGroupCfg(Checked):
                     return frames.length
                 return 1
         return 1
+
+
+def _numbers_of_frames(history: int | HistoryCfg | None, num_envs: int) -> Mapping[tuple[str, ...], float]:
+    # A config of its own tells for itself.
+    if isinstance(history, int):
+        return {("history",): num_envs * history}
+    return {}
 
 
 def history_cfg(history: int | HistoryCfg | None) -> HistoryCfg | None:
