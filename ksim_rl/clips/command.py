@@ -5,7 +5,7 @@ from pathlib import Path
 
 import mujoco
 
-from ksim_rl.checks import OneLineParser, near
+from ksim_rl.checks import OneLineParser, naming, near
 from ksim_rl.clips.amass import HEIGHT, read_amass
 from ksim_rl.clips.bvh import read_bvh
 from ksim_rl.clips.motion_file import write_motion
@@ -50,7 +50,9 @@ def motion(arguments: Sequence[str]) -> int:
             recording = read_bvh(options.source, scale=options.unit, y_up=not options.z_up)
         else:
             recording = read_amass(options.source, height=options.height)
-        qpos_FL = retargeted(recording, model, read_retarget(options.pairs), fps=options.fps)
+        pairs = read_retarget(options.pairs)
+        with naming(str(options.source)):
+            qpos_FL = retargeted(recording, model, pairs, fps=options.fps)
     write_motion(options.motion, model, qpos_FL, options.fps)
     show(f"{options.motion}: {len(qpos_FL)} frames, {(len(qpos_FL) - 1) / options.fps:.2f} s")
     return 0

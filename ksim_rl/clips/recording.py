@@ -8,8 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ksim_rl.checked import Checked, Positive
+from ksim_rl.checks import check_in_range
+from ksim_rl.scene.motions.motion import FASTEST, SLOWEST
 
 Array = np.ndarray
+
+
+# Two days at 50 per second.
+MOST_FRAMES = 10**7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +43,20 @@ class Recording(Checked):
 
 
 def between(count: int, fps: float, wanted_fps: float) -> tuple[Array, Float[Array, " F"]]:
-    """Return for each frame at another rate the frame before it, and the part of the way to the next one."""
+    """Return for each frame at another rate the frame before it, and the part of the way to the next one.
+
+    A ValueError refuses rates that no recording has, and one so low that its frames would last for days.
+    """
+    for name, rate in (("frames per second of the recording", fps), ("frames per second", wanted_fps)):
+        check_in_range(name, rate, low=SLOWEST, high=FASTEST)
+    wanted = (count - 1) / fps * wanted_fps
+    if wanted > MOST_FRAMES:
+        raise ValueError(
+            f"{count} frames, {fps:g} of them per second, are {wanted:g} at {wanted_fps:g} per second: expected "
+            f"{MOST_FRAMES} at most; repair the rate"
+        )
     # The small number keeps the last frame where the division falls just short of it.
-    times_F = np.arange(0, int((count - 1) / fps * wanted_fps + 1e-6) + 1) / wanted_fps
+    times_F = np.arange(0, int(wanted + 1e-6) + 1) / wanted_fps
     # At most the last but one, so that there is always a next frame.
     low_F = np.minimum((times_F * fps + 1e-9).astype(int), count - 2)
     return low_F, np.clip(times_F * fps - low_F, 0.0, 1.0)

@@ -1,10 +1,12 @@
 """Rotations, chains of joints, and other rates, against closed forms and MuJoCo's own quaternions."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
 
-from ksim_rl.clips.recording import Recording, chain, from_rotation_vector, multiply, rotate, slerp
+from ksim_rl.clips.recording import Recording, between, chain, from_rotation_vector, multiply, rotate, slerp
 
 
 def test_quaternions_are_those_of_mujoco():
@@ -47,3 +49,25 @@ def test_other_rates_meet_a_motion_of_constant_speed():
     assert played.pos_FN3[:, 0, 0] == pytest.approx(2.0 * at_F)
     angle_F = 2.0 * np.arctan2(played.quat_FN4[:, 0, 3], played.quat_FN4[:, 0, 0])
     assert np.unwrap(angle_F, period=4 * np.pi) == pytest.approx(3.0 * at_F, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("fps", "wanted", "said"),
+    [
+        (
+            1e-300,
+            50.0,
+            "frames per second of the recording=1e-300: expected a finite number in [0.01, 100000.0]",
+        ),
+        (np.inf, 50.0, "frames per second of the recording=inf: expected a finite number"),
+        (30.0, 0.0, "frames per second=0.0: expected a finite number"),
+        (
+            0.01,
+            1e5,
+            "3 frames, 0.01 of them per second, are 2e+07 at 100000 per second: expected 10000000 at most",
+        ),
+    ],
+)
+def test_rates_by_which_few_frames_last_for_ever_are_refused(fps, wanted, said):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        between(3, fps, wanted)

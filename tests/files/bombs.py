@@ -67,6 +67,20 @@ def yaml_of_keys_that_are_compared(folder):
 
 
 @bomb
+def yaml_of_a_number_that_nobody_can_print(folder):
+    path = folder / "config.yaml"
+    path.write_text("num_envs: 0x" + "f" * 500_000)
+    return lambda: read_yaml(path)
+
+
+@bomb
+def yaml_of_more_digits_than_python_reads(folder):
+    path = folder / "config.yaml"
+    path.write_text("num_envs: " + "9" * 5000)
+    return lambda: read_yaml(path)
+
+
+@bomb
 def group_of_references(folder):
     """Each text is the one before it twice, which Hydra writes out."""
     path = folder / "objective" / "long.yaml"
@@ -190,6 +204,43 @@ def motion_of_terabytes(folder):
 def motion_whose_size_overflows(folder):
     path = folder / "motion.npz"
     claims(path, "qpos", (2**62, 2**62), fps=np.float64(30.0), qvel=np.zeros((2, 6)))
+    return lambda: motion._read(path)
+
+
+def _archive_of(path: Path, shape: str) -> None:
+    """Write a motion whose header has this text for a shape."""
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(
+            "qpos.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(8)
+        )
+
+
+@bomb
+def motion_whose_header_exhausts_the_parser(folder):
+    path = folder / "motion.npz"
+    _archive_of(path, "(" + "-" * 8000 + "1,)")
+    return lambda: motion._read(path)
+
+
+@bomb
+def motion_whose_header_never_ends(folder):
+    path = folder / "motion.npz"
+    _archive_of(path, "(" * 5000)
+    return lambda: motion._read(path)
+
+
+@bomb
+def motion_whose_size_is_a_truth_value(folder):
+    path = folder / "motion.npz"
+    _archive_of(path, "(True,)")
+    return lambda: motion._read(path)
+
+
+@bomb
+def motion_of_words(folder):
+    path = folder / "motion.npz"
+    np.savez(path, fps="fast", qpos=np.array([["a"]]), qvel=np.array([["b"]]))
     return lambda: motion._read(path)
 
 

@@ -163,8 +163,13 @@ def test_the_settings_win_over_the_probe():
 )
 def test_more_than_warp_can_count_is_refused_by_name(field, number, most):
     capacity.check_countable(**{"njmax": 1, "nconmax": 1, field: most}, num_envs=4)
-    sim = SimCfg(**{"njmax": 1, "nconmax": 1, field: number}, engine="warp")
     with pytest.raises(ValueError, match=f"sim.{field}={number}: expected at most {most} for num_envs=4"):
+        capacity.check_countable(**{"njmax": 1, "nconmax": 1, field: number}, num_envs=4)
+
+
+def test_a_world_of_more_contacts_than_warp_can_count_is_refused():
+    sim = SimCfg(njmax=1, nconmax=10**9, engine="warp")
+    with pytest.raises(ValueError, match=r"sim.nconmax=1000000000: expected at most \d+ for num_envs=4"):
         World(cartpole(), num_envs=4, device="cpu", sim=sim)
 
 

@@ -18,6 +18,8 @@ from ksim_rl.scene.near_names import NearNames
 
 KEYS = ("fps", "qpos", "qvel")
 _OPTIONAL = ("joint_names",)
+# Frames per second: beyond these, a motion would last for years, or no time at all.
+SLOWEST, FASTEST = 1e-2, 1e5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,9 +116,9 @@ def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device
     arrays = _read(motion_path(str(file)))
     # One number, also as an array.
     fps = arrays["fps"]
-    if fps.size != 1 or not np.isfinite(fps).all() or fps.item() <= 0.0:
+    if fps.size != 1 or not SLOWEST <= fps.item() <= FASTEST:
         raise ValueError(
-            f"motion {file}: fps={fps.tolist()!r}: expected one positive number of frames per second"
+            f"motion {file}: fps={fps.tolist()!r}: expected one number of frames per second, {SLOWEST:g} to {FASTEST:g}"
         )
     for key, width, kind in (("qpos", mj_model.nq, "nq"), ("qvel", mj_model.nv, "nv")):
         array = arrays[key]
@@ -185,6 +187,8 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
     for key in KEYS:
         if key not in arrays:
             raise ValueError(f"motion {path}: no array {key!r}: it has {', '.join(sorted(arrays)) or 'none'}")
+        if arrays[key].dtype.kind not in "fiu":
+            raise ValueError(f"motion {path}: {key} is {arrays[key].dtype}: expected numbers")
     unknown = sorted(arrays.keys() - {*KEYS, *_OPTIONAL})
     if unknown:
         raise ValueError(
