@@ -94,8 +94,7 @@ def touched_accepted(mj_model: mujoco.MjModel, state: Mapping[str, np.ndarray], 
     mj_data = put(state, mj_model)
     for _ in range(substeps - 1):
         mujoco.mj_step(mj_model, mj_data)
-        contact = mj_data.contact
-        if accepted.depths(np.array(contact.geom), np.array(contact.dist), mj_model.geom_type):
+        if accepted.depths_in_c(mj_data):
             return True
     return False
 

@@ -243,9 +243,9 @@ class _Trial:
         self, row: int, mj_data: mujoco.MjData, found: tuple[np.ndarray, np.ndarray], when: str
     ) -> bool:
         """Whether contacts that may differ decide a world; their depths are compared."""
-        geom_type = mj_data.model.geom_type
-        wanted = accepted.depths(np.array(mj_data.contact.geom), np.array(mj_data.contact.dist), geom_type)
-        actual = accepted.depths(*found, geom_type)
+        mj_model = mj_data.model
+        wanted = accepted.depths_in_c(mj_data)
+        actual = accepted.depths(mj_model, *found)
         if not wanted and not actual:
             return False
         self._add(accepted=self.verdict.accepted + 1)
@@ -254,9 +254,9 @@ class _Trial:
             return True
         for pair in wanted.keys() & actual.keys():
             error = abs(wanted[pair] - actual[pair])
-            limit = accepted.depth_limit(mj_data.model, pair, wanted[pair], actual[pair])
+            limit = accepted.depth_limit(mj_model, pair, wanted[pair], actual[pair])
             if limit is not None and not error <= limit:
-                kinds = " ".join(mujoco.mjtGeom(kind).name[7:].lower() for kind in geom_type[list(pair)])
+                kinds = " ".join(accepted.name_of(kind) for kind in accepted.kinds_of(mj_model, pair))
                 self._find(f"depth {kinds}", error, limit, row, when)
         return True
 
@@ -322,9 +322,12 @@ def _is_of_adhesion(mj_model: mujoco.MjModel, sensor: int) -> bool:
 
 
 def _contacts(world: WarpWorld) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the geoms [N, 2] and distances [N] of each world's contacts."""
+    """Return the parts [N, 2] and distances [N] of each world's contacts."""
     count = int(world.last_substep("nacon").item())
     owners = world.last_substep("contact.worldid")[:count].numpy(force=True)
-    geoms = world.last_substep("contact.geom")[:count].numpy(force=True)
     dist = world.last_substep("contact.dist")[:count].numpy(force=True)
-    return [(geoms[owners == row], dist[owners == row]) for row in range(world.num_envs)]
+    # Models without flexes have no arrays of them.
+    names = ["geom", "flex", "elem"] if world.mj_model.nflex else ["geom", "geom", "geom"]
+    numbers = (world.last_substep(f"contact.{name}")[:count].numpy(force=True) for name in names)
+    parts = accepted.parts_of(world.mj_model, *numbers)
+    return [(parts[owners == row], dist[owners == row]) for row in range(world.num_envs)]
