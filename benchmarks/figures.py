@@ -26,6 +26,7 @@ TASK = ("ksim_rl/tasks", "ksim_rl/trainers/trainer.py")
 MEASURED: dict[str, tuple[str, ...]] = {
     "agreement": STEP[:1],
     "before_and_now": (*STEP, *LEARN),
+    "cards": ("ksim_rl/transfer", "ksim_rl/zoo", *STEP),
     "collector": (*STEP, "ksim_rl/collectors"),
     "dm_control": (*STEP, *LEARN, "ksim_rl/suites"),
     "determinism": (*STEP, *LEARN, *TASK),

@@ -47,6 +47,7 @@ GROUPS = {
     "tools": (
         "tables",
         "viewer",
+        "transfer",
         "zoo",
         "export",
         "diagnosis",

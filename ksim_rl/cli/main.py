@@ -31,6 +31,7 @@ usage: ksim-rl <command> [arguments]
   compare  a table and a picture:   ksim-rl compare RUN1 RUN2
   export   a folder that runs elsewhere:  ksim-rl export RUN
   sim2sim  run it on MuJoCo's C engine:   ksim-rl sim2sim RUN/export --episodes 100
+  card     what a policy keeps under other conditions:  ksim-rl card zoo:go1 --episodes 32
   identify the numbers of a robot's joints, from a log:  ksim-rl identify LOG.csv --robot go2
            what to log:             ksim-rl identify --propose go2
   diagnose what goes wrong in learning:   ksim-rl diagnose RUN
@@ -66,6 +67,7 @@ COMMANDS = {
     "compare": "ksim_rl.cli.runs:compare",
     "export": "ksim_rl.export.sim2sim:run_export",
     "sim2sim": "ksim_rl.export.sim2sim:run_sim2sim",
+    "card": "ksim_rl.transfer.command:card",
     "identify": "ksim_rl.identification.command:identify",
     "diagnose": "ksim_rl.diagnosis.diagnose:command",
     "doctor": "ksim_rl.diagnosis.doctor:command",

@@ -1,0 +1,39 @@
+"""A policy is judged as an evaluation judges it, and conditions reach the worlds."""
+
+import dataclasses
+
+import pytest
+
+from ksim_rl.trainers import checkpoint
+from ksim_rl.trainers.build import build_evaluator
+from ksim_rl.trainers.run_folder import policy_of
+from ksim_rl.transfer.conditions import CONDITIONS
+from ksim_rl.transfer.judge import judge
+from ksim_rl.zoo.cards import FOLDER
+
+BY_NAME = {condition.name: condition for condition in CONDITIONS}
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return policy_of(checkpoint.load_latest(FOLDER / "quadruped"), device="cpu")
+
+
+@pytest.mark.full
+def test_as_trained_is_an_evaluation_on_the_c_engine(policy):
+    found = judge(policy.cfg, policy.actor, CONDITIONS[0], episodes=4)
+    sim = dataclasses.replace(policy.cfg.task.sim, engine="c", one_kernel_dynamics=None)
+    task = dataclasses.replace(policy.cfg.task, sim=sim)
+    evaluator = build_evaluator(dataclasses.replace(policy.cfg, task=task), policy.actor, episodes=4)
+    assert found.return_mean == pytest.approx(evaluator().return_mean)
+    assert 0.0 < found.effort <= 1.0 and found.speed > 0.5 and found.power > 1.0
+    assert found.impact > 0.0 and set(found.errors) == {"linear_velocity_error", "angular_velocity_error"}
+
+
+@pytest.mark.full
+def test_limits_of_effort_reach_the_worlds(policy):
+    strong = judge(policy.cfg, policy.actor, CONDITIONS[0], episodes=2)
+    weak = judge(policy.cfg, policy.actor, BY_NAME["a battery that is empty"], episodes=2)
+    # Of the limit of the robot's files no more than what is left of it.
+    assert weak.effort <= 0.7 + 1e-4 < strong.effort + 0.7
+    assert weak.return_mean != strong.return_mean
