@@ -40,7 +40,7 @@ from ksim_rl.checks import check_in_range
 from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-from ksim_rl.mdp.commands import UniformVelocityCommand
+from ksim_rl.mdp.commands.velocity import UniformVelocityCommand
 from ksim_rl.mdp.curricula import TerrainLevels
 from ksim_rl.mdp.events import PushByVelocity, ResetRootUniform
 from ksim_rl.mdp.fields import distance_from_origin

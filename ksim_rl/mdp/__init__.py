@@ -7,7 +7,10 @@ or draw a field that they do not name.
 import inspect
 
 from ksim_rl.mdp.actions import *  # noqa: F403
-from ksim_rl.mdp.commands import *  # noqa: F403
+from ksim_rl.mdp.commands.gait import *  # noqa: F403
+from ksim_rl.mdp.commands.joystick import *  # noqa: F403
+from ksim_rl.mdp.commands.pose import *  # noqa: F403
+from ksim_rl.mdp.commands.velocity import *  # noqa: F403
 from ksim_rl.mdp.curricula import *  # noqa: F403
 from ksim_rl.mdp.events import *  # noqa: F403
 from ksim_rl.mdp.metrics import *  # noqa: F403

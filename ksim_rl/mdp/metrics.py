@@ -15,7 +15,7 @@ from ksim_rl.checked import Filled, Positive
 from ksim_rl.checks import check_known
 from ksim_rl.envs.term import MetricTerm, Reduction
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.commands import OfTarget
+from ksim_rl.mdp.commands.pose import OfTarget
 from ksim_rl.mdp.fields import (
     OfCommand,
     OfEntity,

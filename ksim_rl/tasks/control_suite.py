@@ -20,7 +20,7 @@ from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.commands import HeldCommand
+from ksim_rl.mdp.commands.pose import HeldCommand
 from ksim_rl.mdp.rewards.tracking import tolerance
 from ksim_rl.modules import ActorCfg, CriticCfg
 from ksim_rl.objectives import PPOCfg

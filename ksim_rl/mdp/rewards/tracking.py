@@ -14,7 +14,7 @@ from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.actions import per_joint
-from ksim_rl.mdp.commands import OfTarget, target_pose_w
+from ksim_rl.mdp.commands.pose import OfTarget, target_pose_w
 from ksim_rl.mdp.fields import (
     GaussianReward,
     InFrame,

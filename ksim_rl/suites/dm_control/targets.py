@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ksim_rl.checked import NonNegativeRange, Positive, Share
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.commands import HeldCommand
+from ksim_rl.mdp.commands.pose import HeldCommand
 from ksim_rl.mdp.constants import constant
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 

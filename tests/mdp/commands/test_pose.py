@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from ksim_rl.mdp.commands import target_pose_w
+from ksim_rl.mdp.commands.pose import target_pose_w
 from tests.mdp.bench import FREE_BODY, Bench
 from tests.mdp.recorder import Recorder
 
