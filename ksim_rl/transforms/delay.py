@@ -12,8 +12,9 @@ from torchrl.data import Composite
 from ksim_rl.checked import Checked, Share, WholeNumber
 from ksim_rl.device import random
 from ksim_rl.transforms import ring
+from ksim_rl.transforms.checked_keys import Keys
 from ksim_rl.transforms.history import RingTransform
-from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys, RowTransform, checked_action
+from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, RowTransform, checked_action
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,9 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
 from ksim_rl import checks
+from ksim_rl.transforms.checked_keys import CheckedKeys, Keys, one_per_key
 from ksim_rl.transforms.noise.cfg import PerDim
-from ksim_rl.transforms.row_transform import CheckedKeys, FollowsLevel, Keys, by_level, one_per_key
+from ksim_rl.transforms.row_transform import FollowsLevel, by_level
 from ksim_rl.transforms.specs import bounded, bounds, multiply_bounds
 
 Range = tuple[float | None, float | None]

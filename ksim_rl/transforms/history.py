@@ -11,8 +11,9 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from ksim_rl.checked import Checked, Count
 from ksim_rl.transforms import ring
+from ksim_rl.transforms.checked_keys import Keys
 from ksim_rl.transforms.columns import side_by_side
-from ksim_rl.transforms.row_transform import Keys, RowTransform
+from ksim_rl.transforms.row_transform import RowTransform
 from ksim_rl.transforms.specs import bounded, bounds
 
 

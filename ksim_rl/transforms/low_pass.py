@@ -8,7 +8,8 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from ksim_rl import checks
-from ksim_rl.transforms.row_transform import Keys, RowTransform, checked_action
+from ksim_rl.transforms.checked_keys import Keys
+from ksim_rl.transforms.row_transform import RowTransform, checked_action
 
 
 def smoothing(cutoff_hz: float, step_s: float) -> float:

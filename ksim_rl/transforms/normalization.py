@@ -11,7 +11,8 @@ from torchrl.data import Composite, Unbounded
 from ksim_rl import checks, ranks
 from ksim_rl.ranks.running_moments import RunningMoments, publish
 from ksim_rl.transforms import upstream
-from ksim_rl.transforms.row_transform import Keys, RowTransform
+from ksim_rl.transforms.checked_keys import Keys
+from ksim_rl.transforms.row_transform import RowTransform
 from ksim_rl.transforms.specs import Device
 
 

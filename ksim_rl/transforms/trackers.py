@@ -12,8 +12,9 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from ksim_rl import checks
 from ksim_rl.transforms import upstream
+from ksim_rl.transforms.checked_keys import Keys, as_keys, checked_out_keys
 from ksim_rl.transforms.innermost import EpisodeLimit, innermost
-from ksim_rl.transforms.row_transform import Keys, RowTransform, as_keys, checked_out_keys
+from ksim_rl.transforms.row_transform import RowTransform
 from ksim_rl.transforms.specs import leaf_spec, set_leaf_spec
 from ksim_rl.transforms.tally import tally
 

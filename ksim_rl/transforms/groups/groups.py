@@ -10,8 +10,9 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from ksim_rl import checks
+from ksim_rl.transforms.checked_keys import CheckedKeys, as_keys
 from ksim_rl.transforms.columns import side_by_side
-from ksim_rl.transforms.row_transform import CheckedKeys, as_keys, held_transforms
+from ksim_rl.transforms.row_transform import held_transforms
 from ksim_rl.transforms.specs import Device, bounded, bounds, drop_leaf, leaf_spec, set_leaf_spec, spell
 
 

@@ -12,7 +12,8 @@ from torchrl.data import Composite, TensorSpec
 
 from ksim_rl import checks
 from ksim_rl.device import random
-from ksim_rl.transforms.row_transform import KeyedTransform, Keys
+from ksim_rl.transforms.checked_keys import Keys
+from ksim_rl.transforms.row_transform import KeyedTransform
 from ksim_rl.transforms.specs import Device, bounded, bounds, path_of
 
 Bounds = tuple[Tensor, Tensor]

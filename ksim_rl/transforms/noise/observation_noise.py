@@ -11,11 +11,12 @@ from torchrl.data import Composite, TensorSpec
 
 from ksim_rl.checks import naming
 from ksim_rl.transforms import upstream
+from ksim_rl.transforms.checked_keys import Keys, one_per_key
 from ksim_rl.transforms.columns import side_by_side, split
 from ksim_rl.transforms.noise import kernel as noise_kernel
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
 from ksim_rl.transforms.noise.kernel import HAS_BIAS, HAS_DROPOUT, HAS_WALK, add_noise
-from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, Keys, RowTransform, one_per_key
+from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, RowTransform
 from ksim_rl.transforms.specs import Device, bounded, bounds, multiply_bounds
 
 
