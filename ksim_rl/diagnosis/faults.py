@@ -9,7 +9,7 @@ import statistics
 from collections.abc import Callable, Mapping
 
 from ksim_rl.diagnosis.curves import Curves
-from ksim_rl.modules.actor import MIN_STD
+from ksim_rl.modules.actor_cfg import MIN_STD
 
 # A function of the curves that returns the evidence, or None where the fault is not seen.
 Fault = Callable[[Curves], str | None]

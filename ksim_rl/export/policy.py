@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ksim_rl.modules.actor import PARAMETERS, MixedHead
+from ksim_rl.modules.action_heads import PARAMETERS, MixedHead
 from ksim_rl.modules.network import ObservationNormalizer, side_by_side
 from ksim_rl.modules.recurrent import RESET_KEY, RecurrentModule
 

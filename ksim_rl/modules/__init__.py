@@ -1,6 +1,7 @@
 """The networks: actor, critic and the parts that they are made of, each a TorchRL or torch module."""
 
-from ksim_rl.modules.actor import ActorCfg, PolicyNetwork, make_actor
+from ksim_rl.modules.actor import PolicyNetwork, make_actor
+from ksim_rl.modules.actor_cfg import ActorCfg
 from ksim_rl.modules.bounded_actors import (
     DeterministicActorCfg,
     SquashedActorCfg,

@@ -12,7 +12,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 
 from ksim_rl.checked import Count, NonNegative, Positive
-from ksim_rl.modules.actor import action_range
+from ksim_rl.modules.action_heads import action_range
 from ksim_rl.modules.distributions import TanhGaussian
 from ksim_rl.modules.mlp import Device
 from ksim_rl.modules.network import ObservingNetwork, OffPolicyNetworkCfg

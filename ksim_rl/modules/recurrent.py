@@ -24,7 +24,8 @@ from torchrl.modules import SafeProbabilisticTensorDictSequential, recurrent_mod
 from ksim_rl.checked import Checked, Count
 from ksim_rl.device.memory import NUMBERS_PER_WEIGHT
 from ksim_rl.device.state_tree import copy_into
-from ksim_rl.modules.actor import ActorCfg, make_actor
+from ksim_rl.modules.actor import make_actor
+from ksim_rl.modules.actor_cfg import ActorCfg
 from ksim_rl.modules.critic import CriticCfg, make_critic
 from ksim_rl.modules.mlp import Device
 from ksim_rl.modules.network import ObservationKey, ObservationNormalizer, side_by_side

@@ -13,7 +13,7 @@ from ksim_rl.modules import (
     make_deterministic_actor,
     make_squashed_actor,
 )
-from ksim_rl.modules.actor import action_range
+from ksim_rl.modules.action_heads import action_range
 
 LOW, HIGH = torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 5.0])
 

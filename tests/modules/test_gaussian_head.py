@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from ksim_rl.modules import ActorCfg
-from ksim_rl.modules.actor import MIN_STD, GaussianHead
+from ksim_rl.modules.action_heads import GaussianHead
+from ksim_rl.modules.actor_cfg import MIN_STD
 
 
 def _head(**kwargs):

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate
 from ksim_rl.data import EpochSampler
 from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, TanhGaussian, ValueNetwork
-from ksim_rl.modules.actor import GaussianHead, TanhGaussianHead
+from ksim_rl.modules.action_heads import GaussianHead, TanhGaussianHead
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.objectives import SymmetricAugmentation
 from ksim_rl.objectives.fused_ppo import ACTIVATIONS, FusedNetworks, why_not_fused
