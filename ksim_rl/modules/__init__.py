@@ -8,6 +8,7 @@ from ksim_rl.modules.bounded_actors import (
     make_deterministic_actor,
     make_squashed_actor,
 )
+from ksim_rl.modules.carried_state import CarriedState, burnt_in
 from ksim_rl.modules.collecting_policies import ExploringPolicy, MixedPolicy
 from ksim_rl.modules.critic import (
     CriticCfg,
@@ -30,13 +31,11 @@ from ksim_rl.modules.network import (
     update_normalizers,
 )
 from ksim_rl.modules.recurrent import (
-    CarriedState,
     RecurrentCfg,
     RecurrentModule,
     RecurrentNetwork,
     RecurrentStatePrimer,
     behind,
-    burnt_in,
     make_recurrent_actor,
     make_recurrent_critic,
     recurrent_modules,
