@@ -33,7 +33,7 @@ class Kernel:
 
 @pytest.fixture
 def ahead(monkeypatch):
-    from ksim_rl.objectives.fused_ppo.fused_ppo import Ahead
+    from ksim_rl.objectives.fused_ppo.ahead import Ahead
 
     class Driver:
         launchers: list = []

@@ -10,13 +10,11 @@ import itertools
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextvars import copy_context
 from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-import triton
 from jaxtyping import Float, Int32, Int64
 from numpy.polynomial.hermite_e import hermegauss
 from tensordict import TensorDictBase
@@ -27,7 +25,8 @@ from ksim_rl import ranks
 from ksim_rl.device.memory import ROLLOUT_PARTS
 from ksim_rl.device.streams import beside, warp_scope, warp_stream
 from ksim_rl.objectives.algorithm_cfg import PPOCfg
-from ksim_rl.objectives.fused_ppo.dataset import FusedDataset, as_tf32
+from ksim_rl.objectives.fused_ppo.ahead import Ahead
+from ksim_rl.objectives.fused_ppo.dataset import FusedDataset
 from ksim_rl.objectives.fused_ppo.layer_kernels import layer, output_gradients
 from ksim_rl.objectives.fused_ppo.layout import (
     ACTIVATIONS,
@@ -36,7 +35,6 @@ from ksim_rl.objectives.fused_ppo.layout import (
     LayerPlace,
     Tuning,
     launch,
-    only_compiles,
     parts,
     power_of_two,
 )
@@ -46,6 +44,7 @@ from ksim_rl.objectives.fused_ppo.mlp_kernels import (
     network_outputs,
     weight_gradients,
 )
+from ksim_rl.objectives.fused_ppo.parameters import FusedParameters
 from ksim_rl.objectives.fused_ppo.step_kernels import (
     SUMMARY,
     adam_step,
@@ -58,100 +57,9 @@ from ksim_rl.objectives.symmetry import SymmetricAugmentation
 
 # Sums that each block leaves in addition to its gradients.
 NUM_STATISTICS = 16
-MOMENTS = "exp_avg", "exp_avg_sq"
 # Points of the quadrature for the entropy of squashed actions: it is good to 1e-3 nats for standard deviations to 1.5
 # before the tanh.
 NODES = 16
-
-
-class FusedParameters:
-    """Flat and padded forms (see `FusedLayout`) of the tensors that an update changes.
-
-    Parameters of the modules and moments of the optimizer are views of the flat form: checkpoints, evaluation and
-    collection see the same as ever. `load` makes the padded form of it, and `store` tells how many steps were made.
-    """
-
-    def __init__(
-        self,
-        networks: FusedNetworks,
-        layout: FusedLayout,
-        *,
-        optimizer: torch.optim.Adam,
-        dtype: torch.dtype,
-        tf32: bool,
-        num_steps: int,
-        size: int,
-    ) -> None:
-        self._parameters, self._optimizer, self._tf32 = networks.parameters, optimizer, tf32
-        device = self._parameters[0].device
-        padding = -layout.num_flat % size
-        # Parameters, and the optimizer's means and variances, each [N] and zeros up to a whole number of `size`.
-        self.flat = [torch.zeros(layout.num_flat + padding, device=device) for _ in range(3)]
-        sizes = [own.numel() for own in self._parameters]
-        self._views = [flat[: layout.num_flat].split(sizes) for flat in self.flat]
-        self._index = layout.padded_index(networks).to(device, torch.int64)  # as torch takes it
-        self.places = functional.pad(self._index, (0, padding)).to(torch.int32)
-        # The parameters in padded form, in float32 and in the dtype of the products.
-        self.exact = torch.zeros(2, layout.num_padded, device=device)
-        self.weights = torch.zeros(2, layout.num_padded, dtype=dtype, device=device)
-        # The biases of both networks in float32; rows are as far apart as in `exact`.
-        self.biases_2N = self.exact[:, layout.num_weights :]
-        # The optimizer's number of steps before the first gradient step of the update, and after each.
-        self.steps = torch.zeros(num_steps + 1, device=device)
-        for parameter in self._parameters:
-            if parameter not in optimizer.state:
-                moments = {name: torch.zeros_like(parameter) for name in MOMENTS}
-                optimizer.state[parameter] = {"step": torch.zeros((), device=device), **moments}
-        self.load()
-
-    @torch.no_grad()
-    def load(self) -> None:
-        """Take over the parameters of the modules and the state of the optimizer."""
-        for parameter, *views in zip(self._parameters, *self._views, strict=True):
-            state = self._optimizer.state[parameter]
-            held = [parameter, *(state[name] for name in MOMENTS)]
-            # Elsewhere at first, and where torch has loaded the optimizer's state.
-            if any(own.data_ptr() != view.data_ptr() for own, view in zip(held, views, strict=True)):
-                views = [
-                    view.copy_(own.flatten()).view_as(own) for own, view in zip(held, views, strict=True)
-                ]
-                parameter.data, *moments = views
-                state.update(zip(MOMENTS, moments, strict=True))
-        self.steps[0].copy_(self._optimizer.state[self._parameters[0]]["step"])
-        self.exact.view(-1)[self._index] = self.flat[0][: len(self._index)]
-        self.weights.copy_(as_tf32(self.exact) if self._tf32 else self.exact)
-
-    @torch.no_grad()
-    def store(self) -> None:
-        """Give the optimizer the number of steps after the last gradient step."""
-        counts = [self._optimizer.state[parameter]["step"] for parameter in self._parameters]
-        torch._foreach_copy_(counts, [self.steps[-1]] * len(counts))
-
-
-class Ahead(triton.AsyncCompileMode):
-    """Threads compile the kernels that some work launches; loading them, too, would break the capture of a graph."""
-
-    def add(self, work: Callable[[], object]) -> None:
-        """Do `work`, and begin to compile the kernels that it would launch."""
-        context = copy_context()
-        context.run(only_compiles.set, True)
-        context.run(self.__enter__)  # whose exit waits
-        context.run(work)
-
-    def submit(self, key: str, compile_fn: Callable[[], Any], finalize_fn: Callable[[Any], None]) -> Any:
-        """Compile a kernel and its launcher, for which some versions of Triton start gcc."""
-        driver: Any = triton.runtime.driver.active
-
-        def compiled() -> Any:
-            kernel = compile_fn()
-            driver.launcher_cls(kernel.src, kernel.metadata)
-            return kernel
-
-        return super().submit(key, compiled, finalize_fn)
-
-    def wait(self) -> None:
-        """Wait for all that was added, and raise its errors."""
-        self.__exit__(None, None, None)
 
 
 def _squashing(networks: FusedNetworks, zeros_A: Tensor) -> dict[str, Any]:
