@@ -1,6 +1,6 @@
 """Estimates advantages from a rollout, and has the losses and gradient steps that improve the policy."""
 
-from ksim_rl.objectives.advantage_estimators import GAE, RolloutEstimator, TDLambda, VTrace
+from ksim_rl.objectives.advantage_estimators import GAE, TDLambda, VTrace
 from ksim_rl.objectives.algorithm_cfg import (
     AlgorithmCfg,
     AMPCfg,
@@ -34,4 +34,5 @@ from ksim_rl.objectives.ppo_step import (
     ppo_step,
     with_precision_of,
 )
+from ksim_rl.objectives.rollout_estimator import RolloutEstimator
 from ksim_rl.objectives.symmetry import SymmetricAugmentation, mirror_loss

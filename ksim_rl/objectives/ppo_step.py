@@ -13,11 +13,12 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from ksim_rl.objectives.advantage_estimators import GAE, RolloutEstimator, TDLambda, VTrace
+from ksim_rl.objectives.advantage_estimators import GAE, TDLambda, VTrace
 from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg, PPOCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, go_back, rate_bounds, step
 from ksim_rl.objectives.masked import MASK_KEY
+from ksim_rl.objectives.rollout_estimator import RolloutEstimator
 from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, mirror_loss
 from ksim_rl.transforms import MirrorMap
 

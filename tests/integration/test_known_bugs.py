@@ -14,8 +14,8 @@ from ksim_rl.algorithms.ppo import update as ppo_update_module
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import EpochSampler
 from ksim_rl.modules import ObservationNormalizer
-from ksim_rl.objectives.advantage_estimators import RolloutEstimator, Signals
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
+from ksim_rl.objectives.rollout_estimator import RolloutEstimator, Signals
 from tests.integration.probes import GAMMA, E, ProbeEnv, Run, T, one, sign_only, the_sign
 
 # The package has a function of the same name.

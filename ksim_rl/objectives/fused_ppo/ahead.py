@@ -6,9 +6,7 @@ from typing import Any
 
 import triton
 
-from ksim_rl.objectives.fused_ppo.layout import (
-    only_compiles,
-)
+from ksim_rl.objectives.fused_ppo.layout import only_compiles
 
 
 class Ahead(triton.AsyncCompileMode):

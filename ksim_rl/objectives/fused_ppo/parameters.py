@@ -4,10 +4,7 @@ import torch
 from torch.nn import functional
 
 from ksim_rl.objectives.fused_ppo.dataset import as_tf32
-from ksim_rl.objectives.fused_ppo.layout import (
-    FusedLayout,
-    FusedNetworks,
-)
+from ksim_rl.objectives.fused_ppo.layout import FusedLayout, FusedNetworks
 
 MOMENTS = "exp_avg", "exp_avg_sq"
 
