@@ -25,7 +25,7 @@ from ksim_rl.modules import ActorCfg
 from ksim_rl.scene.robots.legged_robot import LeggedRobot
 from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from ksim_rl.scene.viewer_cfg import ViewerCfg
-from ksim_rl.tasks import velocity
+from ksim_rl.tasks import velocity, velocity_training
 from ksim_rl.tasks.planar import upright
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
@@ -187,7 +187,7 @@ QUADRUPED = Task(
     name="quadruped_get_up",
     description="our quadruped gets up from any pose",
     cfg=quadruped_get_up,
-    training=velocity.training(num_iterations=1_000, entropy_coeff=0.005),
+    training=velocity_training.training(num_iterations=1_000, entropy_coeff=0.005),
 )
 HUMANOID = Task(
     name="humanoid_get_up",
@@ -195,5 +195,7 @@ HUMANOID = Task(
     cfg=humanoid_get_up,
     # An output layer of ordinary scale acts the more, the faster joints move, until statistics of observations are
     # known: the humanoid then throws itself about so hard that no engine simulates it, MuJoCo's own included.
-    training=velocity.training(num_iterations=3_000, entropy_coeff=0.005, actor=ActorCfg(init_std=0.5)),
+    training=velocity_training.training(
+        num_iterations=3_000, entropy_coeff=0.005, actor=ActorCfg(init_std=0.5)
+    ),
 )

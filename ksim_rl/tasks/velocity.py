@@ -1,10 +1,10 @@
-"""All velocity tasks share this module: a legged robot follows a planar velocity command.
+"""The parts that all velocity tasks share: a legged robot follows a planar velocity command.
 
 A task's module holds the figures of its robot and puts the parts together. Weights, noise and pushes are from mjlab
-1.6.0's velocity tasks, so that both can be compared on the same work, and so are the training settings but for two (see
-`training`). Contact clocks run once per env step, and commands keep their ranges: `with_memory_of_mjlab` changes both.
-One more thing is ours: the actor's joint positions are a term of their own (`joint_pos_biased`), because groups share
-terms by name.
+1.6.0's velocity tasks, so that both can be compared on the same work. So are the training settings but for two (see
+`velocity_training`). Contact clocks run once per env step, and commands keep their ranges: `with_memory_of_mjlab`
+changes both. One more thing is ours: the actor's joint positions are a term of their own (`joint_pos_biased`), because
+groups share terms by name.
 """
 
 import dataclasses
@@ -16,16 +16,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 from ksim_rl import mdp
-from ksim_rl.algorithms import fast_sac, fast_td3
-from ksim_rl.algorithms.fast_sac import FastSACCfg
-from ksim_rl.algorithms.fast_td3 import FastTD3Cfg
-from ksim_rl.algorithms.off_policy import MANY_ENVS
-from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import EventTerm, ObservationTerm, RewardTerm
-from ksim_rl.modules import ActorCfg, QNetworkCfg
-from ksim_rl.objectives import PPOCfg
 from ksim_rl.physics import SimCfg
 from ksim_rl.physics.load import Source
 from ksim_rl.scene import terrains
@@ -36,7 +29,7 @@ from ksim_rl.scene.robots.strangers_model import robot_name
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.sensors import ContactSensor, Sensor
 from ksim_rl.scene.viewer_cfg import ViewerCfg
-from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
+from ksim_rl.tasks.velocity_training import fast_sac_training, training
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.transforms.noise.cfg import UniformNoise
 
@@ -47,7 +40,6 @@ SELF = "self_collision"
 """The contact sensor of a robot against itself, for tasks that have one."""
 MOVING = {"command": COMMAND, "command_threshold": 0.05}
 """Rewards of the feet count only while the command asks to move."""
-ACTOR = ActorCfg(output_gain=1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -364,11 +356,17 @@ class VelocityTask(Task):
 
 def _proposed_cfg(proposed: ModelRobot, analysis: RobotAnalysis) -> ManagerBasedRlEnvCfg:
     """Return the config of a robot of any size; bipeds are slower."""
-    robot, height, biped = cast(LeggedRobot, proposed), proposed.init_pos[2], len(analysis.foot_bodies) == 2
-    moving = analysis.by_joint(0.35, 0.15, 0.15) if biped else analysis.by_joint(0.6, 0.3, 0.15)
+    robot = cast(LeggedRobot, proposed)
+    height = proposed.init_pos[2]
+    biped = len(analysis.foot_bodies) == 2
+    if biped:
+        moving = analysis.by_joint(0.35, 0.15, 0.15)
+        # A leg's natural speed grows with the root of its length: 1 m/s is much for a leg of 0.25 m.
+        speed = round(min(1.0, 0.5 * math.sqrt(9.81 * height)), 2)
+    else:
+        moving = analysis.by_joint(0.6, 0.3, 0.15)
+        speed = 1.0
     pose = PoseStd(standing={".*": 0.05}, walking=moving, running=analysis.by_joint(0.6, 0.3, 0.4))
-    # A leg's natural speed grows with the root of its length: 1 m/s is much for a leg of 0.25 m.
-    speed = round(min(1.0, 0.5 * math.sqrt(9.81 * height)), 2) if biped else 1.0
     slow = dataclasses.replace(velocity_command(), lin_vel_x=(-speed, speed), lin_vel_y=(-speed, speed))
     cfg = flat_cfg(
         robot,
@@ -379,60 +377,3 @@ def _proposed_cfg(proposed: ModelRobot, analysis: RobotAnalysis) -> ManagerBased
         viewer=ViewerCfg(body=robot.root_body, distance=max(1.0, 4.0 * height), elevation=-12.0),
     )
     return with_command(cfg, slow)
-
-
-def training(*, num_iterations: int, actor: ActorCfg = ACTOR, **ppo: Any) -> TrainingCfg:
-    """Return the training settings: 24 steps of 4096 envs per update; `ppo` are fields of `PPOCfg`.
-
-    Defaults are mjlab's but for two: with a discount of 0.98 (it has 0.99) and an output layer of ordinary scale Go1
-    tracks both velocities better after 30 M env states (linear 1.64, angular 1.35, against 1.48 and 1.07).
-    """
-    return TrainingCfg(
-        num_envs=4096,
-        seed=42,
-        objective=PPOCfg(**({"gamma": 0.98, "entropy_coeff": 0.01, "precision": "auto"} | ppo)),
-        data=DatasetCfg(num_env_states_per_minibatch=24 * 4096 // 4, num_minibatches=4),
-        modules=ModulesCfg(actor=actor),
-        trainer=TrainerCfg(num_iterations=num_iterations),
-    )
-
-
-def fast_sac_training(*, symmetry: Literal["none", "augment"] = "augment") -> TrainingCfg:
-    """Return the training settings of FastSAC: 4 steps of 4096 envs and 48 gradient steps in turn.
-
-    Rewards reach 0.12 per step, so that returns lie within the atoms: 0.12 / (1 - 0.97) = 4. Actions reach twice the
-    scale of the action term (0.75 rad on Go1), which is about as much as policies of PPO use. The target entropy fits a
-    standard deviation of 0.09 of them: with the paper's 0 (arXiv 2512.01996), one of 0.24, the noise alone costs Go1
-    half of its reward for the turning rate, and G1 nearly all. Critics have two thirds of the paper's width and
-    half its atoms; with such an actor one seed of five never walked.
-    """
-    objective = FastSACCfg(
-        target_entropy_per_action=-1.0, policy_delay=2, symmetry=symmetry, autocast=True, compile=True
-    )
-    data = dataclasses.replace(_REPLAY, num_env_states_per_minibatch=8192, num_minibatches=48)
-    critic = dataclasses.replace(fast_sac.CRITIC, hidden_dims=(512, 256, 128), num_atoms=51)
-    return _off_policy(objective=objective, data=data, actor=fast_sac.ACTOR, critic=critic)
-
-
-def fast_td3_training() -> TrainingCfg:
-    """Return the training settings of FastTD3, with noise near the paper's for quadrupeds (arXiv 2505.22642)."""
-    objective = FastTD3Cfg(target_noise=0.1, autocast=True)
-    return _off_policy(objective=objective, data=_REPLAY, actor=fast_td3.ACTOR, critic=fast_td3.CRITIC)
-
-
-# 2.2 GB for Go1; without it a resumed run fills the replay again.
-_REPLAY = dataclasses.replace(MANY_ENVS, save_replay=False)
-
-
-def _off_policy(*, objective: Any, data: Any, actor: Any, critic: QNetworkCfg) -> TrainingCfg:
-    return TrainingCfg(
-        num_envs=4096,
-        seed=42,
-        objective=objective,
-        data=data,
-        modules=ModulesCfg(
-            actor=dataclasses.replace(actor, action_bound=2.0),
-            critic=dataclasses.replace(critic, v_min=-2.0, v_max=6.0),
-        ),
-        trainer=TrainerCfg(num_iterations=6_000, eval_interval=500, checkpoint_interval=500, log_interval=10),
-    )

@@ -17,7 +17,7 @@ from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
 from ksim_rl.scene.robots.unitree_go import UnitreeGo1, UnitreeGo2
 from ksim_rl.scene.sensors import ContactSensor
 from ksim_rl.scene.viewer_cfg import ViewerCfg
-from ksim_rl.tasks import velocity
+from ksim_rl.tasks import velocity, velocity_training
 from ksim_rl.tasks.rough_ground import on_rough_ground
 from ksim_rl.trainers import TrainingCfg
 from ksim_rl.transforms import ActionDelay, DelayCfg
@@ -44,8 +44,8 @@ def _task(
         name=cfg.__name__,
         description=f"{robot} follows a velocity command {how}",
         cfg=cfg,
-        training=velocity.training(num_iterations=num_iterations, **ppo),
-        other_trainings=(velocity.fast_sac_training(), *others),
+        training=velocity_training.training(num_iterations=num_iterations, **ppo),
+        other_trainings=(velocity_training.fast_sac_training(), *others),
     )
 
 
@@ -110,7 +110,9 @@ def quadruped_velocity_delayed() -> ManagerBasedRlEnvCfg:
     return dataclasses.replace(quadruped_velocity_flat(), transforms={"lag": lag})
 
 
-GO1 = _task(go1_velocity_flat, "Unitree Go1", num_iterations=10_000, others=(velocity.fast_td3_training(),))
+GO1 = _task(
+    go1_velocity_flat, "Unitree Go1", num_iterations=10_000, others=(velocity_training.fast_td3_training(),)
+)
 GO2 = _task(go2_velocity_flat, "Unitree Go2", num_iterations=10_000)
 QUADRUPED = _task(quadruped_velocity_flat, "our quadruped", num_iterations=2_000)
 DELAYED = _task(quadruped_velocity_delayed, "our quadruped", "with late actions", num_iterations=2_000)

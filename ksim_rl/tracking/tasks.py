@@ -19,7 +19,7 @@ from ksim_rl.modules import ActorCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.scene.robots.unitree_g1 import SIDES, UnitreeG1
 from ksim_rl.scene.viewer_cfg import ViewerCfg
-from ksim_rl.tasks import velocity
+from ksim_rl.tasks import velocity, velocity_training
 from ksim_rl.tasks.velocity import noisy
 from ksim_rl.tracking import terms
 from ksim_rl.tracking.starts import FailedParts, StartInMotion
@@ -185,7 +185,7 @@ def _task(clip: str, what: str) -> Task:
         description=f"Unitree G1 follows {what} with its whole body",
         cfg=partial(track_cfg, f"g1_{clip}"),
         training=training(),
-        other_trainings=(velocity.fast_sac_training(symmetry="none"),),
+        other_trainings=(velocity_training.fast_sac_training(symmetry="none"),),
     )
 
 

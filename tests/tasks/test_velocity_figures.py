@@ -197,7 +197,7 @@ def test_training_defaults(ref):
     for theirs, ours in names.items():
         assert getattr(objective, ours) == algorithm[theirs], ours
     assert training.data.num_minibatches == algorithm["num_mini_batches"]
-    # Ours on purpose; see `velocity.training`, and docs/notes/g1.md for G1.
+    # Ours on purpose; see `velocity_training.training`, and docs/notes/g1.md for G1.
     assert (algorithm["gamma"], spread["init_std"]) == (0.99, 1.0)
     own = {"go1_velocity_flat": (0.98, 1.0), "g1_velocity_flat": (0.99, 0.5)}
     assert (objective.gamma, actor.init_std) == own[ref.task.name]
