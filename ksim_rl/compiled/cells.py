@@ -60,6 +60,12 @@ class Cells:
         """The same for tensors that have no rows."""
         return replace(self, rows=0)
 
+    def inner(self, tensor: Shaped[Tensor, "*shape"]) -> list[int]:
+        """Return the shape of a tensor without its rows."""
+        if self.rows:
+            return list(tensor.shape[1:])
+        return list(tensor.shape)
+
     def at(self, tensor: Shaped[Tensor, "*shape"], place: Sequence[str]) -> str:
         """Return the element of a tensor at a place, whose indices are the operation's dims without the rows."""
         if tensor.dtype not in CTYPES:

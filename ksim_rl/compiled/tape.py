@@ -15,7 +15,7 @@ import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.compiled import row_code
+from ksim_rl.compiled import row_code, row_formulas
 from ksim_rl.compiled.cells import CTYPES, Cells, Element, Loop, NotARowError
 from ksim_rl.compiled.lanes import BLOCK, DEAL, LANES, SHARED, Own, Work, schedule, source
 from ksim_rl.device import kernel_loading, random
@@ -318,7 +318,7 @@ class Tape:
         body = source(works, own, kinds, read if lanes else None)
         body = [f"auto run = [&]({pointers}) {{", *body, "};", f"run({calls});"]
         sizes = f"#define LANES {max(lanes, 1)}\n#define BLOCK {BLOCK}"
-        text = "\n".join([sizes, DEAL, random.DRAWS, row_code.PRELUDE, *body])
+        text = "\n".join([sizes, DEAL, random.DRAWS, row_formulas.PRELUDE, *body])
         fields = " ".join(names[place] for place in given)
         launch = QuickLaunch(arguments_of((ADDRESS, fields)), text, block_dim=BLOCK)
         kernel.launch = partial(launch, self._device, (self._num_rows, max(lanes, 1)), *given)
