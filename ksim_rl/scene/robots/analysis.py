@@ -18,18 +18,16 @@ from rich.table import Table
 from ksim_rl.files.writing import whole_file
 from ksim_rl.physics.capacity import probe
 from ksim_rl.physics.load import Source
-from ksim_rl.scene.actuators import PositionActuator
-from ksim_rl.scene.names import actuators_of_joint, scalar_joint_ids
+from ksim_rl.scene.names import scalar_joint_ids
 from ksim_rl.scene.rendering.rendering import choose_gl_platform
 from ksim_rl.scene.rendering.visualizer import visible_groups
-from ksim_rl.scene.robots.anatomy import Anatomy, dissect, posed, rounded
-from ksim_rl.scene.robots.edit import Site
+from ksim_rl.scene.robots.anatomy import dissect, posed
 from ksim_rl.scene.robots.legged_robot import ModelRobot
 from ksim_rl.scene.robots.passive import passive_joints
+from ksim_rl.scene.robots.proposal import drive_of, propose, three_digits
 from ksim_rl.scene.robots.stance import find_stance, on_plane, stand
 from ksim_rl.scene.robots.starting_poses import StartingPose, starting_poses
 from ksim_rl.scene.robots.strangers_model import StrangersModel, read_model
-from ksim_rl.scene.state.joint_control import joint_control
 
 FREQUENCY = 10.0
 DAMPING_RATIO = 2.0
@@ -39,9 +37,6 @@ ARMATURE_PER_EFFORT = 2e-4
 SOFTEST = 0.25
 MOST_SAG = 0.1
 """rad: from which error on a servo may saturate whatever its armature, and what the load in the stance may bend it."""
-LEAST_SCALE = 0.15
-MOST_SCALE = 0.5
-"""rad per unit action: stiff servos saturate within less than a step, soft ones only beyond what legs can do."""
 MOST_EFFORT = 1000.0
 """Times weight and height of the centre of mass: where a file says more, its author meant that nothing limits it."""
 TRIAL_S = 5.0
@@ -241,15 +236,17 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
         mujoco.mj_jac(mj_model, data, jacobian, None, leg.points(data).mean(0), data.body(leg.foot).id)
         load -= jacobian[2] * weight / len(legs)
     most = MOST_EFFORT * weight * com_height
-    given_drives = {j: _drive(mj_model, j, most=most) for j in names}
+    given_drives = {j: drive_of(mj_model, j, most=most) for j in names}
     # For joints whose file names no limit: half of m g h, to three digits for small robots.
     usual = 0.5 * weight * com_height
     if usual > 1.0:
         usual = round(usual, 1)
     else:
-        usual = _short(usual)
+        usual = three_digits(usual)
     efforts = {j: limit or usual for j, (_, _, limit) in given_drives.items()}
-    inertias = {j: _short(mj_model.dof_armature[dof[j]] or ARMATURE_PER_EFFORT * efforts[j]) for j in names}
+    inertias = {
+        j: three_digits(mj_model.dof_armature[dof[j]] or ARMATURE_PER_EFFORT * efforts[j]) for j in names
+    }
     # Stiffness by joint: the largest of three needs.
     gains = {}
     for j in names:
@@ -282,10 +279,10 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
         stiffer = dict.fromkeys(names, 1.0) | dict.fromkeys(of_legs, STIFFER ** len(trials))
         servos = {}
         for j, kp in gains.items():
-            kp = _short(kp * stiffer[j])
-            kd = _short(2.0 * DAMPING_RATIO * math.sqrt(kp * inertias[j]))
+            kp = three_digits(kp * stiffer[j])
+            kd = three_digits(2.0 * DAMPING_RATIO * math.sqrt(kp * inertias[j]))
             servos[j] = {"stiffness": kp, "damping": kd, "effort_limit": efforts[j], "armature": inertias[j]}
-        robot = _robot(model, data, anatomy, servos)
+        robot = propose(model, data, anatomy, servos)
         mj_stand = on_plane(robot.spec())
         standing = stand(mj_stand, seconds=TRIAL_S)
         sag = max((abs(standing.sag[names[j]]) for joints in pitch for j in joints), default=0.0)
@@ -344,102 +341,3 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
         passive_joints=left_passive,
         notes=(*notes, *model.notes),
     )
-
-
-def _robot(
-    model: StrangersModel, data: mujoco.MjData, anatomy: Anatomy, servos: dict[int, dict[str, float]]
-) -> ModelRobot:
-    """Return the robot in the pose of `data` with servos by joint; bodies whose hulls touch there may pass."""
-    mj_model = data.model
-    every_joint = scalar_joint_ids(mj_model)
-    root_at = int(mj_model.jnt_qposadr[mj_model.jnt_type.argmin()])
-    # Adding 0 turns -0 into 0, for code that is read by people.
-    w, x, y, z = (round(float(value), 6) + 0.0 for value in data.qpos[root_at + 3 : root_at + 7])
-    # Joints with equal servos share an entry.
-    alike: dict[tuple[float, ...], list[int]] = {}
-    for j, servo in servos.items():
-        alike.setdefault(tuple(servo.values()), []).append(j)
-    names = {j: mj_model.joint(j).name for j in servos}
-    soles = tuple(geom for leg in anatomy.legs for geom in leg.geoms)
-    sites = []
-    for leg in anatomy.legs:
-        foot = data.body(leg.foot)
-        # The middle of the tread, in the foot's own frame.
-        tread = (leg.points(data).mean(0) - foot.xpos) @ foot.xmat.reshape(3, 3)
-        sites.append(Site(name=leg.foot, body=leg.foot, pos=rounded(tread)))
-    if not any(site.name == "imu" for site in model.spec.sites):
-        sites.append(Site(name="imu", body=anatomy.root))
-    robot = ModelRobot(
-        name=model.name,
-        model=model.source,
-        root_body=anatomy.root,
-        joint_names=tuple(names.values()),
-        init_pos=(0.0, 0.0, round(float(data.body(anatomy.root).xpos[2]), 4)),
-        init_quat=(w, x, y, z),
-        default_joint_pos=dict(
-            zip(
-                (mj_model.joint(j).name for j in every_joint),
-                rounded(data.qpos[mj_model.jnt_qposadr[every_joint]]),
-                strict=True,
-            )
-        ),
-        action_scale={
-            names[j]: round(
-                float(np.clip(0.25 * s["effort_limit"] / s["stiffness"], LEAST_SCALE, MOST_SCALE)), 3
-            )
-            for j, s in servos.items()
-        },
-        actuators=tuple(
-            PositionActuator(joints=tuple(names[j] for j in group), **servos[group[0]])
-            for group in alike.values()
-        ),
-        foot_geoms=tuple(geom.name for geom in soles),
-        foot_sites=tuple(leg.foot for leg in anatomy.legs),
-        collision_geoms=(*anatomy.hulls, *soles),
-        sites=tuple(sites),
-        dropped=model.dropped,
-        free_root=model.frees_root,
-        root_turn=model.root_turn,
-    )
-    # Hulls that touch in the stance would push the robot apart: their bodies pass through each other.
-    trial = robot.spec().compile()
-    contacts = posed(trial, trial.key_qpos[0]).contact.geom
-    touching = set()
-    for first, second in contacts:
-        bodies = trial.geom_bodyid[first], trial.geom_bodyid[second]
-        touching.add((trial.body(bodies[0]).name, trial.body(bodies[1]).name))
-    return dataclasses.replace(robot, overlaps=tuple(sorted(touching)))
-
-
-def _drive(
-    mj_model: mujoco.MjModel, joint: int, *, most: float
-) -> tuple[str, tuple[float, float], float | None]:
-    """Return a joint's kind of drive in the model, stiffness and damping, and the least of all limits of its effort.
-
-    A limit above `most` is no limit.
-    """
-    kind = "none"
-    gains = (0.0, 0.0)
-    limits = []
-    if mj_model.jnt_actfrclimited[joint]:
-        limits.append(np.abs(mj_model.jnt_actfrcrange[joint]).max())
-    for a in actuators_of_joint(mj_model, joint):
-        gear = abs(mj_model.actuator_gear[a, 0])
-        control = joint_control(mj_model, a)
-        target = control.kind
-        kind = {"pos": "position", "vel": "velocity", "effort": "motor"}[target]
-        if target != "effort":
-            gains = abs(control.stiffness), abs(control.damping)
-        if mj_model.actuator_forcelimited[a]:
-            limits.append(gear * np.abs(mj_model.actuator_forcerange[a]).max())
-        # A motor's control range limits its force where no force range does.
-        elif mj_model.actuator_ctrllimited[a] and target == "effort":
-            limits.append(
-                gear * np.abs(mj_model.actuator_gainprm[a, 0] * mj_model.actuator_ctrlrange[a]).max()
-            )
-    limits = [limit for limit in limits if 0.0 < limit < most]
-    return kind, gains, _short(min(limits)) if limits else None
-
-
-def _short(number: float) -> float:
-    return float(f"{number:.3g}")
