@@ -31,6 +31,19 @@ class EnvDriver(Simulation):
         self.view = EnvView(self, self.readings, **parts)
         self.guard = TermGuard(self, self.readings, self.view)
 
+    def seed_(self, seed: int) -> None:
+        """Seed all draws, and start their counters again."""
+        self.seed.fill_(seed)
+        self.step_count.zero_()
+        self.reset_count_E.zero_()
+
+    def stagger_episodes(self) -> None:
+        """Let the running episodes time out at random steps, where episodes time out."""
+        if self.max_episode_length:
+            with self.scope("stagger_episodes", self.reset_count_E):
+                share_E = self.view.uniform(1)[:, 0]
+            self.time_out_offset_E.copy_((share_E * self.max_episode_length).long())
+
     def add_sensors(self, sensors: Mapping[str, Sensor]) -> None:
         """Let sensors read the worlds from now on."""
         for name, sensor in sensors.items():

@@ -34,16 +34,17 @@ from ksim_rl.envs.managers.outcomes import (
     RewardManager,
     TerminationManager,
 )
+from ksim_rl.envs.managers.rehearsal import rehearse
 from ksim_rl.envs.masked_reset import MaskedReset
-from ksim_rl.envs.rehearsal import rehearse
 from ksim_rl.envs.reset_to_default import ResetToDefault
+from ksim_rl.envs.saved_state import buffers_to_save, completed, joined_state, parts_of_state
 from ksim_rl.envs.specs import make_specs
 from ksim_rl.envs.step_counts import episode_steps
-from ksim_rl.physics import World, load_model, prepare_spec
+from ksim_rl.physics import World
 from ksim_rl.scene.actuators import JointDrives
 from ksim_rl.scene.rendering.rendering import OffscreenRenderer
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
-from ksim_rl.scene.scene import build_spec, warp_alone
+from ksim_rl.scene.scene import load_scene, warp_alone
 
 RENDER_MODES = (None, "rgb_array")
 
@@ -85,10 +86,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         fields = [field for term in events.values() for field in term.per_world_fields]
         if cfg.scene.terrain is not None:
             fields += cfg.scene.terrain.per_world_fields
-        spec = build_spec(cfg.scene)
-        cfg.sim.apply_to(spec)
-        prepare_spec(spec, fields)  # before compilation, which may specialize these fields
-        model = load_model(spec)
+        model = load_scene(cfg.scene, cfg.sim, per_world_fields=fields)
         self._renderer = (
             OffscreenRenderer(model, cfg.viewer, spacing=cfg.scene.spacing) if render_mode else None
         )
@@ -203,7 +201,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         driver, world = self.driver, self.world
-        action_EL = self._checked_action(tensordict.get("action"))
+        action_EL = self.action_manager.checked(tensordict.get("action"))
         # Else a graph would read quantities of the step before, which no replay computes again.
         driver.forget()
         driver.step_count.add_(1)
@@ -275,18 +273,6 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             data["command"] = {name: value.clone() for name, value in self.command_manager.values.items()}
         return TensorDict(data | leaves, batch_size=self.batch_size, device=self.device, names=[dims.E])
 
-    def _checked_action(self, action_EL: Tensor | None) -> Tensor:
-        expected = (self.num_envs, self.action_manager.size)
-        if action_EL is None:
-            raise ValueError(f"the tensordict has no 'action': expected float32 of shape {expected}")
-        if tuple(action_EL.shape) != expected or action_EL.dtype != torch.float32:
-            raise ValueError(
-                f"action has dtype {action_EL.dtype} and shape {tuple(action_EL.shape)}: expected torch.float32 and "
-                f"{expected}"
-            )
-        # Physics has no gradient: a policy that is not run under `no_grad` has its own only.
-        return action_EL.detach()
-
     # -- seeds ---------------------------------------------------------------------------------------------------
 
     def _set_seed(self, seed: int | None) -> None:
@@ -294,9 +280,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         if seed is None:
             seed = secrets.randbelow(2**31)
         self.cfg = dataclasses.replace(self.cfg, seed=seed)
-        self.driver.seed.fill_(seed)
-        self.driver.step_count.zero_()
-        self.driver.reset_count_E.zero_()
+        self.driver.seed_(seed)
         self.event_manager.startup()  # its draws depend on the seed
 
     def stagger_episodes_(self) -> None:
@@ -304,10 +288,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
         Without it envs that start together also end together, and each rollout shows one phase of an episode only.
         """
-        if self.max_episode_length:
-            with self.driver.scope("stagger_episodes", self.driver.reset_count_E):
-                share_E = self.view.uniform(1)[:, 0]
-            self.driver.time_out_offset_E.copy_((share_E * self.max_episode_length).long())
+        self.driver.stagger_episodes()
 
     # -- for trainers --------------------------------------------------------------------------------------------
 
@@ -321,10 +302,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
     def values_by_term(self) -> dict[str, Float[Tensor, " E"] | Bool[Tensor, " E"]]:
         """Return reward sums, metrics and termination flags of the running episodes, [E] each, written in place."""
-        values = {f"rewards.{name}": sum_E for name, sum_E in self.view.episode_rewards.items()}
-        held = zip(self.metric_manager.names, self.metric_manager.held_EM.unbind(-1), strict=True)
-        values |= {f"metrics.{name}": held_E for name, held_E in held}
-        return values | {f"terminations.{name}": flag_E for name, flag_E in self.view.terminations.items()}
+        return self._log.running()
 
     def non_finite_terms(self) -> list[str]:
         """Return a line for each term that gave a number that is not finite; reads the device."""
@@ -332,8 +310,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
     def curriculum_levels(self) -> dict[str, Float[Tensor, ""]]:
         """Return the latest level of each curriculum."""
-        curricula = self.curriculum_manager
-        return dict(zip(curricula.names, curricula.levels_C.unbind(), strict=True))
+        return self.curriculum_manager.levels()
 
     def command_levels(self) -> dict[str, Float[Tensor, ""]]:
         """Return the ranges that commands are drawn from now; they change by curricula, and without any there are none.
@@ -342,18 +319,11 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         """
         if not self.cfg.curriculum:
             return {}
-        return {
-            f"{command}/{field}_{end}": value
-            for command, ranges in self.view.command_ranges.items()
-            for field, pair_2 in ranges.items()
-            for end, value in zip(("low", "high"), pair_2.unbind(), strict=True)
-        }
+        return self.command_manager.levels()
 
     def state_dict(self, *args: Any, **kwargs: Any) -> State:
         """Return all that the env needs to continue bit-exactly: physics, clocks, commands, counters, buffers."""
-        state = {f"world.{name}": value for name, value in self.world.state_dict().items()}
-        state |= {f"env.{name}": tensor.clone() for name, tensor in self._buffers_to_save().items()}
-        return state
+        return joined_state(self._buffers_to_save(), self.world.state_dict())
 
     def load_state_dict(self, state_dict: State, strict: bool = True, assign: bool = False) -> None:
         """Continue from a `state_dict`; a ValueError says how the state of another env differs.
@@ -361,32 +331,19 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         Without `strict`, entries that are missing stay as they are, and unknown ones are left out.
         """
         own = self._buffers_to_save()
-        of_world, given = (
-            {name.removeprefix(room): value for name, value in state_dict.items() if name.startswith(room)}
-            for room in ("world.", "env.")
-        )
+        of_env, of_world = parts_of_state(state_dict)
         if not strict:
-            kept = self.world.state_dict()
-            of_world = kept | {name: value for name, value in of_world.items() if name in kept}
-            given = {name: given.get(name, buffer) for name, buffer in own.items()}
-        copy_into(own, given, what="state of an env (of the same config and num_envs)")
+            of_env = completed(of_env, own)
+            of_world = completed(of_world, self.world.state_dict())
+        copy_into(own, of_env, what="state of an env (of the same config and num_envs)")
         self.world.load_state_dict(of_world)
         self.driver.refreshed()  # cached quantities are of the old state
         self.cfg = dataclasses.replace(self.cfg, seed=int(self.view.seed))
 
     def _buffers_to_save(self) -> dict[str, Tensor]:
-        driver = self.driver
-        counters = {
-            "seed": driver.seed,
-            "step_count": driver.step_count,
-            "reset_count_E": driver.reset_count_E,
-            "episode_step_E": driver.episode_step_E,
-            "reward_weights_R": self.reward_manager.weights_R,
-            "curriculum_levels_C": self.curriculum_manager.levels_C,
-            "episode_log_N": self._log.totals_N,
-        }
-        shared = {f"shared/{name}": tensor for name, tensor in driver.shared_values.by_name().items()}
-        return counters | shared | driver.buffers.by_name()
+        return buffers_to_save(
+            self.driver, rewards=self.reward_manager, curricula=self.curriculum_manager, log=self._log
+        )
 
     def explain(self, *, width: int = WIDTH) -> str:
         """Return the parts of the env as tables, one per manager, with index, name, shape, weight, mode, parameters."""

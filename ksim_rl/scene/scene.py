@@ -1,7 +1,7 @@
 """Puts the scene of one world together: robots at their places on a terrain, and sensors."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Protocol, runtime_checkable
 
@@ -9,7 +9,7 @@ import mujoco
 
 from ksim_rl.checked import Checked, Count, Filled, NonNegative, Share
 from ksim_rl.checks import near
-from ksim_rl.physics import load_model, load_spec
+from ksim_rl.physics import SimCfg, load_model, load_spec, prepare_spec
 from ksim_rl.scene.actuators import Actuator, set_actuators
 from ksim_rl.scene.joining import joined
 from ksim_rl.scene.keyframes import complete_keyframes, move_keyframe
@@ -145,6 +145,15 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     for name, sensor in cfg.sensors.items():
         sensor.add_to(spec, name)
     return spec
+
+
+def load_scene(cfg: SceneCfg, sim: SimCfg, *, per_world_fields: Iterable[str] = ()) -> mujoco.MjModel:
+    """Return the model of a scene under the options of `sim`, in which worlds may differ in some fields."""
+    spec = build_spec(cfg)
+    sim.apply_to(spec)
+    # Before compilation, which may specialize these fields.
+    prepare_spec(spec, per_world_fields)
+    return load_model(spec)
 
 
 def _name_actuators(spec: mujoco.MjSpec) -> None:

@@ -55,6 +55,16 @@ class CommandManager:
         # No clock: this command lasts for the episode.
         return torch.full((self._view.num_envs,), torch.inf, device=self._view.device)
 
+    def levels(self) -> dict[str, Float[Tensor, ""]]:
+        """Return the present ends of the ranges, at `<command>/<field>_low` and `<command>/<field>_high`."""
+        ends = {}
+        for command, ranges in self._driver.readings.command_ranges.items():
+            for field, pair_2 in ranges.items():
+                low, high = pair_2.unbind()
+                ends[f"{command}/{field}_low"] = low
+                ends[f"{command}/{field}_high"] = high
+        return ends
+
     def set(
         self,
         name: str,

@@ -305,6 +305,10 @@ class CurriculumManager(_OutcomeManager):
             # Level is a device tensor: nothing is read by the host.
             self.levels_C[index].copy_(level)
 
+    def levels(self) -> dict[str, Float[Tensor, ""]]:
+        """Return the latest level of each curriculum."""
+        return dict(zip(self.names, self.levels_C.unbind(), strict=True))
+
     def rehearse(self) -> None:
         """Adapt to no episode, which changes nothing."""
         # The level is written even where no row resets, so it is put back.
@@ -360,6 +364,17 @@ class EpisodeLog:
         """Return the sums by name, float32 [] each, still on the device."""
         sums = dict(zip(self.names, self.totals_N.unbind(), strict=True))
         return sums | {"non_finite_terms": self._num_non_finite()}
+
+    def running(self) -> dict[str, Float[Tensor, " E"] | Bool[Tensor, " E"]]:
+        """Return reward sums, metrics and termination flags of the running episodes, [E] each, written in place."""
+        values: dict[str, Tensor] = {}
+        for name, sum_E in self._view.episode_rewards.items():
+            values[f"rewards.{name}"] = sum_E
+        for name, held_E in zip(self._metrics.names, self._metrics.held_EM.unbind(-1), strict=True):
+            values[f"metrics.{name}"] = held_E
+        for name, flag_E in self._view.terminations.items():
+            values[f"terminations.{name}"] = flag_E
+        return values
 
     def clear(self) -> None:
         """Start the sums again at 0."""
