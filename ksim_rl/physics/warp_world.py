@@ -1,6 +1,5 @@
 """A world batch simulates many copies of one model on MuJoCo Warp, and shows their data as zero-copy torch views."""
 
-import copy
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from typing import Literal, get_args
 
@@ -17,15 +16,10 @@ from ksim_rl.device.kernel_loading import loaded_together
 from ksim_rl.device.memory import memory_for
 from ksim_rl.device.streams import warp_scope, warp_stream
 from ksim_rl.physics import capacity, upstream, views
-from ksim_rl.physics.actuators.actuators_of_joints import let_actuators_add
-from ksim_rl.physics.actuators.disabled_actuators import switch_off
 from ksim_rl.physics.callbacks import Callbacks
-from ksim_rl.physics.constants.least_weights import raising_of_weights
 from ksim_rl.physics.constants.masked_constants import MaskedConstants
-from ksim_rl.physics.contacts import follow_the_c_engine
 from ksim_rl.physics.field_effects import as_if_drawn
 from ksim_rl.physics.fields import FIXED, GRAVITY, INERT0, const_groups, derived_fields
-from ksim_rl.physics.model_checks import warn_of_weightless, warp_model_of
 from ksim_rl.physics.nan_guard.guard import NanGuard, NanReport
 from ksim_rl.physics.newton.solver import one_kernel_unavailable, takes_conditional_nodes
 from ksim_rl.physics.overflow import OverflowRecord, OverflowReport
@@ -34,6 +28,7 @@ from ksim_rl.physics.rows.second_limits import room_for_nonzeros
 from ksim_rl.physics.sim_cfg import SimCfg
 from ksim_rl.physics.substep_plan import SubstepPlan, substep_plan, with_callbacks
 from ksim_rl.physics.substeps import Sensors, Substeps
+from ksim_rl.physics.warp_model import make_warp_model, stored_form
 from ksim_rl.physics.world import ENGINES, RecordedPython, World
 
 
@@ -73,26 +68,12 @@ class WarpWorld(World):
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
         capacity.check_countable(self.njmax, self.nconmax, num_envs=num_envs)
         self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
-        # Our solver takes sparse rows only, and `mj_model` keeps the user's settings.
-        stored_model = copy.copy(self.mj_model)
-        if self.has_one_kernel_solver:
-            stored_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-        if not upstream.may_sleep(self.mj_model.opt):
-            # MuJoCo Warp's solver looks at this flag alone, and writes to arrays that it has not made without islands.
-            stored_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        stored_model = stored_form(self.mj_model, is_sparse=self.has_one_kernel_solver)
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
         with memory_for(num_envs, self.device), warp_scope(self.device):
-            self.warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
-            warn_of_weightless(self.mj_model)
-            raising_of_weights(self.mj_model, self.warp_model)()
-            with as_if_drawn(self.warp_model, expanded):
-                follow_the_c_engine(self.warp_model)
-            switch_off(self.mj_model, self.warp_model)
-            let_actuators_add(self.mj_model, self.warp_model, expanded)
-            # The report of overflow tells of it, once per rollout.
-            self.warp_model.opt.warn_overflow = 0
-            if self.sim.tolerance is not None:
-                self.warp_model.opt.tolerance.fill_(self.sim.tolerance)
+            self.warp_model = make_warp_model(
+                self.mj_model, stored_model, self.sim, expanded=expanded, num_envs=num_envs
+            )
             if self.device.type == "cuda":
                 self.warp_model.opt.graph_conditional = takes_conditional_nodes(
                     self.warp_model, supported=wp.is_conditional_graph_supported()
