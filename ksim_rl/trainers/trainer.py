@@ -11,9 +11,8 @@ import torch
 from ksim_rl import ranks
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.diagnosis.iteration_warnings import warnings_of
 from ksim_rl.diagnosis.probes import probed
-from ksim_rl.envs.contract import EpisodeClock, EpisodeSums, missing_parts, part
+from ksim_rl.envs.contract import EpisodeClock, missing_parts, part
 from ksim_rl.envs.recorded_python import FrozenPythonError
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import HasProgress, State, Update, notes_of
@@ -36,6 +35,7 @@ from ksim_rl.trainers.outcome import Outcome
 from ksim_rl.trainers.progress import RunClock, RunProgress
 from ksim_rl.trainers.restoring import load_env_state, load_networks, load_random_state, random_state
 from ksim_rl.trainers.run_cfg import TrainerCfg
+from ksim_rl.trainers.said_once import SaidOnce
 from ksim_rl.trainers.suspect_iterations import with_iterations
 from ksim_rl.transforms import observation_columns
 
@@ -189,8 +189,7 @@ class Trainer:
         self._unread: list[tuple[int, PendingMetrics]] = []  # oldest first
         self.collecting = ranks.Timing(update.device)
         self._target_met = False
-        self._warned: set[str] = set()  # kinds of warnings, each said once
-        self._non_finite_terms = 0.0
+        self._warnings = SaidOnce(lambda text: self.progress.note(text))  # of the progress at that time
         self._told_to_end = False  # by any rank
 
     @property
@@ -248,7 +247,7 @@ class Trainer:
                     hook.at_end(self)
             finally:
                 for logger in self.loggers:
-                    self._ask(logger, logger.close)
+                    self._warnings.call(logger, logger.close, iteration=self.iteration)
         return Outcome(
             iteration=self.iteration,
             env_states=self.env_states,
@@ -323,7 +322,7 @@ class Trainer:
         physics = explain_physics(env, read)  # waits for the device only after a failure
         for text in physics.saved:
             self.progress.note(f"NaN guard: {text}")
-        self._warn(physics.lost, read, iteration)
+        self._warnings.warn_of(physics.lost, read, env=env, iteration=iteration)
         self.update.check(read)  # may end the run: warnings come first
         if clock is None:
             longest_s = 0.0  # rewards are then per episode, not per second
@@ -344,29 +343,12 @@ class Trainer:
     def _write(self, metrics: dict[str, float], iteration: int) -> None:
         env_states = iteration * self.num_env_states
         for logger in self.loggers:
-            self._ask(logger, logger.log_metrics, metrics, env_states)
+            self._warnings.call(logger, logger.log_metrics, metrics, env_states, iteration=self.iteration)
         self.progress.update(
             iteration,
             {"env_states": env_states, **metrics},
             seconds_left=self.clock.seconds_left(self.cfg.num_iterations - iteration),
         )
-
-    def _ask(self, logger: MetricLogger, call: Callable[..., None], *given: dict[str, float] | int) -> None:
-        """Call a logger; a full disk or a server that is gone loses its records, but does not end the run."""
-        try:
-            call(*given)
-        except Exception as error:
-            name = type(logger).__name__
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            self._warn_once(
-                name,
-                f"the logger {name} failed at iteration {self.iteration}: {reason}; the run goes on (said once)",
-            )
-
-    def _warn_once(self, kind: str, text: str) -> None:
-        if kind not in self._warned:
-            self._warned.add(kind)
-            self.progress.note(f"warning: {text}")
 
     def _look_at_target(self) -> None:
         targets = self.cfg.stop_at or {}
@@ -375,18 +357,7 @@ class Trainer:
         for name in targets:
             known = name in self.metrics or name.startswith("evaluation/")
             if not known and "episode/return" in self.metrics:  # else terms have no metrics yet
-                self._warn_once(name, f"stop_at: {name!r} is no metric: {near(name, self.metrics)}")
-
-    def _warn(self, losses: Sequence[str], metrics: Mapping[str, float], iteration: int) -> None:
-        """Warn of problems in this iteration, each kind once; the counts stay in the metrics."""
-        texts = warnings_of(losses, metrics)
-        if (found := metrics.get("sum/non_finite_terms", 0.0)) > self._non_finite_terms:
-            self._non_finite_terms = found
-            terms = part(self.collector.env, EpisodeSums)
-            for line in terms.non_finite_terms() if terms else ():
-                texts[line.split(":")[0]] = line
-        for kind, text in texts.items():
-            self._warn_once(kind, f"{text} (iteration {iteration}; said once)")
+                self._warnings.warn(name, f"stop_at: {name!r} is no metric: {near(name, self.metrics)}")
 
     def save(self) -> Path:
         """Write a checkpoint of everything that the next iteration depends on, of all ranks; see `checkpoint.save`."""
