@@ -9,7 +9,7 @@ import warp as wp
 
 from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.physics.newton import solver as newton
-from tests.physics.test_newton import CONES, ROWS_OF_ALL_KINDS
+from tests.physics.rows_of_all_kinds import CONES, ROWS_OF_ALL_KINDS
 
 NUM_ENVS = 300
 ROWS_ON_CHIP = (64, 8, 0)

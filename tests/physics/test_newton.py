@@ -10,69 +10,11 @@ import pytest
 import torch
 import warp as wp
 
-from ksim_rl.physics import SimCfg, World, load_model, substep
-from ksim_rl.physics.integration.integrators import integrator
-from ksim_rl.physics.newton import kernel
+from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.physics.newton import solver as newton
-from ksim_rl.physics.newton.kernel import Invariant
 from ksim_rl.physics.newton.limbs import limbs_of
+from tests.physics.rows_of_all_kinds import CONES, NUM_ENVS, ONE_OF_CONES, ROWS_OF_ALL_KINDS, worlds
 from tests.physics.solver_problem import problems
-
-NUM_ENVS = 6
-ROWS_OF_ALL_KINDS = """
-<mujoco>
-  <option timestep="0.004" integrator="implicitfast" iterations="{iterations}" tolerance="1e-8" cone="{cone}"
-          impratio="3"/>
-  <worldbody>
-    <geom type="plane" size="5 5 1" condim="1" friction="0.8 0.02 0.01"/>
-    <body name="pushed" pos="0 0 0.09">
-      <freejoint/>
-      <geom size="0.1" pos="0.2 0 0" condim="6" mass="0.4"/>
-      <geom size="0.1" pos="-0.2 0.1 0" condim="4" mass="0.3"/>
-      <geom size="0.1" pos="-0.2 -0.1 0" condim="3" mass="0.3"/>
-      <body pos="0 0 0.1">
-        <joint name="a" axis="0 1 0" range="-0.2 0.2" limited="true" damping="0.1"/>
-        <geom type="capsule" size="0.03 0.1" pos="0 0 0.15" mass="0.2" contype="0" conaffinity="0"/>
-        <body pos="0 0 0.3">
-          <joint name="b" axis="1 0 0" frictionloss="0.05" armature="0.01"/>
-          <geom size="0.05" mass="0.1" pos="0.1 0 0" contype="0" conaffinity="0"/>
-        </body>
-      </body>
-    </body>
-    <body name="smooth" pos="1 0 0.08">
-      <freejoint/>
-      <geom size="0.09" condim="1" mass="0.5"/>
-    </body>
-    <body name="arm" pos="1 0.5 0.5">
-      <joint name="c" axis="0 1 0"/>
-      <geom type="capsule" size="0.02 0.2" mass="0.3" contype="0" conaffinity="0"/>
-      <site name="tip" pos="0 0 0.2"/>
-    </body>
-  </worldbody>
-  <tendon>
-    <fixed name="rope" limited="true" range="-0.1 0.1" frictionloss="0.02">
-      <joint joint="a" coef="1"/><joint joint="c" coef="-1"/>
-    </fixed>
-  </tendon>
-  <equality><joint joint1="c" joint2="b" polycoef="0.1 0.5 0 0 0"/></equality>
-</mujoco>
-"""
-CONES = ("pyramidal", "elliptic")
-# Each case compiles kernels of its own.
-full = pytest.mark.full
-ONE_OF_CONES = (pytest.param("pyramidal", marks=full), "elliptic")
-
-
-def worlds(cone: str, *, iterations: int = 100, **sim) -> World:
-    model = load_model(ROWS_OF_ALL_KINDS.format(cone=cone, iterations=iterations))
-    world = World(model, num_envs=NUM_ENVS, sim=SimCfg(njmax=64, nconmax=16, tolerance=1e-8, **sim))
-    generator = torch.Generator().manual_seed(0)
-    world.qpos_EL[:, 2] -= 0.02 * torch.rand(NUM_ENVS, generator=generator)
-    world.qpos_EL[:, 7:9] += 0.4 * torch.randn(NUM_ENVS, 2, generator=generator)
-    world.qvel_EL.copy_(0.7 * torch.randn(world.qvel_EL.shape, generator=generator))
-    # The last world falls freely, with no row of a contact.
-    world.qpos_EL[-1, 2] = 1.0
-    return world
 
 
 def rows_of(world: World) -> None:
@@ -244,47 +186,6 @@ def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memo
     assert 4 * warps_of_a_quarter >= by_memory or registers == least
 
 
-def broken_invariants(world: World, substeps: int) -> Invariant:
-    with wp.ScopedDevice("cpu"):
-        model, data = world.warp_model, world.warp_data_E
-        broken = wp.zeros(NUM_ENVS, dtype=int)
-        solve = newton.solver(model, data, broken=broken)
-        integrate = integrator(world.mj_model, model, data)
-        stages = substep.Stages(solve=solve, integrate=integrate)
-        for _ in range(substeps):
-            substep.run(stages, model, data, sensors=False)
-    return Invariant(int(np.bitwise_or.reduce(broken.numpy())))
-
-
-@pytest.mark.parametrize("cone", ONE_OF_CONES)
-def test_a_debug_build_finds_no_broken_invariant(cone):
-    assert not broken_invariants(worlds(cone), 20)
-
-
-WRONG_LINES = {
-    "ROWS_ARE_WHOLE": ("efc_D[row] = row_of(problem.efc_D)", "efc_D[row] = -row_of(problem.efc_D)"),
-    "CONES_ARE_WHOLE": ("friction[0] * impratio", "-friction[0] * impratio"),
-    "FORCES_ARE_ADMISSIBLE": ("push = -efc_D[row] * residual[row]", "push = efc_D[row] * residual[row]"),
-    "HESSIAN_IS_POSITIVE": ("hessian[block][dof] = mass[", "hessian[block][dof] = -mass["),
-    "SEARCH_DESCENDS": ("search[block] *= -inverse_pivot", "search[block] *= inverse_pivot"),
-    "COST_FALLS": ("step = Step {alpha, -point", "step = Step {alpha, point"),
-}
-
-
-@pytest.mark.parametrize(
-    "invariant",
-    [
-        name if name in ("ROWS_ARE_WHOLE", "COST_FALLS") else pytest.param(name, marks=full)
-        for name in WRONG_LINES
-    ],
-)
-def test_a_debug_build_names_the_invariant_that_is_broken(monkeypatch, invariant):
-    right, wrong = WRONG_LINES[invariant]
-    assert kernel._SOURCE.count(right) == 1
-    monkeypatch.setattr(kernel, "_SOURCE", kernel._SOURCE.replace(right, wrong))
-    assert Invariant[invariant] in broken_invariants(worlds("elliptic"), 1)
-
-
 def test_steps_follow_those_of_mujoco_warp():
     ours, theirs = worlds("elliptic"), worlds("elliptic", one_kernel_solver=False)
     assert not theirs.has_one_kernel_solver
@@ -393,7 +294,12 @@ TWO_BALLS = """
 
 
 @pytest.mark.parametrize(
-    ("condim", "njmax"), [(3, 5), pytest.param(3, 4, marks=full), pytest.param(4, 5, marks=full)]
+    ("condim", "njmax"),
+    [
+        (3, 5),
+        pytest.param(3, 4, marks=pytest.mark.full),
+        pytest.param(4, 5, marks=pytest.mark.full),
+    ],
 )
 def test_a_cone_that_njmax_cuts_off_pushes_nothing_as_with_mujoco_warp(condim, njmax):
     model = load_model(TWO_BALLS.format(condim=condim))
