@@ -18,11 +18,13 @@ from torch import Tensor
 from ksim_rl import dims
 from ksim_rl.device.state_tree import State, copy_into
 from ksim_rl.device.streams import checked_device
+from ksim_rl.envs.closed import Closed
 from ksim_rl.envs.contract import DifficultyLevels, EpisodeClock, EpisodeSums, Pictures, SimulatedWorld
 from ksim_rl.envs.drawing import Drawing, draw, drawings
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.explain import WIDTH, explain
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.managers import saved_state
 from ksim_rl.envs.managers.action_manager import ActionManager
 from ksim_rl.envs.managers.command_manager import CommandManager
 from ksim_rl.envs.managers.event_manager import EventManager
@@ -37,7 +39,6 @@ from ksim_rl.envs.managers.outcomes import (
 from ksim_rl.envs.managers.rehearsal import rehearse
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.envs.reset_to_default import ResetToDefault
-from ksim_rl.envs.saved_state import buffers_to_save, completed, joined_state, parts_of_state
 from ksim_rl.envs.specs import make_specs
 from ksim_rl.envs.step_counts import episode_steps
 from ksim_rl.physics import World
@@ -47,13 +48,6 @@ from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 from ksim_rl.scene.scene import load_scene, warp_alone
 
 RENDER_MODES = (None, "rgb_array")
-
-
-class _Closed:
-    """Replaces each part of a closed env, and says so in an error."""
-
-    def __getattr__(self, name: str) -> Any:
-        raise RuntimeError("the env is closed, and the memory of its worlds is free: make another one")
 
 
 class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels, SimulatedWorld, Pictures):
@@ -91,9 +85,14 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
             OffscreenRenderer(model, cfg.viewer, spacing=cfg.scene.spacing) if render_mode else None
         )
         self._is_closed = False
-        how: dict[str, Any] = {"device": device, "sim": cfg.sim, "warp_alone": warp_alone(cfg.scene)}
-        how["per_world_fields"] = tuple(dict.fromkeys(fields))
-        self.world = World(model, num_envs=cfg.scene.num_envs, **how)
+        self.world = World(
+            model,
+            num_envs=cfg.scene.num_envs,
+            device=device,
+            sim=cfg.sim,
+            per_world_fields=tuple(dict.fromkeys(fields)),
+            warp_alone=warp_alone(cfg.scene),
+        )
         self.driver = EnvDriver(
             self.world,
             step_dt=self.step_dt,
@@ -106,11 +105,16 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.view = self.driver.view
         self.load_managers()
         self.driver.freeze()  # no buffer may be made in a captured step
-        readings = {"obs": self.observation_manager.examples, "command": self.command_manager.values}
-        size, bounds_L2 = self.action_manager.size, self.action_manager.bounds_L2
-        self.observation_spec, self.full_action_spec, self.full_reward_spec, self.full_done_spec = make_specs(
-            readings, size, bounds_L2, batch_size=self.batch_size, device=self.device
+        observed = self.observation_manager.examples
+        readings = {"obs": observed, "command": self.command_manager.values}
+        actions = self.action_manager
+        observation, action, reward, done = make_specs(
+            readings, actions.size, actions.bounds_L2, batch_size=self.batch_size, device=self.device
         )
+        self.observation_spec = observation
+        self.full_action_spec = action
+        self.full_reward_spec = reward
+        self.full_done_spec = done
         self.seed(-1 if cfg.seed is None else cfg.seed)
         rehearse(
             self.driver,
@@ -131,7 +135,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
         Each term runs once here, so that names that match nothing are errors before the first step.
         """
-        cfg, driver, view = self.cfg, self.driver, self.driver.view
+        cfg = self.cfg
+        driver = self.driver
+        view = self.view
         if cfg.scene.terrain is not None:
             driver.ground = cfg.scene.terrain.ground(view)  # events and sensors read it
         driver.add_sensors(cfg.scene.sensors)
@@ -200,7 +206,8 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     # -- step and reset ------------------------------------------------------------------------------------------
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        driver, world = self.driver, self.world
+        driver = self.driver
+        world = self.world
         action_EL = self.action_manager.checked(tensordict.get("action"))
         # Else a graph would read quantities of the step before, which no replay computes again.
         driver.forget()
@@ -216,7 +223,8 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         )
         driver.keep_moment_of_contacts()
         # Also false for NaN. Beyond this bound MuJoCo's C engine, too, calls a state bad and resets it.
-        finite_E = finite_E & ((world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1)).abs() < mujoco.mjMAXVAL)
+        size_E = (world.qpos_EL.sum(-1) + world.qvel_EL.sum(-1)).abs()
+        finite_E = finite_E & (size_E < mujoco.mjMAXVAL)
         # Failed worlds are cleared before anything is computed from them, so that all of it is finite.
         world.reset(~finite_E)
         world.refresh()
@@ -269,8 +277,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
     def _env_state(self, *, reset_E: Tensor | None = None, **leaves: Tensor) -> TensorDict:
         data: dict[str, Any] = {"obs": self.observation_manager.read(reset_E)}
-        if self.command_manager.values:
-            data["command"] = {name: value.clone() for name, value in self.command_manager.values.items()}
+        commands = self.command_manager.values
+        if commands:
+            data["command"] = {name: value.clone() for name, value in commands.items()}
         return TensorDict(data | leaves, batch_size=self.batch_size, device=self.device, names=[dims.E])
 
     # -- seeds ---------------------------------------------------------------------------------------------------
@@ -323,7 +332,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
 
     def state_dict(self, *args: Any, **kwargs: Any) -> State:
         """Return all that the env needs to continue bit-exactly: physics, clocks, commands, counters, buffers."""
-        return joined_state(self._buffers_to_save(), self.world.state_dict())
+        return saved_state.joined(self._buffers_to_save(), self.world.state_dict())
 
     def load_state_dict(self, state_dict: State, strict: bool = True, assign: bool = False) -> None:
         """Continue from a `state_dict`; a ValueError says how the state of another env differs.
@@ -331,18 +340,18 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         Without `strict`, entries that are missing stay as they are, and unknown ones are left out.
         """
         own = self._buffers_to_save()
-        of_env, of_world = parts_of_state(state_dict)
+        of_env, of_world = saved_state.parts(state_dict)
         if not strict:
-            of_env = completed(of_env, own)
-            of_world = completed(of_world, self.world.state_dict())
+            of_env = saved_state.completed(of_env, own)
+            of_world = saved_state.completed(of_world, self.world.state_dict())
         copy_into(own, of_env, what="state of an env (of the same config and num_envs)")
         self.world.load_state_dict(of_world)
         self.driver.refreshed()  # cached quantities are of the old state
         self.cfg = dataclasses.replace(self.cfg, seed=int(self.view.seed))
 
     def _buffers_to_save(self) -> dict[str, Tensor]:
-        return buffers_to_save(
-            self.driver, rewards=self.reward_manager, curricula=self.curriculum_manager, log=self._log
+        return saved_state.buffers_to_save(
+            self.driver, self.reward_manager, self.curriculum_manager, self._log
         )
 
     def explain(self, *, width: int = WIDTH) -> str:
@@ -376,7 +385,8 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         It is the one that the viewer shows, unless `env_index` says otherwise.
         """
         shown = self.cfg.viewer.env_index if env_index is None else env_index
-        draw(self.driver, self.setup_manager_visualizers(), visualizer, env_index=shown, drawn=drawn)
+        parts = self.setup_manager_visualizers()
+        draw(self.driver, parts, visualizer, env_index=shown, drawn=drawn)
 
     def render(self) -> np.ndarray | None:
         """Return a picture of the current state, None without a render mode; a RuntimeError tells how to get OpenGL."""
@@ -397,7 +407,7 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.world.close()
         managers = [name for name in vars(self) if name.endswith("_manager")]
         for name in ("world", "driver", "view", "_log", "_renderer", *managers):
-            setattr(self, name, _Closed())
+            setattr(self, name, Closed())
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         raise TypeError(

@@ -227,7 +227,8 @@ class TruncatedGaussian(BoundedDistribution):
         # The bounds in standard deviations from loc, in the mirror image where that is taken.
         self._a = torch.where(mirrored, -right, left)
         self._b = torch.where(mirrored, -left, right)
-        self._log_cdf_a, self._log_cdf_b = log_ndtr(self._a), log_ndtr(self._b)
+        self._log_cdf_a = log_ndtr(self._a)
+        self._log_cdf_b = log_ndtr(self._b)
         self._log_mass = self._log_cdf_b + (-torch.expm1(self._log_cdf_a - self._log_cdf_b)).log()
 
     @property

@@ -16,7 +16,9 @@ from ksim_rl.checks import check_choice, check_in_range
 from ksim_rl.device.gradient_context import GradientContext
 
 Device = torch.device | str | None
-SPLITS, OUTPUTS = 4, 2**16  # see `_Product`
+# Of `_Product`.
+SPLITS = 4
+OUTPUTS = 2**16
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
@@ -231,7 +233,8 @@ class _Product(Function):
             splits = math.gcd(SPLITS * max(OUTPUTS // rounded.numel(), 1), rows)
             parts = [part.reshape(networks * splits, rows // splits, -1) for part in (features, d_out)]
             if ctx.alone:
-                parts, fan_in, fan_out = parts[::-1], fan_out, fan_in
+                parts = parts[::-1]
+                fan_in, fan_out = fan_out, fan_in
             sums = torch.bmm(parts[0].mT, parts[1]).unflatten(0, (networks, splits))
             # Parts are added up in float32: their sum would lose digits in bfloat16.
             d_weight = sums[..., :fan_in, :fan_out].sum(1, dtype=torch.float32)

@@ -42,7 +42,8 @@ def _sigmoid(value):
 @triton.jit
 def _of_columns(weights, WIDTH: tl.constexpr, CHUNKS: tl.constexpr, LANES: tl.constexpr):
     # A tuple of chunks stays in registers: loops over chunks are unrolled.
-    found, at = (), weights + tl.program_id(1) * WIDTH
+    found = ()
+    at = weights + tl.program_id(1) * WIDTH
     for chunk in tl.static_range(CHUNKS):  # pyright: ignore[reportGeneralTypeIssues]
         column = chunk * LANES + tl.arange(0, LANES)[None, :]
         found = found + (tl.load(at + column, mask=column < WIDTH, other=0.0),)
@@ -67,14 +68,20 @@ def normalize_rows(
     row, for the way back.
     """
     # Loaded once for all rows of the program.
-    biases, gains = _of_columns(bias, WIDTH, CHUNKS, LANES), _of_columns(gain, WIDTH, CHUNKS, LANES)
+    biases = _of_columns(bias, WIDTH, CHUNKS, LANES)
+    gains = _of_columns(gain, WIDTH, CHUNKS, LANES)
     offsets = _of_columns(offset, WIDTH, CHUNKS, LANES)
     first = tl.program_id(1).to(tl.int64) * num_rows
-    features, out, moments = features + first * WIDTH, out + first * WIDTH, moments + 2 * first
+    features = features + first * WIDTH
+    out = out + first * WIDTH
+    moments = moments + 2 * first
     for step in tl.range(0, STEPS, num_stages=3):  # pyright: ignore[reportGeneralTypeIssues]
         row = (tl.program_id(0) * STEPS + step) * ROWS + tl.arange(0, ROWS)  # pyright: ignore[reportGeneralTypeIssues]
         # Mean first, then squares about it: a difference of mean squares would cancel.
-        values, errors, total, square = (), (), 0.0, 0.0
+        values = ()
+        errors = ()
+        total = 0.0
+        square = 0.0
         for chunk in tl.static_range(CHUNKS):
             at, keep = _chunk(row, num_rows, chunk, WIDTH, LANES)  # pyright: ignore[reportGeneralTypeIssues]
             values = values + (tl.load(features + at, mask=keep, other=0.0).to(tl.float32) + biases[chunk],)
@@ -109,11 +116,15 @@ def normalize_rows_back(
 
     `partials` [3, N, programs, WIDTH] get the sums of bias, gain and offset.
     """
-    biases, gains = _of_columns(bias, WIDTH, CHUNKS, LANES), _of_columns(gain, WIDTH, CHUNKS, LANES)
+    biases = _of_columns(bias, WIDTH, CHUNKS, LANES)
+    gains = _of_columns(gain, WIDTH, CHUNKS, LANES)
     offsets = _of_columns(offset, WIDTH, CHUNKS, LANES)
     first = tl.program_id(1).to(tl.int64) * num_rows
-    features, d_out, moments = features + first * WIDTH, d_out + first * WIDTH, moments + 2 * first
-    d_features, sums = d_features + first * WIDTH, ()
+    features = features + first * WIDTH
+    d_out = d_out + first * WIDTH
+    moments = moments + 2 * first
+    d_features = d_features + first * WIDTH
+    sums = ()
     for _ in tl.static_range(3 * CHUNKS):
         sums = sums + (tl.zeros((ROWS, LANES), dtype=tl.float32),)
     # Loads run ahead of the sums.
@@ -121,7 +132,13 @@ def normalize_rows_back(
         row = (tl.program_id(0) * STEPS + step) * ROWS + tl.arange(0, ROWS)  # pyright: ignore[reportGeneralTypeIssues]
         mean = tl.load(moments + 2 * row, mask=row < num_rows, other=0.0)[:, None]
         scale = tl.load(moments + 2 * row + 1, mask=row < num_rows, other=0.0)[:, None]
-        units, slopes, of_gain, of_offset, of_bias, along, total = (), (), (), (), (), 0.0, 0.0
+        units = ()
+        slopes = ()
+        of_gain = ()
+        of_offset = ()
+        of_bias = ()
+        along = 0.0
+        total = 0.0
         for chunk in tl.static_range(CHUNKS):
             at, keep = _chunk(row, num_rows, chunk, WIDTH, LANES)  # pyright: ignore[reportGeneralTypeIssues]
             value = tl.load(features + at, mask=keep, other=0.0).to(tl.float32) + biases[chunk]
@@ -135,13 +152,16 @@ def normalize_rows_back(
             if ACTIVATION == 2:
                 share = _sigmoid(value)
                 slope *= share + value * (share - share * share)
-            of_gain, of_offset = of_gain + (slope * unit,), of_offset + (slope,)
+            of_gain = of_gain + (slope * unit,)
+            of_offset = of_offset + (slope,)
             # Zero beyond the last row and column, as are `slope` and `scale` there.
             slope *= gains[chunk]
             along += slope * unit
             total += slope
-            units, slopes = units + (unit,), slopes + (slope,)
-        mean_along, mean_slope = tl.sum(along, 1)[:, None] / WIDTH, tl.sum(total, 1)[:, None] / WIDTH
+            units = units + (unit,)
+            slopes = slopes + (slope,)
+        mean_along = tl.sum(along, 1)[:, None] / WIDTH
+        mean_slope = tl.sum(total, 1)[:, None] / WIDTH
         for chunk in tl.static_range(CHUNKS):
             at, keep = _chunk(row, num_rows, chunk, WIDTH, LANES)
             # The gradient through mean and standard deviation: both components that the norm removes are taken out.
@@ -149,7 +169,8 @@ def normalize_rows_back(
             tl.store(d_features + at, slope.to(d_features.dtype.element_ty), mask=keep)
             of_bias = of_bias + (slope,)
         if WEIGHTS:
-            added, found = of_bias + of_gain + of_offset, ()
+            added = of_bias + of_gain + of_offset
+            found = ()
             for part in tl.static_range(3 * CHUNKS):
                 found = found + (sums[part] + added[part],)
             sums = found

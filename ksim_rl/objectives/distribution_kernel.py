@@ -41,8 +41,10 @@ def compare_rows(
     Program (i, n) is of network n. `logits`, `following` and `slope` are [N, num_rows, COUNT].
     """
     # A tile [ROWS, LANES]: one lane per atom, and lanes beyond COUNT without one.
-    row, atom = tl.program_id(0) * ROWS + tl.arange(0, ROWS)[:, None], tl.arange(0, LANES)[None, :]
-    there, last = row < num_rows, COUNT - 1.0
+    row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)[:, None]
+    atom = tl.arange(0, LANES)[None, :]
+    there = row < num_rows
+    last = COUNT - 1.0
     keep = there & (atom < COUNT)
     low = tl.load(support)
     spacing = (tl.load(support + COUNT - 1) - low) / last
@@ -56,7 +58,8 @@ def compare_rows(
         scale = tl.load(discount + row, mask=there, other=0.0)
         # Atom i moves to `start + scale * i`, in units of the spacing.
         start = (tl.load(reward + row, mask=there, other=0.0) + scale * low - low) / spacing
-        moved, source = start + scale * atom, own
+        moved = start + scale * atom
+        source = own
         # All critics share the target of the lowest mean, so each program reads the logits of all of them.
         if LOWEST:
             lowest = tl.full((ROWS, 1), float("inf"), tl.float32)
@@ -64,7 +67,8 @@ def compare_rows(
                 at = row.to(tl.int64) + network * num_rows
                 _, of_next, sum_next, _ = _exponentials(following + at * COUNT + atom, keep)
                 found = tl.sum(of_next * _within(moved, last), 1)[:, None] / sum_next
-                source, lowest = tl.where(found < lowest, at, source), tl.minimum(found, lowest)
+                source = tl.where(found < lowest, at, source)
+                lowest = tl.minimum(found, lowest)
         following += source * COUNT
         _, of_next, sum_next, peak = _exponentials(following + atom, keep)
         # Mass that moves beyond the ends goes to the end atoms; the loop below sees neighbours only.
@@ -78,7 +82,8 @@ def compare_rows(
         for _ in range(tl.max(tl.minimum(tl.ceil(2.0 / apart), COUNT).to(tl.int32))):
             near_logit = tl.load(following + near, mask=there & (near < COUNT), other=-1e30).to(tl.float32)
             target += tl.exp2(near_logit * LOG2_E - peak * LOG2_E) * _within(1.0 - tl.abs(distance), 1.0)
-            near, distance = near + 1, distance + scale
+            near = near + 1
+            distance = distance + scale
         # Where nothing of the future counts, all atoms move to one place.
         spike = sum_next * _within(1.0 - tl.abs(_within(start, last) - atom), 1.0)
         target = tl.where(scale > 0.0, target, spike) * (1.0 / sum_next)
@@ -87,7 +92,8 @@ def compare_rows(
         change = mass - target
     else:
         # Without targets the mean itself is the result, and the slope is its gradient.
-        result, change = value, mass * (low + spacing * atom - value)
+        result = value
+        change = mass * (low + spacing * atom - value)
     tl.store(loss + own, result, mask=there)
     tl.store(mean + own, value, mask=there)
     tl.store(slope + own * COUNT + atom, change.to(slope.dtype.element_ty), mask=keep)

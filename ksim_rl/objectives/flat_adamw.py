@@ -38,7 +38,8 @@ class FlatAdamW(torch.optim.Optimizer):
         self._learning = learning
         # Zeros between the parameters: their gradient, moments and change stay zero.
         self._gaps = [own.new_zeros(-own.numel() % ALIGNMENT) for own in learning]
-        self._flat, self._target = self._end_to_end(learning), self._end_to_end(list(target))
+        self._flat = self._end_to_end(learning)
+        self._target = self._end_to_end(list(target))
         self._moments = torch.zeros_like(self._flat), torch.zeros_like(self._flat)
         self._steps = torch.zeros((), device=device)
         # Views of the flat moments, so that checkpoints see an optimizer like torch's.

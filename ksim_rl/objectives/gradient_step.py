@@ -175,7 +175,8 @@ def step(
     """
     grad_norm, found_inf = clip_and_guard(_parameters(optimizer), max_grad_norm, loss=loss.detach())
     # Fused optimizers read these two, which torch's GradScaler sets as well, and skip the step on the device.
-    optimizer.grad_scale, optimizer.found_inf = None, found_inf  # type: ignore[attr-defined]
+    optimizer.grad_scale = None  # type: ignore[attr-defined]
+    optimizer.found_inf = found_inf  # type: ignore[attr-defined]
     optimizer.step()
     return grad_norm, found_inf
 

@@ -96,7 +96,8 @@ class OffPolicyLoss(LossModule):
         self.register_buffer("support_A", support_A, persistent=False)
         self.gamma = gamma
         self.value_reduction: ValueReduction = value_reduction
-        self.reduction, self._selected = "mean", list[NestedKey](self._written)
+        self.reduction = "mean"
+        self._selected = list[NestedKey](self._written)
 
     @property
     def functional(self) -> bool:

@@ -43,10 +43,12 @@ def align_steep_capsules(
     if contact >= nacon[0]:
         return
     # Geoms of a contact are -1 where flexes touch.
-    plane, capsule = geom[contact][0], geom[contact][1]
+    plane = geom[contact][0]
+    capsule = geom[contact][1]
     if plane < 0 or capsule < 0 or geom_type[plane] != PLANE or geom_type[capsule] != CAPSULE:
         return
-    turn, normal = geom_xmat[world[contact], capsule], frame[contact][0]
+    turn = geom_xmat[world[contact], capsule]
+    normal = frame[contact][0]
     # The capsule's axis is the z axis of its frame.
     axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
     # Its projection on the plane, of a length from 0 (upright) to 1.
@@ -86,7 +88,8 @@ def drop_upper_corners(
     contact = wp.tid()
     if contact >= nacon[0]:
         return
-    plane, box = geom[contact][0], geom[contact][1]
+    plane = geom[contact][0]
+    box = geom[contact][1]
     if plane < 0 or box < 0 or geom_type[plane] != PLANE or geom_type[box] != BOX:
         return
     # The plane's normal, world frame.
@@ -113,12 +116,14 @@ def take_the_law_of_priority(
     contact = wp.tid()
     if contact >= nacon[0]:
         return
-    a, b = geom[contact][0], geom[contact][1]
+    a = geom[contact][0]
+    b = geom[contact][1]
     if a < 0 or b < 0 or geom_priority[a] == geom_priority[b]:
         return
     # A <pair> of its own has its own law, and heeds no priority.
     for pair in range(pair_geom1.shape[0]):
-        first, second = pair_geom1[pair], pair_geom2[pair]
+        first = pair_geom1[pair]
+        second = pair_geom2[pair]
         if (first == a and second == b) or (first == b and second == a):
             return
     stronger = wp.where(geom_priority[a] > geom_priority[b], a, b)
@@ -140,7 +145,8 @@ def leave_out_rows(
     contact = wp.tid()
     if contact >= nacon[0]:
         return
-    a, b = geom[contact][0], geom[contact][1]
+    a = geom[contact][0]
+    b = geom[contact][1]
     if a >= 0 and b >= 0 and rigid_body[a] == rigid_body[b]:
         includemargin[contact] = NO_ROWS
         adhesion[contact] = 0.0

@@ -48,8 +48,10 @@ class RayBatch:
             self._distance = wp.zeros(shape, dtype=float)
             self._geom = wp.zeros(shape, dtype=int)
             self._exclude = wp.array(np.full(num_rays, exclude_body, dtype=np.int32), dtype=int)
-        self.start_EN3, self.direction_EN3 = wp.to_torch(self._start), wp.to_torch(self._direction)
-        self.distance_EN, self.normal_EN3 = wp.to_torch(self._distance), wp.to_torch(self._normal)
+        self.start_EN3 = wp.to_torch(self._start)
+        self.direction_EN3 = wp.to_torch(self._direction)
+        self.distance_EN = wp.to_torch(self._distance)
+        self.normal_EN3 = wp.to_torch(self._normal)
 
     def cast(self) -> None:
         """Cast all rays against the present poses of the geoms."""

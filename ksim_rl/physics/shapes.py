@@ -27,7 +27,8 @@ def start_of_edge(edge: int, half: wp.vec3) -> wp.vec3:
     axis = edge // 4
     start = wp.vec3()
     start[axis] = -half[axis]
-    one, other = (axis + 1) % 3, (axis + 2) % 3
+    one = (axis + 1) % 3
+    other = (axis + 2) % 3
     # The two axes across the edge: bits of its number are the signs.
     start[one] = wp.where((edge & 1) == 0, -half[one], half[one])
     start[other] = wp.where((edge & 2) == 0, -half[other], half[other])
@@ -45,20 +46,25 @@ def along_edge(edge: int, half: wp.vec3) -> wp.vec3:
 @wp.func
 def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
     """Return the closest point of a triangle (Ericson, "Real-Time Collision Detection", 2005, 5.1.5)."""
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
+    ab = b - a
+    ac = c - a
+    ap = p - a
+    d1 = wp.dot(ab, ap)
+    d2 = wp.dot(ac, ap)
     # Beyond corner a, then b, then along edge ab, and so on: the regions around a triangle.
     if d1 <= 0.0 and d2 <= 0.0:
         return a
     bp = p - b
-    d3, d4 = wp.dot(ab, bp), wp.dot(ac, bp)
+    d3 = wp.dot(ab, bp)
+    d4 = wp.dot(ac, bp)
     if d3 >= 0.0 and d4 <= d3:
         return b
     vc = d1 * d4 - d3 * d2
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
         return a + ab * (d1 / (d1 - d3))
     cp = p - c
-    d5, d6 = wp.dot(ab, cp), wp.dot(ac, cp)
+    d5 = wp.dot(ab, cp)
+    d6 = wp.dot(ac, cp)
     if d6 >= 0.0 and d5 <= d6:
         return c
     vb = d5 * d2 - d1 * d6
@@ -76,8 +82,11 @@ def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.ve
 def closest_of_segments(p: wp.vec3, d1: wp.vec3, q: wp.vec3, d2: wp.vec3):
     """Return the parameters in [0, 1] of the closest points of p + s d1 and q + t d2 (Ericson 2005, 5.1.9)."""
     r = p - q
-    a, e, f = wp.dot(d1, d1), wp.dot(d2, d2), wp.dot(d2, r)
-    b, c = wp.dot(d1, d2), wp.dot(d1, r)
+    a = wp.dot(d1, d1)
+    e = wp.dot(d2, d2)
+    f = wp.dot(d2, r)
+    b = wp.dot(d1, d2)
+    c = wp.dot(d1, r)
     denominator = a * e - b * b
     s = float(0.5)  # noqa: UP018 (Warp: a variable that changes)
     # Segments that are not parallel; of parallel ones, any point will do, such as the middle.

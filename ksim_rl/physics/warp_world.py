@@ -87,7 +87,9 @@ class WarpWorld(World):
             self._overflow = OverflowRecord(self.warp_model, self.warp_data_E)
             self._reset_mask = wp.zeros(num_envs, dtype=bool)
             self._launch_reset = resets(self.warp_model, self.warp_data_E, self._reset_mask)
-            m, d, no_solver = self.warp_model, self.warp_data_E, self.one_kernel_unavailable
+            m = self.warp_model
+            d = self.warp_data_E
+            no_solver = self.one_kernel_unavailable
             plan = self._plan = substep_plan(m, d, self.sim, solver_unavailable=no_solver)
             self.one_kernel_dynamics_unavailable = plan.dynamics
             self.one_kernel_rows_unavailable = plan.rows

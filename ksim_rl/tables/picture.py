@@ -8,7 +8,9 @@ from ksim_rl.runs.plotting import Figure, FigureCanvasAgg, plain_style
 from ksim_rl.tables.levels import Result, value_of
 from ksim_rl.tables.table import Table
 
-OURS, OTHERS = "#3465a4", (("D", "#cc5500"), ("s", "#75507b"), ("^", "#4e9a06"), ("v", "#c4a000"))
+OURS = "#3465a4"
+# Marker and colour of each publication.
+OTHERS = (("D", "#cc5500"), ("s", "#75507b"), ("^", "#4e9a06"), ("v", "#c4a000"))
 
 
 @plain_style()

@@ -31,7 +31,8 @@ def on_rough_ground(
     envs move through the levels by how far their robots walk. Heights are seen relative to the soles of a robot whose
     root stands at `root_height`, m. `njmax` and `nconmax` make room for edges, where a foot touches in several places.
     """
-    scan, terrain = mdp.HeightScan(offset=root_height), terrains.TerrainGrid(patches=PATCHES)
+    scan = mdp.HeightScan(offset=root_height)
+    terrain = terrains.TerrainGrid(patches=PATCHES)
     groups = {}
     for name, seen in (("actor", velocity.noisy(scan, 0.1)), ("critic", ObservationTermCfg(term=scan))):
         group = flat.observations[name]

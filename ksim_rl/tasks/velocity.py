@@ -63,8 +63,10 @@ def noisy(term: ObservationTerm, reach: float) -> ObservationTermCfg:
 
 def observations(robot: LeggedRobot) -> dict[str, ObservationGroupCfg]:
     """Return the groups: a noisy "actor" and a clean "critic" that also sees the feet."""
-    lin_vel, ang_vel = mdp.SensorReading(sensor="imu_lin_vel"), mdp.SensorReading(sensor="imu_ang_vel")
-    gravity, joint_vel = mdp.ProjectedGravity(), mdp.JointVel(joints=robot.joint_names)
+    lin_vel = mdp.SensorReading(sensor="imu_lin_vel")
+    ang_vel = mdp.SensorReading(sensor="imu_ang_vel")
+    gravity = mdp.ProjectedGravity()
+    joint_vel = mdp.JointVel(joints=robot.joint_names)
     seen_by_both = {
         "actions": ObservationTermCfg(term=mdp.LastAction()),
         "command": ObservationTermCfg(term=mdp.Command(command=COMMAND)),
@@ -238,7 +240,8 @@ def velocity_cfg(
     `feet` has one element per foot in the order of `robot.foot_sites`. The command is `velocity_command()`;
     `with_command` gives another one. The ground is a plane; `rough_ground.on_rough_ground` changes that.
     """
-    elements, num_feet = feet.geoms or feet.bodies or feet.subtrees, len(robot.foot_sites)
+    elements = feet.geoms or feet.bodies or feet.subtrees
+    num_feet = len(robot.foot_sites)
     if len(elements) != num_feet and all(re.fullmatch(r"[\w/-]+", element) for element in elements):
         raise ValueError(
             f"feet: {len(elements)} {feet.kind} elements {elements} for {num_feet} foot_sites: give one per foot; for "

@@ -22,7 +22,9 @@ PROGRAM = (
     "import faulthandler, os; faulthandler.dump_traceback_later(600, exit=True); "
     "from ksim_rl.trainers import trial; os._exit(trial.main())"
 )
-FITS, DOES_NOT = 0, 3  # exit codes
+# Exit codes.
+FITS = 0
+DOES_NOT = 3
 ITERATIONS = 8  # the first ones run eagerly or fill a replay, the next ones record graphs
 SPARE = 0.1  # of the memory that was free
 

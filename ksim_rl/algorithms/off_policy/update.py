@@ -89,7 +89,8 @@ class OffPolicyUpdate(RolloutUpdate):
         self._images = None
         if cfg.symmetry == "augment":
             self._images = SymmetricAugmentation(mirror, read=self._observations, device=self.device)
-        self._read, self._count_ = fast(self._stored), fast(self._counted_)
+        self._read = fast(self._stored)
+        self._count_ = fast(self._counted_)
         self._critic_loss = fast(loss.critic_loss)
         self._actor_losses = fast(loss.actor_losses)
         self.replay = ReplayRing(

@@ -27,7 +27,8 @@ def read_observations(
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     column = tl.arange(0, LANES)[None, :]
-    keep, at = row < num_rows, row
+    keep = row < num_rows
+    at = row
     value = read_rows(
         source, row[:, None], column, keep[:, None], mean, var, eps, obs, WIDTH, NORMALIZED, TF32
     )
@@ -79,10 +80,13 @@ def write_records(
         squares = tl.sum(tl.load(moments + 3 * part + 2, mask=known, other=0.0) + counts * gap * gap)
         std = tl.sqrt(squares / tl.maximum(count - 1.0, 1.0))
         advantage = (advantage - mean) / tl.maximum(std, min_advantage_std)
-    row, column = rows[:, None], tl.arange(0, RECORD_LANES)[None, :]
+    row = rows[:, None]
+    column = tl.arange(0, RECORD_LANES)[None, :]
     # Which of action, mean and std a column belongs to, and of which action it is.
-    kind, output = column // OUT, column % OUT
-    own, used = row * ACTIONS + output, valid[:, None] & (output < ACTIONS)
+    kind = column // OUT
+    output = column % OUT
+    own = row * ACTIONS + output
+    used = valid[:, None] & (output < ACTIONS)
     # A std of 1 has a logarithm and an inverse; all else is neutral as zero.
     neutral = tl.where(kind == 2, 1.0, 0.0)
     record = tl.where(used, 0.0, neutral)

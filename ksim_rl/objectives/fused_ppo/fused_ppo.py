@@ -66,7 +66,8 @@ def _squashing(networks: FusedNetworks, zeros_A: Tensor) -> dict[str, Any]:
     """Return the arguments of kernels for the entropy of squashed actions."""
     if networks.squashed is None:
         return {"nodes": None, "log_range": 0.0, "NODES": 0}
-    policy, (points, weights) = networks.squashed(zeros_A, zeros_A + 1.0), hermegauss(NODES)
+    policy = networks.squashed(zeros_A, zeros_A + 1.0)
+    points, weights = hermegauss(NODES)
     nodes = torch.tensor(np.stack((points, weights / math.sqrt(2.0 * math.pi)), 1), dtype=torch.float32)
     # At the median only the range sets both densities apart.
     log_range = policy.base.log_prob(zeros_A) - policy.log_prob(policy.median)
@@ -94,10 +95,14 @@ class FusedPPO:
     ) -> None:
         if (mirror is None) != (cfg.symmetry == "none"):
             raise ValueError(f"mirror={mirror}: symmetry={cfg.symmetry!r} needs one, and 'none' has none")
-        self.cfg, self.networks, self.optimizer, self.guard = cfg, networks, optimizer, guard
+        self.cfg = cfg
+        self.networks = networks
+        self.optimizer = optimizer
+        self.guard = guard
         self._mirrored = cfg.symmetry == "loss"
         self.layout = layout = FusedLayout(networks, chained=networks.chained and not self._mirrored)
-        device, dtype = networks.parameters[0].device, getattr(torch, cfg.precision)
+        device = networks.parameters[0].device
+        dtype = getattr(torch, cfg.precision)
         tf32 = self._tf32 = dtype is torch.float32 and torch.get_float32_matmul_precision() != "highest"
         self.tuning = tuning = tuning or Tuning.of(layout, dtype)
         self.batch = num_env_states_per_minibatch
@@ -142,10 +147,14 @@ class FusedPPO:
 
     def _all_arguments(self, rows: int, mirror: SymmetricAugmentation | None) -> dict[str, Any]:
         """Return the arguments of kernels in every step, by name; `rows` is the number of rows of a minibatch."""
-        cfg, layout, tuning = self.cfg, self.layout, self.tuning
-        dataset, parameters = self.dataset, self.parameters
+        cfg = self.cfg
+        layout = self.layout
+        tuning = self.tuning
+        dataset = self.dataset
+        parameters = self.parameters
         zeros = partial(torch.zeros, device=dataset.records.device)
-        blocks, dtype = parts(rows, tuning.block), dataset.obs.dtype
+        blocks = parts(rows, tuning.block)
+        dtype = dataset.obs.dtype
         held = min(rows, self._splits * self._split(rows))
         programs = 2 * parts(layout.num_padded, tuning.size) + 2
         # Where the image of each action comes from, counted from 1, times its sign; see `output_gradients`.
@@ -273,7 +282,9 @@ class FusedPPO:
 
     def _multiply(self, index_B: Tensor) -> None:
         """Run a minibatch through both networks and back, up to the gradients of the weights, some splits at a time."""
-        tuning, split, own = self.tuning, self._split(len(index_B)), self._arguments
+        tuning = self.tuning
+        split = self._split(len(index_B))
+        own = self._arguments
         for number, part_B in enumerate(index_B.split(self._splits * split)):
             first = number * self._splits
             given = own | {
@@ -294,8 +305,11 @@ class FusedPPO:
 
     def _multiply_by_layers(self, given: Mapping[str, Any]) -> None:
         """Leave the results of `minibatch_gradients`, with kernels of each layer."""
-        layout, tuning, index_B = self.layout, self.tuning, given["order"]
-        weights, biases = self.parameters.weights, self.parameters.biases_2N
+        layout = self.layout
+        tuning = self.tuning
+        index_B = given["order"]
+        weights = self.parameters.weights
+        biases = self.parameters.biases_2N
         seen = given["inputs"][: 2 * len(index_B) * layout.inputs].view(2, len(index_B), -1)
         seen[..., : layout.obs] = self.dataset.obs[:, index_B]
 
@@ -331,7 +345,8 @@ class FusedPPO:
 
     def _improve(self, step: int) -> None:
         """Add the parts up, over all ranks by one collective, and make the step of the optimizer."""
-        summary, given = self._summary[step], self._arguments
+        summary = self._summary[step]
+        given = self._arguments
         rate = self.optimizer.param_groups[0]["lr"]
         own = summary if ranks.size() == 1 else given["gradients"][given["NUM_GRADIENTS"] :]
         programs = len(given["squares"])
@@ -353,6 +368,7 @@ class FusedPPO:
         for obs_BL, values_B in zip(obs_DL.chunk(ROLLOUT_PARTS), values_D.chunk(ROLLOUT_PARTS), strict=True):
             hidden_BL = obs_BL[:, : self.layout.obs_dims[1]]
             for below in layers:
-                weight, bias = below.weight.to(obs_DL.dtype), below.bias.to(obs_DL.dtype)
+                weight = below.weight.to(obs_DL.dtype)
+                bias = below.bias.to(obs_DL.dtype)
                 hidden_BL = activation(functional.linear(hidden_BL, weight, bias))
             values_B.copy_(last(hidden_BL.to(values_D.dtype)).squeeze(-1))

@@ -74,7 +74,8 @@ def policy_gradient(
     log_slope = tl.zeros_like(loc)
     if NODES:  # the mean of log(1 - tanh(u)^2) over the gaussian
         for node in range(NODES):
-            at, share = tl.load(nodes + 2 * node), tl.load(nodes + 2 * node + 1)
+            at = tl.load(nodes + 2 * node)
+            share = tl.load(nodes + 2 * node + 1)
             # Each node is one value before the tanh, at a fixed number of standard deviations from the mean.
             latent = loc + bounded * at
             # From |u| alone, so that the exponential never overflows: the function is even.

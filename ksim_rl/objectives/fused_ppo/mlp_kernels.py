@@ -321,10 +321,12 @@ def weight_gradients(
     input_columns = tl.multiple_of(tl.load(tile + 5), 16)
     gradient_columns = tl.multiple_of(tl.load(tile + 6), 16)
     bias = tl.load(tile + 7)
-    row, lane = tl.arange(0, DEPTH), tl.arange(0, TILE)
+    row = tl.arange(0, DEPTH)
+    lane = tl.arange(0, TILE)
     column = lane[None, :]
     # Columns past the tile's own are not read: in a network's last tiles these are most.
-    reads, inside = lane < input_columns, lane < gradient_columns
+    reads = lane < input_columns
+    inside = lane < gradient_columns
     inputs += network.to(tl.int64) * num_rows * INPUTS + first_input
     slopes += network.to(tl.int64) * num_rows * GRADIENTS + first_gradient
     acc = tl.zeros((TILE, TILE), dtype=tl.float32)

@@ -27,7 +27,9 @@ class FusedParameters:
         num_steps: int,
         size: int,
     ) -> None:
-        self._parameters, self._optimizer, self._tf32 = networks.parameters, optimizer, tf32
+        self._parameters = networks.parameters
+        self._optimizer = optimizer
+        self._tf32 = tf32
         device = self._parameters[0].device
         padding = -layout.num_flat % size
         # Parameters, and the optimizer's means and variances, each [N] and zeros up to a whole number of `size`.

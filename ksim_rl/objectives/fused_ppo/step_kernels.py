@@ -75,7 +75,8 @@ def _adapt(learning_rate, kl, desired_kl, bounds, ADAPTIVE: tl.constexpr):
     """Return the learning rate, after `adapt_learning_rate_` if it is ADAPTIVE."""
     rate = tl.load(learning_rate)
     if ADAPTIVE:  # comparisons with NaN are False
-        slower, faster = tl.maximum(rate / 1.5, tl.load(bounds)), tl.minimum(rate * 1.5, tl.load(bounds + 1))
+        slower = tl.maximum(rate / 1.5, tl.load(bounds))
+        faster = tl.minimum(rate * 1.5, tl.load(bounds + 1))
         too_near = (kl < 0.5 * desired_kl) & (kl > 0.0)
         rate = tl.where(kl > 2.0 * desired_kl, slower, tl.where(too_near, faster, rate))
         tl.store(learning_rate, rate)
@@ -152,7 +153,11 @@ def sum_gradients(
     else:
         # The last program has the value's statistics: loss, and the moments of targets and errors.
         count = tl.zeros((ROWS,), dtype=tl.float32)
-        loss, target, error, target_squares, error_squares = count, count, count, count, count
+        loss = count
+        target = count
+        error = count
+        target_squares = count
+        error_squares = count
         for first in range(0, BLOCKS, ROWS):
             block = first + tl.arange(0, ROWS)
             keep = block < BLOCKS
@@ -160,9 +165,11 @@ def sum_gradients(
             row = block_partials + (block * 2 * WIDTH + WIDTH + OUT)
             size = tl.load(row, mask=keep, other=0.0)
             loss += tl.load(row + 1, mask=keep, other=0.0)
-            total, own = tl.load(row + 2, mask=keep, other=0.0), tl.load(row + 3, mask=keep, other=0.0)
+            total = tl.load(row + 2, mask=keep, other=0.0)
+            own = tl.load(row + 3, mask=keep, other=0.0)
             target, target_squares = _merged(count, target, target_squares, size, total, own)
-            total, own = tl.load(row + 4, mask=keep, other=0.0), tl.load(row + 5, mask=keep, other=0.0)
+            total = tl.load(row + 4, mask=keep, other=0.0)
+            own = tl.load(row + 5, mask=keep, other=0.0)
             error, error_squares = _merged(count, error, error_squares, size, total, own)
             count += size
         counted = tl.sum(count)
@@ -267,7 +274,8 @@ def mean_steps(
 ):  # fmt: skip
     """Write the means of all columns over the steps that were made, and how many in a row were skipped at most."""
     row = tl.arange(0, POWER_OF_STEPS)[:, None]
-    at, inside = summary + row * COLUMNS, row < STEPS
+    at = summary + row * COLUMNS
+    inside = row < STEPS
     # Rows beyond the steps count as skipped.
     made = tl.load(at + SKIPPED, mask=inside, other=1.0) == 0.0
     # The measurements of a skipped step would spoil the means.

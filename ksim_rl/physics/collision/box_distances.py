@@ -90,7 +90,8 @@ def gap_between(half: wp.vec3, other_half: wp.vec3, turn: wp.mat33, place: wp.ve
         gap = nearer(gap, own, place + turn @ wp.max(wp.min(inside, other_half), -other_half))
     # Each edge of one box against each of the other.
     for pair in range(EDGE_PAIRS):
-        start, along = start_of_edge(pair // 12, half), along_edge(pair // 12, half)
+        start = start_of_edge(pair // 12, half)
+        along = along_edge(pair // 12, half)
         other_start = place + turn @ start_of_edge(pair % 12, other_half)
         other_along = turn @ along_edge(pair % 12, other_half)
         s, t = closest_of_segments(start, along, other_start, other_along)
@@ -111,7 +112,8 @@ def overlap_of(half: wp.vec3, other_half: wp.vec3, turn: wp.mat33, place: wp.vec
         elif axis < 6:
             normal = wp.vec3(turn[0, axis - 3], turn[1, axis - 3], turn[2, axis - 3])
         else:
-            edge, other = wp.vec3(), (axis - 6) % 3
+            edge = wp.vec3()
+            other = (axis - 6) % 3
             edge[(axis - 6) // 3] = 1.0
             normal = wp.cross(edge, wp.vec3(turn[0, other], turn[1, other], turn[2, other]))
         length = wp.length(normal)
@@ -136,7 +138,8 @@ def forget_touching_boxes(c: Measured):
     if contact >= c.nacon[0]:
         return
     # Geoms of a contact are -1 where flexes touch.
-    first, second = c.contact_geom[contact][0], c.contact_geom[contact][1]
+    first = c.contact_geom[contact][0]
+    second = c.contact_geom[contact][1]
     if first < 0 or second < 0 or c.geom_type[first] != BOX or c.geom_type[second] != BOX:
         return
     c.contact_type[contact] = c.contact_type[contact] & ~SENSOR
@@ -146,9 +149,11 @@ def forget_touching_boxes(c: Measured):
 def measure_boxes(c: Measured):
     """Append a contact for each measured pair and world, which has no rows: the closest places of the two boxes."""
     world, pair = wp.tid()
-    first, second = c.pairs[pair][0], c.pairs[pair][1]
+    first = c.pairs[pair][0]
+    second = c.pairs[pair][1]
     row = world % c.geom_size.shape[0]
-    half, other_half = c.geom_size[row, first], c.geom_size[row, second]
+    half = c.geom_size[row, first]
+    other_half = c.geom_size[row, second]
     frame = c.geom_xmat[world, first]
     back = wp.transpose(frame)
     turn = back @ c.geom_xmat[world, second]

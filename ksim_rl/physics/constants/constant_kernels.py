@@ -223,7 +223,8 @@ def mend_weights(c: Constants):
     com = c.xpos[frame, body] + rot_vec_quat(
         c.body_ipos[world % c.body_ipos.shape[0], body], c.xquat[frame, body]
     )
-    fastest, turns = float(0.0), float(0.0)  # noqa: UP018 (Warp: variables that change in a loop)
+    fastest = float(0.0)  # noqa: UP018 (Warp: variables that change in a loop)
+    turns = float(0.0)  # noqa: UP018
     dof = c.last_dof[body]
     # From the body's last degree of freedom up to the root.
     while dof >= 0:

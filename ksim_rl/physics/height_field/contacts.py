@@ -74,7 +74,8 @@ def core_of(kind: int, size: wp.vec3, center: wp.vec3, turn: wp.mat33) -> Core:
 def height_field_contacts(c: Collisions):
     """Append the contacts of one pair (height field, geom) in one world, one for each prism that it touches."""
     world, pair = wp.tid()
-    ground, geom = c.pairs[pair][0], c.pairs[pair][1]
+    ground = c.pairs[pair][0]
+    geom = c.pairs[pair][1]
     patch = c.geom_dataid[world % c.geom_dataid.shape[0], ground]
     size = c.hfield_size[patch]
     field_turn = c.geom_xmat[world, ground]

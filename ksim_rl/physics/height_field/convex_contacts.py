@@ -72,7 +72,8 @@ class Searches:
 @wp.func
 def append_contacts(c: Searches, slot: int, world: int, pair: int):
     """Append the contacts of one pair (height field, geom) in one world, one for each prism that it touches."""
-    ground, geom = c.pairs[pair][0], c.pairs[pair][1]
+    ground = c.pairs[pair][0]
+    geom = c.pairs[pair][1]
     patch = c.geom_dataid[world % c.geom_dataid.shape[0], ground]
     size = c.hfield_size[patch]
     field_turn = c.geom_xmat[world, ground]
@@ -149,7 +150,8 @@ def append_contacts(c: Searches, slot: int, world: int, pair: int):
     below.vertnum = 6
     below.graphadr = -1
     # The geom's box along the axes, grown by the distance at which contacts exist.
-    low, high = wp.vec3(), wp.vec3()
+    low = wp.vec3()
+    high = wp.vec3()
     for axis in range(3):
         along = wp.vec3()
         along[axis] = 1.0

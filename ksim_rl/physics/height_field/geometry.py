@@ -193,7 +193,8 @@ def closest_on_face(prism: Prism, face: int, point: wp.vec3) -> wp.vec3:
             corner_of_prism(prism, level + 2),
         )
     # A side is a quadrilateral, tested as two triangles.
-    start, end = corner_of_prism(prism, face), corner_of_prism(prism, (face + 1) % 3)
+    start = corner_of_prism(prism, face)
+    end = corner_of_prism(prism, (face + 1) % 3)
     below = corner_of_prism(prism, 3 + (face + 1) % 3)
     place = closest_on_triangle(point, start, end, below)
     other = closest_on_triangle(point, start, corner_of_prism(prism, 3 + face), below)
@@ -304,14 +305,17 @@ def widest_axis(prism: Prism, core: Core) -> Touch:
         if length > PARALLEL:
             normal = normal / length
             # The projections of the prism, then of the core, on the axis.
-            low, high = float(FAR), float(-FAR)
+            low = float(FAR)
+            high = float(-FAR)
             for corner in range(CORNERS):
                 along = wp.dot(normal, corner_of_prism(prism, corner))
-                low, high = wp.min(low, along), wp.max(high, along)
+                low = wp.min(low, along)
+                high = wp.max(high, along)
             middle = wp.dot(normal, core.center)
             reach = wp.dot(wp.abs(wp.transpose(core.turn) @ normal), core.half)
             # The signed distance in both senses of the axis.
-            above, below = middle - reach - high, low - middle - reach
+            above = middle - reach - high
+            below = low - middle - reach
             # Between equal axes, a face's normal wins over the rounding of a cross product.
             needed = best.distance + wp.where(axis < FACE_AXES, 0.0, NEARLY)
             if wp.max(above, below) > needed:

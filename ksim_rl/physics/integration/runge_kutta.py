@@ -183,7 +183,8 @@ class _ExactFilters:
 
     def rate(self) -> None:
         """Launch what moves them by their rate, before the stage computes the next one."""
-        m, d = self._warp_model, self._warp_data_E
+        m = self._warp_model
+        d = self._warp_data_E
         fraction = STAGE_TIMES[self._stage]
         self._stage += 1
         inputs = [self._actuators, m.actuator_actadr, m.actuator_dynprm, m.opt.timestep, d.act_dot, fraction]

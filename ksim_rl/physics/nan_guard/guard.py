@@ -122,7 +122,8 @@ class NanGuard:
         self._failed = wp.zeros(num_envs, dtype=int)
         self._count = wp.zeros(num_envs, dtype=int)
         self._reached = {name: wp.zeros_like(rows) for name, rows in self._reached_from.items()}
-        self._failed_E, self._count_E = wp.to_torch(self._failed), wp.to_torch(self._count)
+        self._failed_E = wp.to_torch(self._failed)
+        self._count_E = wp.to_torch(self._count)
         self._fields = dict(fields)
         # A reset draws new fields before the report is read: the failed world's are copied.
         self._kept_fields = {name: tensor.clone() for name, tensor in fields.items()}

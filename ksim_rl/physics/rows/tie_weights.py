@@ -83,7 +83,8 @@ def weigh_ties(
     if row >= 3 and efc_type[world, third_before] == EQUALITY and efc_id[world, third_before] == equality:
         part = 1
     of_world = world % body_invweight0.shape[0]
-    present, wanted = float(0.0), float(0.0)  # noqa: UP018
+    present = float(0.0)  # noqa: UP018
+    wanted = float(0.0)  # noqa: UP018
     for side in range(2):
         present += body_invweight0[of_world, carriers[equality][side]][part]
         wanted += body_invweight0[of_world, bodies[equality][side]][part]

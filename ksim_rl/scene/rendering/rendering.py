@@ -126,7 +126,8 @@ class OffscreenRenderer:
                 vis = self._mj_model.vis.global_
                 cfg = self._cfg
                 # MuJoCo refuses pictures that are larger than its off-screen buffer.
-                vis.offwidth, vis.offheight = max(vis.offwidth, cfg.width), max(vis.offheight, cfg.height)
+                vis.offwidth = max(vis.offwidth, cfg.width)
+                vis.offheight = max(vis.offheight, cfg.height)
                 self._renderer = mujoco.Renderer(self._mj_model, cfg.height, cfg.width, max_geom=20_000)
             except Exception as error:  # MuJoCo's platforms raise whatever their loader raises
                 raise RuntimeError(f"{_FIXES}. MUJOCO_GL is {platform!r}, and it said: {error}") from error

@@ -136,5 +136,6 @@ def _as_text(spec: mujoco.MjSpec) -> str:
     spec.compile()
     folder = Path(spec.modelfiledir or ".").resolve()
     # Absolute folders, since the text is read from elsewhere.
-    spec.meshdir, spec.texturedir = str(folder / spec.meshdir), str(folder / spec.texturedir)
+    spec.meshdir = str(folder / spec.meshdir)
+    spec.texturedir = str(folder / spec.texturedir)
     return spec.to_xml()

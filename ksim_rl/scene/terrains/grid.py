@@ -288,7 +288,8 @@ class PatchedGround(Ground):
                 f"max_difference={max_difference}: ask for a smaller edge, or allow more"
             )
         chosen = np.random.default_rng((grid.seed, level, column, count)).integers(0, len(row_N), count)
-        row_N, column_N = row_N[chosen], column_N[chosen]
+        row_N = row_N[chosen]
+        column_N = column_N[chosen]
         # A window begins `reach` points before its middle.
         x_N = lattice.x_RC[0, column_N + reach]
         y_N = lattice.y_RC[row_N + reach, 0]

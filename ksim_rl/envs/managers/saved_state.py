@@ -14,7 +14,7 @@ WORLD = "world."
 
 
 def buffers_to_save(
-    driver: EnvDriver, *, rewards: RewardManager, curricula: CurriculumManager, log: EpisodeLog
+    driver: EnvDriver, rewards: RewardManager, curricula: CurriculumManager, log: EpisodeLog
 ) -> dict[str, Shaped[Tensor, "*?shape"]]:
     """Return the tensors that later steps depend on, by name: counters, shared values and buffers of terms."""
     counters = {
@@ -30,7 +30,7 @@ def buffers_to_save(
     return counters | shared | driver.buffers.by_name()
 
 
-def joined_state(
+def joined(
     of_env: Mapping[str, Shaped[Tensor, "*?shape"]], of_world: Mapping[str, Shaped[Tensor, "*?shape"]]
 ) -> State:
     """Return the state dict of an env and its worlds; the env's tensors are copied."""
@@ -40,10 +40,10 @@ def joined_state(
     return state
 
 
-def parts_of_state(
+def parts(
     state: State,
 ) -> tuple[dict[str, Shaped[Tensor, "*?shape"]], dict[str, Shaped[Tensor, "*?shape"]]]:
-    """Return the entries of a state dict that are the env's, and those of its worlds; see `joined_state`."""
+    """Return the entries of a state dict that are the env's, and those of its worlds; see `joined`."""
     of_env = {}
     of_world = {}
     for name, value in state.items():
