@@ -56,7 +56,8 @@ def between(count: int, fps: float, wanted_fps: float) -> tuple[Array, Float[Arr
             f"{MOST_FRAMES} at most; repair the rate"
         )
     # The small number keeps the last frame where the division falls just short of it.
-    times_F = np.arange(0, int(wanted + 1e-6) + 1) / wanted_fps
+    last = int(wanted + 1e-6)
+    times_F = np.arange(0, last + 1) / wanted_fps
     # At most the last but one, so that there is always a next frame.
     low_F = np.minimum((times_F * fps + 1e-9).astype(int), count - 2)
     return low_F, np.clip(times_F * fps - low_F, 0.0, 1.0)
@@ -89,14 +90,17 @@ def multiply(a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"]) -> Float[
     bw = b[..., :1]
     bu = b[..., 1:]
     scalar = aw * bw - (au * bu).sum(-1, keepdims=True)
-    return np.concatenate((scalar, aw * bu + bw * au + np.cross(au, bu)), axis=-1)
+    vector = aw * bu + bw * au + np.cross(au, bu)
+    return np.concatenate((scalar, vector), axis=-1)
 
 
 def rotate(q: Float[Array, "*batch 4"], v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
     """Rotate vectors by quaternions."""
     # v + 2 (w (u x v) + u x (u x v)) with u the vector part: cheaper than two products.
-    across = np.cross(q[..., 1:], v)
-    return v + 2.0 * (q[..., :1] * across + np.cross(q[..., 1:], across))
+    w = q[..., :1]
+    u = q[..., 1:]
+    across = np.cross(u, v)
+    return v + 2.0 * (w * across + np.cross(u, across))
 
 
 def from_rotation_vector(turn: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4"]:

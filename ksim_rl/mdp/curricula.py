@@ -51,7 +51,8 @@ class LinearLevel(LevelCurriculum):
         share = (view.step_count - self.begin_step) / (self.end_step - self.begin_step)
         level = self.initial_level + (1.0 - self.initial_level) * share.clamp(0.0, 1.0)
         # Levels change only at resets of some env, on any rank: all ranks must keep the same level.
-        view.level.copy_(torch.where(ranks.any_of(mask_E), level.to(torch.float32), view.level))
+        changes = ranks.any_of(mask_E)
+        view.level.copy_(torch.where(changes, level.to(torch.float32), view.level))
         return view.level.clone()
 
 
@@ -80,9 +81,10 @@ class SteppedLevel(LevelCurriculum):
         # A reset before the first step ends no episode.
         ended_E = mask_E & (view.episode_step_E > 0)
         held_2 = view.shared("episodes_and_score_2", (0.0, 0.0))
-        ended_E2 = torch.stack((torch.ones_like(ended_E, dtype=torch.float32), self.score(view)), dim=-1)
+        one_E = torch.ones_like(ended_E, dtype=torch.float32)
+        one_and_score_E2 = torch.stack((one_E, self.score(view)), dim=-1)
         # Number of ended episodes, and sum of their scores.
-        added_2 = torch.where(ended_E[:, None], ended_E2, 0.0).sum(0)
+        added_2 = torch.where(ended_E[:, None], one_and_score_E2, 0.0).sum(0)
         # All ranks count together, so that they move at the same moment.
         ranks.sum_(added_2)
         total_2 = held_2 + added_2
@@ -167,18 +169,21 @@ class TerrainLevels(OfCommand, OfEntity, CurriculumTerm):
         level_E = terrain.levels_E
         top = terrain.num_levels - 1
         distance_E = distance_from_origin(view, self.entity)
-        speed_E = torch.linalg.vector_norm(view.command(self.command)[:, :2], dim=-1)
+        planar_E2 = view.command(self.command)[:, :2]
+        speed_E = torch.linalg.vector_norm(planar_E2, dim=-1)
         # Metres that a robot covers in a whole episode if it follows its last command.
         asked_E = speed_E * (view.max_episode_length * view.step_dt)
         up_E = distance_E >= self.up_distance * terrain.half_width
         # Never both: who got far enough moves up, even if the command asked for more.
         down_E = ~up_E & (distance_E < self.down_share * asked_E)
         moved_E = level_E + up_E.long() - down_E.long()
+        share_E = view.uniform(1)[:, 0]
         # The product may round up to `num_levels`, hence the clamp.
-        drawn_E = (view.uniform(1)[:, 0] * terrain.num_levels).long().clamp(max=top)
+        drawn_E = (share_E * terrain.num_levels).long().clamp(max=top)
         next_E = torch.where(moved_E > top, drawn_E, moved_E.clamp(min=0))
         # An env that is reset before its first step has shown nothing, and stays where it is.
-        terrain.set_levels(mask_E & (view.episode_step_E > 0), next_E)
+        ended_E = mask_E & (view.episode_step_E > 0)
+        terrain.set_levels(ended_E, next_E)
         return terrain.levels_E.to(torch.float32).mean()
 
 
@@ -203,7 +208,8 @@ class RewardWeight(CurriculumTerm):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         held = view.reward_weights[self.reward]
         # Weights are shared by all envs, and change in place and at resets only.
-        held.copy_(torch.where(ranks.any_of(mask_E), self.weight(view, held), held))
+        changes = ranks.any_of(mask_E)
+        held.copy_(torch.where(changes, self.weight(view, held), held))
         return held.clone()
 
 
@@ -218,6 +224,13 @@ class RewardWeightByStage(RewardWeight):
         for step, value in sorted(self.stages.items()):
             held = torch.where(view.step_count >= step, float(value), held)
         return held
+
+
+def _stages_begun(view: EnvView, stages: Iterable[int]) -> Tensor:
+    """Return how many stages have begun, float32 []."""
+    # Stages begin in order, so their number is how many starts have passed.
+    begins_S = constant(sorted(stages), view.device)
+    return (view.step_count >= begins_S).sum().to(torch.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,7 +249,7 @@ class FieldsByStage(CurriculumTerm):
         return {self.adapted: [fields for _, fields in sorted(self.stages.items())]}
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
-        stage = (view.step_count >= constant(sorted(self.stages), view.device)).sum().to(torch.float32)
+        stage = _stages_begun(view, self.stages)
         held = view.stages[self.adapted]
         # At resets only, so that an episode is rated by one rule.
         held.copy_(torch.where(ranks.any_of(mask_E), stage, held))
@@ -294,15 +307,17 @@ class CommandRangesByStage(OfCommand, CurriculumTerm):
     stages: Annotated[Mapping[WholeNumber, Ranges], SOME_STAGE]
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
-        held = _ranges_of(view, self.command, {field for ranges in self.stages.values() for field in ranges})
+        fields: set[str] = set()
+        fields.update(*self.stages.values())
+        held = _ranges_of(view, self.command, fields)
         changes = ranks.any_of(mask_E)
         for step, ranges in sorted(self.stages.items()):
             begins = changes & (view.step_count >= step)
             for field, pair in ranges.items():
                 # In place: the command reads these tensors.
-                held[field].copy_(torch.where(begins, constant(pair, view.device), held[field]))
-        # Stages begin in order, so their number is how many starts have passed.
-        stage = (view.step_count >= constant(sorted(self.stages), view.device)).sum().to(torch.float32)
+                wanted_2 = constant(pair, view.device)
+                held[field].copy_(torch.where(begins, wanted_2, held[field]))
+        stage = _stages_begun(view, self.stages)
         held_stage = view.shared("stage", 0.0)
         held_stage.copy_(torch.where(changes, stage, held_stage))
         return held_stage.clone()

@@ -65,7 +65,8 @@ class ResetJoints(JointReset):
         default_EL = view.joints(self.joints).default_pos_EL
         count = default_EL.shape[1]
         pos_EL = default_EL + self._draw(view, count, self.position_range)
-        self._write(view, mask_E, pos_EL, self._draw(view, count, self.velocity_range))
+        vel_EL = self._draw(view, count, self.velocity_range)
+        self._write(view, mask_E, pos_EL, vel_EL)
 
     def _draw(self, view: EnvView, count: int, pair: tuple[float, float]) -> Float[Tensor, "E L"]:
         first = float(pair[0])
@@ -89,7 +90,8 @@ class ResetJointsByScale(JointReset):
         default_EL = view.joints(self.joints).default_pos_EL
         count = default_EL.shape[1]
         pos_EL = default_EL * view.uniform(count, *self.position_scale)
-        self._write(view, mask_E, pos_EL, view.uniform(count, *self.velocity_range))
+        vel_EL = view.uniform(count, *self.velocity_range)
+        self._write(view, mask_E, pos_EL, vel_EL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +111,8 @@ class ResetRootUniform(OfEntity, EventTerm):
         velocity_E6 = draw_by_axis(view, self.velocity_range)
         turn_E4 = quaternion.from_euler_xyz(*offset_E6[:, 3:].unbind(-1))
         # The turn is on the right: its axes are the default pose's, not the world's.
-        quat_E4 = quaternion.multiply(body.default_root_quat_L.expand(view.num_envs, 4), turn_E4)
+        default_E4 = body.default_root_quat_L.expand(view.num_envs, 4)
+        quat_E4 = quaternion.multiply(default_E4, turn_E4)
         pos_E3 = body.default_root_pos_L + offset_E6[:, :3]
         start_E3 = self.start(view)
         if start_E3 is not None:
@@ -142,7 +145,8 @@ class ResetRootOnEvenGround(ResetRootUniform):
             edge=self.edge, max_difference=self.max_difference, count=self.num_places
         )
         chosen_E1 = view.integers(1, 0, self.num_places - 1)
-        return places_EK3.gather(1, chosen_E1[..., None].expand(-1, -1, 3))[:, 0]
+        chosen_E13 = chosen_E1[..., None].expand(-1, -1, 3)
+        return places_EK3.gather(1, chosen_E13)[:, 0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +163,8 @@ class ResetHeading(OfEntity, EventTerm):
         nothing_E = torch.zeros_like(turn_E)
         turn_E4 = quaternion.from_euler_xyz(nothing_E, nothing_E, turn_E)
         # On the left, since it turns about the world's z axis.
-        body.write_root_pose(mask_E, body.root_pos_EL, quaternion.multiply(turn_E4, body.root_quat_EL))
+        quat_E4 = quaternion.multiply(turn_E4, body.root_quat_EL)
+        body.write_root_pose(mask_E, body.root_pos_EL, quat_E4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +177,9 @@ class ResetHeight(OfEntity, EventTerm):
         body = view.entity(self.entity)
         # The root moves by the difference of heights, so that slopes and steps need no special case.
         rise_E1 = view.uniform(1, *self.height_range) - root_height(view, self.entity)[:, None]
-        pos_E3 = torch.cat((body.root_pos_EL[:, :2], body.root_pos_EL[:, 2:] + rise_E1), dim=-1)
+        planar_E2 = body.root_pos_EL[:, :2]
+        height_E1 = body.root_pos_EL[:, 2:] + rise_E1
+        pos_E3 = torch.cat((planar_E2, height_E1), dim=-1)
         body.write_root_pose(mask_E, pos_E3, body.root_quat_EL)
 
 
@@ -201,9 +208,9 @@ class StartAtCommand(OfCommand, OfEntity, EventTerm):
         # The command is in the root's frame, velocities are written in the world's.
         quat_E4 = body.root_quat_EL
         starts_E = mask_E & (view.uniform(1)[:, 0] < self.share)
-        body.write_root_velocity(
-            starts_E, quaternion.rotate(quat_E4, planar_E3), quaternion.rotate(quat_E4, turn_E3)
-        )
+        lin_vel_E3 = quaternion.rotate(quat_E4, planar_E3)
+        ang_vel_E3 = quaternion.rotate(quat_E4, turn_E3)
+        body.write_root_velocity(starts_E, lin_vel_E3, ang_vel_E3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +225,8 @@ class PushByVelocity(OfEntity, EventTerm):
         kick_E6 = draw_by_axis(view, self.velocity_range)
         # Added to the present velocity, not in place of it.
         lin_vel_E3 = body.root_lin_vel_w_EL + kick_E6[:, :3]
-        body.write_root_velocity(mask_E, lin_vel_E3, body.root_ang_vel_w_EL + kick_E6[:, 3:])
+        ang_vel_E3 = body.root_ang_vel_w_EL + kick_E6[:, 3:]
+        body.write_root_velocity(mask_E, lin_vel_E3, ang_vel_E3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,9 +259,11 @@ class PushByForce(EventTerm):
         left_E.copy_(torch.where(mask_E, duration_E, left_E - view.step_dt))
         held_E6.copy_(torch.where(mask_E[:, None], drawn_E6, held_E6))
         # The clock has run out at the env step that is nearest, whatever the subtractions round to.
-        wrench_E6 = torch.where((left_E > 0.5 * view.step_dt)[:, None], held_E6, 0.0)
+        is_on_E = left_E > 0.5 * view.step_dt
+        wrench_E6 = torch.where(is_on_E[:, None], held_E6, 0.0)
+        body = view.resolver.one("body", self.body)
         # Only the change is added: other events may press on the same body.
-        view.world.xfrc_applied_EL[:, view.resolver.one("body", self.body)].add_(wrench_E6 - applied_E6)
+        view.world.xfrc_applied_EL[:, body].add_(wrench_E6 - applied_E6)
         applied_E6.copy_(wrench_E6)
 
 
@@ -268,7 +278,8 @@ class Jump(OfEntity, EventTerm):
         body = view.entity(self.entity)
         height_E = view.uniform(1, *self.height_range)[:, 0]
         # Each world may have gravity of its own.
-        up_E = torch.sqrt(2.0 * torch.linalg.vector_norm(view.world.gravity_EL, dim=-1) * height_E)
+        gravity_E = torch.linalg.vector_norm(view.world.gravity_EL, dim=-1)
+        up_E = torch.sqrt(2.0 * gravity_E * height_E)
         lin_vel_E3 = body.root_lin_vel_w_EL.clone()
         # World z is up, whatever the direction of gravity.
         lin_vel_E3[:, 2] += up_E

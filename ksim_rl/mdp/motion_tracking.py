@@ -71,8 +71,9 @@ class MotionJoints(OfMotion, OfJoints, ObservationTerm):
             # The present frame is sampled once per step for all terms.
             return torch.cat(motion_joints(view, self.file, self.joints), dim=-1)
         time_E = motion_time(view, self.file) + self.ahead_s
+        motion = view.motion(self.file)
         # Positions, then velocities, both of the later moment.
-        return torch.cat(view.motion(self.file).sample_joints(time_E, view.joints(self.joints).index), dim=-1)
+        return torch.cat(motion.sample_joints(time_E, view.joints(self.joints).index), dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +90,8 @@ class TrackMotionJointPos(OfMotion, OfJoints, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         pos_EL, _ = motion_joints(view, self.file, self.joints)
-        return self.rate((view.joints(self.joints).pos_EL - pos_EL).square().sum(-1))
+        error_EL = view.joints(self.joints).pos_EL - pos_EL
+        return self.rate(error_EL.square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +100,8 @@ class TrackMotionJointVel(OfMotion, OfJoints, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, vel_EL = motion_joints(view, self.file, self.joints)
-        return self.rate((view.joints(self.joints).vel_EL - vel_EL).square().sum(-1))
+        error_EL = view.joints(self.joints).vel_EL - vel_EL
+        return self.rate(error_EL.square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +120,8 @@ class TrackMotionBodyQuat(OfMotionBodies, GaussianReward):
         _, quat_EN4 = motion_bodies(view, self.file, self.bodies)
         own_EN4 = view.bodies(self.bodies).quat_EN4
         # The angle is free of the sign of the quaternions.
-        return self.rate(quaternion.angle_between(own_EN4, quat_EN4).square().sum(-1))
+        angle_EN = quaternion.angle_between(own_EN4, quat_EN4)
+        return self.rate(angle_EN.square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +131,8 @@ class FarFromMotion(OfMotionBodies, TerminationTerm):
     distance: Positive
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
-        return (torch.linalg.vector_norm(self.offset(view), dim=-1) > self.distance).any(-1)
+        distance_EN = torch.linalg.vector_norm(self.offset(view), dim=-1)
+        return (distance_EN > self.distance).any(-1)
 
 
 @dataclass(frozen=True, kw_only=True)

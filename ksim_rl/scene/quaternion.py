@@ -15,8 +15,11 @@ def multiply(a: Float[Tensor, "*a 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor
     bw = b[..., :1]
     bu = b[..., 1:]
     # Vector part: a_w b_u + b_w a_u + a_u x b_u.
-    vector = torch.addcmul(torch.addcmul(torch.linalg.cross(au, bu), aw, bu), bw, au)
-    return torch.cat((aw * bw - (au * bu).sum(-1, keepdim=True), vector), dim=-1)
+    vector = torch.linalg.cross(au, bu)
+    vector = torch.addcmul(vector, aw, bu)
+    vector = torch.addcmul(vector, bw, au)
+    scalar = aw * bw - (au * bu).sum(-1, keepdim=True)
+    return torch.cat((scalar, vector), dim=-1)
 
 
 def conjugate(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -30,7 +33,8 @@ def rotate(q: Float[Tensor, "*q 4"], v: Float[Tensor, "*v 3"]) -> Float[Tensor, 
     u = q[..., 1:]
     across = torch.linalg.cross(u, v)
     # Rodrigues: v + 2 (w (u x v) + u x (u x v)), which needs no conjugate.
-    return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across), alpha=2.0)
+    half_change = torch.addcmul(torch.linalg.cross(u, across), w, across)
+    return torch.add(v, half_change, alpha=2.0)
 
 
 def rotate_inverse(q: Float[Tensor, "*q 4"], v: Float[Tensor, "*v 3"]) -> Float[Tensor, "*batch 3"]:
@@ -39,13 +43,16 @@ def rotate_inverse(q: Float[Tensor, "*q 4"], v: Float[Tensor, "*v 3"]) -> Float[
     u = q[..., 1:]
     across = torch.linalg.cross(u, v)
     # The same with -w: the inverse turns the other way.
-    return torch.add(v, torch.addcmul(torch.linalg.cross(u, across), w, across, value=-1.0), alpha=2.0)
+    half_change = torch.addcmul(torch.linalg.cross(u, across), w, across, value=-1.0)
+    return torch.add(v, half_change, alpha=2.0)
 
 
 def angle_between(a: Float[Tensor, "*a 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor, "*batch"]:
     """Return the angle of the rotation that turns orientation `a` into `b`, [..., 4] each: rad in [0, pi], [...]."""
     # By the chord, which unlike the cosine is well-conditioned at 0. `b` and `-b` are the same orientation.
-    chord = torch.minimum(torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1))
+    to_b = torch.linalg.vector_norm(a - b, dim=-1)
+    to_minus_b = torch.linalg.vector_norm(a + b, dim=-1)
+    chord = torch.minimum(to_b, to_minus_b)
     # A chord of 2 sin(angle / 4); rounding may lead beyond 1.
     return 4.0 * torch.asin((0.5 * chord).clamp(max=1.0))
 
@@ -54,7 +61,9 @@ def yaw(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
     """Return the heading of quaternions [..., 4]: the angle of the rotated x axis in the xy plane, rad, [...]."""
     w, x, y, z = q.unbind(-1)
     # Half of both arguments of the usual formula, which saves two products.
-    return torch.atan2(torch.addcmul(w * z, x, y), 0.5 - torch.addcmul(y * y, z, z))
+    half_sin = torch.addcmul(w * z, x, y)
+    half_cos = 0.5 - torch.addcmul(y * y, z, z)
+    return torch.atan2(half_sin, half_cos)
 
 
 def from_euler_xyz(
@@ -64,12 +73,16 @@ def from_euler_xyz(
     half = 0.5 * torch.stack((roll, pitch, yaw_angle), dim=-1)
     cos_sin = torch.stack((torch.cos(half), torch.sin(half)), dim=-1)
     # Ry(pitch) and Rz(yaw) as products cc, cs, sc, ss; then Rx(roll) from the right.
-    products = (cos_sin[..., 1, :, None] * cos_sin[..., 2, None, :]).flatten(-2)
+    of_pitch = cos_sin[..., 1, :, None]
+    of_yaw = cos_sin[..., 2, None, :]
+    products = (of_pitch * of_yaw).flatten(-2)
     cc, cs, sc, ss = products.unbind(-1)
     _, _, minus_sc, minus_ss = (-products).unbind(-1)
     by_cos = torch.stack((cc, minus_ss, sc, cs), dim=-1)
     by_sin = torch.stack((ss, cc, cs, minus_sc), dim=-1)
-    return torch.addcmul(cos_sin[..., 0, :1] * by_cos, cos_sin[..., 0, 1:], by_sin)
+    cos_roll = cos_sin[..., 0, :1]
+    sin_roll = cos_sin[..., 0, 1:]
+    return torch.addcmul(cos_roll * by_cos, sin_roll, by_sin)
 
 
 def wrap_to_pi(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

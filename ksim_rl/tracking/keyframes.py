@@ -86,8 +86,10 @@ def eased(keys: Keys, time_F: Float[Array, " F"]) -> Float[Array, " F"]:
     if len(keys) == 1:
         return np.full_like(time_F, values[0])
     # Index of the key before each frame, within the first and the last interval.
-    index_F = np.clip(np.searchsorted(key_s, time_F, side="right") - 1, 0, len(keys) - 2)
-    share_F = np.clip((time_F - key_s[index_F]) / np.diff(key_s)[index_F], 0.0, 1.0)
+    index_F = np.searchsorted(key_s, time_F, side="right") - 1
+    index_F = np.clip(index_F, 0, len(keys) - 2)
+    since_F = time_F - key_s[index_F]
+    share_F = np.clip(since_F / np.diff(key_s)[index_F], 0.0, 1.0)
     # 10 s^3 - 15 s^4 + 6 s^5: velocity and acceleration are zero at both ends.
     smooth_F = share_F**3 * (10.0 - 15.0 * share_F + 6.0 * share_F**2)
     return values[index_F] + smooth_F * np.diff(values)[index_F]
@@ -115,7 +117,8 @@ def foot_paths(
         # Standing at the start until the first move.
         paths_FN5[:, foot, [0, 1, 3]] = plan.feet[foot]
         # In the order of time, as each move starts where the one before has ended.
-        for move in sorted((m for m in plan.moves if m.foot == foot), key=lambda m: m.begin_s):
+        moves = [move for move in plan.moves if move.foot == foot]
+        for move in sorted(moves, key=lambda move: move.begin_s):
             from_3 = paths_FN5[-1, foot, [0, 1, 3]]
             for column, start, end in zip((0, 1, 3), from_3, move.to, strict=True):
                 # Before the move the path so far; after it `eased` holds the place.
@@ -155,7 +158,9 @@ def zmp_plan(
     alone_F = planted_FN.sum(1) == 1
     middle_F2 = paths_FN5[:, :, :2].mean(1)
     # The standing foot; where both stand, this is not used.
-    on_foot_F2 = np.where(planted_FN[:, :1], paths_FN5[:, 0, :2], paths_FN5[:, 1, :2])
+    first_F2 = paths_FN5[:, 0, :2]
+    second_F2 = paths_FN5[:, 1, :2]
+    on_foot_F2 = np.where(planted_FN[:, :1], first_F2, second_F2)
     keys: list[tuple[int, Array]] = [(0, middle_F2[0])]
     # Changes between standing on one foot and on two; motions begin and end on two.
     edges = np.flatnonzero(np.diff(alone_F.astype(int)))
@@ -169,9 +174,11 @@ def zmp_plan(
         # From lift-off to landing the pressure stays on the standing foot.
         keys += [(begin, on_foot_F2[begin + 1]), (end + 1, on_foot_F2[end])]
     if len(keys) > 1:
-        keys.append((min(keys[-1][0] + shift_frames, len(alone_F) - 1), middle_F2[-1]))
+        rests_at = min(keys[-1][0] + shift_frames, len(alone_F) - 1)
+        keys.append((rests_at, middle_F2[-1]))
     frames, places = zip(*keys, strict=True)
-    columns = [np.interp(np.arange(len(alone_F)), frames, column) for column in np.array(places).T]
+    every_F = np.arange(len(alone_F))
+    columns = [np.interp(every_F, frames, column) for column in np.array(places).T]
     return np.stack(columns, axis=-1)
 
 
@@ -188,7 +195,10 @@ def pendulum(zmp_F2: Float[Array, "F 2"], height_F: Float[Array, " F"], fps: flo
     ratio_F[[0, -1]] = 0.0
     count = len(ratio_F)
     # Tridiagonal; a dense solve is quick enough for some hundred frames.
-    system_FF = np.diag(1.0 + 2.0 * ratio_F) - np.diag(ratio_F[1:], -1) - np.diag(ratio_F[:-1], 1)
+    diagonal_FF = np.diag(1.0 + 2.0 * ratio_F)
+    below_FF = np.diag(ratio_F[1:], -1)
+    above_FF = np.diag(ratio_F[:-1], 1)
+    system_FF = diagonal_FF - below_FF - above_FF
     assert system_FF.shape == (count, count)
     return np.linalg.solve(system_FF, zmp_F2)
 
@@ -210,12 +220,14 @@ def perform(
     time_F = np.arange(round(plan.duration_s * fps) + 1) / fps
     paths_FN5, planted_FN = foot_paths(plan, time_F)
     # Steps of the plan are blurred, as a jump of pressure asks for endless acceleration.
-    zmp_F2 = smoothed(zmp_plan(paths_FN5, planted_FN, shift_frames=round(shift_s * fps)), 1.5)
+    planned_F2 = zmp_plan(paths_FN5, planted_FN, shift_frames=round(shift_s * fps))
+    zmp_F2 = smoothed(planned_F2, 1.5)
     posture_FL, weight_M = _posture(mj_model, figure, plan, time_F)
     root_F = eased(plan.root_height, time_F)
     lean_F = eased(plan.lean, time_F)
     # Between the headings of the feet, and blurred: the trunk does not turn with each step.
-    heading_F = smoothed(paths_FN5[:, :, 3].mean(1, keepdims=True), 0.1 * fps)[:, 0]
+    middle_F1 = paths_FN5[:, :, 3].mean(1, keepdims=True)
+    heading_F = smoothed(middle_F1, 0.1 * fps)[:, 0]
     solver = InverseKinematics(mj_model)
     # A first guess of the centre of mass: somewhat below the root. It is replaced by the true one.
     height_F = root_F - 0.09
@@ -243,10 +255,12 @@ def _posture(
     # The root is placed by the goals alone.
     weight_M[:6] = 0.0
     for joint, weight in figure.posture_weights.items():
-        weight_M[mj_model.joint(joint).dofadr[0]] = weight
+        dof = mj_model.joint(joint).dofadr[0]
+        weight_M[dof] = weight
     # Offsets of the joints that the plan names, from the default pose.
     for joint, keys in plan.joints.items():
-        posture_FL[:, mj_model.joint(joint).qposadr[0]] += eased(keys, time_F)
+        place = mj_model.joint(joint).qposadr[0]
+        posture_FL[:, place] += eased(keys, time_F)
     return posture_FL, weight_M
 
 
@@ -291,8 +305,10 @@ def _solved(
 
 def turned(heading: float, pitch: float) -> Float[Array, " 4"]:
     """Return the orientation that is pitched about y, then turned about z, rad, as (w, x, y, z)."""
-    heading_4 = np.array((np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)))
-    pitch_4 = np.array((np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0))
+    half_heading = heading / 2
+    half_pitch = pitch / 2
+    heading_4 = np.array((np.cos(half_heading), 0.0, 0.0, np.sin(half_heading)))
+    pitch_4 = np.array((np.cos(half_pitch), 0.0, np.sin(half_pitch), 0.0))
     both_4 = np.empty(4)
     mujoco.mju_mulQuat(both_4, heading_4, pitch_4)
     return both_4

@@ -40,7 +40,7 @@ class MotionAnchorPos(OfAnchor, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         own = view.body(self.anchor)
-        (pos_E3, _) = self.wanted(view)
+        pos_E3, _ = self.wanted(view)
         # Relative to the robot, so that the policy needs no place in the world.
         return quaternion.rotate_inverse(own.quat_EL, pos_E3 - own.pos_EL)
 
@@ -51,9 +51,10 @@ class MotionAnchorAxes(OfAnchor, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         own = view.body(self.anchor)
-        (_, quat_E4) = self.wanted(view)
+        _, quat_E4 = self.wanted(view)
         # The rotation from the robot's anchor to the motion's.
-        return first_axes(quaternion.multiply(quaternion.conjugate(own.quat_EL), quat_E4)[:, None])
+        turn_E4 = quaternion.multiply(quaternion.conjugate(own.quat_EL), quat_E4)
+        return first_axes(turn_E4[:, None])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +72,8 @@ class BodiesFromAnchor(ObservationTerm):
         if self.part == "positions":
             away_EN3 = bodies.pos_EN3 - anchor.pos_EL[:, None]
             return quaternion.rotate_inverse(turn_EN4, away_EN3).flatten(start_dim=1)
-        return first_axes(quaternion.multiply(quaternion.conjugate(turn_EN4), bodies.quat_EN4))
+        turned_EN4 = quaternion.multiply(quaternion.conjugate(turn_EN4), bodies.quat_EN4)
+        return first_axes(turned_EN4)
 
 
 # -- actions ---------------------------------------------------------------------------------------------------------
@@ -104,7 +106,8 @@ class TrackAnchorPos(OfAnchor, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         pos_E3, _ = self.wanted(view)
-        return self.rate((view.body(self.anchor).pos_EL - pos_E3).square().sum(-1))
+        error_E3 = view.body(self.anchor).pos_EL - pos_E3
+        return self.rate(error_E3.square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +116,8 @@ class TrackAnchorQuat(OfAnchor, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, quat_E4 = self.wanted(view)
-        return self.rate(quaternion.angle_between(view.body(self.anchor).quat_EL, quat_E4).square())
+        angle_E = quaternion.angle_between(view.body(self.anchor).quat_EL, quat_E4)
+        return self.rate(angle_E.square())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +135,8 @@ class TrackAlignedQuat(OfAlignedBodies, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         own_EN4 = view.bodies(self.bodies).quat_EN4
-        return self.rate(quaternion.angle_between(own_EN4, self.aligned(view).quat_EN4).square().mean(-1))
+        angle_EN = quaternion.angle_between(own_EN4, self.aligned(view).quat_EN4)
+        return self.rate(angle_EN.square().mean(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +145,8 @@ class TrackBodyLinVel(OfMotionBodies, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         lin_vel_EN3, _ = motion_velocities(view, self.file, self.bodies)
-        return self.rate((view.bodies(self.bodies).lin_vel_EN3 - lin_vel_EN3).square().sum(-1).mean(-1))
+        error_EN3 = view.bodies(self.bodies).lin_vel_EN3 - lin_vel_EN3
+        return self.rate(error_EN3.square().sum(-1).mean(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +155,8 @@ class TrackBodyAngVel(OfMotionBodies, GaussianReward):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         _, ang_vel_EN3 = motion_velocities(view, self.file, self.bodies)
-        return self.rate((view.bodies(self.bodies).ang_vel_EN3 - ang_vel_EN3).square().sum(-1).mean(-1))
+        error_EN3 = view.bodies(self.bodies).ang_vel_EN3 - ang_vel_EN3
+        return self.rate(error_EN3.square().sum(-1).mean(-1))
 
 
 # -- terminations ----------------------------------------------------------------------------------------------------
@@ -204,4 +211,5 @@ class BodyDrift(OfMotionBodies, MetricTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         pos_EN3, _ = motion_bodies(view, self.file, self.bodies)
-        return torch.linalg.vector_norm(view.bodies(self.bodies).pos_EN3 - pos_EN3, dim=-1).mean(-1)
+        away_EN3 = view.bodies(self.bodies).pos_EN3 - pos_EN3
+        return torch.linalg.vector_norm(away_EN3, dim=-1).mean(-1)
