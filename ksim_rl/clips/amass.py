@@ -68,7 +68,8 @@ def read_amass(
             raise refused(path, f"offsets: no joint {name!r}", f"one of {', '.join(JOINTS)}")
         offsets_N3[JOINTS.index(name)] = offset_3
     # Three numbers per joint; columns beyond the body's joints are the hands.
-    turns_FN4 = from_rotation_vector(poses_FC[:, : 3 * len(JOINTS)].reshape(len(poses_FC), -1, 3))
+    of_body_FC = poses_FC[:, : 3 * len(JOINTS)]
+    turns_FN4 = from_rotation_vector(of_body_FC.reshape(len(poses_FC), -1, 3))
     pos_FN3, quat_FN4 = chain(parents, offsets_N3, turns_FN4, root_F3)
     return Recording(fps=fps, names=JOINTS, pos_FN3=pos_FN3, quat_FN4=quat_FN4)
 

@@ -95,7 +95,8 @@ def read_bvh(path: Path, *, scale: float = 0.01, y_up: bool = True) -> Recording
         raise words.wrong(f"{frames:g} frames of {count} numbers, in a file of {len(text)} letters")
     # One row per frame.
     size = int(frames) * count
-    table_FC = np.fromiter((words.number() for _ in range(size)), float, size).reshape(-1, count)
+    numbers = np.fromiter((words.number() for _ in range(size)), float, size)
+    table_FC = numbers.reshape(-1, count)
     # Turns in the parents' frames become poses in the world, still in units of the file.
     turns_FN4, root_F3 = _turns(skeleton, table_FC)
     pos_FN3, quat_FN4 = chain(skeleton.parents, np.array(skeleton.offsets), turns_FN4, root_F3)

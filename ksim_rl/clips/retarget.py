@@ -143,7 +143,9 @@ def _facing(rest_L: Array, first: PoseGoal) -> Array:
         w, x, y, z = first.quat_4
         # Yaw of the quaternion; roll and pitch are left out, so that the robot starts upright.
         heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        start_L[3:7] = multiply(np.array((np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2))), rest_L[3:7])
+        half = heading / 2
+        turn_4 = np.array((np.cos(half), 0.0, 0.0, np.sin(half)))
+        start_L[3:7] = multiply(turn_4, rest_L[3:7])
     return start_L
 
 

@@ -57,14 +57,18 @@ def read_csv(
     # Joints that the file leaves out stay as in this pose.
     qpos_FL = np.tile(rest_L, (len(table_FC), 1))
     qpos_FL[:, :3] = table_FC[:, :3]
+    quat_F4 = table_FC[:, 3:7] / norm_F[:, None]
     # From (x, y, z, w) to MuJoCo's (w, x, y, z).
-    qpos_FL[:, 3:7] = (table_FC[:, 3:7] / norm_F[:, None])[:, [3, 0, 1, 2]]
-    qpos_FL[:, [int(mj_model.joint(joint).qposadr[0]) for joint in joints]] = table_FC[:, 7:]
+    qpos_FL[:, 3:7] = quat_F4[:, [3, 0, 1, 2]]
+    places = [int(mj_model.joint(joint).qposadr[0]) for joint in joints]
+    qpos_FL[:, places] = table_FC[:, 7:]
     low_F, share_F = between(len(qpos_FL), fps, wanted_fps)
     share_F1 = share_F[:, None]
+    before_FL = qpos_FL[low_F]
+    after_FL = qpos_FL[low_F + 1]
     # Linear between frames, and the root's orientation along the arc.
-    found_FL = (1.0 - share_F1) * qpos_FL[low_F] + share_F1 * qpos_FL[low_F + 1]
-    found_FL[:, 3:7] = slerp(qpos_FL[low_F, 3:7], qpos_FL[low_F + 1, 3:7], share_F1)
+    found_FL = (1.0 - share_F1) * before_FL + share_F1 * after_FL
+    found_FL[:, 3:7] = slerp(before_FL[:, 3:7], after_FL[:, 3:7], share_F1)
     return found_FL
 
 

@@ -2,7 +2,7 @@
 
 import importlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from ksim_rl.checks import near
@@ -108,14 +108,23 @@ def _modules(name: str) -> list[str]:
             moved = moved.replace(old, new, 1)
     # Longest first, so that a module counts before the packages above it.
     parts = moved.split(".")
-    return list(dict.fromkeys([name, *(".".join(parts[:end]) for end in range(len(parts), 1, -1))]))
+    candidates = [name]
+    for end in range(len(parts), 1, -1):
+        candidates.append(".".join(parts[:end]))
+    return list(dict.fromkeys(candidates))
 
 
 def foreign(tree: Plain) -> Iterator[str]:
     """Yield the `_target_`s in a tree that are neither ours nor TorchRL's."""
-    if isinstance(tree, dict) and str(tree.get(TARGET, OWN)).split(".")[0] not in (OWN, "torchrl"):
-        yield str(tree[TARGET])
-    for entry in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ():
+    entries: Iterable[Plain] = ()
+    if isinstance(tree, dict):
+        package = str(tree.get(TARGET, OWN)).split(".")[0]
+        if package not in (OWN, "torchrl"):
+            yield str(tree[TARGET])
+        entries = tree.values()
+    elif isinstance(tree, list):
+        entries = tree
+    for entry in entries:
         yield from foreign(entry)
 
 

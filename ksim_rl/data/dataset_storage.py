@@ -109,7 +109,8 @@ class DatasetStorage(TensorStorage):
             self.non_finite_count = self.non_finite_count.to(self.device)
         # Zeros, so that all rows are finite from the start.
         content: Any = data.new_zeros(torch.Size([self.max_size]), device=self.device)
-        content.set(MASK_KEY, torch.ones((self.max_size, 1), dtype=torch.bool, device=self.device))
+        mask = torch.ones((self.max_size, 1), dtype=torch.bool, device=self.device)
+        content.set(MASK_KEY, mask)
         self._storage = dims.name(content, dims.D)
         self.initialized = True
 
@@ -123,7 +124,8 @@ class DatasetStorage(TensorStorage):
                 f"the data must have the leaves of the first write: missing {missing}, new {extra}"
             )
         for key, leaf in leaves.items():
-            if stored[key].shape[1:] != leaf.shape[batch_dims:] or stored[key].dtype != leaf.dtype:
+            has_shape = stored[key].shape[1:] == leaf.shape[batch_dims:]
+            if not has_shape or stored[key].dtype != leaf.dtype:
                 raise ValueError(
                     f"leaf {key!r} is {leaf.dtype} {tuple(leaf.shape[batch_dims:])} per env state; the first write "
                     f"had {stored[key].dtype} {tuple(stored[key].shape[1:])}"

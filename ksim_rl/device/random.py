@@ -91,8 +91,9 @@ def integers(
         if not 0 <= high - low < 1 << 31:
             raise ValueError(f"low={low}, high={high}: expected low <= high < low + 2^31")
         return _drawn(*keys, n, _INTEGER, 0.0, 1.0, low, high - low + 1)
+    bits_EL = _drawn(*keys, n, _INTEGER, 0.0, 1.0, 0, 1 << 32)
     # 32 random bits times the span, whose upper half is the number.
-    return low + ((_drawn(*keys, n, _INTEGER, 0.0, 1.0, 0, 1 << 32) * (high - low + 1)) >> 32)
+    return low + ((bits_EL * (high - low + 1)) >> 32)
 
 
 def permutations(keys: RowKeys, n: int) -> Int64[Tensor, "E L"]:

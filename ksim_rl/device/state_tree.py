@@ -50,7 +50,8 @@ def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, A
         return {}
     state: State = {}
     for path, leaf in [*tensors.items(), *values.items()]:
-        *parents, last = [key.replace("~1", "/").replace("~0", "~") for key in path.split("/")[1:]]
+        keys = path.split("/")[1:]
+        *parents, last = [key.replace("~1", "/").replace("~0", "~") for key in keys]
         node = state
         for key in parents:
             # Parents are made on the way; one that is a leaf already is a fault of the file.

@@ -88,6 +88,8 @@ def _saturated(env: EnvBase, rollout_ET: TensorDictBase) -> dict[str, Tensor]:
     if not bool((high - low).isfinite().all()):
         return {}
     margin = BOUND_SHARE * (high - low)
-    # [E, A] beside [E, T, A].
-    inside = (action_ET > (low + margin).unsqueeze(1)) & (action_ET < (high - margin).unsqueeze(1))
+    # [E, 1, A] beside [E, T, A].
+    lowest = (low + margin).unsqueeze(1)
+    highest = (high - margin).unsqueeze(1)
+    inside = (action_ET > lowest) & (action_ET < highest)
     return {"rollout/saturated_actions": 1.0 - inside.to(torch.float32).mean()}

@@ -202,4 +202,5 @@ class ActuatorAction(ActionTerm):
         limits_K2 = view.ctrl_limits_L2[index]
         asked_EK = action_EK * self.numbers(view, "scale") + self.numbers(view, "offset")
         # Clamped here, so that `ctrl` reads as the control in force.
-        view.world.ctrl_EL[:, index] = torch.clamp(asked_EK, limits_K2[:, 0], limits_K2[:, 1])
+        low_K, high_K = limits_K2.unbind(-1)
+        view.world.ctrl_EL[:, index] = torch.clamp(asked_EK, low_K, high_K)

@@ -177,7 +177,8 @@ def commanded_speed(view: EnvView, command: str) -> Float[Tensor, " E"]:
     key = f"speed of {command}"
     if key not in cache:
         command_EK = view.command(command)
-        cache[key] = torch.linalg.vector_norm(command_EK[:, :2], dim=-1) + command_EK[:, 2].abs()
+        planar_E = torch.linalg.vector_norm(command_EK[:, :2], dim=-1)
+        cache[key] = planar_E + command_EK[:, 2].abs()
     return cache[key]
 
 

@@ -35,8 +35,9 @@ class LinearVelocityError(OfCommand, OfEntity, MetricTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         # Columns x and y of both, in the root's frame.
-        error_E2 = view.command(self.command)[:, :2] - view.entity(self.entity).root_lin_vel_b_EL[:, :2]
-        return torch.linalg.vector_norm(error_E2, dim=-1)
+        wanted_E2 = view.command(self.command)[:, :2]
+        actual_E2 = view.entity(self.entity).root_lin_vel_b_EL[:, :2]
+        return torch.linalg.vector_norm(wanted_E2 - actual_E2, dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -158,8 +158,9 @@ def _(term: JointAction, env: ManagerBasedRlEnv) -> MirrorMap:
     offset = per_joint(view, "offset", term.offset, term.joints)
     # Adding 0 * signs broadcasts a single offset to all columns.
     _check_symmetric("offset", signs * 0.0 + offset, mirror(signs * 0.0 + offset))
+    is_lopsided = term.clip is not None and term.clip[0] != -term.clip[1]
     # With a sign of -1 the clip's ends swap: only a symmetric one stays itself.
-    if term.clip is not None and term.clip[0] != -term.clip[1] and bool((signs < 0).any()):
+    if is_lopsided and bool((signs < 0).any()):
         raise ValueError(
             f"clip={term.clip} is not symmetric, and some joints turn the other way in the mirror"
         )

@@ -209,14 +209,17 @@ def action_range(
     trust region that keeps it near tried actions. `bound` is in the units of the action, before its term's own scale.
     """
     # Discrete specs have a space without these two, and unbounded ones may have no space.
-    low, high = (getattr(getattr(spec, "space", None), name, None) for name in ("low", "high"))
+    space = getattr(spec, "space", None)
+    low = getattr(space, "low", None)
+    high = getattr(space, "high", None)
     shape = spec.shape[-1:]
     lowest = torch.full(shape, -bound, device=device)
     highest = torch.full(shape, bound, device=device)
     if not isinstance(low, Tensor) or not isinstance(high, Tensor):
         return lowest, highest
     # A spec has the batch dims of its env; all envs have the same bounds. Unbounded ones are huge or infinite.
-    low, high = (edge.reshape(-1, *shape)[0].to(lowest) for edge in (low, high))
+    low = low.reshape(-1, *shape)[0].to(lowest)
+    high = high.reshape(-1, *shape)[0].to(lowest)
     bounded = (low > -1e6) & (high < 1e6)
     return torch.where(bounded, low, lowest), torch.where(bounded, high, highest)
 

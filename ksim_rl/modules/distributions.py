@@ -284,11 +284,10 @@ class TruncatedGaussian(BoundedDistribution):
 
     def _moments(self) -> tuple[Tensor, Tensor]:
         """Return the mean and the mean square of the standardized variable, in the mirror image where it is taken."""
-        log_densities = (
-            -0.5 * bound.square() - _HALF_LOG_2_PI - self._log_mass for bound in (self._a, self._b)
-        )
-        density_a, density_b = (log_density.exp() for log_density in log_densities)
-        return density_a - density_b, 1.0 + self._a * density_a - self._b * density_b
+        density_a = (-0.5 * self._a.square() - _HALF_LOG_2_PI - self._log_mass).exp()
+        density_b = (-0.5 * self._b.square() - _HALF_LOG_2_PI - self._log_mass).exp()
+        mean_square = 1.0 + self._a * density_a - self._b * density_b
+        return density_a - density_b, mean_square
 
 
 def _inverse_log_ndtr(log_cdf: Tensor) -> Tensor:
@@ -396,15 +395,16 @@ class Categorical(Distribution):
 
     def log_prob(self, value: Shaped[Tensor, "*value"]) -> Float[Tensor, "*shape"]:
         """Return the log probability of `value`, summed over the choices."""
-        chosen = (
-            log_probs.expand(*index.shape, -1).gather(-1, index.unsqueeze(-1)).squeeze(-1)
-            for log_probs, index in zip(self._log_probs, self._as_indices(value), strict=True)
-        )
+        chosen = []
+        for log_probs, index in zip(self._log_probs, self._as_indices(value), strict=True):
+            of_each = log_probs.expand(*index.shape, -1)
+            chosen.append(of_each.gather(-1, index.unsqueeze(-1)).squeeze(-1))
         return reduce(add, chosen)
 
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Return the entropy in nats, summed over the choices."""
-        return reduce(add, (-(log_probs.exp() * log_probs).sum(-1) for log_probs in self._log_probs))
+        entropies = [-(log_probs.exp() * log_probs).sum(-1) for log_probs in self._log_probs]
+        return reduce(add, entropies)
 
     def _as_value(self, indices: Sequence[Tensor]) -> Tensor:
         if self.one_hot:
@@ -431,5 +431,7 @@ class Categorical(Distribution):
 
 @register_kl(Categorical, Categorical)
 def _kl(p: Categorical, q: Categorical) -> Tensor:
-    pairs = zip(p._log_probs, q._log_probs, strict=True)
-    return reduce(add, ((log_p.exp() * (log_p - log_q)).sum(-1) for log_p, log_q in pairs))
+    divergences = []
+    for log_p, log_q in zip(p._log_probs, q._log_probs, strict=True):
+        divergences.append((log_p.exp() * (log_p - log_q)).sum(-1))
+    return reduce(add, divergences)

@@ -106,12 +106,14 @@ class EnsembleLinear(nn.Module):
         """Draw the weights again."""
         # Stored as [inputs, outputs] for the batched product, so that the drawn matrix is turned over.
         for network in self.weight:
-            network.copy_(nn.init.orthogonal_(torch.empty(network.shape[::-1]), self.gain).t())
+            drawn = nn.init.orthogonal_(torch.empty(network.shape[::-1]), self.gain)
+            network.copy_(drawn.t())
         self.bias.zero_()
 
     def forward(self, features_NBL: Float[Tensor, "#N B L"]) -> Float[Tensor, "N B M"]:
         """Return the outputs of each layer for its own input."""
-        return torch.baddbmm(self.bias, features_NBL.expand(len(self.weight), -1, -1), self.weight)
+        of_each_NBL = features_NBL.expand(len(self.weight), -1, -1)
+        return torch.baddbmm(self.bias, of_each_NBL, self.weight)
 
 
 class EnsembleLayerNorm(nn.Module):
@@ -249,10 +251,14 @@ def _rounded(weights: list[Tensor]) -> list[Tensor]:
 
     Tensor cores are fast with such rows: 315 inputs take three times as long as 320.
     """
-    padded = [functional.pad(own, (0, -own.shape[-1] % 8, 0, -own.shape[-2] % 8)) for own in weights]
+    padded = []
+    for own in weights:
+        columns = -own.shape[-1] % 8
+        rows = -own.shape[-2] % 8
+        padded.append(functional.pad(own, (0, columns, 0, rows)))
     flat = torch.cat([own.reshape(-1) for own in padded]).to(torch.bfloat16)
-    parts = zip(flat.split([own.numel() for own in padded]), padded, strict=True)
-    return [part.view_as(own) for part, own in parts]
+    parts = flat.split([own.numel() for own in padded])
+    return [part.view_as(own) for part, own in zip(parts, padded, strict=True)]
 
 
 def _padded(features: Tensor, columns: int) -> Tensor:

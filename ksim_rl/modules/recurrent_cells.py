@@ -191,12 +191,13 @@ def _gru_step(gates_BG: Tensor, recurrent_BG: Tensor, h_BH: Tensor) -> tuple[Ten
     if gates_BG.is_cuda:
         return upstream.fused_gru_cell(gates_BG, recurrent_BG, h_BH)
     # The formulas of `torch.nn.GRU`: the reset gate acts behind the recurrent product.
-    (rx_BH, zx_BH, nx_BH) = gates_BG.chunk(3, -1)
-    (rh_BH, zh_BH, nh_BH) = recurrent_BG.chunk(3, -1)
+    rx_BH, zx_BH, nx_BH = gates_BG.chunk(3, -1)
+    rh_BH, zh_BH, nh_BH = recurrent_BG.chunk(3, -1)
     r_BH = (rx_BH + rh_BH).sigmoid()
     z_BH = (zx_BH + zh_BH).sigmoid()
     n_BH = (nx_BH + r_BH * nh_BH).tanh()
-    return n_BH + z_BH * (h_BH - n_BH), torch.cat([r_BH, z_BH, n_BH, h_BH, nh_BH], -1)
+    workspace = torch.cat([r_BH, z_BH, n_BH, h_BH, nh_BH], -1)
+    return n_BH + z_BH * (h_BH - n_BH), workspace
 
 
 def _gru_step_backward(dh_BH: Tensor, workspace_BG: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -21,7 +21,8 @@ def discounted_sum(
 ) -> Float[Tensor, "*batch 1"]:
     """Return x with x_t = term_t + discount_t x_{t+1}; x after the last step is zero."""
     # Time first, and split into its steps: a loop over T small tensors, [*batch, 1] each.
-    terms, discounts = (leaf.movedim(time_dim, 0).unbind(0) for leaf in (term_ET, discount_ET))
+    terms = term_ET.movedim(time_dim, 0).unbind(0)
+    discounts = discount_ET.movedim(time_dim, 0).unbind(0)
     total = torch.zeros_like(terms[0])
     totals = []
     # Backward in time: each sum contains the one of the step after it.
@@ -155,7 +156,8 @@ class VTrace(RolloutEstimator, value.VTrace):
             observed = list(critic.in_keys)
         read = [*observed, *actor.in_keys, *actor.dist_sample_keys, keys.sample_log_prob]
         flags = [keys.reward, keys.done, keys.terminated]
-        return list(dict.fromkeys([*read, *(("next", key) for key in [*observed, *flags])]))
+        following = [("next", key) for key in [*observed, *flags]]
+        return list(dict.fromkeys([*read, *following]))
 
     def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         time_dim = signals.time_dim
@@ -170,7 +172,8 @@ class VTrace(RolloutEstimator, value.VTrace):
         target_ET_t_plus_1 = _shifted(target_ET, value_ET_t_plus_1, time_dim)
         target_ET_t_plus_1 = torch.where(known_ET, target_ET_t_plus_1, value_ET_t_plus_1)
         bootstrap_ET = signals.bootstrap(target_ET_t_plus_1, self.gamma)
-        return rho_ET * (signals.reward_ET + bootstrap_ET - signals.value_ET_t), target_ET, finite_ET
+        adv_ET = rho_ET * (signals.reward_ET + bootstrap_ET - signals.value_ET_t)
+        return adv_ET, target_ET, finite_ET
 
     def _ratio(self, tensordict: TensorDictBase, signals: Signals) -> Tensor:
         actor = self.actor_network
@@ -200,4 +203,6 @@ class VTrace(RolloutEstimator, value.VTrace):
 def _shifted(leaf: Tensor, last: Tensor, time_dim: int) -> Tensor:
     """Return the leaf one step later, [..., T, ...], and `last` at the last step."""
     length = leaf.shape[time_dim]
-    return torch.cat((leaf.narrow(time_dim, 1, length - 1), last.narrow(time_dim, length - 1, 1)), time_dim)
+    later = leaf.narrow(time_dim, 1, length - 1)
+    end = last.narrow(time_dim, length - 1, 1)
+    return torch.cat((later, end), time_dim)

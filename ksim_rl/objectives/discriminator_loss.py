@@ -44,7 +44,9 @@ def discriminator_loss(
     loss = loss + 0.5 * gradient_penalty * penalty
     with torch.no_grad():
         # A transition counts as judged right if its score has the sign of its side.
-        accuracy = (mean((reference_C > 0.0).float()) + mean((policy_B < 0.0).float())) / 2
+        of_reference = mean((reference_C > 0.0).float())
+        of_policy = mean((policy_B < 0.0).float())
+        accuracy = (of_reference + of_policy) / 2
         logged = {
             "loss": loss.detach(),
             "penalty": penalty.detach(),

@@ -127,4 +127,7 @@ def _action_error(dist: Distribution, labels: TensorDictBase) -> Tensor:
     """Return a - a*, [*batch, A]; parts of an action lie side by side."""
     if not isinstance(dist, CompositeDistribution):
         return _action_of(dist) - labels.get("action")
-    return torch.cat([_action_of(part) - labels.get(key) for key, part in dist.dists.items()], -1)
+    errors = []
+    for key, part in dist.dists.items():
+        errors.append(_action_of(part) - labels.get(key))
+    return torch.cat(errors, -1)

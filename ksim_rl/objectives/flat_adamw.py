@@ -53,16 +53,17 @@ class FlatAdamW(torch.optim.Optimizer):
         return [part[: own.numel()].view_as(own) for part, own in parts]
 
     def _pieces(self, tensors: list[Tensor]) -> list[Tensor]:
-        pairs = zip(tensors, self._gaps, strict=True)
-        return [part for own, gap in pairs for part in (own.reshape(-1), gap)]
+        pieces = []
+        for own, gap in zip(tensors, self._gaps, strict=True):
+            pieces += [own.reshape(-1), gap]
+        return pieces
 
     def _end_to_end(self, parameters: list[nn.Parameter]) -> Tensor:
-        if parameters:
-            flat = torch.cat(self._pieces([own.detach() for own in parameters]))
-        else:
-            flat = torch.empty(0)
+        if not parameters:
+            return torch.empty(0)
+        flat = torch.cat(self._pieces([own.detach() for own in parameters]))
         # Modules keep their parameter objects, whose memory is now a part of the flat tensor.
-        for parameter, part in zip(parameters, self._parts(flat) if parameters else (), strict=True):
+        for parameter, part in zip(parameters, self._parts(flat), strict=True):
             parameter.data = part
         return flat
 

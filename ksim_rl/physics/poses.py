@@ -133,7 +133,8 @@ def _ground_heights(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndar
         ground[:] = mj_data.geom_xpos[planes, 2].max()
     down = np.array([0.0, 0.0, -1.0])
     for field in np.flatnonzero(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD):
-        above = mj_data.geom_xpos[field, 2] + mj_model.hfield_size[mj_model.geom_dataid[field], 2] + 1.0
+        top = mj_model.hfield_size[mj_model.geom_dataid[field], 2]
+        above = mj_data.geom_xpos[field, 2] + top + 1.0
         for geom, (x, y, _) in enumerate(mj_data.geom_xpos):
             # The centre of the square around the bounding sphere, its corners and the middles of its sides.
             reach = mj_model.geom_rbound[geom]
@@ -151,10 +152,13 @@ def _lowest_points(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> np.ndarr
     up = mj_data.geom_xmat.reshape(-1, 3, 3)[:, 2]
     center = mj_model.geom_aabb[:, :3]
     half = mj_model.geom_aabb[:, 3:]
-    box = mj_data.geom_xpos[:, 2] + (up * center).sum(1) - (np.abs(up) * half).sum(1)
+    height = mj_data.geom_xpos[:, 2]
+    box = height + (up * center).sum(1) - (np.abs(up) * half).sum(1)
+    is_sphere = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+    is_capsule = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
     radius = mj_model.geom_size[:, 0]
-    length = np.where(mj_model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE, mj_model.geom_size[:, 1], 0.0)
+    length = np.where(is_capsule, mj_model.geom_size[:, 1], 0.0)
     # A capsule's lower end is a half sphere around the end of its axis.
-    round_end = mj_data.geom_xpos[:, 2] - radius - np.abs(up[:, 2]) * length
-    is_round = np.isin(mj_model.geom_type, (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE))
+    round_end = height - radius - np.abs(up[:, 2]) * length
+    is_round = is_sphere | is_capsule
     return np.where(is_round, round_end, box)

@@ -73,10 +73,11 @@ def dealt(
     `live` are those that this run has now, and whose shapes tell where the envs are. A ValueError says how many envs
     fit.
     """
-    before = 1 if saved is None else int(saved["size"])
-    parts = [dict(first)] + [
-        {**first, **(saved or {})["parts"].get(str(index), {})} for index in range(1, before)
-    ]
+    parts = [dict(first)]
+    if saved is not None:
+        for index in range(1, int(saved["size"])):
+            parts.append({**first, **saved["parts"].get(str(index), {})})
+    before = len(parts)
     # The same number of ranks: no tensor is cut or merged.
     if before == size():
         return parts[rank()]
@@ -114,15 +115,16 @@ def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
     shape = tensors[0].shape
     # The dim in which the sizes differ is the dim of the envs.
     if live is not None and live.shape != shape:
-        dim = next(
-            (dim for dim in range(min(live.ndim, len(shape))) if live.shape[dim] != shape[dim]), len(shape)
-        )
+        dims = range(min(live.ndim, len(shape)))
+        dim = next((dim for dim in dims if live.shape[dim] != shape[dim]), len(shape))
         if live.ndim != len(shape) or shape[dim] * len(parts) != live.shape[dim] * size():
             raise ValueError(
                 f"{name} is {list(shape)} in the checkpoint of {len(parts)} ranks and {list(live.shape)} in this run "
                 f"of {size()}: all ranks together must have as many envs as before"
             )
-        return torch.cat(tensors, dim).narrow(dim, rank() * live.shape[dim], live.shape[dim]).clone()
+        width = live.shape[dim]
+        whole = torch.cat(tensors, dim)
+        return whole.narrow(dim, rank() * width, width).clone()
     # Running moments are merged, as each rank has counted other rows.
     room, _, leaf = name.rpartition("/")
     stem = leaf.rpartition(".")[0]

@@ -78,7 +78,8 @@ class CsvTable:
             writer.writeheader()
             with _opened(self.path) as (_, rows):
                 # Rows at or beyond this step come from a run that is resumed before them.
-                writer.writerows(row for row in rows if int(row[STEP]) < int(self._rows[0][STEP]))
+                begin = int(self._rows[0][STEP])
+                writer.writerows(row for row in rows if int(row[STEP]) < begin)
             writer.writerows(self._rows[:-1])
             begins = file.tell()
             writer.writerow(self._rows[-1])

@@ -126,7 +126,11 @@ def numbers(rows: Sequence[dict[str, str]], name: str) -> list[float]:
 def last(rows: Sequence[dict[str, str]], name: str) -> float | None:
     """Return a metric's last finite value, or None."""
     # Only the newest row that has the metric is looked at.
-    return next(iter(numbers([row for row in rows[::-1] if row.get(name)][:1], name)), None)
+    for row in reversed(rows):
+        if row.get(name):
+            found = numbers([row], name)
+            return found[0] if found else None
+    return None
 
 
 def _number(text: str | None) -> float:

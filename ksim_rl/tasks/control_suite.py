@@ -81,7 +81,8 @@ class CartpoleReward(RewardTerm):
         upright_E = (torch.cos(angle_E) + 1.0) / 2.0
         centered_E = (1.0 + tolerance(cart_E, low=0.0, high=0.0, margin=2.0)) / 2.0
         # Control counts for a fifth at most, each of the others for half or all.
-        small_control_E = (4.0 + (1.0 - view.action_EL[:, 0].clamp(-1.0, 1.0).square())) / 5.0
+        control_E = view.action_EL[:, 0].clamp(-1.0, 1.0)
+        small_control_E = (4.0 + (1.0 - control_E.square())) / 5.0
         small_velocity_E = (1.0 + tolerance(velocity_E, low=0.0, high=0.0, margin=5.0)) / 2.0
         return upright_E * centered_E * small_control_E * small_velocity_E
 
@@ -192,7 +193,9 @@ class PendulumAngle(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 2"]:
         # The pendulum's hinge is its only joint.
-        return torch.cat((torch.cos(view.joint_pos_EL), torch.sin(view.joint_pos_EL)), dim=-1)
+        cos_EL = torch.cos(view.joint_pos_EL)
+        sin_EL = torch.sin(view.joint_pos_EL)
+        return torch.cat((cos_EL, sin_EL), dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,7 +301,8 @@ class ReacherTarget(HeldCommand):
         # The square root makes points uniform by area, not crowded at the hub.
         radius_E = torch.sqrt(inner**2 + share_E * (outer**2 - inner**2))
         angle_E = 2.0 * torch.pi * angle_E
-        return radius_E[:, None] * torch.stack((torch.cos(angle_E), torch.sin(angle_E)), dim=-1)
+        direction_E2 = torch.stack((torch.cos(angle_E), torch.sin(angle_E)), dim=-1)
+        return radius_E[:, None] * direction_E2
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         x, y = self.held(view)[env_index].tolist()

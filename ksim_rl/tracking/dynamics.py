@@ -91,7 +91,8 @@ def _ground_wrench(data: mujoco.MjData) -> tuple[Array, Array, float]:
     # The root's wrench belongs to the ground: p x f with p on the ground has these horizontal moments.
     zmp_2 = np.array((-about_origin_3[1], about_origin_3[0])) / force_3[2]
     # The moment about the vertical, which friction of the soles has to hold.
-    return force_3, zmp_2, float(about_origin_3[2] - (zmp_2[0] * force_3[1] - zmp_2[1] * force_3[0]))
+    spin = about_origin_3[2] - (zmp_2[0] * force_3[1] - zmp_2[1] * force_3[0])
+    return force_3, zmp_2, float(spin)
 
 
 def _joint_torques(
@@ -112,7 +113,8 @@ def _joint_torques(
     # Two feet share the force as a lever does, by the place of the pressure on the line between them.
     if len(standing) == 2:
         line_2 = places_N3[1, :2] - places_N3[0, :2]
-        second = np.clip((zmp_2 - places_N3[0, :2]) @ line_2 / (line_2 @ line_2), 0.0, 1.0)
+        from_first_2 = zmp_2 - places_N3[0, :2]
+        second = np.clip(from_first_2 @ line_2 / (line_2 @ line_2), 0.0, 1.0)
         shares = np.array([1.0 - second, second])
     # Pressure that is not on that line is beside both feet alike.
     beside_2 = zmp_2 - shares @ places_N3[:, :2]

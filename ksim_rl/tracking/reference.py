@@ -54,17 +54,20 @@ class OfAlignedBodies(OfAnchor, OfMotionBodies):
         key = f"motion/{self.file}.aligned {self.bodies} with {self.anchor}"
         if key not in view.cache:
             own = view.body(self.anchor)
-            (pos_E3, quat_E4) = self.wanted(view)
+            pos_E3, quat_E4 = self.wanted(view)
             # Yaw from the motion's anchor to the robot's: roll and pitch are to be tracked, so they stay.
-            turn_E = quaternion.yaw(quaternion.multiply(own.quat_EL, quaternion.conjugate(quat_E4)))
+            whole_turn_E4 = quaternion.multiply(own.quat_EL, quaternion.conjugate(quat_E4))
+            turn_E = quaternion.yaw(whole_turn_E4)
             half_E1 = 0.5 * turn_E[:, None]
             zero_E2 = torch.zeros_like(quat_E4[:, :2])
             # Quaternion (w, 0, 0, z) of a turn about the vertical.
-            turn_EN4 = torch.cat((torch.cos(half_E1), zero_E2, torch.sin(half_E1)), dim=-1)[:, None]
+            turn_E4 = torch.cat((torch.cos(half_E1), zero_E2, torch.sin(half_E1)), dim=-1)
+            turn_EN4 = turn_E4[:, None]
             pos_EN3, quat_EN4 = motion_bodies(view, self.file, self.bodies)
             # The robot's place on the ground and the motion's height: drift is forgiven, crouching is not.
             place_E3 = torch.cat((own.pos_EL[:, :2], pos_E3[:, 2:]), dim=-1)
-            placed_EN3 = place_E3[:, None] + quaternion.rotate(turn_EN4, pos_EN3 - pos_E3[:, None])
+            away_EN3 = pos_EN3 - pos_E3[:, None]
+            placed_EN3 = place_E3[:, None] + quaternion.rotate(turn_EN4, away_EN3)
             view.cache[key] = Poses(placed_EN3, quaternion.multiply(turn_EN4, quat_EN4))
         return view.cache[key]
 

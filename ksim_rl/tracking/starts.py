@@ -82,7 +82,8 @@ class StartInMotion(ResetToMotion):
         # Not a probability yet: weights need not add up to 1.
         whole_E = reach_EB[:, -1]
         # The first part whose cumulated weight exceeds the draw.
-        part_E = (drawn_E2[:, :1] * whole_E[:, None] >= reach_EB).sum(-1).clamp(max=parts - 1)
+        is_past_EB = drawn_E2[:, :1] * whole_E[:, None] >= reach_EB
+        part_E = is_past_EB.sum(-1).clamp(max=parts - 1)
         # Zeros, before the curriculum has run, mean a start from the plain range.
         return torch.where(whole_E > 0.0, (part_E + drawn_E2[:, 1]) / parts, plain_E)
 
@@ -115,7 +116,8 @@ class FailedParts(OfMotion, CurriculumTerm):
         part_E = (share_E * parts).long().clamp(0, parts - 1)
         is_here_EB = part_E[:, None] == torch.arange(parts, device=view.device)
         # Only failures count; motions that were finished say nothing about where it is hard.
-        counts_B = (is_here_EB & (lived_E & view.terminated_E)[:, None]).sum(0).to(torch.float32)
+        failed_E = lived_E & view.terminated_E
+        counts_B = (is_here_EB & failed_E[:, None]).sum(0).to(torch.float32)
         # All ranks learn from all failures.
         ranks.sum_(counts_B)
         # An exponential mean over resets; nothing is read back from the device.

@@ -121,7 +121,9 @@ class BrowserScene:
             return kind, geom.dataid, alpha
         # A capsule cannot be scaled: its caps would become ellipsoids.
         if kind == _KIND.mjGEOM_CAPSULE:
-            return kind, round(float(geom.size[0]), 4), round(float(geom.size[2]), 4), alpha
+            radius = round(float(geom.size[0]), 4)
+            half_length = round(float(geom.size[2]), 4)
+            return kind, radius, half_length, alpha
         if kind in _PRIMITIVES:
             return kind, alpha
         # Remembered by name; such geoms are not drawn.
@@ -186,7 +188,9 @@ class BrowserScene:
         if key[0] == _KIND.mjGEOM_CAPSULE:
             body = trimesh.creation.capsule(height=2 * key[2], radius=key[1], count=(12, 12))
             # Trimesh's capsule begins at its lower cap; MuJoCo's centre is in the middle.
-            return np.asarray(body.vertices) - [0, 0, body.bounds.mean(axis=0)[2]], np.asarray(body.faces)
+            middle = body.bounds.mean(axis=0)[2]
+            vertices = np.asarray(body.vertices) - [0, 0, middle]
+            return vertices, np.asarray(body.faces)
         return _PRIMITIVES[key[0]]
 
     def _plane(self, geom: mujoco.MjvGeom) -> None:
@@ -238,9 +242,11 @@ def mesh_of_model(mj_model: mujoco.MjModel, mesh: int) -> Mesh:
     corners = mj_model.mesh_face[first : first + count].reshape(-1)
     normals = mj_model.mesh_facenormal[first : first + count].reshape(-1)
     # Vertices that share place and normal become one; corners of an edge stay several.
-    pairs, faces = np.unique(np.stack([corners, normals], axis=1), axis=0, return_inverse=True)
+    both = np.stack([corners, normals], axis=1)
+    pairs, faces = np.unique(both, axis=0, return_inverse=True)
     start = mj_model.mesh_vertadr[mesh]
-    return mj_model.mesh_vert[start + pairs[:, 0]], faces.reshape(-1, 3).astype(np.uint32)
+    vertices = mj_model.mesh_vert[start + pairs[:, 0]]
+    return vertices, faces.reshape(-1, 3).astype(np.uint32)
 
 
 def height_field_mesh(mj_model: mujoco.MjModel, field: int) -> Mesh:
@@ -251,14 +257,17 @@ def height_field_mesh(mj_model: mujoco.MjModel, field: int) -> Mesh:
     half_x, half_y, rise, _ = mj_model.hfield_size[field]
     start = mj_model.hfield_adr[field]
     height = mj_model.hfield_data[start : start + rows * columns] * rise
-    y, x = np.meshgrid(
-        np.linspace(-half_y, half_y, rows), np.linspace(-half_x, half_x, columns), indexing="ij"
-    )
+    along_x = np.linspace(-half_x, half_x, columns)
+    along_y = np.linspace(-half_y, half_y, rows)
+    y, x = np.meshgrid(along_y, along_x, indexing="ij")
+    vertices = np.stack([x.ravel(), y.ravel(), height], axis=1)
     # Of each cell the lower left corner; two triangles fill it, wound to face up.
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    lower = np.stack([corner, corner + 1, corner + columns + 1], axis=1)
-    upper = np.stack([corner, corner + columns + 1, corner + columns], axis=1)
-    return np.stack([x.ravel(), y.ravel(), height], axis=1), np.concatenate([lower, upper])
+    row = np.arange(rows - 1)[:, None]
+    corner = (row * columns + np.arange(columns - 1)).ravel()
+    above = corner + columns
+    lower = np.stack([corner, corner + 1, above + 1], axis=1)
+    upper = np.stack([corner, above + 1, above], axis=1)
+    return vertices, np.concatenate([lower, upper])
 
 
 def _of_trimesh(*bodies: trimesh.Trimesh) -> Mesh:

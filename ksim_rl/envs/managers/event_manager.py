@@ -120,4 +120,5 @@ class EventManager:
         assert term.interval_range_s is not None
         low, high = term.interval_range_s
         clock_E = self._clocks[scope]
-        clock_E.copy_(torch.where(mask_E, self._view.uniform(1, low, high)[:, 0], clock_E))
+        drawn_E = self._view.uniform(1, low, high)[:, 0]
+        clock_E.copy_(torch.where(mask_E, drawn_E, clock_E))

@@ -243,4 +243,5 @@ def _odd_numbers(like: Shaped[Tensor, "*shape"]) -> Tensor:
     # Multiples of the golden ratio, modulo 1, are spread evenly, so neighbors differ.
     places = torch.arange(like.numel(), dtype=torch.float64, device=like.device)
     golden_ratio = 0.6180339887498949
-    return (0.01 + 0.01 * (golden_ratio * places).frac()).to(like.dtype).view(like.shape)
+    spread = 0.01 + 0.01 * (golden_ratio * places).frac()
+    return spread.to(like.dtype).view(like.shape)

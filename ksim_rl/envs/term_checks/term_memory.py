@@ -65,7 +65,8 @@ def bits_of(tensor: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
     """Return the bits of numbers, on the same memory."""
     if not tensor.is_floating_point():
         return tensor
-    return tensor.view({2: torch.int16, 4: torch.int32, 8: torch.int64}[tensor.element_size()])
+    whole_number = {2: torch.int16, 4: torch.int32, 8: torch.int64}
+    return tensor.view(whole_number[tensor.element_size()])
 
 
 def _piece(name: str, owner: str, tensor: Shaped[Tensor, "*shape"], *, has_rows: bool = False) -> Piece:

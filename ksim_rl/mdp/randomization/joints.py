@@ -199,7 +199,8 @@ class RandomizeActuator(OfJoints, Randomize):
         # An infinite limit has no nominal value that a factor could change.
         owners = view.actuator_params.joints(name, finite=finite)
         # A shared draw has one column, which all joints take.
-        drawn_EN = self.draw(view, len(joints), [pair])[..., 0].expand(-1, len(joints))
+        drawn_ENC = self.draw(view, len(joints), [pair])
+        drawn_EN = drawn_ENC[..., 0].expand(-1, len(joints))
         # Places among the matched joints, not ids.
         explicit = [i for i, joint in enumerate(joints) if joint in owners]
         if explicit:

@@ -238,7 +238,8 @@ class Pose(OfCommand, OfJoints, RewardTerm):
         # From the outside in: running or walking first, then standing, which wins below its threshold.
         moving_EL = torch.where(speed_E1 < self.running_threshold, walking_L, running_L)
         std_EL = torch.where(speed_E1 < self.walking_threshold, standing_L, moving_EL)
-        return torch.exp(-(view.joints(self.joints).pos_rel_EL / std_EL).square().mean(-1))
+        error_EL = view.joints(self.joints).pos_rel_EL / std_EL
+        return torch.exp(-error_EL.square().mean(-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,7 +299,8 @@ class LinkAccelerationL2(RewardTerm):
         acceleration_EN3 = (vel_EN3 - last_EN3) / view.step_dt
         last_EN3.copy_(vel_EN3)
         # The first step has no velocity before it: the buffer's zero is not one.
-        return torch.where(view.episode_step_E <= 1, 0.0, acceleration_EN3.square().sum((-2, -1)))
+        squares_E = acceleration_EN3.square().sum((-2, -1))
+        return torch.where(view.episode_step_E <= 1, 0.0, squares_E)
 
 
 @dataclass(frozen=True, kw_only=True)

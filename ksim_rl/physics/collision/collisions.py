@@ -66,7 +66,10 @@ def _pairs(warp_model: mjw.Model) -> Iterator[tuple[int, int, list[str], int]]:
         kinds = [mjw.GeomType(types[geom]).name.lower() for geom in (a, b)]
         # A sensor that measures a pair reads contacts that have no rows, too.
         known = sensor == upstream.NO_SENSOR
-        yield a, b, kinds, MOST_CONTACTS.get(kinds[0], {}).get(kinds[1], 0) if known else 0
+        most = 0
+        if known:
+            most = MOST_CONTACTS.get(kinds[0], {}).get(kinds[1], 0)
+        yield a, b, kinds, most
 
 
 def collisions(
@@ -81,7 +84,8 @@ def collisions(
     d = warp_data_E
     device = d.qpos.device
     aabb = m.geom_aabb
-    pairs = np.array([(a, b, most) for a, b, _, most in _pairs(m)], dtype=np.int32).reshape(-1, 3)
+    found = [(a, b, most) for a, b, _, most in _pairs(m)]
+    pairs = np.array(found, dtype=np.int32).reshape(-1, 3)
     # Pairs that our narrow phase leaves to MuJoCo Warp are handed over by the broad phase.
     are_theirs = pairs[:, 2] == 0
     others = pairs[are_theirs, :2]

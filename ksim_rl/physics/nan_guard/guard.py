@@ -174,7 +174,8 @@ class NanGuard:
         for name, field in self._fields.items():
             kept = self._kept_fields[name]
             # A mask [E] broadcasts over the leaf dims of the field.
-            torch.where(fails_E.view(-1, *[1] * (field.ndim - 1)), field, kept, out=kept)
+            fails = fails_E.view(-1, *[1] * (field.ndim - 1))
+            torch.where(fails, field, kept, out=kept)
         self._failed_E.masked_fill_(fails_E, _KEPT)
 
     def count(self) -> Int[Tensor, ""]:
@@ -183,7 +184,8 @@ class NanGuard:
 
     def report(self) -> NanReport:
         """Write the worlds that failed since the last report, and watch them again; reads the device."""
-        worlds = tuple(int(world) for world in (self._failed_E != _WATCHED).nonzero().flatten().cpu())
+        failed = (self._failed_E != _WATCHED).nonzero().flatten().cpu()
+        worlds = tuple(int(world) for world in failed)
         if not worlds:
             return NanReport()
         files = []

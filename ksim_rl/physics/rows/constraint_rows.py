@@ -60,8 +60,10 @@ def constraint_rows(
     # Sorted below by number: MuJoCo Warp lists balls apart from hinges and slides.
     limited = np.concatenate([m.jnt_limited_ball_adr.numpy(), m.jnt_limited_slide_hinge_adr.numpy()])
     # For each geom, 64 bits say which degrees of freedom move it: a contact's row needs no search.
-    moves = m.body_isdofancestor.numpy()[m.body_weldid.numpy()[m.geom_bodyid.numpy()], : m.nv] != 0
-    masks = (moves * (np.uint64(1) << np.arange(m.nv, dtype=np.uint64))).sum(-1, dtype=np.uint64)
+    bodies = m.body_weldid.numpy()[m.geom_bodyid.numpy()]
+    moves = m.body_isdofancestor.numpy()[bodies, : m.nv] != 0
+    bit_of_dof = np.uint64(1) << np.arange(m.nv, dtype=np.uint64)
+    masks = (moves * bit_of_dof).sum(-1, dtype=np.uint64)
     device = d.qpos.device
     own = {
         **vars(lists),

@@ -173,8 +173,13 @@ class MLPActuator(NetActuator):
 
         def predict(error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]) -> Float[Tensor, "E N"]:
             seen.push(torch.cat((error_EN, vel_EN), dim=1))
-            # Two tuples of [E, N], one tensor per lag.
-            errors, velocities = zip(*(seen.at(lag).chunk(2, dim=1) for lag in lags), strict=True)
+            # Two lists of [E, N], one tensor per lag.
+            errors = []
+            velocities = []
+            for lag in lags:
+                error, velocity = seen.at(lag).chunk(2, dim=1)
+                errors.append(error)
+                velocities.append(velocity)
             # [E, N, F]: a linear layer works on the last dim, for all joints alike.
             return layers(torch.stack((*errors, *velocities), dim=-1))[..., 0]
 
@@ -240,9 +245,11 @@ class LSTMActuator(NetActuator):
         layers: list[list[Tensor]] = []
         for layer in range(num_layers):
             # The first layer sees two numbers, later ones the layer below; four gates are stacked.
-            shapes = ((4 * size, size if layer else 2), (4 * size, size), (4 * size,), (4 * size,))
-            named = zip((f"lstm.{part}_l{layer}" for part in _LSTM_PARTS), shapes, strict=True)
-            layers.append([net.tensor(name, *shape) for name, shape in named])
+            width = size if layer else 2
+            gates = 4 * size
+            shapes = ((gates, width), (gates, size), (gates,), (gates,))
+            parts = zip(_LSTM_PARTS, shapes, strict=True)
+            layers.append([net.tensor(f"lstm.{part}_l{layer}", *shape) for part, shape in parts])
         names = {f"lstm.{part}_l{layer}" for part in _LSTM_PARTS for layer in range(num_layers)}
         # After the layers, since their number decides which names are known.
         net.check_all_known(names | {"head.weight", "head.bias"})

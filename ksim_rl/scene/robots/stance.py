@@ -62,7 +62,8 @@ def find_stance(
             for (joint, sign), turn in zip(list(pitch.items())[-3:], bend, strict=False):
                 data.qpos[mj_model.jnt_qposadr[joint]] += sign * turn
     # Unlimited joints may go half a turn each way.
-    limits = np.where(mj_model.jnt_limited[joints][:, None], mj_model.jnt_range[joints], [-np.pi, np.pi])
+    is_limited = mj_model.jnt_limited[joints]
+    limits = np.where(is_limited[:, None], mj_model.jnt_range[joints], [-np.pi, np.pi])
     # A margin of 5 % at each end of the ranges.
     low = limits @ [0.95, 0.05]
     high = limits @ [0.05, 0.95]
@@ -80,11 +81,14 @@ def find_stance(
         soles = [leg.points(data) for leg in legs]
         middles = np.array([points.mean(0)[:2] for points in soles])
         # Soles flat, m; balance, m; feet in place up to a common shift, m; near the start, m and rad.
+        com = data.subtree_com[mj_model.jnt_bodyid[root]]
+        shifts = middles - given
+        tolerances = np.array([0.05, *[0.5] * len(joints)])
         parts = (
             np.concatenate(soles)[:, 2] / 0.001,
-            (data.subtree_com[mj_model.jnt_bodyid[root]][:2] - middles.mean(0)) / 0.002,
-            (middles - given - (middles - given).mean(0)).ravel() / 0.02,
-            (x - wanted) / np.array([0.05, *[0.5] * len(joints)]),
+            (com[:2] - middles.mean(0)) / 0.002,
+            (shifts - shifts.mean(0)).ravel() / 0.02,
+            (x - wanted) / tolerances,
         )
         if closed is None:
             return np.concatenate(parts)
@@ -92,11 +96,14 @@ def find_stance(
         mujoco.mj_fwdPosition(closed, data)
         return np.concatenate((*parts, data.efc_pos[: data.ne] / 0.001))
 
+    # The root may move by a metre up or down.
+    lowest = np.array([[wanted[0] - 1.0, *low]]).T
+    highest = np.array([[wanted[0] + 1.0, *high]]).T
     x, _ = minimize.least_squares(
         wanted[:, None],
         # The solver asks for several points in one call, as columns.
         lambda x_LK: np.stack([misses(x) for x in x_LK.T], axis=-1),
-        bounds=[np.array([[wanted[0] + reach, *ends]]).T for reach, ends in ((-1.0, low), (1.0, high))],
+        bounds=[lowest, highest],
         verbose=0,
     )
     data.qpos[columns] = x.ravel()

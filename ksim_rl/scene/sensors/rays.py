@@ -111,14 +111,13 @@ class RingPattern(RayPattern):
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         # Without 2 pi itself, which is the direction of 0.
         around = 2 * np.pi * np.arange(self.num_rays) / self.num_rays
-        up_N, around_N = (
-            table.ravel() for table in np.meshgrid(np.radians(self.elevations), around, indexing="ij")
-        )
+        tables = np.meshgrid(np.radians(self.elevations), around, indexing="ij")
+        up_N, around_N = (table.ravel() for table in tables)
         # A higher ring has a smaller circle.
         flat_N = np.cos(up_N)
-        return _from_origin(
-            np.stack((flat_N * np.cos(around_N), flat_N * np.sin(around_N), np.sin(up_N)), axis=-1)
-        )
+        x_N = flat_N * np.cos(around_N)
+        y_N = flat_N * np.sin(around_N)
+        return _from_origin(np.stack((x_N, y_N, np.sin(up_N)), axis=-1))
 
 
 def grid_points(size: tuple[float, float], resolution: float) -> np.ndarray:
@@ -235,7 +234,8 @@ class RayTracker(SensorTracker):
     @property
     def origin_EN3(self) -> Float[Tensor, "E N 3"]:
         """Place of the sensor that each ray belongs to, world frame, m; position stage."""
-        places = [self._origin(site)[:, None].expand(-1, len(self._start_N3), 3) for site in self._sites]
+        num_rays = len(self._start_N3)
+        places = [self._origin(site)[:, None].expand(-1, num_rays, 3) for site in self._sites]
         return torch.cat(places, dim=1)
 
     def _origin(self, site: int) -> Float[Tensor, "E 3"]:

@@ -296,7 +296,8 @@ class PatchedGround(Ground):
         return np.stack((x_N, y_N, highest_RC[row_N, column_N]), axis=-1)
 
     def set_levels(self, mask_E: Bool[Tensor, " E"], levels_E: Int64[Tensor, " E"]) -> None:
-        self._moved_E.copy_(torch.where(mask_E, levels_E - self._first_level_E, self._moved_E))
+        moved_E = levels_E - self._first_level_E
+        self._moved_E.copy_(torch.where(mask_E, moved_E, self._moved_E))
         self._place(mask_E)
 
     def _place(self, mask_E: Bool[Tensor, " E"]) -> None:
@@ -315,7 +316,8 @@ def _geom_fields(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
     """Return the values of `GEOM_FIELDS` that MuJoCo's compiler gives a geom of each height field, by name."""
     # In float32, as the engines keep model fields.
     half_x, half_y, top, base = mj_model.hfield_size.astype(np.float32).T
-    centre_P3 = np.stack((np.zeros_like(top), np.zeros_like(top), (top - base) / 2), axis=-1)
+    nothing_P = np.zeros_like(top)
+    centre_P3 = np.stack((nothing_P, nothing_P, (top - base) / 2), axis=-1)
     half_P3 = np.stack((half_x, half_y, (top + base) / 2), axis=-1)
     return {
         "geom_dataid": np.arange(mj_model.nhfield, dtype=np.int32),

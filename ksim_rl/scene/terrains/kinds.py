@@ -117,7 +117,9 @@ class DiscreteObstacles(TerrainPatch):
             # Half edges and centre of a block, m.
             half_x, half_y = rng.uniform(*self.width, size=2) / 2
             x, y = rng.uniform(-reach, reach, size=2)
-            inside_RC = (np.abs(lattice.x_RC - x) <= half_x) & (np.abs(lattice.y_RC - y) <= half_y)
+            in_x_RC = np.abs(lattice.x_RC - x) <= half_x
+            in_y_RC = np.abs(lattice.y_RC - y) <= half_y
+            inside_RC = in_x_RC & in_y_RC
             # A block or a pit, with even chances; it replaces what lay there.
             ground_RC[inside_RC] = rng.choice((-height, height))
         # Envs start on the platform, whatever was drawn there.
@@ -161,9 +163,9 @@ class SteppingStones(TerrainPatch):
         # One height per stone.
         tops = rng.uniform(-unevenness, unevenness, size=(stone_C[-1] + 1,) * 2)
         # A point is on a stone if both its row and its column are.
-        ground_RC = np.where(
-            on_stone_C[:, None] & on_stone_C, tops[stone_C[:, None], stone_C[None, :]], -self.depth
-        )
+        on_stone_RC = on_stone_C[:, None] & on_stone_C
+        top_RC = tops[stone_C[:, None], stone_C[None, :]]
+        ground_RC = np.where(on_stone_RC, top_RC, -self.depth)
         ground_RC[lattice.ring_RC <= self.platform_width / 2 + TIE] = 0.0
         return ground_RC
 

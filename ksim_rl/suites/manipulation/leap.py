@@ -84,7 +84,8 @@ class GoalOrientation(CommandTerm):
         half_E3 = 0.5 * view.step_dt * turn_E3
         angle_E1 = torch.linalg.vector_norm(half_E3, dim=-1, keepdim=True)
         # (cos a, sin(a) / a * v), with sinc(x) = sin(pi x) / (pi x), 1 at 0.
-        step_E4 = torch.cat((torch.cos(angle_E1), torch.sinc(angle_E1 / math.pi) * half_E3), dim=-1)
+        vector_E3 = torch.sinc(angle_E1 / math.pi) * half_E3
+        step_E4 = torch.cat((torch.cos(angle_E1), vector_E3), dim=-1)
         # Normalized again: rounding adds up over 1000 steps.
         turned_E4 = normalize(quaternion.multiply(goal_E4, step_E4), dim=-1)
         goal_E4.copy_(torch.where(moves_E1, turned_E4, goal_E4))

@@ -62,7 +62,8 @@ class OneMinusTanh(RewardTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         # 1 at the target, with a slope everywhere.
-        return 1.0 - torch.tanh(self.gain * torch.linalg.vector_norm(self.of(view), dim=-1))
+        length_E = torch.linalg.vector_norm(self.of(view), dim=-1)
+        return 1.0 - torch.tanh(self.gain * length_E)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,12 +81,15 @@ class CarryToTarget(RewardTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         body_E3 = view.body(self.body).pos_EL
-        gap_E = torch.linalg.vector_norm(body_E3 - view.site(self.site).pos_EL, dim=-1)
+        gap_E3 = body_E3 - view.site(self.site).pos_EL
+        gap_E = torch.linalg.vector_norm(gap_E3, dim=-1)
         was_there_E = view.buffer("was_there_E", dtype=torch.bool)
         # It stays true for the rest of the episode; resets clear it.
         was_there_E.logical_or_(gap_E < self.reach)
-        distance_E = torch.linalg.vector_norm(view.command(self.command)[:, :3] - body_E3, dim=-1)
-        turn_E = torch.linalg.vector_norm(TurnFromUpright(body=self.body)(view), dim=-1)
+        target_E3 = view.command(self.command)[:, :3]
+        distance_E = torch.linalg.vector_norm(target_E3 - body_E3, dim=-1)
+        turn_E3 = TurnFromUpright(body=self.body)(view)
+        turn_E = torch.linalg.vector_norm(turn_E3, dim=-1)
         # 5 * 0.9 and 5 * 0.1.
         return (1.0 - torch.tanh(4.5 * distance_E + 0.5 * turn_E)) * was_there_E
 
