@@ -9,7 +9,7 @@ from typing import NoReturn
 
 # Warp, MuJoCo and torch's kernels count in 32 bits.
 MOST_COUNT = 2**31 - 1
-# What is raised where data of a file is well formed, and lacks a part or has one of another kind.
+# Errors that well-formed data of a file raises where it lacks a part, or has one of another kind.
 MISFITS = (LookupError, TypeError, AttributeError, ArithmeticError)
 
 

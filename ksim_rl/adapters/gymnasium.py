@@ -265,7 +265,7 @@ def _one_seed(seeds: Sequence[int | None], num_envs: int) -> int | None:
     if None in seeds:
         return None
     first = int(seeds[0] or 0)
-    # s, s + 1, ... is what Gymnasium makes of a single seed s.
+    # Gymnasium turns a single seed s into s, s + 1, ...
     if all(seed == first + row for row, seed in enumerate(seeds)):
         return first
     # Mixed into one seed; shifted to fit a signed integer.

@@ -81,7 +81,7 @@ class SkrlWrapper(Wrapper):
 
     def reset(self) -> tuple[Float[Tensor, "E L"], Infos]:
         """Return the observations that the next actions answer to; the first call resets all envs."""
-        # skrl resets before each training; going on is what its wrappers of vector envs do.
+        # skrl resets before each training; its wrappers of vector envs go on instead.
         self._current = self._current or self._stepper.reset()
         return self._joined(self._current, self._observed), {}
 

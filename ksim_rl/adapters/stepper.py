@@ -26,7 +26,7 @@ AUTORESETS: tuple[Autoreset, ...] = ("same_step", "next_step", "disabled")
 Observations = dict[str, Shaped[Tensor, "E *?leaf"]]
 """Observations by name, each with its own leaf dims (most often one, L)."""
 Infos: TypeAlias = dict[str, Any]
-"""What is told of a step beyond its observations, rewards and ends: for each library something else."""
+"""Further facts of a step, beside its observations, rewards and ends: each library has its own."""
 
 
 @dataclass(frozen=True)

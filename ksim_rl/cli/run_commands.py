@@ -28,7 +28,7 @@ from ksim_rl.trainers.run_folder import FOLDERS, policy_of
 from ksim_rl.trainers.sources import check_sources
 from ksim_rl.zoo import locate
 
-# What a checkpoint is of, and a resumed run cannot change.
+# Settings that belong to a checkpoint, and that a resumed run cannot change.
 KEPT = ("task_name", "num_envs", "seed", "modules", "checkpoint")
 
 

@@ -97,7 +97,7 @@ def train(arguments: list[str]) -> int:
         )
     if ranks.rank():  # rank 0 has the run's folder
         overrides.append(f"hydra.run.dir={tempfile.mkdtemp(prefix='ksim-rl-rank-')}")
-    if flags.multirun:  # jobs are named by what they differ in
+    if flags.multirun:  # jobs are named by their differences
         same = ",".join(f"'{key}'" for key in conf.without_sweeps(overrides))
         overrides.append(f"hydra.job.config.override_dirname.exclude_keys=[{same}]")
     # Overrides come together: Hydra takes those after a flag for faults.
@@ -111,7 +111,7 @@ def train(arguments: list[str]) -> int:
 
 
 def _with_first_cause(error: HydraException) -> str:
-    """Return Hydra's message with what began it, such as a library that a variable of the environment breaks."""
+    """Return Hydra's message with its cause, such as a library that a variable of the environment breaks."""
     text = str(error)
     cause: BaseException = error
     while cause.__cause__ is not None:

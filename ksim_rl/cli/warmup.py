@@ -14,7 +14,7 @@ from ksim_rl.trainers.sources import check_sources
 USAGE = """usage: ksim-rl warmup [overrides of ksim-rl train]
 
 Compiles the kernels of a task's physics, terms and networks and keeps them in the caches of Warp, Triton and torch, so
-that the next run with the same task starts at once: one iteration runs, with nothing logged or saved."""
+that the next run with the same task starts immediately: one iteration runs, with nothing logged or saved."""
 
 
 def warmup(arguments: list[str]) -> int:

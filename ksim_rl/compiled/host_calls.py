@@ -125,7 +125,7 @@ class _Tracer:
             owner = None
         name = self._names.get(id(owner))
         if name is not None:
-            # What was drawn before this was drawn by whoever called it.
+            # Earlier draws were made by the caller.
             self._look_at_numpy(self._part)
             self._running.append((frame, name))
 

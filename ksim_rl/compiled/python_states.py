@@ -63,7 +63,7 @@ def place_of(iterator: Iterator) -> str | None:
             _, *arguments = iterator.__reduce__()
         except (TypeError, AttributeError):
             return None
-    # What it goes through may be large, and is looked at elsewhere if it can change.
+    # The object that it iterates over may be large, and is watched elsewhere if it can change.
     # `__reduce__` gives the iterated object and the position; only plain ones can be compared.
     plain = [argument for argument in arguments if issubclass(type(argument), PLAIN)]
     # Chains and zips hold other iterators, which have places, too.

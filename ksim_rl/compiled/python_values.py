@@ -163,7 +163,7 @@ class _Search:
         values = read()
         # One place is held once, with a path from each part.
         if (id(owner), what) not in self.found:
-            # What reads all of a table gives the table itself.
+            # A read of the whole table gives the table itself.
             if values is table:
                 pick = None
             else:

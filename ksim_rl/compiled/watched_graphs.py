@@ -38,7 +38,7 @@ class WatchedGraphs:
         # More graphs than before: one was captured in this call.
         num_ready = sum(graph.ready for graph in self._graphs)
         if num_ready != self._num_ready:
-            # What a call does in Python, it has done now; from here on each change is somebody else's.
+            # The call has made its own changes in Python by now; from here on each change is somebody else's.
             self._watch.look(self._parts)
             self._num_ready = num_ready
 

@@ -21,7 +21,7 @@ def help_page(overrides: Sequence[str]) -> str:
     """Return the page for the config that overrides compose; a ValueError names an override that is wrong."""
     register()
     (cfg, *_) = check_command_line(overrides, name=NAME, multirun=True, values=True)
-    # What Hydra prints around it for configs of a user's own.
+    # The text that Hydra prints around it for configs of a user's own.
     around = yaml.safe_load(files(MODULE).joinpath("launch.yaml").read_text())["hydra"]["help"]
     return "\n".join(
         (

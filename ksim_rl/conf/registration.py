@@ -166,7 +166,7 @@ def searched_folders(overrides: Sequence[str]) -> list[Path]:
             else:
                 places = [value]
             found += [
-                # Packages come with what is installed, and so are trusted.
+                # Packages are installed, and so are trusted.
                 Path(str(place).removeprefix("file://"))
                 for place in places
                 if "pkg://" not in str(place)

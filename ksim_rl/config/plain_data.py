@@ -101,7 +101,7 @@ def check_plain(tree: Any, where: str) -> None:
 
 def check_references(tree: Plain, where: str) -> None:
     """Refuse interpolations that do more than name another field of the config, such as `${num_envs}`."""
-    # What is left after taking off plain references must be plain.
+    # The rest, without plain references, must be plain.
     check_plain(_without_references(tree), where)
 
 

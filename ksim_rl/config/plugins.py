@@ -81,7 +81,7 @@ def load(names: Sequence[str]) -> None:
     names one that cannot be imported.
     """
     _extend_path()
-    # Those of the environment first: a command adds to them.
+    # First the plug-ins of the environment: a command adds to them.
     wanted = [*os.environ.get(VARIABLE, "").split(","), *names]
     for name in dict.fromkeys(name.strip() for name in wanted if name.strip()):
         if name in _named:

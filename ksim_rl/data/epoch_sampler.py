@@ -24,7 +24,7 @@ MOST_STATE_BYTES = 10_000
 
 # Which entries of a storage are meant: their numbers, or one tensor of numbers per dim.
 Entries: TypeAlias = Int64[Tensor, "*entries"] | tuple[Int64[Tensor, "*?entries"], ...] | int
-# What a sampler tells about a sample, by key.
+# Facts that a sampler gives about a sample, by key.
 SampleInfo: TypeAlias = dict[NestedKey, Shaped[Tensor, "*?leaf"]]
 
 

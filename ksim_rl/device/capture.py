@@ -21,7 +21,7 @@ from ksim_rl.device.streams import checked_device, warp_device, warp_scope, warp
 
 
 class _Phase(threading.local):
-    """What this thread is doing inside a `Captured`."""
+    """The state of this thread inside a `Captured`."""
 
     live = 0
     warming_up = 0

@@ -69,7 +69,7 @@ def _user_name() -> str:
 
 def _explanation(error: BaseException, *, triton_alone: bool) -> str:
     said = " ".join(str(error).split())[:_MOST_LETTERS]
-    # What torch compiles for a GPU are kernels of Triton.
+    # Torch compiles kernels of Triton for a GPU.
     caches = [triton_cache()] if triton_alone else [torch_cache(), triton_cache()]
     advice = ", ".join(
         f"{cache.compiler}'s {cache.folder} (or set {cache.variable} to another folder)" for cache in caches

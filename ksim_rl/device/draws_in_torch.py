@@ -87,7 +87,7 @@ def permuted(keys: Keys, n: int, bits: int, rounds: int) -> Int64[Tensor, "E n"]
         return (high << low_bits) | low
 
     number = through(torch.arange(n, device=device).expand(len(keys.first_E), n))
-    # What the next power of two takes past the last number goes through the network again.
+    # Numbers past the last one, up to the next power of two, go through the network again.
     while bool((number >= n).any()):
         number = torch.where(number >= n, through(number), number)
     return number

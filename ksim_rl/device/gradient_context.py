@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class GradientContext(Protocol):
-    """What autograd hands to the `forward` and `backward` of a `Function`, as far as ours use it."""
+    """The part of autograd's context that the `forward` and `backward` of our `Function`s use."""
 
     saved_tensors: tuple[Tensor, ...]
     needs_input_grad: tuple[bool, ...]

@@ -14,7 +14,7 @@ import torch
 from ksim_rl.checked import Checked
 from ksim_rl.device.upstream import ALLOCATION_REFUSALS
 
-# In so many parts a rollout is read: what is computed of one on the way takes several times its memory.
+# A rollout is read in so many parts: intermediate results of a part take several times its memory.
 ROLLOUT_PARTS = 4
 _UNITS = {None: 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 # Of a number in memory: float32 nearly everywhere.

@@ -18,7 +18,7 @@ from torch.utils._pytree import PyTree, tree_leaves
 _HOST_READS = frozenset({"_local_scalar_dense", "equal", "item", "masked_select", "nonzero"})
 # On the CPU these never reach the dispatcher.
 _HOST_METHODS = frozenset({Tensor.numpy, Tensor.tolist, Tensor.__array__, Tensor.__dlpack__})
-# What torch's operators are called with; what they return is a tree, too.
+# The arguments of torch's operators; their results are trees, too.
 OpArgs: TypeAlias = tuple[PyTree, ...]
 OpKwargs: TypeAlias = dict[str, PyTree]
 _INTERNAL = ("/torch/", "/tensordict/", "/contextlib.py", __file__)

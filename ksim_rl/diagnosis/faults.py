@@ -40,7 +40,7 @@ def entropy_collapsed(curves: Curves) -> str | None:
         name = "policy/std"
     else:
         name = "loss/entropy"
-    # A tenth of what it was: learning narrows it too, but not that far.
+    # A tenth of its first value: learning narrows it too, but not that far.
     first = curves.early(name)
     last = curves.late(name)
     if first is None or last is None or first <= 0.0 or not 0.0 <= last <= 0.1 * first:

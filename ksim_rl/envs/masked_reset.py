@@ -240,7 +240,7 @@ class MaskedReset(EnvBase):
 
     def _complete_with_last_root(self, tensordict: TensorDictBase) -> None:
         """Give a partial reset the root values that it was not given."""
-        # What a root consists of: observations and flags of done.
+        # The parts of a root: observations and flags of done.
         root_keys = [*self.full_observation_spec.keys(True, True), *self.full_done_spec.keys(True, True)]
         missing = [key for key in root_keys if tensordict.get(key, None) is None]
         if missing and self.last_root is None:

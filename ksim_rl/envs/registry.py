@@ -115,7 +115,7 @@ def build(
         # Transforms of others are tried out below, ours and TorchRL's are not.
         if not type(transform).__module__.startswith(("ksim_rl.", "torchrl.")):
             foreign[name] = transform
-        # What scales with difficulty reads the env's own tensor.
+        # Transforms that scale with difficulty read the env's own tensor.
         follow_level([transform], level)
         try:
             _check_reads(transform, env)
@@ -140,7 +140,7 @@ def build(
 def _check_writes(env: MaskedTransformedEnv, foreign: Mapping[str, Transform]) -> None:
     """Refuse foreign transforms whose outputs in a first root do not match their specs."""
     try:
-        # Specs are what a transform declares; only a run shows what it does.
+        # Specs say what a transform declares; only a run shows what it does.
         root = env.reset()
     except Exception as error:
         error.add_note(f"(in the first reset, with task.transforms.{', '.join(foreign)})")

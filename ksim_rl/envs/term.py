@@ -26,7 +26,7 @@ Fields = Mapping[str, bool | float | str | tuple[float, ...]]
 EventMode = Literal["startup", "reset", "start", "interval", "step"]
 """When an event happens: as the env is made, at a reset, at an episode's start, after drawn times, at each step."""
 Reduction = Literal["mean", "last", "max", "sum"]
-"""What an episode keeps of a metric."""
+"""How an episode reduces the values of a metric to one."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ WRITING = ".writing-"
 
 
 def open_streams() -> None:
-    """Open those of the three standard streams that are closed, on nothing.
+    """Open each of the three standard streams that is closed, on nothing.
 
     Else the next file that is opened takes the place of one, such as a checkpoint into which a library in C prints its
     errors; and libraries in Python call methods of `sys.stderr`.

@@ -37,7 +37,7 @@ class JointAction(ActionTerm):
     tanh: bool = False
     """Squashes the action into (-1, 1)."""
     cutoff_hz: Positive | None = None
-    """Of a first-order low-pass filter. After a reset it starts at 0, which is what no action at all asks for."""
+    """Of a first-order low-pass filter. After a reset it starts at 0, as if there were no action."""
 
     def size(self, view: EnvView) -> int:
         return len(view.joints(self.joints))
@@ -103,7 +103,7 @@ class JointPositionAction(JointAction):
 
 @dataclass(frozen=True, kw_only=True)
 class RelativeJointPositionAction(JointAction):
-    """Positions (rad or m): the shaped action, relative to what encoders read when the env step begins."""
+    """Positions (rad or m): the shaped action, relative to the encoders' readings when the env step begins."""
 
     def __call__(self, view: EnvView, action_EK: Float[Tensor, "E K"]) -> None:
         # Measured positions, not the last targets: errors of tracking do not add up.

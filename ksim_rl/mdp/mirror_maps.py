@@ -178,7 +178,7 @@ def _joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
 
 def _relative_joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
     mirror = _joints(env, joints)
-    # The model's own pose: what events draw around it is as likely on either side.
+    # The model's own pose: draws of events around it are as likely on either side.
     default_K = env.view.default_qpos_L[env.view.joints(joints).qpos]
     _check_symmetric("the default pose", default_K, mirror(default_K))
     return mirror

@@ -46,7 +46,7 @@ class GradientCfg(AlgorithmCfg):
 
     Attributes:
         betas: decay of Adam's means of gradients and of their squares.
-        adam_eps: what Adam adds to the root of the squares.
+        adam_eps: the number that Adam adds to the root of the squares.
         weight_decay: share of the weights that a step takes away, times the learning rate.
         max_grad_norm: greatest norm of a gradient, to which longer ones are clipped; None does not clip.
         max_skipped_steps: so many steps in a row that are not finite end the run.

@@ -21,7 +21,7 @@ REFUSED: dict[str, tuple[tuple[Any, ...], str]] = {
     "num_chunk": ((None,), IN_ROWS),
     "value_chunk_dim": ((0,), IN_ROWS),
 }
-"""Options of TorchRL's estimators: the values that ask for what is done here, and why others are refused."""
+"""Options of TorchRL's estimators: the values that ours honour, and why others are refused."""
 
 
 def normalizes(normalize_advantage: bool, options: dict[str, Any]) -> bool:

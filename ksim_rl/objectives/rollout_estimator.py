@@ -54,7 +54,7 @@ class RolloutEstimator(ValueEstimatorBase):
     finite ones to mean 0 and standard deviation 1 over all env states, or divides by `min_advantage_std` where that is
     more (the default is TorchRL's). Time is the batch dim `time_dim`, whatever the names say; with None it is the dim
     named "time", or the last one. With `skip_existing` values that the data has are not computed again. Other options
-    of TorchRL's are refused where they ask for something else than what is done here.
+    of TorchRL's are refused where they ask for anything else.
     """
 
     time_dim: int | None

@@ -12,7 +12,7 @@ from ksim_rl.physics.upstream import per_world_fields
 FIXED, KIN0, INERT0 = (int(mjw.SetConstGroup[name]) for name in ("FIXED", "KIN0", "INERT0"))
 ALL = FIXED | KIN0 | INERT0
 
-# What MuJoCo's mj_setConst derives from a field (see mujoco_warp.set_const). `actuator_gear` scales the moments.
+# The constants that mj_setConst derives from a field (see mujoco_warp.set_const); `actuator_gear` scales the moments.
 _FIELDS_OF_GROUPS = {
     ALL: "body_mass",
     FIXED: "geom_size",
@@ -26,7 +26,7 @@ DERIVED_FIELDS = {
     KIN0: "tendon_length0 eq_data cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0",
     INERT0: "dof_invweight0 body_invweight0 tendon_invweight0 actuator_acc0",
 }
-# What paths go by: tendons over sites and geoms, and transmissions from sites.
+# The elements that paths pass: tendons over sites and geoms, and transmissions from sites.
 _PATH_FIELDS = {"geom_size", "geom_pos", "geom_quat", "site_pos", "site_quat", "actuator_cranklength"}
 _PATH_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK)
 # Not a field of the model but of its options, which put_model cannot expand.

@@ -258,7 +258,7 @@ def _float_fields(mj_model: mujoco.MjModel) -> Iterator[tuple[str, float | np.nd
         value = getattr(mj_model.opt, name)
         if not name.startswith("_") and isinstance(value, (float, np.ndarray)):
             yield f"option.{name}", value
-    # What the compiler derives comes last, so that an error names the field that the user wrote.
+    # Derived fields come last, so that an error names the field that the user wrote.
     for name in sorted(dir(mj_model), key=lambda name: (name.endswith(DERIVED), name)):
         # Textures hold pixels only.
         if name.startswith("_") or name.startswith("tex_"):

@@ -161,7 +161,7 @@ def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> t
                     f"{read.label}: <{tag} file={attributes['file']!r}>: the file takes in itself"
                 )
             if path not in read.counts:
-                # What is no file, a pipe among them, is refused; one that is missing MuJoCo names with its line.
+                # Anything but a file, such as a pipe, is refused; MuJoCo names a missing file with its line.
                 read.counts[path] = 0, 0
                 if path.exists():
                     read.included.append(folder / attributes["file"])

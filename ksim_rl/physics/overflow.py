@@ -136,7 +136,7 @@ class OverflowRecord:
         d = self._warp_data_E
         worlds = dict(zip(BIT_NAMES, numbers, strict=False))
         nefc = numbers[len(BIT_NAMES)]
-        # Contacts and candidate pairs share the pool: the larger number is what it needed.
+        # Contacts and candidate pairs share the pool, which needed room for the larger number.
         ncon = max(numbers[len(BIT_NAMES) + 1 :])
         return OverflowReport(
             worlds=worlds, nefc=nefc, njmax=d.njmax, ncon=ncon, naconmax=d.naconmax, num_envs=d.nworld

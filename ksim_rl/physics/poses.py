@@ -112,7 +112,7 @@ def _highest_solid(
     start = np.array([point[0], point[1], highest])
     down = np.array([0.0, 0.0, -1.0])
     hit = np.zeros(1, dtype=np.int32)
-    # Rays hit what moves and what does not collide, too: then they go on below it.
+    # Rays also hit geoms that move or do not collide: then they go on below.
     for _ in range(mj_model.ngeom):
         distance = mujoco.mj_ray(mj_model, mj_data, start, down, None, True, -1, hit)
         if distance < 0.0:

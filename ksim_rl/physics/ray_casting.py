@@ -77,7 +77,7 @@ class RayBatch:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """What a camera draws: width and height in pixels, which kinds of picture, and what is seen in them."""
+    """The pictures of a camera: width and height in pixels, their kinds, and which geoms are seen."""
 
     width: int
     height: int

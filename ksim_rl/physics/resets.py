@@ -12,7 +12,7 @@ import warp as wp
 from ksim_rl.physics.views import ACCELERATION_STAGE
 
 LANES = 32
-# What `reset_data` sets to zero in a model that has none of `HAS_MORE`, and what it leaves though it should not.
+# Arrays that `reset_data` zeroes in a model with none of `HAS_MORE`, and arrays that it leaves though it should not.
 _ZEROED = (
     "solver_niter ne nf nl nefc time energy qvel qacc_warmstart qfrc_applied qacc ctrl act act_dot userdata sensordata "
     "xfrc_applied M overflow"

@@ -9,7 +9,7 @@ import warp as wp
 
 from ksim_rl.physics.upstream import Struct
 
-# The value of one field of a kernel's struct, and what has such values by name.
+# The value of one field of a kernel's struct, and any object with such values as attributes.
 Field: TypeAlias = wp.array | int | float
 Owner: TypeAlias = Mapping[str, Field] | mjw.Model | mjw.Option | mjw.Data
 

@@ -213,7 +213,7 @@ def _solve_as_they_do(
 def _mending(
     mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
 ) -> Callable[[], None] | None:
-    """Return a launcher of what MuJoCo Warp's solver needs corrected before it; None where all is right."""
+    """Return a launcher of the corrections that MuJoCo Warp's solver needs before it; None where all is right."""
     # The first ones change rows of MuJoCo Warp's; the last one appends rows.
     of_rows = (
         counting_of_ties(mj_model, warp_data_E),

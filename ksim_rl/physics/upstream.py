@@ -21,7 +21,7 @@ from mujoco_warp._src.collision_core import contact_params as contact_params
 # The lists between its broad phase and its narrow one, and the narrow phase.
 from mujoco_warp._src.collision_core import create_collision_context as create_collision_context
 
-# Its search for the distance of convex shapes, and what that needs.
+# Its search for the distance of convex shapes, and the parts that it needs.
 from mujoco_warp._src.collision_core import geom_collision_pair as geom_collision_pair
 from mujoco_warp._src.collision_core import write_contact as write_contact
 from mujoco_warp._src.collision_driver import _narrowphase as narrowphase  # noqa: F401

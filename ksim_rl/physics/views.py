@@ -21,7 +21,7 @@ _KEPT = (
     "history plastic eq_active userdata tree_asleep tree_awake body_awake body_awake_ind dof_awake_ind ntree_awake "
     "nbody_awake nv_awake overflow sensordata qacc act_dot actuator_length actuator_velocity"
 )
-# What `refresh` recomputes, and what it, or the last of the next substeps, computes from when on it is read.
+# Arrays that `refresh` recomputes, and arrays that it, or the next last substep, computes once they have been read.
 _REFRESHED = (
     "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat subtree_com cdof cinert cvel "
     "cdof_dot ten_J ten_length ten_wrapadr ten_wrapnum wrap_obj wrap_xpos flexvert_xpos flexedge_J flexedge_length"

@@ -74,7 +74,7 @@ class World(views.DataViews):
 
     def __new__(cls, *args: Any, sim: SimCfg | None = None, **kwargs: Any) -> Self:
         """Choose the engine."""
-        # `World(...)` chooses a subclass; a subclass itself is what was asked for.
+        # `World(...)` chooses a subclass; a call of a subclass makes that one.
         if cls is not World:
             return super().__new__(cls)
         name, _ = _choice(*args, sim=sim, **kwargs)

@@ -16,7 +16,7 @@ from ksim_rl.device.group import first_row, size
 
 
 class TensorOptions(TypedDict, total=False):
-    """What torch's functions take that make a tensor."""
+    """The keywords of torch's functions that make a tensor."""
 
     dtype: torch.dtype
     device: torch.device | str

@@ -16,7 +16,7 @@ from ksim_rl.device import group
 from ksim_rl.ranks import heartbeat, store
 from ksim_rl.ranks.variables import number, world_size
 
-# What torchrun sets; `python -m torch.distributed.run` is the same.
+# Variables that torchrun sets; `python -m torch.distributed.run` is the same.
 VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
 COMMANDS = ("train", "resume")
 

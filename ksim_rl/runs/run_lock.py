@@ -18,7 +18,7 @@ from ksim_rl.files.writing import open_own
 
 LOCK = ".lock"
 MOST_LETTERS = 1000
-# What some file systems of clusters answer.
+# The errors of file systems without locks, as some clusters have them.
 WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 

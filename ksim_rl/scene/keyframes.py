@@ -36,7 +36,7 @@ def complete_keyframes(spec: mujoco.MjSpec) -> None:
     for key in silent:
         # An empty qpos means the model's own pose.
         holding = held(mj_model, np.array(key.qpos) if len(key.qpos) else mj_model.qpos0)
-        # What the keyframe says itself stays.
+        # Values that the keyframe has itself stay.
         if not len(key.ctrl):
             key.ctrl = holding.ctrl_L
         if mj_model.na and not len(key.act):

@@ -6,7 +6,7 @@ from ksim_rl.checks import near
 
 
 class NearNames:
-    """What terms read by attributes: a name that is none of them is an AttributeError with the near ones."""
+    """Base of objects whose attributes terms read: an unknown name is an AttributeError that lists the near ones."""
 
     # Hidden from type checkers, to which any attribute would exist.
     if not TYPE_CHECKING:

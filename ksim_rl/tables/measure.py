@@ -172,7 +172,7 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
 def main(name: str, row: str, seed: str, result: str, run_folder: str, device: str, smoke: str = "") -> None:
     """Measure and write; the result appears whole or not at all."""
     go_to_parents_folder()  # the table, and the paths of the command, are as they were given there
-    plugins.load([])  # those of KSIM_RL_PLUGINS, where `ksim-rl --plugin` has put its own
+    plugins.load([])  # from KSIM_RL_PLUGINS, where `ksim-rl --plugin` has put its own
     # The child composes the row itself: it gets names only.
     found = measure(load(name).rows[row], int(seed), Path(run_folder), device=device, smoke=bool(smoke))
     path = Path(result)

@@ -69,8 +69,8 @@ class Row(Checked):
 
     @property
     def goal(self) -> float | None:
-        """What the measure should reach: a return or share at least, seconds at most; None where nothing is asked."""
-        # What counts depends on the measure: a return is compared with a publication.
+        """The bound of the measure: the least return or share, the most seconds; None where there is none."""
+        # The measure decides what counts: a return is compared with a publication.
         goals = {"success": self.at_least, "seconds": self.within_s}
         return goals.get(self.measure, self.published.get(self.against))
 

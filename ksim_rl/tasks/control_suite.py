@@ -177,7 +177,7 @@ CARTPOLE_SWINGUP = Task(
         gamma=0.995,
         entropy_coeff=0.003,
     ),
-    # What a pole gives that is up, centered and at rest from 2 s on (800 of 1000 steps), with nothing before that.
+    # The return of a pole that is up, centered and at rest from 2 s on (800 of 1000 steps), and earns nothing before.
     solved_at=800.0,
 )
 

@@ -12,7 +12,7 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.specs import misfit
 
 _NOT_FINITE = (
-    "Look for a division by zero, a root of a negative number or an uninitialized buffer in what computes it"
+    "Look for a division by zero, a root of a negative number or an uninitialized buffer where it is computed"
 )
 
 

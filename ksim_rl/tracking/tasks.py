@@ -63,7 +63,7 @@ def observations(file: str) -> dict[str, ObservationGroupCfg]:
     joints = ROBOT.joint_names
     reference = {"reference": ObservationTermCfg(term=mdp.MotionJoints(file=file, joints=joints))}
     last = {"actions": ObservationTermCfg(term=mdp.LastAction())}
-    # Term and reach of its uniform noise, in the term's units: what the robot's sensors can tell.
+    # Term and reach of its uniform noise, in the term's units, about as good as the robot's sensors.
     reaches = {
         "anchor_pos": (terms.MotionAnchorPos(file=file, anchor=ANCHOR), 0.25),
         "anchor_axes": (terms.MotionAnchorAxes(file=file, anchor=ANCHOR), 0.05),

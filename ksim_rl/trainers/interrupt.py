@@ -27,7 +27,7 @@ class InterruptRequest:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # Back to the handlers of before, which may be those of an outer request.
+        # Back to the earlier handlers, which may belong to an outer request.
         for number, handler in self._previous.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._previous.clear()

@@ -21,7 +21,7 @@ from ksim_rl.files.writing import make_folder, write_whole
 from ksim_rl.runs.csv_table import CsvTable
 from ksim_rl.runs.listing import METRICS
 
-# What MLflow takes in one request, and how long a value may be.
+# MLflow's limits: entries of one request, and letters of a value.
 _MAX_PARAMS = 100
 _MAX_LETTERS = 6000
 

@@ -16,7 +16,7 @@ from rich.text import Text
 from ksim_rl import ranks
 from ksim_rl.terminal import printable
 
-# What is shown, in this order, where the run has it: metric, label, format.
+# The figures that are shown, in this order, where the run has them: metric, label, format.
 SHOWN = (
     ("env_states", "env states", "{:,.0f}"),
     ("throughput/env_states_per_s", "env states/s", "{:,.0f}"),

@@ -28,7 +28,7 @@ _GROUND: dict[str, Any] = {
 }  # fmt: skip
 # Vertices [V, 3] in m, and triangles [F, 3] of their indices.
 Mesh = tuple[np.ndarray, np.ndarray]
-# What geoms of one mesh share: kind, number in the model, sizes that cannot be scaled, transparency.
+# The key of geoms that share a mesh: kind, number in the model, sizes that cannot be scaled, transparency.
 Key: TypeAlias = tuple[Any, ...]
 
 

@@ -19,7 +19,7 @@ from websockets.http11 import Request, Response
 
 # More pages than anybody looks at; each costs a thread or three tasks, and a queue.
 MOST_CLIENTS = 16
-# What a page sends while somebody turns the view and drags a slider, and some more; beyond that it waits.
+# More than a page sends while somebody turns the view and drags a slider; beyond that rate it waits.
 MESSAGES_PER_S = 240.0
 _EVERYWHERE = ("0.0.0.0", "::", "")
 

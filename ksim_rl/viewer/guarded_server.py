@@ -77,7 +77,7 @@ class _Clients:
                     clients.gate.ignore()
 
             async def _keep_pace(self) -> None:
-                # What is not read stays with the client, whose own queue then fills.
+                # Unread data stays with the client, whose own queue then fills.
                 now = asyncio.get_running_loop().time()
                 # A pause earns half a second of messages at most.
                 self._free_at = max(self._free_at, now - _BURST_S) + 1.0 / MESSAGES_PER_S

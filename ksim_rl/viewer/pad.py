@@ -88,7 +88,7 @@ class Pad:
                 else:
                     # Requests run in the thread of the session, as all that touches the env does.
                     self._session.ask(partial(self._obey, asked))
-                # What is not read stays with the client, whose own queue then fills.
+                # Unread data stays with the client, whose own queue then fills.
                 time.sleep(1.0 / MESSAGES_PER_S)
         except ConnectionClosed:
             return

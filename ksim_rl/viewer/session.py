@@ -306,7 +306,7 @@ class Session:
             changed = True
             self._guarded(self._step)
             after_step()
-        # What could not be kept up with is dropped, not made up for later.
+        # Steps that came too late are dropped, not made up for later.
         self._due = min(self._due, 1.0)
         # The pace over the last 61 calls is shown beside the speed that was asked for.
         self._paces = [*self._paces[-60:], (now, self.steps)]

@@ -49,7 +49,7 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
         # Of the training, not of this command.
         made = {"commit": card.commit, "versions": dict(record.read(run)[-1].versions)}
         export(entry, exported, episodes=episodes, note=show, origin=made)
-        # The rounded policy is compared, as that is what users get.
+        # The rounded policy is compared, since users get that one.
         report = sim2sim(exported, episodes=episodes, note=show)
         if not math.isfinite(report.return_ratio):
             raise ValueError(f"{run}: of its rewards none has a description; see docs/deploy.md")

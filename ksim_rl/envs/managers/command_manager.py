@@ -31,7 +31,7 @@ class CommandManager:
             for name, term in terms.items()
             if term.resampling_time_range_s is not None
         }
-        # What each term writes whenever its vector is computed; most write nothing then.
+        # The buffers that each term writes whenever its vector is computed; most write none.
         self._kept: dict[str, dict[str, Kept]] = {name: {} for name in terms}
         nobody_E = torch.zeros(view.num_envs, dtype=torch.bool, device=view.device)
         for name, term in terms.items():

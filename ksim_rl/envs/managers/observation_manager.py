@@ -24,7 +24,7 @@ class ObservationManager:
         self._driver = driver
         self._view = driver.view
         self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
-        # What each term writes whenever it is read; most write nothing.
+        # The buffers that each term writes whenever it is read; most write none.
         self._kept: dict[str, dict[str, Kept]] = {}
         self._shapes: dict[str, torch.Size] = {}
         # Reads each term once: wrong names and shapes are errors now.

@@ -31,7 +31,7 @@ def rehearse(
         # Motor models and sensors, in the order of an env step.
         laws.apply()
         driver.update_sensors()
-        # Twice: what a term changes in a quantity that it is the first to read shows the second time.
+        # Twice: a change to a quantity by its first reader shows the second time.
         for _ in range(2):
             for manager in reading:
                 manager.rehearse()

@@ -43,7 +43,7 @@ def joined(
 def parts(
     state: State,
 ) -> tuple[dict[str, Shaped[Tensor, "*?shape"]], dict[str, Shaped[Tensor, "*?shape"]]]:
-    """Return the entries of a state dict that are the env's, and those of its worlds; see `joined`."""
+    """Return the env's entries of a state dict, and the entries of its worlds; see `joined`."""
     of_env = {}
     of_world = {}
     for name, value in state.items():
@@ -57,5 +57,5 @@ def parts(
 def completed(
     given: Mapping[str, Shaped[Tensor, "*?shape"]], present: Mapping[str, Shaped[Tensor, "*?shape"]]
 ) -> dict[str, Shaped[Tensor, "*?shape"]]:
-    """Return the entries of `given` that `present` has, too, and those of `present` for the missing ones."""
+    """Return a value for each name of `present`: from `given`, or else the present one."""
     return {name: given.get(name, value) for name, value in present.items()}

@@ -41,7 +41,7 @@ class JointPosLimits(OfJoints, RewardTerm):
         joints = view.joints(self.joints)
         pos_EL = joints.pos_EL
         limits_L2 = joints.soft_limits_L2
-        # What the clamp cuts off is the distance to the nearer limit; infinite limits cut nothing.
+        # The clamp cuts off the distance to the nearer limit; infinite limits cut nothing.
         inside_EL = torch.clamp(pos_EL, limits_L2[:, 0], limits_L2[:, 1])
         return (pos_EL - inside_EL).abs().sum(-1)
 

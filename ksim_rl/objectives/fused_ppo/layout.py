@@ -32,7 +32,7 @@ MAX_PLACES = 2**31
 only_compiles = ContextVar("only_compiles", default=False)
 
 
-# What a Triton kernel takes under a name: an array, a number of the launch, or a constant that it is compiled for.
+# An argument of a Triton kernel: an array, a number of the launch, or a constant that it is compiled for.
 Argument: TypeAlias = Any
 
 

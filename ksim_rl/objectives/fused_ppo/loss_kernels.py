@@ -161,8 +161,8 @@ def estimate_advantages(
 ):  # fmt: skip
     """Write advantages and value targets of BLOCK envs; all signals are time-major, [STEPS, num_envs].
 
-    As `GAE`: a step whose delta is not finite gets a NaN advantage, and the recursion starts anew before it. `decay` is
-    gamma * lambda. `moments` [programs, 3] get the finite advantages' number, mean, and sum of squares about it.
+    As `GAE`: a step whose delta is not finite gets a NaN advantage, and the recursion starts again before it; `decay`
+    is gamma * lambda. `moments` [programs, 3] get the finite advantages' number, mean, and sum of squares about it.
     """
     env = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = env < num_envs

@@ -244,7 +244,7 @@ def lower_gradients(
     LOWER: tl.constexpr, LOWER_DEPTH: tl.constexpr, LOWER_STAGES: tl.constexpr,
     ACTIVATION: tl.constexpr, TF32: tl.constexpr,
 ):  # fmt: skip
-    """Sum the gradients of both layers around the first hidden one, which is computed here anew.
+    """Sum the gradients of both layers around the first hidden one, which is computed here again.
 
     Program (i, s, n) has LOWER of its elements, whose weights stay on the chip, over the ROWS of split s, in network n;
     neither they nor the gradients at them are ever in memory. It writes to the places of its split, as
@@ -285,7 +285,7 @@ def lower_gradients(
         # Forward again for these elements, then back to them through the second layer's weights.
         hidden = operand(activate(hidden + bias, ACTIVATION), observed.dtype, TF32)
         slope = tl.dot(weight2, tl.trans(above))
-        # Beside which a GPU takes the slopes of the activation: a product that adds up is not waited for.
+        # A GPU computes the slopes of the activation meanwhile: nothing waits for a product that adds up.
         d_weight2 = tl.dot(hidden, above, d_weight2)
         slope = operand(slope * slope_of(hidden.to(tl.float32), ACTIVATION), observed.dtype, TF32)
         d_weight1 = tl.dot(slope, observed, d_weight1)

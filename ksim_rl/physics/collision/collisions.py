@@ -111,7 +111,7 @@ def collisions(
     margins = m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap
     constants = {
         **upstream.GEOM_TYPES,
-        # Those of each world's own may be drawn at any time.
+        # Margins that differ between worlds may be drawn at any time.
         "has_margins": any(field.shape[0] > 1 or bool(field.numpy().any()) for field in margins),
         "has_pairs": m.pair_dim.size > 0,
         "measures": bool((m.nxn_pairid_filtered.numpy()[:, 1] > upstream.NO_SENSOR).any()),

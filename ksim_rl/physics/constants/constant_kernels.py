@@ -236,7 +236,7 @@ def mend_weights(c: Constants):
         fastest = wp.max(fastest, wp.length(velocity))
         dof = c.dof_parentid[dof]
     weights = c.body_invweight0[row, body]
-    # Of two figures, it puts the other one in the place of what is zero; C leaves it zero.
+    # Where one of two figures is zero, it takes the other one; C leaves it zero.
     if weights[0] == weights[1]:
         if turns == 0.0:
             c.body_invweight0[row, body] = wp.vec2(weights[0], 0.0)

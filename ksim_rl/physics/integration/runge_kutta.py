@@ -44,7 +44,7 @@ def mended_runge_kutta(
     hooks: dict[str, list[Callable[[], None]]] = {}
     mends = [] if mend is None else [mend]
     if warp_model.eq_connect_adr.size + warp_model.eq_wld_adr.size:
-        # Rows of connect and weld read body velocities, which by the time of the hook are those of the stage.
+        # Rows of connect and weld read body velocities, which at the time of the hook belong to the stage.
         mends.insert(0, lambda: mjw.make_constraint(warp_model, warp_data_E))
     hook = hook_after_rows(warp_model)
     if mends:

@@ -103,7 +103,7 @@ def adding_of_second_limits(
     own = {
         "joints": wp.array(joints, dtype=int, device=d.qpos.device),
         "tendons": wp.array(tendons, dtype=int, device=d.qpos.device),
-        # Blocks of rows are what MuJoCo Warp's own Newton solver adds up.
+        # MuJoCo Warp's own Newton solver adds up blocks of rows.
         "has_blocks": m.is_sparse and m.opt.solver == mjw.SolverType.NEWTON,
         "is_discrete": m.opt.integrator == mjw.IntegratorType.DISCRETE,
     }
@@ -236,7 +236,7 @@ def _add_second(
     # Distances to both limits, rad or m; a row exists below the margin.
     lower = value - bounds[0]
     upper = bounds[1] - value
-    # One limit alone is what MuJoCo Warp handles.
+    # MuJoCo Warp handles a single limit.
     if lower >= margin or upper >= margin:
         return
     # MuJoCo Warp's row may be of either side: it is written again as the lower one.

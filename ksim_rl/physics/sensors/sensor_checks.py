@@ -65,7 +65,7 @@ def check_sites_of_meshes(mj_model: mujoco.MjModel) -> None:
     kinds = mujoco.mjtSensor
     m = mj_model
     for sensor in np.flatnonzero(np.isin(m.sensor_type, (kinds.mjSENS_CONTACT, kinds.mjSENS_INSIDESITE))):
-        # A sensor of what is inside names the site second.
+        # A sensor that tells whether an object is inside names the site second.
         is_second = m.sensor_type[sensor] == kinds.mjSENS_INSIDESITE
         if is_second:
             kind = m.sensor_reftype[sensor]

@@ -33,7 +33,7 @@ FREQUENCY = 10.0
 DAMPING_RATIO = 2.0
 """Of a joint's motor alone under its servo, Hz; as in BeyondMimic (Liao et al., 2025)."""
 ARMATURE_PER_EFFORT = 2e-4
-"""kg m^2 per N m for a model without armature: that of Go1's and G1's geared motors is 1.1e-4 to 2.5e-4."""
+"""kg m^2 per N m for a model without armature: geared motors of Go1 and G1 have 1.1e-4 to 2.5e-4."""
 SOFTEST = 0.25
 MOST_SAG = 0.1
 """rad: from which error on a servo may saturate whatever its armature, and what the load in the stance may bend it."""
@@ -229,7 +229,7 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
             f"in pose {start.name!r} the soles lie over the centre of mass: the robot does not stand in it"
         )
     weight = float(mj_model.body_subtreemass[0]) * GRAVITY
-    # What holds the pose while all feet carry the same weight.
+    # The torques that hold the pose while all feet carry the same weight.
     load = data.qfrc_bias.copy()
     jacobian = np.zeros((3, mj_model.nv))
     for leg in legs:

@@ -205,7 +205,7 @@ def drop_references(spec: mujoco.MjSpec, kind: mujoco.mjtObj, names: Collection[
 
 
 def drop_bodies(spec: mujoco.MjSpec, names: Iterable[str]) -> None:
-    """Delete bodies with all that hangs on them and refers to them; keyframes keep the columns of what stays."""
+    """Delete bodies with all that hangs on them or refers to them; keyframes keep the columns of the other joints."""
     for name in names:
         check_known("body", name, [body.name for body in spec.bodies])
         # MuJoCo deletes sensors, actuators, tendons, pairs and equalities along, and columns of keyframes.

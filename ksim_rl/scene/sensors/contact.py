@@ -263,7 +263,7 @@ class ContactTracker(SensorTracker):
         leaves = touched & ~touches
         # As if it went on flying, or standing; used only where it does, or where that ends just now.
         flight_EN = clock["air_time"] + dt
-        # What stands on the ground at the start of an episode has not flown.
+        # A part that stands on the ground at the start of an episode has not flown.
         ends_flight = lands & (clock["air_time"] > 0)
         clock["last_air_time"].copy_(torch.where(ends_flight, flight_EN, clock["last_air_time"]))
         stance_EN = clock["contact_time"] + dt
@@ -277,7 +277,7 @@ class ContactTracker(SensorTracker):
 
     def _keep_event(self, event_EN: Tensor, happens: Tensor, lasts: Tensor, *, starts: bool) -> None:
         """Note what happens, in whichever substep of the env step, as long as the state that it began lasts."""
-        # What happened in the env step before is over.
+        # Events of the env step before are over.
         if not starts:
             happens = happens | (event_EN > 0)
         event_EN.copy_(happens & lasts)

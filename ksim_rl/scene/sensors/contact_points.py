@@ -27,8 +27,8 @@ _KEPT = ("force", "torque", "distance")
 class ContactPoints(ContactElements):
     """The separate contacts of elements with each of several partners: up to `num_slots` of each pair, N in all.
 
-    Elements are given as in `ContactSensor`. Their contacts stand one after the other: those of the first element with
-    the first partner of `against`, with the second, and so on, then those of the next element. It has no clocks.
+    Elements are given as in `ContactSensor`. Their contacts stand one after the other: of the first element with
+    the first partner of `against`, with the second, and so on, then of the next element. It has no clocks.
 
     Attributes:
         against: the names of the partners, each of the kind `against_kind`; none of them stands for anything.

@@ -15,7 +15,7 @@ from ksim_rl.device import recording
 # Numbers per env that an arena has room for; a wider buffer has an arena to itself.
 ARENA_WIDTH = 128
 ENV = "env"
-"""The owner of what managers keep, and no term writes."""
+"""The owner of buffers that managers keep, and no term writes."""
 
 
 class Kept(NamedTuple):

@@ -217,7 +217,7 @@ class Sites(_Elements):
     @quantity
     def axes_EN33(self) -> Float[Tensor, "E N 3 3"]:
         """The x, y and z axes of the sites, a unit vector each, world frame; position stage."""
-        # MuJoCo's matrix has the axes as columns, as that of bodies.
+        # MuJoCo's matrix has the axes as columns, like a body's matrix.
         return self._state.derived().site_xmat_EL[:, self.index].view(-1, len(self), 3, 3).mT
 
     @quantity

@@ -251,7 +251,7 @@ class JointTargets:
             for kind, numbers in beyond.items()
             if numbers.any()
         }
-        # What the world's own reset leaves at zero.
+        # The controls that the world's own reset leaves at zero.
         self._start_ctrl_L = None
         if other_ctrl_L.any():
             self._start_ctrl_L = torch.tensor(other_ctrl_L, device=device, dtype=torch.float32)

@@ -15,7 +15,7 @@ from ksim_rl.scene.state.buffers import ENV, Buffers, Kept, SharedValues
 from ksim_rl.scene.state.ground import Ground
 
 UNWATCHED: AbstractContextManager[Mapping[str, Kept]] = nullcontext({})
-"""The watch of what nobody watches."""
+"""The context that watches nothing."""
 
 
 class Simulation:
@@ -65,7 +65,7 @@ class Simulation:
         self.is_frozen = False
         self._is_stale = False
         self._caches: list[dict[str, Tensor]] = []
-        # What is kept of the moment of the contacts, and how it is read there.
+        # The quantities that are kept from the moment of the contacts, and how each is read there.
         self._of_contacts: dict[str, tuple[Tensor, Callable[[], Tensor]]] = {}
         # The tree of each body; its centre of mass is the reference of `cvel`.
         self._body_root = torch.tensor(world.mj_model.body_rootid, device=self.device, dtype=torch.int64)
@@ -149,7 +149,7 @@ class Simulation:
             kept_EN3 = self.buffers.get(f"of_contacts/{name}", count, 3, owner=ENV)
 
             def read() -> Tensor:
-                # Not from `derived`: poses of the last substep are what is asked for here.
+                # Not from `derived`: the poses of the last substep are needed here.
                 return self._point_velocity(self.world, self.world.site_xpos_EL[:, site], body)
 
             self._of_contacts[name] = (kept_EN3, read)

@@ -226,7 +226,7 @@ class NestedRings(TerrainPatch):
         platform = in_cells(self.platform_width / 2, lattice, least=1)
         # Whole cells from the centre; the rounding takes care of coordinates that are a little off.
         from_platform_RC = np.rint(lattice.ring_RC / lattice.spacing).astype(int) - platform
-        # Both brinks of a trench belong to what lies beside it.
+        # Both brinks of a trench belong to the ground on either side.
         place_RC = from_platform_RC % (gap + ring)
         in_gap_RC = (from_platform_RC > 0) & (place_RC > 0) & (place_RC < gap)
         return np.where(in_gap_RC, -self.depth, np.where(from_platform_RC <= 0, 0.0, self.height))
