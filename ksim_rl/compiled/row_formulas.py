@@ -1,6 +1,7 @@
 """Writes operations that act element by element as C++, each by its formula."""
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 
 from ksim_rl.compiled.cells import CTYPES, Cells, NotARowError, literal, names_of
@@ -119,7 +120,7 @@ PRELUDE = r"""
 
 
 def write_pointwise(
-    name: str, expression: str, args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells
+    name: str, expression: str, args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells
 ) -> None:
     """Write an operation that computes each element of `out` from the operands' elements at the same place."""
     if kwargs.get("rounding_mode") is not None:
@@ -183,7 +184,7 @@ def _replacements(args: OpArgs, kwargs: OpKwargs, dtype: torch.dtype) -> dict[st
     return chosen
 
 
-def write_power(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
+def write_power(args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells) -> None:
     """Write a power of elements."""
     base, exponent = args[:2]
     if isinstance(base, Tensor) and isinstance(exponent, (int, float)):

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 from torch.utils._pytree import PyTree
 
@@ -23,7 +24,7 @@ def _picked(index: Tensor, names: Sequence[str], size: int, cells: Cells) -> str
     return f"({cell} < 0 ? {cell} + {size} : {cell})"
 
 
-def write_index(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
+def write_index(args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells) -> None:
     """Write the elements that one index of whole numbers picks along a dim, or along the rows of a shared table."""
     source, indices = args[:2]
     dim = _one_index(indices)
@@ -42,13 +43,13 @@ def write_index(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> No
     cells.loop(shape, [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
 
-def write_index_select(args: tuple[Tensor, int, Tensor], kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
+def write_index_select(args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells) -> None:
     """Write the slices that an index picks along a dim."""
     source, dim, index = args
     write_index((source, [*[None] * (dim % source.ndim), index]), kwargs, out, cells)
 
 
-def write_index_put(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
+def write_index_put(args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells) -> None:
     """Write values to the places that an index picks along a dim; the rows must not be written so."""
     target, indices, values = args[:3]
     if len(args) > 3 and args[3]:
@@ -66,7 +67,7 @@ def write_index_put(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -
     cells.loop(shape, [f"{cells.at(out, place)} = {cells.at(values, names)};"])
 
 
-def write_gather(args: tuple[Tensor, int, Tensor], kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
+def write_gather(args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells) -> None:
     """Write, at each place, the element that the index there picks along a dim."""
     source, dim, index = args[:3]
     dim = dim % source.ndim

@@ -19,18 +19,18 @@ from ksim_rl.physics.sim_cfg import SimCfg
 def stored_form(mj_model: mujoco.MjModel, *, is_sparse: bool) -> mujoco.MjModel:
     """Return a copy of a model with the options that MuJoCo Warp's arrays are made for; `is_sparse` is of the rows."""
     # Our solver takes sparse rows only, and `mj_model` keeps the user's settings.
-    stored_model = copy.copy(mj_model)
+    stored_mj_model = copy.copy(mj_model)
     if is_sparse:
-        stored_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+        stored_mj_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     if not upstream.may_sleep(mj_model.opt):
         # MuJoCo Warp's solver looks at this flag alone, and writes to arrays that it has not made without islands.
-        stored_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    return stored_model
+        stored_mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    return stored_mj_model
 
 
 def make_warp_model(
     mj_model: mujoco.MjModel,
-    stored_model: mujoco.MjModel,
+    stored_mj_model: mujoco.MjModel,
     sim: SimCfg,
     *,
     expanded: Sequence[str],
@@ -40,7 +40,7 @@ def make_warp_model(
 
     Called in a Warp scope.
     """
-    warp_model = warp_model_of(stored_model, dict.fromkeys(expanded, num_envs))
+    warp_model = warp_model_of(stored_mj_model, dict.fromkeys(expanded, num_envs))
     warn_of_weightless(mj_model)
     raising_of_weights(mj_model, warp_model)()
     with as_if_drawn(warp_model, expanded):

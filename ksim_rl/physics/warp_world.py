@@ -68,11 +68,11 @@ class WarpWorld(World):
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
         capacity.check_countable(self.njmax, self.nconmax, num_envs=num_envs)
         self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
-        stored_model = stored_form(self.mj_model, is_sparse=self.has_one_kernel_solver)
+        stored_mj_model = stored_form(self.mj_model, is_sparse=self.has_one_kernel_solver)
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
         with memory_for(num_envs, self.device), warp_scope(self.device):
             self.warp_model = make_warp_model(
-                self.mj_model, stored_model, self.sim, expanded=expanded, num_envs=num_envs
+                self.mj_model, stored_mj_model, self.sim, expanded=expanded, num_envs=num_envs
             )
             if self.device.type == "cuda":
                 self.warp_model.opt.graph_conditional = takes_conditional_nodes(
@@ -80,7 +80,7 @@ class WarpWorld(World):
                 )
             nonzeros = room_for_nonzeros(self.warp_model, expanded, njmax=self.njmax)
             self.warp_data_E = mjw.make_data(
-                stored_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax, njmax_nnz=nonzeros
+                stored_mj_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax, njmax_nnz=nonzeros
             )
             upstream.drop_unread(self.warp_model, self.warp_data_E)
             gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ksim_rl.envs.driver import EnvDriver
@@ -67,18 +67,18 @@ class ActionManager:
         # Once with zeros, so that a wrong name or shape is an error now.
         self._run_terms(self._action_EL)
 
-    def checked(self, action_EL: Tensor | None) -> Float[Tensor, "E L"]:
+    def checked(self, action: Shaped[Tensor, "*shape"] | None) -> Float[Tensor, "E L"]:
         """Return an action without its gradient; a ValueError where it is missing, or has another shape or dtype."""
         expected = (self._view.num_envs, self.size)
-        if action_EL is None:
+        if action is None:
             raise ValueError(f"the tensordict has no 'action': expected float32 of shape {expected}")
-        if tuple(action_EL.shape) != expected or action_EL.dtype != torch.float32:
+        if tuple(action.shape) != expected or action.dtype != torch.float32:
             raise ValueError(
-                f"action has dtype {action_EL.dtype} and shape {tuple(action_EL.shape)}: expected torch.float32 and "
+                f"action has dtype {action.dtype} and shape {tuple(action.shape)}: expected torch.float32 and "
                 f"{expected}"
             )
         # Physics has no gradient: a policy that is not run under `no_grad` has its own only.
-        return action_EL.detach()
+        return action.detach()
 
     def apply(self, action_EL: Float[Tensor, "E L"]) -> Bool[Tensor, " E"]:
         """Write the controls of the action, and return which rows were finite; the others repeat their last action."""

@@ -22,7 +22,7 @@ FLOATS_OF_MANY = 5048
 # A multiprocessor has 228 KiB of shared memory, of which each block takes another KiB, and in each quarter, where
 # warps stay, 512 registers for a lane. With 72 of them as many worlds of Go1 run in parallel as the memory lets, 28.
 # With 96 only 20 do, and fewer values lie in memory meanwhile, which is faster where most worlds run in parallel anyway
-# (H200, 4096 worlds: 119 us, 125 with 72; 32768: 776 and 722). Where more than 128 are left, there is no need of a bound.
+# (H200, 4096 worlds: 119 us, 125 with 72; 32768: 776 and 722). Where more than 128 are left, no bound is needed.
 SHARED_BYTES = 228 * 1024
 LEAST_REGISTERS = (96, 72)
 MOST_REGISTERS = 128
