@@ -30,7 +30,8 @@ def contributed():
     """Run all recipes in one module, as one contributor would write them."""
     module = types.ModuleType(NAME)
     sys.modules[NAME] = module
-    exec(compile("".join(RECIPES.values()), "CONTRIBUTING.md", "exec", dont_inherit=True), vars(module))  # noqa: S102
+    code = compile("".join(RECIPES.values()), "CONTRIBUTING.md", "exec", dont_inherit=True)
+    exec(code, vars(module))  # noqa: S102
     yield module
     del sys.modules[NAME]
 

@@ -104,7 +104,11 @@ def answer(address, *, host, origin, path, websocket):
     """Return the status of a request with these headers, which no ordinary client sends."""
     parts = urlsplit(address)
     token = parts.path.lstrip("/")
-    fill = lambda text: text.replace("HOST", parts.netloc).replace("TOKEN", token).replace("TOKE", token[:-1])  # noqa: E731
+
+    def fill(text):
+        whole = text.replace("HOST", parts.netloc).replace("TOKEN", token)
+        return whole.replace("TOKE", token[:-1])
+
     lines = [f"GET {fill(path)} HTTP/1.1", f"Host: {fill(host)}"]
     if origin is not None:
         lines.append(f"Origin: {fill(origin)}")
