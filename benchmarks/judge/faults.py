@@ -192,7 +192,7 @@ FAULTS = {
     "disabled actuators": Fault(
         number="4",
         what="actuators of disabled groups act",
-        place=("warp_world", "switch_off"),
+        place=("warp_model", "switch_off"),
         instead=gives(nothing),
         needs=("actuatorgroupdisable", "transmission.joint", "actuator.position"),
     ),
@@ -221,7 +221,7 @@ FAULTS = {
     "armature of actuators": Fault(
         number="8",
         what="worlds have the model's armature of actuators",
-        place=("warp_world", "let_actuators_add"),
+        place=("warp_model", "let_actuators_add"),
         instead=gives(nothing),
         needs=("field.actuator_armature", "transmission.joint"),
     ),

@@ -318,6 +318,6 @@ def test_rewards_are_scaled_by_the_step_and_time_outs_marked_by_the_horizon():
     ],
 )
 def test_a_value_out_of_range_is_refused_before_any_model_is_compiled(fields, message, monkeypatch):
-    monkeypatch.setattr("ksim_rl.envs.manager_based_rl_env.load_model", None)
+    monkeypatch.setattr("ksim_rl.scene.scene.load_model", None)
     with pytest.raises(ValueError, match=message):
         puck_env(**fields)
