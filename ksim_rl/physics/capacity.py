@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from ksim_rl.physics.candidate_pairs import CandidatePairs
+from ksim_rl.physics.collision.candidate_pairs import CandidatePairs
 from ksim_rl.physics.load import caught_warnings
 from ksim_rl.physics.model_checks import model_bytes
 from ksim_rl.physics.overflow import OF_POOL, OF_ROWS, OverflowReport

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ksim_rl.physics import SimCfg, World, capacity, load_model, poses
-from ksim_rl.physics.candidate_pairs import CandidatePairs
+from ksim_rl.physics.collision.candidate_pairs import CandidatePairs
 from tests.physics.models import cartpole, quadruped
 
 GROUNDS = ('<geom type="plane" size="9 9 1"/>', '<geom type="box" size="9 9 0.5" pos="0 0 -0.5"/>')

@@ -16,7 +16,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from ksim_rl.physics.candidate_pairs import CandidatePairs
+from ksim_rl.physics.collision.candidate_pairs import CandidatePairs
 
 # Below this, in 1/kg, an inverse weight is rounding error.
 ROUNDING = 1e-12

@@ -22,21 +22,24 @@ class CandidatePairs:
         weld_2 = mj_model.body_weldid[body_2]
         parent_1 = mj_model.body_weldid[mj_model.body_parentid[weld_1]]
         parent_2 = mj_model.body_weldid[mj_model.body_parentid[weld_2]]
-        affine = (mj_model.geom_contype[first] & mj_model.geom_conaffinity[second]) | (
-            mj_model.geom_contype[second] & mj_model.geom_conaffinity[first]
-        )
+        one_way = mj_model.geom_contype[first] & mj_model.geom_conaffinity[second]
+        other_way = mj_model.geom_contype[second] & mj_model.geom_conaffinity[first]
+        affine = one_way | other_way
         # Pairs collide if one's contype meets the other's conaffinity; see MuJoCo's filters.
         keep = (affine != 0) & (weld_1 != weld_2)
         if not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
             # The world (0) is nobody's parent for this filter, so that robots collide with what is fixed to it.
-            keep &= ~((weld_1 != 0) & (weld_2 != 0) & ((weld_1 == parent_2) | (weld_2 == parent_1)))
+            both_move = (weld_1 != 0) & (weld_2 != 0)
+            are_related = (weld_1 == parent_2) | (weld_2 == parent_1)
+            keep &= ~(both_move & are_related)
         keep &= ~np.isin((body_1 << 16) + body_2, mj_model.exclude_signature)
         # Explicit <pair>s come on top, whatever the filters say.
         self.first = np.concatenate([first[keep], mj_model.pair_geom1])
         self.second = np.concatenate([second[keep], mj_model.pair_geom2])
         self.margin = np.maximum(mj_model.geom_margin[self.first], mj_model.geom_margin[self.second])
         is_plane = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        self.plane_1, self.plane_2 = is_plane[self.first], is_plane[self.second]
+        self.plane_1 = is_plane[self.first]
+        self.plane_2 = is_plane[self.second]
         # A plane has a radius of 0; its distance is measured along the normal below.
         self.reach = mj_model.geom_rbound[self.first] + mj_model.geom_rbound[self.second] + self.margin
 
