@@ -84,7 +84,7 @@ COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    if argv is None:  # a program of its own
+    if argv is None:  # called as a program
         # Libraries start Python too: compilers of kernels, launchers of jobs. As with `-P`, the working directory,
         # which may be a stranger's, is not on the path of these.
         os.environ["PYTHONSAFEPATH"] = "1"

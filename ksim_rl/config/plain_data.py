@@ -88,7 +88,8 @@ def check_plain(tree: Any, where: str) -> None:
         for key, entry in tree.items():
             check_plain(key, where)
             # The path so far; the first part is the file.
-            check_plain(entry, f"{where}: {key}" if ": " not in where else f"{where}.{key}")
+            separator = "." if ": " in where else ": "
+            check_plain(entry, f"{where}{separator}{key}")
     elif isinstance(tree, (list, tuple)):
         for index, entry in enumerate(tree):
             check_plain(entry, f"{where}[{index}]")

@@ -230,7 +230,7 @@ class SequenceSampler(EpochSampler):
         self.rollout_length = rollout_length
 
     def begin(self, batch_size_ET: torch.Size, *, batch_size: int) -> None:
-        """Take T from a rollout that a storage of one dim takes in, and check the sizes before anything is sampled."""
+        """Note T of a rollout that a storage of one dim receives, and check the sizes before anything is sampled."""
         if len(batch_size_ET) != 2:
             raise ValueError(
                 f"sequences are cut from a rollout [E, T]; the data has the dims {tuple(batch_size_ET)}"

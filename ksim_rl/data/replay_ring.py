@@ -153,10 +153,12 @@ class PrioritySampler(SavedByStateDict, Sampler):
         share_B = torch.arange(batch_size, dtype=torch.float64, device=device)
         share_B = (share_B + torch.rand(batch_size, dtype=torch.float64, device=device)) / batch_size
         # Rounding could lead past the last entry that has a score.
-        last = (score_N > 0.0).to(torch.int64).mul_(torch.arange(score_N.shape[0], device=device)).amax()
-        index_B = torch.searchsorted(upto_N, (share_B * upto_N[-1]).to(torch.int64), right=True)
+        has_score_N = score_N > 0.0
+        last = has_score_N.to(torch.int64).mul_(torch.arange(score_N.shape[0], device=device)).amax()
+        drawn_B = (share_B * upto_N[-1]).to(torch.int64)
+        index_B = torch.searchsorted(upto_N, drawn_B, right=True)
         index_B = torch.minimum(index_B, last)
-        lowest = torch.where(score_N > 0.0, score_N, torch.inf).amin()
+        lowest = torch.where(has_score_N, score_N, torch.inf).amin()
         # Where nothing has a score, the draws are masked: a finite weight keeps the losses' means finite.
         weight_B = (score_N[index_B] / lowest).pow(-self.beta).clamp_max(1.0).to(torch.float32)
         return index_B, {"priority_weight": weight_B}

@@ -201,7 +201,7 @@ EXPLAINS: Mapping[Fault, tuple[Fault, ...]] = {
     # Ratios are extreme where nothing scatters.
     std_at_floor: (entropy_collapsed, kl_far_off, most_ratios_clipped),
     entropy_collapsed: (kl_far_off, most_ratios_clipped),
-    # Steps that are too long spoil whatever the networks know.
+    # Steps that are too long destroy what the networks have learned.
     kl_far_off: (
         saturated_actions,
         most_ratios_clipped,

@@ -75,7 +75,7 @@ class GaussianHead(nn.Module):
             return loc, self.scale(features).expand_as(loc)
 
     def scale(self, features: Float[Tensor, "*batch L"] | None = None) -> Float[Tensor, "*own action_dim"]:
-        """Return the `scale`, [action_dim] where it does not depend on the state, whose features are not read then."""
+        """Return the `scale`; where it does not depend on the state it is [action_dim], and needs no features."""
         # One standard deviation per action for all states, or a second layer's output for each.
         if self.std_layer is None:
             assert self.std is not None

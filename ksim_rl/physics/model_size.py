@@ -84,9 +84,9 @@ class _Files:
 
 
 def check_text(text: str, folder: Path, label: str) -> dict[str, bytes]:
-    """Refuse an XML text that comes to too much with its replicas, grids and surfaces, and the files it includes.
+    """Refuse an XML text that grows too large by its replicas, grids and surfaces, or by the files that it includes.
 
-    The files that it names, of meshes, pictures and height fields too, are regular ones of limited size, or refused.
+    Files that it names, of meshes, pictures and height fields too, must be regular ones of limited size.
     Return the included files that MuJoCo cannot decode, as UTF-8, by the path under which it looks for them.
     """
     read = _Files(label=label, folder=folder)

@@ -4,7 +4,7 @@ import os
 
 
 def number(name: str, *, least: int = 0) -> int:
-    """Return a variable's whole number; a ValueError names the variable where it is none of at least `least`."""
+    """Return a variable's whole number; a ValueError names the variable unless it has one of at least `least`."""
     text = os.environ[name].strip()
     if not text.isdecimal() or int(text) < least:
         raise ValueError(

@@ -330,28 +330,35 @@ class VelocityTask(Task):
         num_iterations: int = 3_000,
         pose: str | None = None,
     ) -> "VelocityTask":
-        """Return the task of a model with all that `robots.analyse` proposes for it, of that, or of an edited proposal.
+        """Return the task of a robot: a model, its analysis by `robots.analyse`, or an edited proposal of one.
 
-        The robot is analysed when the config is first asked for, from the keyframe `pose` where one is named. `name` is
+        A model is analysed when the config is first asked for, from the keyframe `pose` where one is named. `name` is
         "<robot>_velocity_flat" by default.
         """
         if isinstance(robot, RobotAnalysis):
             own = robot.robot.name
+        elif isinstance(robot, ModelRobot):
+            own = robot.name
         else:
-            own = robot.name if isinstance(robot, ModelRobot) else robot_name(robot)
+            own = robot_name(robot)
 
         @functools.cache
         def analysis() -> RobotAnalysis:
             if isinstance(robot, RobotAnalysis):
                 return robot
-            return analyse(robot.spec() if isinstance(robot, ModelRobot) else robot, pose=pose)
+            if isinstance(robot, ModelRobot):
+                return analyse(robot.spec(), pose=pose)
+            return analyse(robot, pose=pose)
+
+        def cfg() -> ManagerBasedRlEnvCfg:
+            # An edited proposal is taken as it is.
+            proposed = robot if isinstance(robot, ModelRobot) else analysis().robot
+            return _proposed_cfg(proposed, analysis())
 
         return cls(
             name=name or f"{own}_velocity_flat",
             description=f"{own} follows a velocity command on flat ground",
-            cfg=lambda: _proposed_cfg(
-                robot if isinstance(robot, ModelRobot) else analysis().robot, analysis()
-            ),
+            cfg=cfg,
             training=training(num_iterations=num_iterations),
             other_trainings=(fast_sac_training(symmetry="none"),),  # left and right are seldom quite equal
         )

@@ -18,7 +18,7 @@ from ksim_rl.trainers.interrupt import InterruptRequest
 
 # Pictures per second of simulated time. Software rendering takes 50 to 90 ms each, far more than a step of one env.
 FPS = 25.0
-# Why rendering failed in this process, once it did. MuJoCo aborts the process when it tries a second time without a
+# The reason that rendering failed in this process. MuJoCo aborts the process when it tries a second time without a
 # working OpenGL platform.
 _failed: list[str] = []
 

@@ -126,9 +126,9 @@ class ObservationNormalization(RowTransform):
 
     def _normalize(self, tensordict: TensorDictBase) -> TensorDictBase:
         num_rows = tensordict.numel()
-        for out_key, key, (values_EL, moments) in zip(
-            self.out_keys, self.in_keys, self._flat(tensordict, num_rows), strict=True
-        ):
+        leaves = self._flat(tensordict, num_rows)
+        for out_key, key, leaf in zip(self.out_keys, self.in_keys, leaves, strict=True):
+            values_EL, moments = leaf
             value = tensordict.get(key)
             # Statistics are float64; the leaf keeps its dtype.
             normalized_EL = moments.normalized(values_EL, self.eps)

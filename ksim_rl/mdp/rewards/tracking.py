@@ -298,8 +298,8 @@ class LinkAccelerationL2(RewardTerm):
         # Over an env step, not a substep: an impact between the two moments is seen in full.
         acceleration_EN3 = (vel_EN3 - last_EN3) / view.step_dt
         last_EN3.copy_(vel_EN3)
-        # The first step has no velocity before it: the buffer's zero is not one.
         squares_E = acceleration_EN3.square().sum((-2, -1))
+        # The first step has no velocity before it: the buffer's zero is not one.
         return torch.where(view.episode_step_E <= 1, 0.0, squares_E)
 
 

@@ -201,7 +201,7 @@ def analyse(source: Source, *, pose: str | None = None, drop: Sequence[str] = ()
             continue
         if found[-1].stands_s >= TRIAL_S:
             return found[-1]
-    # The first refusal is of the pose that was meant most.
+    # The first refusal is about the pose with the highest priority.
     if not found:
         raise refused[0]
     return max(found, key=lambda analysis: analysis.stands_s)

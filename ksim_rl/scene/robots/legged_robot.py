@@ -57,7 +57,7 @@ class MenagerieRobot(Checked):
     joint_names: ClassVar[tuple[str, ...]]
     foot_geoms: ClassVar[tuple[str, ...]]
     foot_sites: ClassVar[tuple[str, ...]]
-    model: ClassVar[str]  # the menagerie's name of it
+    model: ClassVar[str]  # its name in the menagerie
     collision_geoms: ClassVar[tuple[edit.CollisionGeom, ...]]  # in place of the model's own
     sites: ClassVar[tuple[edit.Site, ...]]  # to move or to add
     imu: ClassVar[str] = "imu"  # one of the sites or of the model's

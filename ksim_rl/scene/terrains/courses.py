@@ -229,7 +229,8 @@ class NestedRings(TerrainPatch):
         # Both brinks of a trench belong to the ground on either side.
         place_RC = from_platform_RC % (gap + ring)
         in_gap_RC = (from_platform_RC > 0) & (place_RC > 0) & (place_RC < gap)
-        return np.where(in_gap_RC, -self.depth, np.where(from_platform_RC <= 0, 0.0, self.height))
+        ground_RC = np.where(from_platform_RC <= 0, 0.0, self.height)
+        return np.where(in_gap_RC, -self.depth, ground_RC)
 
 
 @dataclass(frozen=True, kw_only=True)

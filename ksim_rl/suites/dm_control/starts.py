@@ -78,7 +78,7 @@ class DrawStart(StartRule):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         low_L, high_L = self._device_bounds(view)
         qpos_EL = view.uniform(len(low_L), low_L, high_L)
-        # A number between equal bounds may be rounded.
+        # Rounding may move a number away from equal bounds.
         qpos_EL = torch.where(low_L == high_L, low_L, qpos_EL)
         if self.root != "default":
             if self.root == "uniform":
