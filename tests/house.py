@@ -15,6 +15,7 @@ from functools import cache, cached_property
 from pathlib import Path
 
 from tests import density, signatures
+from tests.circles import strong_components
 
 PACKAGE = "ksim_rl"
 ROOM_SHARE = 0.25
@@ -138,7 +139,7 @@ class House:
         """Return the groups of modules that import each other; imports for type checkers and in functions count."""
         modules = {self._module(path): path for path in self.texts}
         imports = {name: sorted(self._imports(name, path, modules)) for name, path in modules.items()}
-        return [sorted(group) for group in _strong_components(imports) if len(group) > 1]
+        return [sorted(group) for group in strong_components(imports) if len(group) > 1]
 
     def _module(self, path: Path) -> str:
         parts = path.relative_to(self.checkout).with_suffix("").parts
@@ -170,39 +171,6 @@ def words_of_code(text: str) -> int:
         token.type in kinds and not (token.type == tokenize.STRING and token.start[0] in docstrings)
         for token in tokens
     )
-
-
-def _strong_components(edges: dict[str, list[str]]) -> list[list[str]]:
-    """Return the groups of nodes that reach each other (Tarjan, "Depth-first search and linear graph algorithms")."""
-    order: dict[str, int] = {}
-    lowest: dict[str, int] = {}
-    stack: list[str] = []
-    groups: list[list[str]] = []
-    for start in edges:
-        if start in order:
-            continue
-        work = [(start, iter(edges[start]))]
-        order[start] = lowest[start] = len(order)
-        stack.append(start)
-        while work:
-            node, targets = work[-1]
-            for target in targets:
-                if target not in order:
-                    order[target] = lowest[target] = len(order)
-                    stack.append(target)
-                    work.append((target, iter(edges[target])))
-                    break
-                if target in stack:
-                    lowest[node] = min(lowest[node], order[target])
-            else:
-                work.pop()
-                if work:
-                    lowest[work[-1][0]] = min(lowest[work[-1][0]], lowest[node])
-                if lowest[node] == order[node]:
-                    at = stack.index(node)
-                    groups.append(stack[at:])
-                    del stack[at:]
-    return groups
 
 
 # ---- limits: each returns what breaks it ----

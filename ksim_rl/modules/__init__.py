@@ -9,6 +9,7 @@ from ksim_rl.modules.bounded_actors import (
     make_squashed_actor,
 )
 from ksim_rl.modules.carried_state import CarriedState, burnt_in
+from ksim_rl.modules.categorical import Categorical
 from ksim_rl.modules.collecting_policies import ExploringPolicy, MixedPolicy
 from ksim_rl.modules.critic import (
     CriticCfg,
@@ -19,7 +20,7 @@ from ksim_rl.modules.critic import (
     make_critic,
     make_q_network,
 )
-from ksim_rl.modules.distributions import Categorical, DiagonalGaussian, TanhGaussian, TruncatedGaussian
+from ksim_rl.modules.distributions import DiagonalGaussian, TanhGaussian, TruncatedGaussian
 from ksim_rl.modules.mlp import ACTIVATIONS, mlp
 from ksim_rl.modules.network import (
     FEATURES,

@@ -17,8 +17,8 @@ from torchrl import data as specs
 from torchrl.data import Composite, TensorSpec
 
 from ksim_rl.modules.actor_cfg import ActorCfg
+from ksim_rl.modules.categorical import Categorical
 from ksim_rl.modules.distributions import (
-    Categorical,
     DiagonalGaussian,
     TanhGaussian,
     TruncatedGaussian,

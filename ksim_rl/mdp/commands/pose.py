@@ -167,8 +167,9 @@ class CartesianCommand(InFrame, HeldCommand):
     def ranges(self) -> Mapping[str, tuple[float, float]]:
         """The ranges that a curriculum may change, of all axes that the command has, x, y, z, roll, pitch, yaw."""
         given: dict[str, Range] = {}
-        given.update(self.position)
-        given.update(self.orientation or {})
+        for part in (self.position, self.orientation or {}):
+            for axis, pair in part.items():
+                given[axis] = pair
         # An orientation is drawn as three angles, but held as a quaternion of four numbers.
         axes = _AXES[: 3 if self.orientation is None else 6]
         return {axis: given.get(axis, (0.0, 0.0)) for axis in axes}
