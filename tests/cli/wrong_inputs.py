@@ -1,4 +1,4 @@
-"""Wrong inputs of users: words of the command line, sizes, terms, transforms and models, each in its own process.
+"""Wrong inputs of users: words of the command line, terms, transforms and models, each in a process of its own.
 
 `python -m tests.cli.wrong_inputs [PART ...]` prints what did not end in one clear line.
 """
@@ -13,8 +13,7 @@ from benchmarks.faults import children
 from ksim_rl import envs
 from ksim_rl.cli.errors import report
 from ksim_rl.cli.main import main
-from ksim_rl.device import memory
-from tests.cli import wrong_models, wrong_sizes, wrong_terms
+from tests.cli import wrong_models, wrong_terms
 
 # Words of `ksim-rl train`, and what the line that refuses them names.
 WORDS: Sequence[tuple[str, str]] = (
@@ -166,7 +165,7 @@ TRANSFORMS: Sequence[tuple[str, str]] = (
 )
 
 
-def _train(words: Sequence[str], folder: Path) -> int:
+def train(words: Sequence[str], folder: Path) -> int:
     """Train for an iteration as the command does; words that are given replace those of the smallest task."""
     given = [word.partition("=")[0] for word in words]
     few = ["trainer.num_iterations=1", "trainer.eval_episodes=0", f"hydra.run.dir={folder / 'run'}"]
@@ -174,12 +173,6 @@ def _train(words: Sequence[str], folder: Path) -> int:
     own = [word for word in own if word.partition("=")[0] not in [one.partition("=")[0] for one in few]]
     few = [word for word in few if word.partition("=")[0] not in given]
     return _exit_code(["train", *own, *few, *words])
-
-
-def _train_in_little_memory(words: Sequence[str], folder: Path) -> int:
-    """Train as on a machine of 1 GiB, so that what is taken by mistake fills no more of this one."""
-    memory.total_bytes = lambda device: 2**30
-    return _train(words, folder)
 
 
 def _exit_code(words: Sequence[str]) -> int:
@@ -206,10 +199,7 @@ def cases(folder: Path) -> dict[str, list[tuple[str, str, Callable[[], int]]]]:
     found: dict[str, list[tuple[str, str, Callable[[], int]]]] = {"words": [], "transforms": []}
     for part, inputs in (("words", WORDS), ("transforms", TRANSFORMS)):
         for word, named in inputs:
-            found[part].append((word, named, lambda word=word: _train([word], folder)))
-    found["sizes"] = []
-    for name, words, named in wrong_sizes.words():
-        found["sizes"].append((name, named, lambda words=words: _train_in_little_memory(words, folder)))
+            found[part].append((word, named, lambda word=word: train([word], folder)))
     found["terms"] = []
     for name, named, change in wrong_terms.changes():
         found["terms"].append((name, named, lambda change=change: _build(change)))

@@ -4,13 +4,20 @@ import dataclasses
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
+import pytest
+
+from benchmarks.faults import children
 from ksim_rl import conf
 from ksim_rl.checked import Annotation
+from ksim_rl.device import memory
 from ksim_rl.trainers import RunCfg
+from tests.cli import wrong_inputs
 
 # Beyond 32 bits, and just within them.
 HUGE = (10**12, 2 * 10**9)
+LITTLE_BYTES = 2**30
 # No memory and no time within an iteration depends on these, so that any number of 32 bits is as good as another.
 FREE = frozenset(
     {
@@ -75,16 +82,53 @@ def configs() -> Iterator[tuple[RunCfg, Sequence[str], list[tuple[str, bool]]]]:
         yield cfg, words, fresh
 
 
-def words() -> Iterator[tuple[str, Sequence[str], str]]:
-    """Yield each wrong number as words of the command line: its name, the words, and what the line has to name."""
-    for _, brought, numbers in configs():
-        for path, is_list in numbers:
-            for value in (*HUGE, -1, 0):
-                # A run that goes on for ever is what was asked for.
-                if path == "trainer.num_iterations" and value == HUGE[1]:
-                    continue
-                word = f"{path}={[value, value] if is_list else value}".replace(" ", "")
-                yield word, (*brought, word), path.rpartition(".")[2]
+def refusal(cfg: RunCfg, path: str, value: int | list[int]) -> str:
+    """Return the message that refuses a run with this value before anything is built, or nothing where it is taken."""
+    tree = part = cfg.to_tree()
+    *above, name = path.split(".")
+    for each in above:
+        part = part[each]
+    part[name] = value
+    try:
+        changed = RunCfg.from_tree(tree)
+        memory.check_room(changed, num_envs=changed.num_envs, device=changed.resolved_device())
+    except ValueError as refused:
+        return str(refused)
+    return ""
+
+
+def figures(folder: Path, *, commands: int) -> dict[str, float]:
+    """Try every whole number, and so many spread over them by a command, in a process of its own."""
+    found = dict.fromkeys(("fields", "not_refused", "not_named", "commands", "neither"), 0)
+    words: list[tuple[Sequence[str], str]] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(memory, "total_bytes", lambda device: LITTLE_BYTES)
+        for cfg, brought, numbers in configs():
+            for path, is_list in numbers:
+                found["fields"] += 1
+                name = path.rpartition(".")[2]
+                for value in (*HUGE, -1):
+                    given = [value, value] if is_list else value
+                    said = refusal(cfg, path, given)
+                    is_free = path in FREE and value == HUGE[1] or name == "seed" and value > 0
+                    found["not_refused"] += not said and not is_free
+                    found["not_named"] += bool(said) and name not in said
+                    if not is_free:
+                        words.append(((*brought, f"{path}={given}".replace(" ", "")), name))
+    for brought, name in words[:: -(-len(words) // commands)][:commands]:
+        ended = children.start(lambda brought=brought: _train(brought, folder), hangs_s=60).wait()
+        wrong = wrong_inputs.verdict(ended, name)
+        found["commands"] += 1
+        found["neither"] += bool(wrong)
+        if wrong:
+            print(f"{brought}: {wrong}: {ended.text[-500:]}", flush=True)
+    return found
+
+
+def _train(words: Sequence[str], folder: Path) -> int:
+    # In a forked process: what is taken by mistake fills no more of this machine.
+    memory.total_bytes = lambda device: LITTLE_BYTES
+    return wrong_inputs.train(words, folder)
 
 
 def whole_numbers(part: object, path: str = "") -> Iterator[tuple[str, bool]]:
