@@ -170,7 +170,7 @@ ROWS = {
         must="refused by name, or read, within 10 s and 1 GiB",
         limits={"files": (AT_LEAST, "files"), **dict.fromkeys(("crashes", "hangs"), (EXACTLY, 0))},
         measure=small_files,
-        amounts={"files": 20},
+        amounts={"files": 26},
         short={"files": 5},
         files=("ksim_rl/files", "ksim_rl/config/plain_data.py", "ksim_rl/runs/csv_table.py", "ksim_rl/clips"),
     ),
