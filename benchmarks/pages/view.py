@@ -19,7 +19,7 @@ from ksim_rl.scene.sensors import (
 )
 from ksim_rl.scene.sensors.rays import RayState
 from ksim_rl.scene.state.elements import Bodies, Body, Joints, Site, Sites
-from ksim_rl.scene.state.entity import Entity
+from ksim_rl.scene.state.entity import Entity, GroundScan
 from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.state.quantity import FirstOf, QuantityOf
 
@@ -62,6 +62,7 @@ PARTS = (
         Entity,
         "A robot or object of the scene; `view.robot` is the first.",
     ),
+    Part("view.robot.ground_scan(points)", GroundScan, "The ground at points about an entity's root."),
     Part('view.contact("feet")', ContactState, "A `ContactSensor` of `scene.sensors`."),
     Part('view.contact_points("hand")', ContactPointsState, "A `ContactPoints` of `scene.sensors`."),
     Part('view.imu("imu")', ImuTracker, "An `ImuSensor` of `scene.sensors`."),

@@ -30,7 +30,7 @@ struct Limits {
 };
 
 struct Reading {
-  Numbers obs;      // the terms of `observation_names`, side by side, in this order
+  Numbers obs;      // the terms of `observation_names`, side by side: obs.onnx gives them, then clip and scale
   float tilt = 0.0f;
 };
 

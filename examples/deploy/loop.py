@@ -2,9 +2,8 @@
 
 python examples/deploy/loop.py RUN/export --seconds 10
 
-Put `runner.py` of the exported folder beside it, or run it where ksim_rl is installed. To drive a robot, replace
-`SimulatedRobot`: `read` fills joint positions and velocities, and what the other observations need, by name; `write`
-sends joint targets by name. Read docs/deploy.md first.
+To drive a robot, replace `SimulatedRobot`: `read` fills the inputs of `obs.onnx` by the names of `obs.measurements` in
+export.json, and clips and scales what it gives; `write` sends joint targets by name. Read docs/deploy.md first.
 """
 
 import argparse

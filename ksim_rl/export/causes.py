@@ -60,7 +60,7 @@ def find_causes(meta: Json, trace: Arrays, replay: Arrays) -> list[Cause]:
         causes = _of_observation(term["name"], ours[:, columns], theirs[:, columns], episode)
         obs_differs = obs_differs or bool(causes)
         # The last action follows from the action chain, which the targets show.
-        found += [] if term["value"] == {"quantity": "action"} else causes
+        found += [] if term["reads"] == ["action"] else causes
     # The network itself: it was given the recorded observation, so only its file can explain a difference.
     ours, theirs, _ = signal("action")
     # With a history or a recurrent state the runner feeds its own frames, and inherits their errors.

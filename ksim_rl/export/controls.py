@@ -8,8 +8,8 @@ from torch import Tensor
 from ksim_rl import mdp
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.view import EnvView
-from ksim_rl.export.describe import NotDescribedError, describe, joint_names, names_of
 from ksim_rl.export.exported_transforms import lag
+from ksim_rl.export.refusal import NotDescribedError
 from ksim_rl.export.standalone.files import Json
 from ksim_rl.mdp.actions import per_joint
 from ksim_rl.scene.actuators import (
@@ -20,6 +20,7 @@ from ksim_rl.scene.actuators import (
 )
 from ksim_rl.scene.actuators.builtin import BuiltinActuator
 from ksim_rl.scene.actuators.joint_drives import driven_joints
+from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.state.joint_control import TargetKind
 from ksim_rl.transforms import DelayCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, history_cfg
@@ -27,12 +28,11 @@ from ksim_rl.transforms.low_pass import smoothing
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
 
 Plain = Json
-# For readers of export.json, by quantity; a term that is computed from several says "see value".
-UNITS = {
-    "joint_pos": "rad or m", "joint_pos_rel": "rad or m", "joint_vel": "rad/s or m/s", "root_lin_vel": "m/s",
-    "root_ang_vel": "rad/s", "projected_gravity": "1", "action": "1", "body_pos": "m", "site_height": "m",
-    "height_scan": "m", "time": "s", "joint_effort": "N m or N", "contact": "N, s or 1",
-}  # fmt: skip
+
+
+def joint_names(view: EnvView, patterns: Patterns | None) -> list[str]:
+    """Return the names of the hinges and slides that some patterns match, in the order of the patterns."""
+    return list(view.joints(patterns).names)
 
 
 def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
@@ -55,37 +55,22 @@ def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
 
 
 def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[Plain]:
-    """Return the terms of groups, in the order in which a policy reads them.
-
-    Raises NotDescribedError, naming the term, where it has no description.
-    """
+    """Return what becomes of the readings of each term of groups, in the order in which a policy reads them."""
     found = []
     for group in groups:
         cfg: ObservationGroupCfg = env.cfg.observations[group]
         for name, term in cfg.terms.items():
-            try:
-                # Described first: without a description there is nothing to run the rest on.
-                value = describe(term.term, env.view)
-            except NotDescribedError as error:
-                raise NotDescribedError(
-                    f"task.observations.{group}.terms.{name}: {error}; or leave the term out"
-                ) from None
             # Size of one frame, before history.
             size = env.observation_spec["obs", name].shape[-1]
             low, high = term.clip or (None, None)
             # A term's own history or lag takes the place of its group's; a group's lag is shared by its
             # terms.
             frames = history_cfg(term.history if term.history is not None else cfg.history)
-            # Only a bare quantity has units and a frame of its own; a computed value is a tree.
-            leaf = value if isinstance(value, dict) else {}
             delay = lag(term.delay) or lag(cfg.delay, shared=group)
             found.append(
                 {
                     "name": name,
                     "size": size,
-                    "value": value,
-                    "units": UNITS.get(leaf.get("quantity", ""), "see value"),
-                    "frame": leaf.get("frame", leaf.get("sensor", "")),
                     "noise": noise(term.noise if cfg.enable_noise else None, size),
                     "clip": [low, high],
                     "scale": per_dim("scale", term.scale, size),
@@ -122,7 +107,8 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
     }
     # Controls are written as they are, without a joint's target in between.
     if type(term) is mdp.ActuatorAction:
-        names = names_of(view, "actuator", term.actuators)
+        every = view.resolver.names("actuator")
+        names = [every[i] for i in view.resolver.ids("actuator", term.actuators)]
         limits = view.ctrl_limits_L2[view.resolver.index("actuator", term.actuators)].T.tolist()
         scale, offset = (_plain(term.numbers(view, field)) for field in ("scale", "offset"))
         plain = {"clip": None, "tanh": False, "scale": scale, "offset": offset, "alpha": None}

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from ksim_rl.envs import ManagerBasedRlEnvCfg
-from ksim_rl.export.describe import NotDescribedError
+from ksim_rl.export.refusal import NotDescribedError
 from ksim_rl.export.standalone.files import Json
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.transforms import ActionClip, ActionDelay, ActionLowPass, ActionScale, DelayCfg, ObservationNoise

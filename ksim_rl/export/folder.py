@@ -13,11 +13,13 @@ import numpy as np
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.contract import part
 from ksim_rl.export import controls, policy
-from ksim_rl.export.describe import NotDescribedError, describe, joint_names
+from ksim_rl.export.controls import joint_names
 from ksim_rl.export.exported_transforms import TaskTransforms, check_equal, sort_transforms, with_transforms
+from ksim_rl.export.onnx_file import attach
 from ksim_rl.export.record import Kept, Recording
 from ksim_rl.export.robot import write_robot
-from ksim_rl.export.standalone.files import Json
+from ksim_rl.export.standalone.files import FORMAT, Json
+from ksim_rl.export.traced_task import TracedTask, greatest_difference, trace_task
 from ksim_rl.files.writing import check_folder, check_own, whole_folder
 from ksim_rl.physics import prepare_spec
 from ksim_rl.runs import record
@@ -35,7 +37,7 @@ from ksim_rl.trainers.run_folder import Policy, policy_of
 
 STANDALONE = Path(__file__).parent / "standalone"
 # Each needs only those before it, since they become one file.
-PARTS = ("files", "contacts", "signals", "network", "runner")
+PARTS = ("files", "contacts", "network", "signals", "runner")
 """The modules of `runner.py`, in this order."""
 # Episodes of trace.npz and env steps of each: enough for the causes, and small beside the recorded episodes.
 TRACED = 4
@@ -43,12 +45,20 @@ TRACED_STEPS = 60
 FILES = (
     "policy.onnx",
     "policy.pt2",
+    "obs.onnx",
+    "scores.onnx",
     "robot.xml",
     "export.json",
     "runner.py",
     "README.md",
     "episodes.npz",
     "trace.npz",
+)
+# The entries of export.json that controllers for mjlab's policies look for in the ONNX file, and more of the kind.
+ATTACHED = (
+    *("run_path", "joint_names", "joint_stiffness", "joint_damping", "default_joint_pos", "action_scale"),
+    *("command_names", "observation_names", "observation_history_lengths", "physics_dt", "decimation"),
+    *("step_dt", "task", "iteration", "commit"),
 )
 EXTRA = ("onnx", "onnxruntime", "onnxscript")
 README = """# {task}, iteration {iteration}
@@ -57,12 +67,15 @@ README = """# {task}, iteration {iteration}
 |---|---|
 | `policy.onnx` | `obs` [batch, {obs_dim}] to `actions` [batch, {num_actions}], normalization inside{state} |
 | `policy.pt2` | the same for `torch.export.load` |
+| `obs.onnx` | what a robot measures, one batch row, to `obs` before noise, clip and scale; `obs` in `export.json` |
+| `scores.onnx` | terminations, rewards and metrics, for simulators |
 | `robot.xml` | the robot's model; actuators stand in the order of the actions |
-| `export.json` | names, order, units, scales, gains, rates, noise, lags; how each observation and reward is computed |
+| `export.json` | names, order, scales, gains, rates, noise, lags; which quantities the ONNX files read |
 | `runner.py` | `python runner.py --episodes 100` runs it on MuJoCo's C engine; needs numpy, onnxruntime, mujoco |
 | `episodes.npz`, `trace.npz` | starts, commands and pushes of recorded episodes, and steps to compare with |
 
-The policy's actions equal the trained network's within {difference:.1e} on {checked} observations. One step lasts
+The policy's actions equal the trained network's within {difference:.1e} on {checked} observations, and the observations
+those of training within {obs[difference]:.1e}. One step lasts
 {step_dt:g} s, of {decimation} physics steps. Joints, in the order of actions: {joints}.
 """
 
@@ -171,8 +184,16 @@ def _fill(
     ours = part(env, ManagerBasedRlEnv)
     assert ours is not None  # the env of a config is ours
     terms = {str(group): controls.observations(ours, [str(group)]) for group in groups}
-    # Descriptions before files: a term without one is refused before minutes of work.
-    meta = metadata(ours, [term for of_group in terms.values() for term in of_group], transforms, note)
+    # Before files: a term that cannot be traced is refused before minutes of work.
+    traced = _traced(cfg, [str(group) for group in groups], seed, note)
+    observed = [term for of_group in terms.values() for term in of_group]
+    meta = metadata(ours, observed, transforms, traced)
+    note("writing obs.onnx")
+    traced.obs.write(folder / "obs.onnx")
+    names = [term["name"] for term in observed]
+    meta["obs"]["difference"] = greatest_difference(traced.obs, ours, folder / "obs.onnx", names)
+    if traced.scores:
+        traced.scores.write(folder / "scores.onnx")
     columns = {
         group: [
             policy.Column(
@@ -234,7 +255,8 @@ def _fill(
         rates = {"trace/dt": np.array(ours.physics_dt), "trace/decimation": np.array(ours.cfg.decimation)}
         np.savez_compressed(folder / "trace.npz", **traced.arrays, **rates)  # pyright: ignore
     env.close(raise_if_closed=False)
-    _attach(folder / "policy.onnx", meta)
+    for path in sorted(folder.glob("*.onnx")):
+        attach(path, {key: meta[key] for key in ATTACHED})
     # NaN is no JSON, and stands for a mistake of ours.
     (folder / "export.json").write_text(json.dumps(meta, indent=1, allow_nan=False) + "\n")
     (folder / "runner.py").write_text(runner_source())
@@ -245,6 +267,17 @@ def _fill(
             checked=policy.CHECKED,
         )
     )
+
+
+def _traced(cfg: RunCfg, groups: Sequence[str], seed: int, note: Callable[[str], None]) -> TracedTask:
+    """Trace the terms of a task in an env of its own, of one row on the CPU, as the files are for one robot."""
+    env = build_env(dataclasses.replace(cfg, device="cpu"), num_envs=1, seed=seed)
+    ours = part(env, ManagerBasedRlEnv)
+    assert ours is not None
+    try:
+        return trace_task(ours, groups, note)
+    finally:
+        env.close(raise_if_closed=False)
 
 
 def _check_transforms(
@@ -274,9 +307,9 @@ def metadata(
     ours: ManagerBasedRlEnv,
     terms: list[Json],
     transforms: TaskTransforms,
-    note: Callable[[str], None],
+    traced: TracedTask,
 ) -> Json:
-    """Return the description of the env; rewards, metrics and terminations without a description are left out.
+    """Return the description of the env, whose terms are traced.
 
     `terms` are those that the policy observes. Raises NotDescribedError, naming the term, for an action or actuator.
     """
@@ -287,23 +320,6 @@ def metadata(
     # Joints of the actions first, in their order; then the others, which observations may name.
     asked = list(dict.fromkeys(n for action in actions if action["kind"] != "ctrl" for n in action["names"]))
     names = [*asked, *(n for n in joint_names(view, None) if n not in asked)]
-    left_out: list[str] = []
-
-    def described(kind: str, some: Any) -> Json:
-        found = {}
-        for name, term in some.items():
-            try:
-                found[name] = describe(term, view)
-            except NotDescribedError as error:
-                left_out.append(f"{kind}.{name}")
-                note(f"task.{kind}.{name} is left out of sim2sim: {error}")
-        return found
-
-    # A reward of weight 0 needs no description.
-    weights = {name: term for name, term in cfg.rewards.items() if term.weight != 0.0}
-    # The runner knows the time limit from `episode_steps`.
-    ends = {name: term for name, term in cfg.terminations.items() if type(term).__name__ != "TimeOut"}
-    means = {name: term for name, term in cfg.metrics.items() if term.reduce == "mean"}
     # Controllers for mjlab's policies read the first entries, by these names.
     gains = _gains(ours, laws, names)
     if names:
@@ -314,7 +330,7 @@ def metadata(
     scales = [s for a in actions for s in np.broadcast_to(a["scale"], len(a["names"])).tolist()]
     sensors = {n: s for n, s in cfg.scene.sensors.items() if isinstance(s, ContactSensor)}
     return {
-        "format": 1,
+        "format": FORMAT,
         "joint_names": asked,
         "joint_stiffness": gains[0][: len(asked)],
         "joint_damping": gains[1][: len(asked)],
@@ -324,7 +340,7 @@ def metadata(
         "observation_names": [term["name"] for term in terms],
         "observation_history_lengths": [term["history_length"] for term in terms],
         "joints": {"names": names, "default_pos": by_term[1], "limits": _limits(ours, names)},
-        "observations": terms,
+        "observations": [{**term, "reads": traced.reads(term["name"])} for term in terms],
         "actions": actions,
         "action_chain": transforms.stages,
         "actuators": laws,
@@ -340,14 +356,13 @@ def metadata(
             }
             for name, s in sensors.items()
         },
-        "rewards": {
-            name: {"weight": weights[name].weight, "value": v} for name, v in described("rewards", weights).items()
-        },
+        **traced.described(),
+        "rewards": {name: {"weight": cfg.rewards[name].weight} for name in traced.scored["rewards"]},
         "terminations": {
-            name: {"time_out": ends[name].time_out, "value": v} for name, v in described("terminations", ends).items()
+            name: {"time_out": cfg.terminations[name].time_out} for name in traced.scored["terminations"]
         },
-        "metrics": described("metrics", means),
-        "left_out": left_out,
+        "metrics": list(traced.scored["metrics"]),
+        "left_out": list(traced.left_out),
         "scale_rewards_by_dt": cfg.scale_rewards_by_dt,
         "engine": ours.world.sim.engine,
         "physics_dt": ours.physics_dt,
@@ -406,32 +421,3 @@ def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> Json:
             edges.append(edge if np.isfinite(edge) else None)
         finite.append(edges)
     return {"position": finite, "effort": [effort.get(name) for name in names]}
-
-
-def _attach(path: Path, meta: Json) -> None:
-    """Put the entries that controllers look for into the ONNX file: numbers as text, lists with commas."""
-    import onnx  # an extra
-
-    # The weights are in the file: nothing is loaded from beside it.
-    model = onnx.load(path, load_external_data=False)
-    for written in (*model.graph.node, *model.graph.value_info):
-        written.ClearField("metadata_props")  # what the exporter notes for itself, 20 kB
-    keys = (
-        "run_path",
-        "joint_names",
-        "joint_stiffness",
-        "joint_damping",
-        "default_joint_pos",
-        "action_scale",
-    )
-    keys += ("command_names", "observation_names", "observation_history_lengths", "physics_dt", "decimation")
-    keys += ("step_dt", "task", "iteration", "commit")
-    for key in keys:
-        entry = model.metadata_props.add()
-        entry.key = key
-        value = meta[key]
-        if isinstance(value, list):
-            entry.value = ",".join(map(str, value))
-        else:
-            entry.value = str(value)
-    onnx.save(model, path)

@@ -9,6 +9,7 @@ from ksim_rl.envs.contract import part
 from ksim_rl.export import controls
 from ksim_rl.export.exported_transforms import sort_transforms
 from ksim_rl.export.folder import metadata
+from ksim_rl.export.traced_task import trace_task
 from ksim_rl.trainers.run_cfg import RunCfg
 
 
@@ -19,11 +20,12 @@ def say_lacks(cfg: RunCfg, env: EnvBase, note: Callable[[str], None]) -> None:
     if ours is None:
         return
     groups = [str(group) for group in cfg.modules.observation_keys("actor")]
-    # Describing is the part of an export that may fail; it writes nothing here.
+    # Tracing and describing are the parts of an export that may fail; they write nothing here.
     try:
         transforms = sort_transforms(ours.cfg, groups)
         for name in transforms.training_only:
             note(f"task.transforms.{name} acts in training only: an export leaves it out")
-        metadata(ours, controls.observations(ours, groups), transforms, note)
+        traced = trace_task(ours, groups, note)
+        metadata(ours, controls.observations(ours, groups), transforms, traced)
     except ValueError as error:
         note(f"`ksim-rl export` will refuse this run: {error}")

@@ -1,10 +1,7 @@
 """Turns a policy into a file: its deterministic action, with normalization and recurrent state inside."""
 
 import io
-import logging
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -19,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from ksim_rl.export.onnx_file import quiet, write_onnx
 from ksim_rl.modules.action_heads import PARAMETERS, MixedHead
 from ksim_rl.modules.network import ObservationNormalizer, side_by_side
 from ksim_rl.modules.recurrent import RESET_KEY, RecurrentModule
@@ -28,7 +26,6 @@ TOLERANCE = 1e-5
 CHECKED = 10_000
 # Observations in one call, as parallel episodes.
 ROWS = 100
-OPSET = 18
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,40 +253,18 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
     # One entry per parameter of `forward`; the states are one parameter, a tuple.
     shapes: tuple[Any, ...] = ({0: batch}, tuple({0: batch} for _ in policy.states))
     # No gradients; warnings of the exporter are not for users.
-    with torch.no_grad(), _quiet():
+    with torch.no_grad(), quiet():
         program = torch.export.export(policy, example, dynamic_shapes=shapes if policy.states else shapes[:1])
-        # They name the folders of this machine, in files that are made to be given away.
-        for node in program.graph.nodes:
-            node.meta.pop("stack_trace", None)
-        # Torch's writer of files aborts the process where the disk is full.
-        memory = io.BytesIO()
-        torch.export.save(program, memory)
-        (folder / "policy.pt2").write_bytes(memory.getvalue())
-        onnx = torch.onnx.export(
-            program,
-            args=example,
-            input_names=policy.input_names,
-            output_names=policy.output_names,
-            opset_version=OPSET,
-            dynamo=True,
-            verbose=False,
-        )
-        assert onnx is not None
-        onnx.save(folder / "policy.onnx")
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the exporter's messages about its own workings."""
-    # Both ways of speaking are closed: loggers and warnings.
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(before)
+    # They name the folders of this machine, in files that are made to be given away.
+    for node in program.graph.nodes:
+        node.meta.pop("stack_trace", None)
+    # Torch's writer of files aborts the process where the disk is full.
+    memory = io.BytesIO()
+    torch.export.save(program, memory)
+    (folder / "policy.pt2").write_bytes(memory.getvalue())
+    write_onnx(
+        program, example, folder / "policy.onnx", inputs=policy.input_names, outputs=policy.output_names
+    )
 
 
 def greatest_difference(policy: ExportedPolicy, path: Path) -> float:

@@ -147,8 +147,7 @@ class RewardWhileCommanded(OfCommand, RewardTerm):
 
 def root_height(view: EnvView, entity: str = "") -> Float[Tensor, " E"]:
     """Return the height of an entity's root frame above the ground right below it, m; position stage."""
-    # `clearance` takes [E, N, 3]; the root is a single point per env.
-    return view.terrain.clearance(view.entity(entity).root_pos_EL[:, None])[:, 0]
+    return view.entity(entity).root_height_E
 
 
 def distance_from_origin(view: EnvView, entity: str) -> Float[Tensor, " E"]:

@@ -45,6 +45,7 @@ def parts(tmp_path_factory):
         'view.sites(".*_foot")': seen.sites(".*_foot"),
         'view.site("finger")': seen.site("imu"),
         'view.entity("cube")': seen.entity(),
+        "view.robot.ground_scan(points)": seen.robot.ground_scan(((0.5, 0.0),)),
         'view.contact("feet")': seen.contact("feet"),
         'view.contact_points("hand")': seen.contact_points("hand"),
         'view.imu("imu")': seen.imu("imu"),

@@ -132,6 +132,28 @@ def policy_that_is_cut(folder):
     path.write_bytes(path.read_bytes()[:300])
 
 
+def observations_that_are_cut(folder):
+    path = folder / "obs.onnx"
+    path.write_bytes(path.read_bytes()[:300])
+
+
+def observations_of_the_policy(folder):
+    shutil.copyfile(folder / "policy.onnx", folder / "obs.onnx")
+
+
+def scores_without_end(folder):
+    change_json(folder, lambda meta: meta["scores"]["measurements"].clear())
+
+
+def unknown_array(folder):
+    node = {"input": "joint_vel", "quantity": "data", "field": "__class__"}
+    change_json(folder, lambda meta: meta["obs"]["measurements"].append(node))
+
+
+def an_older_export(folder):
+    change_json(folder, lambda meta: meta.update(format=1))
+
+
 def mesh_that_is_a_pipe(folder):
     os.mkfifo(folder / "mesh.stl")
     asset = '<mujoco><asset><mesh name="a" file="mesh.stl"/></asset><worldbody><geom type="mesh" mesh="a"/></worldbody>'

@@ -15,18 +15,18 @@ from ksim_rl.transforms import ObservationTermCfg
 
 @dataclass(frozen=True, kw_only=True)
 class OwnReward(RewardTerm):
-    """Nothing describes it."""
+    """It is drawn, which nobody else can do."""
 
     def __call__(self, view: EnvView) -> Tensor:
-        return view.joint_pos_EL[:, 0]
+        return view.uniform(1)[:, 0]
 
 
 @dataclass(frozen=True, kw_only=True)
 class OwnSignal(ObservationTerm):
-    """Nothing describes it."""
+    """It is drawn, which no robot can do."""
 
     def __call__(self, view: EnvView) -> Tensor:
-        return view.joint_pos_EL
+        return view.uniform(1)
 
 
 def lines(change) -> list[str]:
@@ -53,7 +53,7 @@ def test_a_reward_that_is_left_out_is_said():
     assert line.startswith("task.rewards.own is left out of sim2sim: ")
 
 
-def test_an_observation_that_no_export_can_describe_is_said():
+def test_an_observation_that_no_export_can_take_is_said():
     (line,) = lines(observing)
     assert line.startswith("`ksim-rl export` will refuse this run: task.observations.actor.terms.own: ")
 

@@ -3,32 +3,39 @@
 import mujoco
 import numpy as np
 
-from ksim_rl.export.standalone.files import Json
+from ksim_rl.export.standalone.files import Array, Json
 
 
 class Contacts:
-    """The readings of one contact sensor of the export: values by field, one per element, or three."""
+    """The readings of one contact sensor of the export: values by field, one per element, or three.
 
-    def __init__(self, spec: Json, mj_model: mujoco.MjModel) -> None:
+    `substeps` are the physics steps of an env step, and `refine` into how many each of them is divided.
+    """
+
+    def __init__(self, spec: Json, mj_model: mujoco.MjModel, substeps: int) -> None:
         self.strongest, self.every = spec["strongest"], spec["every_substep"]
         # One MuJoCo sensor reads found, force and position (7 numbers); of the strongest
         # contact also normal and tangent (13).
         first = [mj_model.sensor(name).adr[0] for name in spec["elements"]]
         self.index = np.add.outer(first, np.arange(13 if self.strongest else 7))
+        self.kept, self.refine = (substeps if self.every else 1), 1
         self.reset()
 
     def reset(self) -> None:
         """Begin an episode."""
         count = len(self.index)
         times = ("air_time", "last_air_time", "contact_time", "last_contact_time")
-        self.fields = {name: np.zeros(count) for name in ("found", "first_contact", "first_air", *times)}
-        self.fields["force"] = np.zeros(3 * count)
-        self.history: list[float] = []
-        self.fields["peak_history"] = np.zeros(1)
+        self.fields: dict[str, Array] = {
+            name: np.zeros(count) for name in ("found", "first_contact", "first_air", *times)
+        }
+        self.fields |= {name: np.zeros((count, 3)) for name in ("force", "position")}
+        # The force of each substep, the oldest first; the env's own buffer begins with zeros, too.
+        self.fields["force_history"] = np.zeros((self.kept, count, 3))
+        self.updates = 0
 
     def update(self, data: mujoco.MjData, dt: float, starts: bool) -> None:
-        # "found" is needed at the next update, to tell landing from standing.
         """Let `dt` seconds pass; `starts` where this begins an env step."""
+        # "found" is needed at the next update, to tell landing from standing.
         reading, kept = data.sensordata[self.index], self.fields
         force = reading[:, 1:4]
         # The force of the strongest contact is in the contact's own axes: turn it into the world's.
@@ -36,12 +43,10 @@ class Contacts:
             normal, tangent = reading[:, 7:10], reading[:, 10:13]
             axes = np.stack((normal, tangent, np.cross(normal, tangent)), -1)
             force = np.einsum("nij,nj->ni", axes, force)
-        kept["force"] = force.ravel()
-        # Peaks since this env step began; each entry is the largest norm of one update.
-        self.history = ([] if starts else self.history) + [
-            float(np.linalg.norm(force, axis=1).max(initial=0.0))
-        ]
-        kept["peak_history"] = np.array(self.history)
+        kept["force"], kept["position"] = force, reading[:, 4:7]
+        # A substep that is divided leaves the force of its last part.
+        self.updates = 0 if starts else self.updates + 1
+        kept["force_history"][self.updates // self.refine] = force
         # Rising and falling edges of contact.
         touches, touched = reading[:, 0] > 0, kept["found"] > 0
         lands, leaves = touches & ~touched, touched & ~touches

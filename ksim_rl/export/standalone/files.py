@@ -16,6 +16,8 @@ import numpy as np
 Array = np.ndarray
 # 1 GiB: a file of more, or one that unpacks to more, is refused before it fills the memory.
 MOST_BYTES = 2**30
+# Of export.json, which says what the ONNX files read.
+FORMAT = 2
 # Far more than an export has of anything that is counted, such as actions or steps of a delay.
 MOST = 1_000_000
 # Tags by which MuJoCo would load other files or code, and "<!", which begins an XML entity.
@@ -72,8 +74,13 @@ def read_json(path: Path) -> Json:
         found = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from None
-    if not isinstance(found, dict) or found.get("format") != 1:
-        raise ValueError(f"{path}: expected the metadata of an export, of format 1")
+    if not isinstance(found, dict) or found.get("format") not in (1, FORMAT):
+        raise ValueError(f"{path}: expected the metadata of an export, of format {FORMAT}")
+    if found["format"] == 1:
+        raise ValueError(
+            f"{path}: format 1, of before observations were traced: write it once more with `ksim-rl export RUN`; the "
+            "folder's own runner.py still runs it"
+        )
     return found
 
 

@@ -1,51 +1,87 @@
-"""Runs the network of an exported policy, with the states that it carries from step to step."""
+"""Runs the ONNX files of an export, with the states that they carry from step to step."""
 
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, Json, read
+from ksim_rl.export.standalone.files import Array, Json, check_count, read
+
+# Types of the inputs that an export writes, by ONNX's names.
+TYPES = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)": np.bool_}
 
 
-class Policy:
-    """The policy in `policy.onnx`, with the states that it carries from step to step."""
+class Network:
+    """An ONNX file, with the states that it carries from step to step."""
 
-    def __init__(self, folder: Path, meta: Json) -> None:
+    def __init__(self, path: Path, states: list[Json], output: str) -> None:
         # Here, so that a program that only reads signals needs no onnxruntime.
         import onnxruntime
 
         # As bytes: a path would let ONNX load further files from beside it.
-        data = read(folder / "policy.onnx")
+        data = read(path)
         # The protobuf field by which a tensor keeps its weights in another file.
         if b"\x0a\x08location" in data:
-            raise ValueError(
-                f"{folder / 'policy.onnx'}: weights outside of the file: expected all of them in it"
-            )
+            raise ValueError(f"{path}: weights outside of the file: expected all of them in it")
         # Episodes run in parallel processes; a small network gains nothing from threads.
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self.session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-        self.specs = meta["policy"]["states"]
-        self.states: list[Array] = []
-        self.outputs = ["actions", *(spec["output"] for spec in self.specs)]
+        self.path, self.specs = path, states
+        self.outputs = [output, *(spec["output"] for spec in states)]
+        self.inputs = {value.name: self._example(value) for value in self.session.get_inputs()}
+        self.reset()
+
+    def _example(self, value: Any) -> Array:
+        """Return zeros of the shape and type of an input, for one robot."""
+        shape = []
+        for edge in value.shape:
+            # A batch of any size has a name in place of a number.
+            shape.append(1 if isinstance(edge, str) else edge)
+        check_count(f"size of {value.name}", math.prod(shape))
+        return np.zeros(shape, TYPES[value.type])
 
     def reset(self) -> None:
         """Forget the episode."""
-        self.states = []
+        self.states: list[Array] = []
+        self.next_states: list[Array] = []
+
+    def begin(self, frame: Array) -> list[Array]:
+        """Return the states of a new episode: zeros, or columns of its first frame in all places."""
+        return [
+            np.repeat(frame[:, None, slice(*spec["columns"])], self.inputs[spec["input"]].shape[1], 1)
+            if spec.get("starts_with") == "frame"
+            else self.inputs[spec["input"]]
+            for spec in self.specs
+        ]
+
+    def run(self, given: dict[str, Array]) -> Array:
+        """Return the first output, of one robot; `advance` makes the states of this run those of the next."""
+        feed = {}
+        for name, value in given.items():
+            example = self.inputs[name]
+            feed[name] = np.asarray(value).reshape(example.shape).astype(example.dtype)
+        if not self.states:
+            self.states = self.begin(feed.get("obs", np.zeros((1, 0))))
+        # `states`, `specs` and the outputs after the first have the same order.
+        feed |= {spec["input"]: state for spec, state in zip(self.specs, self.states, strict=True)}
+        first, *self.next_states = (np.asarray(value) for value in self.session.run(self.outputs, feed))
+        return first[0].astype(np.float64)
+
+    def advance(self) -> None:
+        """Let the step end: what the last run has kept is read by the next one."""
+        self.states = self.next_states
+
+
+class Policy(Network):
+    """The policy in `policy.onnx`."""
+
+    def __init__(self, folder: Path, meta: Json) -> None:
+        super().__init__(folder / "policy.onnx", meta["policy"]["states"], "actions")
 
     def __call__(self, obs: Array) -> Array:
         """Return the action [A] for the newest frame [L]."""
-        # ONNX holds float32, with a batch of one in front.
-        frame = np.asarray(obs, np.float32)[None]
-        # The first call of an episode: memories begin as zeros, or as the first frame in all places.
-        if not self.states:
-            self.states = [
-                np.zeros((1, *spec["shape"]), np.float32)
-                if spec["starts_with"] == "zeros"
-                else np.repeat(frame[:, None, slice(*spec["columns"])], spec["shape"][0], 1)
-                for spec in self.specs
-            ]
-        # `states`, `specs` and the outputs after the actions have the same order.
-        feed = {"obs": frame} | {s["input"]: v for s, v in zip(self.specs, self.states, strict=True)}
-        actions, *self.states = (np.asarray(value) for value in self.session.run(self.outputs, feed))
-        return actions[0].astype(np.float64)
+        action = self.run({"obs": obs})
+        self.advance()
+        return action

@@ -23,12 +23,10 @@ import numpy as np
 
 from ksim_rl.export.standalone.files import Array, Json, as_text, check_record, read_arrays, read_json
 from ksim_rl.export.standalone.network import Policy
-from ksim_rl.export.standalone.signals import INTEGRATORS, Lag, Noise, Signals
+from ksim_rl.export.standalone.signals import INTEGRATORS, KINDS, Lag, Noise, Signals, Values
 
 # Recorded starts, commands and pushes, which an export writes beside the model.
 RECORD = "episodes.npz"
-# In this order targets lie side by side in a trace: rad (m for slides), rad/s, N m.
-KINDS = ("pos", "vel", "effort")
 # Fields of MjData that a recording may set.
 STATE = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
 
@@ -42,20 +40,19 @@ class Runner(Signals):
         self.policy, self.noisy = Policy(self.folder, meta), bool(meta.get("noisy", True))
         self.lags: list[Lag] = []
         self.noises: list[Noise] = []
+        self.readings, self.scores = Values(self, "obs"), Values(self, "scores")
         self.terms = [self._term(spec) for spec in meta["observations"]]
-        self.rewards = {n: (s["weight"], self.value(s["value"])) for n, s in meta["rewards"].items()}
-        self.endings = {n: (s["time_out"], self.value(s["value"])) for n, s in meta["terminations"].items()}
-        self.metrics = {name: self.value(node) for name, node in meta["metrics"].items()}
+        self.stops = np.cumsum([spec["size"] for spec in meta["observations"]])
+        kinds = ("terminations", "rewards", "metrics")
+        self.scored = [(kind, name) for kind in kinds for name in meta[kind]]
         self.chain = [self._stage(spec) for spec in meta["action_chain"]]
         self.asked = [self._action(spec) for spec in meta["actions"]]
-        self.targets = {kind: dict.fromkeys(self.joints, 0.0) for kind in KINDS}
         self.laws = [self._law(spec) for spec in meta["actuators"]]
         self.reset()
 
     # -- observations --------------------------------------------------------------------------------------------
 
-    def _term(self, spec: Json) -> Callable[[bool], Array]:
-        read_it = self.value(spec["value"])
+    def _term(self, spec: Json) -> Callable[[Array, bool], Array]:
         low, high = spec["clip"]
         # JSON has no infinity: None is a side without a bound.
         low = -np.inf if low is None else low
@@ -68,8 +65,7 @@ class Runner(Signals):
             lag = Lag(spec["delay"], self)
             self.lags.append(lag)
 
-        def term(advances: bool) -> Array:
-            value = read_it()
+        def term(value: Array, advances: bool) -> Array:
             # As in training: noise on the raw value, then clip, scale and delay.
             if noise and self.noisy:
                 value = noise(value)
@@ -80,7 +76,10 @@ class Runner(Signals):
 
     def observe(self, advances: bool = True) -> Array:
         """Return the newest frame that the policy reads, [L]; call it once per env step."""
-        return np.concatenate([term(advances) for term in self.terms])
+        parts = np.split(self.readings(), self.stops[:-1])
+        self.readings.advance()
+        frame = [term(part, advances) for term, part in zip(self.terms, parts, strict=True)]
+        return np.concatenate(frame)
 
     # -- actions and actuators -----------------------------------------------------------------------------------
 
@@ -128,8 +127,8 @@ class Runner(Signals):
             if spec["relative"]:
                 # A robot's own encoders tell where it is.
                 value = value + self.data.qpos[at] + self.bias_of(names)
-            # The offset has the model's own pose in it; exports of before 0.2.0 do not say so.
-            if spec.get("from_default"):
+            # The offset has the model's own pose in it.
+            if spec["from_default"]:
                 value = value + [self.default[name] - self.own_default[name] for name in names]
             self.targets[kind].update(zip(names, np.clip(value, *spec["limits"]), strict=True))
 
@@ -162,8 +161,7 @@ class Runner(Signals):
         self.numbers = getattr(self, "numbers", []) + [(names, numbers)]
         lag = Lag(spec["delay"], self) if spec["delay"] else None
         self.lags += [lag] if lag else []
-        # Exports of before 0.2.0 say nothing of these: there all servos were plain.
-        scale, offset = np.asarray(spec.get("scale", 1.0)), np.asarray(spec.get("offset", 0.0))
+        scale, offset = np.asarray(spec["scale"]), np.asarray(spec["offset"])
 
         # Targets stay the same for all substeps of an env step; measured state does not.
         def law() -> None:
@@ -209,7 +207,8 @@ class Runner(Signals):
         for kind in KINDS:
             self.targets[kind] = dict(self.default) if kind == "pos" else dict.fromkeys(self.joints, 0.0)
         self.drawn.clear()
-        for part in (self.policy, *self.lags, *self.noises, *self.contacts.values()):
+        networks = (self.policy, self.readings, self.scores)
+        for part in (*networks, *self.lags, *self.noises, *self.contacts.values()):
             part.reset()
         for forget in self.resets:
             forget()
@@ -269,12 +268,19 @@ class Runner(Signals):
             if not tracker.every:
                 tracker.update(self.data, self.step_dt, starts=True)
         # Endings come before rewards, since a reward may read whether the episode was terminated.
-        ended = [name for name, (_, value) in self.endings.items() if bool(value()[0])]
+        scores = self.scores.named(self.scored)
+        endings = self.meta["terminations"]
+        ended = [name for name in endings if scores["terminations", name]]
         finite = bool(np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all())
-        self.terminated = not finite or any(not self.endings[name][0] for name in ended)
+        self.terminated = not finite or any(not endings[name]["time_out"] for name in ended)
+        if "terminated" in self.scores.read:
+            scores = self.scores.named(self.scored)
+        self.scores.advance()
         unit = self.step_dt if self.meta["scale_rewards_by_dt"] else 1.0
-        rewards = {name: float(weight * unit * value()[0]) for name, (weight, value) in self.rewards.items()}
-        metrics = {name: float(value()[0]) for name, value in self.metrics.items()}
+        rewards = {}
+        for name, spec in self.meta["rewards"].items():
+            rewards[name] = spec["weight"] * unit * scores["rewards", name]
+        metrics = {name: scores["metrics", name] for name in self.meta["metrics"]}
         # Rewards above belong to the old command; the next frame already shows the new one.
         self.command |= command or {}
         if observes:

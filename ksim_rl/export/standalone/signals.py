@@ -1,4 +1,4 @@
-"""Computes the values that an exported folder describes from MuJoCo's state."""
+"""Reads the quantities of an exported folder from MuJoCo's state, and makes its values of them by ONNX files."""
 
 import math
 from collections.abc import Callable
@@ -10,60 +10,19 @@ import numpy as np
 
 from ksim_rl.export.standalone.contacts import Contacts
 from ksim_rl.export.standalone.files import Array, Json, check_count, read_json, read_model
+from ksim_rl.export.standalone.network import Network
 
 Value = Callable[[], Array]
-# An export is a stranger's file: deeper nesting would exhaust Python's stack, more parts its memory.
-MOST_DEPTH, MOST_NODES = 40, 100_000
+# In this order targets lie side by side in a trace: rad (m for slides), rad/s, N m.
+KINDS = ("pos", "vel", "effort")
 INTEGRATORS = {
     name.removeprefix("mjINT_").lower(): kind for name, kind in mujoco.mjtIntegrator.__members__.items()
 }
-# Only these can be called from an export: names map to fixed functions, never to attributes of numpy.
-FUNCTIONS: dict[str, Callable[..., Any]] = {
-    name: getattr(np, name)
-    for name in (
-        *("add", "subtract", "multiply", "divide", "maximum", "minimum", "where"),
-        *("negative", "absolute", "square", "sqrt", "exp", "log1p", "sin", "cos", "sign"),
-    )
-}
-# Truth values are 0.0 and 1.0, so that they can be weighted and added like any other value.
-FUNCTIONS |= {
-    "greater": lambda a, b: (a > b) * 1.0,
-    "less": lambda a, b: (a < b) * 1.0,
-    "any": lambda a: np.atleast_1d(np.any(a > 0) * 1.0),
-    "mean": lambda a: np.atleast_1d(a.mean()),
-    "concat": lambda *parts: np.concatenate(parts),
-    # The small bound keeps a zero vector finite.
-    "normalize": lambda a: a / max(float(np.linalg.norm(a)), 1e-12),
-    "subtract_point": lambda a, b: (a.reshape(-1, 3) - b).ravel(),
-    "rotate": lambda quat, vector: rotated(quat, vector),
-    # The conjugate of a unit quaternion is its inverse.
-    "rotate_inverse": lambda quat, vector: rotated(quat * np.array([1.0, -1.0, -1.0, -1.0]), vector),
-}
-
-
-def _in_blocks(values: Array, width: int | None) -> Array:
-    """Return values in rows of a width; without one they are a single row."""
-    if width:
-        return values.reshape(-1, width)
-    return values[None]
-
-
-def _sum(blocks: Array) -> Array:
-    return blocks.sum(-1)
-
-
-def _norm(blocks: Array) -> Array:
-    return np.sqrt((blocks * blocks).sum(-1))
-
-
-def rotated(quat: Array, vector: Array) -> Array:
-    """Return a vector turned by a quaternion (w, x, y, z)."""
-    result = np.zeros(3)
-    # MuJoCo reads both as raw doubles in a row, and writes into `result`.
-    mujoco.mju_rotVecQuat(
-        result, np.ascontiguousarray(vector, np.float64), np.ascontiguousarray(quat, np.float64)
-    )
-    return result
+# Arrays of MuJoCo's data that an exported model has in the env's layout, and the only ones that an export may name.
+ARRAYS = (
+    *("qpos", "qvel", "qacc", "qfrc_actuator", "sensordata", "cvel", "subtree_com"),
+    *("xpos", "xquat", "xmat", "xipos", "site_xpos", "site_xmat", "geom_xpos", "geom_xmat"),
+)
 
 
 class Lag:
@@ -156,8 +115,40 @@ class Noise:
         return value
 
 
+class Values:
+    """What one ONNX file makes of the quantities that it reads."""
+
+    def __init__(self, signals: "Signals", name: str) -> None:
+        spec = signals.meta[name]
+        # A task without rewards, metrics and terminations has none.
+        self.network, self.read = None, {}
+        if spec is not None:
+            self.network = Network(signals.folder / f"{name}.onnx", spec["states"], spec["output"])
+            self.read = {one["input"]: signals.quantity(one) for one in spec["measurements"]}
+
+    def __call__(self) -> Array:
+        """Return the values of the current state; ask once per env step, or `advance` afterwards."""
+        if self.network is None:
+            return np.zeros(0)
+        return self.network.run({name: read() for name, read in self.read.items()})
+
+    def named(self, names: list[tuple[str, str]]) -> dict[tuple[str, str], float]:
+        """Return the values of the current state by name, one each."""
+        return dict(zip(names, self().tolist(), strict=True))
+
+    def advance(self) -> None:
+        """Let the step end, see `Network.advance`."""
+        if self.network is not None:
+            self.network.advance()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        if self.network is not None:
+            self.network.reset()
+
+
 class Signals:
-    """The quantities of a robot's model, and the descriptions that are made of them."""
+    """The quantities of a robot's model."""
 
     def __init__(self, folder: str | Path, seed: int = 0) -> None:
         self.folder = Path(folder)
@@ -174,7 +165,8 @@ class Signals:
         self.of_contacts: list[Callable[[], None]] = []
         # Shared lags of this episode by group and age, see `Lag`.
         self.drawn: dict[Any, int] = {}
-        self._nodes = 0
+        # Positions, velocities and efforts that joints are asked for; the runner's actions write them.
+        self.targets = {kind: dict.fromkeys(meta["joints"]["names"], 0.0) for kind in KINDS}
         # Addresses differ from joint numbers as soon as there is a free or ball joint.
         names = meta["joints"]["names"]
         self.joints = {n: (int(model.joint(n).qposadr[0]), int(model.joint(n).dofadr[0])) for n in names}
@@ -186,7 +178,9 @@ class Signals:
         # Commands are zero until the caller gives one.
         sizes = {n: check_count(f"commands.{n}.size", c["size"]) for n, c in meta["commands"].items()}
         self.command: dict[str, Array] = {name: np.zeros(size) for name, size in sizes.items()}
-        self.contacts = {name: Contacts(spec, model) for name, spec in meta["contacts"].items()}
+        self.contacts = {
+            name: Contacts(spec, model, self.decimation) for name, spec in meta["contacts"].items()
+        }
         self.action = self.last_action = np.zeros(
             check_count("policy.num_actions", meta["policy"]["num_actions"])
         )
@@ -207,11 +201,15 @@ class Signals:
             option.integrator = int(INTEGRATORS[integrator])
         option.timestep /= refine
         self.decimation *= refine
+        for tracker in self.contacts.values():
+            tracker.refine = refine
 
     def refresh(self) -> None:
         """Recompute all that follows from position and velocity; contacts and forces stay from the last substep."""
         model, data = self.model, self.data
-        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+        # Velocities of subtrees, too: sensors of momentum take those of the last substep where nobody computes them.
+        stages = (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel, mujoco.mj_subtreeVel)
+        for compute in stages:
             compute(model, data)
         mujoco.mj_sensorPos(model, data)
         mujoco.mj_sensorVel(model, data)
@@ -220,135 +218,24 @@ class Signals:
         """Return what the encoders of some joints read beyond their positions, rad or m."""
         return np.array([self.bias[name] for name in names])
 
-    def value(self, node: Any, depth: int = 0) -> Value:
-        """Return a function that computes a description; a ValueError shows a part that is not one."""
-        # Parts are counted over all descriptions of the export, not for each one.
-        self._nodes += 1
-        if depth > MOST_DEPTH or self._nodes > MOST_NODES:
-            raise ValueError("export.json: a description has too many parts")
-        if not isinstance(node, dict):
-            constant = np.atleast_1d(np.asarray(node, np.float64))
-            return lambda: constant
+    def quantity(self, node: Json) -> Value:
+        """Return a function that reads a quantity; a ValueError shows a node that names none."""
         try:
-            if "quantity" in node:
-                return self._quantity(node["quantity"], node)
-            return self._op(node["op"], node, [self.value(part, depth + 1) for part in node["of"]])
-        # A description is data of a stranger: a missing key or a wrong type is told with its text.
+            return self._quantity(node["quantity"], node)
+        # A node is data of a stranger: a missing key or a wrong type is told with its text.
         except (KeyError, TypeError) as error:
             raise ValueError(f"export.json: {str(node)[:200]}: {error}") from None
 
-    def _op(self, name: str, node: Json, parts: list[Value]) -> Value:
-        # Values are flat; `width` says how many numbers belong to one item, such as 3 for a vector.
-        width = node.get("width")
-        if name in ("sum", "norm"):
-            power = _norm if name == "norm" else _sum
-            return lambda: power(_in_blocks(parts[0](), width))
-        if name == "take":
-            wanted = np.asarray(node["indices"], int)
-            return lambda: _in_blocks(parts[0](), width)[:, wanted].ravel()
-        if name == "clip":
-            return lambda: np.clip(parts[0](), node["low"], node["high"])
-        # Rows times the matrix is the transpose's product: from world axes into the body's.
-        if name == "into":
-            body = self.model.body(node["body"]).id
-            return lambda: (parts[0]().reshape(-1, 3) @ self.data.xmat[body].reshape(3, 3)).ravel()
-        # These keep a value from step to step, and so have to forget it at a reset.
-        if name in ("previous", "peak", "low_pass"):
-            return self._remembering(name, node, parts)
-        function = FUNCTIONS[name]
-
-        def applied() -> Array:
-            return function(*[part() for part in parts])
-
-        return applied
-
-    def _remembering(self, name: str, node: Json, parts: list[Value]) -> Value:
-        # None until the first call of an episode.
-        kept: list[Any] = [None]
-        self.resets.append(lambda: kept.__setitem__(0, None))
-
-        def previous() -> Array:
-            value = parts[0]()
-            before, kept[0] = np.zeros_like(value) if kept[0] is None else kept[0], value
-            return before
-
-        def peak() -> Array:
-            # Height of the swing so far; a landing gives the peak once and starts again at 0.
-            height, found, landed = (part() for part in parts)
-            before = np.zeros_like(height) if kept[0] is None else kept[0]
-            highest = np.where(found > 0, before, np.maximum(before, height))
-            kept[0] = np.where(landed > 0, 0.0, highest)
-            return highest
-
-        def low_pass() -> Array:
-            # Exact for a first-order filter at any step length.
-            gain = 1.0 - math.exp(-self.step_dt / node["time_constant"])
-            if kept[0] is None:
-                kept[0] = parts[0]()
-            else:
-                kept[0] = kept[0] + gain * (parts[0]() - kept[0])
-            return kept[0]
-
-        return {"previous": previous, "peak": peak, "low_pass": low_pass}[name]
-
     def _quantity(self, name: str, node: Json) -> Value:
+        for kind, read in (
+            ("joints", self._of_joints),
+            ("bodies", self._of_bodies),
+            ("sites", self._of_sites),
+            ("body", self._of_root),
+        ):
+            if kind in node:
+                return read(name, node)
         data, model = self.data, self.model
-        # Readings of joints, rad and rad/s (m and m/s for slides), in the order of the names.
-        if "joints" in node:
-            names = node["joints"]
-            pos = np.array([self.joints[joint][0] for joint in names], int)
-            vel = np.array([self.joints[joint][1] for joint in names], int)
-            # Only measured angles have encoder errors; rewards read true ones.
-            biased = bool(node.get("biased"))
-            of_joints = {
-                "joint_pos": lambda: data.qpos[pos] + (self.bias_of(names) if biased else 0.0),
-                "joint_vel": lambda: data.qvel[vel],
-                "joint_acc": lambda: data.qacc[vel],
-                "joint_effort": lambda: data.qfrc_actuator[vel],
-            }
-            if name == "joint_pos_rel":
-
-                def joint_pos_rel() -> Array:
-                    # Looked up at each reading, since a recorded start may bring another default pose.
-                    default = [self.default[joint] for joint in names]
-                    return of_joints["joint_pos"]() - default
-
-                return joint_pos_rel
-            return of_joints[name]
-        # Bodies and sites, in the world frame. `data` is the same object for good, so its arrays may be kept.
-        if "bodies" in node or "sites" in node:
-            if "bodies" in node:
-                kind = "body"
-                where = data.xpos
-                ids = [model.body(name).id for name in node["bodies"]]
-            else:
-                kind = "site"
-                where = data.site_xpos
-                ids = [model.site(name).id for name in node["sites"]]
-            if name == "site_lin_vel_of_contacts":
-                return self._kept_velocities(ids)
-            return {
-                f"{kind}_pos": lambda: where[ids].ravel(),
-                # Above the ground below each point, not above z = 0.
-                f"{kind}_height": lambda: where[ids][:, 2] - [self.ground_at(p) for p in where[ids]],
-                # mj_objectVelocity gives angular velocity first, linear second.
-                f"{kind}_lin_vel": lambda: self._velocities(kind, ids)[:, 3:].ravel(),
-                f"{kind}_ang_vel": lambda: self._velocities(kind, ids)[:, :3].ravel(),
-                "body_quat": lambda: data.xquat[ids].ravel(),
-                # The first two axes of each body: six numbers fix an orientation without jumps.
-                "body_axes": lambda: data.xmat[ids].reshape(-1, 3, 3).transpose(0, 2, 1)[:, :2].ravel(),
-                "com_pos": lambda: data.subtree_com[ids].ravel(),
-            }[name]
-        # The root, in its own axes where the frame says so.
-        if "body" in node:
-            body, local = model.body(node["body"]).id, node.get("frame") == "root"
-            return {
-                # Gravity's direction (0, 0, -1) in the body's axes is the matrix's last row, negated.
-                "projected_gravity": lambda: -data.xmat[body].reshape(3, 3)[2],
-                "root_lin_vel": lambda: self._velocities("body", [body], local)[0, 3:],
-                "root_ang_vel": lambda: self._velocities("body", [body], local)[0, :3],
-                "height_scan": lambda: self._scan(body, np.asarray(node["points"])),
-            }[name]
         # A sensor of the model, any width.
         if name == "sensor":
             start = int(model.sensor(node["sensor"]).adr[0])
@@ -357,19 +244,107 @@ class Signals:
             return lambda: data.sensordata[start:stop].copy()
         if name == "contact":
             tracker, field = self.contacts[node["sensor"]], node["field"]
+            tracker.fields[field]  # refused now, not in the first step
             return lambda: tracker.fields[field]
         if name == "command":
+            self.command[node["command"]]
             return lambda: self.command[node["command"]]
-        if name == "actuator_force":
+        if name in ("actuator_force", "ctrl"):
             actuators = [model.actuator(n).id for n in node["actuators"]]
-            return lambda: data.actuator_force[actuators]
+            array = {"actuator_force": data.actuator_force, "ctrl": data.ctrl}[name]
+            return lambda: array[actuators]
+        if name == "data":
+            field = node["field"]
+            if field not in ARRAYS:
+                raise KeyError(field)
+            return lambda: getattr(data, field)
         return {
             "action": lambda: self.action,
             "last_action": lambda: self.last_action,
-            "terminated": lambda: np.array([float(self.terminated)]),
+            "terminated": lambda: np.array([self.terminated]),
+            "step": lambda: np.array([self.steps]),
+            # Only in training do first episodes end early, so that not all of them end at once.
+            "time_out_offset": lambda: np.zeros(1),
             "time": lambda: np.array([self.steps * self.step_dt]),
-            "time_left": lambda: np.array([max(self.limit - self.steps, 0) * self.step_dt]),
         }[name]
+
+    def _of_joints(self, name: str, node: Json) -> Value:
+        """Readings of joints, rad and rad/s (m and m/s for slides), in the order of the names."""
+        data = self.data
+        names = node["joints"]
+        pos = np.array([self.joints[joint][0] for joint in names], int)
+        vel = np.array([self.joints[joint][1] for joint in names], int)
+
+        def default() -> Array:
+            # Looked up at each reading, since a recorded start may bring another default pose.
+            return np.array([self.default[joint] for joint in names])
+
+        def target(kind: str) -> Value:
+            def asked() -> Array:
+                return np.array([self.targets[kind][joint] for joint in names])
+
+            return asked
+
+        return {
+            "joint_pos": lambda: data.qpos[pos],
+            "joint_pos_rel": lambda: data.qpos[pos] - default(),
+            "joint_vel": lambda: data.qvel[vel],
+            "joint_acc": lambda: data.qacc[vel],
+            "joint_effort": lambda: data.qfrc_actuator[vel],
+            "default_joint_pos": default,
+            # Of a simulated encoder; a robot's own reading has its bias in it.
+            "encoder_bias": lambda: self.bias_of(names),
+            "joint_pos_target": target("pos"),
+            "joint_vel_target": target("vel"),
+            "joint_effort_target": target("effort"),
+        }[name]
+
+    def _of_bodies(self, name: str, node: Json) -> Value:
+        # `data` is the same object for good, so its arrays may be kept.
+        data = self.data
+        ids = [self.model.body(body).id for body in node["bodies"]]
+        return {
+            "body_pos": lambda: data.xpos[ids],
+            "body_quat": lambda: data.xquat[ids],
+            # The axes are the columns of MuJoCo's matrix.
+            "body_axes": lambda: data.xmat[ids].reshape(-1, 3, 3).transpose(0, 2, 1),
+            # mj_objectVelocity gives angular velocity first, linear second.
+            "body_lin_vel": lambda: self._velocities("body", ids)[:, 3:],
+            "body_ang_vel": lambda: self._velocities("body", ids)[:, :3],
+            "com_pos": lambda: data.subtree_com[ids],
+        }[name]
+
+    def _of_sites(self, name: str, node: Json) -> Value:
+        data = self.data
+        ids = [self.model.site(site).id for site in node["sites"]]
+        if name == "site_lin_vel_of_contacts":
+            return self._kept_velocities(ids)
+        return {
+            "site_pos": lambda: data.site_xpos[ids],
+            "site_axes": lambda: data.site_xmat[ids].reshape(-1, 3, 3).transpose(0, 2, 1),
+            # Above the ground below each point, not above z = 0.
+            "site_height": lambda: self._heights(data.site_xpos[ids]),
+            "site_lin_vel": lambda: self._velocities("site", ids)[:, 3:],
+        }[name]
+
+    def _of_root(self, name: str, node: Json) -> Value:
+        """The root, in its own axes where the frame says so."""
+        data = self.data
+        body, local = self.model.body(node["body"]).id, node.get("frame") == "root"
+        return {
+            "root_pos": lambda: data.xpos[body],
+            "root_quat": lambda: data.xquat[body],
+            "root_height": lambda: self._heights(data.xpos[[body]]),
+            # Gravity's direction (0, 0, -1) in the body's axes is the matrix's last row, negated.
+            "projected_gravity": lambda: -data.xmat[body].reshape(3, 3)[2],
+            "root_lin_vel": lambda: self._velocities("body", [body], local)[0, 3:],
+            "root_ang_vel": lambda: self._velocities("body", [body], local)[0, :3],
+            "ground_below": lambda: self._scan(body, np.asarray(node["points"])),
+        }[name]
+
+    def _heights(self, points: Array) -> Array:
+        """Return how high points [N, 3] are above the ground right below them."""
+        return points[:, 2] - [self.ground_at(point) for point in points]
 
     def _kept_velocities(self, ids: list[int]) -> Value:
         """Return a function that gives the velocities of sites at the start of the last substep, 0 after a reset."""

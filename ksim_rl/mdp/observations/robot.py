@@ -305,24 +305,11 @@ class HeightScan(OfEntity, ObservationTerm):
     clip: Range = (-1.0, 1.0)
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
-        body = view.entity(self.entity)
-        # Points of the grid in the frame of root and yaw, [N] each.
-        x_N, y_N = _grid(tuple(self.size), self.resolution, view.device)
-        # Turned with the yaw alone: a robot that pitches still scans straight down.
-        sin_E1 = torch.sin(body.heading_E)[:, None]
-        cos_E1 = torch.cos(body.heading_E)[:, None]
-        root_E3 = body.root_pos_EL
-        points_EN2 = root_E3[:, None, :2] + torch.stack(
-            (cos_E1 * x_N - sin_E1 * y_N, sin_E1 * x_N + cos_E1 * y_N), dim=-1
-        )
-        # Height of the root above each point's ground, less the offset.
-        below_EN = root_E3[:, 2:] - view.terrain.heights(points_EN2) - self.offset
-        return below_EN.clamp(*self.clip)
+        scan = view.entity(self.entity).ground_scan(_grid(tuple(self.size), self.resolution))
+        return (scan.below_EN - self.offset).clamp(*self.clip)
 
 
 @cache
-def _grid(size: tuple[float, float], resolution: float, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return x and y of the points about the root, m, [N] each, on the device; made once."""
-    # Python numbers, since `constant` keys its tensors by value.
-    x_N, y_N, _ = grid_points(size, resolution).T.tolist()
-    return constant(x_N, device), constant(y_N, device)
+def _grid(size: tuple[float, float], resolution: float) -> tuple[tuple[float, float], ...]:
+    """Return x and y of the points about the root, m; made once."""
+    return tuple((x, y) for x, y, _ in grid_points(size, resolution).tolist())

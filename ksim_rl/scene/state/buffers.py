@@ -168,6 +168,10 @@ class Buffers:
         """Return the owner of a buffer, as it was given when the buffer was made."""
         return self._owners[name]
 
+    def is_kept(self, name: str) -> bool:
+        """Whether resets leave a buffer alone."""
+        return name in self._kept
+
     def _arena(self, width: int, dtype: torch.dtype) -> Arena:
         """Return an arena with room for so many numbers per env."""
         # First fit: small buffers fill the rest of earlier arenas.

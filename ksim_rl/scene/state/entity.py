@@ -1,5 +1,7 @@
 """Reads and moves one robot or object of a scene: its root, its joints, and where it starts."""
 
+from collections.abc import Sequence
+
 import mujoco
 import torch
 from jaxtyping import Bool, Float
@@ -13,6 +15,35 @@ from ksim_rl.scene.state.quantity import quantity
 from ksim_rl.scene.state.simulation import Simulation
 
 
+class GroundScan(NearNames):
+    """The ground at points about an entity's root that turn with its yaw only: `view.robot.ground_scan(points)`.
+
+    Attributes:
+        points: x (forward) and y (left) of each point from the root, m.
+        cache: a dict of computed quantities; it is emptied whenever the state changes.
+    """
+
+    def __init__(self, state: Simulation, entity: "Entity", points: Sequence[tuple[float, float]]) -> None:
+        self.points = tuple(points)
+        self.cache = state.new_cache()
+        self._state = state
+        self._entity = entity
+        points_N2 = torch.tensor(self.points, device=state.world.device, dtype=torch.float32)
+        self._x_N, self._y_N = points_N2.view(-1, 2).unbind(-1)
+
+    @quantity
+    def below_EN(self) -> Float[Tensor, "E N"]:
+        """How far the ground is below the root's frame at each of the points, m; position stage."""
+        # Turned with the yaw alone: a robot that pitches still looks straight down.
+        sin_E1 = torch.sin(self._entity.heading_E)[:, None]
+        cos_E1 = torch.cos(self._entity.heading_E)[:, None]
+        root_E3 = self._entity.root_pos_EL
+        x_EN = cos_E1 * self._x_N - sin_E1 * self._y_N
+        y_EN = sin_E1 * self._x_N + cos_E1 * self._y_N
+        points_EN2 = root_E3[:, None, :2] + torch.stack((x_EN, y_EN), dim=-1)
+        return root_E3[:, 2:] - self._state.ground.heights(points_EN2)
+
+
 class Entity(NearNames):
     """A robot or object, addressed by name: `view.entity("cube").root_pos_EL`.
 
@@ -21,6 +52,7 @@ class Entity(NearNames):
         prefix: the beginning of its elements' names; empty if it is alone in the scene.
         free_root: whether its first joint is free.
         root: the body of its first joint if that is free, else its first body.
+        root_bodies: the same, as the only one of several bodies.
         root_qpos, root_qvel: columns of the free joint in MuJoCo's state, empty if the root is fixed.
         joints: its hinges and slides.
         default_root_pos_L: position of the root at reset, m, world frame.
@@ -57,7 +89,9 @@ class Entity(NearNames):
         else:
             # A model without bodies leaves the world itself as the root.
             root = (bodies or [0])[0]
-        self.root = Body(Bodies(state, [root], [model.body(root).name]))
+        self.root_bodies = Bodies(state, [root], [model.body(root).name])
+        self.root = Body(self.root_bodies)
+        self._scans: dict[tuple[tuple[float, float], ...], GroundScan] = {}
         self.root_qpos = slice(0, 0)
         self.root_qvel = slice(0, 0)
         # A fixed root stands where its model puts it, relative to its parent.
@@ -126,6 +160,23 @@ class Entity(NearNames):
         if self.free_root:  # MuJoCo keeps a free joint's angular velocity in the body frame
             return self._free_qvel_EL[:, 3:]
         return quaternion.rotate_inverse(self.root_quat_EL, self.root_ang_vel_w_EL)
+
+    @quantity
+    def root_height_E(self) -> Float[Tensor, " E"]:
+        """Height of the root body's frame above the ground right below it, m; position stage."""
+        # `clearance` takes [E, N, 3]; the root is a single point per env.
+        return self._state.ground.clearance(self.root_pos_EL[:, None])[:, 0]
+
+    def ground_scan(self, points: tuple[tuple[float, float], ...]) -> GroundScan:
+        """Return the ground at points (x, y) about the root, m; it is made once, while the env is constructed."""
+        if points not in self._scans:
+            self._scans[points] = GroundScan(self._state, self, points)
+        return self._scans[points]
+
+    @property
+    def ground_scans(self) -> list[GroundScan]:
+        """All scans that terms have asked for."""
+        return list(self._scans.values())
 
     def write_root_pose(
         self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E 3"], quat_EL: Float[Tensor, "E 4"]

@@ -237,7 +237,11 @@ class WorldView(NearNames):
         """Return the reading of an MJCF sensor."""
         if name not in self._sensor_slices:
             raise ValueError(f"no sensor {name!r}: {near(name, self._sensor_slices)}")
-        return self._simulation.derived().sensordata_EL[:, self._sensor_slices[name]]
+        # Kept as other quantities are, so that whoever asks what a term has read finds it by its name.
+        key = f"sensor/{name}"
+        if key not in self.cache:
+            self.cache[key] = self._simulation.derived().sensordata_EL[:, self._sensor_slices[name]]
+        return self.cache[key]
 
     def parts(self) -> dict[str, object]:
         """Return the objects that hold the quantities and tables of the view, by how a term spells them."""
