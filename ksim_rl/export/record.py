@@ -177,7 +177,7 @@ class Recording:
         # Steps of the running episode so far; also the divisor of means below.
         step_E = view.episode_step_E.float()
         now = {f"reward/{name}": value_E for name, value_E in view.episode_rewards.items()}
-        # The return of the described and undescribed terms alike, as training reports it.
+        # The return of all terms, traced or not, as training reports it.
         now["return"] = sum(now.values(), torch.zeros_like(step_E))
         now |= {"length": step_E, "fell": view.terminated_E.float()}
         now |= dict(

@@ -41,7 +41,7 @@ class Report:
 
     @property
     def return_ratio(self) -> float:
-        """Their mean return by ours, both of the reward terms that the export describes."""
+        """Their mean return by ours, both of the reward terms that the export has."""
         if self.ours["return"]:
             return self.theirs["return"] / self.ours["return"]
         return float("nan")
@@ -64,7 +64,7 @@ class Report:
                     share = f"{value - own:+.3g}"
                 line = f"{name:<44}{own:>12.4g}{value:>12.4g}{share:>12}"
                 lines.append(line + without if name == "return" else line)
-        lines += [f"left out, since it has no description: {name}" for name in self.left_out]
+        lines += [f"left out, since it cannot be traced: {name}" for name in self.left_out]
         lines.append(f"return ratio {self.return_ratio:.4f} +- {self.standard_error:.4f} (standard error)")
         if self.causes:
             lines.append("likely causes:")
@@ -124,7 +124,7 @@ def sim2sim(
     for name in found[0]:
         if name.startswith(TABLE):
             theirs[name] = np.array([one[name] for one in found])
-    # Only terms that both sides have: the recorded return also has those without a description.
+    # Only terms that both sides have: the recorded return also has those that cannot be traced.
     described = [own[name] for name in own if name.startswith("reward/") and name in theirs]
     own["return"] = np.sum(described, axis=0) if described else np.zeros(episodes)
     return Report(

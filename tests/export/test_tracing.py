@@ -89,7 +89,7 @@ def watch_rewards(env: ManagerBasedRlEnv, task: TracedTask) -> list[float]:
 
 
 # One of each kind of robot, ground and suite; the others run in full tests.
-QUICK = ("cartpole_balance", "arm_reach", "quadruped_velocity_flat")
+QUICK = ("cartpole_balance", "arm_reach", "quadruped_velocity_flat", "walker_walk")
 NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in envs.names()]
 
 

@@ -3,7 +3,7 @@
     python runner.py [DIR] --episodes 100 --output result.json
 
 In a program of yours: `runner = Runner(DIR)`, `runner.reset()`, then `runner.step(runner.act())` at each env step.
-`export.json` describes observations and actions; names, not numbers, say which joint is which. All files are
+`export.json` says what the ONNX files read; names, not numbers, say which joint is which. All files are
 data: nothing in them is executed, and none may lead out of the folder.
 """
 
