@@ -76,9 +76,14 @@ def exported(folder, keyframe):
     )
 
 
+@pytest.fixture(scope="module")
+def with_keyframe(tmp_path_factory):
+    return exported(tmp_path_factory.mktemp("arm") / "export", KEYFRAME)
+
+
 @pytest.mark.parametrize("keyframe", ["", KEYFRAME], ids=["no keyframe", "keyframe"])
-def test_an_export_acts_in_the_c_engine_as_here(tmp_path, keyframe):
-    folder = exported(tmp_path / "export", keyframe)
+def test_an_export_acts_in_the_c_engine_as_here(tmp_path, with_keyframe, keyframe):
+    folder = with_keyframe if keyframe else exported(tmp_path / "export", keyframe)
     runner = Runner(folder)
     record = read_arrays(folder / "trace.npz")
     replayed = runner.replay(record, 0, 0)
@@ -93,9 +98,8 @@ def test_an_export_acts_in_the_c_engine_as_here(tmp_path, keyframe):
     assert meta["joints"]["limits"]["effort"] == [None, None, 80.0]
 
 
-def test_a_reset_of_an_export_is_the_default_state(tmp_path):
-    folder = exported(tmp_path / "export", KEYFRAME)
-    runner = Runner(folder)
+def test_a_reset_of_an_export_is_the_default_state(with_keyframe):
+    runner = Runner(with_keyframe)
     runner.reset()
     names = [runner.model.actuator(i).name for i in range(3)]
     assert names == ["c", "b", "a"]
