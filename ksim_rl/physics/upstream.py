@@ -18,12 +18,13 @@ from jaxtyping import Float32
 from mujoco_warp._src.bvh import build_hfield_bvh
 from mujoco_warp._src.collision_core import contact_params as contact_params
 
-# The lists between its broad phase and its narrow one, and the narrow phase.
+# The lists between its broad phase and its narrow one, the narrow phase, and what follows it.
 from mujoco_warp._src.collision_core import create_collision_context as create_collision_context
 
 # Its search for the distance of convex shapes, and the parts that it needs.
 from mujoco_warp._src.collision_core import geom_collision_pair as geom_collision_pair
 from mujoco_warp._src.collision_core import write_contact as write_contact
+from mujoco_warp._src.collision_driver import _contact_surfacevel as velocities_of_surfaces
 from mujoco_warp._src.collision_driver import _narrowphase as narrowphase  # noqa: F401
 from mujoco_warp._src.collision_gjk import ccd as ccd
 from mujoco_warp._src.collision_gjk import support as support
@@ -166,6 +167,15 @@ def bias_forces(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     aside = dataclasses.replace(d, cacc=wp.empty_like(d.cacc), cfrc_int=wp.empty_like(d.cfrc_int))
     mjw.rne(warp_model, aside)
     tendon_bias(warp_model, d, d.qfrc_bias)
+
+
+def give_velocities_of_surfaces(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    """Launch the velocities of surfaces of all contacts again: those that we append come after its own launch."""
+    d = warp_data_E
+    contact = d.contact
+    inputs = [warp_model.geom_surfacevel, d.geom_xpos, d.geom_xmat, contact.pos, contact.frame, contact.geom]
+    inputs += [contact.worldid, d.naconmax, d.nacon]
+    wp.launch(velocities_of_surfaces, dim=d.naconmax, inputs=inputs, outputs=[contact.surfacevel])
 
 
 def without_limit_sensors(warp_model: mjw.Model) -> mjw.Model:

@@ -119,6 +119,25 @@ def test_a_belt_carries_a_steep_rod_as_in_the_c_engine(cone: str, kernels: str):
     step_and_check(xml, KERNELS[kernels], spread=0.002, speed=0.1)
 
 
+def test_a_moving_field_carries_balls_at_any_depth_as_in_the_c_engine():
+    """Fields of models with moving surfaces were left to MuJoCo Warp, whose depths are off by centimetres."""
+    xml = """
+<mujoco>
+  <asset>
+    <hfield name="hills" nrow="3" ncol="3" size="1 1 0.1 0.1" elevation="0.9 0.6 0.1 0.5 1 0.2 0.4 0.1 0.3"/>
+  </asset>
+  <worldbody>
+    <geom type="hfield" hfield="hills" surfacevel="0.5 -0.3 0 0 0 1"/>
+    <body pos="0.28 0.25 -0.02">
+      <joint type="slide" axis="1 1 0"/><joint type="slide" axis="1 -1 0"/><geom size="0.08"/></body>
+    <body pos="-0.4 0.5 0.15"><freejoint/><geom size="0.08" condim="4"/></body>
+    <body pos="-0.6 -0.4 0.18"><freejoint/><geom type="box" size="0.1 0.1 0.1" margin="1e-6"/></body>
+  </worldbody>
+</mujoco>
+"""
+    step_and_check(xml, KERNELS["our solver"], spread=0.002, speed=0.1)
+
+
 # Of each pair one geom has priority, and one gives stiffness and damping directly; the last pair has a law of its own.
 LAWS = """
 <mujoco>

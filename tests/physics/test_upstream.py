@@ -62,6 +62,11 @@ def warp_model() -> mjw.Model:
             "contact_solreffriction_out contact_solimp_out contact_dim_out contact_geom_out contact_efc_address_out "
             "contact_worldid_out contact_type_out contact_geomcollisionid_out contact_adhesion_out nacon_out",
         ),
+        (
+            "collision_driver._contact_surfacevel",
+            "geom_surfacevel geom_xpos_in geom_xmat_in contact_pos_in contact_frame_in contact_geom_in "
+            "contact_worldid_in naconmax_in nacon_in contact_surfacevel_out",
+        ),
     ],
 )
 def test_functions_take_the_same_arguments(name: str, arguments: str) -> None:

@@ -189,7 +189,7 @@ def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.D
     """Take the pairs of height fields away from MuJoCo Warp, in place.
 
     Returns a hook that appends their contacts after its collision pass, or None where there are no such pairs. Pairs
-    with signed distance fields stay with MuJoCo Warp, as do all where surfaces move.
+    with signed distance fields stay with MuJoCo Warp.
     """
     geom_type = warp_model.geom_type.numpy()
     # The kernel expects the height field first.
@@ -202,8 +202,7 @@ def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.D
     is_exact = touches & np.isin(others, (SPHERE, CAPSULE, BOX))
     is_convex = touches & np.isin(others, convex_contacts.TYPES)
     taken = is_exact | is_convex
-    # Our kernels write no velocity of a surface.
-    if not taken.any() or warp_model.flg_surfacevel:
+    if not taken.any():
         return None
     upstream.drop_contacts(warp_model, taken)
     lists = [
@@ -229,5 +228,8 @@ def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.D
                     convex_contacts.memory_for(warp_model, warp_data_E, num_pairs=int(is_convex.sum()))
                 )
             convex_contacts.append({**lists[1], **memory}, warp_model, warp_data_E)
+        # Our kernels write no velocity of a surface.
+        if warp_model.flg_surfacevel:
+            upstream.give_velocities_of_surfaces(warp_model, warp_data_E)
 
     return append
