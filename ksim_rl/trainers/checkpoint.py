@@ -289,7 +289,13 @@ def _read_manifest(path: Path) -> Tree:
 
 
 def _has(tree: Plain, **kinds: type) -> bool:
-    return isinstance(tree, dict) and all(isinstance(tree.get(name), kind) for name, kind in kinds.items())
+    if not isinstance(tree, dict):
+        return False
+    # A truth value is a whole number in Python.
+    found = {name: tree.get(name) for name in kinds}
+    return all(
+        isinstance(found[name], kind) and not isinstance(found[name], bool) for name, kind in kinds.items()
+    )
 
 
 def _read_regular_file(path: Path, *, limit: int) -> bytes:

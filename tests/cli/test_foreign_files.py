@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from ksim_rl.config import class_paths
+from ksim_rl.config.plain_data import check_links, read_yaml
 from ksim_rl.files import arrays, reading
 from ksim_rl.scene.actuators import nets
 from ksim_rl.scene.motions import motion
@@ -141,3 +142,12 @@ def test_policies_are_loaded_without_a_folder_for_failures(place, monkeypatch):
 def test_pickles_are_what_this_file_says():
     with pytest.raises(ZeroDivisionError):
         pickle.loads(pickle.dumps(Bomb("1 / 0")))
+
+
+def test_a_link_to_itself_is_refused_by_name(tmp_path):
+    loop = tmp_path / "config.yaml"
+    loop.symlink_to(loop)
+    # It leads nowhere, and is refused where it is read.
+    check_links(tmp_path, below=())
+    with pytest.raises(ValueError, match=r"config\.yaml: cannot be read: Too many levels of symbolic links"):
+        read_yaml(loop)

@@ -197,6 +197,18 @@ def test_a_format_that_cannot_be_read_is_refused_with_what_to_do(saved, version,
         checkpoint.load(with_version(saved, version))
 
 
+@pytest.mark.parametrize("field", ["iteration", "bytes"])
+def test_a_truth_value_is_no_number_of_a_manifest(saved, field):
+    manifest = json.loads((saved / MANIFEST).read_text())["manifest"]
+    where = manifest if field == "iteration" else manifest["files"][checkpoint.TENSORS]
+    where[field] = True
+    (saved / MANIFEST).write_bytes(checkpoint._seal(manifest))
+    with pytest.raises(
+        CheckpointError, match="not a checkpoint manifest: a field is missing or of another type"
+    ):
+        checkpoint.load(saved)
+
+
 def test_an_older_format_without_a_way_up_is_refused(saved, monkeypatch):
     monkeypatch.setattr(checkpoint_formats, "MIGRATIONS", {})
     with pytest.raises(
