@@ -36,7 +36,7 @@ SPEED = 3.0
 EFFORT = 0.2
 """Largest commanded effort, of the limit."""
 UNLIMITED_EFFORT = 2.0
-"""N m or N, of a joint without a limit of its effort."""
+"""Largest commanded effort of a joint without a limit, N m or N."""
 MOST_EFFORT = 0.6
 """Share of the limit that all commands together may ask for."""
 MARGIN = 0.05
@@ -66,10 +66,9 @@ def propose(
     for kind in sorted(kinds):
         slope = POSITION_SLOPE if kind == "pos" else OTHER_SLOPE
         shapes[kind] = _sines(rng, time_T, num, slope)
-    effort_N = np.array(
-        [UNLIMITED_EFFORT if np.isinf(j.effort_limit) else j.effort_limit for j in robot.joints]
-    )
-    sizes = {"pos": reach_N, "vel": np.full(num, SPEED), "effort": EFFORT * effort_N}
+    limit_N = np.array([joint.effort_limit for joint in robot.joints])
+    effort_N = np.where(np.isinf(limit_N), UNLIMITED_EFFORT, EFFORT * limit_N)
+    sizes = {"pos": reach_N, "vel": np.full(num, SPEED), "effort": effort_N}
     scale_N = np.ones(num)
     why = ""
     for _ in range(MOST_SHRINKS):

@@ -105,7 +105,24 @@ def _event(make: Callable[[ManagerBasedRlEnvCfg], EventTerm]) -> Change:
 
 
 def _friction(value: float) -> Change:
-    return _event(lambda cfg: RandomizeGeomFriction(geoms=".*", operation="abs", ranges={0: (value, value)}))
+    return _event(
+        lambda cfg: RandomizeGeomFriction(
+            geoms=_rough_geoms(cfg), operation="abs", ranges={0: (value, value)}
+        )
+    )
+
+
+def _rough_geoms(cfg: ManagerBasedRlEnvCfg) -> tuple[str, ...]:
+    """Return the geoms that touch others with friction."""
+    mj_model = build_spec(cfg.scene).compile()
+    touches = (mj_model.geom_contype | mj_model.geom_conaffinity) != 0
+    rough = np.flatnonzero(touches & (mj_model.geom_condim > 1))
+    names = [mj_model.geom(int(geom)).name for geom in rough]
+    found = tuple(name for name in names if name)
+    none_touch = bool(mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    if none_touch or not found:
+        raise ValueError("nothing of it touches anything with friction")
+    return found
 
 
 def _masses(factor: float) -> Change:

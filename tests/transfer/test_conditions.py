@@ -101,6 +101,7 @@ def test_what_a_task_has_none_of_is_refused():
         ("twice the noise, and biases", "observations have no noise"),
         ("ideal PD motors", "its GearedMotor has no position servo"),
         ("a slope of 5 degrees", "its ground is no plane"),
+        ("friction 0.3", "nothing of it touches anything"),
     ):
         with pytest.raises(ValueError, match=words):
             BY_NAME[name](cartpole)
