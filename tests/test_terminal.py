@@ -23,7 +23,7 @@ OBEYED = set("\x1b\x07\x9b\u202e\r\x08")
 # A console into memory, whose text is shown later; words between a process and its child; a program that stands alone.
 OTHERS = {
     "envs/explain.py": {"console.print"},
-    "export/standalone/runner.py": {"print"},
+    "export/standalone/command.py": {"print"},
     "scene/robots/analysis.py": {"Console(file=text, force_jupyter=False, width=240, highlight=False).print"},
     "cli/runs.py": {"Console(highlight=False, width=None if console.is_terminal else 400).print"},
     "terminal.py": {"print"},

@@ -8,7 +8,7 @@ from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.contract import part
 from ksim_rl.export import controls
 from ksim_rl.export.exported_transforms import sort_transforms
-from ksim_rl.export.folder import metadata
+from ksim_rl.export.metadata import metadata
 from ksim_rl.export.traced_task import trace_task
 from ksim_rl.trainers.run_cfg import RunCfg
 

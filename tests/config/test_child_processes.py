@@ -18,7 +18,7 @@ STARTS = {"config/child_processes.py"}
 # It runs without this library, and its workers are as isolated as it is; one that asks which process it is; and one
 # that waits in the event loop of a server.
 OTHERS = {
-    "export/standalone/runner.py": {"multiprocessing", "concurrent.futures", "concurrent.futures.process"},
+    "export/standalone/command.py": {"multiprocessing", "concurrent.futures", "concurrent.futures.process"},
     "transforms/upstream.py": {"multiprocessing"},
     "viewer/guarded_server.py": {"asyncio"},
 }

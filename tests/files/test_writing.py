@@ -39,7 +39,7 @@ OTHERS = {
     "export/policy.py": {"write_bytes"},
     "export/robot.py": {"write_text", "write_bytes"},
     "export/sim2sim.py": {"write_text"},
-    "export/standalone/runner.py": {"write_text", "savez_compressed"},
+    "export/standalone/command.py": {"write_text", "savez_compressed"},
     "zoo/adding.py": {"write_text", "copyfile"},
     "zoo/sources.py": {"copytree"},
     "clips/motion_file.py": {"savez_compressed"},  # into memory

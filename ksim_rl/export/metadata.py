@@ -1,0 +1,136 @@
+"""The description of an env for whoever runs its policy elsewhere: joints, terms, actions, limits."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ksim_rl.envs import ManagerBasedRlEnv
+from ksim_rl.export import controls
+from ksim_rl.export.controls import joint_names
+from ksim_rl.export.exported_transforms import TaskTransforms
+from ksim_rl.export.standalone.files import FORMAT, Json
+from ksim_rl.export.traced_task import TracedTask
+from ksim_rl.scene.names import drives_scalar_joint
+from ksim_rl.scene.sensors import ContactSensor
+from ksim_rl.scene.state.joint_control import joint_control
+
+
+def metadata(
+    ours: ManagerBasedRlEnv,
+    terms: list[Json],
+    transforms: TaskTransforms,
+    traced: TracedTask,
+) -> Json:
+    """Return the description of the env, whose terms are traced.
+
+    `terms` are those that the policy observes. Raises NotDescribedError, naming the term, for an action or actuator.
+    """
+    cfg = ours.cfg
+    view = ours.view
+    actions = controls.actions(ours)
+    laws = controls.actuators(ours)
+    # Joints of the actions first, in their order; then the others, which observations may name.
+    asked = list(dict.fromkeys(n for action in actions if action["kind"] != "ctrl" for n in action["names"]))
+    names = [*asked, *(n for n in joint_names(view, None) if n not in asked)]
+    # Controllers for mjlab's policies read the first entries, by these names.
+    gains = _gains(ours, laws, names)
+    if names:
+        # The model's own pose: what events draw around it differs from world to world.
+        by_term = [view.default_qpos_L[view.joints(n).qpos].tolist() for n in (asked, names)]
+    else:
+        by_term = [[], []]
+    scales = [s for a in actions for s in np.broadcast_to(a["scale"], len(a["names"])).tolist()]
+    sensors = {n: s for n, s in cfg.scene.sensors.items() if isinstance(s, ContactSensor)}
+    return {
+        "format": FORMAT,
+        "joint_names": asked,
+        "joint_stiffness": gains[0][: len(asked)],
+        "joint_damping": gains[1][: len(asked)],
+        "default_joint_pos": by_term[0],
+        "action_scale": scales,
+        "command_names": list(cfg.commands),
+        "observation_names": [term["name"] for term in terms],
+        "observation_history_lengths": [term["history_length"] for term in terms],
+        "joints": {"names": names, "default_pos": by_term[1], "limits": _limits(ours, names)},
+        "observations": [{**term, "reads": traced.reads(term["name"])} for term in terms],
+        "actions": actions,
+        "action_chain": transforms.stages,
+        "actuators": laws,
+        "commands": {
+            name: {"size": value.shape[-1], "kind": type(cfg.commands[name]).__name__}
+            for name, value in ours.command_manager.values.items()
+        },
+        "contacts": {
+            name: {
+                "elements": [f"{name}_{e}" for e in s.elements(view.resolver.names("geom" if s.geoms else "body"))],
+                "strongest": s.reduce == "strongest",
+                "every_substep": s.every_substep,
+            }
+            for name, s in sensors.items()
+        },
+        **traced.described(),
+        "rewards": {name: {"weight": cfg.rewards[name].weight} for name in traced.scored["rewards"]},
+        "terminations": {
+            name: {"time_out": cfg.terminations[name].time_out} for name in traced.scored["terminations"]
+        },
+        "metrics": list(traced.scored["metrics"]),
+        "left_out": list(traced.left_out),
+        "scale_rewards_by_dt": cfg.scale_rewards_by_dt,
+        "engine": ours.world.sim.engine,
+        "physics_dt": ours.physics_dt,
+        "decimation": cfg.decimation,
+        "step_dt": ours.step_dt,
+        "episode_steps": ours.max_episode_length if any(t.time_out for t in cfg.terminations.values()) else 0,
+        "encoders": "targets of positions are readings of encoders, as biased observations are: a robot's servos take "
+        "them as they are. Only a simulation, whose servos see true positions, takes the encoders' bias off them",
+        "frames": "x forward, y left, z up; quaternions (w, x, y, z); root velocities and gravity in its own axes",
+    }  # fmt: skip
+
+
+def _gains(
+    ours: ManagerBasedRlEnv, laws: Sequence[Any], names: Sequence[str]
+) -> tuple[list[float], list[float]]:
+    """Return stiffness and damping by joint: the numbers of laws, and the model's gains for MuJoCo's servos."""
+    # Gains of servos are in the model, gains of laws in the numbers that the laws were given.
+    model = ours.world.mj_model
+    found = dict.fromkeys(names, (0.0, 0.0))
+    for law in laws:
+        for k, (joint, actuator) in enumerate(zip(law["joints"], law["actuators"], strict=True)):
+            control = joint_control(model, model.actuator(actuator).id)
+            stiffness = control.stiffness
+            damping = control.damping
+            if "stiffness" in law["numbers"] and law["kind"] != "builtin":
+                stiffness = law["numbers"]["stiffness"][k]
+                damping = law["numbers"]["damping"][k]
+            found[joint] = (stiffness, damping)
+    stiffness_of = [found[name][0] for name in names]
+    damping_of = [found[name][1] for name in names]
+    return stiffness_of, damping_of
+
+
+def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> Json:
+    """Return soft limits of position, and of effort at the joint, behind the gear; null where there is none."""
+    model = ours.world.mj_model
+    if names:
+        limits = ours.view.joints(list(names)).soft_limits_L2.tolist()
+    else:
+        limits = []
+    # Of effort only at joints: a tendon's force is no joint's torque.
+    effort: dict[str, float] = {}
+    for i in range(model.nu):
+        if not drives_scalar_joint(model, i) or not model.actuator_forcelimited[i]:
+            continue
+        joint = int(model.actuator_trnid[i, 0])
+        # The motor's limit times its gear.
+        effort[model.joint(joint).name] = float(
+            abs(model.actuator_gear[i, 0]) * model.actuator_forcerange[i, 1]
+        )
+    finite = []
+    for low, high in limits:
+        # JSON has no infinity.
+        edges = []
+        for edge in (low, high):
+            edges.append(edge if np.isfinite(edge) else None)
+        finite.append(edges)
+    return {"position": finite, "effort": [effort.get(name) for name in names]}
