@@ -20,7 +20,7 @@ from ksim_rl.terminal import show
 
 
 def identify(arguments: Sequence[str]) -> int:
-    """Write a plan of commands, or find a robot's numbers; the code is 1 where some were not told or are doubtful."""
+    """Write a plan of commands, or find a robot's numbers; the code is 1 where those of a joint are doubtful."""
     options: Any = _parser().parse_args(arguments)
     if (options.propose is None) == (options.log is None):
         raise ValueError("give either the LOG of a robot, or --propose ROBOT")
@@ -72,10 +72,7 @@ def _find(options: Any) -> int:
         words = path.with_suffix(".overrides")
         write_whole(words, "\n".join(lines) + "\n")
         show(f"{words}: for ksim-rl train task={task} $(cat {words})")
-    told = all(
-        number.is_told or number.remark for numbers in findings.joints.values() for number in numbers.values()
-    )
-    return int(bool(findings.warnings) or not told)
+    return int(bool(findings.warnings))
 
 
 def _kinds(text: str | None, robot: HeldRobot) -> list[TargetKind]:
