@@ -49,9 +49,9 @@ _TERRAINS = "ksim_rl.scene.terrains"
 # Parts that a small task leaves out: the words that bring them, and where fields are looked at with them.
 PARTS: Sequence[tuple[Sequence[str], Sequence[str]]] = (
     (("objective=sac",), ("objective", "data", "modules")),
-    (("modules=lstm",), ("modules", "objective", "data")),
     (
         (
+            "modules=lstm",
             "task.sim.nan_guard={folder: failures}",
             "task.observations.actor.delay={max_lag: 1}",
             "task.observations.critic.history={length: 2}",
