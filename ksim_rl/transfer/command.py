@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ksim_rl.checks import OneLineParser, check_count, check_in_range
-from ksim_rl.files.writing import whole_folder
+from ksim_rl.files.writing import whole_folder, write_whole
 from ksim_rl.terminal import show
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.run_cfg import check_run_tree
@@ -40,8 +40,8 @@ def card(arguments: Sequence[str]) -> int:
     found = judge_all(run, name=str(options.run), **how)
     folder = options.output or run / "card"
     with whole_folder(folder, below=folder.parent) as unfinished:
-        (unfinished / "card.md").write_text(found.page())
-        (unfinished / "card.json").write_text(found.numbers())
+        write_whole(unfinished / "card.md", found.page())
+        write_whole(unfinished / "card.json", found.numbers())
         found.draw(unfinished / "card.png")
     show(found.verdict())
     show(f"{folder / 'card.md'}: the page, with card.png and card.json")
