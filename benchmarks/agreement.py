@@ -105,17 +105,28 @@ TASKS = (
 )
 CASES = (
     Case(name="cartpole", load=lambda: load_model(CARTPOLE), substeps=100, start="anywhere"),
-    Case(name="double_pendulum", load=lambda: load_model(DOUBLE_PENDULUM), substeps=100, start="anywhere"),
-    Case(name="spinning_body", load=lambda: load_model(SPINNING_BODY), substeps=100, start="anywhere"),
+    Case(
+        name="double_pendulum",
+        load=lambda: load_model(DOUBLE_PENDULUM),
+        substeps=100,
+        start="anywhere",
+    ),
+    Case(
+        name="spinning_body", load=lambda: load_model(SPINNING_BODY), substeps=100, start="anywhere"
+    ),
     Case(name="quadruped", load=lambda: load_model(QUADRUPED), start="standing", spread=0.3),
     Case(
         name="unitree_go1",
-        load=lambda: with_contact_sensors("unitree_go1", ("FR_calf", "FL_calf", "RR_calf", "RL_calf")),
+        load=lambda: with_contact_sensors(
+            "unitree_go1", ("FR_calf", "FL_calf", "RR_calf", "RL_calf")
+        ),
         start="standing",
     ),
     Case(
         name="unitree_g1",
-        load=lambda: with_contact_sensors("unitree_g1", ("left_ankle_roll_link", "right_ankle_roll_link")),
+        load=lambda: with_contact_sensors(
+            "unitree_g1", ("left_ankle_roll_link", "right_ankle_roll_link")
+        ),
         start="standing",
         spread=0.05,
     ),
@@ -165,7 +176,11 @@ def run_warp(
         name: world.view(name).cpu().numpy().astype(np.float64).reshape(world.num_envs, -1)
         for name in COMPARED
     }
-    owners = world.last_substep("contact.worldid")[: int(world.last_substep("nacon").item())].cpu().numpy()
+    owners = (
+        world.last_substep("contact.worldid")[: int(world.last_substep("nacon").item())]
+        .cpu()
+        .numpy()
+    )
     found["ncon"] = np.bincount(owners, minlength=world.num_envs)[:, None].astype(np.float64)
     world.close()
     return found
@@ -270,7 +285,9 @@ def judge_registered(options: argparse.Namespace, device: torch.device) -> int:
     names, not_here = registered.tasks_of_models(envs.names())
     if not_here:
         print(f"not installed: {', '.join(not_here)}", flush=True)
-    tasks = [registered.Registered(name=name, is_task=True, device=options.device) for name in names]
+    tasks = [
+        registered.Registered(name=name, is_task=True, device=options.device) for name in names
+    ]
     for path in registered.robot_files():
         tasks.append(registered.Registered(name=path, is_task=False, device=options.device))
     outcomes = registered.judge_all(tasks, jobs=options.jobs, most_minutes=options.minutes)
@@ -294,14 +311,22 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--models", nargs="+", metavar="MODEL", help="names of models or tasks, or MJCF files"
     )
-    parser.add_argument("--generated", type=int, default=0, metavar="N", help="judge N random models instead")
+    parser.add_argument(
+        "--generated", type=int, default=0, metavar="N", help="judge N random models instead"
+    )
     parser.add_argument(
         "--registered", action="store_true", help="judge all registered tasks and robot files"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the random models")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes for random models")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no further model after these")
-    parser.add_argument("--shrink", action="store_true", help="make each random model that fails small")
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count() or 1, help="processes for random models"
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=math.inf, help="begin no further model after these"
+    )
+    parser.add_argument(
+        "--shrink", action="store_true", help="make each random model that fails small"
+    )
     options = parser.parse_args(arguments)
     device = checked_device(options.device)
     if options.generated:
@@ -332,14 +357,19 @@ def main(arguments: list[str] | None = None) -> int:
                 f"{'' if good else '  DISAGREES'}"
             )
             prefix = f"{label}/{case.name}/{quantity}"
-            figures |= {f"{prefix}/{key}": value for key, value in dataclasses.asdict(values).items()}
             figures |= {
-                f"{prefix}/as_trained/{key}": value for key, value in dataclasses.asdict(as_trained).items()
+                f"{prefix}/{key}": value for key, value in dataclasses.asdict(values).items()
+            }
+            figures |= {
+                f"{prefix}/as_trained/{key}": value
+                for key, value in dataclasses.asdict(as_trained).items()
             }
         figures[f"{label}/{case.name}/other_contacts_share"] = found.other_contacts_share
         if case.start != "anywhere":
             share = found.other_contacts_share
-            print(f"{case.name:24s}the engines differ in their number of contacts in {share:.1%} of worlds")
+            print(
+                f"{case.name:24s}the engines differ in their number of contacts in {share:.1%} of worlds"
+            )
     limits = {
         "smooth models, 100 substeps, all worlds": SMOOTH_LIMIT,
         "robots in contact, 20 substeps, 95 % of worlds": CONTACT_LIMIT,

@@ -63,8 +63,14 @@ def compare(
     mj_model: mujoco.MjModel, actual: dict[str, np.ndarray], expected: dict[str, np.ndarray]
 ) -> dict[str, Errors]:
     """Return the errors of each quantity that the model has."""
-    found = {name: errors(actual[name], expected[name]) for name in COMPARED if np.any(expected[name])}
-    sensors = [columns for columns in sensor_columns(mj_model) if np.any(expected["sensordata"][:, columns])]
+    found = {
+        name: errors(actual[name], expected[name]) for name in COMPARED if np.any(expected[name])
+    }
+    sensors = [
+        columns
+        for columns in sensor_columns(mj_model)
+        if np.any(expected["sensordata"][:, columns])
+    ]
     if sensors:
         found["sensordata"] = worst(
             [

@@ -72,7 +72,9 @@ def measure(cfg: RunCfg, *, steps: int = STEPS, rounds: int = ROUNDS) -> dict[st
         for name, work in sides.items():
             times[name].append(milliseconds(work, device=device, repeats=1))
     env_states = 1000.0 * steps * cfg.num_envs
-    figures = {f"{name}_env_states_per_s": env_states / statistics.median(ms) for name, ms in times.items()}
+    figures = {
+        f"{name}_env_states_per_s": env_states / statistics.median(ms) for name, ms in times.items()
+    }
     for name in ("stock", "stock_with_graphs"):
         ratios = [other / own for other, own in zip(times[name], times["captured"], strict=True)]
         figures[f"captured_over_{name}"] = statistics.median(ratios)

@@ -60,7 +60,12 @@ TASKS: dict[str, tuple[str, ...]] = {
     "arm_push": ("task=arm_push",),
     "arm_clutter": ("task=arm_push", *CLUTTER),
 }
-QUIET = ("logger=none", "trainer.eval_episodes=0", "trainer.video=false", "trainer.checkpoint_interval=0")
+QUIET = (
+    "logger=none",
+    "trainer.eval_episodes=0",
+    "trainer.video=false",
+    "trainer.checkpoint_interval=0",
+)
 FIRST_LOOKS, LATER_LOOKS = (1, 2, 3, 5), 10
 MOST_NAMES = 40
 """Names that are printed of one iteration."""
@@ -88,12 +93,16 @@ class Bits:
     def read(self) -> None:
         """Bring the hashes to the host."""
         for look in self.looks.values():
-            look.update({path: value.item() for path, value in look.items() if isinstance(value, Tensor)})
+            look.update(
+                {path: value.item() for path, value in look.items() if isinstance(value, Tensor)}
+            )
 
     @property
     def digest(self) -> str:
         """One hash of all that was the same in each run if equal runs are equal."""
-        counted = {at: {k: v for k, v in look.items() if counts(k)} for at, look in self.looks.items()}
+        counted = {
+            at: {k: v for k, v in look.items() if counts(k)} for at, look in self.looks.items()
+        }
         return hashlib.sha256(json.dumps(counted, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -132,7 +141,9 @@ def state_of(trainer: Trainer) -> dict[str, Any]:
     world = _world(trainer)
     if world is not None:
         # What only MuJoCo Warp's own solver writes is memory that nobody has set.
-        names = [name for name in views.arrays(world.warp_data_E) if not name.startswith("efc.jtdaj")]
+        names = [
+            name for name in views.arrays(world.warp_data_E) if not name.startswith("efc.jtdaj")
+        ]
         state["world"] = {name: world.last_substep(name) for name in names}
     return state
 
@@ -188,7 +199,9 @@ def differing(runs: Sequence[Bits]) -> dict[int, list[str]]:
         found[iteration] = [
             path
             for path in paths
-            if any(path not in look or run.looks[iteration].get(path) != look[path] for run in others)
+            if any(
+                path not in look or run.looks[iteration].get(path) != look[path] for run in others
+            )
         ]
     return found
 
@@ -199,7 +212,9 @@ def explain(found: Mapping[int, Sequence[str]]) -> list[str]:
     for iteration, paths in found.items():
         counted, pool = [p for p in paths if counts(p)], [p for p in paths if not counts(p)]
         if pool:
-            lines.append(f"after iteration {iteration}, in the order of the pool: {_names(pool, most=6)}")
+            lines.append(
+                f"after iteration {iteration}, in the order of the pool: {_names(pool, most=6)}"
+            )
         if counted:
             lines.append(
                 f"after iteration {iteration}, {len(counted)} differ: {_names(counted, most=MOST_NAMES)}"
@@ -210,7 +225,9 @@ def explain(found: Mapping[int, Sequence[str]]) -> list[str]:
     return lines
 
 
-def compare(cfg: RunCfg, *, runs: int, iterations: int) -> tuple[dict[str, float], list[str], list[str]]:
+def compare(
+    cfg: RunCfg, *, runs: int, iterations: int
+) -> tuple[dict[str, float], list[str], list[str]]:
     """Train equal runs; return the figures of their end, the hash of each, and lines that say what differs."""
     bits = []
     for _ in range(runs):
@@ -236,7 +253,9 @@ def main() -> int:
     runs = command_line.whole_number("runs", own["runs"], least=2)
     iterations = command_line.whole_number("iterations", own["iterations"])
     wanted = list(TASKS) if own["tasks"] == "all" else own["tasks"].split(",")
-    switched = own["switch"].split(",") if own["switch"] else [task for task in wanted if task == SWITCHED]
+    switched = (
+        own["switch"].split(",") if own["switch"] else [task for task in wanted if task == SWITCHED]
+    )
     for task in wanted:
         check_choice("tasks", task, TASKS)
     for task in switched:

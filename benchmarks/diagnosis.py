@@ -83,7 +83,11 @@ HEALTHY: dict[str, tuple[str, ...]] = {
     ),
     "cartpole_swingup_shared_trunk": ("task=cartpole_swingup", "modules=shared_trunk", *PPO),
     "cartpole_swingup_tanh": (*SWING_UP, "modules.actor.distribution=tanh_gaussian"),
-    "cartpole_swingup_relu": (*SWING_UP, "modules.actor.activation=relu", "modules.critic.activation=relu"),
+    "cartpole_swingup_relu": (
+        *SWING_UP,
+        "modules.actor.activation=relu",
+        "modules.critic.activation=relu",
+    ),
     **{
         f"pendulum_swingup_ppo_{seed}": ("task=pendulum_swingup", *PPO, *NETWORKS, f"seed={seed}")
         for seed in (1, 2)
@@ -189,7 +193,11 @@ FAULTS: dict[str, tuple[tuple[str, ...], tuple[Hook, ...], Sabotage | None]] = {
         (),
         None,
     ),
-    "episodes_end_at_once": ((*QUADRUPED, "task.terminations.fell_over.limit_angle=0.02"), (), None),
+    "episodes_end_at_once": (
+        (*QUADRUPED, "task.terminations.fell_over.limit_angle=0.02"),
+        (),
+        None,
+    ),
     "penalty_outweighs": ((*QUADRUPED, "task.rewards.action_rate_l2.weight=-10.0"), (), None),
     "saturated_actions": ((*SWING_UP, "modules.actor.init_std=50.0"), (), None),
     "dead_units": (
@@ -224,7 +232,9 @@ def _last(text: str) -> str:
     return next((word for word in reversed(text.split()) if word != "-"), "-")
 
 
-def train(overrides: tuple[str, ...], hooks: tuple[Hook, ...], sabotage: Sabotage | None) -> dict[str, Any]:
+def train(
+    overrides: tuple[str, ...], hooks: tuple[Hook, ...], sabotage: Sabotage | None
+) -> dict[str, Any]:
     """Train a run, and return the parts of its config and the metrics that a diagnosis reads."""
     cfg = command_line.compose([*overrides, *LOCAL])
     with tempfile.TemporaryDirectory() as folder:
@@ -243,7 +253,8 @@ def kept_metrics(rows: list[dict[str, str]]) -> dict[str, str]:
     rows = thinned(rows, KEPT_ROWS)
     names = [name for name in rows[-1] if name.startswith(KEPT)]
     return {
-        name: " ".join(f"{float(row[name]):.4g}" if row.get(name) else "-" for row in rows) for name in names
+        name: " ".join(f"{float(row[name]):.4g}" if row.get(name) else "-" for row in rows)
+        for name in names
     }
 
 

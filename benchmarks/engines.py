@@ -78,7 +78,13 @@ def main() -> None:
     """Measure each number of envs, print the tables, and write the figures."""
     options, overrides = command_line.split(sys.argv[1:], {"num_envs": "64,512,4096"})
     for num_envs in command_line.whole_numbers("num_envs", options["num_envs"]):
-        words = [*overrides, f"num_envs={num_envs}", "device=cpu", "logger=none", "trainer.eval_episodes=0"]
+        words = [
+            *overrides,
+            f"num_envs={num_envs}",
+            "device=cpu",
+            "logger=none",
+            "trainer.eval_episodes=0",
+        ]
         cfg = command_line.compose(words)
         figures = measure(cfg)
         Console().print(table(cfg, figures))
@@ -129,7 +135,9 @@ def _by_turns(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, Ti
             wall[name].append(1000.0 * (time.perf_counter() - began))
             processor[name].append(1000.0 * (time.process_time() - used))
     return {
-        name: Times(wall_ms=statistics.median(wall[name]), processor_ms=statistics.median(processor[name]))
+        name: Times(
+            wall_ms=statistics.median(wall[name]), processor_ms=statistics.median(processor[name])
+        )
         for name in calls
     }
 

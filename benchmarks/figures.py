@@ -20,7 +20,13 @@ from benchmarks.faults.rows import ROWS
 
 ROOT = Path(__file__).parents[1]
 STEP = ("ksim_rl/physics", "ksim_rl/envs", "ksim_rl/scene", "ksim_rl/mdp", "ksim_rl/device")
-LEARN = ("ksim_rl/algorithms", "ksim_rl/objectives", "ksim_rl/modules", "ksim_rl/data", "ksim_rl/collectors")
+LEARN = (
+    "ksim_rl/algorithms",
+    "ksim_rl/objectives",
+    "ksim_rl/modules",
+    "ksim_rl/data",
+    "ksim_rl/collectors",
+)
 TASK = ("ksim_rl/tasks", "ksim_rl/trainers/trainer.py")
 # What each benchmark measures; a result takes the longest name that it begins with.
 MEASURED: dict[str, tuple[str, ...]] = {
@@ -103,7 +109,9 @@ def old(results: Path, root: Path = ROOT) -> Iterator[Old]:
             else:
                 because = _changed_since(run["commit"], (*files, *_own(path.stem, root)), root)
             if because:
-                yield Old(where, run["commit"], RENEWED_BY.get(path.stem) or run["command"], because)
+                yield Old(
+                    where, run["commit"], RENEWED_BY.get(path.stem) or run["command"], because
+                )
 
 
 def measured(name: str, group: str = "") -> tuple[str, ...]:
@@ -130,7 +138,11 @@ def _runs(name: str, saved: Mapping) -> dict[str, Mapping]:
 
 
 def _own(name: str, root: Path) -> list[str]:
-    return [str(path.relative_to(root)) for path in (root / "benchmarks" / f"{name}.py",) if path.exists()]
+    return [
+        str(path.relative_to(root))
+        for path in (root / "benchmarks" / f"{name}.py",)
+        if path.exists()
+    ]
 
 
 def _changed_since(commit: str, files: tuple[str, ...], root: Path) -> str:

@@ -33,11 +33,18 @@ print(time.monotonic())
 def first_iteration_s(overrides: list[str], cache: str) -> float:
     """Return the seconds that a new process takes for one iteration, with its caches in the folder `cache`."""
     environment = os.environ | {"WARP_CACHE_PATH": cache, "TRITON_CACHE_DIR": f"{cache}/triton"}
-    environment |= {"TORCHINDUCTOR_CACHE_DIR": f"{cache}/inductor", "CUDA_CACHE_PATH": f"{cache}/driver"}
+    environment |= {
+        "TORCHINDUCTOR_CACHE_DIR": f"{cache}/inductor",
+        "CUDA_CACHE_PATH": f"{cache}/driver",
+    }
     environment |= {"PYTHONPYCACHEPREFIX": f"{cache}/bytecode", "PYTHONDONTWRITEBYTECODE": ""}
     command, began = [sys.executable, "-c", _CHILD, *overrides], time.monotonic()
-    said = subprocess.run(command, check=True, env=environment, stdout=subprocess.PIPE, text=True).stdout
-    return float(said.split()[-1]) - began  # the clock of the machine: an exit frees memory for a while
+    said = subprocess.run(
+        command, check=True, env=environment, stdout=subprocess.PIPE, text=True
+    ).stdout
+    return (
+        float(said.split()[-1]) - began
+    )  # the clock of the machine: an exit frees memory for a while
 
 
 def main() -> None:

@@ -12,7 +12,12 @@ import torch
 from torch.profiler import ProfilerActivity, profile, record_function
 
 # Calls that wait for all work of a stream or the device. An event is waited for only where a copy is read.
-SYNCS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cuStreamSynchronize", "cuCtxSynchronize")
+SYNCS = (
+    "cudaStreamSynchronize",
+    "cudaDeviceSynchronize",
+    "cuStreamSynchronize",
+    "cuCtxSynchronize",
+)
 BLOCKING_COPIES = ("cudaMemcpy", "cuMemcpyDtoH_v2")
 
 WORK = "work"
@@ -23,7 +28,10 @@ Event = dict[str, Any]
 def cuda_events(work: Callable[[], object]) -> list[Event]:
     """Run `work` under the profiler and return its events, as a Chrome trace has them."""
     torch.cuda.synchronize()
-    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as recorded, record_function(WORK):
+    with (
+        profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as recorded,
+        record_function(WORK),
+    ):
         work()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "trace.json"
@@ -35,7 +43,9 @@ def host_traffic(work: Callable[[], object]) -> dict[str, int]:
     """Return how often `work` waits for the device, and how many copies it takes to the host."""
     events = cuda_events(work)
     work_event = next(
-        event for event in events if event.get("name") == WORK and event.get("cat") == "user_annotation"
+        event
+        for event in events
+        if event.get("name") == WORK and event.get("cat") == "user_annotation"
     )
     end = work_event["ts"] + work_event["dur"]
     # Leaving the profiler waits for the device as well, after the end.

@@ -60,7 +60,10 @@ def main() -> int:
     print(f"largest error {largest:.2%}, delay off by {delay_error_ms:.3f} ms, seed {options.seed}")
     path = report.write(
         "identification",
-        figures={"hidden_robot/largest_error": largest, "hidden_robot/delay_error_ms": delay_error_ms},
+        figures={
+            "hidden_robot/largest_error": largest,
+            "hidden_robot/delay_error_ms": delay_error_ms,
+        },
         device=torch.device("cpu"),
         module="benchmarks.identification",
         robot=options.robot,
@@ -79,7 +82,9 @@ def hide_and_find(
     log = folder / "log.csv"
     found = folder / "found.json"
     targets = "pos,vel,effort"
-    identify(["--propose", robot, "--targets", targets, "--seconds", str(seconds), "--output", str(plan)])
+    identify(
+        ["--propose", robot, "--targets", targets, "--seconds", str(seconds), "--output", str(plan)]
+    )
     hidden = HiddenRobot(robot, seed)
     log.write_text(hidden.follow(plan.read_text().splitlines()))
     identify([str(log), "--robot", robot, "--output", str(found)])
@@ -165,7 +170,9 @@ class HiddenRobot:
         lines += [",".join(f"{value:.9g}" for value in row) for row in rows]
         return "\n".join(lines) + "\n"
 
-    def _run(self, time_T: np.ndarray, control_TN: np.ndarray, starts: Sequence[float]) -> np.ndarray:
+    def _run(
+        self, time_T: np.ndarray, control_TN: np.ndarray, starts: Sequence[float]
+    ) -> np.ndarray:
         model = self._model
         data = mujoco.MjData(model)
         names = list(self.truth["joints"])
@@ -197,7 +204,11 @@ def _gains(robot: Any, model: mujoco.MjModel) -> dict[str, tuple[float, float, f
         name = model.joint(model.actuator_trnid[actuator, 0]).name
         if name not in found:
             control = joint_control(model, actuator)
-            found[name] = (control.stiffness, control.damping, float(model.actuator_forcerange[actuator, 1]))
+            found[name] = (
+                control.stiffness,
+                control.damping,
+                float(model.actuator_forcerange[actuator, 1]),
+            )
     return found
 
 

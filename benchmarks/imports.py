@@ -38,7 +38,9 @@ print(time.process_time() - began)
 def import_s(room: str, first: str) -> float:
     """Return the seconds of the processor for one import in a new process, once `first` has run there."""
     program = _CHILD.format(room=room, first=first)
-    done = subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], check=True, stdout=subprocess.PIPE, text=True
+    )
     return float(done.stdout.split()[-1])
 
 
@@ -55,7 +57,9 @@ def main() -> None:
         median = statistics.median(seconds)
         figures[f"cpu/{name}_s"] = round(median, 2)
         print(f"{name} {median:.2f} s")
-    path = report.write("imports", figures=figures, device=torch.device("cpu"), module="benchmarks.imports")
+    path = report.write(
+        "imports", figures=figures, device=torch.device("cpu"), module="benchmarks.imports"
+    )
     print(f"written to {path}")
 
 

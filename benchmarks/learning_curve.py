@@ -74,7 +74,9 @@ def chosen_seeds(own: dict[str, str], overrides: list[str]) -> list[int]:
     return command_line.whole_numbers("seeds", own["seeds"], least=0)
 
 
-def train_and_keep(seeds: list[int], *, cfg: RunCfg, overrides: list[str]) -> dict[int, list[Point]]:
+def train_and_keep(
+    seeds: list[int], *, cfg: RunCfg, overrides: list[str]
+) -> dict[int, list[Point]]:
     """Train all seeds, keep the curve of each when it is done, print, write and draw all; return the curves.
 
     Without the seeds that failed, and without any medians if there are such.
@@ -90,7 +92,10 @@ def train_and_keep(seeds: list[int], *, cfg: RunCfg, overrides: list[str]) -> di
             figures=figures,
             device=device,
             module="benchmarks.learning_curve",
-            curves={f"{label}/seed_{seed}": thinned(points, KEPT_POINTS) for seed, points in curves.items()},
+            curves={
+                f"{label}/seed_{seed}": thinned(points, KEPT_POINTS)
+                for seed, points in curves.items()
+            },
         )
 
     for seed, points in train_all(seeds):
@@ -103,14 +108,22 @@ def train_and_keep(seeds: list[int], *, cfg: RunCfg, overrides: list[str]) -> di
     short = _short_names(figures) if figures and device.type == "cuda" else {}
     path = write({f"{label}/{figure}": value for figure, value in figures.items()} | short)
     learner = ", ".join(others) or "ppo"
-    draw(curves, path.with_suffix(".png"), task_name=cfg.task_name, learner=learner, num_envs=cfg.num_envs)
+    draw(
+        curves,
+        path.with_suffix(".png"),
+        task_name=cfg.task_name,
+        learner=learner,
+        num_envs=cfg.num_envs,
+    )
     print(f"written to {path}")
     return curves
 
 
 def other_choices(overrides: list[str]) -> list[str]:
     """Return the objective and the modules that are chosen, without the usual ones, PPO and MLPs."""
-    chosen = dict(word.split("=", 1) for word in overrides if word.startswith(("objective=", "modules=")))
+    chosen = dict(
+        word.split("=", 1) for word in overrides if word.startswith(("objective=", "modules="))
+    )
     return [choice for choice in chosen.values() if choice not in ("ppo", "mlp")]
 
 
@@ -121,7 +134,9 @@ def train_one(cfg: RunCfg) -> list[Point]:
         _, rows = read_table(Path(folder) / "metrics.csv")
     ended = [row for row in rows if row.get("episode/return")]
     if not ended:
-        raise ValueError(f"no episode ended within {cfg.trainer.num_iterations} iterations: raise env_states")
+        raise ValueError(
+            f"no episode ended within {cfg.trainer.num_iterations} iterations: raise env_states"
+        )
     wanted = [name for name in ended[0] if name in KEPT or name.startswith("reward/")]
     return [{name: float(row[name]) for name in wanted if row.get(name)} for row in ended]
 
@@ -130,8 +145,14 @@ def summary(curves: list[list[Point]]) -> dict[str, float]:
     """Return the medians over the seeds at the end of their curves, and the seconds that took."""
     ends = []
     for points in curves:
-        last = [point for point in points if point["env_states"] > points[-1]["env_states"] - AVERAGED_STATES]
-        ends.append({name: statistics.fmean(point.get(name, 0.0) for point in last) for name in last[-1]})
+        last = [
+            point
+            for point in points
+            if point["env_states"] > points[-1]["env_states"] - AVERAGED_STATES
+        ]
+        ends.append(
+            {name: statistics.fmean(point.get(name, 0.0) for point in last) for name in last[-1]}
+        )
         ends[-1] |= {name: points[-1][name] for name in ("env_states", "seconds")}
     return {
         name.removeprefix("reward/"): round(statistics.median(end[name] for end in ends), 4)
@@ -164,13 +185,23 @@ def train_all(seeds: list[int]) -> Iterator[tuple[int, list[Point]]]:
             ]
             for process, seed in running:
                 if process.wait():
-                    print(f"the run of seed {seed} ended with exit code {process.returncode}", flush=True)
+                    print(
+                        f"the run of seed {seed} ended with exit code {process.returncode}",
+                        flush=True,
+                    )
                 else:
                     yield seed, json.loads((Path(folder) / f"{seed}.json").read_text())
 
 
 def _start(words: list[str], seed: int, points: Path, gpu: int) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "benchmarks.learning_curve", *words, f"seed={seed}", f"points={points}"]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.learning_curve",
+        *words,
+        f"seed={seed}",
+        f"points={points}",
+    ]
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     own = visible.split(",")[gpu] if visible else str(gpu)
     return subprocess.Popen(command, env=os.environ | {"CUDA_VISIBLE_DEVICES": own})

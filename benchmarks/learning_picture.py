@@ -31,7 +31,12 @@ _PEER_COLOR = "#cc5500"
 
 
 def draw(
-    curves: dict[int, list[dict[str, float]]], picture: Path, *, task_name: str, learner: str, num_envs: int
+    curves: dict[int, list[dict[str, float]]],
+    picture: Path,
+    *,
+    task_name: str,
+    learner: str,
+    num_envs: int,
 ) -> None:
     """Draw each panel over env states, and over seconds below it; `learner` is for the title."""
     rows = next(iter(curves.values()))
@@ -45,7 +50,9 @@ def draw(
             axes = figure.add_subplot(2, len(present), line * len(present) + column + 1)
             for (seed, points), color in zip(curves.items(), _COLORS * len(curves), strict=False):
                 pairs = [(point[step], point[name]) for point in points if name in point]
-                axes.plot(*zip(*pairs, strict=True), color=color, linewidth=1.4, label=f"seed {seed}")
+                axes.plot(
+                    *zip(*pairs, strict=True), color=color, linewidth=1.4, label=f"seed {seed}"
+                )
             finish_panel(axes, name, task_name=task_name, step=step)
             axes.set_xlabel(label, fontsize=9)
             if column == 1 and line == 0:

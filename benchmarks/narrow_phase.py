@@ -49,12 +49,20 @@ FAR, HALVINGS = 1.0, 30
 
 def main() -> None:
     """Compare, print the table, and write the figures."""
-    defaults = {"worlds": "256", "depth": "0.005", "margin": "1e-6", "poses": "any", "device": "cpu"}
+    defaults = {
+        "worlds": "256",
+        "depth": "0.005",
+        "margin": "1e-6",
+        "poses": "any",
+        "device": "cpu",
+    }
     given = command_line.options(sys.argv[1:], defaults)
     check_choice("poses", given["poses"], ("any", "upright"))
     worlds = command_line.whole_number("worlds", given["worlds"])
     device = checked_device(given["device"])
-    conditions = f"{given['poses']} poses, up to {given['depth']} m deep, margin {given['margin']} m"
+    conditions = (
+        f"{given['poses']} poses, up to {given['depth']} m deep, margin {given['margin']} m"
+    )
     table = Table(title=f"{worlds} worlds, {conditions}")
     label = f"{report.device_label(device)}/{given['poses']}/margin_{given['margin']}"
     columns = ("pair", "as many contacts", "depth within, mm", "normal within, degrees")
@@ -63,18 +71,28 @@ def main() -> None:
     figures: dict[str, float] = {}
     for pair in PAIRS:
         mj_model = model(*pair, margin=float(given["margin"]))
-        pose_EL = touching(mj_model, worlds, depth=float(given["depth"]), upright=given["poses"] == "upright")
+        pose_EL = touching(
+            mj_model, worlds, depth=float(given["depth"]), upright=given["poses"] == "upright"
+        )
         found = compared(mj_model, pose_EL, device)
         table.add_row("-".join(pair), *(f"{value:.3g}" for value in found.values()))
-        figures |= {f"{label}/{'-'.join(pair)}/{name}": round(value, 6) for name, value in found.items()}
+        figures |= {
+            f"{label}/{'-'.join(pair)}/{name}": round(value, 6) for name, value in found.items()
+        }
     Console().print(table)
-    path = report.write("narrow_phase", figures=figures, device=device, module="benchmarks.narrow_phase")
+    path = report.write(
+        "narrow_phase", figures=figures, device=device, module="benchmarks.narrow_phase"
+    )
     print(f"written to {path}")
 
 
 def model(one: str, other: str, *, margin: float) -> mujoco.MjModel:
     """Return two geoms, of which the second is free, and the first if it is no ground."""
-    first = f"<geom {GROUNDS[one]}/>" if one in GROUNDS else f"<body><freejoint/><geom {SHAPES[one]}/></body>"
+    first = (
+        f"<geom {GROUNDS[one]}/>"
+        if one in GROUNDS
+        else f"<body><freejoint/><geom {SHAPES[one]}/></body>"
+    )
     xml = f"""<mujoco><option gravity="0 0 0"/>{ASSETS}<worldbody>{first}
     <body><freejoint/><geom {SHAPES[other]} margin="{margin}"/></body></worldbody></mujoco>"""
     spec = mujoco.MjSpec.from_string(xml)
@@ -112,14 +130,18 @@ def touching(mj_model: mujoco.MjModel, worlds: int, *, depth: float, upright: bo
     return torch.tensor(poses, dtype=torch.float32)
 
 
-def compared(mj_model: mujoco.MjModel, pose_EL: torch.Tensor, device: torch.device) -> dict[str, float]:
+def compared(
+    mj_model: mujoco.MjModel, pose_EL: torch.Tensor, device: torch.device
+) -> dict[str, float]:
     """Return the share of worlds with as many contacts as in C, and errors of the deepest contact in 99 of 100."""
     sim = SimCfg(njmax=400, nconmax=60, one_kernel_dynamics=True)
     world = WarpWorld(mj_model, num_envs=len(pose_EL), device=device, sim=sim)
     world.qpos_EL.copy_(pose_EL)
     world.step()
     contact, count = world.warp_data_E.contact, int(world.warp_data_E.nacon.numpy()[0])
-    owner, dist, frame = (getattr(contact, name).numpy()[:count] for name in ("worldid", "dist", "frame"))
+    owner, dist, frame = (
+        getattr(contact, name).numpy()[:count] for name in ("worldid", "dist", "frame")
+    )
     mj_data, as_many, depths, angles = mujoco.MjData(mj_model), 0, [], []
     for row, qpos in enumerate(pose_EL.double().numpy()):
         mj_data.qpos[:] = qpos

@@ -78,7 +78,8 @@ def main() -> None:
         raise ValueError(f"seeds={own['seeds']}: expected two or more, for their deviation")
     cfgs = {
         num_envs: [
-            command_line.compose([*overrides, f"num_envs={num_envs}", f"seed={seed}"]) for seed in seeds
+            command_line.compose([*overrides, f"num_envs={num_envs}", f"seed={seed}"])
+            for seed in seeds
         ]
         for num_envs in command_line.whole_numbers("num_envs", own["num_envs"])
     }
@@ -86,9 +87,12 @@ def main() -> None:
     at_once = command_line.whole_number("at_once", own["at_once"])
     with ProcessPoolExecutor(at_once, multiprocessing.get_context("spawn")) as pool:
         begun = {
-            num_envs: [pool.submit(learning_curve, cfg) for cfg in found] for num_envs, found in cfgs.items()
+            num_envs: [pool.submit(learning_curve, cfg) for cfg in found]
+            for num_envs, found in cfgs.items()
         }
-        curves = {num_envs: [future.result() for future in found] for num_envs, found in begun.items()}
+        curves = {
+            num_envs: [future.result() for future in found] for num_envs, found in begun.items()
+        }
     cfg = next(iter(cfgs.values()))[0]
     scores = {num_envs: [score(curve) for curve in found] for num_envs, found in curves.items()}
     figures = compare(scores)
@@ -100,7 +104,10 @@ def main() -> None:
         figures={f"{label}/{name}": value for name, value in figures.items()},
         device=device,
         module="benchmarks.num_envs",
-        scores={str(num_envs): [round(value, 3) for value in found] for num_envs, found in scores.items()},
+        scores={
+            str(num_envs): [round(value, 3) for value in found]
+            for num_envs, found in scores.items()
+        },
     )
     draw(curves, path.with_suffix(".png"), title=_title(cfg, len(seeds), figures))
     print(f"written to {path}")

@@ -33,7 +33,10 @@ WARMUP, REPEATS = 4, 20
 
 def main() -> None:
     """Time the update with and without the compiler, print the figures, and write them."""
-    defaults = {"device": "cuda" if torch.cuda.is_available() else "cpu", "task": "g1_velocity_flat"}
+    defaults = {
+        "device": "cuda" if torch.cuda.is_available() else "cpu",
+        "task": "g1_velocity_flat",
+    }
     given = command_line.options(sys.argv[1:], defaults)
     device, task = checked_device(given["device"]), given["task"]
     cfg: Any = conf.compose([f"task={task}", "objective=fast_sac", f"device={device.type}"])
@@ -50,7 +53,9 @@ def main() -> None:
     print(f"written to {path}")
 
 
-def compare(cfg: RunCfg, env: EnvBase, *, device: torch.device, repeats: int = REPEATS) -> dict[str, float]:
+def compare(
+    cfg: RunCfg, env: EnvBase, *, device: torch.device, repeats: int = REPEATS
+) -> dict[str, float]:
     """Return milliseconds and kernels of a gradient step, with the compiler and without."""
     figures, objective = {}, cfg.objective
     for compiled, time, kernels in (
@@ -58,17 +63,23 @@ def compare(cfg: RunCfg, env: EnvBase, *, device: torch.device, repeats: int = R
         (False, "eager_ms", "eager_kernels"),
     ):
         torch.manual_seed(0)
-        update = make_off_policy_update(replace(cfg, objective=replace(objective, compile=compiled)), env)
+        update = make_off_policy_update(
+            replace(cfg, objective=replace(objective, compile=compiled)), env
+        )
         rollout_ET = make_rollout(cfg, env, device=device)
         steps = update.data.num_minibatches
         for _ in range(WARMUP):
             update(rollout_ET)
-        figures[time] = milliseconds(partial(update, rollout_ET), repeats=repeats, device=device) / steps
+        figures[time] = (
+            milliseconds(partial(update, rollout_ET), repeats=repeats, device=device) / steps
+        )
         if device.type == "cuda":
             with profile(activities=[ProfilerActivity.CUDA]) as recorded:
                 update(rollout_ET)
                 torch.cuda.synchronize()
-            figures[kernels] = round(sum(event.count for event in recorded.key_averages()) / steps, 1)
+            figures[kernels] = round(
+                sum(event.count for event in recorded.key_averages()) / steps, 1
+            )
     return figures
 
 

@@ -72,7 +72,12 @@ def main() -> None:
             keep(f"end/{name}", flags)
         # Before a reset clears them.
         clocks = env.scene[FEET]._air_time_state
-        for name in ("current_air_time", "last_air_time", "current_contact_time", "last_contact_time"):
+        for name in (
+            "current_air_time",
+            "last_air_time",
+            "current_contact_time",
+            "last_contact_time",
+        ):
             keep(f"clock/{name}", getattr(clocks, name))
         return total
 
@@ -110,7 +115,9 @@ def main() -> None:
 
 def _terms(env: ManagerBasedRlEnv, group: str) -> Any:
     manager = env.observation_manager
-    return zip(manager._group_obs_term_names[group], manager._group_obs_term_cfgs[group], strict=True)
+    return zip(
+        manager._group_obs_term_names[group], manager._group_obs_term_cfgs[group], strict=True
+    )
 
 
 def _names(model: mujoco.MjModel) -> dict[str, np.ndarray]:
@@ -121,7 +128,9 @@ def _names(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
     return {
         "names/joint": plain([model.joint(i).name for i in range(model.njnt)]),
-        "names/actuator": plain([model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)]),
+        "names/actuator": plain(
+            [model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)]
+        ),
         "names/geom": plain([model.geom(i).name for i in range(model.ngeom)]),
         "names/body": plain([model.body(i).name for i in range(model.nbody)]),
     }

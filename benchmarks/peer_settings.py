@@ -71,10 +71,19 @@ VARIANTS = {
     "discount": Variant(label="discount 0.99", overrides=DISCOUNT),
     "initialization": Variant(label="torch's initialization", torch_initialization=True),
     "float32": Variant(label="float32, no TF32", overrides=FLOAT32),
-    "all": Variant(label="all three, no TF32", overrides=(*DISCOUNT, *FLOAT32), torch_initialization=True),
-    "all_tf32": Variant(label="all three, TF32", overrides=(*DISCOUNT, *TF32), torch_initialization=True),
+    "all": Variant(
+        label="all three, no TF32", overrides=(*DISCOUNT, *FLOAT32), torch_initialization=True
+    ),
+    "all_tf32": Variant(
+        label="all three, TF32", overrides=(*DISCOUNT, *TF32), torch_initialization=True
+    ),
 }
-OWN_OPTIONS = {"seeds": "1,2,3", "env_states": "40e6", "variants": ",".join(VARIANTS), "at_once": "1"}
+OWN_OPTIONS = {
+    "seeds": "1,2,3",
+    "env_states": "40e6",
+    "variants": ",".join(VARIANTS),
+    "at_once": "1",
+}
 _COLORS = ("#3465a4", "#4e9a06", "#75507b", "#c4a000", "#a40000", "#888a85")
 
 
@@ -83,19 +92,28 @@ def main() -> None:
     own, overrides = command_line.split(sys.argv[1:], OWN_OPTIONS)
     seeds = learning_curve.chosen_seeds(own, overrides)
     names = own["variants"].split(",")
-    cfgs = {name: [run_cfg(name, seed, overrides, own["env_states"]) for seed in seeds] for name in names}
+    cfgs = {
+        name: [run_cfg(name, seed, overrides, own["env_states"]) for seed in seeds]
+        for name in names
+    }
     at_once = command_line.whole_number("at_once", own["at_once"])
     spawn = multiprocessing.get_context("spawn")
     runs: dict[str, dict[int, Run]] = {}
     with ProcessPoolExecutor(at_once, spawn, max_tasks_per_child=1) as pool:
-        begun = {name: [pool.submit(train, name, cfg) for cfg in found] for name, found in cfgs.items()}
+        begun = {
+            name: [pool.submit(train, name, cfg) for cfg in found] for name, found in cfgs.items()
+        }
         for name, futures in begun.items():
             runs[name] = dict(zip(seeds, (future.result() for future in futures), strict=True))
             # What is done stays, should a later run fail.
             path = write(cfgs[name][0], {name: runs[name]}, at_once=at_once)
     Console(width=160).print(_table(runs))
     cfg = cfgs[names[0]][0]
-    draw(runs, path.with_suffix(".png"), title=f"{TASK}, PPO: {cfg.num_envs} envs, {len(seeds)} seeds")
+    draw(
+        runs,
+        path.with_suffix(".png"),
+        title=f"{TASK}, PPO: {cfg.num_envs} envs, {len(seeds)} seeds",
+    )
     print(f"written to {path}")
 
 
@@ -122,7 +140,11 @@ class Run:
         """The end of the first window in which the levels hold, None where there is none, and the last window."""
         end = reached(self.points, LEVELS)
         last = self.points[-1]
-        held = [point for point in self.points if point["env_states"] >= last["env_states"] - HELD_STATES]
+        held = [
+            point
+            for point in self.points
+            if point["env_states"] >= last["env_states"] - HELD_STATES
+        ]
         return {
             "env_states_to_levels": None if end is None else end["env_states"],
             "seconds_to_levels": None if end is None else round(end["seconds"], 2),
@@ -224,7 +246,9 @@ def train(name: str, cfg: RunCfg) -> Run:
     trainer.train()
     trainer.collector.env.close(raise_if_closed=False)
     if not any(set(LEVELS) <= set(point) for point in rows.points):
-        raise ValueError(f"no episode ended within {cfg.trainer.num_iterations} iterations: raise env_states")
+        raise ValueError(
+            f"no episode ended within {cfg.trainer.num_iterations} iterations: raise env_states"
+        )
     # What the process really did, as the config says no more than what was asked for.
     facts = {
         **first.facts,
@@ -250,7 +274,9 @@ def write(cfg: RunCfg, runs: Mapping[str, Mapping[int, Run]], *, at_once: int) -
         for reward in LEVELS:
             values = [one["means"][reward] for one in found if reward in one["means"]]
             short = reward.removeprefix("reward/")
-            figures |= {f"{label}/{name}/{short}": round(statistics.median(values), 4)} if values else {}
+            figures |= (
+                {f"{label}/{name}/{short}": round(statistics.median(values), 4)} if values else {}
+            )
     return report.write(
         "peer_settings",
         figures=figures,
@@ -308,7 +334,9 @@ def draw(runs: Mapping[str, Mapping[int, Run]], picture: Path, *, title: str) ->
         for (name, of_seeds), color in zip(runs.items(), _COLORS, strict=False):
             curves = [held_means(run.points) for run in of_seeds.values()]
             for curve in curves:
-                axes.plot(*_columns(median_curve([curve], reward)), color=color, linewidth=0.6, alpha=0.35)
+                axes.plot(
+                    *_columns(median_curve([curve], reward)), color=color, linewidth=0.6, alpha=0.35
+                )
             line = _columns(median_curve(curves, reward))
             axes.plot(*line, color=color, linewidth=1.8, label=VARIANTS[name].label)
         finish_panel(axes, reward, task_name=TASK)
@@ -326,13 +354,21 @@ def _table(runs: Mapping[str, Mapping[int, Run]]) -> Table:
     table = Table(
         title=f"{TASK}: {' and '.join(f'{level:.2f}' for level in LEVELS.values())}, median of seeds"
     )
-    for column in ("settings", "seeds at the levels", "env states to them", "seconds", "rewards at the end"):
+    for column in (
+        "settings",
+        "seeds at the levels",
+        "env states to them",
+        "seconds",
+        "rewards at the end",
+    ):
         table.add_column(column, justify="left" if column == "settings" else "right")
     for name, own in runs.items():
         found = [run.found for run in own.values()]
         at_levels = sum(one["env_states_to_levels"] is not None for one in found)
         medians = [median_of(found, f"{unit}_to_levels") for unit in ("env_states", "seconds")]
-        ends = [statistics.median(one["means"].get(reward, 0.0) for one in found) for reward in LEVELS]
+        ends = [
+            statistics.median(one["means"].get(reward, 0.0) for one in found) for reward in LEVELS
+        ]
         cells = ["–" if value is None else f"{value:,.4g}" for value in medians]
         rewards = " and ".join(f"{end:.2f}" for end in ends)
         table.add_row(VARIANTS[name].label, f"{at_levels} of {len(found)}", *cells, rewards)

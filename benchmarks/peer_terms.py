@@ -68,7 +68,15 @@ def recorded(python: str, task: str, *, num_envs: int, steps: int) -> Record:
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "run.npz"
         # Not by its path: the modules beside it would stand in front of the standard library's.
-        words = [python, "-c", PROGRAM.read_text(), TASKS[task], str(num_envs), str(steps), str(output)]
+        words = [
+            python,
+            "-c",
+            PROGRAM.read_text(),
+            TASKS[task],
+            str(num_envs),
+            str(steps),
+            str(output),
+        ]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
         with np.load(output) as file:
             return dict(file)
@@ -100,7 +108,9 @@ class Replay:
             names = list(record[f"names/{kind}"])
             own = env.view.resolver.names(kind)
             shared = [name for name in own if name in names]
-            values = torch.from_numpy(record[f"field/{field}"])[:, [names.index(name) for name in shared]]
+            values = torch.from_numpy(record[f"field/{field}"])[
+                :, [names.index(name) for name in shared]
+            ]
             env.world.field(field)[:, [own.index(name) for name in shared]] = values
         env.world.set_const(["body_ipos", "geom_friction"])
         joints = [model.joint(int(i)).name for i in scalar_joint_ids(model)]

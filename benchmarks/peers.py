@@ -80,13 +80,17 @@ def peer_rate(
     environment["CUDA_VISIBLE_DEVICES"] = gpu
     with tempfile.TemporaryDirectory() as folder:
         words = [TASKS[task_name], str(num_envs), str(iterations), folder]
-        subprocess.run([python, "-c", _PEER, *words], check=True, env=environment, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [python, "-c", _PEER, *words], check=True, env=environment, stdout=subprocess.DEVNULL
+        )
         return json.loads((Path(folder) / "peer.json").read_text())
 
 
 def main() -> None:
     """Train both, print and write env states/s and their ratio."""
-    parser = argparse.ArgumentParser(description="Training beside mjlab's, each in its own environment.")
+    parser = argparse.ArgumentParser(
+        description="Training beside mjlab's, each in its own environment."
+    )
     parser.add_argument("--python", help="the interpreter of an environment with mjlab and rsl_rl")
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as of `ksim-rl train`")

@@ -63,7 +63,11 @@ def watch(trainer: Trainer, clock: Clock) -> None:
     collector: Any = trainer.collector
     calls: list[tuple[Any, str, Callable[..., str]]] = [
         # Launches of physics go through here in a compiled step, too.
-        (innermost(collector.env).world._graphs, "run", lambda key, _: LAUNCHES.get(key, "physics")),
+        (
+            innermost(collector.env).world._graphs,
+            "run",
+            lambda key, _: LAUNCHES.get(key, "physics"),
+        ),
         (collector.policy, "forward", lambda *_: "policy"),
         (collector, "_store", lambda *_: "storage"),
         (collector, "collect", lambda *_: "terms"),
@@ -103,7 +107,9 @@ def measure(cfg: RunCfg) -> dict[str, float]:
         for room, (count, microseconds) in by_room(cuda_events(iterate)).items():
             figures[f"{room}_ms"] = microseconds / 1000.0
             figures[f"{room}_kernels"] = count
-        figures["gaps_ms"] = whole - sum(value for name, value in figures.items() if name.endswith("_ms"))
+        figures["gaps_ms"] = whole - sum(
+            value for name, value in figures.items() if name.endswith("_ms")
+        )
     else:
         iterate()
         figures = {f"{room}_ms": 1000.0 * seconds for room, seconds in clock.seconds.items()}
@@ -127,14 +133,17 @@ def by_room(events: list[Event]) -> dict[str, tuple[int, float]]:
     launched = {
         event["args"]["correlation"]: event["ts"]
         for event in events
-        if event.get("cat") in ("cuda_runtime", "cuda_driver") and "correlation" in event.get("args", {})
+        if event.get("cat") in ("cuda_runtime", "cuda_driver")
+        and "correlation" in event.get("args", {})
     }
     found: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
     for event in events:
         if event.get("cat") not in ("kernel", "gpu_memcpy", "gpu_memset"):
             continue
         at = launched.get(event["args"].get("correlation"), -1.0)
-        room = next((s["name"] for s in spans if s["ts"] <= at <= s["ts"] + s["dur"]), PREFIX + "other")
+        room = next(
+            (s["name"] for s in spans if s["ts"] <= at <= s["ts"] + s["dur"]), PREFIX + "other"
+        )
         room = room.removeprefix(PREFIX)
         entry = found["gae" if room == "update" and "advantage" in event["name"].lower() else room]
         entry[0] += 1

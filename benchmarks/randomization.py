@@ -65,8 +65,12 @@ def measure(cfg: RunCfg, episode_steps: int) -> dict[str, float]:
         name: _build(cfg.task, _inertial_events(bodies, name), episode_steps * step_dt, device)
         for name in VARIANTS
     }
-    step_ms = _step_ms({name: _captured_step(env, device) for name, env in built.items()}, device, schedule)
-    events_ms = {name: _reset_events_ms(env, episode_steps, device, schedule) for name, env in built.items()}
+    step_ms = _step_ms(
+        {name: _captured_step(env, device) for name, env in built.items()}, device, schedule
+    )
+    events_ms = {
+        name: _reset_events_ms(env, episode_steps, device, schedule) for name, env in built.items()
+    }
     all_rows_ms = _all_rows_ms(built["reset"], device, schedule)
     alone_ms = events_ms["reset"] - events_ms["startup"]
     return {
@@ -88,7 +92,9 @@ def _bodies_and_step(task: ManagerBasedRlEnvCfg) -> tuple[tuple[str, ...], float
     task.sim.apply_to(spec)
     model = load_model(spec)
     heavy = [
-        model.body(i).name for i in range(model.nbody) if model.body_mass[i] > 0.0 and model.body(i).name
+        model.body(i).name
+        for i in range(model.nbody)
+        if model.body_mass[i] > 0.0 and model.body(i).name
     ]
     return tuple(re.escape(name) for name in heavy), model.opt.timestep * task.decimation
 
@@ -103,10 +109,15 @@ def _inertial_events(bodies: tuple[str, ...], variant: str) -> dict[str, EventTe
 
 
 def _build(
-    task: ManagerBasedRlEnvCfg, events: Mapping[str, EventTerm], episode_length_s: float, device: torch.device
+    task: ManagerBasedRlEnvCfg,
+    events: Mapping[str, EventTerm],
+    episode_length_s: float,
+    device: torch.device,
 ) -> Any:
     """Build the task without randomization of its own, with `events`, and with episodes that end by time alone."""
-    own = {name: term for name, term in (task.events or {}).items() if not isinstance(term, Randomize)}
+    own = {
+        name: term for name, term in (task.events or {}).items() if not isinstance(term, Randomize)
+    }
     env: Any = envs.build(
         dataclasses.replace(
             task,
@@ -134,7 +145,9 @@ def _captured_step(env: Any, device: torch.device) -> Captured:
     return Captured(step, device=device, warmup=2)
 
 
-def _step_ms(steps: Mapping[str, Captured], device: torch.device, schedule: Schedule) -> dict[str, float]:
+def _step_ms(
+    steps: Mapping[str, Captured], device: torch.device, schedule: Schedule
+) -> dict[str, float]:
     """Time the steps in turns, so that a drift of the device's clocks reaches all of them alike."""
     for step in steps.values():
         _repeat(step, schedule.warmup_steps)
@@ -145,7 +158,9 @@ def _step_ms(steps: Mapping[str, Captured], device: torch.device, schedule: Sche
     return {name: statistics.median(times) for name, times in rounds.items()}
 
 
-def _reset_events_ms(env: Any, episode_steps: int, device: torch.device, schedule: Schedule) -> float:
+def _reset_events_ms(
+    env: Any, episode_steps: int, device: torch.device, schedule: Schedule
+) -> float:
     """Time the reset events alone, for as many rows as reset in a step."""
     base_env = env.base_env
     rows = torch.arange(base_env.num_envs, device=device)
@@ -179,7 +194,9 @@ def _repeat(work: Callable[[], None], count: int) -> None:
         work()
 
 
-def _table(cfg: RunCfg, figures: Mapping[str, float], episode_steps: int, device: torch.device) -> Table:
+def _table(
+    cfg: RunCfg, figures: Mapping[str, float], episode_steps: int, device: torch.device
+) -> Table:
     title = f"{cfg.task_name}, {cfg.num_envs} envs, a reset every {episode_steps} steps, {report.device_name(device)}"
     table = Table(title=title)
     for column in ("", "ms", "share of the control step"):

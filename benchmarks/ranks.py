@@ -50,7 +50,11 @@ OPTIONS = {
 }
 LEVELS = load("velocity").rows["ppo/go1"].levels
 # Each switches off what would use NVLink multicast, which not every machine allows.
-NCCL = {"NCCL_NVLS_ENABLE": "0", "TORCH_SYMM_MEM_DISABLE_MULTICAST": "1", "NVSHMEM_DISABLE_NVLS": "1"}
+NCCL = {
+    "NCCL_NVLS_ENABLE": "0",
+    "TORCH_SYMM_MEM_DISABLE_MULTICAST": "1",
+    "NVSHMEM_DISABLE_NVLS": "1",
+}
 ROLLOUT_LENGTH = 24
 WARMUP, TIMED = {"cuda": 12, "cpu": 1}, {"cuda": 20, "cpu": 2}
 
@@ -68,7 +72,12 @@ def worker(device: str, tasks: str) -> None:
 
 def measured(device: str, task: str, num_envs: str) -> dict[str, float]:
     """Return what whole iterations of a task take."""
-    run = [f"task={task}", f"num_envs={num_envs}", f"device={device}", "collector.rollout_length=24"]
+    run = [
+        f"task={task}",
+        f"num_envs={num_envs}",
+        f"device={device}",
+        "collector.rollout_length=24",
+    ]
     trainer = build(conf.compose([*run, "logger=none", "trainer.eval_episodes=0"]))
     own = trainer.update.device
 
@@ -84,7 +93,10 @@ def measured(device: str, task: str, num_envs: str) -> dict[str, float]:
     for _ in range(TIMED[own.type]):
         trainer.iterate()
     seconds = (settled() - began) / TIMED[own.type]
-    figures = {"iteration_ms": seconds * 1000.0, "env_states_per_s": trainer.num_env_states / seconds}
+    figures = {
+        "iteration_ms": seconds * 1000.0,
+        "env_states_per_s": trainer.num_env_states / seconds,
+    }
     if own.type == "cuda":
         figures |= host_traffic(trainer.iterate)
     settled()
@@ -99,7 +111,9 @@ def start(
     if size > 1:
         command += ["torch.distributed.run", "--rdzv-backend=c10d", "--rdzv-endpoint=localhost:0"]
         command += [f"--nproc-per-node={size}", "-m"]
-    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", ""))))
+    path = os.pathsep.join(
+        filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")))
+    )
     env = os.environ | NCCL | {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
     if gpu is not None:
         env["CUDA_VISIBLE_DEVICES"] = str(gpu)
@@ -144,7 +158,13 @@ def seconds_to_track(seed: str, *, env_states: float, device: str) -> float:
     """Train Go1 until it follows its command, and return the seconds without the first iteration; else infinity."""
     iterations = max(2, int(env_states / (4096 * ROLLOUT_LENGTH)))
     # As many env states per update on any number of ranks: twice as many do not halve the updates that learning takes.
-    run = ["task=go1_velocity_flat", f"device={device}", "num_envs=4096", f"seed={seed}", "logger=none"]
+    run = [
+        "task=go1_velocity_flat",
+        f"device={device}",
+        "num_envs=4096",
+        f"seed={seed}",
+        "logger=none",
+    ]
     run += [f"collector.rollout_length={ROLLOUT_LENGTH // ranks.size()}"]
     run += [f"trainer.num_iterations={iterations}", "trainer.eval_episodes=0"]
     levels = ", ".join(f"{metric}: {value}" for metric, value in LEVELS.items())
@@ -152,7 +172,9 @@ def seconds_to_track(seed: str, *, env_states: float, device: str) -> float:
     kept = Rows()
     trainer.loggers = [kept]
     outcome = trainer.train()
-    return kept.rows[-1]["seconds"] - kept.rows[0]["seconds"] if outcome.target_met else float("inf")
+    return (
+        kept.rows[-1]["seconds"] - kept.rows[0]["seconds"] if outcome.target_met else float("inf")
+    )
 
 
 def seconds_of_seeds(
@@ -160,9 +182,20 @@ def seconds_of_seeds(
 ) -> dict[int, float]:
     """Return `seconds_to_track` of each seed on so many ranks; those of one rank run side by side, on all GPUs."""
     here = Path(__file__).parents[1]
-    shares = [(seeds[gpu::gpus], gpu) for gpu in range(gpus)] if size == 1 and gpus else [(seeds, None)]
+    shares = (
+        [(seeds[gpu::gpus], gpu) for gpu in range(gpus)] if size == 1 and gpus else [(seeds, None)]
+    )
     runs = [
-        start(size, "benchmarks.ranks", "learner", device, env_states, ",".join(share), folder=here, gpu=gpu)
+        start(
+            size,
+            "benchmarks.ranks",
+            "learner",
+            device,
+            env_states,
+            ",".join(share),
+            folder=here,
+            gpu=gpu,
+        )
         for share, gpu in shares
         if share
     ]
@@ -175,14 +208,23 @@ def seconds_of_seeds(
 def seconds_to_end(size: int, task: str, num_envs: str, *, device: str) -> float:
     """Kill a rank of a run of a task, and return the seconds until all have ended."""
     with tempfile.TemporaryDirectory() as name:
-        run = [f"task={task}", f"device={device}", f"num_envs={num_envs}", "collector.rollout_length=24"]
+        run = [
+            f"task={task}",
+            f"device={device}",
+            f"num_envs={num_envs}",
+            "collector.rollout_length=24",
+        ]
         run += ["trainer.num_iterations=1000000"]
-        process = start(size, "ksim_rl.cli.main", "train", *run, "hydra.run.dir=run", folder=Path(name))
+        process = start(
+            size, "ksim_rl.cli.main", "train", *run, "hydra.run.dir=run", folder=Path(name)
+        )
         assert process.stdout is not None
         for line in process.stdout:
             if "iteration 3/" in line:
                 break
-        found = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True)
+        found = subprocess.run(
+            ["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True
+        )
         os.kill(int(found.stdout.split()[-1]), signal.SIGKILL)
         began = time.monotonic()
         process.communicate()
@@ -191,7 +233,9 @@ def seconds_to_end(size: int, task: str, num_envs: str, *, device: str) -> float
 
 def compare(tasks: str, size: int, *, device: str, label: str, saved: Callable[..., Path]) -> None:
     """Measure whole iterations of tasks on one rank and on `size`, print them side by side and save them."""
-    table = Table("task", "envs", "1: ms", f"{size}: ms", "1: env states/s", f"{size}: env states/s", "ratio")
+    table = Table(
+        "task", "envs", "1: ms", f"{size}: ms", "1: env states/s", f"{size}: env states/s", "ratio"
+    )
     by_size: list[list[dict[str, float]]] = []
     for count in (
         1,
@@ -228,7 +272,9 @@ def main() -> None:
     if size < 2:
         raise ValueError(f"device={device} has {size} of it: ranks are measured on two or more")
     label = f"{report.device_label(device)}x{size}"
-    saved = partial(report.write, "ranks", device=device, module="benchmarks.ranks", environment=NCCL)
+    saved = partial(
+        report.write, "ranks", device=device, module="benchmarks.ranks", environment=NCCL
+    )
     if own["tasks"] != "none":
         compare(own["tasks"], size, device=own["device"], label=label, saved=saved)
     if own["kill"] == "yes":
@@ -240,7 +286,11 @@ def main() -> None:
         medians, prefix = {}, f"{label}/seconds_to_track"
         for count in (size, 1):
             seconds = seconds_of_seeds(
-                count, own["seeds"].split(","), gpus=gpus, env_states=own["env_states"], device=own["device"]
+                count,
+                own["seeds"].split(","),
+                gpus=gpus,
+                env_states=own["env_states"],
+                device=own["device"],
             )
             medians[count] = statistics.median(seconds.values())
             each = {f"{prefix}/{count}/{seed}": value for seed, value in seconds.items()}

@@ -56,7 +56,9 @@ def curves() -> dict[str, list[tuple[float, float]]]:
                 words = ("resume", "run", f"--num-iterations={end}", "--device=cpu")
                 if part == 0:
                     words = ("train", *RUN, f"trainer.num_iterations={end}")
-                output(start(1 if part == 1 else 2, "ksim_rl.cli.main", *words, folder=Path(folder)))
+                output(
+                    start(1 if part == 1 else 2, "ksim_rl.cli.main", *words, folder=Path(folder))
+                )
             found[name] = curve(Path(folder, "run"))
     return found
 
@@ -70,7 +72,9 @@ def draw(found: dict[str, list[tuple[float, float]]], path: Path) -> None:
     for (name, points), style in zip(found.items(), ("-", "--"), strict=True):
         axes.plot(*zip(*points, strict=True), style, label=name)
     for end in ITERATIONS[:-1]:
-        axes.axvline(end / ITERATIONS[-1] * next(iter(found.values()))[-1][0], color="0.8", zorder=0)
+        axes.axvline(
+            end / ITERATIONS[-1] * next(iter(found.values()))[-1][0], color="0.8", zorder=0
+        )
     axes.legend()
     figure.savefig(path, dpi=100)
 

@@ -62,13 +62,19 @@ def stock_world(world: WarpWorld) -> WarpWorld:
         num_envs=world.num_envs,
         device=world.device,
         sim=dataclasses.replace(
-            world.sim, one_kernel_solver=False, nan_guard=None, njmax=world.njmax, nconmax=world.nconmax
+            world.sim,
+            one_kernel_solver=False,
+            nan_guard=None,
+            njmax=world.njmax,
+            nconmax=world.nconmax,
         ),
         per_world_fields=tuple(world.per_world_fields()),
     )
 
 
-def physics_ms(world: WarpWorld, decimation: int, steps: Sequence[RecordedStep], *, repeats: int) -> float:
+def physics_ms(
+    world: WarpWorld, decimation: int, steps: Sequence[RecordedStep], *, repeats: int
+) -> float:
     """Time MuJoCo Warp's substeps of one env step, as one graph with all sensors in each, over the recorded steps."""
     stock = stock_world(world)
     device, warp_device = stock.device, wp.get_device(str(stock.device))
@@ -80,7 +86,11 @@ def physics_ms(world: WarpWorld, decimation: int, steps: Sequence[RecordedStep],
     with warp_scope(device):
         substeps()
     _synchronize(device)
-    with no_collection(), wp.ScopedDevice(warp_device), wp.ScopedCapture(device=warp_device) as capture:
+    with (
+        no_collection(),
+        wp.ScopedDevice(warp_device),
+        wp.ScopedCapture(device=warp_device) as capture,
+    ):
         substeps()
     _launch(capture.graph, device)
     found = _mean_ms(stock, lambda: _launch(capture.graph, device), steps, repeats=repeats)

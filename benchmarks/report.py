@@ -17,7 +17,16 @@ import torch
 # The variable is for benchmarks that run others and take their figures.
 RESULTS = Path(os.environ.get("BENCHMARK_RESULTS") or Path(__file__).parent / "results")
 WRITTEN = ("benchmarks/results", "docs")
-PACKAGES = ("ksim_rl", "torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
+PACKAGES = (
+    "ksim_rl",
+    "torch",
+    "torchrl",
+    "tensordict",
+    "mujoco",
+    "mujoco-warp",
+    "warp-lang",
+    "numpy",
+)
 
 
 def device_label(device: torch.device) -> str:
@@ -61,7 +70,9 @@ def commit() -> str:
         return found.stdout.strip()
 
     try:
-        changed = git("status", "--porcelain", "--", *(f":(top,exclude){folder}" for folder in WRITTEN))
+        changed = git(
+            "status", "--porcelain", "--", *(f":(top,exclude){folder}" for folder in WRITTEN)
+        )
         return git("rev-parse", "HEAD") + ("-dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return os.environ.get("GIT_COMMIT", "unknown")

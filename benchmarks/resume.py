@@ -146,7 +146,10 @@ def main() -> None:
         tensors_that_differ=sum(comparison.tensors_that_differ for comparison in found.values()),
         components={
             f"{label}/{case}": {
-                component: {"tensors_compared": count, "that_differ": comparison.differing.get(component, [])}
+                component: {
+                    "tensors_compared": count,
+                    "that_differ": comparison.differing.get(component, []),
+                }
                 for component, count in comparison.compared.items()
             }
             for case, comparison in found.items()
@@ -161,7 +164,9 @@ def run_command(*words: str) -> None:
     command = [sys.executable, "-m", "ksim_rl.cli.main", *words]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     if done.returncode:
-        raise RuntimeError(f"ksim-rl {words[0]} ended with exit code {done.returncode}:\n{done.stdout}")
+        raise RuntimeError(
+            f"ksim-rl {words[0]} ended with exit code {done.returncode}:\n{done.stdout}"
+        )
 
 
 def compare_runs(
@@ -175,8 +180,15 @@ def compare_runs(
     """Train at a stretch and in two processes, and compare the final checkpoints; `train` runs what is not resumed."""
     straight, halves = folder / "straight", folder / "halves"
     overrides = (*overrides, f"device={device}")
-    train("train", *overrides, f"trainer.num_iterations={num_iterations}", f"hydra.run.dir={straight}")
-    train("train", *overrides, f"trainer.num_iterations={num_iterations // 2}", f"hydra.run.dir={halves}")
+    train(
+        "train", *overrides, f"trainer.num_iterations={num_iterations}", f"hydra.run.dir={straight}"
+    )
+    train(
+        "train",
+        *overrides,
+        f"trainer.num_iterations={num_iterations // 2}",
+        f"hydra.run.dir={halves}",
+    )
     run_command("resume", str(halves), "--num-iterations", str(num_iterations), "--device", device)
     one, other = (checkpoint.load_latest(run) for run in (straight, halves))
     if one.iteration != num_iterations or other.iteration != num_iterations:
@@ -186,13 +198,16 @@ def compare_runs(
 
 def compare(one: state_tree.State, other: state_tree.State) -> Comparison:
     """Compare two states leaf by leaf; only the run's seconds may differ."""
-    ours, theirs = ({**tensors, **values} for tensors, values in map(state_tree.split, (one, other)))
+    ours, theirs = (
+        {**tensors, **values} for tensors, values in map(state_tree.split, (one, other))
+    )
     comparison = Comparison()
     for path in dict.fromkeys([*ours, *theirs]):
         if path == "/seconds":
             continue
         component = next(
-            (name for prefix, name in COMPONENTS.items() if path.startswith(prefix)), path.split("/")[1]
+            (name for prefix, name in COMPONENTS.items() if path.startswith(prefix)),
+            path.split("/")[1],
         )
         comparison.compared[component] += 1
         if path not in ours or path not in theirs or not _same(ours[path], theirs[path]):
@@ -220,7 +235,9 @@ def _table(found: dict[str, Comparison]) -> Table:
         table.add_column(column, justify="left" if column in ("case", "component") else "right")
     for case, comparison in found.items():
         for component, count in comparison.compared.items():
-            table.add_row(case, component, str(count), str(len(comparison.differing.get(component, []))))
+            table.add_row(
+                case, component, str(count), str(len(comparison.differing.get(component, [])))
+            )
         totals = (str(comparison.tensors_compared), str(comparison.tensors_that_differ))
         table.add_row(case, "[bold]all[/bold]", *totals, end_section=True)
     return table

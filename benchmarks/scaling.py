@@ -85,7 +85,10 @@ def draw(figures: dict[int, dict[str, float]], path: Path, *, task_name: str, de
             label="mjlab 1.6.0 + rsl_rl, training (published, H200)",
         )
     axes.set(
-        xscale="log", xlabel="envs", ylabel="million env states per second", title=f"{task_name} on {device}"
+        xscale="log",
+        xlabel="envs",
+        ylabel="million env states per second",
+        title=f"{task_name} on {device}",
     )
     axes.set_xticks(sizes, [str(size) for size in sizes])
     axes.minorticks_off()
@@ -124,9 +127,15 @@ def main() -> None:
 
 def _table(figures: dict[int, dict[str, float]], title: str) -> Table:
     table = Table(
-        title=title, caption=" ".join(f"{name} {value:.2f}" for name, value in growth(figures).items())
+        title=title,
+        caption=" ".join(f"{name} {value:.2f}" for name, value in growth(figures).items()),
     )
-    for column in ("envs", "training, env states/s", "raw physics, env states/s", "relative to physics"):
+    for column in (
+        "envs",
+        "training, env states/s",
+        "raw physics, env states/s",
+        "relative to physics",
+    ):
         table.add_column(column, justify="right")
     for size, row in figures.items():
         speeds = (f"{row[name]:,.0f}" for name in ("env_states_per_s", "physics_env_states_per_s"))

@@ -93,7 +93,9 @@ def main() -> int:
     print(words)
     for name in ("return", "length", "fell"):
         print(f"{name:<10}{figures[name]:>12.4g}{figures[f'{name}_c_engine']:>12.4g}")
-    print(f"return ratio {figures['return_ratio']:.4f} +- {figures['standard_error']:.4f} (standard error)")
+    print(
+        f"return ratio {figures['return_ratio']:.4f} +- {figures['standard_error']:.4f} (standard error)"
+    )
     where = group(options)
     path = report.write(
         "sim2sim",
@@ -126,7 +128,12 @@ def run(policy: Policy, *, episodes: int, noise: bool) -> Episodes:
     built.env.train(noise)
     base = part(built.env, ManagerBasedRlEnv)
     assert base is not None  # the env of a config is ours
-    parts = {"env": built.env, "policy": policy.actor, "max_steps": built.max_steps, "seed": built.seed}
+    parts = {
+        "env": built.env,
+        "policy": policy.actor,
+        "max_steps": built.max_steps,
+        "seed": built.seed,
+    }
     found = EpisodeRunner(base, **parts).episodes()
     built.env.close(raise_if_closed=False)
     return found
@@ -171,7 +178,9 @@ def _policy(options: dict[str, str], overrides: list[str], *, cfg: RunCfg | None
     """Return the policy that the options name, with its own config, as overrides change it, or with another one."""
     if options["policy"] != "standing":
         return trained(locate(options["policy"]), overrides, device=options["device"], cfg=cfg)
-    own = command_line.compose([f"task={options['task']}", *overrides, f"device={options['device']}"])
+    own = command_line.compose(
+        [f"task={options['task']}", *overrides, f"device={options['device']}"]
+    )
     return Policy(cfg=cfg or own, actor=standing(cfg or own), iteration=0)
 
 
@@ -182,7 +191,9 @@ def _in_c(cfg: RunCfg, given: list[str]) -> tuple[RunCfg, str]:
     return judged_by(in_c, trained=cfg.task.sim.engine, given=given)
 
 
-def trained(run_folder: Path, overrides: list[str], *, device: str, cfg: RunCfg | None = None) -> Policy:
+def trained(
+    run_folder: Path, overrides: list[str], *, device: str, cfg: RunCfg | None = None
+) -> Policy:
     """Return the policy of a run, with its config as the overrides change it."""
     saved = checkpoint.load_latest(run_folder)
     if cfg is None:

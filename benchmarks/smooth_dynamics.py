@@ -40,7 +40,12 @@ LARGEST_ERROR = 1e-5
 def main() -> None:
     """Measure, print the table, and write the figures."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    defaults = {"task": "go1_velocity_flat", "num_envs": "4096", "device": device, "lanes": "4,8,16,32"}
+    defaults = {
+        "task": "go1_velocity_flat",
+        "num_envs": "4096",
+        "device": device,
+        "lanes": "4,8,16,32",
+    }
     given = command_line.options(sys.argv[1:], defaults)
     num_envs = command_line.whole_number("num_envs", given["num_envs"])
     lanes = command_line.whole_numbers("lanes", given["lanes"])
@@ -49,7 +54,9 @@ def main() -> None:
     env = envs.make(given["task"], num_envs=num_envs, device=device, seed=0)
     env.rollout(RANDOM_STEPS, break_when_any_done=False)
     world = innermost(env).world
-    figures = stages_ms(world, lanes) | integration_ms(world, lanes) | substeps_ms(world, decimation)
+    figures = (
+        stages_ms(world, lanes) | integration_ms(world, lanes) | substeps_ms(world, decimation)
+    )
     table = Table(title=f"{given['task']}, {num_envs} envs, {report.device_name(device)}")
     for column in ("", "ms"):
         table.add_column(column, justify="left" if not column else "right")
@@ -172,7 +179,9 @@ def substeps_ms(world: WarpWorld, decimation: int) -> dict[str, float]:
 
         for _ in range(3):
             own.step(decimation)
-        name = "substeps_with_one_kernel_ms" if one_kernel_dynamics else "substeps_with_mujoco_warp_ms"
+        name = (
+            "substeps_with_one_kernel_ms" if one_kernel_dynamics else "substeps_with_mujoco_warp_ms"
+        )
         step = lambda own=own: own.step(decimation)  # noqa: E731
         found[name] = milliseconds(step, device=world.device, repeats=REPEATS, before=restore)
         own.close()

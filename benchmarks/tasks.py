@@ -209,7 +209,10 @@ def _time(name: str, options: Options, figures: dict[str, float], outcome: Outco
         figures["syncs"] = len(syncs)
         outcome.findings += [f"[syncs] {sync}" for sync in syncs]
         raw_ms = physics_ms(
-            innermost(env).world, cfg.task.decimation, record_steps(collector), repeats=schedule.repeats
+            innermost(env).world,
+            cfg.task.decimation,
+            record_steps(collector),
+            repeats=schedule.repeats,
         )
         figures["physics_ms"] = raw_ms
         figures["rollout_over_physics"] = raw_ms * length / rollout_ms
@@ -241,7 +244,9 @@ def host_syncs(collector: RolloutCollector, device: torch.device) -> list[str]:
         return counted.calls
     # The count misses what C++ reads by itself, and this stops at the first: together they miss none.
     return counted.calls or [
-        message for work in (step, collector.collect) if (message := _sync_error(work, device)) is not None
+        message
+        for work in (step, collector.collect)
+        if (message := _sync_error(work, device)) is not None
     ]
 
 
@@ -271,7 +276,9 @@ def table(saved: Mapping[str, Any]) -> Table:
         shown.add_column(column, justify="left" if column in ("task", "check_env") else "right")
     for prefix, outcome in sorted(saved["outcomes"].items()):
         figures = {key: saved["figures"].get(f"{prefix}/{key}") for _, key, _ in COLUMNS}
-        cells = ["" if figures[key] is None else form.format(figures[key]) for _, key, form in COLUMNS]
+        cells = [
+            "" if figures[key] is None else form.format(figures[key]) for _, key, form in COLUMNS
+        ]
         shown.add_row(prefix, *cells, outcome["check_env"])
     return shown
 

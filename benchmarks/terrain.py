@@ -93,7 +93,9 @@ def measure(cfg: ManagerBasedRlEnvCfg, device: torch.device, cell_scale: float) 
         name: dataclasses.replace(patch, cell=patch.cell * cell_scale)
         for name, patch in terrain.patches.items()
     }
-    everywhere = dataclasses.replace(terrain, patches=patches, max_initial_level=terrain.num_levels - 1)
+    everywhere = dataclasses.replace(
+        terrain, patches=patches, max_initial_level=terrain.num_levels - 1
+    )
     grounds: dict[str, Terrain] = {"plane": PlaneTerrain(friction=terrain.friction)}
     for name, patch in patches.items():
         grounds[name] = dataclasses.replace(everywhere, patches={name: patch}, num_columns=1)
@@ -104,7 +106,9 @@ def measure(cfg: ManagerBasedRlEnvCfg, device: torch.device, cell_scale: float) 
 def summary(milliseconds_by_kind: Mapping[str, float]) -> dict[str, float]:
     """Return `rough_over_flat`, the mean over the kinds, and `mixed_over_flat`, with all kinds in one batch."""
     plane = milliseconds_by_kind["plane"]
-    kinds = [value for name, value in milliseconds_by_kind.items() if name not in ("plane", "mixed")]
+    kinds = [
+        value for name, value in milliseconds_by_kind.items() if name not in ("plane", "mixed")
+    ]
     return {
         "rough_over_flat": statistics.mean(kinds) / plane,
         "mixed_over_flat": milliseconds_by_kind["mixed"] / plane,
@@ -123,7 +127,9 @@ def _physics_ms(cfg: ManagerBasedRlEnvCfg, terrain: Terrain, device: torch.devic
         sim=cfg.sim,
         per_world_fields=terrain.per_world_fields,
     )
-    view = EnvDriver(world, step_dt=cfg.decimation * world.timestep, entities=tuple(scene.entities)).view
+    view = EnvDriver(
+        world, step_dt=cfg.decimation * world.timestep, entities=tuple(scene.entities)
+    ).view
     generator = torch.Generator(device).manual_seed(0)
     _spread(view, terrain.ground(view), generator)
     pose_K = _default_targets(view)

@@ -158,14 +158,22 @@ def course_of(cfg: ManagerBasedRlEnvCfg) -> Course:
         ValueError: if the task has no terrain in levels, or no velocity command that may ask for the course's speed.
     """
     grid = cfg.scene.terrain
-    levels = next((term for term in cfg.curriculum.values() if isinstance(term, TerrainLevels)), None)
+    levels = next(
+        (term for term in cfg.curriculum.values() if isinstance(term, TerrainLevels)), None
+    )
     command = cfg.commands.get(levels.command) if levels else None
-    if levels is None or not isinstance(grid, TerrainGrid) or not isinstance(command, UniformVelocityCommand):
+    if (
+        levels is None
+        or not isinstance(grid, TerrainGrid)
+        or not isinstance(command, UniformVelocityCommand)
+    ):
         raise ValueError(
             f"terrain={type(grid).__name__}, curriculum={sorted(cfg.curriculum)}: the course needs a TerrainGrid and a "
             "TerrainLevels of a UniformVelocityCommand: take a run of a task such as go1_velocity_rough"
         )
-    check_in_range("speed of the course", SPEED, low=command.lin_vel_x[0], high=command.lin_vel_x[1])
+    check_in_range(
+        "speed of the course", SPEED, low=command.lin_vel_x[0], high=command.lin_vel_x[1]
+    )
     ahead = UniformVelocityCommand(
         resampling_time_range_s=command.resampling_time_range_s,
         lin_vel_x=(SPEED, SPEED),
@@ -196,7 +204,9 @@ def course_of(cfg: ManagerBasedRlEnvCfg) -> Course:
 
 
 def _in_the_middle(event: ResetRootUniform) -> ResetRootUniform:
-    return dataclasses.replace(event, pose_range={**event.pose_range, "x": (0.0, 0.0), "y": (0.0, 0.0)})
+    return dataclasses.replace(
+        event, pose_range={**event.pose_range, "x": (0.0, 0.0), "y": (0.0, 0.0)}
+    )
 
 
 def walk(policy: Policy, course: Course, *, num_envs: int) -> Outcomes:
@@ -217,7 +227,12 @@ def walk(policy: Policy, course: Course, *, num_envs: int) -> Outcomes:
     base = part(env, ManagerBasedRlEnv)
     assert base is not None  # the env of a config is ours
     runner = Walk(
-        base, course, env=env, policy=policy.actor, max_steps=base.max_episode_length, seed=ROBOT_SEED
+        base,
+        course,
+        env=env,
+        policy=policy.actor,
+        max_steps=base.max_episode_length,
+        seed=ROBOT_SEED,
     )
     runner()
     lost = base.world.overflow_report().messages
@@ -239,7 +254,9 @@ def summary(
     success_by_level: dict[str, list[float]] = {}
     figures: dict[str, float] = {}
     for index, kind in enumerate(kinds):
-        cells = [(outcomes.kind_E == index) & (outcomes.level_E == level) for level in range(num_levels)]
+        cells = [
+            (outcomes.kind_E == index) & (outcomes.level_E == level) for level in range(num_levels)
+        ]
         success, fell = (
             [float(figure_E[cell_E].double().mean()) for cell_E in cells]
             for figure_E in (success_E, outcomes.fell_E)
@@ -260,7 +277,8 @@ def trained(path: Path, iteration: int) -> dict[str, float]:
     `path` is the run folder, its folder of checkpoints, or one of these.
     """
     table = next(
-        (folder / METRICS for folder in (path, *path.parents[:2]) if (folder / METRICS).exists()), None
+        (folder / METRICS for folder in (path, *path.parents[:2]) if (folder / METRICS).exists()),
+        None,
     )
     if table is None:
         return {}
@@ -269,10 +287,14 @@ def trained(path: Path, iteration: int) -> dict[str, float]:
     env_states = int(rows[-1]["env_states"])
     last = [row for row in rows if int(row["env_states"]) > env_states - HELD_STATES]
     levels = [float(row[LEVEL]) for row in last if row.get(LEVEL)]
-    return {"env_states": env_states} | ({"trained_level": statistics.fmean(levels)} if levels else {})
+    return {"env_states": env_states} | (
+        {"trained_level": statistics.fmean(levels)} if levels else {}
+    )
 
 
-def _table(title: str, figures: Mapping[str, float], success_by_level: Mapping[str, list[float]]) -> Table:
+def _table(
+    title: str, figures: Mapping[str, float], success_by_level: Mapping[str, list[float]]
+) -> Table:
     table = Table(title=f"{title}, {figures['num_envs']} envs")
     table.add_column("ground")
     for column in ("success", "fell", "levels", "success by level, %"):

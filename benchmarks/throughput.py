@@ -205,7 +205,9 @@ def _world(trainer: Trainer) -> WarpWorld:
     env: Any = trainer.collector.env
     world = env.base_env.world
     if not isinstance(world, WarpWorld):
-        raise ValueError(f"sim.engine={world.sim.engine!r}: this benchmark measures worlds on MuJoCo Warp")
+        raise ValueError(
+            f"sim.engine={world.sim.engine!r}: this benchmark measures worlds on MuJoCo Warp"
+        )
     return world
 
 
@@ -242,7 +244,11 @@ def _table(cfg: RunCfg, figures: dict[str, float], device: torch.device) -> Tabl
     for label, key, env_states in rows:
         per_s = 1000.0 * env_states / figures[key]
         table.add_row(
-            label, f"{figures[key]:.3f}", str(env_states), f"{per_s:,.0f}", f"{per_s / physics_per_s:.3f}"
+            label,
+            f"{figures[key]:.3f}",
+            str(env_states),
+            f"{per_s:,.0f}",
+            f"{per_s / physics_per_s:.3f}",
         )
     return table
 
@@ -254,7 +260,10 @@ def main() -> None:
     figures = measure(cfg)
     Console().print(_table(cfg, figures, device))
     beside = ("per_world", "host", "kernels")
-    for name in ("guards_share", *(name for name in figures if any(word in name for word in beside))):
+    for name in (
+        "guards_share",
+        *(name for name in figures if any(word in name for word in beside)),
+    ):
         print(f"{name} {figures[name]:.4g}")
     if device.type == "cpu":
         both = engines.measure(cfg)

@@ -51,7 +51,9 @@ def _noisy(draw: Callable[[Tensor], Tensor]) -> Callable[[], Transform]:
 
 def _clock() -> Transform:
     left = UnaryTransform(
-        in_keys=["step_count"], out_keys=["left"], fn=lambda n: ((HORIZON - n) / HORIZON).clamp_min(0.0)
+        in_keys=["step_count"],
+        out_keys=["left"],
+        fn=lambda n: ((HORIZON - n) / HORIZON).clamp_min(0.0),
     )
     return Compose([StepCounter(), left])
 

@@ -66,7 +66,9 @@ def measure(num_envs: int, device: torch.device) -> dict[str, Row]:
         for what in ("env", "step", "reset"):
             rows[name] |= _compare(what, getattr(mine, what), getattr(theirs, what), device)
     if device.type == "cuda":
-        graphs = {name: _Rig(pair.ours, num_envs, device).captured() for name, pair in PAIRS.items()}
+        graphs = {
+            name: _Rig(pair.ours, num_envs, device).captured() for name, pair in PAIRS.items()
+        }
         # Stock ones last: what cannot be captured leaves torch's generator in a bad state.
         for name, pair in PAIRS.items():
             mine, theirs = graphs[name], _Rig(pair.stock, num_envs, device).captured()
@@ -98,7 +100,9 @@ class _Rig:
     @torch.no_grad()
     def step(self) -> None:
         """Do what the transform does in a step: with the action, and with what the env answers."""
-        sent = self.transform._inv_call(self.root.copy()) if self.transform.in_keys_inv else self.root
+        sent = (
+            self.transform._inv_call(self.root.copy()) if self.transform.in_keys_inv else self.root
+        )
         self.transform._step(sent, self.reached.copy())
 
     @torch.no_grad()
@@ -131,7 +135,9 @@ def _renew_generator(device: torch.device) -> None:
     )
 
 
-def _time(work: Callable[[], object], device: torch.device, *, calls: int = CALLS, per: int = 1) -> float:
+def _time(
+    work: Callable[[], object], device: torch.device, *, calls: int = CALLS, per: int = 1
+) -> float:
     """Return the ms of one of `calls` calls, each of which does the thing `per` times."""
 
     def repeatedly() -> None:
@@ -165,7 +171,11 @@ def _compare(
         for work, index in order:
             if work is not None:
                 times[index].append(_time(work, device, **kwargs))
-    row: Row = {f"{what}_ms": statistics.median(times[0]), f"stock_{what}_ms": None, f"{what}_ratio": None}
+    row: Row = {
+        f"{what}_ms": statistics.median(times[0]),
+        f"stock_{what}_ms": None,
+        f"{what}_ratio": None,
+    }
     if theirs is not None:
         row[f"stock_{what}_ms"] = statistics.median(times[1])
         row[f"{what}_ratio"] = statistics.median(a / b for a, b in zip(*times, strict=True))
@@ -185,7 +195,9 @@ def measure_go1(num_envs: int, device: torch.device) -> dict[str, float]:
         if name == "actor"
     }
     chain = compile_groups(groups)
-    bare, chained = (_Go1(cfg, transforms, device) for transforms in (Compose([]), Compose(list(chain))))
+    bare, chained = (
+        _Go1(cfg, transforms, device) for transforms in (Compose([]), Compose(list(chain)))
+    )
     generator = torch.Generator(device).manual_seed(0)
     times: tuple[list[float], list[float]] = ([], [])
     settle = GO1_STEPS[device.type] // 2
@@ -211,7 +223,9 @@ def measure_go1(num_envs: int, device: torch.device) -> dict[str, float]:
 class _Go1:
     """Go1 with transforms, whose step is one graph."""
 
-    def __init__(self, cfg: ManagerBasedRlEnvCfg, transforms: Compose, device: torch.device) -> None:
+    def __init__(
+        self, cfg: ManagerBasedRlEnvCfg, transforms: Compose, device: torch.device
+    ) -> None:
         self.base = ManagerBasedRlEnv(cfg, device=device)
         self.env = MaskedTransformedEnv(self.base, transforms)
         self.env.seed(0)
@@ -232,10 +246,14 @@ class _Go1:
 
 
 def _table(rows: dict[str, Row], num_envs: int, device: torch.device) -> Table:
-    table = Table(title=f"{num_envs} envs, {report.device_name(device)}; ms of ours / of the nearest: ratio")
+    table = Table(
+        title=f"{num_envs} envs, {report.device_name(device)}; ms of ours / of the nearest: ratio"
+    )
     columns = ["env", "step", "reset", *(["captured"] if device.type == "cuda" else [])]
     for heading in ("transform", "nearest", *columns):
-        table.add_column(heading, justify="left" if heading in ("transform", "nearest") else "right")
+        table.add_column(
+            heading, justify="left" if heading in ("transform", "nearest") else "right"
+        )
     for name, row in rows.items():
         nearest = PAIRS[name].nearest if name in PAIRS else ""
         table.add_row(name, nearest, *(_cell(row, column) for column in columns))
@@ -247,7 +265,11 @@ def _cell(row: Row, column: str) -> str:
         return ""
     mine, theirs, ratio = (
         "none" if value is None else f"{value:.3f}"
-        for value in (row[f"{column}_ms"], row.get(f"stock_{column}_ms"), row.get(f"{column}_ratio"))
+        for value in (
+            row[f"{column}_ms"],
+            row.get(f"stock_{column}_ms"),
+            row.get(f"{column}_ratio"),
+        )
     )
     return f"{mine} / {theirs}: {ratio}" if f"{column}_ratio" in row else mine
 
@@ -274,7 +296,9 @@ def main() -> None:
     prefix = f"{report.device_label(device)}/{num_envs}"
     figures: dict[str, float] = {}
     for name, row in rows.items():
-        figures |= {f"{prefix}/{name}/{column}": round(v, 6) for column, v in row.items() if v is not None}
+        figures |= {
+            f"{prefix}/{name}/{column}": round(v, 6) for column, v in row.items() if v is not None
+        }
     for column in ("step_ratio", "env_ratio", "captured_ratio"):
         found = [ratio for row in rows.values() if (ratio := row.get(column)) is not None]
         if found:

@@ -18,7 +18,10 @@ class WideEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         sizes = {"observation": sum(TERMS.values()), **TERMS}
         self.observation_spec = Composite(
-            {name: Unbounded(torch.Size([num_envs, size]), device=device) for name, size in sizes.items()},
+            {
+                name: Unbounded(torch.Size([num_envs, size]), device=device)
+                for name, size in sizes.items()
+            },
             shape=(num_envs,),
             device=device,
         )
@@ -28,7 +31,9 @@ class WideEnv(EnvBase):
             device=device,
         )
         self.full_reward_spec = Composite(
-            reward=Unbounded(torch.Size([num_envs, 1]), device=device), shape=(num_envs,), device=device
+            reward=Unbounded(torch.Size([num_envs, 1]), device=device),
+            shape=(num_envs,),
+            device=device,
         )
         generator = torch.Generator(device=device).manual_seed(0)
         self._values = {
@@ -46,7 +51,9 @@ class WideEnv(EnvBase):
 
     def _answer(self, **leaves: torch.Tensor) -> TensorDictBase:
         flags = {name: self._no.clone() for name in ("done", "terminated")}
-        return TensorDict({**self._values, **flags, **leaves}, batch_size=self.batch_size, device=self.device)
+        return TensorDict(
+            {**self._values, **flags, **leaves}, batch_size=self.batch_size, device=self.device
+        )
 
     def _set_seed(self, seed: int | None) -> None:
         pass

@@ -57,7 +57,11 @@ Networks = tuple[ProbabilisticTensorDictSequential, TensorDictModule]
 
 def main() -> None:
     """Time all sides for each number of envs, print the figures, and write them."""
-    defaults = {"device": "cuda" if torch.cuda.is_available() else "cpu", "num_envs": "", "hidden_dims": ""}
+    defaults = {
+        "device": "cuda" if torch.cuda.is_available() else "cpu",
+        "num_envs": "",
+        "hidden_dims": "",
+    }
     given = command_line.options(sys.argv[1:], defaults)
     device = checked_device(given["device"])
     sizes = given["num_envs"] or ("4096,16384" if device.type == "cuda" else "64")
@@ -77,7 +81,9 @@ def main() -> None:
     for name, value in [*figures.items(), *notes.items()]:
         table.add_row(name, value if isinstance(value, str) else f"{value:.4g}")
     Console(width=160).print(table)
-    path = report.write("update", figures=figures, device=device, module="benchmarks.update", notes=notes)
+    path = report.write(
+        "update", figures=figures, device=device, module="benchmarks.update", notes=notes
+    )
     print(f"written to {path}")
 
 
@@ -125,7 +131,11 @@ class StockUpdate:
     def __init__(self, networks: Networks, *, num_envs: int) -> None:
         self.actor, self.critic = copy.deepcopy(networks)
         self.advantage = GAE(
-            gamma=CFG.gamma, lmbda=CFG.lmbda, value_network=self.critic, average_gae=True, time_dim=1
+            gamma=CFG.gamma,
+            lmbda=CFG.lmbda,
+            value_network=self.critic,
+            average_gae=True,
+            time_dim=1,
         )
         self.loss = ClipPPOLoss(
             self.actor,
@@ -175,7 +185,9 @@ def parameter_difference(networks: Networks, rollout_ET: TensorDict) -> float:
     update(rollout_ET)
     stock = StockUpdate(networks, num_envs=num_envs)
     stock(rollout_ET)
-    before, ours, theirs = map(_flat, (networks, (update.actor, update.critic), (stock.actor, stock.critic)))
+    before, ours, theirs = map(
+        _flat, (networks, (update.actor, update.critic), (stock.actor, stock.critic))
+    )
     return float((ours - theirs).norm() / (theirs - before).norm())
 
 

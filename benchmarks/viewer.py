@@ -103,7 +103,9 @@ class Alternate(Hook):
     def _connect(self) -> None:
         _wait_for(lambda: bool(self._addresses), "the viewer did not say its address")
         command = [sys.executable, "-m", "benchmarks.viewer", "--client", self._addresses[0]]
-        self._client = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._client = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
         self._wait(watched=True)
 
     def leave(self) -> None:
@@ -183,7 +185,10 @@ def main(arguments: list[str] | None = None) -> None:
     medians = {name: statistics.median(speed) for name, speed in speeds.items()}
     share = medians["open"] / medians["closed"]
     prefix = f"{report.device_label(where)}/{given['task']}"
-    figures = {f"{prefix}/open_share_of_speed": share, f"{prefix}/messages_read": float(alternate.messages)}
+    figures = {
+        f"{prefix}/open_share_of_speed": share,
+        f"{prefix}/messages_read": float(alternate.messages),
+    }
     figures |= {f"{prefix}/bytes_read": float(alternate.bytes)}
     figures |= {f"{prefix}/{name}_env_states_per_s": median for name, median in medians.items()}
     table = Table("", "env states/s", "blocks")

@@ -17,7 +17,11 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
-PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+PAGES = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+}
 _LINK = re.compile(r"(\]\(|src=\")([^)\s\"]+)")
 _log = logging.getLogger("mkdocs.hooks")
 
@@ -27,11 +31,15 @@ def on_files(files: Files, config: Any) -> Files:
     for source, page in PAGES.items():
         files.append(File.generated(config, page, content=(ROOT / source).read_text()))
     for name in re.findall(r"reference/([\w.]+)\.md", str(config.nav)):
-        files.append(File.generated(config, f"reference/{name}.md", content=_reference(f"ksim_rl.{name}")))
+        files.append(
+            File.generated(config, f"reference/{name}.md", content=_reference(f"ksim_rl.{name}"))
+        )
     texts = [(_origin(file), file.content_string) for file in files.documentation_pages()]
     for origin, text in texts:
         for _, link in _LINK.findall(text):
-            if (target := _outside(origin, link)) and not files.get_file_from_path(_page_of(target)):
+            if (target := _outside(origin, link)) and not files.get_file_from_path(
+                _page_of(target)
+            ):
                 files.append(_copied(target, config))
     return files
 
@@ -46,14 +54,18 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
             return match[0]
         anchor = match[2].partition("#")[2]
         start = posixpath.dirname(page.file.src_uri) or "."
-        return match[1] + posixpath.relpath(_page_of(target), start) + (f"#{anchor}" if anchor else "")
+        return (
+            match[1] + posixpath.relpath(_page_of(target), start) + (f"#{anchor}" if anchor else "")
+        )
 
     return _LINK.sub(moved, markdown)
 
 
 def _origin(file: File) -> str:
     """Return where in the repository a page comes from."""
-    return next((source for source, page in PAGES.items() if page == file.src_uri), f"docs/{file.src_uri}")
+    return next(
+        (source for source, page in PAGES.items() if page == file.src_uri), f"docs/{file.src_uri}"
+    )
 
 
 def _outside(origin: str, link: str) -> str | None:
@@ -90,7 +102,9 @@ def _copied(target: str, config: Any) -> File:
     elif path.suffix == ".ipynb":
         cells = json.loads(path.read_text())["cells"]
         sources = [(cell["cell_type"], "".join(cell["source"])) for cell in cells]
-        text = "\n\n".join(f"```python\n{text}\n```" if kind == "code" else text for kind, text in sources)
+        text = "\n\n".join(
+            f"```python\n{text}\n```" if kind == "code" else text for kind, text in sources
+        )
     else:
         text = f"````{path.suffix.removeprefix('.') or 'text'}\n{path.read_text()}\n````"
     heading = "" if path.suffix == ".ipynb" else f"# `{target}`\n\n"
@@ -100,10 +114,13 @@ def _copied(target: str, config: Any) -> File:
 def _reference(module: str) -> str:
     """Return a page with what a package gives out, each name under its package."""
     loaded = importlib.import_module(module)
-    names = sorted(name for name in getattr(loaded, "__all__", vars(loaded)) if _is_ours(loaded, name))
+    names = sorted(
+        name for name in getattr(loaded, "__all__", vars(loaded)) if _is_ours(loaded, name)
+    )
     first = (loaded.__doc__ or "").strip()
     entries = (
-        f"::: {getattr(loaded, name).__module__}.{getattr(loaded, name).__qualname__}" for name in names
+        f"::: {getattr(loaded, name).__module__}.{getattr(loaded, name).__qualname__}"
+        for name in names
     )
     return "\n\n".join((f"# `{module}`", first, *entries)) + "\n"
 

@@ -87,7 +87,9 @@ def read_settings(arguments: list[str]) -> Settings:
         *owner, field = path.split(".")
         value = ast.literal_eval(text)
         if owner:
-            settings = replace(settings, **{owner[0]: replace(getattr(settings, owner[0]), **{field: value})})
+            settings = replace(
+                settings, **{owner[0]: replace(getattr(settings, owner[0]), **{field: value})}
+            )
         else:
             settings = replace(settings, **{field: value})
     return replace(settings, objective=with_precision_of(settings.objective, settings.device))
@@ -117,7 +119,9 @@ class PPO:
         loss = make_loss(cfg, self.actor, self.critic)
         self.loss = in_precision(loss, cfg.precision, device=device)
         self.optimizer = make_optimizer(cfg, self.actor, self.critic)
-        self.dataset = DatasetBuffer(settings.data, keys=loss.dataset_keys, seed=settings.seed, device=device)
+        self.dataset = DatasetBuffer(
+            settings.data, keys=loss.dataset_keys, seed=settings.seed, device=device
+        )
         self.guard = StepGuard(device=device)
         self.fused = make_fused(settings, self) if device.startswith("cuda") else None
         self.kl = torch.zeros((), device=device)
@@ -153,7 +157,9 @@ class PPO:
             # Writes "advantage" and "value_target"; values after a step are those of the true next observation.
             self.dataset.extend(self.estimate_advantages(rollout_ET))
             for minibatch_B in self._minibatches():
-                step = ppo_step(self.loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
+                step = ppo_step(
+                    self.loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard
+                )
                 self.kl.copy_(step["kl"])
         # Only now, so that all gradient steps see the statistics that the rollout's actions were drawn with.
         update_normalizers(rollout_ET, self.actor, self.critic)
@@ -172,7 +178,10 @@ def make_fused(settings: Settings, ppo: PPO) -> Any:
         "num_env_states_per_minibatch": data.num_env_states_per_minibatch,
         "num_minibatches": data.num_minibatches,
     }
-    if isinstance(networks, NotFused) or why_not_fused(settings.objective, networks, **sizes) is not None:
+    if (
+        isinstance(networks, NotFused)
+        or why_not_fused(settings.objective, networks, **sizes) is not None
+    ):
         return None
     from ksim_rl.objectives.fused_ppo.fused_ppo import FusedPPO
 
@@ -188,7 +197,9 @@ def train(settings: Settings) -> list[dict[str, float]]:
     torch.set_float32_matmul_precision("high")
     # One core stays free for Warp: threads that wait for a core that is taken make small products many times slower.
     torch.set_num_threads(max(1, min(8, (os.cpu_count() or 1) - 1)))
-    env = envs.make(settings.task, num_envs=settings.num_envs, device=settings.device, seed=settings.seed)
+    env = envs.make(
+        settings.task, num_envs=settings.num_envs, device=settings.device, seed=settings.seed
+    )
     ppo = PPO(settings, env)
     collector = RolloutCollector(
         env,

@@ -35,7 +35,11 @@ SUBSTEPS = 5  # steps of physics between two commands: 100 commands a second
 
 
 def reach(
-    *, engine: Literal["warp", "c"] = "warp", num_worlds: int = 256, seconds: float = 3.0, device: str = "cpu"
+    *,
+    engine: Literal["warp", "c"] = "warp",
+    num_worlds: int = 256,
+    seconds: float = 3.0,
+    device: str = "cpu",
 ) -> tuple[Float32[Tensor, " E"], Float32[Tensor, " E"]]:
     """Return the mass of each world's arm, in kg, and by how many rad it stays below the target."""
     mj_model = load_model(MODEL)
@@ -75,7 +79,9 @@ def reach(
 
 def main() -> None:
     """Print how far some of the arms sag."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--engine", choices=("warp", "c"), default="warp")
     engine = parser.parse_args().engine
     on_gpu = engine == "warp" and torch.cuda.is_available()

@@ -111,7 +111,9 @@ def check_value(field: str, value: object, annotation: Annotation) -> None:
                 high = MOST_COUNT if bound.high is None else int(bound.high)
                 check_count(field, value, low=int(bound.low), high=high)
             elif arguments[0] in (int, float):
-                check_in_range(field, value, low=bound.low, high=bound.high, low_open=bound.low_open)
+                check_in_range(
+                    field, value, low=bound.low, high=bound.high, low_open=bound.low_open
+                )
             elif value is None or not bound.ordered:
                 check_value(field, value, arguments[0])
             # Ranges and tuples of numbers.

@@ -18,9 +18,14 @@ def near(name: str, choices: Iterable[str]) -> str:
     choices = sorted(set(choices))
     # Case is ignored: names of classes are often typed in lower case.
     lower = {choice.lower(): choice for choice in choices}
-    close = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.6)]
+    close = [
+        lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.6)
+    ]
     # A name that was cut short differs from each in too much.
-    close = close or [choice for choice in choices if name and choice.lower().startswith(name.lower())][:3]
+    close = (
+        close
+        or [choice for choice in choices if name and choice.lower().startswith(name.lower())][:3]
+    )
     if close:
         return f"did you mean {' or '.join(repr(choice) for choice in close)}?"
     if not choices:
@@ -52,7 +57,12 @@ def naming(where: str, *errors: type[Exception]) -> Iterator[None]:
 
 
 def check_in_range(
-    field: str, value: object, *, low: float | None = None, high: float | None = None, low_open: bool = False
+    field: str,
+    value: object,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    low_open: bool = False,
 ) -> None:
     """Refuse a number that is not finite or lies outside `[low, high]` (`(low, high]` with `low_open`)."""
     # As intervals are written: a bound that is not part of the interval has a round bracket.
@@ -71,7 +81,12 @@ def check_in_range(
         number = float(value)
     below = low is not None and (number <= low if low_open else number < low)
     # NaN differs from itself.
-    if number != number or abs(number) == float("inf") or below or (high is not None and number > high):
+    if (
+        number != number
+        or abs(number) == float("inf")
+        or below
+        or (high is not None and number > high)
+    ):
         raise ValueError(f"{field}={value!r}: expected a finite number in {bounds}")
 
 
@@ -91,7 +106,9 @@ def check_choice(field: str, value: object, choices: Iterable[object]) -> None:
         raise ValueError(f"{field}={value!r}: {hint}")
 
 
-def check_pair(field: str, value: object, *, low: float | None = None, high: float | None = None) -> None:
+def check_pair(
+    field: str, value: object, *, low: float | None = None, high: float | None = None
+) -> None:
     """Refuse a range that is not a pair of finite, ordered numbers within `[low, high]`."""
     # YAML gives lists where Python has tuples.
     if not isinstance(value, (tuple, list)) or len(value) != 2:

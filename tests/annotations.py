@@ -45,11 +45,15 @@ def _axis_error(axis: str, size: int, sizes: dict[str, Any]) -> bool:
 def _array_check(annotation: type[AbstractArray]) -> Check:
     axes = annotation.dim_str.split()
     kind = annotation.array_type
-    (several, *more) = [index for index, axis in enumerate(axes) if "*" in axis[:2] or axis == "..."] or [-1]
+    (several, *more) = [
+        index for index, axis in enumerate(axes) if "*" in axis[:2] or axis == "..."
+    ] or [-1]
     assert not more, annotation
     count = len(axes)
     fixed = [(index, int(axis)) for index, axis in enumerate(axes) if axis.isdecimal()]
-    named = [(index, axis) for index, axis in enumerate(axes) if axis.isidentifier() and axis != "_"]
+    named = [
+        (index, axis) for index, axis in enumerate(axes) if axis.isidentifier() and axis != "_"
+    ]
     plain = several < 0 and len(fixed) + len(named) == count
 
     fits: dict[object, bool] = {}
@@ -109,8 +113,12 @@ def _union_check(parts: Iterable[object]) -> Check:
 
 
 def _kind_check(kind: type) -> Check:
-    kinds = (int, float) if kind is float else kind  # an int will do for a float, as type checkers have it
-    return lambda value, sizes: "" if isinstance(value, kinds) else f"is of type {type(value).__name__}"
+    kinds = (
+        (int, float) if kind is float else kind
+    )  # an int will do for a float, as type checkers have it
+    return lambda value, sizes: (
+        "" if isinstance(value, kinds) else f"is of type {type(value).__name__}"
+    )
 
 
 def items_check(kind: type, items: Callable[[Any], Iterable[Any]], item: Check) -> Check:

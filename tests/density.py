@@ -13,8 +13,8 @@ from tests import signatures
 SUBJECT_LETTERS = 72
 # Tokens in a line of code and the word `Any` per function, as the package has them. Lower them where it falls;
 # a change that makes them rise is too dense, or has no types.
-TOKENS_PER_LINE = 9.75
-ANY_PER_FUNCTION = 0.101
+TOKENS_PER_LINE = 8.94
+ANY_PER_FUNCTION = 0.09
 # The commit since which subjects are held to the limit.
 RULED_SINCE = "df0eb0bf"
 

@@ -30,7 +30,16 @@ VAGUE_NAMES = {"utils", "util", "helpers", "helper", "misc", "common"}
 # The groups of docs/architecture.md, from what people use down to what computes; "" is the modules beside the rooms.
 OTHERS = "of no group"
 GROUPS = {
-    "applications": ("cli", "conf", "tasks", "tracking", "suites", "algorithms", "trainers", "runs"),
+    "applications": (
+        "cli",
+        "conf",
+        "tasks",
+        "tracking",
+        "suites",
+        "algorithms",
+        "trainers",
+        "runs",
+    ),
     "library": (
         "collectors",
         "objectives",
@@ -120,7 +129,9 @@ class House:
         found = []
         for room in {self.room(path) for path in self.texts}:
             paths = [path for path in self.texts if self.room(path) == room]
-            in_folder = {path.parent: sum(other.parent == path.parent for other in paths) for path in paths}
+            in_folder = {
+                path.parent: sum(other.parent == path.parent for other in paths) for path in paths
+            }
             most = max(in_folder, key=lambda folder: in_folder[folder])
             longest = max(paths, key=lambda path: self.lines[path])
             found.append(
@@ -138,7 +149,9 @@ class House:
     def circles(self) -> list[list[str]]:
         """Return the groups of modules that import each other; imports for type checkers and in functions count."""
         modules = {self._module(path): path for path in self.texts}
-        imports = {name: sorted(self._imports(name, path, modules)) for name, path in modules.items()}
+        imports = {
+            name: sorted(self._imports(name, path, modules)) for name, path in modules.items()
+        }
         return [sorted(group) for group in strong_components(imports) if len(group) > 1]
 
     def _module(self, path: Path) -> str:
@@ -180,12 +193,18 @@ def room_shares(house: House) -> list[str]:
     """Return rooms with too large a share."""
     total = sum(house.lines.values())
     shares = {room.name: room.lines / total for room in house.rooms() if room.name}
-    return [f"{name} has {share:.1%} of the lines" for name, share in shares.items() if share > ROOM_SHARE]
+    return [
+        f"{name} has {share:.1%} of the lines"
+        for name, share in shares.items()
+        if share > ROOM_SHARE
+    ]
 
 
 def file_lengths(house: House) -> list[str]:
     """Return files that are too long."""
-    return [f"{house.name(path)} has {n} lines" for path, n in house.lines.items() if n > FILE_LINES]
+    return [
+        f"{house.name(path)} has {n} lines" for path, n in house.lines.items() if n > FILE_LINES
+    ]
 
 
 def folder_sizes(house: House) -> list[str]:
@@ -197,7 +216,9 @@ def folder_sizes(house: House) -> list[str]:
 
 def vague_names(house: House) -> list[str]:
     """Return modules and folders whose names say nothing."""
-    paths = {part for path in house.texts for part in (path, *path.parents) if house.root in part.parents}
+    paths = {
+        part for path in house.texts for part in (path, *path.parents) if house.root in part.parents
+    }
     return sorted(house.name(path) for path in paths if path.stem.strip("_") in VAGUE_NAMES)
 
 
@@ -212,7 +233,11 @@ def contract_size(house: House) -> list[str]:
     if not path.is_file():
         return [f"{house.name(path)} is missing"]
     n = house.lines[path]
-    return [f"{house.name(path)} has {n} lines: {CONTRACT_LINES} at most"] if n > CONTRACT_LINES else []
+    return (
+        [f"{house.name(path)} has {n} lines: {CONTRACT_LINES} at most"]
+        if n > CONTRACT_LINES
+        else []
+    )
 
 
 def bare_tensors(house: House) -> list[str]:
@@ -251,7 +276,9 @@ def tests_in_place(house: House) -> list[str]:
     rooms = {room.name for room in house.rooms() if room.name}
     folders = {path.name for path in tests.iterdir() if path.is_dir() and any(path.rglob("*.py"))}
     found = [f"tests/{room} is missing" for room in sorted(rooms - folders)]
-    found += [f"tests/{name} is of no room" for name in sorted(folders - rooms - TESTS_OF_ALL_ROOMS)]
+    found += [
+        f"tests/{name} is of no room" for name in sorted(folders - rooms - TESTS_OF_ALL_ROOMS)
+    ]
     rooms_of: dict[str, set[str]] = {}
     folders_of: dict[str, set[str]] = {}
     for path in house.texts:
@@ -283,15 +310,23 @@ def long_signatures(house: House) -> list[str]:
                 continue
             most = PUBLIC_PARAMETERS if function.public else PARAMETERS
             if function.arguments > most:
-                found.append(f"{function.place} {function.name} has {function.arguments}: {most} at most")
+                found.append(
+                    f"{function.place} {function.name} has {function.arguments}: {most} at most"
+                )
     return found
 
 
 def _operators(text: str) -> set[str]:
     """Return the names of functions that a module makes operators of torch, whose schemas are flat."""
     calls = [node for node in ast.walk(signatures.parse(text)) if isinstance(node, ast.Call)]
-    made = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id == "as_operator"]
-    given = [part for call in made for part in (*call.args, *(keyword.value for keyword in call.keywords))]
+    made = [
+        call for call in calls if isinstance(call.func, ast.Name) and call.func.id == "as_operator"
+    ]
+    given = [
+        part
+        for call in made
+        for part in (*call.args, *(keyword.value for keyword in call.keywords))
+    ]
     return {part.id for part in given if isinstance(part, ast.Name)}
 
 
@@ -300,10 +335,14 @@ def means(house: House) -> list[str]:
     found = []
     tokens = density.tokens_per_line(house.texts)
     if tokens > density.TOKENS_PER_LINE:
-        found.append(f"{tokens:.2f} tokens in a line of code, and not {density.TOKENS_PER_LINE} or less")
+        found.append(
+            f"{tokens:.2f} tokens in a line of code, and not {density.TOKENS_PER_LINE} or less"
+        )
     anys = density.any_per_function(house.texts)
     if anys > density.ANY_PER_FUNCTION:
-        found.append(f"`Any` {anys:.3f} times per function, and not {density.ANY_PER_FUNCTION} or less")
+        found.append(
+            f"`Any` {anys:.3f} times per function, and not {density.ANY_PER_FUNCTION} or less"
+        )
     return found
 
 
@@ -358,7 +397,8 @@ def report(house: House, most: int) -> tuple[str, bool]:
         broken = check(house)
         holds = holds and not broken
         lines.append(
-            f"{'FAILS' if broken else 'holds'}: {limit}" + (f" ({len(broken)} do not)" if broken else "")
+            f"{'FAILS' if broken else 'holds'}: {limit}"
+            + (f" ({len(broken)} do not)" if broken else "")
         )
         lines += [f"    {finding}" for finding in broken[:most]]
         if len(broken) > most:
@@ -369,8 +409,12 @@ def report(house: House, most: int) -> tuple[str, bool]:
 def main(arguments: list[str] | None = None) -> int:
     """Print the report; 1 where a limit is broken."""
     parser = argparse.ArgumentParser(prog="python -m tests.house", description=__doc__)
-    parser.add_argument("--root", type=Path, default=Path(__file__).parents[1], help="checkout to measure")
-    parser.add_argument("--most", type=int, default=8, help="findings to show for each broken limit")
+    parser.add_argument(
+        "--root", type=Path, default=Path(__file__).parents[1], help="checkout to measure"
+    )
+    parser.add_argument(
+        "--most", type=int, default=8, help="findings to show for each broken limit"
+    )
     options = parser.parse_args(arguments)
     text, holds = report(House(options.root.resolve()), options.most)
     print(text)

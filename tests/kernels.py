@@ -17,12 +17,16 @@ LAYERS = "gpu/test_off_policy.py::test_layers_in_half_precision_err_as_torch_doe
 SINGLE_MODELS = "gpu/test_repeatability.py::test_kernels_of_single_models_give_the_same_bits_again"
 
 TESTS = {
-    "compiled/tape.py": {"_compiled": "compiled/test_lanes.py::test_lanes_give_what_one_thread_gives"},
+    "compiled/tape.py": {
+        "_compiled": "compiled/test_lanes.py::test_lanes_give_what_one_thread_gives"
+    },
     "device/copying.py": {
         "_launcher": "gpu/test_copying.py::test_copies_of_all_types_widths_and_layouts_are_exact"
     },
     "device/native_kernel.py": {"kernel": EQUAL_WORLDS},
-    "device/random.py": {"_launch": "gpu/test_transforms.py::test_draws_are_the_hash_that_they_say_they_are"},
+    "device/random.py": {
+        "_launch": "gpu/test_transforms.py::test_draws_are_the_hash_that_they_say_they_are"
+    },
     "ranks/running_moments.py": {
         "_quick": (
             "gpu/test_repeatability.py::"
@@ -46,7 +50,10 @@ TESTS = {
         "read_observations": CAPTURED_STEPS,
         "write_records": CAPTURED_STEPS,
     },
-    "objectives/fused_ppo/layer_kernels.py": {"layer": CAPTURED_STEPS, "output_gradients": CAPTURED_STEPS},
+    "objectives/fused_ppo/layer_kernels.py": {
+        "layer": CAPTURED_STEPS,
+        "output_gradients": CAPTURED_STEPS,
+    },
     "objectives/fused_ppo/loss_kernels.py": {"estimate_advantages": CAPTURED_STEPS},
     "objectives/fused_ppo/mlp_kernels.py": {
         "lower_gradients": CAPTURED_STEPS,
@@ -110,8 +117,14 @@ TESTS = {
     "physics/rows/tie_counts.py": {"count_fitting_ties": SINGLE_MODELS},
     "physics/rows/tie_weights.py": {"weigh_ties": SINGLE_MODELS},
     "physics/rows/contact_lists.py": {"__init__": EQUAL_WORLDS},
-    "physics/sensors/sensor_mending.py": {"_reading_of": SINGLE_MODELS, "bound_touch": SINGLE_MODELS},
-    "physics/sensors/limit_sensors.py": {"_read_forces": SINGLE_MODELS, "_read_state": SINGLE_MODELS},
+    "physics/sensors/sensor_mending.py": {
+        "_reading_of": SINGLE_MODELS,
+        "bound_touch": SINGLE_MODELS,
+    },
+    "physics/sensors/limit_sensors.py": {
+        "_read_forces": SINGLE_MODELS,
+        "_read_state": SINGLE_MODELS,
+    },
     "physics/smooth/stages.py": {
         "_launcher": (
             "gpu/test_smooth.py::test_all_numbers_of_lanes_give_the_same_bits_which_are_those_of_mujoco_warp"
@@ -129,7 +142,9 @@ TESTS = {
 def kernels(sources: dict[str, str]) -> set[tuple[str, str]]:
     """Return file and name of each kernel in the sources, by file."""
     trees = {name: ast.parse(source) for name, source in sources.items()}
-    launched = {name for tree in trees.values() for node in ast.walk(tree) for name in _launched(node)}
+    launched = {
+        name for tree in trees.values() for node in ast.walk(tree) for name in _launched(node)
+    }
     return {(file, name) for file, tree in trees.items() for name in _kernels(tree, launched)}
 
 
@@ -166,10 +181,16 @@ def compares_bits(test: str) -> bool:
     if not file.exists():
         return False
     functions = {
-        node.name: node for node in ast.parse(file.read_text()).body if isinstance(node, ast.FunctionDef)
+        node.name: node
+        for node in ast.parse(file.read_text()).body
+        if isinstance(node, ast.FunctionDef)
     }
     if name not in functions:
         return False
-    called = {own.id for own in ast.walk(functions[name]) if isinstance(own, ast.Name)} & functions.keys()
+    called = {
+        own.id for own in ast.walk(functions[name]) if isinstance(own, ast.Name)
+    } & functions.keys()
     text = "".join(ast.unparse(functions[own]) for own in {name, *called})
-    return any(word in text for word in ("equal(", "torch.equal", "== expected", "first_difference("))
+    return any(
+        word in text for word in ("equal(", "torch.equal", "== expected", "first_difference(")
+    )

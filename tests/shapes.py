@@ -39,7 +39,9 @@ _DTYPES = {
     for name, kind in vars(jaxtyping).items()
     if inspect.isclass(kind) and issubclass(kind, jaxtyping.AbstractDtype)
 }
-_ALIAS = re.compile(rf"^(\w+)(?:: TypeAlias)? = .*\b(?:{'|'.join(sorted(_DTYPES))})\[", re.MULTILINE)
+_ALIAS = re.compile(
+    rf"^(\w+)(?:: TypeAlias)? = .*\b(?:{'|'.join(sorted(_DTYPES))})\[", re.MULTILINE
+)
 
 
 def shape_aliases(root: Path) -> set[str]:
@@ -153,7 +155,9 @@ def _wrapper_code(
         if isinstance(node, ast.stmt | ast.expr | ast.arg):
             node.lineno = node.end_lineno = code.co_firstlineno
     code_of_module = compile(tree, code.co_filename, "exec")
-    (enclosing,) = [constant for constant in code_of_module.co_consts if isinstance(constant, CodeType)]
+    (enclosing,) = [
+        constant for constant in code_of_module.co_consts if isinstance(constant, CodeType)
+    ]
     (wrapper,) = [constant for constant in enclosing.co_consts if isinstance(constant, CodeType)]
     return wrapper.replace(co_name=name, co_qualname=code.co_qualname)
 
@@ -168,7 +172,9 @@ def checked(function: FunctionType, *parameters: str) -> FunctionType:
     signature = inspect.signature(function)
     bare = signature.replace(
         parameters=[
-            p.replace(annotation=_KINDS.empty, default=p.default if p.default is _KINDS.empty else None)
+            p.replace(
+                annotation=_KINDS.empty, default=p.default if p.default is _KINDS.empty else None
+            )
             for p in signature.parameters.values()
         ],
         return_annotation=inspect.Signature.empty,
@@ -242,9 +248,15 @@ class _Decorating(ast.NodeTransformer):
             isinstance(node, ast.Name) and node.id in self.names for node in ast.walk(annotation)
         )
 
-    def _decorator(self, name: str, node: ast.FunctionDef | ast.ClassDef, parameters: list[str]) -> ast.expr:
-        module = ast.Call(ast.Name("__import__", ast.Load()), [ast.Constant(__name__), *_NO_NAMES], [])
-        named = ast.Call(ast.Attribute(module, name, ast.Load()), [ast.Constant(p) for p in parameters], [])
+    def _decorator(
+        self, name: str, node: ast.FunctionDef | ast.ClassDef, parameters: list[str]
+    ) -> ast.expr:
+        module = ast.Call(
+            ast.Name("__import__", ast.Load()), [ast.Constant(__name__), *_NO_NAMES], []
+        )
+        named = ast.Call(
+            ast.Attribute(module, name, ast.Load()), [ast.Constant(p) for p in parameters], []
+        )
         ast.copy_location(named, (node.decorator_list or [node])[0])
         return ast.fix_missing_locations(named)
 
@@ -275,7 +287,9 @@ class _Decorating(ast.NodeTransformer):
             arguments.vararg,
             arguments.kwarg,
         ]
-        parameters = [part.arg for part in parts if part is not None and self._mentions(part.annotation)]
+        parameters = [
+            part.arg for part in parts if part is not None and self._mentions(part.annotation)
+        ]
         if self._mentions(node.returns):
             parameters.append("return")
         if parameters:

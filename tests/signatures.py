@@ -61,7 +61,9 @@ def docstring_lines(text: str) -> frozenset[int]:
     """Return the numbers of the lines that docstrings stand in."""
     lines: set[int] = set()
     for node in ast.walk(parse(text)):
-        is_documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        is_documented = isinstance(
+            node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+        )
         if is_documented and ast.get_docstring(node, clean=False) is not None:
             docstring = node.body[0]
             lines.update(range(docstring.lineno, (docstring.end_lineno or 0) + 1))
@@ -75,7 +77,9 @@ def _parse(text: str) -> ast.Module:
 
 def functions(path: Path, root: Path) -> Iterator[Function]:
     """Yield all functions of a file, with those inside of others and the fields of classes."""
-    yield from _functions(parse(path.read_text()).body, str(path.relative_to(root)), [], True, False)
+    yield from _functions(
+        parse(path.read_text()).body, str(path.relative_to(root)), [], True, False
+    )
 
 
 def _functions(
@@ -106,7 +110,9 @@ def _functions(
                 arguments.kwarg,
             ]
             parameters = [
-                (part.arg, part.annotation) for part in parts if part is not None and part.annotation
+                (part.arg, part.annotation)
+                for part in parts
+                if part is not None and part.annotation
             ]
             if node.returns is not None:
                 parameters.append(("return", node.returns))
@@ -115,7 +121,9 @@ def _functions(
                 ".".join([*scope, node.name]),
                 public and (not node.name.startswith("_") or node.name in _PUBLIC_MAGIC),
                 tuple(parameters),
-                is_property=any(d in ("property", "cached_property", "quantity") for d in decorators),
+                is_property=any(
+                    d in ("property", "cached_property", "quantity") for d in decorators
+                ),
                 is_nested=nested,
                 decorators=tuple(node.decorator_list),
                 arguments=sum(part is not None and part.arg not in _RECEIVERS for part in parts),
@@ -139,9 +147,17 @@ def aliases(root: Path) -> set[str]:
 def is_bare(annotation: ast.expr, bare_aliases: set[str]) -> bool:
     """Say whether a tensor without named axes stands in `annotation`."""
     if isinstance(annotation, ast.Subscript) and _last_name(annotation.value) in DTYPES:
-        array, axes = annotation.slice.elts if isinstance(annotation.slice, ast.Tuple) else (None, None)
-        named = isinstance(axes, ast.Constant) and isinstance(axes.value, str) and "..." not in axes.value
-        return not named or _last_name(array) == "Any" or re.search(r"(^|\s)_", axes.value) is not None
+        array, axes = (
+            annotation.slice.elts if isinstance(annotation.slice, ast.Tuple) else (None, None)
+        )
+        named = (
+            isinstance(axes, ast.Constant)
+            and isinstance(axes.value, str)
+            and "..." not in axes.value
+        )
+        return (
+            not named or _last_name(array) == "Any" or re.search(r"(^|\s)_", axes.value) is not None
+        )
     if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):
         try:
             return is_bare(ast.parse(annotation.value, mode="eval").body, bare_aliases)
@@ -150,7 +166,9 @@ def is_bare(annotation: ast.expr, bare_aliases: set[str]) -> bool:
     if isinstance(annotation, ast.Name | ast.Attribute):
         return _last_name(annotation) == "Tensor" or _last_name(annotation) in bare_aliases
     return any(
-        is_bare(part, bare_aliases) for part in ast.iter_child_nodes(annotation) if isinstance(part, ast.expr)
+        is_bare(part, bare_aliases)
+        for part in ast.iter_child_nodes(annotation)
+        if isinstance(part, ast.expr)
     )
 
 
@@ -160,14 +178,17 @@ def arrays(annotation: ast.expr) -> list[str]:
         return [*arrays(annotation.left), *arrays(annotation.right)]
     if isinstance(annotation, ast.Subscript) and _last_name(annotation.value) in DTYPES:
         axes = annotation.slice.elts[1] if isinstance(annotation.slice, ast.Tuple) else None
-        return [axes.value] if isinstance(axes, ast.Constant) and isinstance(axes.value, str) else []
+        return (
+            [axes.value] if isinstance(axes, ast.Constant) and isinstance(axes.value, str) else []
+        )
     return []
 
 
 def has_axes(annotation: ast.expr) -> bool:
     """Say whether an array with axes stands anywhere in `annotation`."""
     return any(
-        isinstance(part, ast.Subscript) and _last_name(part.value) in DTYPES for part in ast.walk(annotation)
+        isinstance(part, ast.Subscript) and _last_name(part.value) in DTYPES
+        for part in ast.walk(annotation)
     )
 
 
@@ -219,8 +240,14 @@ def _wrong_suffixes(path: Path, root: Path) -> Iterator[tuple[str, str]]:
                 if not function.is_property:
                     continue
                 name = function.name.rsplit(".", 1)[-1]
-            kinds = {part for axes in arrays(annotation) if (part := " ".join(axes.split())) is not None}
-            if kinds and name not in PRESCRIBED and not any(suffix_agrees(name, axes) for axes in kinds):
+            kinds = {
+                part for axes in arrays(annotation) if (part := " ".join(axes.split())) is not None
+            }
+            if (
+                kinds
+                and name not in PRESCRIBED
+                and not any(suffix_agrees(name, axes) for axes in kinds)
+            ):
                 yield (
                     function.place,
                     f"{function.name}: {name} has the axes {' or '.join(map(repr, sorted(kinds)))}",
@@ -241,9 +268,19 @@ def _wrong_models(path: Path, root: Path) -> Iterator[tuple[str, str]]:
         for wanted, pattern in patterns.items():
             found = pattern.fullmatch(text) if patterns is _MODELS else pattern.search(text)
             for name in names:
-                if found and name is not None and not re.fullmatch(rf"_?(\w+_)?{wanted}(_\w+)?", name):
+                if (
+                    found
+                    and name is not None
+                    and not re.fullmatch(rf"_?(\w+_)?{wanted}(_\w+)?", name)
+                ):
                     yield f"{where}:{node.lineno}", f"{name} is a {wanted}"
 
 
 def _last_name(node: ast.AST | None) -> str | None:
-    return node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else None
+    return (
+        node.id
+        if isinstance(node, ast.Name)
+        else node.attr
+        if isinstance(node, ast.Attribute)
+        else None
+    )

@@ -106,7 +106,9 @@ def _undeclared(cls: type) -> list[str]:
     """Return the constants of a class that neither it nor a base of it annotates."""
     declared = {name for base in cls.__mro__ for name in inspect.get_annotations(base)}
     constants = {
-        name for name, value in vars(cls).items() if name[0] != "_" and not hasattr(type(value), "__get__")
+        name
+        for name, value in vars(cls).items()
+        if name[0] != "_" and not hasattr(type(value), "__get__")
     }
     return sorted(constants - declared)
 

@@ -7,7 +7,9 @@ from ksim_rl.checks import check_count, check_in_range, check_known, naming
 
 def test_bounds_of_large_ints_are_exact():
     check_in_range("seed", 2**63 - 1, low=0, high=2**63 - 1)
-    with pytest.raises(ValueError, match=r"seed=9223372036854775808: .* in \[0, 9223372036854775807\]"):
+    with pytest.raises(
+        ValueError, match=r"seed=9223372036854775808: .* in \[0, 9223372036854775807\]"
+    ):
         check_in_range("seed", 2**63, low=0, high=2**63 - 1)
 
 
@@ -42,7 +44,10 @@ def test_an_unknown_name_is_refused_with_the_near_ones():
 
 
 def test_errors_are_named_by_what_they_are_of():
-    with pytest.raises(ValueError, match=r"^scene.robots.go1: no file$"), naming("scene.robots.go1"):
+    with (
+        pytest.raises(ValueError, match=r"^scene.robots.go1: no file$"),
+        naming("scene.robots.go1"),
+    ):
         raise ValueError("no file")
     with pytest.raises(ValueError, match=r"^go1: no file$"), naming("go1", OSError):
         raise OSError("no file")

@@ -44,7 +44,10 @@ BREAKS = {
         {"ksim_rl/scene/a.py": _TENSORS + "    bad_L: Float[Tensor, 'E L']\n"},
         "bad_L has the axes 'E L'",
     ),
-    "probes": ({"ksim_rl/trainers/a.py": "def f(env):\n    return hasattr(env, 'x')\n"}, "hasattr(env, 'x')"),
+    "probes": (
+        {"ksim_rl/trainers/a.py": "def f(env):\n    return hasattr(env, 'x')\n"},
+        "hasattr(env, 'x')",
+    ),
     "tests_in_place": ({"tests/old_room/test_a.py": "x = 1\n"}, "tests/old_room is of no room"),
     "crammed": (
         {"ksim_rl/scene/a.py": "x = [a if a else 0 for a in (1, 2)]\n"},
@@ -58,7 +61,10 @@ BREAKS = {
         "shown has 9: 8 at most",
     ),
     "means": (
-        {"ksim_rl/scene/a.py": "x = ((1, 2, 3), (4, 5, 6), (7, 8, 9), (1, 2, 3), (4, 5, 6))\n" * 200},
+        {
+            "ksim_rl/scene/a.py": "x = ((1, 2, 3), (4, 5, 6), (7, 8, 9), (1, 2, 3), (4, 5, 6))\n"
+            * 200
+        },
         "tokens in a line",
     ),
 }
@@ -72,11 +78,17 @@ def sound(tmp_path):
         _write(tmp_path, {f"tests/{room}/test_thing.py": "x = 1\n"})
     _write(
         tmp_path,
-        {"ksim_rl/envs/contract.py": '"""This module is the contract."""\n', "ksim_rl/scene/t.py": _TENSORS},
+        {
+            "ksim_rl/envs/contract.py": '"""This module is the contract."""\n',
+            "ksim_rl/scene/t.py": _TENSORS,
+        },
     )
     _write(
         tmp_path,
-        {f"ksim_rl/{room}/size.py": "x = 1\n" * 40 for room in ("mdp", "trainers", "envs", "physics")},
+        {
+            f"ksim_rl/{room}/size.py": "x = 1\n" * 40
+            for room in ("mdp", "trainers", "envs", "physics")
+        },
     )
     for path in tmp_path.rglob("size.py"):
         path.write_text('"""This module has a size."""\n' + path.read_text())
@@ -125,7 +137,9 @@ def test_a_long_subject_is_found(tmp_path):
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.example"]
     subprocess.run([*git, "init", "--quiet"], check=True)
     for letters in (72, 73):
-        subprocess.run([*git, "commit", "--quiet", "--allow-empty", "-m", "x" * letters], check=True)
+        subprocess.run(
+            [*git, "commit", "--quiet", "--allow-empty", "-m", "x" * letters], check=True
+        )
     assert density.long_subjects(tmp_path, "HEAD") == ["x" * 73]
 
 

@@ -9,7 +9,9 @@ LISTED = {(file, name) for file, tests in kernels.TESTS.items() for name in test
 def test_each_kernel_has_a_test_of_its_bits():
     sources = {str(path.relative_to(PACKAGE)): path.read_text() for path in PACKAGE.rglob("*.py")}
     found = kernels.kernels(sources)
-    assert found - LISTED == set(), "name a test that compares the bits of these in tests/kernels.py"
+    assert found - LISTED == set(), (
+        "name a test that compares the bits of these in tests/kernels.py"
+    )
     assert LISTED - found == set(), "these are no kernels (any more)"
 
 

@@ -54,7 +54,9 @@ def test_the_sdist_has_the_package_the_tests_and_what_builds_them(built):
         "constraints-oldest.txt",
         "pyproject.toml",
     } <= names
-    assert not [name for name in names if name.split("/")[0] in ("envs", "objectives", ".venv", "runs")]
+    assert not [
+        name for name in names if name.split("/")[0] in ("envs", "objectives", ".venv", "runs")
+    ]
 
 
 def test_the_wheel_that_is_built_from_the_sdist_has_every_source_and_data_file(built):
@@ -127,9 +129,15 @@ def test_the_oldest_versions_that_are_tried_are_the_lower_bounds():
     extras = project["optional-dependencies"]
     integrations = {entry for name, entries in extras.items() if name != "dev" for entry in entries}
     wanted = [
-        Requirement(entry) for entry in {*project["dependencies"], *(integrations & set(extras["dev"]))}
+        Requirement(entry)
+        for entry in {*project["dependencies"], *(integrations & set(extras["dev"]))}
     ]
-    lows = {each.name: part.version for each in wanted for part in each.specifier if part.operator == ">="}
+    lows = {
+        each.name: part.version
+        for each in wanted
+        for part in each.specifier
+        if part.operator == ">="
+    }
     lines = (ROOT / "constraints-oldest.txt").read_text().splitlines()
     pinned = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert {name: Version(low) for name, low in lows.items()} == {
@@ -143,7 +151,9 @@ def test_the_citation_is_of_this_version():
     assert {"cff-version", "title", "message", "authors"} <= citation.keys()
 
 
-@pytest.mark.skipif(shutil.which("hadolint") is None, reason="hadolint has no wheel for this platform")
+@pytest.mark.skipif(
+    shutil.which("hadolint") is None, reason="hadolint has no wheel for this platform"
+)
 def test_the_image_is_written_as_docker_recommends():
     done = subprocess.run(["hadolint", ROOT / "Dockerfile"], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
@@ -161,7 +171,9 @@ def test_the_workflow_and_the_hooks_run_what_make_runs():
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
     commands = [step.get("run", "") for job in jobs.values() for step in job["steps"]]
     assert ".ci/run" in commands and os.access(ROOT / ".ci" / "run", os.X_OK)
-    (bounds,) = yaml.safe_load((ROOT / ".github" / "workflows" / "versions.yml").read_text())["jobs"].values()
+    (bounds,) = yaml.safe_load((ROOT / ".github" / "workflows" / "versions.yml").read_text())[
+        "jobs"
+    ].values()
     tried = {f"test-{each['versions']}" for each in bounds["strategy"]["matrix"]["include"]}
     assert f"{' '.join(sorted(tried, reverse=True))}: test-%:" in (ROOT / "Makefile").read_text()
     assert bounds["steps"][-1]["run"].startswith("make test-${{ matrix.versions }}")

@@ -28,7 +28,9 @@ def test_the_python_block_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     composed = runpy.run_path(str(script), run_name="__main__")
     for network in (composed["actor"], composed["critic"]):
-        counts = [int(part.count) for part in network.modules() if isinstance(part, ObservationNormalizer)]
+        counts = [
+            int(part.count) for part in network.modules() if isinstance(part, ObservationNormalizer)
+        ]
         assert counts == [3 * 2048], "each env state counts once"
     assert capsys.readouterr().out.count("reward per step") == 3
 
@@ -37,5 +39,7 @@ def test_the_unit_test_passes_as_it_stands(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     copied = tmp_path / "test_copied.py"
     copied.write_text(block("pytest"))
-    (test,) = (value for name, value in runpy.run_path(str(copied)).items() if name.startswith("test_"))
+    (test,) = (
+        value for name, value in runpy.run_path(str(copied)).items() if name.startswith("test_")
+    )
     test()

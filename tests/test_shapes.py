@@ -57,7 +57,11 @@ def test_a_wrong_shape_is_an_error():
         (Shaped[Tensor, "E L+1"], torch.ones(4, 6), torch.ones(4, 5)),
         (Float[Tensor, " E"] | None, None, 1.0),
         (Float[Tensor, " E"] | float, 1.0, torch.ones(5)),
-        (Mapping[str, Float[Tensor, " E"]], {"a": torch.ones(4)}, {"a": torch.ones(4), "b": torch.ones(5)}),
+        (
+            Mapping[str, Float[Tensor, " E"]],
+            {"a": torch.ones(4)},
+            {"a": torch.ones(4), "b": torch.ones(5)},
+        ),
         (dict[str, Float[Tensor, " E"]], {}, [torch.ones(4)]),
         (
             dict[str, Float[Tensor, "E ?L"]],
@@ -70,7 +74,11 @@ def test_a_wrong_shape_is_an_error():
             {"a": torch.ones(4, 2), "b": torch.ones(5)},
         ),
         (list[Float[Tensor, " E"]], [torch.ones(4)], [torch.ones(4), torch.ones(3)]),
-        (tuple[Float[Tensor, " E"], Float[Tensor, " L"]], (torch.ones(4), torch.ones(5)), (torch.ones(4),)),
+        (
+            tuple[Float[Tensor, " E"], Float[Tensor, " L"]],
+            (torch.ones(4), torch.ones(5)),
+            (torch.ones(4),),
+        ),
         (tuple[Float[Tensor, " E"], ...], (torch.ones(4),) * 3, (torch.ones(4), torch.ones(3))),
     ],
 )
@@ -235,7 +243,9 @@ def test_no_function_of_the_package_is_left_out(package, record_property):
                 continue
             named = any(signatures.has_axes(annotation) for _, annotation in function.parameters)
             is_foreign = any(map(shapes.is_foreign, function.decorators))
-            (foreign if is_foreign else with_axes if named else without).add(f"{module}.{function.name}")
+            (foreign if is_foreign else with_axes if named else without).add(
+                f"{module}.{function.name}"
+            )
     wrapped = {shaped.name for shaped in shapes.WRAPPED.values()}
     assert with_axes <= wrapped, f"not checked: {sorted(with_axes - wrapped)}"
     counts = {
@@ -261,7 +271,8 @@ def test_twenty_functions_of_the_package_refuse_a_wrong_shape(package):
     by_room = {}
     for shaped in shapes.WRAPPED.values():
         plain = all(
-            p.kind is p.POSITIONAL_OR_KEYWORD for p in inspect.signature(shaped.function).parameters.values()
+            p.kind is p.POSITIONAL_OR_KEYWORD
+            for p in inspect.signature(shaped.function).parameters.values()
         )
         if shaped.arguments and plain and not shaped.name.startswith("loaded"):
             by_room.setdefault(shaped.name.split(".")[1], []).append(shaped)

@@ -24,7 +24,9 @@ OBEYED = set("\x1b\x07\x9b\u202e\r\x08")
 OTHERS = {
     "envs/explain.py": {"console.print"},
     "export/standalone/command.py": {"print"},
-    "scene/robots/analysis.py": {"Console(file=text, force_jupyter=False, width=240, highlight=False).print"},
+    "scene/robots/analysis.py": {
+        "Console(file=text, force_jupyter=False, width=240, highlight=False).print"
+    },
     "cli/runs.py": {"Console(highlight=False, width=None if console.is_terminal else 400).print"},
     "terminal.py": {"print"},
     "trainers/progress.py": {"print", "self.console.print"},
@@ -96,4 +98,6 @@ def test_a_folder_of_any_name_is_named_in_one_line(command, name, tmp_path, monk
             main.main(words)
         said = capsys.readouterr()
         assert stopped.value.code == (0 if said.out.startswith("no runs in") else 2)
-        assert not OBEYED & set(said.out + said.err) and len((said.out + said.err).splitlines()) == 1
+        assert (
+            not OBEYED & set(said.out + said.err) and len((said.out + said.err).splitlines()) == 1
+        )

@@ -19,7 +19,11 @@ def test_fields_that_once_gave_other_errors_are_refused_by_name():
     names = {"betas", "hidden_dims", "in_keys", "stop_at", "bias"}
     seen = set()
     for kind, name, value, error in wrong_configs.tries(only=names):
-        assert error is None or (isinstance(error, ValueError) and name in str(error)), (kind, name, value)
+        assert error is None or (isinstance(error, ValueError) and name in str(error)), (
+            kind,
+            name,
+            value,
+        )
         seen.add(name)
     assert seen == names
 

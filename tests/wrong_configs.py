@@ -99,7 +99,9 @@ def figures(only: Collection[str] = ()) -> dict:
             others.append(what)
         elif error is not None and not any(own in str(error) for own in names):
             unnamed.append(what)
-        elif error is None and not _may_be(typing.get_type_hints(kind, include_extras=True)[name], value):
+        elif error is None and not _may_be(
+            typing.get_type_hints(kind, include_extras=True)[name], value
+        ):
             taken.append(what)
     return {
         "tries": count,
@@ -124,7 +126,11 @@ def _may_be(annotation: Any, value: Any) -> bool:
     if annotation is int:
         return isinstance(value, int) and not isinstance(value, bool)
     if annotation is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < float("inf")
+        return (
+            isinstance(value, (int, float))
+            and not isinstance(value, bool)
+            and abs(value) < float("inf")
+        )
     if annotation is str:
         return isinstance(value, str)
     return True

@@ -87,7 +87,11 @@ def _apart(names: Sequence[str], *, form: str, jobs: int) -> Iterator[int]:
                 environment["CUDA_VISIBLE_DEVICES"] = ""
             command = [sys.executable, "-m", "benchmarks.faults", name, f"form={form}"]
             return results, subprocess.run(
-                command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+                command,
+                env=environment,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
             )
 
         on_cpu = sorted(
@@ -99,7 +103,10 @@ def _apart(names: Sequence[str], *, form: str, jobs: int) -> Iterator[int]:
                     results, ended = row.result()
                     print(ended.stdout, end="", flush=True)
                     if ended.returncode not in (0, 1):
-                        print(f"{results.name}: FAILS: ended with exit code {ended.returncode}", flush=True)
+                        print(
+                            f"{results.name}: FAILS: ended with exit code {ended.returncode}",
+                            flush=True,
+                        )
                     if (results / "faults.json").exists():
                         page.merge([results])
                     yield ended.returncode

@@ -116,7 +116,9 @@ class Child:
 def start(work: Callable[[], int], *, hangs_s: float = HANGS_S) -> Child:
     """Fork, and let the child do `work` and exit with what it returns; its output goes to the parent."""
     warm()
-    torch.set_num_threads(1)  # again: who ran in between may have set more, and a fork would wait for them
+    torch.set_num_threads(
+        1
+    )  # again: who ran in between may have set more, and a fork would wait for them
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     reading, writing = os.pipe()
@@ -143,7 +145,11 @@ def start(work: Callable[[], int], *, hangs_s: float = HANGS_S) -> Child:
 
 
 def train(
-    folder: Path, *, hooks: tuple[Hook, ...] = (), resume_from: Checkpoint | None = None, **trainer_cfg: int
+    folder: Path,
+    *,
+    hooks: tuple[Hook, ...] = (),
+    resume_from: Checkpoint | None = None,
+    **trainer_cfg: int,
 ) -> int:
     """Train in a child as `ksim-rl train` or `resume` does, from the config on; return the exit code."""
     cfg, trainer = warm()

@@ -54,7 +54,9 @@ def full_disk_of_commands(folder: Path, *, points: int, sizes: int, commands: in
         many = _operations(COMMANDS[name], place)
         harms: list[tuple[str, Callable[[], None]]] = []
         for at in range(0, many, max(1, many // points)):
-            harms.append((f"full at {at} of {many}", lambda at=at, place=place: _full_from(place, at)))
+            harms.append(
+                (f"full at {at} of {many}", lambda at=at, place=place: _full_from(place, at))
+            )
         for size in SIZES[:sizes]:
             harms.append((f"files of {size} bytes", lambda size=size: limit_files(size)))
         for harm, before in harms:
@@ -89,7 +91,13 @@ def _fill(name: str, place: Path, harm: str, before: Callable[[], None]) -> dict
 def two_tables(folder: Path, *, races: int) -> Figures:
     """Begin `reproduce` of one table twice at the same moment."""
     children.warm()
-    found = {"races": 0, "ended_badly": 0, "results_absent": 0, "raw_tracebacks": 0, "done_twice": 0}
+    found = {
+        "races": 0,
+        "ended_badly": 0,
+        "results_absent": 0,
+        "raw_tracebacks": 0,
+        "done_twice": 0,
+    }
     for number in range(races):
         place = folder / str(number)
         place.mkdir()
@@ -114,19 +122,28 @@ ROWS = {
         must="ended with a clear error; nothing half looks whole; with room again the command goes on",
         limits={
             "cases": (AT_LEAST, "least"),
-            **dict.fromkeys(("ended_badly", "half_files", "raw_tracebacks", "do_not_go_on"), (EXACTLY, 0)),
+            **dict.fromkeys(
+                ("ended_badly", "half_files", "raw_tracebacks", "do_not_go_on"), (EXACTLY, 0)
+            ),
         },
         measure=lambda folder, *, least, **amounts: full_disk_of_commands(folder, **amounts),
         amounts={"points": 8, "sizes": 4, "commands": 3, "least": 30},
         short={"points": 1, "sizes": 1, "commands": 1, "least": 2},
-        files=("ksim_rl/files/writing.py", "ksim_rl/export", "ksim_rl/zoo/adding.py", "ksim_rl/tables"),
+        files=(
+            "ksim_rl/files/writing.py",
+            "ksim_rl/export",
+            "ksim_rl/zoo/adding.py",
+            "ksim_rl/tables",
+        ),
     ),
     "two_tables": Row(
         fault="two processes reproduce one table at the same time",
         must="both end with exit code 0; each job is done once, and its result is there",
         limits={
             "races": (AT_LEAST, "races"),
-            **dict.fromkeys(("ended_badly", "results_absent", "raw_tracebacks", "done_twice"), (EXACTLY, 0)),
+            **dict.fromkeys(
+                ("ended_badly", "results_absent", "raw_tracebacks", "done_twice"), (EXACTLY, 0)
+            ),
         },
         measure=two_tables,
         amounts={"races": 4},

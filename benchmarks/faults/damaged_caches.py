@@ -32,7 +32,9 @@ def _compilers(output: Path) -> dict[str, Compiler]:
     found = {}
     if has_triton():
         found["Triton"] = Compiler(
-            variable="TRITON_CACHE_DIR", words=(*ONCE, "triton"), patterns=("twice.json", "__grp__*.json")
+            variable="TRITON_CACHE_DIR",
+            words=(*ONCE, "triton"),
+            patterns=("twice.json", "__grp__*.json"),
         )
     found["torch.compile"] = Compiler(
         variable="TORCHINDUCTOR_CACHE_DIR",
@@ -66,7 +68,11 @@ def _run(compiler: Compiler, cache: Path, output: Path) -> subprocess.CompletedP
     environment = {**os.environ, compiler.variable: str(cache)}
     shutil.rmtree(output, ignore_errors=True)
     return subprocess.run(
-        [sys.executable, *compiler.words], env=environment, capture_output=True, text=True, timeout=1800
+        [sys.executable, *compiler.words],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=1800,
     )
 
 
@@ -78,7 +84,9 @@ def _cases(
         cache = folder / name
         first = _run(compiler, cache, folder / "run")
         if first.returncode not in (0, 1):
-            raise RuntimeError(f"{name} ended with exit code {first.returncode}:\n{first.stderr[-2000:]}")
+            raise RuntimeError(
+                f"{name} ended with exit code {first.returncode}:\n{first.stderr[-2000:]}"
+            )
         damages = []
         for pattern in compiler.patterns:
             files = sorted(path for path in cache.rglob(pattern) if path.is_file())
@@ -106,7 +114,10 @@ def damaged_caches(folder: Path, *, damages: int) -> Figures:
             found["named_in_one_line"] += ended.returncode not in (0, 1) and not fault
             found["neither"] += bool(fault)
             if fault:
-                print(f"{name}: {path.name} {damage.__name__}: {fault}: {ended.stderr[-800:]}", flush=True)
+                print(
+                    f"{name}: {path.name} {damage.__name__}: {fault}: {ended.stderr[-800:]}",
+                    flush=True,
+                )
             shutil.rmtree(cache)
             shutil.copytree(whole, cache)
         shutil.rmtree(whole)

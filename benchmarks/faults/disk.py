@@ -151,7 +151,9 @@ def _read_only(run: Path) -> None:
     """Let the folder answer as a disk that is mounted read-only does, which also stops an administrator."""
     access = os.access
     os.access = lambda path, mode, **options: (
-        False if str(path).startswith(str(run)) and mode & os.W_OK else access(path, mode, **options)
+        False
+        if str(path).startswith(str(run)) and mode & os.W_OK
+        else access(path, mode, **options)
     )
 
     def refuse(kind: str, path: str) -> None:
@@ -162,7 +164,13 @@ def _read_only(run: Path) -> None:
 
 def folder_gone(folder: Path, *, cases: int) -> Figures:
     """Delete, move, empty and lock away a run folder in the middle of a run."""
-    found = {"cases": 0, "exit_code_3": 0, "said_within_one_iteration": 0, "new_halves": 0, "unloadable": 0}
+    found = {
+        "cases": 0,
+        "exit_code_3": 0,
+        "said_within_one_iteration": 0,
+        "new_halves": 0,
+        "unloadable": 0,
+    }
     found["raw_tracebacks"] = 0
     for harm, word in (
         (_delete, "deleted or moved"),
@@ -177,7 +185,9 @@ def folder_gone(folder: Path, *, cases: int) -> Figures:
             harm(run)
 
         ended = children.start(
-            lambda run=run, act=act: children.train(run, hooks=(children.At(2, act),), num_iterations=6)
+            lambda run=run, act=act: children.train(
+                run, hooks=(children.At(2, act),), num_iterations=6
+            )
         ).wait()
         after = ended.text.partition("@harm")[2]
         later = after.partition(word)[0].count("\niteration ")
@@ -205,7 +215,9 @@ ROWS = {
             "raw_tracebacks": (EXACTLY, 0),
             "hangs": (EXACTLY, 0),
         },
-        measure=lambda folder, *, points, sizes, least: disk_full(folder, points=points, sizes=sizes),
+        measure=lambda folder, *, points, sizes, least: disk_full(
+            folder, points=points, sizes=sizes
+        ),
         amounts={"points": 1000, "sizes": 8, "least": 100},
         short={"points": 2, "sizes": 1, "least": 5},
         files=FILES,

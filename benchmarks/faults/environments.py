@@ -17,7 +17,14 @@ from benchmarks.faults.row import AT_LEAST, EXACTLY, Figures, Row
 
 MIB = 2**20
 # Variables of whoever measures: a case has its own or none.
-LEFT_OUT = ("COLUMNS", "DISPLAY", "MUJOCO_GL", "WARP_CACHE_PATH", "XDG_CACHE_HOME", "OMP_NUM_THREADS")
+LEFT_OUT = (
+    "COLUMNS",
+    "DISPLAY",
+    "MUJOCO_GL",
+    "WARP_CACHE_PATH",
+    "XDG_CACHE_HOME",
+    "OMP_NUM_THREADS",
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,10 @@ GO1 = ("task=go1_velocity_flat", "device=cuda", "trainer.eval_episodes=0", "trai
 # so that one number is tried: each takes a process, which spends most of its time before it trains.
 ALGORITHMS = {
     "ppo": (49152, "collector.rollout_length=24"),
-    "sac": (40960, "data.capacity=256"),  # with the steps of a run's replay, hardly an env would fit
+    "sac": (
+        40960,
+        "data.capacity=256",
+    ),  # with the steps of a run's replay, hardly an env would fit
     # Its own replay of 1024 steps is nine tenths of what an env takes. The batches of 48 gradient steps would take
     # gigabytes beside it, however few the envs are, and compiling takes a minute each time.
     "fast_sac": (61440, "objective.compile=false", "data.num_minibatches=4"),
@@ -70,7 +73,8 @@ def gpu_soak(folder: Path, *, seconds: int) -> Figures:
     return {
         "seconds": watch.rows[-1][0],
         "last_speed_over_first": last / watch.speed(0.0, part),
-        "last_speed_over_second": last / watch.speed(part, 2 * part),  # the first one sees robots that fall
+        "last_speed_over_second": last
+        / watch.speed(part, 2 * part),  # the first one sees robots that fall
         "host_memory_rise": half[-1][2] - half[0][2],
         "device_memory_rise": half[-1][3] - half[0][3],
     }
@@ -82,14 +86,20 @@ def gpu_memory(folder: Path) -> Figures:
     for name, (asked, *own) in ALGORITHMS.items():
         overrides = [*GO1, f"objective={name}", "logger=none", "trainer.num_iterations=10", *own]
         # A GPU of 8 GB, so that what fits is soon trained.
-        taken = torch.empty(max(0, torch.cuda.mem_get_info()[0] - ROOM), dtype=torch.uint8, device="cuda")
+        taken = torch.empty(
+            max(0, torch.cuda.mem_get_info()[0] - ROOM), dtype=torch.uint8, device="cuda"
+        )
         fits, began = None, time.monotonic()
         try:
             cfg = conf.compose([*overrides, f"num_envs={asked}"])
             run_folder.run(cfg, folder / name, progress=RunProgress(1, enabled=False))
         except ValueError as error:
             fits = re.search(r"num_envs=([0-9]+) was tried and fits", str(error))
-            told += "one env takes at least" in str(error) and "\n" not in str(error) and fits is not None
+            told += (
+                "one env takes at least" in str(error)
+                and "\n" not in str(error)
+                and fits is not None
+            )
             print(f"{name}, after {time.monotonic() - began:.0f} s: {error}", flush=True)
         gc.collect()
         torch.cuda.empty_cache()
@@ -97,7 +107,10 @@ def gpu_memory(folder: Path) -> Figures:
             cfg = conf.compose([*overrides, f"num_envs={fits[1]}"])
             run_folder.run(cfg, folder / f"{name}_fits", progress=RunProgress(1, enabled=False))
             ran += 1
-            print(f"{name}: num_envs={fits[1]} has run after {time.monotonic() - began:.0f} s", flush=True)
+            print(
+                f"{name}: num_envs={fits[1]} has run after {time.monotonic() - began:.0f} s",
+                flush=True,
+            )
         del taken
         gc.collect()
         torch.cuda.empty_cache()
@@ -171,7 +184,9 @@ ROWS = {
         "beside whole ones",
         limits={
             "broken": (AT_LEAST, 4),
-            **dict.fromkeys(("not_ended_within_one_step", "non_finite_in_the_dataset"), (EXACTLY, 0)),
+            **dict.fromkeys(
+                ("not_ended_within_one_step", "non_finite_in_the_dataset"), (EXACTLY, 0)
+            ),
             "others_that_differ": (EXACTLY, 0),
         },
         measure=gpu_nan_worlds,

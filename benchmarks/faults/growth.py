@@ -26,7 +26,9 @@ PICTURE = "faults_soak.png"
 
 def memory(kind: str = "RssAnon") -> int:
     """Return the memory of this process in bytes: its own, or with the pages of libraries ("VmRSS")."""
-    (kilobytes,) = re.findall(rf"^{kind}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    (kilobytes,) = re.findall(
+        rf"^{kind}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE
+    )
     return int(kilobytes) * 1024
 
 
@@ -55,7 +57,9 @@ class _Samples(Hook):
                     "open_files": len(os.listdir("/proc/self/fd")),
                     "threads": threading.active_count(),
                     "files": len(files),
-                    "log_bytes": sum(path.stat().st_size for path in files if "checkpoint" not in str(path)),
+                    "log_bytes": sum(
+                        path.stat().st_size for path in files if "checkpoint" not in str(path)
+                    ),
                 }
             )
             self.samples.write_text(json.dumps(self.rows))  # also if the process is killed
@@ -85,7 +89,9 @@ def soak(
             eval_interval=max(10, iterations // 20),
             stop_when_solved=False,
         )
-        run_folder.run(dataclasses.replace(cfg, trainer=trainer_cfg), folder / "run", progress=quiet)
+        run_folder.run(
+            dataclasses.replace(cfg, trainer=trainer_cfg), folder / "run", progress=quiet
+        )
         return 0
 
     build = run_folder.build
@@ -151,7 +157,9 @@ def draw(rows: list[dict[str, float]], picture: Path) -> None:
     for number, (title, series) in enumerate(panels.items()):
         axes = figure.add_subplot(2, 2, number + 1)
         for name, scale in series:
-            axes.plot([row["iteration"] for row in rows], [row[name] * scale for row in rows], label=name)
+            axes.plot(
+                [row["iteration"] for row in rows], [row[name] * scale for row in rows], label=name
+            )
         axes.set_title(title, fontsize=10)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.25)

@@ -12,9 +12,20 @@ from pathlib import Path
 from benchmarks.faults import children
 from benchmarks.faults.row import AT_LEAST, EXACTLY, Figures, Row
 
-MODULES = ("mujoco.py", "torch.py", "sitecustomize.py", "usercustomize.py", "ksim_rl/__init__.py", "numpy.py")
+MODULES = (
+    "mujoco.py",
+    "torch.py",
+    "sitecustomize.py",
+    "usercustomize.py",
+    "ksim_rl/__init__.py",
+    "numpy.py",
+)
 # As the installed command starts: its folder is on the path, and not the one in which the user stands.
-PROGRAM = ("-P", "-c", "import sys; sys.argv[0] = 'ksim-rl'; from ksim_rl.cli.main import main; main()")
+PROGRAM = (
+    "-P",
+    "-c",
+    "import sys; sys.argv[0] = 'ksim-rl'; from ksim_rl.cli.main import main; main()",
+)
 TABLE = """\
 name: hostile
 title: A table of a stranger
@@ -40,7 +51,13 @@ def _commands(output: Path) -> dict[str, list[str]]:
         "doctor": ["--no-test"],
         "play": [".", "--seconds", "0.1", "--device", "cpu"],
         "resume": [".", "--num-iterations", "3", "--device", "cpu", "trainer.video=true"],
-        "train": ["--config-dir", ".", *quick, "viewer.browser=true", f"hydra.run.dir={output / 'new'}"],
+        "train": [
+            "--config-dir",
+            ".",
+            *quick,
+            "viewer.browser=true",
+            f"hydra.run.dir={output / 'new'}",
+        ],
         "eval": [".", "--episodes", "2", "--device", "cpu"],
         "demo": ["--seconds", "0.1", "--output", str(output / "demo.mp4")],
         "zoo": [],
@@ -70,7 +87,9 @@ def _commands(output: Path) -> dict[str, list[str]]:
 def hostile_folder(folder: Path, *, commands: int) -> Figures:
     """Run commands in a run folder that has modules named as libraries; count those that were imported."""
     run, marks = folder / "run", folder / "marks"
-    environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")
+    }
     words = ["train", *children.SMALLEST, f"hydra.run.dir={run}"]
     subprocess.run([sys.executable, *PROGRAM, *words], env=environment, cwd=folder, timeout=1800)
     write_modules(run, marks=marks)

@@ -38,7 +38,14 @@ def _phases() -> dict[str, tuple[Any, str, int]]:
 
 def signals(folder: Path, *, phases: int) -> Figures:
     """Send SIGINT and SIGTERM in each phase, and a second signal after the first."""
-    found = {"cases": 0, "exit_codes": 0, "said": 0, "true_words": 0, "leftovers": 0, "raw_tracebacks": 0}
+    found = {
+        "cases": 0,
+        "exit_codes": 0,
+        "said": 0,
+        "true_words": 0,
+        "leftovers": 0,
+        "raw_tracebacks": 0,
+    }
     for phase, (owner, name, least) in list(_phases().items())[:phases]:
         for number in (signal.SIGINT, signal.SIGTERM):
             for times in (1, 2):
@@ -60,7 +67,9 @@ def signals(folder: Path, *, phases: int) -> Figures:
                 ended = children.start(work).wait()
                 found["cases"] += 1
                 found["exit_codes"] += ended.code == 128 + number
-                found["said"] += f"{signal.Signals(number).name}: " in ended.text and "save" in ended.text
+                found["said"] += (
+                    f"{signal.Signals(number).name}: " in ended.text and "save" in ended.text
+                )
                 found["true_words"] += _true(ended.text, run, least if times == 1 else 0)
                 found["leftovers"] += len(children.leftovers(run))
                 found["raw_tracebacks"] += ended.raw_traceback
@@ -171,7 +180,9 @@ def clock(folder: Path) -> Figures:
         "ended_well": ended.code in (0, 1) and not ended.raw_traceback,
         "differ": same_bits(one.state, other.state),
         "newest_taken": other.iteration == one.iteration,
-        "seconds_that_do_not_rise": sum(b < a or a < 0 for a, b in zip(seconds, seconds[1:], strict=False)),
+        "seconds_that_do_not_rise": sum(
+            b < a or a < 0 for a, b in zip(seconds, seconds[1:], strict=False)
+        ),
     }
 
 

@@ -79,7 +79,12 @@ def _whole_zoo(place: Path) -> int:
 
 
 def _train(place: Path) -> list[str]:
-    return ["train", *children.SMALLEST, "trainer.num_iterations=20", f"hydra.run.dir={place / 'run'}"]
+    return [
+        "train",
+        *children.SMALLEST,
+        "trainer.num_iterations=20",
+        f"hydra.run.dir={place / 'run'}",
+    ]
 
 
 def _train_again(place: Path) -> list[str]:
@@ -101,7 +106,16 @@ def _export(place: Path) -> list[str]:
 
 
 def _zoo_add(place: Path) -> list[str]:
-    return ["zoo", "add", str(place / "run"), ENTRY, "--folder", str(place / "zoo"), "--episodes", "2"]
+    return [
+        "zoo",
+        "add",
+        str(place / "run"),
+        ENTRY,
+        "--folder",
+        str(place / "zoo"),
+        "--episodes",
+        "2",
+    ]
 
 
 def _zoo_again(place: Path) -> list[str]:
@@ -171,13 +185,17 @@ def killed_commands(folder: Path, *, kills: int, commands: int) -> Figures:
     names = list(COMMANDS)[:commands]
     for number, name in enumerate(names):
         share = kills // len(names) + (number < kills % len(names))
-        for figure, value in _kill(name, trained, folder / name, kills=share, choose=choose).items():
+        for figure, value in _kill(
+            name, trained, folder / name, kills=share, choose=choose
+        ).items():
             found[figure] += value
         found[f"kills_of_{name.replace(' ', '_')}"] = share
     return found
 
 
-def _kill(name: str, trained: Path, folder: Path, *, kills: int, choose: random.Random) -> dict[str, int]:
+def _kill(
+    name: str, trained: Path, folder: Path, *, kills: int, choose: random.Random
+) -> dict[str, int]:
     """Kill one command so often, each time in a copy of a folder with a trained run, or for `train` without it."""
     command = COMMANDS[name]
     found = {"kills": 0, "corrupt": 0, "do_not_go_on": 0, "stray": 0, "raw_tracebacks": 0}

@@ -50,7 +50,11 @@ def headless(folder: Path) -> Figures:
             failed = environment["MUJOCO_GL"] not in works
             return SimpleNamespace(returncode=int(failed), stderr="no such display")
 
-        kept = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
+        kept = {
+            name: value
+            for name, value in os.environ.items()
+            if name not in ("MUJOCO_GL", "DISPLAY")
+        }
         with (
             mock.patch.dict(os.environ, kept, clear=True),
             mock.patch.object(rendering, "run_python", probe),
@@ -61,14 +65,24 @@ def headless(folder: Path) -> Figures:
             except RuntimeError as error:
                 message = str(error)
     words = ("EGL", "OSMesa", "Xvfb", "DISPLAY", "no such display")
-    return {"platforms": 2, "picked": picked, "error_with_the_fix": all(word in message for word in words)}
+    return {
+        "platforms": 2,
+        "picked": picked,
+        "error_with_the_fix": all(word in message for word in words),
+    }
 
 
 def caches(folder: Path) -> Figures:
     """Train where nothing can be written at home, where Warp's cache cannot be made, and without a HOME."""
-    places = {"home": {"HOME": "/dev/null"}, "warp": {"WARP_CACHE_PATH": "/dev/null/cache"}, "none": {}}
+    places = {
+        "home": {"HOME": "/dev/null"},
+        "warp": {"WARP_CACHE_PATH": "/dev/null/cache"},
+        "none": {},
+    }
     kept = {
-        key: value for key, value in os.environ.items() if key not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")
+        key: value
+        for key, value in os.environ.items()
+        if key not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")
     }
     told, codes = 0, {}
     for name, changed in places.items():
@@ -76,13 +90,25 @@ def caches(folder: Path) -> Figures:
         if name == "none":
             environment.pop("HOME", None)
         command = [sys.executable, *PROGRAM, "train", *children.SMALLEST]
-        command += ["trainer.num_iterations=1", "trainer.eval_episodes=0", f"hydra.run.dir={folder / name}"]
-        ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=1800)
+        command += [
+            "trainer.num_iterations=1",
+            "trainer.eval_episodes=0",
+            f"hydra.run.dir={folder / name}",
+        ]
+        ended = subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=1800
+        )
         codes[name] = ended.returncode
         lines = [line for line in ended.stderr.splitlines() if line.startswith("ksim-rl: error")]
-        told += len(lines) == 1 and "WARP_CACHE_PATH" in lines[0] and "Traceback" not in ended.stderr
+        told += (
+            len(lines) == 1 and "WARP_CACHE_PATH" in lines[0] and "Traceback" not in ended.stderr
+        )
     refused = sum(codes[name] == 2 for name in ("home", "warp"))
-    return {"refused": refused, "one_line_with_the_fix": told, "runs_without_home": codes["none"] in (0, 1)}
+    return {
+        "refused": refused,
+        "one_line_with_the_fix": told,
+        "runs_without_home": codes["none"] in (0, 1),
+    }
 
 
 ROWS = {

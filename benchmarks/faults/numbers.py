@@ -55,7 +55,12 @@ def nan_actions(folder: Path) -> Figures:
 
     env = puck_env(num_envs=6, limit=None)
     root_E = env.reset()
-    wrong = (torch.zeros(6), torch.zeros(6, 2), torch.zeros(6, 1, 1), torch.zeros(6, 1, dtype=torch.float64))
+    wrong = (
+        torch.zeros(6),
+        torch.zeros(6, 2),
+        torch.zeros(6, 1, 1),
+        torch.zeros(6, 1, dtype=torch.float64),
+    )
     refused = 0
     before_EL = env.world.qpos_EL.clone()
     for action in wrong:
@@ -106,7 +111,9 @@ def nan_terms(folder: Path) -> Figures:
 
 def non_finite_loss(folder: Path) -> Figures:
     """Make every loss NaN by a critic that is, and train on."""
-    trainer = build(conf.compose([*children.SMALLEST, "logger=none", "objective.max_skipped_steps=4"]))
+    trainer = build(
+        conf.compose([*children.SMALLEST, "logger=none", "objective.max_skipped_steps=4"])
+    )
     trainer.iterate()
     with torch.no_grad():
         update: Any = trainer.update
@@ -121,7 +128,11 @@ def non_finite_loss(folder: Path) -> Figures:
         named = "in a row" in str(error)
     after = list(trainer.update.actor.parameters())
     changed = sum(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
-    return {"steps_taken_on_it": changed, "iterations_until_the_stop": iterations, "named_stop": named}
+    return {
+        "steps_taken_on_it": changed,
+        "iterations_until_the_stop": iterations,
+        "named_stop": named,
+    }
 
 
 def overflow(folder: Path) -> Figures:
@@ -136,11 +147,15 @@ def overflow(folder: Path) -> Figures:
     ):
         world = fallen(room)
         world.step(2)
-        world.reset(torch.ones(4, dtype=torch.bool))  # a reset clears what the physics itself remembers
+        world.reset(
+            torch.ones(4, dtype=torch.bool)
+        )  # a reset clears what the physics itself remembers
         world.step(1)
         text = " ".join(world.overflow_report().messages)
         cases += 1
-        seen += field in text and any(f"{words} {n}" in text for words, n in (("has", 10), ("now", 1)))
+        seen += field in text and any(
+            f"{words} {n}" in text for words, n in (("has", 10), ("now", 1))
+        )
     return {"cases": cases, "seen_with_needed_and_present": seen}
 
 
@@ -150,7 +165,9 @@ def same_seed(folder: Path, *, iterations: int) -> Figures:
     for run in runs:
 
         def work(run=run) -> int:
-            trainer = build(conf.compose([*children.SMALLEST, "logger=none"]))  # anew, not the parent's
+            trainer = build(
+                conf.compose([*children.SMALLEST, "logger=none"])
+            )  # anew, not the parent's
             for _ in range(iterations):
                 trainer.iterate()
             checkpoint.save(run, trainer.state_dict(), iteration=trainer.iteration, config={})
@@ -184,13 +201,18 @@ def threads(folder: Path, *, iterations: int) -> Figures:
                 trainer.iterate()
         states.append(trainer.state_dict())
     torch.set_num_threads(1)
-    return {"iterations": iterations, "differ": sum(same_bits(states[0], other) for other in states[1:])}
+    return {
+        "iterations": iterations,
+        "differ": sum(same_bits(states[0], other) for other in states[1:]),
+    }
 
 
 def count_non_finite(tensordict: Any) -> int:
     """Return how many numbers of a TensorDict are not finite."""
     return sum(
-        int((~leaf.isfinite()).sum()) for leaf in tensordict.values(True, True) if leaf.is_floating_point()
+        int((~leaf.isfinite()).sum())
+        for leaf in tensordict.values(True, True)
+        if leaf.is_floating_point()
     )
 
 

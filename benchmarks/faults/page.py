@@ -20,7 +20,9 @@ BEGIN, END = "<!-- table: python -m benchmarks.faults -->", "<!-- end of the tab
 NOT_MEASURED = "not measured: no CUDA device"
 
 
-def write_row(name: str, figures: Mapping[str, float], *, passed: bool, folder: Path | None = None) -> None:
+def write_row(
+    name: str, figures: Mapping[str, float], *, passed: bool, folder: Path | None = None
+) -> None:
     """Add what was measured of one row to the results, and make the page's table anew where they are committed."""
     row = ROWS[name]
     device = torch.device(row.device)
@@ -79,9 +81,12 @@ def table(saved: Mapping[str, Any]) -> str:
     """Return the table: a row for each fault, with its figures or why there are none."""
     lines = ["| row | fault | must | measured | |", "|---|---|---|---|---|"]
     for name, row in ROWS.items():
-        figures = {key: value for key, value in saved["figures"].items() if key.split("/")[1] == name}
+        figures = {
+            key: value for key, value in saved["figures"].items() if key.split("/")[1] == name
+        }
         shown = ", ".join(
-            f"{key.rpartition('/')[2].replace('_', ' ')} {value:g}" for key, value in figures.items()
+            f"{key.rpartition('/')[2].replace('_', ' ')} {value:g}"
+            for key, value in figures.items()
         )
         missing = NOT_MEASURED if row.device == "cuda" else "not measured yet"
         verdict = {True: "passes", False: "**fails**", None: "-"}[saved["passed"].get(name)]

@@ -44,7 +44,9 @@ class Row:
         figures = self.measure(folder, **amounts)
         return figures, self.broken(figures, amounts)
 
-    def broken(self, figures: Mapping[str, float], amounts: Mapping[str, int] | None = None) -> list[str]:
+    def broken(
+        self, figures: Mapping[str, float], amounts: Mapping[str, int] | None = None
+    ) -> list[str]:
         """Return the limits that the figures break; one without a figure is broken."""
         amounts = self.amounts if amounts is None else amounts
         found = []

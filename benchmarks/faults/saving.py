@@ -15,7 +15,11 @@ from ksim_rl.device import state_tree
 from ksim_rl.trainers import Hook, Trainer, checkpoint
 from ksim_rl.trainers.checkpoint import MANIFEST, TENSORS, CheckpointError
 
-FILES = ("ksim_rl/trainers/checkpoint.py", "ksim_rl/trainers/trainer.py", "ksim_rl/files/writing.py")
+FILES = (
+    "ksim_rl/trainers/checkpoint.py",
+    "ksim_rl/trainers/trainer.py",
+    "ksim_rl/files/writing.py",
+)
 # About as many file operations as a save makes with the deletion of an old checkpoint, so all of them are hit.
 OPERATIONS_OF_A_SAVE = 12
 
@@ -53,7 +57,14 @@ def kill9(folder: Path, *, kills: int, inside: int) -> Figures:
     choose = random.Random(kills)
     order = [True] * inside + [False] * (kills - inside)
     choose.shuffle(order)
-    found = {"kills": 0, "kills_inside_a_save": 0, "corrupt": 0, "absent": 0, "intervals_lost": 0, "stray": 0}
+    found = {
+        "kills": 0,
+        "kills_inside_a_save": 0,
+        "corrupt": 0,
+        "absent": 0,
+        "intervals_lost": 0,
+        "stray": 0,
+    }
     for number, in_save in enumerate(order):
         # The newest whole one, which is what `ksim-rl resume` takes.
         before = _newest(run)
@@ -93,7 +104,11 @@ def kill9(folder: Path, *, kills: int, inside: int) -> Figures:
         assert at is not None
         saved = checkpoint.load(at)
         return children.train(
-            run, hooks=(Hook(),), resume_from=saved, num_iterations=saved.iteration + 1, eval_interval=0
+            run,
+            hooks=(Hook(),),
+            resume_from=saved,
+            num_iterations=saved.iteration + 1,
+            eval_interval=0,
         )
 
     found["restart_ends_well"] = children.start(finish).wait().code in (0, 1)
@@ -135,7 +150,9 @@ def damaged(content: bytes, choose: random.Random) -> bytes:
 def corruption(folder: Path, *, damages: int) -> Figures:
     """Damage a checkpoint of a real run at random, and load it."""
     _, trainer = children.warm()
-    saved = checkpoint.save(folder / "checkpoint", trainer.state_dict(), iteration=1, config={"a": 1})
+    saved = checkpoint.save(
+        folder / "checkpoint", trainer.state_dict(), iteration=1, config={"a": 1}
+    )
     whole = {name: (saved / name).read_bytes() for name in (MANIFEST, TENSORS)}
     choose = random.Random(damages)
     refused = reasons = 0
@@ -149,7 +166,12 @@ def corruption(folder: Path, *, damages: int) -> Figures:
             reasons += str(saved) in str(error) and "\n" not in str(error)
         (saved / name).write_bytes(whole[name])
     intact = checkpoint.load(saved).iteration == 1
-    return {"damages": damages, "refused": refused, "with_file_and_reason": reasons, "intact_loads": intact}
+    return {
+        "damages": damages,
+        "refused": refused,
+        "with_file_and_reason": reasons,
+        "intact_loads": intact,
+    }
 
 
 def _emptied(path: Path) -> None:
@@ -246,7 +268,11 @@ ROWS = {
     "latest": Row(
         fault="the newest checkpoints are empty, cut, or without a manifest",
         must="`latest` passes over them, and says which one it takes",
-        limits={"damaged_folders": (EXACTLY, 6), "whole_one_taken": (EXACTLY, 6), "said": (EXACTLY, 6)},
+        limits={
+            "damaged_folders": (EXACTLY, 6),
+            "whole_one_taken": (EXACTLY, 6),
+            "said": (EXACTLY, 6),
+        },
         measure=latest,
         files=FILES,
     ),

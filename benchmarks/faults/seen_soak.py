@@ -55,7 +55,9 @@ def with_mesh_and_camera(cfg: RunCfg) -> RunCfg:
     groups = {}
     for name, group in cfg.task.observations.items():
         groups[name] = dataclasses.replace(group, terms={**group.terms, "picture": picture})
-    return dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, scene=scene, observations=groups))
+    return dataclasses.replace(
+        cfg, task=dataclasses.replace(cfg.task, scene=scene, observations=groups)
+    )
 
 
 def seen_soak(folder: Path, *, iterations: int, **_: int) -> Figures:

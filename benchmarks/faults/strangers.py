@@ -48,7 +48,12 @@ def payloads(folder: Path, *, families: int) -> Figures:
 
     tree = conf.compose(SMALL).to_tree()
     chosen = list(FAMILIES.items())[:: max(1, len(FAMILIES) // families)]
-    found = {"families": 0, "executed_written_or_leaked": 0, "refused_in_one_line": 0, "files_written": 0}
+    found = {
+        "families": 0,
+        "executed_written_or_leaked": 0,
+        "refused_in_one_line": 0,
+        "files_written": 0,
+    }
     for name, (write, _) in chosen:
         with _place(folder / name, tree) as place:
             command = write(place)
@@ -151,7 +156,9 @@ ROWS = {
         must="nothing executed, written or read from the environment; each refused in one line, exit code 2",
         limits={
             "families": (AT_LEAST, "families"),
-            **dict.fromkeys(("executed_written_or_leaked", "not_refused", "files_written"), (EXACTLY, 0)),
+            **dict.fromkeys(
+                ("executed_written_or_leaked", "not_refused", "files_written"), (EXACTLY, 0)
+            ),
         },
         measure=payloads,
         amounts={"families": 20},
@@ -161,9 +168,17 @@ ROWS = {
     "data_files": Row(
         fault="motions and motor models that are pickles, pipes, devices, or without end",
         must="refused by name; nothing executed",
-        limits={"files": (AT_LEAST, 8), "not_refused_by_name": (EXACTLY, 0), "executed": (EXACTLY, 0)},
+        limits={
+            "files": (AT_LEAST, 8),
+            "not_refused_by_name": (EXACTLY, 0),
+            "executed": (EXACTLY, 0),
+        },
         measure=data_files,
-        files=("ksim_rl/config/plain_data.py", "ksim_rl/scene/motions", "ksim_rl/scene/actuators/nets.py"),
+        files=(
+            "ksim_rl/config/plain_data.py",
+            "ksim_rl/scene/motions",
+            "ksim_rl/scene/actuators/nets.py",
+        ),
     ),
     "small_files": Row(
         fault="small files that claim much: YAML, tables, tensors, motions, recordings, and pipes, also for a lock",
@@ -172,12 +187,20 @@ ROWS = {
         measure=small_files,
         amounts={"files": 26},
         short={"files": 5},
-        files=("ksim_rl/files", "ksim_rl/config/plain_data.py", "ksim_rl/runs/csv_table.py", "ksim_rl/clips"),
+        files=(
+            "ksim_rl/files",
+            "ksim_rl/config/plain_data.py",
+            "ksim_rl/runs/csv_table.py",
+            "ksim_rl/clips",
+        ),
     ),
     "control_codes": Row(
         fault="names of files that hold ESC, its like, line ends, marks of direction, and bytes that are no UTF-8",
         must="one line, in which a terminal finds nothing to obey",
-        limits={"cases": (AT_LEAST, 24), **dict.fromkeys(("obeyed_letters", "not_one_line"), (EXACTLY, 0))},
+        limits={
+            "cases": (AT_LEAST, 24),
+            **dict.fromkeys(("obeyed_letters", "not_one_line"), (EXACTLY, 0)),
+        },
         measure=control_codes,
         files=("ksim_rl/terminal.py", "ksim_rl/cli"),
     ),
@@ -191,6 +214,10 @@ ROWS = {
         measure=models,
         amounts={"kinds": 150},
         short={"kinds": 10},
-        files=("ksim_rl/physics/load.py", "ksim_rl/physics/model_checks.py", "ksim_rl/physics/model_size.py"),
+        files=(
+            "ksim_rl/physics/load.py",
+            "ksim_rl/physics/model_checks.py",
+            "ksim_rl/physics/model_size.py",
+        ),
     ),
 }

@@ -40,7 +40,9 @@ def parts_of(
 
 def kinds_of(mj_model: mujoco.MjModel, pair: tuple[int, int]) -> tuple[int, int]:
     """Return the types of two parts."""
-    first, second = (int(mj_model.geom_type[part]) if part < mj_model.ngeom else ELEMENT for part in pair)
+    first, second = (
+        int(mj_model.geom_type[part]) if part < mj_model.ngeom else ELEMENT for part in pair
+    )
     return first, second
 
 
@@ -59,7 +61,10 @@ def ceiling_of(first: int, second: int) -> float | None:
     if not by_iteration:
         return None
     # Points of these on planes, and a ball on a cylinder, have formulas.
-    if int(_GEOM.mjGEOM_PLANE) in kinds or kinds == {int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_CYLINDER)}:
+    if int(_GEOM.mjGEOM_PLANE) in kinds or kinds == {
+        int(_GEOM.mjGEOM_SPHERE),
+        int(_GEOM.mjGEOM_CYLINDER),
+    }:
         return None
     return max(DEPTH_CEILINGS.get(name_of(kind), 0.0) for kind in by_iteration)
 
@@ -80,7 +85,9 @@ def depth_limit(
     return ceiling + (float(mj_model.geom_margin[list(pair)].max()) if on_field else 0.0)
 
 
-def depths(mj_model: mujoco.MjModel, parts: np.ndarray, dist: np.ndarray) -> dict[tuple[int, int], float]:
+def depths(
+    mj_model: mujoco.MjModel, parts: np.ndarray, dist: np.ndarray
+) -> dict[tuple[int, int], float]:
     """Return the distance of the deepest contact of each accepted pair of parts, in m."""
     found: dict[tuple[int, int], float] = {}
     for pair, value in zip(parts, dist, strict=True):
@@ -94,5 +101,7 @@ def depths(mj_model: mujoco.MjModel, parts: np.ndarray, dist: np.ndarray) -> dic
 def depths_in_c(mj_data: mujoco.MjData) -> dict[tuple[int, int], float]:
     """Return the same of the contacts that C has found."""
     contact = mj_data.contact
-    pairs = (np.array(numbers).reshape(-1, 2) for numbers in (contact.geom, contact.flex, contact.elem))
+    pairs = (
+        np.array(numbers).reshape(-1, 2) for numbers in (contact.geom, contact.flex, contact.elem)
+    )
     return depths(mj_data.model, parts_of(mj_data.model, *pairs), np.array(contact.dist))

@@ -5,7 +5,16 @@ import xml.etree.ElementTree as ET
 from benchmarks.judge.draw import Draw
 from benchmarks.judge.scene import Scene
 
-TRANSMISSIONS = ("joint", "joint", "jointinparent", "slidercrank", "tendon", "site", "refsite", "body")
+TRANSMISSIONS = (
+    "joint",
+    "joint",
+    "jointinparent",
+    "slidercrank",
+    "tendon",
+    "site",
+    "refsite",
+    "body",
+)
 SCALAR = (
     "motor",
     "position",
@@ -100,7 +109,9 @@ def _places(scene: Scene, draw: Draw, transmission: str) -> dict[str, str] | Non
 def _element(scene: Scene, draw: Draw, transmission: str, where: dict[str, str]) -> ET.Element:
     section = scene.actuator
     if transmission == "body":
-        return ET.SubElement(section, "adhesion", where, ctrlrange="0 1", gain=draw.number(1.0, 6.0))
+        return ET.SubElement(
+            section, "adhesion", where, ctrlrange="0 1", gain=draw.number(1.0, 6.0)
+        )
     one_coordinate = transmission in ("joint", "tendon") and not where.get("joint", "").startswith(
         ("ball", "free")
     )

@@ -46,10 +46,21 @@ def _add_fixed(scene: Scene, draw: Draw) -> None:
         attributes = {"type": "box", "size": "2 2 0.1", "pos": "0 0 -0.1"}
     elif ground == "hfield":
         ET.SubElement(
-            scene.asset, "hfield", name="ground", nrow="4", ncol="4", size="1 1 0.1 0.1", elevation=_GROUND
+            scene.asset,
+            "hfield",
+            name="ground",
+            nrow="4",
+            ncol="4",
+            size="1 1 0.1 0.1",
+            elevation=_GROUND,
         )
         # With a margin of 0, depths of C itself are off by centimetres (docs/upstream.md).
-        attributes = {"type": "hfield", "hfield": "ground", "pos": "0 0 -0.05", "margin": HFIELD_MARGIN}
+        attributes = {
+            "type": "hfield",
+            "hfield": "ground",
+            "pos": "0 0 -0.05",
+            "margin": HFIELD_MARGIN,
+        }
     else:
         attributes = {}
     if attributes:
@@ -70,7 +81,9 @@ def _add_fixed(scene: Scene, draw: Draw) -> None:
         _add_geom(scene, draw, body, moves=False)
         _add_site(scene, draw, body, moves=False)
         if draw.takes("static_child", 0.5):
-            child = ET.SubElement(body, "body", name="static_child", pos="0 0.05 0.05", quat=draw.quat(0.1))
+            child = ET.SubElement(
+                body, "body", name="static_child", pos="0 0.05 0.05", quat=draw.quat(0.1)
+            )
             _add_geom(scene, draw, child, moves=False)
     if draw.takes("camera", 0.2):
         mode = draw.kind("camera", ("fixed", "track", "trackcom"))
@@ -90,7 +103,9 @@ def _add_fixed(scene: Scene, draw: Draw) -> None:
 
 def _add_tree(scene: Scene, draw: Draw, kind: str, place: tuple[float, float]) -> int:
     """Add a tree, and return its number of degrees of freedom."""
-    height = draw.rng.uniform(0.03, 0.12) if kind.startswith("free") else draw.rng.uniform(0.05, 0.25)
+    height = (
+        draw.rng.uniform(0.03, 0.12) if kind.startswith("free") else draw.rng.uniform(0.05, 0.25)
+    )
     body = _add_body(scene, draw, scene.worldbody, written((*place, height)))
     if kind.startswith("free"):
         joint = ET.SubElement(body, "freejoint", name=f"free{len(scene.joints.get('free', []))}")
@@ -101,10 +116,14 @@ def _add_tree(scene: Scene, draw: Draw, kind: str, place: tuple[float, float]) -
         axes = ("1 0 0", "0 1 0", "0 0 1")
         turned = draw.takes("slides_askew", 0.3)
         for axis in axes[:count]:
-            _add_joint(scene, draw, body, "slide", axis=draw.axis() if turned and axis == axes[0] else axis)
+            _add_joint(
+                scene, draw, body, "slide", axis=draw.axis() if turned and axis == axes[0] else axis
+            )
         dofs = count
     elif kind == "several_joints":
-        dofs = sum(_add_joint(scene, draw, body, draw.kind("joint", ("hinge", "slide"))) for _ in range(2))
+        dofs = sum(
+            _add_joint(scene, draw, body, draw.kind("joint", ("hinge", "slide"))) for _ in range(2)
+        )
         if draw.takes("ball_after_slide", 0.3):
             dofs += _add_joint(scene, draw, body, "ball")
     else:
@@ -113,7 +132,9 @@ def _add_tree(scene: Scene, draw: Draw, kind: str, place: tuple[float, float]) -
     if kind == "free":
         return dofs
     ends = [body]
-    children = int(draw.rng.integers(1, 3)) if kind in ("arm", "free_with_children", "branches") else 0
+    children = (
+        int(draw.rng.integers(1, 3)) if kind in ("arm", "free_with_children", "branches") else 0
+    )
     for _ in range(children):
         above = ends[0] if kind == "branches" else ends[-1]
         child = _add_body(scene, draw, above, written(draw.rng.uniform(-0.15, 0.15, size=3)))
@@ -170,7 +191,9 @@ def _add_site(scene: Scene, draw: Draw, body: ET.Element, *, moves: bool) -> Non
         scene.moving_sites.append(name)
 
 
-def _add_joint(scene: Scene, draw: Draw, body: ET.Element, kind: str, axis: str | None = None) -> int:
+def _add_joint(
+    scene: Scene, draw: Draw, body: ET.Element, kind: str, axis: str | None = None
+) -> int:
     """Add a joint, and return its number of degrees of freedom."""
     draw.taken.add(f"joint.{kind}")
     names = scene.joints.setdefault(kind, [])

@@ -49,7 +49,8 @@ REFRESHED = (
 )
 # What reads contacts, or distances of the collision pass.
 KEPT = [
-    int(kind) for kind in (*COLLISION_SENSORS, mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtSensor.mjSENS_TOUCH)
+    int(kind)
+    for kind in (*COLLISION_SENSORS, mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtSensor.mjSENS_TOUCH)
 ]
 ACCELERATION = int(mujoco.mjtStage.mjSTAGE_ACC)
 
@@ -89,7 +90,9 @@ def run(
     return found, mj_data
 
 
-def touched_accepted(mj_model: mujoco.MjModel, state: Mapping[str, np.ndarray], substeps: int) -> bool:
+def touched_accepted(
+    mj_model: mujoco.MjModel, state: Mapping[str, np.ndarray], substeps: int
+) -> bool:
     """Return whether contacts that may differ are there in a substep before the last one."""
     mj_data = put(state, mj_model)
     for _ in range(substeps - 1):
@@ -131,7 +134,9 @@ def _measure_by_native_search(
 
 def is_kept(mj_model: mujoco.MjModel, sensor: int) -> bool:
     """Whether a refresh leaves a sensor as the last substep had it."""
-    if mj_model.sensor_needstage[sensor] == ACCELERATION or np.any(mj_model.sensor_history[sensor] > 0):
+    if mj_model.sensor_needstage[sensor] == ACCELERATION or np.any(
+        mj_model.sensor_history[sensor] > 0
+    ):
         return True
     return int(mj_model.sensor_type[sensor]) in KEPT
 

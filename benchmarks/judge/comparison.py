@@ -33,7 +33,17 @@ OF_POSES = (
         "xanchor",
         "xaxis",
     ),
-    *("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat"),
+    *(
+        "xpos",
+        "xquat",
+        "xmat",
+        "xipos",
+        "ximat",
+        "geom_xpos",
+        "geom_xmat",
+        "site_xpos",
+        "site_xmat",
+    ),
     *("cam_xpos", "cam_xmat", "light_xpos", "light_xdir"),
 )
 OF_THE_START = ("act_dot", "actuator_force", "actuator_velocity", "qfrc_actuator", "qfrc_passive")
@@ -123,14 +133,18 @@ def differences(
     ]
 
 
-def _rounded_otherwise(mj_model: mujoco.MjModel, state: Arrays, substeps: int, seed: int) -> Iterator[Arrays]:
+def _rounded_otherwise(
+    mj_model: mujoco.MjModel, state: Arrays, substeps: int, seed: int
+) -> Iterator[Arrays]:
     """Yield what C computes where float32 rounds: its model, and then its state and the Jacobian of its constraints."""
     yield c_engine.run(rounded(mj_model), state, substeps)[0]
     noise = jacobian_rounding(mj_model, state)
     for draw in range(PERTURBATIONS):
         rng = np.random.default_rng((seed, draw))
         other = perturbed(state, rng)
-        other["qfrc_applied"] = other["qfrc_applied"] + noise * rng.choice((-1.0, 1.0), size=mj_model.nv)
+        other["qfrc_applied"] = other["qfrc_applied"] + noise * rng.choice(
+            (-1.0, 1.0), size=mj_model.nv
+        )
         yield c_engine.run(mj_model, other, substeps)[0]
 
 

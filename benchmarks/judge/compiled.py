@@ -7,7 +7,19 @@ from ksim_rl.physics import SimCfg, load_spec
 from ksim_rl.physics.load import caught_warnings
 
 # What no physics reads, or what C's compiler and mj_setConst lay out in other ways that mean the same.
-_LAID_OUT = ("key_", "bvh_", "oct_", "mesh_", "hfield_", "tex_", "mat_", "skin_", "flex", "light_", "cam_")
+_LAID_OUT = (
+    "key_",
+    "bvh_",
+    "oct_",
+    "mesh_",
+    "hfield_",
+    "tex_",
+    "mat_",
+    "skin_",
+    "flex",
+    "light_",
+    "cam_",
+)
 _ROUNDING = 1e-5
 
 
@@ -58,6 +70,8 @@ def _mean_the_same(compiled: mujoco.MjModel, world_model: mujoco.MjModel) -> boo
         if not isinstance(wanted, np.ndarray) or wanted.dtype.kind != "f":
             continue
         found = getattr(compiled, name)
-        if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=_ROUNDING, atol=_ROUNDING):
+        if found.shape != wanted.shape or not np.allclose(
+            found, wanted, rtol=_ROUNDING, atol=_ROUNDING
+        ):
             return False
     return True

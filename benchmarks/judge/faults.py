@@ -136,7 +136,9 @@ def of_one_body(mj_model: mujoco.MjModel) -> bool:
 def without_priority(corrections: dict[Any, Any]) -> dict[Any, Any]:
     """Leave out what gives contacts the law of the geom with priority."""
     return {
-        hook: needed for hook, needed in corrections.items() if hook.__name__ != "take_the_law_of_priority"
+        hook: needed
+        for hook, needed in corrections.items()
+        if hook.__name__ != "take_the_law_of_priority"
     }
 
 
@@ -289,7 +291,9 @@ FAULTS = {
         number="11",
         what="actuators have a velocity where actuation is disabled",
         place=("native", "source_of"),
-        instead=Rewrite(folder="smooth", part="actuation", new="ACTUATORS_ACT ? speed : 0.0f", old="speed"),
+        instead=Rewrite(
+            folder="smooth", part="actuation", new="ACTUATORS_ACT ? speed : 0.0f", old="speed"
+        ),
         needs=("disable.actuation", "transmission.joint"),
         kernels="ours",
     ),

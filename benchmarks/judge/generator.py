@@ -58,7 +58,14 @@ FEATURES = (
     *(f"disable.{flag}" for flag in DISABLED),
     *(f"enable.{flag}" for flag in ENABLED),
     *(f"field.{name}" for name in FIELDS),
-    *("tendon.fixed", "tendon.spatial", "tendon.wrap", "tendon.pulley", "tendon.limit", "tendon.armature"),
+    *(
+        "tendon.fixed",
+        "tendon.spatial",
+        "tendon.wrap",
+        "tendon.pulley",
+        "tendon.limit",
+        "tendon.armature",
+    ),
     *(
         "tool",
         "mocap",
@@ -80,7 +87,14 @@ FEATURES = (
         "gap",
         "narrow_limit",
     ),
-    *("limit", "joint_frictionloss", "actuator_armature", "actuator_delay", "sensor_delay", "sensor_cutoff"),
+    *(
+        "limit",
+        "joint_frictionloss",
+        "actuator_armature",
+        "actuator_delay",
+        "sensor_delay",
+        "sensor_cutoff",
+    ),
     *("fluid_shape", "geom_adhesion", "surfacevel", "condim", "forces"),
 )
 # What a feature cannot do without, by the begin of its name.
@@ -116,7 +130,16 @@ IMPLIED = {
 }
 # What our kernels leave to MuJoCo Warp's, by the begin of its name. Every other model has nothing of it.
 FOREIGN = (
-    *("tendon.", "fluid", "wind", "geom_adhesion", "springyield", "noslip", "unsupported", "actuator_delay"),
+    *(
+        "tendon.",
+        "fluid",
+        "wind",
+        "geom_adhesion",
+        "springyield",
+        "noslip",
+        "unsupported",
+        "actuator_delay",
+    ),
     *(
         "sensor_delay",
         "sensor.tendon",
@@ -126,9 +149,26 @@ FOREIGN = (
         "enable.",
         "disable.warmstart",
     ),
-    *("transmission.jointinparent", "transmission.slidercrank", "transmission.tendon", "transmission.site"),
-    *("transmission.refsite", "transmission.body", "actuator.muscle", "actuator.dcmotor", "actuator.damper"),
-    *("equality.connect", "equality.weld", "equality.tendon", "integrator.RK4", "integrator.discrete"),
+    *(
+        "transmission.jointinparent",
+        "transmission.slidercrank",
+        "transmission.tendon",
+        "transmission.site",
+    ),
+    *(
+        "transmission.refsite",
+        "transmission.body",
+        "actuator.muscle",
+        "actuator.dcmotor",
+        "actuator.damper",
+    ),
+    *(
+        "equality.connect",
+        "equality.weld",
+        "equality.tendon",
+        "integrator.RK4",
+        "integrator.discrete",
+    ),
     *("jacobian.dense",),
 )
 # A feature that fewer models of a hunt have is rare, and asked for: of so many in a model at most.
@@ -267,13 +307,20 @@ def _drawn(seed: int, number: int, attempt: int, wishes: tuple[str, ...]) -> Gen
         for body in scene.worldbody.iter("body"):
             body.set("simple", "false")
     return Generated(
-        seed=seed, number=number, xml=scene.text(option, []), features=frozenset(draw.taken), fields=fields
+        seed=seed,
+        number=number,
+        xml=scene.text(option, []),
+        features=frozenset(draw.taken),
+        fields=fields,
     )
 
 
 def _option(draw: Draw) -> ET.Element:
     option = ET.Element("option", timestep=draw.any(("0.002", "0.004")))
-    option.set("integrator", draw.kind("integrator", (*INTEGRATORS, "Euler", "implicitfast", "implicitfast")))
+    option.set(
+        "integrator",
+        draw.kind("integrator", (*INTEGRATORS, "Euler", "implicitfast", "implicitfast")),
+    )
     option.set("cone", draw.kind("cone", CONES))
     option.set("jacobian", draw.kind("jacobian", ("auto", *JACOBIANS, "sparse")))
     if draw.takes("impratio", 0.3):
@@ -316,5 +363,7 @@ def _fields(scene: Scene, draw: Draw) -> tuple[str, ...]:
         "site": bool(scene.sites),
     }
     return tuple(
-        name for name in FIELDS if has.get(name.split("_")[0], True) and draw.takes(f"field.{name}", 0.02)
+        name
+        for name in FIELDS
+        if has.get(name.split("_")[0], True) and draw.takes(f"field.{name}", 0.02)
     )

@@ -91,7 +91,9 @@ def judged(task: Task) -> Outcome:
             return False
         return any(finding.kind == kind for finding in smaller.findings)
 
-    return Outcome(generated=found, verdict=verdict, smallest=shrunk(found.xml, found.fields, fails))
+    return Outcome(
+        generated=found, verdict=verdict, smallest=shrunk(found.xml, found.fields, fails)
+    )
 
 
 def _judge(found: Generated, xml: str, fields: tuple[str, ...], device: str) -> Verdict:
@@ -115,7 +117,9 @@ def hunt(
     most_minutes: float = float("inf"),
 ) -> list[Outcome]:
     """Judge `count` models, as many of them as begin in time, and print each that fails."""
-    tasks = [Task(seed=seed, number=number, device=device, shrinks=shrinks) for number in range(count)]
+    tasks = [
+        Task(seed=seed, number=number, device=device, shrinks=shrinks) for number in range(count)
+    ]
     until = time.monotonic() + 60.0 * most_minutes
     outcomes = []
     for task, result in in_processes(

@@ -63,7 +63,9 @@ def tried(task: Try) -> tuple[Finding, ...]:
 def _findings(found: Generated, kernels: Kernels) -> tuple[Finding, ...]:
     forces = "forces" in found.features
     try:
-        verdict = judge(found.xml, fields=found.fields, kernels=kernels, forces=forces, seed=found.number)
+        verdict = judge(
+            found.xml, fields=found.fields, kernels=kernels, forces=forces, seed=found.number
+        )
     except Exception as error:
         return (_failure(f"{type(error).__name__}: {error}"),)
     return (_failure(verdict.refused),) if verdict.refused else verdict.findings

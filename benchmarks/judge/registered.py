@@ -164,7 +164,9 @@ def _digest(mj_model: mujoco.MjModel) -> str:
     return hashlib.sha256(content.tobytes()).hexdigest()
 
 
-def judge_all(tasks: Sequence[Registered], *, jobs: int, most_minutes: float) -> dict[str, RegisteredOutcome]:
+def judge_all(
+    tasks: Sequence[Registered], *, jobs: int, most_minutes: float
+) -> dict[str, RegisteredOutcome]:
     """Judge tasks and robots, as many of them as begin in time, and print each that fails."""
     until = time.monotonic() + 60.0 * most_minutes
     outcomes = {}

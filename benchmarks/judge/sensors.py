@@ -61,7 +61,15 @@ SENSORS = (
     *OF_WORLD,
 )
 # Directions and orientations have no bounds, and of distances the cutoff is how far they reach.
-WITHOUT_CUTOFF = ("distance", "normal", "fromto", "contact", "ballquat", "insidesite", *OF_FRAMES[1:5])
+WITHOUT_CUTOFF = (
+    "distance",
+    "normal",
+    "fromto",
+    "contact",
+    "ballquat",
+    "insidesite",
+    *OF_FRAMES[1:5],
+)
 REDUCES = ("none", "mindist", "maxforce", "netforce")
 DATA = ("found force", "found dist pos normal", "force torque tangent", "found")
 
@@ -103,11 +111,20 @@ def _sensor(scene: Scene, draw: Draw, kind: str) -> ET.Element | None:
     if kind in OF_TENDONS:
         names = scene.limited_tendons if limits else scene.fixed_tendons + scene.spatial_tendons
         return ET.SubElement(section, kind, tendon=draw.any(names)) if names else None
-    return ET.SubElement(section, kind, actuator=draw.any(scene.actuators)) if scene.actuators else None
+    return (
+        ET.SubElement(section, kind, actuator=draw.any(scene.actuators))
+        if scene.actuators
+        else None
+    )
 
 
 def _of_frame(scene: Scene, draw: Draw, kind: str) -> ET.Element:
-    objects = {"body": scene.bodies, "xbody": scene.bodies, "geom": scene.all_geoms(), "site": scene.sites}
+    objects = {
+        "body": scene.bodies,
+        "xbody": scene.bodies,
+        "geom": scene.all_geoms(),
+        "site": scene.sites,
+    }
     if scene.cameras:
         objects["camera"] = scene.cameras
     type_of_object = draw.any(list(objects))
@@ -130,7 +147,9 @@ def _of_geoms(scene: Scene, draw: Draw, kind: str) -> ET.Element | None:
         return None
     first = draw.any(names)
     second = draw.any([name for name in names if name != first])
-    return ET.SubElement(scene.sensor, kind, geom1=first, geom2=second, cutoff=draw.any(("0.3", "2")))
+    return ET.SubElement(
+        scene.sensor, kind, geom1=first, geom2=second, cutoff=draw.any(("0.3", "2"))
+    )
 
 
 def _of_contacts(scene: Scene, draw: Draw) -> ET.Element:
@@ -151,8 +170,12 @@ def _of_site(scene: Scene, draw: Draw, kind: str) -> ET.Element | None:
     site = draw.any(scene.moving_sites)
     if kind == "camprojection":
         return (
-            ET.SubElement(scene.sensor, kind, site=site, camera=scene.cameras[0]) if scene.cameras else None
+            ET.SubElement(scene.sensor, kind, site=site, camera=scene.cameras[0])
+            if scene.cameras
+            else None
         )
     if kind == "insidesite":
-        return ET.SubElement(scene.sensor, kind, site=site, objtype="body", objname=draw.any(scene.bodies))
+        return ET.SubElement(
+            scene.sensor, kind, site=site, objtype="body", objname=draw.any(scene.bodies)
+        )
     return ET.SubElement(scene.sensor, kind, site=site)

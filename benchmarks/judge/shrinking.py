@@ -39,13 +39,17 @@ def shrunk(
     while is_smaller and left[0] > 0:
         is_smaller = False
         for candidates in (without_elements, without_attributes):
-            smaller = _first_to_last(xml, candidates, lambda candidate: still_fails(candidate, kept))
+            smaller = _first_to_last(
+                xml, candidates, lambda candidate: still_fails(candidate, kept)
+            )
             is_smaller |= smaller != xml
             xml = smaller
     return xml, kept
 
 
-def _first_to_last(xml: str, candidates: Callable[[str], Iterator[str]], fails: Callable[[str], bool]) -> str:
+def _first_to_last(
+    xml: str, candidates: Callable[[str], Iterator[str]], fails: Callable[[str], bool]
+) -> str:
     """Return what is left of a model when each candidate in turn is taken if it fails."""
     place = 0
     while True:

@@ -74,7 +74,9 @@ def add_equalities(scene: Scene, draw: Draw) -> None:
     """Add ties of bodies, joints and tendons."""
     if not (draw.wants_some_of("equality") or draw.rng.random() < 0.3):
         return
-    for number, kind in enumerate(draw.kinds("equality", EQUALITIES, 1 + int(draw.rng.random() < 0.3))):
+    for number, kind in enumerate(
+        draw.kinds("equality", EQUALITIES, 1 + int(draw.rng.random() < 0.3))
+    ):
         tie = _equality(scene, draw, kind)
         if tie is None:
             draw.taken.discard(f"equality.{kind}")
@@ -110,7 +112,11 @@ def _equality(scene: Scene, draw: Draw, kind: str) -> ET.Element | None:
         return ET.SubElement(section, "joint", joint1=scalars[0], polycoef="0.05 0 0 0 0")
     if kind == "joint" and len(scalars) > 1:
         return ET.SubElement(
-            section, "joint", joint1=scalars[0], joint2=scalars[-1], polycoef="0.02 0.5 0.2 -0.1 0.3"
+            section,
+            "joint",
+            joint1=scalars[0],
+            joint2=scalars[-1],
+            polycoef="0.02 0.5 0.2 -0.1 0.3",
         )
     tendons = scene.fixed_tendons + scene.spatial_tendons
     if kind == "tendon" and tendons:
@@ -143,7 +149,9 @@ def add_pairs(scene: Scene, draw: Draw) -> None:
 
 
 def _add_pair(scene: Scene, draw: Draw, own: str, other: str) -> None:
-    pair = ET.SubElement(scene.contact, "pair", geom1=own, geom2=other, condim=draw.any(("1", "3", "4", "6")))
+    pair = ET.SubElement(
+        scene.contact, "pair", geom1=own, geom2=other, condim=draw.any(("1", "3", "4", "6"))
+    )
     pair.set("friction", draw.any(("0.5 0.4 0.01 0.002 0.003", "1 1 0.02 0.001 0.001")))
     if draw.takes("pair_margin", 0.3):
         pair.set("margin", "0.02")

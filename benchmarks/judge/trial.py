@@ -21,7 +21,9 @@ NUM_WORLDS = 4
 Kernels = Literal["ours", "our solver", "theirs"]
 # Our kernels, MuJoCo Warp's kernels with our solver, and MuJoCo Warp alone, each solved to rounding.
 SETTINGS: dict[Kernels, SimCfg] = {
-    "ours": SimCfg(engine="warp", one_kernel_dynamics=True, tolerance=1e-8, iterations=100, ls_iterations=50),
+    "ours": SimCfg(
+        engine="warp", one_kernel_dynamics=True, tolerance=1e-8, iterations=100, ls_iterations=50
+    ),
     "our solver": SimCfg(
         engine="warp", one_kernel_dynamics=False, tolerance=1e-8, iterations=100, ls_iterations=50
     ),
@@ -115,7 +117,9 @@ def judge(
     return judge_worlds(world, given, seed=seed, calls=calls)
 
 
-def judge_worlds(world: WarpWorld, given: Given, *, seed: int, calls: Sequence[Call] = CALLS) -> Verdict:
+def judge_worlds(
+    world: WarpWorld, given: Given, *, seed: int, calls: Sequence[Call] = CALLS
+) -> Verdict:
     """Compare worlds that have their fields with C's models of them, and close them."""
     trial = _Trial(world, given, seed=seed)
     for substeps, sensors in calls:
@@ -138,7 +142,9 @@ def repeats_bits(world: WarpWorld) -> bool:
 def reason(message: str) -> str:
     """Return a refusal without the names and numbers of the model."""
     plain = re.sub(
-        r"'[^']*'|\bnumber \d+ \(unnamed\)|[-\d.]+(?:e-?\d+)?", "", message.replace("XML string: ", "")
+        r"'[^']*'|\bnumber \d+ \(unnamed\)|[-\d.]+(?:e-?\d+)?",
+        "",
+        message.replace("XML string: ", ""),
     )
     return textwrap.shorten(plain, 120, placeholder=" ...")
 
@@ -215,7 +221,9 @@ class _Trial:
         scales = scales_of([quantities for quantities, _ in expected])
         for row, (quantities, mj_data) in enumerate(expected):
             mj_model, state = self.models[row], self.states[row]
-            self._add(states=self.verdict.states + 1, touching=self.verdict.touching or mj_data.ncon > 0)
+            self._add(
+                states=self.verdict.states + 1, touching=self.verdict.touching or mj_data.ncon > 0
+            )
             if (
                 any(warning.number for warning in mj_data.warning)
                 or not np.abs(mj_data.qacc).max(initial=0.0) < MOST_QACC
@@ -224,7 +232,9 @@ class _Trial:
                 continue
             if report.ok and not self._has_accepted(row, mj_data, contacts[row], when):
                 actual = {name: value[row] for name, value in found.items()}
-                actual |= _sensors(mj_model, sensed[row], sensed_later[row], all_of_them=sensors == "every")
+                actual |= _sensors(
+                    mj_model, sensed[row], sensed_later[row], all_of_them=sensors == "every"
+                )
                 differing = differences(
                     *(mj_model, state, substeps, actual, quantities),
                     scales=scales,
@@ -256,7 +266,9 @@ class _Trial:
             error = abs(wanted[pair] - actual[pair])
             limit = accepted.depth_limit(mj_model, pair, wanted[pair], actual[pair])
             if limit is not None and not error <= limit:
-                kinds = " ".join(accepted.name_of(kind) for kind in accepted.kinds_of(mj_model, pair))
+                kinds = " ".join(
+                    accepted.name_of(kind) for kind in accepted.kinds_of(mj_model, pair)
+                )
                 self._find(f"depth {kinds}", error, limit, row, when)
         return True
 
@@ -301,7 +313,9 @@ def rows(view: torch.Tensor) -> np.ndarray:
     return view.numpy(force=True).astype(np.float64).reshape(view.shape[0], -1)
 
 
-def _sensors(mj_model: mujoco.MjModel, last: np.ndarray, later: np.ndarray, *, all_of_them: bool) -> Arrays:
+def _sensors(
+    mj_model: mujoco.MjModel, last: np.ndarray, later: np.ndarray, *, all_of_them: bool
+) -> Arrays:
     """Return what sensors read after the last substep, those that wait for a refresh left out, and after that."""
     found = {}
     for sensor in range(mj_model.nsensor):

@@ -96,10 +96,14 @@ def sayable(mj_model: mujoco.MjModel, name: str, values: np.ndarray) -> np.ndarr
         is_free = mj_model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
         values[is_free] = own[is_free]
     if name == "geom_size":
-        is_made = np.isin(mj_model.geom_type, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD))
+        is_made = np.isin(
+            mj_model.geom_type, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)
+        )
         values[is_made] = own[is_made]
     if name in ("qpos0", "qpos_spring"):
-        is_scalar = np.isin(mj_model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
+        is_scalar = np.isin(
+            mj_model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        )
         places = mj_model.jnt_qposadr[is_scalar]
         own[places] = values[places]
         return own
@@ -107,7 +111,11 @@ def sayable(mj_model: mujoco.MjModel, name: str, values: np.ndarray) -> np.ndarr
 
 
 def give_fields(
-    world: World, fields: tuple[str, ...], rng: np.random.Generator, xml: str = "", sim: SimCfg | None = None
+    world: World,
+    fields: tuple[str, ...],
+    rng: np.random.Generator,
+    xml: str = "",
+    sim: SimCfg | None = None,
 ) -> tuple[list[mujoco.MjModel], int]:
     """Draw fields of all worlds but the first.
 
@@ -136,7 +144,9 @@ def give_fields(
     for row in range(world.num_envs):
         mj_model = copy.copy(world.mj_model)
         if fields:
-            values = {name: world.field(name)[row].numpy(force=True).astype(np.float64) for name in fields}
+            values = {
+                name: world.field(name)[row].numpy(force=True).astype(np.float64) for name in fields
+            }
             write_fields(mj_model, values)
         if fields and row and xml and sim is not None:
             by_compiler = compiled_with(xml, sim, mj_model)
@@ -205,7 +215,16 @@ def state_of_row(world: World, row: int) -> Arrays:
 def perturbed(state: Mapping[str, np.ndarray], rng: np.random.Generator) -> Arrays:
     """Return a state whose numbers are rounded once more."""
     found = dict(state)
-    for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "qfrc_applied", "xfrc_applied", "plastic"):
+    for name in (
+        "qpos",
+        "qvel",
+        "act",
+        "ctrl",
+        "mocap_pos",
+        "qfrc_applied",
+        "xfrc_applied",
+        "plastic",
+    ):
         value = state[name]
         sign = rng.choice((-1.0, 1.0), size=value.shape)
         found[name] = value + ROUNDING * sign * np.maximum(1.0, np.abs(value))

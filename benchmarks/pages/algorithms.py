@@ -7,7 +7,14 @@ from ksim_rl.algorithms import registry
 from ksim_rl.modules import ActorCfg
 from ksim_rl.trainers.algorithm import Algorithm
 
-HEAD = ("`objective=`", "actions", "recurrent", "many GPUs", "mirror images", "gradient steps on a GPU")
+HEAD = (
+    "`objective=`",
+    "actions",
+    "recurrent",
+    "many GPUs",
+    "mirror images",
+    "gradient steps on a GPU",
+)
 YES_OR_NO = {True: "yes", False: "no"}
 
 

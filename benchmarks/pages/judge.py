@@ -40,7 +40,9 @@ def text(saved: Mapping[str, Any]) -> str:
 
 def refusals(reasons: Mapping[str, Mapping[str, int]]) -> str:
     """Return a line for each reason why models of the first device that was measured were refused."""
-    measured = [reasons[f"{device}/generated"] for device in DEVICES if f"{device}/generated" in reasons]
+    measured = [
+        reasons[f"{device}/generated"] for device in DEVICES if f"{device}/generated" in reasons
+    ]
     if not measured:
         return "No model was refused."
     lines = ["Refused, by what the message says without names:", ""]

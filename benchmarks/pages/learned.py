@@ -36,7 +36,9 @@ def walking() -> str:
         # A seed that does not get there counts as infinite, and has no number.
         reached = [run for run in runs if run["seconds_to_levels"] is not None]
         if 2 * len(reached) <= len(runs):
-            raise ValueError(f"{name}.json: the median of {key} is infinite: give the page a sentence on it")
+            raise ValueError(
+                f"{name}.json: the median of {key} is infinite: give the page a sentence on it"
+            )
         missing = [float("inf")] * (len(runs) - len(reached))
         seconds = statistics.median([run["seconds_to_levels"] for run in reached] + missing)
         env_states = statistics.median([run["env_states_to_levels"] for run in reached] + missing)

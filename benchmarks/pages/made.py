@@ -21,7 +21,11 @@ from benchmarks.pages import (
 from benchmarks.pages.committed import results
 
 DOCS = Path(__file__).parents[2] / "docs"
-WHOLE: dict[str, Callable[[], str]] = {"terms.md": terms.page, "tasks.md": tasks.page, "view.md": view.page}
+WHOLE: dict[str, Callable[[], str]] = {
+    "terms.md": terms.page,
+    "tasks.md": tasks.page,
+    "view.md": view.page,
+}
 # By page and name: a part stands between two comments, `<!-- made: NAME -->` and `<!-- end: NAME -->`.
 PARTS: dict[str, dict[str, Callable[[], str]]] = {
     "coming_from.md": {"peer terms": lambda: peer_terms.table(results("peer_terms"))},
@@ -53,6 +57,8 @@ def made(name: str) -> str:
         begin, end = f"<!-- made: {part} -->", f"<!-- end: {part} -->"
         # Without its comments the part would be lost without a word.
         if begin not in text or end not in text:
-            raise ValueError(f"docs/{name} lacks {begin} or {end}: put both where the table belongs")
+            raise ValueError(
+                f"docs/{name} lacks {begin} or {end}: put both where the table belongs"
+            )
         text = report.filled(text, begin, end, make())
     return text

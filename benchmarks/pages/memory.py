@@ -25,7 +25,8 @@ def per_env() -> str:
         sizes = [f"{size / 1000:.0f}" for size in (*parts, sum(parts))]
         rows.append([robot, *sizes])
     return table(
-        ("kB per env", "MuJoCo Warp's data", "env and rollout of 24 steps", "update", "in all"), rows
+        ("kB per env", "MuJoCo Warp's data", "env and rollout of 24 steps", "update", "in all"),
+        rows,
     )
 
 

@@ -18,7 +18,11 @@ def text(saved: Mapping[str, Any]) -> str:
     if (last := last_on_gpu(runs)) is None:
         return UNKNOWN
     prefix = last.rpartition("/")[0]
-    own = {name: saved["seeds"][key] for name in VARIANTS if (key := f"{prefix}/{name}") in saved["seeds"]}
+    own = {
+        name: saved["seeds"][key]
+        for name in VARIANTS
+        if (key := f"{prefix}/{name}") in saved["seeds"]
+    }
     made_by = {key: runs[f"{prefix}/{key}"] for key in own}
     commits = " and ".join(dict.fromkeys(run["commit"][:7] for run in made_by.values()))
     at_once = max(found["at_once"] for found in own.values())
@@ -46,8 +50,12 @@ def text(saved: Mapping[str, Any]) -> str:
 
 def row(label: str, found: Sequence[Mapping[str, Any]]) -> str:
     at_levels = sum(one["env_states_to_levels"] is not None for one in found)
-    env_states, seconds = (median_of(found, f"{unit}_to_levels") for unit in ("env_states", "seconds"))
-    ends = " and ".join(f"{statistics.median(one['means'][name] for one in found):.2f}" for name in LEVELS)
+    env_states, seconds = (
+        median_of(found, f"{unit}_to_levels") for unit in ("env_states", "seconds")
+    )
+    ends = " and ".join(
+        f"{statistics.median(one['means'][name] for one in found):.2f}" for name in LEVELS
+    )
     cells = (
         label,
         f"{at_levels} of {len(found)}",
@@ -63,4 +71,6 @@ def peer_row() -> str:
     peer = PEER[TASK]
     env_states = f"{peer['env_states'][-1] / 1e6:.1f} million"
     ends = " and ".join(f"{peer[name][-1]:.2f}" for name in LEVELS)
-    return f"| mjlab | one curve | {env_states} | {peer['seconds'][-1]} | {ends} after {env_states} |"
+    return (
+        f"| mjlab | one curve | {env_states} | {peer['seconds'][-1]} | {ends} after {env_states} |"
+    )

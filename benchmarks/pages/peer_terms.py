@@ -17,5 +17,7 @@ def table(saved: Mapping[str, Any]) -> str:
         f"{figures[f'{robot}/states_with_other_forces']} of {figures[f'{robot}/states']:,}"
         for robot in ROBOTS
     ]
-    rows.append(f"| states in which contact forces differ by more than 0.1 % | {' | '.join(others)} |")
+    rows.append(
+        f"| states in which contact forces differ by more than 0.1 % | {' | '.join(others)} |"
+    )
     return "\n".join(rows)

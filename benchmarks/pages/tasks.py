@@ -38,7 +38,11 @@ COLUMNS = (
     "`check_env`",
 )
 SIZES = ("action", "actor", "critic")
-MEASURED = (("env_states_per_s", "{:,.0f}"), ("rollout_over_physics", "{:.2f}"), ("syncs", "{:.0f}"))
+MEASURED = (
+    ("env_states_per_s", "{:,.0f}"),
+    ("rollout_over_physics", "{:.2f}"),
+    ("syncs", "{:.0f}"),
+)
 NOTHING = "–"
 HEAD = f"""# Tasks
 
@@ -79,7 +83,16 @@ with [one protocol](tables.md#the-protocol).
 The two rough tasks have no row below: they have not been trained since a foot on a height field touches each prism
 under it, as in the C engine.
 """
-LEARNED_COLUMNS = ("task", "objective", "env states", "seconds", "return", "asked for", "reached", "seeds")
+LEARNED_COLUMNS = (
+    "task",
+    "objective",
+    "env states",
+    "seconds",
+    "return",
+    "asked for",
+    "reached",
+    "seeds",
+)
 
 
 def robots(scene: SceneCfg) -> str:
@@ -111,7 +124,9 @@ def measured(name: str, saved: Mapping[str, Any]) -> tuple[str, ...]:
     if (prefix := last_run(saved, name, str(NUM_ENVS))) is None:
         return (NOTHING,) * (len(MEASURED) + 1)
     values = (
-        form.format(saved["figures"][f"{prefix}/{key}"]) if f"{prefix}/{key}" in saved["figures"] else NOTHING
+        form.format(saved["figures"][f"{prefix}/{key}"])
+        if f"{prefix}/{key}" in saved["figures"]
+        else NOTHING
         for key, form in MEASURED
     )
     return (*values, saved["outcomes"][prefix]["check_env"])
@@ -158,12 +173,18 @@ def page(sizes: Mapping[str, Mapping[str, str]] | None = None) -> str:
     head = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
     rows = [row(name, sizes[name], saved) for name in own_tasks()]
     tables = {name: json.loads(path.read_text()) for name, path in TABLES.items() if path.exists()}
-    return f"{HEAD}\n" + "\n".join([*head, *rows]) + f"\n\n{tail(saved)}\n\n{LEARNED}\n{learned(tables)}\n"
+    return (
+        f"{HEAD}\n"
+        + "\n".join([*head, *rows])
+        + f"\n\n{tail(saved)}\n\n{LEARNED}\n{learned(tables)}\n"
+    )
 
 
 def learned(tables: Mapping[str, Mapping[str, Any]]) -> str:
     """What the tables of results have for each task, and of which commit it is."""
-    rows = [(table, name, of_table) for table in TABLES for name, of_table in load(table).rows.items()]
+    rows = [
+        (table, name, of_table) for table in TABLES for name, of_table in load(table).rows.items()
+    ]
     lines: dict[str, list[str]] = {name: [] for name in own_tasks()}
     runs_of: dict[str, list[Any]] = {name: [] for name in lines}
     for table, name, of_table in rows:
@@ -187,7 +208,9 @@ def learned_row(of_table: Row, saved: Mapping[str, Any] | None) -> str:
     runs = saved["runs"]
     returns = [run["evaluation"]["return_mean"] for run in runs]
     spread = f" ± {statistics.stdev(returns):.1f}" if len(runs) > 1 else ""
-    states, seconds = (statistics.fmean(run[key] for run in runs) for key in ("env_states", "seconds"))
+    states, seconds = (
+        statistics.fmean(run[key] for run in runs) for key in ("env_states", "seconds")
+    )
     took = f"{seconds:.0f}" + (" on a CPU" if {run["device"] for run in runs} == {"CPU"} else "")
     asked = []
     if of_table.measure == "success":
@@ -217,7 +240,10 @@ def where(runs_of: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
         return []
     most, *others = sorted(by_commit, key=lambda commit: -len(by_commit[commit]))
     devices = sorted({run["device"] for runs in runs_of.values() for run in runs})
-    names = (f"{', '.join(f'`{task}`' for task in by_commit[commit])} at {commit[:7]}" for commit in others)
+    names = (
+        f"{', '.join(f'`{task}`' for task in by_commit[commit])} at {commit[:7]}"
+        for commit in others
+    )
     but = f", but {'; '.join(names)}" if others else ""
     return [f"Runs are of {' and '.join(devices)}, at commit {most[:7]}{but}.", ""]
 

@@ -14,7 +14,9 @@ def cells(prefix: str | None, kind: str, saved: Mapping[str, Any]) -> list[str]:
     if prefix is None:
         return ["–"] * 3
     key = f"{prefix}/{kind}".rstrip("/")
-    success, fell, levels = (saved["figures"][f"{key}/{name}"] for name in ("success", "fell", "levels"))
+    success, fell, levels = (
+        saved["figures"][f"{key}/{name}"] for name in ("success", "fell", "levels")
+    )
     return [f"{success:.1%}", f"{fell:.1%}", f"{levels:.0f}" if kind else f"{levels:.1f}"]
 
 
@@ -41,4 +43,6 @@ def table(saved: Mapping[str, Any]) -> str:
     ]
     lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
     lines.insert(1, "|" + "---|" * len(head))
-    return "\n".join([*lines, "", *(about(task, prefix, saved) for task, prefix in prefixes.items())])
+    return "\n".join(
+        [*lines, "", *(about(task, prefix, saved) for task, prefix in prefixes.items())]
+    )

@@ -52,7 +52,9 @@ PARTS = (
         EnvView,
         "The env itself. Without a name, quantities are those of all joints and of the first robot.",
     ),
-    Part('view.joints("hip.*")', Joints, "Some hinges and slides, by names or regular expressions."),
+    Part(
+        'view.joints("hip.*")', Joints, "Some hinges and slides, by names or regular expressions."
+    ),
     Part('view.bodies(".*_foot")', Bodies, "Some bodies."),
     Part('view.body("torso")', Body, "One body."),
     Part('view.sites(".*_foot")', Sites, "Some sites."),
@@ -62,9 +64,13 @@ PARTS = (
         Entity,
         "A robot or object of the scene; `view.robot` is the first.",
     ),
-    Part("view.robot.ground_scan(points)", GroundScan, "The ground at points about an entity's root."),
+    Part(
+        "view.robot.ground_scan(points)", GroundScan, "The ground at points about an entity's root."
+    ),
     Part('view.contact("feet")', ContactState, "A `ContactSensor` of `scene.sensors`."),
-    Part('view.contact_points("hand")', ContactPointsState, "A `ContactPoints` of `scene.sensors`."),
+    Part(
+        'view.contact_points("hand")', ContactPointsState, "A `ContactPoints` of `scene.sensors`."
+    ),
     Part('view.imu("imu")', ImuTracker, "An `ImuSensor` of `scene.sensors`."),
     Part('view.rays("scan")', RayTracker, "A `RayCaster` of `scene.sensors`."),
     Part('view.rays("scan").state', RayState, "Its hits."),
@@ -132,7 +138,9 @@ def _members(owner: type) -> dict[str, object]:
     """Return the public members of a class and its bases in the order of the code, bases first."""
     found: dict[str, object] = {}
     for base in reversed(owner.__mro__):
-        found.update({name: member for name, member in vars(base).items() if not name.startswith("_")})
+        found.update(
+            {name: member for name, member in vars(base).items() if not name.startswith("_")}
+        )
     return found
 
 
@@ -159,7 +167,12 @@ def _row(name: str, shape: str, text: str, stage: str) -> Row:
     text = text.strip(" .;,")
     text = text[:1].upper() + text[1:]
     return Row(
-        name, f"`{shape}`" if shape else "", text, unit[1] if unit else "", frame[1] if frame else "", stage
+        name,
+        f"`{shape}`" if shape else "",
+        text,
+        unit[1] if unit else "",
+        frame[1] if frame else "",
+        stage,
     )
 
 

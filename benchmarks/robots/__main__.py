@@ -50,7 +50,9 @@ def earlier() -> dict[str, tuple[Listed, Attempt]]:
     path = report.RESULTS / "robots.json"
     rows = json.loads(path.read_text())["robots"] if path.exists() else {}
     return {
-        listed.path: (listed, Attempt(**rows[listed.path])) for listed in read_list() if listed.path in rows
+        listed.path: (listed, Attempt(**rows[listed.path]))
+        for listed in read_list()
+        if listed.path in rows
     }
 
 
@@ -58,7 +60,9 @@ def main() -> int:
     """Try the files, print a line for each, and write benchmarks/results/robots.json."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.robots", description=__doc__)
     parser.add_argument("--folder", type=Path, required=True, help="where the packages are")
-    parser.add_argument("--only", default="", help="try files whose path has this in it; other rows stay")
+    parser.add_argument(
+        "--only", default="", help="try files whose path has this in it; other rows stay"
+    )
     options = parser.parse_args()
     tried: dict[str, tuple[Listed, Attempt]] = {}
     commit = report.commit()
@@ -69,7 +73,9 @@ def main() -> int:
         found.commit = commit
         tried[listed.path] = listed, found
         words = (
-            found.said.splitlines()[-1][:160] if found.said else f"{', '.join(found.feet)} from {found.pose}"
+            found.said.splitlines()[-1][:160]
+            if found.said
+            else f"{', '.join(found.feet)} from {found.pose}"
         )
         mark = "as listed" if found.as_listed else "NOT as listed"
         print(f"{listed.path}: {found.outcome} ({mark}, {found.seconds:g} s): {words}", flush=True)
@@ -78,7 +84,11 @@ def main() -> int:
     print(figures)
     robots = {path: dataclasses.asdict(found) for path, (_, found) in tried.items()}
     report.write(
-        "robots", figures=figures, device=torch.device("cpu"), module="benchmarks.robots", robots=robots
+        "robots",
+        figures=figures,
+        device=torch.device("cpu"),
+        module="benchmarks.robots",
+        robots=robots,
     )
     others_are_told = figures["others_with_their_line"] == figures["files"] - figures["walkers"]
     stand = figures["walkers_that_stand"] >= LEAST_SHARE

@@ -64,7 +64,9 @@ def attempt(listed: Listed, folder: Path) -> Attempt:
             found = Attempt(outcome="refused" if "\n" not in text else "traceback", said=text)
             found.as_listed = bool(listed.refusal) and listed.refusal in text
         except Exception as error:
-            found = Attempt(outcome="traceback", said="".join(traceback.format_exception(error))[-1000:])
+            found = Attempt(
+                outcome="traceback", said="".join(traceback.format_exception(error))[-1000:]
+            )
     found.seconds = round(time.monotonic() - began, 1)
     return found
 

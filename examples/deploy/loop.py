@@ -51,10 +51,14 @@ def check(meta: dict[str, Any], runner: Any, robot: SimulatedRobot) -> None:
         position = runner.data.qpos[runner.joints[name][0]]
         reach = 0.1
         if ends[0] is not None and not ends[0] - reach <= position <= ends[1] + reach:
-            raise Stopped(f"joint {name} is at {position:.2f}: expected {ends[0]:.2f} to {ends[1]:.2f}")
+            raise Stopped(
+                f"joint {name} is at {position:.2f}: expected {ends[0]:.2f} to {ends[1]:.2f}"
+            )
         torque = runner.data.qfrc_actuator[runner.joints[name][1]]
         if effort is not None and abs(torque) > 1.01 * effort:
-            raise Stopped(f"joint {name} is driven with {torque:.1f}: expected at most {effort:.1f}")
+            raise Stopped(
+                f"joint {name} is driven with {torque:.1f}: expected at most {effort:.1f}"
+            )
     if runner.model.jnt_type[0] == 0 and robot.tilt() > MOST_TILT:
         raise Stopped(f"tilted by {math.degrees(robot.tilt()):.0f} degrees")
 
@@ -71,7 +75,9 @@ def main() -> None:
     spec = importlib.util.spec_from_file_location("runner", options.folder / "runner.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)  # your own export: the folder of a stranger is for `ksim-rl sim2sim`
+    spec.loader.exec_module(
+        module
+    )  # your own export: the folder of a stranger is for `ksim-rl sim2sim`
     runner = module.Runner(options.folder)
     meta = json.loads((options.folder / "export.json").read_text())
     if options.command:

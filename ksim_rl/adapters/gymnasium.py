@@ -68,12 +68,17 @@ class GymnasiumVectorEnv(VectorEnv):
         # Tells wrappers of which episode `obs` is where one has ended.
         self.metadata = {"autoreset_mode": mode, **_rendering(self._stepper)}
         self.single_observation_space = self._names.space
-        self.single_action_space = space_of(self._stepper.action_spec, batch_dims=self._stepper.batch_dims)
+        self.single_action_space = space_of(
+            self._stepper.action_spec, batch_dims=self._stepper.batch_dims
+        )
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Shown, Infos]:
         """Reset all envs, whose draws follow from one seed; a list of one per env, as Gymnasium takes, makes one.
 
@@ -81,7 +86,11 @@ class GymnasiumVectorEnv(VectorEnv):
         the others go on, so that it takes no seed. A list s, s + 1, s + 2, ... is the seed s, which means the same in
         Gymnasium.
         """
-        if options and "reset_mask" in options and self.metadata["autoreset_mode"] == AutoresetMode.DISABLED:
+        if (
+            options
+            and "reset_mask" in options
+            and self.metadata["autoreset_mode"] == AutoresetMode.DISABLED
+        ):
             return self._reset_rows(seed, dict(options)), {}
         if options:
             raise ValueError(
@@ -168,12 +177,17 @@ class GymnasiumEnv(gymnasium.Env):
             )
         self._names = _Names(self._stepper)
         self.render_mode = self._stepper.render_mode
-        self.metadata = {**type(self).metadata, "render_fps": _rendering(self._stepper)["render_fps"]}
+        self.metadata = {
+            **type(self).metadata,
+            "render_fps": _rendering(self._stepper)["render_fps"],
+        }
         self.observation_space = self._names.space
         space = space_of(self._stepper.action_spec, batch_dims=self._stepper.batch_dims)
         self.action_space = finite(space, action_limit)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Shown, Infos]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Shown, Infos]:
         """Begin an episode, whose draws follow from the seed; there are no options."""
         if options:
             raise ValueError(f"options={options!r}: this env has no reset options; use seed=")
@@ -210,7 +224,8 @@ class _Names:
     def __init__(self, stepper: Stepper) -> None:
         spec = stepper.env.full_observation_spec
         boxes = {
-            name: space_of(spec[key], batch_dims=stepper.batch_dims) for name, key in stepper.keys.items()
+            name: space_of(spec[key], batch_dims=stepper.batch_dims)
+            for name, key in stepper.keys.items()
         }
         self._single = next(iter(boxes)) if len(boxes) == 1 else None
         self.space = spaces.Dict(boxes) if self._single is None else boxes[self._single]
@@ -242,7 +257,9 @@ def make_task(
     task: str, *, keys: Keys = ("actor",), action_limit: float = 1.0, **options: Any
 ) -> GymnasiumEnv:
     """Build a registered task as one env; `options` are of `envs.make`: device, seed, overrides, render_mode."""
-    return GymnasiumEnv(envs.make(task, num_envs=1, **options), keys=keys, action_limit=action_limit)
+    return GymnasiumEnv(
+        envs.make(task, num_envs=1, **options), keys=keys, action_limit=action_limit
+    )
 
 
 def make_tasks(

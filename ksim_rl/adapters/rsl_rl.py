@@ -70,7 +70,9 @@ class RslRlVecEnv(VecEnv):
         """Step all envs; rows that ended come back with the first observation of their next episode."""
         step = self._stepper.step(action_EL)
         # A row that also failed has no value to bootstrap.
-        extras: dict[str, Tensor | dict[str, Tensor]] = {"time_outs": step.truncated_E & ~step.terminated_E}
+        extras: dict[str, Tensor | dict[str, Tensor]] = {
+            "time_outs": step.truncated_E & ~step.terminated_E
+        }
         self._steps += 1
         # Rarely, as figures are read back from the device.
         if self._steps % self._log_interval == 0:
@@ -89,4 +91,6 @@ class RslRlVecEnv(VecEnv):
         sums = {name: total.clone() for name, total in self.unwrapped.episode_log().items()}
         self.unwrapped.episode_log_reset_()
         episodes = sums.pop("episodes").clamp(min=1.0)
-        return {f"Episode/{name.removesuffix('_sum')}": total / episodes for name, total in sums.items()}
+        return {
+            f"Episode/{name.removesuffix('_sum')}": total / episodes for name, total in sums.items()
+        }

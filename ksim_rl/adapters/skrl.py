@@ -50,7 +50,9 @@ class SkrlWrapper(Wrapper):
             name: space_of(env.full_observation_spec[key], batch_dims=self._stepper.batch_dims)
             for key, name in names.items()
         }
-        self._action_space = space_of(self._stepper.action_spec, batch_dims=self._stepper.batch_dims)
+        self._action_space = space_of(
+            self._stepper.action_spec, batch_dims=self._stepper.batch_dims
+        )
 
     @property
     def device(self) -> torch.device:
@@ -87,7 +89,9 @@ class SkrlWrapper(Wrapper):
 
     def step(
         self, actions: Shaped[Tensor, " E *leaf"]
-    ) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E 1"], Bool[Tensor, "E 1"], Bool[Tensor, "E 1"], Infos]:
+    ) -> tuple[
+        Float[Tensor, "E L"], Float[Tensor, "E 1"], Bool[Tensor, "E 1"], Bool[Tensor, "E 1"], Infos
+    ]:
         """Step all envs."""
         step = self._stepper.step(self._stepper.as_action(actions))
         self._current = step.obs
@@ -119,6 +123,7 @@ class SkrlWrapper(Wrapper):
     def _joined_space(self, names: list[str]) -> spaces.Box:
         boxes = [self._spaces[name] for name in names]
         low, high = (
-            np.concatenate([getattr(box, edge).ravel() for box in boxes]) for edge in ("low", "high")
+            np.concatenate([getattr(box, edge).ravel() for box in boxes])
+            for edge in ("low", "high")
         )
         return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)

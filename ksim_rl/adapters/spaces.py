@@ -23,9 +23,12 @@ def space_of(spec: TensorSpec, *, batch_dims: int = 1) -> spaces.Space:
         return spaces.Box(-np.inf, np.inf, shape=shape, dtype=dtype.type)
     limits: Any = spec.space
     if not isinstance(limits, ContinuousBox):
-        raise ValueError(f"{type(spec).__name__} of shape {shape}: adapters take boxes and single choices")
+        raise ValueError(
+            f"{type(spec).__name__} of shape {shape}: adapters take boxes and single choices"
+        )
     low, high = (
-        bound.expand(spec.shape).reshape(-1, *shape)[0].cpu().numpy() for bound in (limits.low, limits.high)
+        bound.expand(spec.shape).reshape(-1, *shape)[0].cpu().numpy()
+        for bound in (limits.low, limits.high)
     )
     return spaces.Box(low, high, dtype=dtype.type)
 

@@ -41,7 +41,9 @@ class StableBaselines3VecEnv(VecEnv):
         self.render_mode = self._stepper.render_mode
         dims = self._stepper.batch_dims
         spec = env.full_observation_spec
-        boxes = {name: space_of(spec[key], batch_dims=dims) for name, key in self._stepper.keys.items()}
+        boxes = {
+            name: space_of(spec[key], batch_dims=dims) for name, key in self._stepper.keys.items()
+        }
         # "MlpPolicy" takes a plain array, "MultiInputPolicy" a dict.
         if len(boxes) == 1:
             self._single = next(iter(boxes))
@@ -51,7 +53,9 @@ class StableBaselines3VecEnv(VecEnv):
         action = finite(space_of(self._stepper.action_spec, batch_dims=dims), action_limit)
         super().__init__(
             num_envs=self._stepper.num_envs,
-            observation_space=spaces.Dict(dict(boxes)) if self._single is None else boxes[self._single],
+            observation_space=spaces.Dict(dict(boxes))
+            if self._single is None
+            else boxes[self._single],
             action_space=action,
         )
         self._action: Tensor | None = None
@@ -110,7 +114,11 @@ class StableBaselines3VecEnv(VecEnv):
         )
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
     ) -> list[Any]:
         """Call a method of the env once, and return its result once per index."""
         result = getattr(self.env, method_name)(*method_args, **method_kwargs)

@@ -64,11 +64,15 @@ class Stepper:
     not count for them; or by whoever calls `reset_rows` ("disabled").
     """
 
-    def __init__(self, env: EnvBase, keys: Keys = None, *, autoreset: Autoreset = "same_step") -> None:
+    def __init__(
+        self, env: EnvBase, keys: Keys = None, *, autoreset: Autoreset = "same_step"
+    ) -> None:
         check_choice("autoreset", autoreset, AUTORESETS)
         self.autoreset = autoreset
         if len(env.batch_size) > 1:
-            raise ValueError(f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E], or none")
+            raise ValueError(
+                f"env.batch_size={tuple(env.batch_size)}: expected one dim, [E], or none"
+            )
         self.env = env
         self.batch_dims = env.batch_dims
         self._signals = signal_keys(env)
@@ -130,7 +134,9 @@ class Stepper:
         """Reset the rows of a mask, and return the observations of all."""
         self._followed.follow()
         root = self.root
-        root.update_(self._reset_where(root.clone(), mask_E.to(self.device)).select(*root.keys(True, True)))
+        root.update_(
+            self._reset_where(root.clone(), mask_E.to(self.device)).select(*root.keys(True, True))
+        )
         self._ended_E.masked_fill_(mask_E.to(self.device), 0)
         return self.read(root)
 
@@ -140,9 +146,14 @@ class Stepper:
         action = torch.as_tensor(values, device=self.device)
         # Other libraries choose by an index, our envs by one-hot rows.
         if isinstance(self.action_spec, OneHot):
-            action = torch.nn.functional.one_hot(action.long().reshape(-1), self.action_spec.space.n)
+            action = torch.nn.functional.one_hot(
+                action.long().reshape(-1), self.action_spec.space.n
+            )
         # [E] and [E, 1] hold the same numbers where an action has one column.
-        if action.shape != self._action.shape and action.numel() == self._action.numel() == self.num_envs:
+        if (
+            action.shape != self._action.shape
+            and action.numel() == self._action.numel() == self.num_envs
+        ):
             action = action.reshape(self._action.shape)
         return (action if self.batch_dims or action.shape == self._action.shape else action[0]).to(
             self._action.dtype
@@ -220,7 +231,10 @@ class Stepper:
                 if self.autoreset == "next_step":
                     root_E = self._reset_where(root_E, self._ended_E)
         # Outputs of a replay stay where they were recorded.
-        self._out = {"next": env_state_E.get("next"), "root": root_E.select(*self._root.keys(True, True))}
+        self._out = {
+            "next": env_state_E.get("next"),
+            "root": root_E.select(*self._root.keys(True, True)),
+        }
 
     def _reset_where(self, root_E: TensorDictBase, mask_E: Bool[Tensor, " E"]) -> TensorDictBase:
         """Reset the rows of a mask, by the flags that `maybe_reset` reads."""
@@ -229,7 +243,8 @@ class Stepper:
             if key is not None:
                 flag = root_E.get(key)
                 root_E.set(
-                    key, mask_E.view(flag.shape) if key != signals.truncated else torch.zeros_like(flag)
+                    key,
+                    mask_E.view(flag.shape) if key != signals.truncated else torch.zeros_like(flag),
                 )
         return self.env.maybe_reset(root_E)
 

@@ -20,7 +20,13 @@ from ksim_rl.device.capture import Captured
 from ksim_rl.device.state_tree import State
 from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import burnt_in, recurrent_modules
-from ksim_rl.objectives import NonFiniteStepsError, StepGuard, anneal_learning_rate_, make_optimizer, ppo_step
+from ksim_rl.objectives import (
+    NonFiniteStepsError,
+    StepGuard,
+    anneal_learning_rate_,
+    make_optimizer,
+    ppo_step,
+)
 
 
 def in_columns(steps: Sequence[Mapping[str, Num[Tensor, ""]]]) -> dict[str, Num[Tensor, " steps"]]:
@@ -131,7 +137,9 @@ class RolloutUpdate(ABC):
         in_a_row = int(metrics["update/skipped_in_a_row"])
         limit = self._max_skipped_steps
         if in_a_row >= limit:
-            raise NonFiniteStepsError(in_a_row, limit=limit, skipped=int(metrics["update/skipped_steps"]))
+            raise NonFiniteStepsError(
+                in_a_row, limit=limit, skipped=int(metrics["update/skipped_steps"])
+            )
 
     @property
     def rollout_ET(self) -> TensorDictBase:
@@ -141,7 +149,10 @@ class RolloutUpdate(ABC):
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return the measurements of the last update, each a tensor [] on the device; means are over the steps made."""
-        skipped = {"update/skipped_steps": self.guard.skipped, "update/skipped_in_a_row": self._longest_skip}
+        skipped = {
+            "update/skipped_steps": self.guard.skipped,
+            "update/skipped_in_a_row": self._longest_skip,
+        }
         return {**self._means, **skipped}
 
     @abstractmethod
@@ -218,7 +229,9 @@ class DatasetUpdate(RolloutUpdate):
         for minibatch_B in self.dataset.epoch():
             # States are renewed by the present networks, as stored ones are of older weights.
             if self._recurrent:
-                minibatch_B = burnt_in(minibatch_B, *self._recurrent, steps=self.dataset.cfg.burn_in)
+                minibatch_B = burnt_in(
+                    minibatch_B, *self._recurrent, steps=self.dataset.cfg.burn_in
+                )
             step = ppo_step(loss, self.optimizer, minibatch_B, cfg=self.cfg, guard=self.guard)
             # A copy: the guard counts in place.
             steps.append(step | {"skipped_in_a_row": self.guard.skipped_in_a_row.clone()})
@@ -244,7 +257,9 @@ class DatasetUpdate(RolloutUpdate):
 def optimizer_state(optimizer: torch.optim.Optimizer) -> state_tree.State:
     """Return learning rates and moments; a parameter that no loss has reached has an empty entry."""
     group = optimizer.param_groups[0]
-    moments = {index: dict(optimizer.state.get(own, {})) for index, own in enumerate(group["params"])}
+    moments = {
+        index: dict(optimizer.state.get(own, {})) for index, own in enumerate(group["params"])
+    }
     rates = {"learning_rate": group["lr"], "initial_learning_rate": group.get("initial_lr")}
     return rates | {"moments": moments}
 
@@ -266,7 +281,10 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: State, *, what
                     f"{what}: {name} of parameter {index} has shape {list(moments[index][name].shape)} in the "
                     f"checkpoint and {list(parameter.shape)} in this run"
                 )
-    if state.get("initial_learning_rate") in (None, group.get("initial_lr")):  # or else it is given again
+    if state.get("initial_learning_rate") in (
+        None,
+        group.get("initial_lr"),
+    ):  # or else it is given again
         group["lr"].copy_(torch.as_tensor(state["learning_rate"]))
     for index, parameter in enumerate(parameters):
         # In place where there are moments, whose addresses a captured graph holds.

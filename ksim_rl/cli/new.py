@@ -30,9 +30,12 @@ def new(arguments: list[str]) -> int:
     """Write what `arguments` name: a package around a robot, or a file with a task."""
     kinds: dict[str, Callable[[list[str]], int]] = {"robot": new_robot, "task": new_task}
     parser = OneLineParser(
-        prog="ksim-rl new", description="Write a package around a robot's model, or a file with a task."
+        prog="ksim-rl new",
+        description="Write a package around a robot's model, or a file with a task.",
     )
-    parser.add_argument("kind", choices=kinds, help="ksim-rl new robot --help and new task --help tell more")
+    parser.add_argument(
+        "kind", choices=kinds, help="ksim-rl new robot --help and new task --help tell more"
+    )
     # Each kind has its own arguments.
     options = parser.parse_args(arguments[:1])
     return kinds[options.kind](arguments[1:])
@@ -40,7 +43,9 @@ def new(arguments: list[str]) -> int:
 
 def new_task(arguments: list[str]) -> int:
     """Write a task with its robot, a term and its settings into one file."""
-    parser = OneLineParser(prog="ksim-rl new task", description="Write a task that trains into one file.")
+    parser = OneLineParser(
+        prog="ksim-rl new task", description="Write a task that trains into one file."
+    )
     parser.add_argument("name", metavar="NAME", help="of the task, and of the file NAME.py")
     parser.add_argument("--output", type=Path, help="the folder of the file; default: here")
     options = parser.parse_args(arguments)
@@ -57,12 +62,16 @@ def new_task(arguments: list[str]) -> int:
 
 def new_robot(arguments: list[str]) -> int:
     """Write the package; the code is 1 for a robot that does not stand."""
-    parser = OneLineParser(prog="ksim-rl new robot", description="Write a package around a robot's model.")
+    parser = OneLineParser(
+        prog="ksim-rl new robot", description="Write a package around a robot's model."
+    )
     parser.add_argument(
         "model", metavar="PATH", help="an MJCF or URDF file, or a menagerie name: unitree_a1/a1"
     )
     parser.add_argument(
-        "--pose", metavar="NAME", help='the keyframe to stand in, or "qpos0"; default: the first that stands'
+        "--pose",
+        metavar="NAME",
+        help='the keyframe to stand in, or "qpos0"; default: the first that stands',
     )
     parser.add_argument(
         "--drop",
@@ -72,7 +81,9 @@ def new_robot(arguments: list[str]) -> int:
         help="leave a body out, such as a prop; repeatable",
     )
     parser.add_argument("--name", help="of the package; default: that of the model")
-    parser.add_argument("--output", type=Path, help="the new folder; default: the package's name, here")
+    parser.add_argument(
+        "--output", type=Path, help="the new folder; default: the package's name, here"
+    )
     options = parser.parse_args(arguments)
     name = options.name or robot_name(options.model)
     folder = options.output or Path(name)
@@ -131,7 +142,9 @@ def copy_model(source: Path, target: Path) -> None:
     """Write a model as one MJCF file, with the meshes, textures and height fields it names, in `assets`."""
     spec = load_spec(source)
     # Files that the model names, with the folder that they are relative to.
-    assets = [(spec.meshdir, entry) for entry in (*spec.meshes, *spec.hfields, *spec.skins) if entry.file]
+    assets = [
+        (spec.meshdir, entry) for entry in (*spec.meshes, *spec.hfields, *spec.skins) if entry.file
+    ]
     assets += [(spec.texturedir, entry) for entry in spec.textures if entry.file]
     names: dict[Path, str] = {}
     for folder, entry in assets:
@@ -168,9 +181,13 @@ def _text(name: str, words: dict[str, object], imports: str = "") -> str:
 
 def _check_name(name: str, task: str, *, field: str = "--name") -> None:
     if not re.fullmatch(r"[a-z]\w*", name, re.ASCII):
-        raise ValueError(f"{field} {name}: expected a name for a Python package: small letters, digits and _")
+        raise ValueError(
+            f"{field} {name}: expected a name for a Python package: small letters, digits and _"
+        )
     if task in envs.names():
         raise ValueError(f"{field} {name}: there is a task {task!r} already; choose another name")
     # A name that shadows an installed package would import the wrong one.
     if importlib.util.find_spec(name) is not None:
-        raise ValueError(f"{field} {name}: Python knows a package of this name already; choose another name")
+        raise ValueError(
+            f"{field} {name}: Python knows a package of this name already; choose another name"
+        )

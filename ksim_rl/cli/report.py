@@ -95,9 +95,7 @@ def run_and_report(cfg: RunCfg, folder: Path, *, resume_from: Checkpoint | None 
 
 def _what_is_saved(folder: Path) -> str:
     if saved := checkpoint.saved(folder / "checkpoint"):
-        return (
-            f"saved are the checkpoints up to {saved[-1].name}; continue with: ksim-rl resume {shown(folder)}"
-        )
+        return f"saved are the checkpoints up to {saved[-1].name}; continue with: ksim-rl resume {shown(folder)}"
     if folder.exists():
         return f"no checkpoint is saved yet; begin anew with: ksim-rl train --config-dir {shown(folder)}"
     return "nothing is saved, and no folder is left"
@@ -161,7 +159,9 @@ def _summary(cfg: RunCfg, outcome: Outcome, folder: Path) -> list[str]:
         f"({speed:,.0f} per s, evaluations included)"
     ]
     if outcome.target_met is not None:
-        targets = ", ".join(f"{name} >= {value:g}" for name, value in (cfg.trainer.stop_at or {}).items())
+        targets = ", ".join(
+            f"{name} >= {value:g}" for name, value in (cfg.trainer.stop_at or {}).items()
+        )
         lines.append(f"stop_at {'MET' if outcome.target_met else 'NOT MET'}: {targets}")
     if outcome.interrupted_by is not None:
         name = outcome.interrupted_by.name

@@ -36,11 +36,18 @@ def resume(arguments: list[str]) -> int:
     """Continue a run from its newest checkpoint."""
     parser = _parser("resume", "Continue a run from its newest checkpoint, in the same folder.")
     parser.add_argument(
-        "overrides", nargs="*", metavar="field=value", help="what changes: objective.learning_rate=1e-4"
+        "overrides",
+        nargs="*",
+        metavar="field=value",
+        help="what changes: objective.learning_rate=1e-4",
     )
-    parser.add_argument("--num-iterations", type=int, help="of the whole run; default: as it was configured")
     parser.add_argument(
-        "--trust", action="store_true", help="the folder is yours: it may hold links, and say where to write"
+        "--num-iterations", type=int, help="of the whole run; default: as it was configured"
+    )
+    parser.add_argument(
+        "--trust",
+        action="store_true",
+        help="the folder is yours: it may hold links, and say where to write",
     )
     # Intermixed, since overrides may stand before and after flags.
     options = parser.parse_intermixed_args(arguments)
@@ -102,13 +109,21 @@ def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
 
 def evaluate(arguments: list[str]) -> int:
     """Evaluate a policy and print the verdict."""
-    parser = _parser("eval", "Evaluate a policy: deterministic actions, fresh envs, whole episodes.")
+    parser = _parser(
+        "eval", "Evaluate a policy: deterministic actions, fresh envs, whole episodes."
+    )
     number = parser.add_mutually_exclusive_group()
     # Episodes and trials are two kinds of evaluation: only one can be meant.
     number.add_argument("--episodes", type=int, help="default: as the run was configured")
-    number.add_argument("--trials", type=int, help="of a tracking run: how many follow the motion to its end")
-    parser.add_argument("--pushes", action="store_true", help="of trials: push the robot as in training")
-    parser.add_argument("--seed", type=int, help="of the initial states; default: the run's evaluation seed")
+    number.add_argument(
+        "--trials", type=int, help="of a tracking run: how many follow the motion to its end"
+    )
+    parser.add_argument(
+        "--pushes", action="store_true", help="of trials: push the robot as in training"
+    )
+    parser.add_argument(
+        "--seed", type=int, help="of the initial states; default: the run's evaluation seed"
+    )
     parser.add_argument(
         "overrides", nargs="*", metavar="field=value", help="of the physics: task.sim.engine=c"
     )
@@ -126,7 +141,12 @@ def evaluate(arguments: list[str]) -> int:
         policy = policy_of(saved, device=options.device, cfg=cfg)
         judged = f"{policy.cfg.task_name}, iteration {policy.iteration}{physics}"
         if options.trials is not None:
-            how = {"trials": options.trials, "seed": options.seed, "pushes": options.pushes, "note": say}
+            how = {
+                "trials": options.trials,
+                "seed": options.seed,
+                "pushes": options.pushes,
+                "note": say,
+            }
             show(f"{judged}: {run_trials(policy.cfg, policy.actor, **how)}")
             return 0
         # From the command line, else as the run was configured; a run without evaluations gets 100.
@@ -192,7 +212,9 @@ def list_envs(arguments: list[str]) -> int:
         # Configs are built for the list; a task that cannot be built must not hide the others.
         try:
             cfg = task.cfg()
-        except Exception as error:  # of a plug-in, or of its robot's file: the other tasks are listed
+        except (
+            Exception
+        ) as error:  # of a plug-in, or of its robot's file: the other tasks are listed
             broken.append(name)
             say(
                 f"task {name!r} is left out of the list: {' '.join(str(error).split()) or type(error).__name__}"
@@ -203,7 +225,9 @@ def list_envs(arguments: list[str]) -> int:
                 name,
                 ", ".join(cfg.scene.robots),
                 f"{cfg.episode_length_s:g} s" if cfg.episode_length_s else "no limit",
-                ", ".join(f"{group} ({len(spec.terms)} terms)" for group, spec in cfg.observations.items()),
+                ", ".join(
+                    f"{group} ({len(spec.terms)} terms)" for group, spec in cfg.observations.items()
+                ),
                 "-" if task.solved_at is None else f"return {task.solved_at:g}",
                 task.description,
             ]
@@ -222,7 +246,9 @@ def robot(arguments: list[str]) -> int:
         "model", metavar="PATH", help="an MJCF or URDF file, or a menagerie name: unitree_a1/a1"
     )
     parser.add_argument(
-        "--pose", metavar="NAME", help='the keyframe to stand in, or "qpos0"; default: the first that stands'
+        "--pose",
+        metavar="NAME",
+        help='the keyframe to stand in, or "qpos0"; default: the first that stands',
     )
     parser.add_argument(
         "--drop",
@@ -231,8 +257,12 @@ def robot(arguments: list[str]) -> int:
         default=[],
         help="leave a body out, such as a prop; repeatable",
     )
-    parser.add_argument("--code", action="store_true", help="print Python to paste, in place of the table")
-    parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw the stance into this file")
+    parser.add_argument(
+        "--code", action="store_true", help="print Python to paste, in place of the table"
+    )
+    parser.add_argument(
+        "--picture", type=Path, metavar="PNG", help="also draw the stance into this file"
+    )
     options = parser.parse_args(arguments)
     if options.picture is not None and options.picture.suffix != ".png":
         raise ValueError(f"--picture {options.picture}: expected a file that ends in .png")
@@ -248,6 +278,8 @@ def robot(arguments: list[str]) -> int:
 
 def _parser(command: str, description: str) -> OneLineParser:
     parser = OneLineParser(prog=f"ksim-rl {command}", description=description)
-    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints")
+    parser.add_argument(
+        "run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints"
+    )
     parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     return parser

@@ -22,28 +22,39 @@ ORDERS = {"began": "began", "return": "evaluation", "speed": "speed"}
 def runs(arguments: list[str]) -> int:
     """List the runs in folders."""
     parser = OneLineParser(prog="ksim-rl runs", description="List runs with return and speed.")
-    parser.add_argument("folders", nargs="*", type=Path, default=[Path("runs")], help="default: runs")
+    parser.add_argument(
+        "folders", nargs="*", type=Path, default=[Path("runs")], help="default: runs"
+    )
     parser.add_argument("--task", help="only runs of this task")
-    parser.add_argument("--sort", choices=ORDERS, default="began", help="the highest or newest comes last")
+    parser.add_argument(
+        "--sort", choices=ORDERS, default="began", help="the highest or newest comes last"
+    )
     options = parser.parse_args(arguments)
     found = [listing.summarize(run) for folder in options.folders for run in listing.find(folder)]
     chosen = [summary for summary in found if options.task in (None, summary.task)]
     field = ORDERS[options.sort]
     # Runs without a figure come first, as the last lines are the ones that are seen.
     ordered = sorted(
-        chosen, key=lambda summary: (getattr(summary, field) is not None, getattr(summary, field) or 0.0)
+        chosen,
+        key=lambda summary: (getattr(summary, field) is not None, getattr(summary, field) or 0.0),
     )
     if not ordered:
         show(f"no runs in {', '.join(map(shown, options.folders))}")
         return 0
-    print_table(listing.HEADS, (listing.line(summary, name=shown(summary.folder)) for summary in ordered))
+    print_table(
+        listing.HEADS, (listing.line(summary, name=shown(summary.folder)) for summary in ordered)
+    )
     return 0
 
 
 def compare(arguments: list[str]) -> int:
     """Print figures and differences of runs, and draw their curves."""
-    parser = OneLineParser(prog="ksim-rl compare", description="Compare runs: a table and a picture.")
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders, two or more")
+    parser = OneLineParser(
+        prog="ksim-rl compare", description="Compare runs: a table and a picture."
+    )
+    parser.add_argument(
+        "runs", nargs="+", type=Path, metavar="RUN", help="run folders, two or more"
+    )
     parser.add_argument(
         "--output", type=Path, default=Path("compare.png"), help="a .png file; default: compare.png"
     )
@@ -71,8 +82,12 @@ class TableOfJobs(Callback):
         """Print the runs in the sweep's folder, by the numbers of their jobs."""
         folder = Path(str(config.hydra.sweep.dir))
         # Jobs are called "<number>_<overrides>": by length first, so that 10 comes after 9.
-        found = sorted(listing.find(folder), key=lambda run: (len(run.name.partition("_")[0]), run.name))
-        print_table(listing.HEADS, (listing.line(listing.summarize(run), name=run.name) for run in found))
+        found = sorted(
+            listing.find(folder), key=lambda run: (len(run.name.partition("_")[0]), run.name)
+        )
+        print_table(
+            listing.HEADS, (listing.line(listing.summarize(run), name=run.name) for run in found)
+        )
         show(f"{shown(folder)}: ksim-rl runs {shown(folder)} --sort return")
 
 

@@ -59,7 +59,9 @@ def train(arguments: list[str]) -> int:
     if not (flags.help or flags.hydra_help or flags.shell_completion or own_config):
         builds = flags.cfg is None and flags.info is None
         multirun = flags.multirun or not builds
-        for cfg in conf.check_command_line(flags.overrides, name=name, multirun=multirun, values=builds):
+        for cfg in conf.check_command_line(
+            flags.overrides, name=name, multirun=multirun, values=builds
+        ):
             check_sources(_with_models_of(began, cfg, note=lambda _: None))
 
     # Checked now, since Hydra composes each job of a multirun on its own.
@@ -75,7 +77,9 @@ def train(arguments: list[str]) -> int:
         try:
             codes.append(_train_one(config, groups, given, began))
         except Exception as error:
-            if os.getpid() != process:  # some launchers run jobs elsewhere; only Hydra can bring it here then
+            if (
+                os.getpid() != process
+            ):  # some launchers run jobs elsewhere; only Hydra can bring it here then
                 raise
             # Kept from Hydra, which would print a line of its own about it and start no other job.
             codes.append(report(error, about=_job_of_a_multirun()))
@@ -105,7 +109,9 @@ def train(arguments: list[str]) -> int:
     sys.argv = ["ksim-rl train", *options, *away, *overrides]
     try:
         job()
-    except HydraException as error:  # all that is left for Hydra to find, such as another --config-name
+    except (
+        HydraException
+    ) as error:  # all that is left for Hydra to find, such as another --config-name
         raise ValueError(_with_first_cause(error)) from error
     return max(codes, default=0)
 
@@ -124,7 +130,9 @@ def _with_first_cause(error: HydraException) -> str:
 def _primary_config(flags: argparse.Namespace) -> tuple[str, bool]:
     """Return the name of the config to compose, and whether the user brings configs that only Hydra can check."""
     for given in filter(None, (flags.config_dir, flags.config_path)):
-        if (flags.config_name or flags.config_path) and os.path.lexists(Path(given, conf.RUN_CONFIG)):
+        if (flags.config_name or flags.config_path) and os.path.lexists(
+            Path(given, conf.RUN_CONFIG)
+        ):
             raise ValueError(
                 f"{given}: the config of a run is data and no primary config: give --config-dir {given} alone"
             )
@@ -163,8 +171,12 @@ def _with_models_of(began: Path | None, cfg: RunCfg, *, note: Callable[[str], No
     return with_kept_models(cfg, began, note=note)
 
 
-def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str], began: Path | None) -> int:
-    plugins.load(())  # plug-ins of the environment, where a launcher runs the job in another process
+def _train_one(
+    config: DictConfig, groups: Sequence[Path], given: Sequence[str], began: Path | None
+) -> int:
+    plugins.load(
+        ()
+    )  # plug-ins of the environment, where a launcher runs the job in another process
     plain: Any = OmegaConf.to_container(config, resolve=True)
     for path, value in reaching_outside(plain, given=given) if groups else ():
         raise ValueError(
@@ -181,7 +193,9 @@ def _train_one(config: DictConfig, groups: Sequence[Path], given: Sequence[str],
     launched = HydraConfig.get()
     folder = Path(launched.runtime.output_dir)
     # Where the user named the folder of a run that is under way, that run's lock says so.
-    named = any(text.startswith("hydra.run.dir=") for text in launched.overrides.hydra) and is_locked(folder)
+    named = any(
+        text.startswith("hydra.run.dir=") for text in launched.overrides.hydra
+    ) and is_locked(folder)
     if not named:
         folder = _unused(folder)
     if folder.is_dir():
@@ -201,7 +215,10 @@ def _unused(folder: Path) -> Path:
 
 def _remove_empty(folder: Path) -> None:
     """Remove the folder that Hydra made for a run which left nothing in it, and those above it in our own `runs`."""
-    made = [folder, *(above for above in folder.parents if above.is_relative_to(Path.cwd() / "runs"))]
+    made = [
+        folder,
+        *(above for above in folder.parents if above.is_relative_to(Path.cwd() / "runs")),
+    ]
     with suppress(OSError):  # as soon as there is something in one
         for empty in made:
             empty.rmdir()

@@ -78,7 +78,9 @@ def _read(path: Path) -> tuple[Array, Array, float]:
     try:
         arrays = read_arrays(path)
     except ValueError as error:
-        raise refused(path, f"cannot be read as .npz: {error}", "give an archive of AMASS") from None
+        raise refused(
+            path, f"cannot be read as .npz: {error}", "give an archive of AMASS"
+        ) from None
     rate = next((name for name in _RATES if name in arrays), "")
     missing = [name for name in ("poses", "trans") if name not in arrays]
     if missing or not rate:
@@ -91,18 +93,24 @@ def _read(path: Path) -> tuple[Array, Array, float]:
     if arrays[rate].size != 1 or any(
         array.dtype.kind not in "fiu" for array in (poses_FC, root_F3, arrays[rate])
     ):
-        raise refused(path, f"poses, trans or {rate} are no numbers, or {rate} is not one", "repair it")
+        raise refused(
+            path, f"poses, trans or {rate} are no numbers, or {rate} is not one", "repair it"
+        )
     fps = float(arrays[rate].item())
     if poses_FC.ndim != 2 or poses_FC.shape[1] < 3 * len(JOINTS) or len(poses_FC) < 2:
         raise refused(
-            path, f"poses has shape {poses_FC.shape}", f"expected [F, {3 * len(JOINTS)} or more], F >= 2"
+            path,
+            f"poses has shape {poses_FC.shape}",
+            f"expected [F, {3 * len(JOINTS)} or more], F >= 2",
         )
     # A place for each frame.
     if root_F3.shape != (len(poses_FC), 3):
         raise refused(path, f"trans has shape {root_F3.shape}", f"expected ({len(poses_FC)}, 3)")
     if not (np.isfinite(poses_FC).all() and np.isfinite(root_F3).all() and fps > 0.0):
         raise refused(
-            path, "it holds numbers that are not finite, or a rate that is not positive", "repair it"
+            path,
+            "it holds numbers that are not finite, or a rate that is not positive",
+            "repair it",
         )
     # In float64: the chain of 22 joints adds up rounding errors.
     return poses_FC.astype(float), root_F3.astype(float), fps

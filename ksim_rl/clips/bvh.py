@@ -61,7 +61,9 @@ class _Words:
         return value
 
     def wrong(self, what: str) -> ValueError:
-        return refused(self.path, f"line {self.line}: {what}", "expected a BVH file; export it anew")
+        return refused(
+            self.path, f"line {self.line}: {what}", "expected a BVH file; export it anew"
+        )
 
 
 def read_bvh(path: Path, *, scale: float = 0.01, y_up: bool = True) -> Recording:
@@ -105,7 +107,9 @@ def read_bvh(path: Path, *, scale: float = 0.01, y_up: bool = True) -> Recording
     if y_up:
         pos_FN3 = pos_FN3[..., [2, 0, 1]]
         quat_FN4 = multiply(np.broadcast_to(_UPRIGHT, quat_FN4.shape), quat_FN4)
-    return Recording(fps=1.0 / frame_s, names=tuple(skeleton.names), pos_FN3=pos_FN3, quat_FN4=quat_FN4)
+    return Recording(
+        fps=1.0 / frame_s, names=tuple(skeleton.names), pos_FN3=pos_FN3, quat_FN4=quat_FN4
+    )
 
 
 def _read_joint(words: _Words, skeleton: _Skeleton, *, parent: int) -> None:
@@ -121,13 +125,21 @@ def _read_joint(words: _Words, skeleton: _Skeleton, *, parent: int) -> None:
         elif word.upper() == "END":
             # The end of a limb has an offset only, no channels.
             words.next("Site")
-            _enter(words, skeleton, f"{skeleton.names[open_joints[-1]]}_end", open_joints[-1], is_end=True)
+            _enter(
+                words,
+                skeleton,
+                f"{skeleton.names[open_joints[-1]]}_end",
+                open_joints[-1],
+                is_end=True,
+            )
             words.next("}")
         else:
             raise words.wrong(f"{word!r} in place of JOINT, End or a bracket")
 
 
-def _enter(words: _Words, skeleton: _Skeleton, name: str, parent: int, *, is_end: bool = False) -> int:
+def _enter(
+    words: _Words, skeleton: _Skeleton, name: str, parent: int, *, is_end: bool = False
+) -> int:
     words.next("{")
     words.next("OFFSET")
     skeleton.names.append(name)

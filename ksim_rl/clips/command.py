@@ -69,13 +69,19 @@ def _parser() -> OneLineParser:
         one = kinds.add_parser(kind, help=said)
         one.add_argument("source", type=Path)
         one.add_argument("motion", type=Path, help="the .npz file to write")
-        one.add_argument("--robot", default="g1", help=f"{', '.join(ROBOTS)}, or a path; default: g1")
+        one.add_argument(
+            "--robot", default="g1", help=f"{', '.join(ROBOTS)}, or a path; default: g1"
+        )
         one.add_argument("--fps", type=float, default=50.0, help="of the motion: the control rate")
         if kind == "csv":
             one.add_argument("--source-fps", type=float, default=30.0)
-            one.add_argument("--joints", default="", help="of the file's columns, if not the model's order")
+            one.add_argument(
+                "--joints", default="", help="of the file's columns, if not the model's order"
+            )
             continue
-        one.add_argument("--pairs", type=Path, required=True, help="a YAML file: see docs/motions.md")
+        one.add_argument(
+            "--pairs", type=Path, required=True, help="a YAML file: see docs/motions.md"
+        )
         if kind == "bvh":
             one.add_argument("--unit", type=float, default=0.01, help="m per unit of the file")
             one.add_argument("--z-up", action="store_true")

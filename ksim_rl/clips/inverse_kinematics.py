@@ -84,7 +84,9 @@ class InverseKinematics:
         """Refuse names that are neither of a site nor of a body, by a ValueError."""
         for name in names:
             if name not in self._points:
-                raise ValueError(f"the model has no site or body {name!r}: {near(name, self._points)}")
+                raise ValueError(
+                    f"the model has no site or body {name!r}: {near(name, self._points)}"
+                )
 
     def solve(
         self,
@@ -134,7 +136,9 @@ class InverseKinematics:
             step_M *= min(1.0, cfg.max_step / max(longest, 1e-12))
             # Along the manifold: quaternions stay unit.
             mujoco.mj_integratePos(model, data.qpos, step_M, 1.0)
-            data.qpos[self._limited_qpos] = np.clip(data.qpos[self._limited_qpos], self._low, self._high)
+            data.qpos[self._limited_qpos] = np.clip(
+                data.qpos[self._limited_qpos], self._low, self._high
+            )
             # The length before shortening: a step that was cut is not the end.
             if longest < cfg.tolerance:
                 break

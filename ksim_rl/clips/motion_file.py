@@ -12,7 +12,9 @@ from ksim_rl.files.writing import write_whole
 Array = np.ndarray
 
 
-def velocities(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float) -> Float[Array, "F M"]:
+def velocities(
+    mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float
+) -> Float[Array, "F M"]:
     """Return qvel by central differences, one-sided at the ends; angular velocities come from quaternions."""
     last = len(qpos_FL) - 1
     qvel_FM = np.zeros((len(qpos_FL), mj_model.nv))
@@ -21,7 +23,9 @@ def velocities(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: floa
         before = max(frame - 1, 0)
         after = min(frame + 1, last)
         seconds = (after - before) / fps
-        mujoco.mj_differentiatePos(mj_model, qvel_FM[frame], seconds, qpos_FL[before], qpos_FL[after])
+        mujoco.mj_differentiatePos(
+            mj_model, qvel_FM[frame], seconds, qpos_FL[before], qpos_FL[after]
+        )
     # The angular velocity is of the body frame at the first of the two frames; turn it to the frame's own.
     return _turned_to_own_frame(mj_model, qpos_FL, qvel_FM)
 
@@ -59,6 +63,8 @@ def motion_bytes(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: fl
     return data.getvalue()
 
 
-def write_motion(path: Path, mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float) -> None:
+def write_motion(
+    path: Path, mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float
+) -> None:
     """Write a motion of the model, whose scene may hold other things without joints, at `fps` frames per second."""
     write_whole(path, motion_bytes(mj_model, qpos_FL, fps))

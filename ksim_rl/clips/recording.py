@@ -47,7 +47,10 @@ def between(count: int, fps: float, wanted_fps: float) -> tuple[Array, Float[Arr
 
     A ValueError refuses rates that no recording has, and one so low that its frames would last for days.
     """
-    for name, rate in (("frames per second of the recording", fps), ("frames per second", wanted_fps)):
+    for name, rate in (
+        ("frames per second of the recording", fps),
+        ("frames per second", wanted_fps),
+    ):
         check_in_range(name, rate, low=SLOWEST, high=FASTEST)
     wanted = (count - 1) / fps * wanted_fps
     if wanted > MOST_FRAMES:
@@ -64,7 +67,9 @@ def between(count: int, fps: float, wanted_fps: float) -> tuple[Array, Float[Arr
 
 
 def slerp(
-    first: Float[Array, "*batch 4"], second: Float[Array, "*batch 4"], share: Float[Array, "*share 1"]
+    first: Float[Array, "*batch 4"],
+    second: Float[Array, "*batch 4"],
+    share: Float[Array, "*share 1"],
 ) -> Float[Array, "*batch 4"]:
     """Return unit quaternions on the shorter arc between two, at an even speed."""
     cosine = (first * second).sum(-1, keepdims=True)

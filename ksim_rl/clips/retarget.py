@@ -57,14 +57,18 @@ class Retarget(Checked):
     def _check_fields(self) -> None:
         super()._check_fields()
         if not self.pairs:
-            raise ValueError("pairs=(): expected at least one pair of a point and a part of the robot")
+            raise ValueError(
+                "pairs=(): expected at least one pair of a point and a part of the robot"
+            )
 
 
 def read_retarget(path: Path) -> Retarget:
     """Read a YAML file with the fields of `Retarget`."""
     tree = read_yaml(path)
     if not isinstance(tree, dict):
-        raise ValueError(f"{path}: expected a mapping with `pairs`, a list of {{point: ..., to: ...}}")
+        raise ValueError(
+            f"{path}: expected a mapping with `pairs`, a list of {{point: ..., to: ...}}"
+        )
     return from_tree(Retarget, tree, str(path))
 
 
@@ -102,11 +106,15 @@ def retargeted(
             # Near to the person and turned as the person is: a search from afar may end in another pose.
             start_L = _facing(rest_L, goals[0])
             patient = InverseKinematics(mj_model, replace(solver.cfg, iterations=400))
-            found.append(patient.solve(goals, start_L=start_L, posture_L=start_L, posture_weight_M=pull_M))
+            found.append(
+                patient.solve(goals, start_L=start_L, posture_L=start_L, posture_weight_M=pull_M)
+            )
             continue
         # Towards the default pose, as far as its weight against the stride's says.
         aim_L = _between(mj_model, found[-1], rest_L, share_M)
-        found.append(solver.solve(goals, start_L=found[-1], posture_L=aim_L, posture_weight_M=both_M))
+        found.append(
+            solver.solve(goals, start_L=found[-1], posture_L=aim_L, posture_weight_M=both_M)
+        )
     qpos_FL = np.array(found)
     if cfg.soles:
         # One constant for all frames: jumps stay jumps.

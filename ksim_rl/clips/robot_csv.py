@@ -37,9 +37,13 @@ def read_csv(
     joints = own if joints is None else list(joints)
     for joint in joints:
         if joint not in own:
-            raise ValueError(f"motion {path}: joints: the model has no joint {joint!r}: {near(joint, own)}")
+            raise ValueError(
+                f"motion {path}: joints: the model has no joint {joint!r}: {near(joint, own)}"
+            )
     if not mj_model.njnt or mj_model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-        raise refused(path, "the model's first joint is not free", "give the model of a robot that can move")
+        raise refused(
+            path, "the model's first joint is not free", "give the model of a robot that can move"
+        )
     table_FC = _table(path, 7 + len(joints))
     # Rounded files have quaternions that are nearly unit; anything else is another column order.
     norm_F = np.linalg.norm(table_FC[:, 3:7], axis=1)
@@ -94,9 +98,13 @@ def _table(path: Path, columns: int) -> Array:
             # No header: a row of names fails here and is told by its line.
             row = [float(cell) for cell in cells]
         except ValueError as error:
-            raise refused(path, f"line {number}: {error}", "expected numbers only, and no header") from None
+            raise refused(
+                path, f"line {number}: {error}", "expected numbers only, and no header"
+            ) from None
         if not np.isfinite(row).all():
-            raise refused(path, f"line {number} holds a number that is not finite", "cut that part off")
+            raise refused(
+                path, f"line {number} holds a number that is not finite", "cut that part off"
+            )
         rows.append(row)
     # Two frames at least, since velocities are differences.
     if len(rows) < 2:

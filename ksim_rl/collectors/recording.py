@@ -181,7 +181,9 @@ class Recording:
             self._drop()
             self.compile(root_E, act)
             if self.compiled_step is None:
-                warnings.warn(f"they have made the last {suspects} rollouts", RuntimeWarning, stacklevel=4)
+                warnings.warn(
+                    f"they have made the last {suspects} rollouts", RuntimeWarning, stacklevel=4
+                )
                 return
         names = ", ".join(found[:3])
         if len(found) > 3:

@@ -134,7 +134,9 @@ class RolloutCollector:
             self._run = Captured(
                 self._rollout, device=device, warmup=cfg.warmup, require_graphs=cfg.require_graphs
             )
-        self._recording = Recording(env, policy, compiles=compiles and not cfg.eager, graph=self._run)
+        self._recording = Recording(
+            env, policy, compiles=compiles and not cfg.eager, graph=self._run
+        )
 
     @property
     def compiled_step(self) -> CompiledStep | None:
@@ -191,7 +193,9 @@ class RolloutCollector:
         added = [one for one in held_transforms(self.env, Transform) if id(one) not in known]
         # A chain passes resets on; others that do not override this have nothing to do at one.
         begins = [
-            one for one in added if type(one)._reset is not Transform._reset and type(one) is not Compose
+            one
+            for one in added
+            if type(one)._reset is not Transform._reset and type(one) is not Compose
         ]
         if begins or _kinds(self._root) != _kinds_of_roots(self.env):
             warnings.warn(

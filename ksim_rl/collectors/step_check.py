@@ -114,7 +114,9 @@ class StepCheck:
     def _draws_forgotten(self) -> AbstractContextManager[None]:
         device = self._env.device
         # Restores the CPU generator and the one of the env's own device.
-        return torch.random.fork_rng([device] if device is not None and device.type == "cuda" else [])
+        return torch.random.fork_rng(
+            [device] if device is not None and device.type == "cuda" else []
+        )
 
     def _state(self) -> _State:
         given = {key: value.clone() for key, value in self.given.items()}
@@ -134,7 +136,9 @@ class StepCheck:
         results = {name: value.clone() for name, value in self._by_term().items()}
         next_E = env_state_E.get("next")
         results |= {_spelled("next", key): leaf.clone() for key, leaf in next_E.items(True, True)}
-        results |= {_spelled("root", key): leaf.clone() for key, leaf in self._root_E.items(True, True)}
+        results |= {
+            _spelled("root", key): leaf.clone() for key, leaf in self._root_E.items(True, True)
+        }
         for name, value in self._env.state_dict().items():
             is_own = not any(left_out in name for left_out in _LEFT_OUT)
             if is_own and isinstance(value, Tensor):

@@ -39,7 +39,9 @@ def differences(
         return {}
     # One look at the device for all of them: most often there is nothing to see.
     is_open = torch.stack([rows.any() for rows in too_far.values()]).tolist()
-    open_rows = {name: rows for (name, rows), is_one in zip(too_far.items(), is_open, strict=True) if is_one}
+    open_rows = {
+        name: rows for (name, rows), is_one in zip(too_far.items(), is_open, strict=True) if is_one
+    }
     # Second pass, only for leaves that failed: can rounding explain the error?
     errors = {name: _error(found[name], true[name], num_rows) for name in open_rows}
     for number in range(MOST_MOVES):

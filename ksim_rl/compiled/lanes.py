@@ -80,7 +80,8 @@ class Work:
         # Loops of one operation have no order among themselves.
         if names and before.operation != self.operation:
             is_at_once = all(
-                before.is_whole if kinds.get(name) == _LONE else before.shares(name, self) for name in names
+                before.is_whole if kinds.get(name) == _LONE else before.shares(name, self)
+                for name in names
             )
             # A level further where lanes must wait, and the same level where each lane reads its own numbers.
             self.level = max(self.level, before.level + (not is_at_once))
@@ -99,7 +100,9 @@ def schedule(works: Sequence[Work], own: Sequence[Own]) -> dict[str, str]:
             kinds |= dict.fromkeys(work.written & kinds.keys(), SHARED)
     for number, work in enumerate(works):
         # A loop that only writes copies of each lane is done by each lane.
-        work.is_whole = bool(work.written) and all(kinds.get(name) == _LONE for name in work.written)
+        work.is_whole = bool(work.written) and all(
+            kinds.get(name) == _LONE for name in work.written
+        )
         for before in works[:number]:
             work.follow(before, kinds)
     for name, used in users.items():
@@ -113,7 +116,10 @@ def schedule(works: Sequence[Work], own: Sequence[Own]) -> dict[str, str]:
 
 
 def source(
-    works: Sequence[Work], own: Sequence[Own], kinds: Mapping[str, str], read: Mapping[str, str] | None
+    works: Sequence[Work],
+    own: Sequence[Own],
+    kinds: Mapping[str, str],
+    read: Mapping[str, str] | None,
 ) -> Iterator[str]:
     """Write the C++ of a row, with loads of `read`-only numbers first; with None, one lane does everything."""
     declared = {one.name: kinds[one.name].format(**one._asdict()) for one in own}
@@ -127,7 +133,9 @@ def source(
         # Joined loops let a lane keep intermediate numbers in registers.
         for shape in dict.fromkeys(work.shape for work in here if not work.is_whole):
             dealt = [work for work in here if work.shape == shape and not work.is_whole]
-            used = dict.fromkeys(name for work in dealt for name in work.texts if kinds.get(name) == _PRIVATE)
+            used = dict.fromkeys(
+                name for work in dealt for name in work.texts if kinds.get(name) == _PRIVATE
+            )
             yield f"{_nest(shape)} {{" if read is None else _deal(shape)
             yield from (declared[name] for name in used)
             yield from (f"{{ {work.body} }}" for work in dealt)
@@ -155,7 +163,10 @@ def _loads(works: Sequence[Work], read: Mapping[str, str]) -> Iterator[str]:
         # Longest first, as one element's text may hold another's.
         for _, _, array, text in sorted(work.loop.elements, key=lambda element: -len(element.text)):
             # Only elements whose indices, too, are read-only.
-            if text not in work.body or not set(re.findall(r"\b(?!row|i\d)[a-z]\w*", text)) <= read.keys():
+            if (
+                text not in work.body
+                or not set(re.findall(r"\b(?!row|i\d)[a-z]\w*", text)) <= read.keys()
+            ):
                 continue
             if re.search(r"\bi\d", text):
                 shape = work.shape
@@ -164,5 +175,9 @@ def _loads(works: Sequence[Work], read: Mapping[str, str]) -> Iterator[str]:
             if (text, shape) not in known:
                 name = known[text, shape] = f"c{len(known)}"
                 yield f"{read[array]} {name}[({prod(shape)} + LANES - 1) / LANES];"
-                yield f"{_deal(shape)} {name}[turn] = {text}; }});" if shape else f"{name}[0] = {text};"
+                yield (
+                    f"{_deal(shape)} {name}[turn] = {text}; }});"
+                    if shape
+                    else f"{name}[0] = {text};"
+                )
             work.body = work.body.replace(text, f"{known[text, shape]}[{'turn' if shape else 0}]")

@@ -27,7 +27,10 @@ def is_library(package: str) -> bool:
     if package == OURS or package in sys.stdlib_module_names:
         return True
     spec = getattr(sys.modules.get(package), "__spec__", None)
-    places = [*(getattr(spec, "submodule_search_locations", None) or ()), getattr(spec, "origin", None) or ""]
+    places = [
+        *(getattr(spec, "submodule_search_locations", None) or ()),
+        getattr(spec, "origin", None) or "",
+    ]
     if any("site-packages" in place or "dist-packages" in place for place in places):
         return True
     # Installed elsewhere, such as by `pip install --target`.

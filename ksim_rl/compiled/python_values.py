@@ -239,7 +239,11 @@ class _Search:
         names = [name for base in cls.__mro__ for name in _slots(base)]
         if names:
             self._hold(
-                value, path, lambda: {n: getattr(value, n, ABSENT) for n in names}, _attribute, "slots"
+                value,
+                path,
+                lambda: {n: getattr(value, n, ABSENT) for n in names},
+                _attribute,
+                "slots",
             )
         self._ahead.append((cls, path))
 
@@ -287,7 +291,9 @@ class _Search:
         if self._is_library(function.__module__):
             return
         self._ahead.append((function.__defaults__, f"{path}: defaults of {function.__qualname__}"))
-        self._ahead.append((function.__kwdefaults__, f"{path}: defaults of {function.__qualname__}"))
+        self._ahead.append(
+            (function.__kwdefaults__, f"{path}: defaults of {function.__qualname__}")
+        )
         own = f"{path}: {function.__qualname__}"
         self._hold(vars(function), own, lambda: vars(function), _attribute, table=vars(function))
         # Names in the code may be globals or attributes; those that exist as globals are watched.
@@ -320,7 +326,9 @@ class _Search:
 
         self._hold(function, path, read, spell, what="closure")
 
-    def _at_names_of_module(self, module: types.ModuleType, names: Collection[str], path: str) -> None:
+    def _at_names_of_module(
+        self, module: types.ModuleType, names: Collection[str], path: str
+    ) -> None:
         """Look at those attributes of a module that some code names, and so may read."""
         own = [name for name in names if name in vars(module)]
 
@@ -346,7 +354,9 @@ class _Search:
     def _at_property(self, given: property, path: str) -> None:
         self._ahead.append((given.fget, path))
 
-    def _at_wrapper(self, wrapper: "staticmethod[Any, Any] | classmethod[Any, Any, Any]", path: str) -> None:
+    def _at_wrapper(
+        self, wrapper: "staticmethod[Any, Any] | classmethod[Any, Any, Any]", path: str
+    ) -> None:
         self._ahead.append((wrapper.__func__, path))
 
     def _at_cached_property(self, given: "functools.cached_property[Any]", path: str) -> None:

@@ -30,7 +30,9 @@ def nudged(value: Shaped[Tensor, "*shape"], generator: torch.Generator) -> Shape
     if not value.is_floating_point():
         return value
     # Drawn where the generator lives, on the CPU: the same directions for every device.
-    is_up = torch.randint(2, value.shape, generator=generator, device=generator.device).to(value.device)
+    is_up = torch.randint(2, value.shape, generator=generator, device=generator.device).to(
+        value.device
+    )
     towards = torch.where(is_up.bool(), torch.inf, -torch.inf).to(value.dtype)
     return torch.where(value.isfinite(), torch.nextafter(value, towards), value)
 
@@ -43,7 +45,11 @@ class Nudging(TorchDispatchMode):
         self._generator = generator
 
     def __torch_dispatch__(
-        self, func: OpOverload, types: Sequence[type], args: OpArgs = (), kwargs: OpKwargs | None = None
+        self,
+        func: OpOverload,
+        types: Sequence[type],
+        args: OpArgs = (),
+        kwargs: OpKwargs | None = None,
     ) -> PyTree:
         result = func(*args, **(kwargs or {}))
         name = func.overloadpacket.__name__

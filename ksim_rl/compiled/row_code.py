@@ -13,10 +13,23 @@ from torch.utils._pytree import PyTree
 
 from ksim_rl.compiled.cells import CTYPES, Cells, NotARowError, literal, names_of
 from ksim_rl.compiled.row_formulas import POINTWISE, TESTS, write_pointwise, write_power
-from ksim_rl.compiled.row_indices import write_gather, write_index, write_index_put, write_index_select
+from ksim_rl.compiled.row_indices import (
+    write_gather,
+    write_index,
+    write_index_put,
+    write_index_select,
+)
 from ksim_rl.device.recording import OpArgs, Operation, OpKwargs, OpOverload
 
-_FILLS = {"empty": 0, "empty_like": 0, "new_empty": 0, "new_zeros": 0, "ones": 1, "ones_like": 1, "zeros": 0}
+_FILLS = {
+    "empty": 0,
+    "empty_like": 0,
+    "new_empty": 0,
+    "new_zeros": 0,
+    "ones": 1,
+    "ones_like": 1,
+    "zeros": 0,
+}
 _FILLS |= {"zeros_like": 0, "new_ones": 1}
 # The start of a sum `s`, its update by an element `e`, and the result of `count` elements.
 _REDUCTIONS = {
@@ -65,9 +78,15 @@ def _fill(out: Tensor, value: PyTree, cells: Cells) -> None:
     cells.loop(shape, [f"{cells.at(out, names_of(len(shape)))} = {number};"])
 
 
-def _dims(function: OpOverload, args: OpArgs, kwargs: OpKwargs, ndim: int) -> tuple[list[int], bool]:
+def _dims(
+    function: OpOverload, args: OpArgs, kwargs: OpKwargs, ndim: int
+) -> tuple[list[int], bool]:
     given = dict(zip([a.name for a in function._schema.arguments], args, strict=False)) | kwargs
-    if given.get("dtype") is not None and given["dtype"] != args[0].dtype and args[0].is_floating_point():
+    if (
+        given.get("dtype") is not None
+        and given["dtype"] != args[0].dtype
+        and args[0].is_floating_point()
+    ):
         raise NotARowError("a sum of another type")
     dims = given.get("dim")
     if given.get("ord", 2) != 2:
@@ -107,7 +126,9 @@ def _reduce(
         ctype = CTYPES[out.dtype]
     count = math.prod(source.shape[k] for k in dims)  # elements of each sum
     inner = f"const {ctype} e = ({ctype}){cells.at(source, list(names.values()))}; {step};"
-    over = " ".join(f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in dims)
+    over = " ".join(
+        f"for (int {names[k]} = 0; {names[k]} < {source.shape[k]}; ++{names[k]})" for k in dims
+    )
     end = end.replace("count", literal(count, ctype))
     body = f"{ctype} s = {start}; {over} {{ {inner} }} {cells.at(out, place)} = {end};"
     cells.loop([source.shape[k] for k in kept], [body])
@@ -129,7 +150,9 @@ def _join(name: str, args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) 
         else:
             place[dim - first] = f"({place[dim - first]} + {offset})"
             offset += tensor.shape[dim]
-        cells.loop(shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"])
+        cells.loop(
+            shape, [f"{cells.at(out, place)} = ({CTYPES[out.dtype]}){cells.at(tensor, names)};"]
+        )
 
 
 def _cross(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
@@ -144,7 +167,9 @@ def _cross(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
 
     ctype = CTYPES[out.dtype]
     body = [
-        f"const {ctype} {letter}{k} = {at(args[n], k)};" for n, letter in enumerate("xy") for k in range(3)
+        f"const {ctype} {letter}{k} = {at(args[n], k)};"
+        for n, letter in enumerate("xy")
+        for k in range(3)
     ]
     pairs = ((1, 2), (2, 0), (0, 1))
     body += [f"{at(out, k)} = x{i} * y{j} - x{j} * y{i};" for k, (i, j) in enumerate(pairs)]
@@ -175,9 +200,11 @@ def _draw(
         count = plain.at(counter, [])
     low_ = literal(low, "float")
     width = f"({literal(high, 'float')} - {literal(low, 'float')})"
-    value = (f"{low_} + unit(b) * {width}", "normal(b)", f"{start}LL + (long long)((b * {span}ull) >> 32)")[
-        kind
-    ]
+    value = (
+        f"{low_} + unit(b) * {width}",
+        "normal(b)",
+        f"{start}LL + (long long)((b * {span}ull) >> 32)",
+    )[kind]
     key = f"const RowKey key = key_of({plain.at(seed, [])}, {stream}u, {count}, {first_row} + row);"
     body = f"const unsigned b = bits_of(key, (unsigned)i0); {cells.at(out, ['i0'])} = {value};"
     cells.loop([n], [key, body])
@@ -189,9 +216,13 @@ def _count_non_finite(
     table, term, step, first, count = args
     plain = cells.uniform
     at = f"{plain.at(term, ['i0'])}"
-    body = [f"if (!(fabsf({cells.at(table, ['i0'])}) <= 3.402823466e38f)) {{ const int term = {at};"]
+    body = [
+        f"if (!(fabsf({cells.at(table, ['i0'])}) <= 3.402823466e38f)) {{ const int term = {at};"
+    ]
     body += [f"const long long place = {plain.at(step, [])} * {table.shape[0]} + row;"]
-    body += [f"count_up(&{plain.at(count, ['term'])}); least(&{plain.at(first, ['term'])}, place); }}"]
+    body += [
+        f"count_up(&{plain.at(count, ['term'])}); least(&{plain.at(first, ['term'])}, place); }}"
+    ]
     cells.loop(table.shape[1:], body)
 
 

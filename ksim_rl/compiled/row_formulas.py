@@ -120,7 +120,12 @@ PRELUDE = r"""
 
 
 def write_pointwise(
-    name: str, expression: str, args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells
+    name: str,
+    expression: str,
+    args: OpArgs,
+    kwargs: OpKwargs,
+    out: Shaped[Tensor, "*out"],
+    cells: Cells,
 ) -> None:
     """Write an operation that computes each element of `out` from the operands' elements at the same place."""
     if kwargs.get("rounding_mode") is not None:

@@ -43,13 +43,17 @@ def write_index(args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cel
     cells.loop(shape, [f"{cells.at(out, names)} = {cells.at(source, place)};"])
 
 
-def write_index_select(args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells) -> None:
+def write_index_select(
+    args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells
+) -> None:
     """Write the slices that an index picks along a dim."""
     source, dim, index = args
     write_index((source, [*[None] * (dim % source.ndim), index]), kwargs, out, cells)
 
 
-def write_index_put(args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells) -> None:
+def write_index_put(
+    args: OpArgs, kwargs: OpKwargs, out: Shaped[Tensor, "*out"], cells: Cells
+) -> None:
     """Write values to the places that an index picks along a dim; the rows must not be written so."""
     target, indices, values = args[:3]
     if len(args) > 3 and args[3]:

@@ -55,12 +55,16 @@ class _Memory:
                 if tensor.numel() and _storage(tensor) not in before:
                     made.setdefault(_storage(tensor), tensor)
         # Memory from outside may be reached by tensors that overlap; these must count as one place.
-        used = [tensor for one in operations for tensor in (*one.read(), *one.made) if tensor.numel()]
+        used = [
+            tensor for one in operations for tensor in (*one.read(), *one.made) if tensor.numel()
+        ]
         starts: dict[tuple[int, int], int] = {}
         start = 0
         end = 0
         # Sorted by address, so one pass merges all extents that overlap.
-        for first, last in sorted({extent(tensor) for tensor in used if _storage(tensor) not in made}):
+        for first, last in sorted(
+            {extent(tensor) for tensor in used if _storage(tensor) not in made}
+        ):
             if first >= end:
                 start = first
             end = max(end, last)
@@ -134,7 +138,9 @@ class Tape:
     ) -> None:
         self._num_rows = num_rows
         self._device = returned[0].device
-        self._memory = _Memory.of([entry for entry in recorder.entries if isinstance(entry, Operation)])
+        self._memory = _Memory.of(
+            [entry for entry in recorder.entries if isinstance(entry, Operation)]
+        )
         self.parts: list[Kernel | Operation | Callable[[], None]] = []
         for entry in recorder.entries:
             if not isinstance(entry, Operation):
@@ -143,11 +149,15 @@ class Tape:
                 self._add(entry)
             # Its result on the host would be a constant of the kernels.
             elif torch.Tag.nondeterministic_seeded in entry.function.tags:
-                raise RuntimeError(f"{entry.function} draws numbers on the host, and would draw them once")
+                raise RuntimeError(
+                    f"{entry.function} draws numbers on the host, and would draw them once"
+                )
         # Only now, as the memory of a kernel depends on all parts that come after it.
         self._own = self._find_own(returned)
         # Kernels hold addresses only, so these tensors must stay alive.
-        self._kept = [tensor for place, tensor in self._memory.made.items() if place not in self._own]
+        self._kept = [
+            tensor for place, tensor in self._memory.made.items() if place not in self._own
+        ]
         # All sources first, so that they are compiled together.
         modules = [self._compiled(part) for part in self.parts if isinstance(part, Kernel)]
         kernel_loading.load([module for module in modules if module], self._device)
@@ -159,8 +169,13 @@ class Tape:
 
     def _does_something(self, operation: Operation) -> bool:
         """Whether numbers on the device change: a view changes none, and numbers of the host are constants."""
-        made = [tensor for tensor in operation.made if self._memory.made.get(_storage(tensor)) is tensor]
-        return any(tensor.numel() and tensor.device == self._device for tensor in (*operation.written, *made))
+        made = [
+            tensor for tensor in operation.made if self._memory.made.get(_storage(tensor)) is tensor
+        ]
+        return any(
+            tensor.numel() and tensor.device == self._device
+            for tensor in (*operation.written, *made)
+        )
 
     def _add(self, operation: Operation) -> None:
         """Put an operation into the kernel that comes last, or into a new one, or leave it to torch."""
@@ -175,7 +190,11 @@ class Tape:
         except NotARowError:
             self.parts.append(operation)
             return
-        fits = isinstance(last, Kernel) and len(last.operations) < MOST_OPERATIONS and last.use.allows(use)
+        fits = (
+            isinstance(last, Kernel)
+            and len(last.operations) < MOST_OPERATIONS
+            and last.use.allows(use)
+        )
         if isinstance(last, Kernel) and fits:
             kernel = last
         else:
@@ -197,7 +216,9 @@ class Tape:
         row_code.write(operation, cells)
         use = _Use()
         counts = operation.name in _COUNTS
-        for tensor, distance, _, _ in (element for loop in cells.loops for element in loop.elements):
+        for tensor, distance, _, _ in (
+            element for loop in cells.loops for element in loop.elements
+        ):
             root = self._memory.made.get(_storage(tensor))
             # An array of a row's own has one C type, so reinterpreted memory is left to torch.
             if root is not None and root.dtype != tensor.dtype:
@@ -273,14 +294,18 @@ class Tape:
             if place not in names:
                 name = names[place] = f"m{len(names)}"
                 if is_own or is_shared:
-                    own.append(Own(name, ctype, self._own_width(kernel, place), tensor.element_size()))
+                    own.append(
+                        Own(name, ctype, self._own_width(kernel, place), tensor.element_size())
+                    )
                 else:
                     pointed[name] = ctype
                 if not is_own:
                     given.append(place)
                 if is_shared and not is_own:  # each row works it out, and one hands it on
                     end = f"if (row == 0) (({ctype}*)a.{name})[i0] = {name}[i0];"
-                    ends.append(Loop((own[-1].size,), end, [Element(tensor, 0, name, f"{name}[i0]")]))
+                    ends.append(
+                        Loop((own[-1].size,), end, [Element(tensor, 0, name, f"{name}[i0]")])
+                    )
             # A place is a byte address, and C++ counts elements.
             offset = (tensor.data_ptr() - place) // tensor.element_size()
             return names[place], offset, not (is_own or is_shared)
@@ -291,10 +316,14 @@ class Tape:
         for number, (operation, rows) in enumerate(kernel.operations):
             cells = Cells(rows=rows, address=address, device=self._device)
             row_code.write(operation, cells)
-            outs = {names.get(self._memory.place(one), "") for one in (*operation.made, *operation.written)}
+            outs = {
+                names.get(self._memory.place(one), "")
+                for one in (*operation.made, *operation.written)
+            }
             changed |= outs
             works += [
-                Work(loop, number, set() if operation.name in _COUNTS else outs) for loop in cells.loops
+                Work(loop, number, set() if operation.name in _COUNTS else outs)
+                for loop in cells.loops
             ]
         works += [Work(loop, -1, set()) for loop in ends]
         if not given:
@@ -324,7 +353,10 @@ class Tape:
         kernel.launch = partial(launch, self._device, (self._num_rows, max(lanes, 1)), *given)
         # Tensors that only this kernel uses need no reference here.
         self._kept += [
-            tensor for one, _ in kernel.operations for tensor in one.read() if _storage(tensor) in given
+            tensor
+            for one, _ in kernel.operations
+            for tensor in one.read()
+            if _storage(tensor) in given
         ]
         # The launch has all that it needs, so the recorded operations and their tensors are dropped.
         kernel.operations.clear()

@@ -1,7 +1,13 @@
 """Composes the config of `ksim-rl train` with Hydra, from YAML, the dataclasses and the registered parts."""
 
 from ksim_rl.conf import spelling
-from ksim_rl.conf.command_line import changed, check_command_line, compose, fields_of, without_sweeps
+from ksim_rl.conf.command_line import (
+    changed,
+    check_command_line,
+    compose,
+    fields_of,
+    without_sweeps,
+)
 from ksim_rl.conf.help_page import completions, help_page
 from ksim_rl.conf.registration import (
     MODULE,

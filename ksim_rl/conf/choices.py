@@ -70,7 +70,9 @@ def store_choices() -> None:
         for group in ("data", "modules"):
             cfg = getattr(algorithm, group)
             # An existing choice of the same content is used, so that names stay few.
-            chosen[group] = next((choice for choice, own in CHOICES[group].items() if own == cfg), name)
+            chosen[group] = next(
+                (choice for choice, own in CHOICES[group].items() if own == cfg), name
+            )
             choices[group].setdefault(chosen[group], cfg)
         # Made when Hydra loads it: building all trees takes longer than a command should.
         upstream.store_config("objective", name, partial(_objective, algorithm, chosen))

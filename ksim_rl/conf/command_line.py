@@ -40,7 +40,9 @@ def changed(tree: Tree, path: Path, overrides: Sequence[str]) -> RunCfg:
     return check_command_line(overrides, name=RUN_AGAIN, multirun=False, values=True)[0]
 
 
-def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, values: bool) -> list[RunCfg]:
+def check_command_line(
+    texts: Sequence[str], *, name: str, multirun: bool, values: bool
+) -> list[RunCfg]:
     """Refuse overrides that name an unknown group, choice or field, or (with `values`) give a field a bad value.
 
     The primary config is `name`; sweeps such as `seed=1,2` need `multirun`. With `values` it returns the config, of
@@ -53,7 +55,9 @@ def check_command_line(texts: Sequence[str], *, name: str, multirun: bool, value
             loader = GlobalHydra.instance().config_loader()
             # Parsed before anything is composed, for errors that name one override.
             overrides = [_parse(text, loader) for text in texts]
-            sweeps = [str(override.input_line) for override in overrides if override.is_sweep_override()]
+            sweeps = [
+                str(override.input_line) for override in overrides if override.is_sweep_override()
+            ]
             if sweeps and not multirun:
                 raise ValueError(
                     f"override {sweeps[0]!r} has several values: add --multirun to run one job for each"
@@ -153,7 +157,9 @@ def _check_names(overrides: Sequence[Override], loader: ConfigLoader, name: str)
     sources = tuple(element.path or "" for element in loader.get_search_path().get_path())
     # The primary config of a run that is made again is another one each time.
     tree = (_names.__wrapped__ if name == RUN_AGAIN else _names)(name, tuple(choices), sources)
-    check_parsed({**dict.fromkeys(group for group in groups if group not in CHOSEN_BY_TASK), **tree}, fields)
+    check_parsed(
+        {**dict.fromkeys(group for group in groups if group not in CHOSEN_BY_TASK), **tree}, fields
+    )
 
 
 @cache

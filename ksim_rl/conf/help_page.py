@@ -49,7 +49,10 @@ def completions() -> list[str]:
     # Fields of tasks differ from task to task: their own help lists these.
     fields = _paths({name: tree for name, tree in cfg.to_tree().items() if name != "task"}, "")
     for name in algorithms.names():
-        fields += [f"objective.{field.name}=" for field in dataclasses.fields(algorithms.algorithm(name).cfg)]
+        fields += [
+            f"objective.{field.name}="
+            for field in dataclasses.fields(algorithms.algorithm(name).cfg)
+        ]
     return [*words, *dict.fromkeys(fields)]
 
 
@@ -73,7 +76,11 @@ def _explained(value: Any, tree: Mapping[str, Any], indent: str) -> list[str]:
     for name, below in tree.items():
         inside = _inside(value, name)
         shown = _plain(below)
-        line = f"{indent}{name}:" if isinstance(below, Mapping) and below else f"{indent}{name}: {shown}"
+        line = (
+            f"{indent}{name}:"
+            if isinstance(below, Mapping) and below
+            else f"{indent}{name}: {shown}"
+        )
         text = texts.get(name) or (_summary(inside) if isinstance(below, Mapping) else "")
         room = WIDTH - len(line)
         # Beside a long value there is no room for more than a word.

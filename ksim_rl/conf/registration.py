@@ -96,7 +96,9 @@ def store_run(tree: Tree, path: Path) -> None:
     """Store the config of a run, which `check_run_tree` has seen, as the primary config `RUN_AGAIN`."""
     task = tree.get("task")
     if not isinstance(task, dict) or not isinstance(task.get("scene"), dict):
-        raise ValueError(f"{path}: task={task!r}: expected the config of an env, as a run writes it")
+        raise ValueError(
+            f"{path}: task={task!r}: expected the config of an env, as a run writes it"
+        )
     # The number of envs and the seed of the env follow the run's, as in a new config.
     plain = without_env_size(up_to_date(tree))
     ConfigStore.instance().store(name=RUN_AGAIN, node={**plain, "defaults": ["launch", "_self_"]})
@@ -105,7 +107,9 @@ def store_run(tree: Tree, path: Path) -> None:
 def config_files(folder: Path) -> list[Path]:
     """Return the YAML files in a folder, relative to it."""
     names = (os.path.join(root, name) for root, _, files in os.walk(folder) for name in files)
-    return sorted(Path(name).relative_to(folder) for name in names if name.endswith((".yaml", ".yml")))
+    return sorted(
+        Path(name).relative_to(folder) for name in names if name.endswith((".yaml", ".yml"))
+    )
 
 
 def check_groups(folder: Path) -> None:
@@ -134,12 +138,16 @@ def check_groups(folder: Path) -> None:
         text = read_bytes(folder / path, limit=MOST_GROUP_BYTES).decode(errors="replace")
         try:
             plain_data.check_events(folder / path, text)
-            with naming(f"{folder / path}: cannot be read"):  # numbers of more digits than Python reads
+            with naming(
+                f"{folder / path}: cannot be read"
+            ):  # numbers of more digits than Python reads
                 tree = yaml.safe_load(
                     text
                 )  # as well as the text, in which a name may be spelled with escapes
         except yaml.YAMLError as error:
-            raise ValueError(f"{folder / path}: cannot be read: {' '.join(str(error).split())}") from error
+            raise ValueError(
+                f"{folder / path}: cannot be read: {' '.join(str(error).split())}"
+            ) from error
         plain_data.check_references(tree, str(folder / path))
         references += str(tree).count("${")
         if references > MOST_REFERENCES:

@@ -86,7 +86,11 @@ def find(
             return found
         declined = declined or found
         # For the error: the names that would have been accepted.
-        names += [name for name, value in vars(module).items() if isinstance(value, type) and accepts(value)]
+        names += [
+            name
+            for name, value in vars(module).items()
+            if isinstance(value, type) and accepts(value)
+        ]
     if isinstance(declined, type) and not accepts(declined):
         raise ValueError(
             f"{where}: {class_name} is a class, and no {kind}: name the {kind} that makes one, as docs/learning.md "

@@ -93,7 +93,9 @@ def build_value(annotation: Annotation, value: Plain, path: str) -> Any:
     if value is None and type(None) in alternatives:
         return None
     alternatives = [option for option in alternatives if option is not type(None)]
-    classes = [option for option in alternatives if isinstance(option, type) and option not in _SCALARS]
+    classes = [
+        option for option in alternatives if isinstance(option, type) and option not in _SCALARS
+    ]
     if len(classes) == 1 and issubclass(classes[0], OwnTree):
         return classes[0].from_tree(value, path)
     takes_mapping = any(typing.get_origin(option) in _MAPPINGS for option in alternatives)
@@ -193,7 +195,9 @@ def _build_dataclass(classes: list[type], tree: Tree, path: str) -> Any:
     cls: type
     # A class of a package that may be built, and of the kind that the field asks for.
     if TARGET in tree:
-        cls = class_paths.find(tree[TARGET], path, kind="dataclass", accepts=dataclasses.is_dataclass)
+        cls = class_paths.find(
+            tree[TARGET], path, kind="dataclass", accepts=dataclasses.is_dataclass
+        )
         # Protocols cannot be asked by `issubclass`.
         bases = [c for c in classes if not getattr(c, "_is_protocol", False)]
         if bases and not issubclass(cls, tuple(bases)):
@@ -218,7 +222,9 @@ def _build_dataclass(classes: list[type], tree: Tree, path: str) -> Any:
     # Told here, since the constructor would name the argument without its path.
     for name, field in fields.items():
         if name not in given and field.default is field.default_factory is dataclasses.MISSING:
-            raise ValueError(f"{path}: {cls.__name__} needs the field {name!r}: {_describe(hints[name])}")
+            raise ValueError(
+                f"{path}: {cls.__name__} needs the field {name!r}: {_describe(hints[name])}"
+            )
     try:
         return cls(**given)
     except ValueError as error:
@@ -234,7 +240,9 @@ def _alternatives(annotation: Annotation) -> list[Annotation]:
 
 def _default_class(annotation: Annotation) -> Any:
     """Return the dataclass that a tree without `_target_` means: the first that the annotation names."""
-    return next((option for option in _alternatives(annotation) if dataclasses.is_dataclass(option)), None)
+    return next(
+        (option for option in _alternatives(annotation) if dataclasses.is_dataclass(option)), None
+    )
 
 
 def _describe(annotation: Annotation) -> str:

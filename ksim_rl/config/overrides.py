@@ -110,7 +110,11 @@ def check_key(tree: Tree, key: str) -> None:
             else:
                 where = ""
             # The field exists one level down: most often a group was forgotten.
-            inside = [top for top, below in tree.items() if isinstance(below, Mapping) and parts[0] in below]
+            inside = [
+                top
+                for top, below in tree.items()
+                if isinstance(below, Mapping) and parts[0] in below
+            ]
             if above or not inside:
                 hint = near(part, choices)
             else:

@@ -30,7 +30,9 @@ class _Loader(_FastLoader):
 
     yaml_implicit_resolvers = yaml_resolvers()
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Plain]:
+    def construct_mapping(
+        self, node: yaml.MappingNode, deep: bool = False
+    ) -> dict[Hashable, Plain]:
         """Refuse keys that are there twice, of which one would win in silence."""
         # By their written form, as 1 and "1" are different keys.
         seen: set[str] = set()
@@ -69,14 +71,21 @@ def check_events(path: Path, text: str) -> None:
         found = None
         if isinstance(event, yaml.NodeEvent) and event.anchor is not None:
             found = f"the anchor {event.anchor!r}, and"
-        elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag is not None:
+        elif (
+            isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent)
+            and event.tag is not None
+        ):
             found = f"the tag {event.tag!r}, and"
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(
+            event, yaml.CollectionEndEvent
+        )
         if depth > MOST_DEPTH:
             found = f"more than {MOST_DEPTH} levels, and"
         if found is not None:
             line = event.start_mark.line + 1
-            raise ValueError(f"{path}, line {line}: {found} a config of others holds plain values only")
+            raise ValueError(
+                f"{path}, line {line}: {found} a config of others holds plain values only"
+            )
 
 
 def check_plain(tree: Any, where: str) -> None:
@@ -95,9 +104,13 @@ def check_plain(tree: Any, where: str) -> None:
             check_plain(entry, f"{where}[{index}]")
     # Resolvers may read the environment, or run code of a plug-in.
     elif isinstance(tree, str) and "${" in tree:
-        raise ValueError(f"{where}={tree[:80]!r}: an interpolation, and a run's config holds values only")
+        raise ValueError(
+            f"{where}={tree[:80]!r}: an interpolation, and a run's config holds values only"
+        )
     elif isinstance(tree, int) and tree.bit_length() > MOST_BITS:
-        raise ValueError(f"{where}: a whole number of {tree.bit_length()} bits: expected {MOST_BITS} at most")
+        raise ValueError(
+            f"{where}: a whole number of {tree.bit_length()} bits: expected {MOST_BITS} at most"
+        )
 
 
 def check_references(tree: Plain, where: str) -> None:

@@ -100,7 +100,9 @@ def environment() -> dict[str, str]:
     folders = _folders()
     for name in sorted({name.split(".")[0] for name in _named} | _allowed):
         module = sys.modules.get(name)
-        if module is None or module.__spec__ is None:  # one that was only allowed may not be imported yet
+        if (
+            module is None or module.__spec__ is None
+        ):  # one that was only allowed may not be imported yet
             continue
         # A package has places, and of a module that is one file this is the place.
         places = module.__spec__.submodule_search_locations or [module.__spec__.origin]
@@ -113,7 +115,11 @@ def environment() -> dict[str, str]:
 
 def _folders() -> list[str]:
     """Return the folders of `KSIM_RL_PLUGIN_PATH`; relative ones would lead into whatever folder the user stands in."""
-    return [folder for folder in os.environ.get(PATH_VARIABLE, "").split(os.pathsep) if os.path.isabs(folder)]
+    return [
+        folder
+        for folder in os.environ.get(PATH_VARIABLE, "").split(os.pathsep)
+        if os.path.isabs(folder)
+    ]
 
 
 def _extend_path() -> None:
@@ -188,4 +194,6 @@ def _import(origin: str, name: str, fix: str) -> list[ModuleType]:
         found = (info.name for info in pkgutil.iter_modules(inside) if info.name != "__main__")
         return [module, *(importlib.import_module(f"{name}.{child}") for child in found)]
     except Exception as error:
-        raise ValueError(f"{origin} cannot be loaded: {type(error).__name__}: {error}; {fix}") from error
+        raise ValueError(
+            f"{origin} cannot be loaded: {type(error).__name__}: {error}; {fix}"
+        ) from error

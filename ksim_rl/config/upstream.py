@@ -28,7 +28,9 @@ class _Kept(ConfigNode):
 class _Made(_Kept):
     """A stored config that is made when it is loaded first."""
 
-    def __init__(self, make: Callable[[], Tree], *, name: str, group: str, package: str | None) -> None:
+    def __init__(
+        self, make: Callable[[], Tree], *, name: str, group: str, package: str | None
+    ) -> None:
         self.make = make
         self.name = name
         self.group = group
@@ -47,7 +49,9 @@ def _made(make: Callable[[], Tree]) -> DictConfig:
     return OmegaConf.create(make())
 
 
-def store_config(group: str, name: str, make: Callable[[], Tree], *, package: str | None = None) -> None:
+def store_config(
+    group: str, name: str, make: Callable[[], Tree], *, package: str | None = None
+) -> None:
     """Store a config in a group; `make` is called for its tree when Hydra first loads it."""
     # Written into the store's folders, since its own method wants the finished tree.
     folder = ConfigStore.instance().repo

@@ -141,7 +141,9 @@ class DatasetBuffer(ReplayBuffer):
         # TorchRL's buffer wraps its storage in its own methods; this one is read directly as well.
         self._dataset = DatasetStorage(cfg.num_env_states, device=device)
         if sampler is None:
-            sampler = EpochSampler(seed=seed, shards=cfg.shards, num_minibatches=cfg.num_minibatches)
+            sampler = EpochSampler(
+                seed=seed, shards=cfg.shards, num_minibatches=cfg.num_minibatches
+            )
         super().__init__(
             storage=self._dataset,
             sampler=sampler,
@@ -156,7 +158,9 @@ class DatasetBuffer(ReplayBuffer):
         """Rows removed so far because an element was not finite, on the device."""
         return self._dataset.non_finite_count
 
-    def extend(self, data: TensorDictBase, *, update_priority: bool | None = None) -> Int64[Tensor, " D"]:
+    def extend(
+        self, data: TensorDictBase, *, update_priority: bool | None = None
+    ) -> Int64[Tensor, " D"]:
         """Replace the dataset by `data`, exactly D env states in env-major order, and return the indices written."""
         size = self.cfg.num_env_states
         if data.numel() != size:
@@ -205,8 +209,12 @@ class DatasetBuffer(ReplayBuffer):
     def epoch_orders(self, count: int) -> Int64[Tensor, "K D"]:
         """Begin `count` epochs of an `EpochSampler`; return their orders instead of minibatches, on the device."""
         if type(self.sampler) is not EpochSampler:
-            raise TypeError(f"a {type(self.sampler).__name__} has no order of single env states: use epoch()")
-        return self.sampler.epoch_orders(count, self.cfg.num_env_states, device=self.non_finite_count.device)
+            raise TypeError(
+                f"a {type(self.sampler).__name__} has no order of single env states: use epoch()"
+            )
+        return self.sampler.epoch_orders(
+            count, self.cfg.num_env_states, device=self.non_finite_count.device
+        )
 
     def all(self) -> TensorDictBase:
         """Return the dataset `["D"]`: views of the storage, which the next `extend` overwrites."""

@@ -114,8 +114,12 @@ class DatasetStorage(TensorStorage):
         self._storage = dims.name(content, dims.D)
         self.initialized = True
 
-    def _stored_leaves(self, leaves: dict[NestedKey, Tensor], batch_dims: int) -> dict[NestedKey, Tensor]:
-        stored: dict[NestedKey, Tensor] = dict(self._storage.items(include_nested=True, leaves_only=True))
+    def _stored_leaves(
+        self, leaves: dict[NestedKey, Tensor], batch_dims: int
+    ) -> dict[NestedKey, Tensor]:
+        stored: dict[NestedKey, Tensor] = dict(
+            self._storage.items(include_nested=True, leaves_only=True)
+        )
         del stored[MASK_KEY]
         if stored.keys() != leaves.keys():
             missing = list(stored.keys() - leaves.keys())
@@ -148,7 +152,9 @@ class DatasetWriter(Stateless, Writer):
     def extend(self, data: TensorDictBase) -> Int64[Tensor, " N"]:
         """Write, and return the indices of the env states written."""
         if not isinstance(data, TensorDictBase):
-            raise ValueError(f"extend() got {type(data).__name__}: expected a TensorDict, e.g. a rollout")
+            raise ValueError(
+                f"extend() got {type(data).__name__}: expected a TensorDict, e.g. a rollout"
+            )
         return self._storage.write(data)
 
 

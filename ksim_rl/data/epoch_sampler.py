@@ -87,7 +87,9 @@ class EpochSampler(Sampler):
                 "nothing could be sampled; use a smaller batch_size or drop_last=False"
             )
         # A slice of the order, which is on the device of the storage already.
-        index = self._next_part(size, batch_size, torch.device(getattr(storage, "device", None) or "cpu"))
+        index = self._next_part(
+            size, batch_size, torch.device(getattr(storage, "device", None) or "cpu")
+        )
         # TorchRL indexes storages of several dims by a tuple.
         if storage.ndim > 1:
             index = torch.unravel_index(index, storage.shape)
@@ -129,7 +131,9 @@ class EpochSampler(Sampler):
         if not self.shuffle:
             orders_KD = torch.arange(size, device=epochs.device).expand(len(epochs), size)
         elif size % self.shards:
-            raise ValueError(f"{size} elements are no whole number for each of {self.shards} shards")
+            raise ValueError(
+                f"{size} elements are no whole number for each of {self.shards} shards"
+            )
         else:
             # A permutation for each shard and epoch, of elements within the shard.
             keys = random.row_keys(epochs.new_full((), self.seed), _STREAM, epochs, self.shards)
@@ -137,7 +141,11 @@ class EpochSampler(Sampler):
         if self.shards == 1:
             return orders_KD
         # From shard by shard to minibatch by minibatch: [K, shards, M, B / shards] to [K, M, shards, ...].
-        return orders_KD.unflatten(1, (self.shards, self.num_minibatches, -1)).transpose(1, 2).flatten(1)
+        return (
+            orders_KD.unflatten(1, (self.shards, self.num_minibatches, -1))
+            .transpose(1, 2)
+            .flatten(1)
+        )
 
     def state_dict(self) -> dict[str, int]:
         """Return the integers from which the orders continue exactly (reads the epoch counter on the host)."""
@@ -248,12 +256,16 @@ class SequenceSampler(EpochSampler):
         else:
             steps = self.rollout_length
         if steps is None:
-            raise ValueError("the storage has one dim: pass rollout_length, the steps of each env in it")
+            raise ValueError(
+                "the storage has one dim: pass rollout_length, the steps of each env in it"
+            )
         if size % steps:
             raise ValueError(
                 f"the storage has {size} env states: no whole number of rollouts of {steps} steps"
             )
-        length = sequence_length(steps, self.sequence_length, batch_size=batch_size, burn_in=self.burn_in)
+        length = sequence_length(
+            steps, self.sequence_length, batch_size=batch_size, burn_in=self.burn_in
+        )
         device = torch.device(getattr(storage, "device", None) or "cpu")
         sequence_S = self._next_part(size // length, batch_size // length, device)
         # Within a rollout; negative where there is nothing before it.
@@ -295,5 +307,7 @@ def sequence_length(
             f"{batch_size} and {rollout_length} here"
         )
     if burn_in > length:
-        raise ValueError(f"burn_in={burn_in} is longer than sequence_length={length}: use at most {length}")
+        raise ValueError(
+            f"burn_in={burn_in} is longer than sequence_length={length}: use at most {length}"
+        )
     return length

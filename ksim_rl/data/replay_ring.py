@@ -45,7 +45,9 @@ class ReplaySampler(Stateless, Sampler):
         device = storage.device
         env = ranks.randint(storage.num_envs // self.shards, shape, dim=1, device=device)
         if self.shards > 1:
-            first_S = torch.arange(0, storage.num_envs, storage.num_envs // self.shards, device=device)
+            first_S = torch.arange(
+                0, storage.num_envs, storage.num_envs // self.shards, device=device
+            )
             # Part s of the batch is from the envs of shard s.
             env += first_S.repeat_interleave(batch_size // self.shards)
         # float64: float32 cannot tell the places of a ring of more than 2^24.
@@ -125,7 +127,9 @@ class PrioritySampler(SavedByStateDict, Sampler):
         priority_B = priority_B.expand(index_B.shape[0])
         # A loss that is not finite says nothing about its entry.
         valid_B = priority_B.isfinite() & (priority_B >= 0.0)
-        self._highest.copy_(torch.maximum(self._highest, torch.where(valid_B, priority_B, 0.0).amax()))
+        self._highest.copy_(
+            torch.maximum(self._highest, torch.where(valid_B, priority_B, 0.0).amax())
+        )
         priority_B = torch.where(valid_B, priority_B, self._default())
         # The highest of several: an order of writes would differ from run to run.
         self._priority_N.scatter_reduce_(0, index_B, priority_B, "amax", include_self=False)
@@ -151,10 +155,14 @@ class PrioritySampler(SavedByStateDict, Sampler):
         device = upto_N.device
         # Stratified draws: number i lies in share i of B equal parts.
         share_B = torch.arange(batch_size, dtype=torch.float64, device=device)
-        share_B = (share_B + torch.rand(batch_size, dtype=torch.float64, device=device)) / batch_size
+        share_B = (
+            share_B + torch.rand(batch_size, dtype=torch.float64, device=device)
+        ) / batch_size
         # Rounding could lead past the last entry that has a score.
         has_score_N = score_N > 0.0
-        last = has_score_N.to(torch.int64).mul_(torch.arange(score_N.shape[0], device=device)).amax()
+        last = (
+            has_score_N.to(torch.int64).mul_(torch.arange(score_N.shape[0], device=device)).amax()
+        )
         drawn_B = (share_B * upto_N[-1]).to(torch.int64)
         index_B = torch.searchsorted(upto_N, drawn_B, right=True)
         index_B = torch.minimum(index_B, last)
@@ -198,14 +206,22 @@ class ReplayCfg(Checked):
     num_env_states_per_minibatch: Count  # env states of a gradient step
     num_minibatches: Repeats  # per iteration
     num_steps: Count = 1  # of each env per iteration
-    capacity: Count = 1024  # env states per env; an episode's end takes one more, for its last observation
+    capacity: Count = (
+        1024  # env states per env; an episode's end takes one more, for its last observation
+    )
     n_step: Repeats = 1  # rewards that a target sums before it bootstraps
-    learning_starts: Count = 10  # steps of each env with random actions before the first gradient step
-    prioritized: bool = False  # by the last temporal-difference error (Schaul et al., arXiv 1511.05952)
+    learning_starts: Count = (
+        10  # steps of each env with random actions before the first gradient step
+    )
+    prioritized: bool = (
+        False  # by the last temporal-difference error (Schaul et al., arXiv 1511.05952)
+    )
     priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
     priority_beta: Share = 0.4  # how far the weights of the losses undo that; 1 is wholly
     save_replay: bool = True  # in checkpoints, so that a resumed run goes on as it would have
-    shards: Count = 1  # equal parts of the envs, of which minibatches have as many each, as with ranks
+    shards: Count = (
+        1  # equal parts of the envs, of which minibatches have as many each, as with ranks
+    )
 
     def _check_fields(self) -> None:
         """Refuse a ring that is too small for its rollouts."""
@@ -234,7 +250,9 @@ class ReplayCfg(Checked):
                 f"shards={self.shards}: use a divisor of num_envs={num_envs} and of minibatches of {size}"
             )
         if self.prioritized and self.shards * ranks.size() > 1:
-            raise ValueError("prioritized=True: priorities are compared in one process without shards only")
+            raise ValueError(
+                "prioritized=True: priorities are compared in one process without shards only"
+            )
         return self.num_steps
 
     def with_rollout_length(self, length: int, num_envs: int) -> "ReplayCfg":
@@ -253,7 +271,9 @@ class ReplayRing(ReplayBuffer):
 
     def __init__(self, cfg: ReplayCfg, **of_storage: Any) -> None:
         self._ring = ReplayStorage(capacity=cfg.capacity, n_step=cfg.n_step, **of_storage)
-        sampler: Sampler = ReplaySampler(shards=cfg.shards, minibatch=cfg.num_env_states_per_minibatch)
+        sampler: Sampler = ReplaySampler(
+            shards=cfg.shards, minibatch=cfg.num_env_states_per_minibatch
+        )
         if cfg.prioritized:
             exponents = {"alpha": cfg.priority_alpha, "beta": cfg.priority_beta}
             sampler = PrioritySampler(self._ring.max_size, device=self._ring.device, **exponents)

@@ -79,7 +79,9 @@ class ReplayStorage(SavedByStateDict, Storage):
         self.non_finite_count = torch.zeros((), dtype=torch.int64, device=self.device)
         self._env_E = torch.arange(num_envs, device=self.device)
 
-    def index(self, env: Int64[Tensor, "*batch"], age: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
+    def index(
+        self, env: Int64[Tensor, "*batch"], age: Int64[Tensor, "*batch"]
+    ) -> Int64[Tensor, "*batch"]:
         """Return the index of the env state that lies `age` >= 1 places behind the newest observation of `env`."""
         return (self.head_E[env] - age) % self.places * self.num_envs + env
 
@@ -108,7 +110,9 @@ class ReplayStorage(SavedByStateDict, Storage):
         place_ET = self.head_E[:, None] + before_ET
         # A place of an env is a row of the storage at place * num_envs + env.
         index_N = (place_ET % self.places * self.num_envs + self._env_E[:, None]).flatten()
-        following_N = ((place_ET + 1) % self.places * self.num_envs + self._env_E[:, None]).flatten()
+        following_N = (
+            (place_ET + 1) % self.places * self.num_envs + self._env_E[:, None]
+        ).flatten()
 
         self._cut_where_not_continued(rollout_ET)
         # One element that is not finite makes its env state invalid, whichever leaf it is in.
@@ -215,7 +219,9 @@ class ReplayStorage(SavedByStateDict, Storage):
         if missing:
             raise ValueError(f"the rollout lacks {missing}; it has {sorted(map(str, produced))}")
         # Under "next" only rewards and flags are stored: observations there lie in the next place.
-        kept_ET = rollout_ET.select(*(key for key in produced if key[0] != "next" or key in _LEAVES))
+        kept_ET = rollout_ET.select(
+            *(key for key in produced if key[0] != "next" or key in _LEAVES)
+        )
         # Asked for as a whole first: a refusal then names the size of all of it, and not of its first leaf.
         row = sum(leaf[0, 0].nbytes for leaf in kept_ET.values(True, True))
         torch.empty(self.max_size * row, dtype=torch.uint8, device=self.device)

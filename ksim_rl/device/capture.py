@@ -62,7 +62,9 @@ def _refuse_or_warn(device: torch.device, *, require_graphs: bool) -> bool:
     if require_graphs:
         raise RuntimeError(f"require_graphs=True, but {reason}")
     # The warning points at the caller of the constructor that asked.
-    warnings.warn(f"RUNNING WITHOUT GRAPHS, about 13 times slower: {reason}", RuntimeWarning, stacklevel=3)
+    warnings.warn(
+        f"RUNNING WITHOUT GRAPHS, about 13 times slower: {reason}", RuntimeWarning, stacklevel=3
+    )
     return False
 
 

@@ -34,7 +34,9 @@ class CompilerCache:
 def torch_cache() -> CompilerCache:
     """Return the cache of `torch.compile`, which makes it in the temporary folder by user."""
     variable = "TORCHINDUCTOR_CACHE_DIR"
-    folder = os.environ.get(variable) or Path(tempfile.gettempdir()) / f"torchinductor_{_user_name()}"
+    folder = (
+        os.environ.get(variable) or Path(tempfile.gettempdir()) / f"torchinductor_{_user_name()}"
+    )
     return CompilerCache(compiler="torch.compile", variable=variable, folder=Path(folder))
 
 
@@ -72,7 +74,8 @@ def _explanation(error: BaseException, *, triton_alone: bool) -> str:
     # Torch compiles kernels of Triton for a GPU.
     caches = [triton_cache()] if triton_alone else [torch_cache(), triton_cache()]
     advice = ", ".join(
-        f"{cache.compiler}'s {cache.folder} (or set {cache.variable} to another folder)" for cache in caches
+        f"{cache.compiler}'s {cache.folder} (or set {cache.variable} to another folder)"
+        for cache in caches
     )
     return (
         f"a compiler failed: {type(error).__name__}: {said}; if a file in its cache is damaged, such as by a "

@@ -30,7 +30,12 @@ def mix(x: Int64[Tensor, "*shape"]) -> Int64[Tensor, "*shape"]:
 
 
 def keys_of(
-    seed: Int64[Tensor, ""], stream: int, count: Int64[Tensor, "*rows"], *, num_rows: int, first_row: int
+    seed: Int64[Tensor, ""],
+    stream: int,
+    count: Int64[Tensor, "*rows"],
+    *,
+    num_rows: int,
+    first_row: int,
 ) -> Keys:
     """Return the keys of `num_rows` rows at a common count [], or at a count each, [E]."""
     row_E = torch.arange(first_row, first_row + num_rows, device=seed.device)

@@ -20,7 +20,9 @@ def _remove(folder: Path, error: Exception, attempt: int) -> None:
     """Delete the folder of a module that cannot be read; a RuntimeError says what to do where that does not help."""
     why = " ".join(str(error).split())
     if attempt > 1:
-        raise RuntimeError(f"Warp's cache: {folder} cannot be read or written: {why}; {ADVICE}") from error
+        raise RuntimeError(
+            f"Warp's cache: {folder} cannot be read or written: {why}; {ADVICE}"
+        ) from error
     if (
         folder.exists() and folder.parent not in _said
     ):  # a damaged cache has many, and hundreds of lines would hide all else

@@ -61,7 +61,9 @@ class CompileLogger:
             f"{self.count} modules, {self.seconds:.0f} s"
         )
 
-    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
+    def warning(
+        self, message: str, category: type[Warning] | None = None, stacklevel: int = 1
+    ) -> None:
         """Write Warp's warnings to stderr."""
         show(f"Warp warning: {message}", to_stderr=True)
 

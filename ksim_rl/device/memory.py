@@ -45,7 +45,9 @@ def check_room(cfg: Checked, *, num_envs: int, device: torch.device, path: str =
     """
     for where, part in _parts(cfg, path):
         for names, numbers in part.least_numbers(num_envs).items():
-            given = ", ".join(f"{where}.{name}={getattr(part, name)!r}".removeprefix(".") for name in names)
+            given = ", ".join(
+                f"{where}.{name}={getattr(part, name)!r}".removeprefix(".") for name in names
+            )
             check_bytes(given, _NUMBER_BYTES * numbers, num_envs=num_envs, device=device)
 
 
@@ -75,7 +77,9 @@ def _parts(value: object, path: str) -> Iterator[tuple[str, Checked]]:
 
 @contextmanager
 def memory_for(
-    num_envs: int, device: torch.device, first_that_fits: Callable[[Iterable[int]], int | None] | None = None
+    num_envs: int,
+    device: torch.device,
+    first_that_fits: Callable[[Iterable[int]], int | None] | None = None,
 ) -> Iterator[None]:
     """Turn an allocation that fails in this block into a TooManyEnvsError: memory of an env, and how many may fit.
 
@@ -97,7 +101,9 @@ def memory_for(
             taken = max(0, free - (free_bytes(device) or 0))
         # A lower bound: the block might have asked for more after this.
         per_env = max(1, (taken + asked) // num_envs)
-        if isinstance(error, TooManyEnvsError):  # raised nearer to it, before anything was given back
+        if isinstance(
+            error, TooManyEnvsError
+        ):  # raised nearer to it, before anything was given back
             per_env = max(per_env, error.per_env)
         most = num_envs
         fits = ""

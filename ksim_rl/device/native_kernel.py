@@ -24,7 +24,11 @@ class NativeKernel:
     """
 
     def __init__(
-        self, fields: Mapping[str, type | str], source: str, indices: tuple[str, str], block_dim: int
+        self,
+        fields: Mapping[str, type | str],
+        source: str,
+        indices: tuple[str, str],
+        block_dim: int,
     ) -> None:
         types = {name: _type_of(kind) for name, kind in fields.items()}
         arguments: Any = wp.struct(type("Arguments", (), {"__annotations__": types}))
@@ -42,7 +46,9 @@ class NativeKernel:
         self._arguments = arguments
         self._block_dim = block_dim
         self.loadable: tuple[wp.Module, int] = kernel.module, block_dim
-        self._recorded: dict[tuple[torch.device, tuple[int, int]], tuple[wp.Launch, ctypes.Structure]] = {}
+        self._recorded: dict[
+            tuple[torch.device, tuple[int, int]], tuple[wp.Launch, ctypes.Structure]
+        ] = {}
         self._packer = struct.Struct("")
         # The bytes are shared by all launches until the driver, or the kernel on the CPU, has read them.
         self._lock = threading.Lock()
@@ -61,7 +67,9 @@ class NativeKernel:
             self._packer.pack_into(packed, 0, *values)
             launch.launch(stream)
 
-    def _record(self, device: torch.device, dim: tuple[int, int]) -> tuple[wp.Launch, ctypes.Structure]:
+    def _record(
+        self, device: torch.device, dim: tuple[int, int]
+    ) -> tuple[wp.Launch, ctypes.Structure]:
         # Sizes that come only once, such as a last batch, would pile up.
         if len(self._recorded) >= MAX_RECORDED:
             self._recorded.clear()

@@ -65,14 +65,18 @@ class QuickLaunch:
         self._block_dim = block_dim
         self._kernel: NativeKernel | None = None
         self._making = threading.Lock()
-        QuickLaunch.existing = WeakSet([*QuickLaunch.existing, self])  # a thread may go through the old one
+        QuickLaunch.existing = WeakSet(
+            [*QuickLaunch.existing, self]
+        )  # a thread may go through the old one
 
     def __call__(self, device: torch.device, dim: tuple[int, int], *values: float) -> None:
         """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""
         if 0 in dim:
             return
         # As an operator, the recording would have noted it; as a launch, it would be lost.
-        assert not recording.is_recording(), "a kernel that is no operator of torch cannot be recorded"
+        assert not recording.is_recording(), (
+            "a kernel that is no operator of torch cannot be recorded"
+        )
         kernel = self._kernel or self._made()
         kernel.launch(device, dim, values)
 
@@ -89,7 +93,9 @@ class QuickLaunch:
         # Two threads may make the first launch at the same time.
         with self._making:
             if self._kernel is None:
-                self._kernel = NativeKernel(self._arguments, self._source, self._indices, self._block_dim)
+                self._kernel = NativeKernel(
+                    self._arguments, self._source, self._indices, self._block_dim
+                )
         return self._kernel
 
 
@@ -121,7 +127,9 @@ def as_operator(
     not installed.
     """
     # torch 2.11 looks for each of these among the arguments that were given, without those that equal their defaults.
-    defaults = {name for name, own in signature(launch).parameters.items() if own.default is not own.empty}
+    defaults = {
+        name for name, own in signature(launch).parameters.items() if own.default is not own.empty
+    }
     assert not defaults & set(mutates), f"{name}: arguments that are changed have no default"
     if in_torch is None:
         chosen = launch

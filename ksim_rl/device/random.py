@@ -160,7 +160,11 @@ def _number_of_counts(seed: Tensor, counter: Tensor, num_rows: int, kind: int) -
         counts = counter.numel()
     else:
         counts = num_rows
-    if seed.dtype != torch.int64 or counter.dtype != torch.int64 or counter.shape not in ((), (counts,)):
+    if (
+        seed.dtype != torch.int64
+        or counter.dtype != torch.int64
+        or counter.shape not in ((), (counts,))
+    ):
         raise ValueError(
             f"seed is {seed.dtype}, counter is {counter.dtype} of shape {tuple(counter.shape)}: expected torch.int64, "
             f"and a counter of shape () or ({counts},)"
@@ -208,5 +212,8 @@ def _empty(seed: Tensor, num_rows: int, n: int, kind: int) -> Tensor:
 
 
 _drawn = as_operator(
-    "draw", _draw_now, lambda *given: _empty(given[0], given[3], *given[5:7]), in_torch=_draw_in_torch
+    "draw",
+    _draw_now,
+    lambda *given: _empty(given[0], given[3], *given[5:7]),
+    in_torch=_draw_in_torch,
 )

@@ -109,7 +109,11 @@ class Recorder(TorchDispatchMode):
             _recording.recorder = self
 
     def __torch_dispatch__(
-        self, func: OpOverload, types: Sequence[type], args: OpArgs = (), kwargs: OpKwargs | None = None
+        self,
+        func: OpOverload,
+        types: Sequence[type],
+        args: OpArgs = (),
+        kwargs: OpKwargs | None = None,
     ) -> PyTree:
         kwargs = kwargs or {}
         # A number that Python reads would be a constant in the recording.

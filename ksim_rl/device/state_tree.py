@@ -62,7 +62,9 @@ def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, A
     return state
 
 
-def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: Mapping[str, Any], *, what: str) -> None:
+def copy_into(
+    live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: Mapping[str, Any], *, what: str
+) -> None:
     """Copy saved tensors into live ones, whose addresses stay for captured graphs; a ValueError names the misfit."""
     # Names are compared in both directions, then shapes, before anything is written.
     for name in live:

@@ -77,7 +77,9 @@ def checked_device(device: str | torch.device) -> torch.device:
     else:
         index = checked.index
     if index >= torch.cuda.device_count():
-        raise ValueError(f"device={device!r}: this machine has {torch.cuda.device_count()} CUDA devices")
+        raise ValueError(
+            f"device={device!r}: this machine has {torch.cuda.device_count()} CUDA devices"
+        )
     return torch.device("cuda", index)
 
 

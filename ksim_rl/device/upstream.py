@@ -106,7 +106,9 @@ def watch_loads(mend: Callable[[Path, Exception, int], None]) -> None:
                 # The folder name depends on the module's hash and block size.
                 folder = Path(wp.config.kernel_cache_dir) / self.get_module_identifier(block_dim)
                 # What is no JSON or no text is a ValueError; what does not compile is none of these.
-                is_read = folder.exists() and (isinstance(error, ValueError) or UNLOADABLE in str(error))
+                is_read = folder.exists() and (
+                    isinstance(error, ValueError) or UNLOADABLE in str(error)
+                )
                 if given or named or not (is_read or isinstance(error, OSError)):
                     raise
                 mend(folder, error, attempt)
@@ -132,23 +134,27 @@ def launches_diverted(
     def note(kernel: wp.Kernel, dim: int | Sequence[int], *args: Any, **kwargs: Any) -> None:
         instead(kernel, dim, kwargs.get("block_dim"))
 
-    def loop_once(condition: wp.array, while_body: Callable[..., None], *args: Any, **kwargs: Any) -> None:
+    def loop_once(
+        condition: wp.array, while_body: Callable[..., None], *args: Any, **kwargs: Any
+    ) -> None:
         while_body(**kwargs)
 
     def for_this_thread(
         original: Callable[..., None], replacement: Callable[..., None]
     ) -> Callable[..., None]:
         # Other threads go on launching.
-        return lambda *args, **kwargs: (replacement if threading.get_ident() == thread else original)(
-            *args, **kwargs
-        )
+        return lambda *args, **kwargs: (
+            replacement if threading.get_ident() == thread else original
+        )(*args, **kwargs)
 
     namespace: Any = vars(wp)
     replacements = {"launch": note, "launch_tiled": note, "capture_while": loop_once}
     # One diversion at a time: overlapping ones would restore each other's replacements.
     with _diversion:
         saved = {name: namespace[name] for name in replacements}
-        namespace.update({name: for_this_thread(saved[name], new) for name, new in replacements.items()})
+        namespace.update(
+            {name: for_this_thread(saved[name], new) for name, new in replacements.items()}
+        )
         try:
             yield
         finally:

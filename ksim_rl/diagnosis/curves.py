@@ -32,7 +32,11 @@ class Curves:
 
     def values(self, name: str) -> list[float]:
         """Return a metric's values, oldest first, where they were finite numbers."""
-        return [value for value in self.columns.get(name, ()) if value is not None and math.isfinite(value)]
+        return [
+            value
+            for value in self.columns.get(name, ())
+            if value is not None and math.isfinite(value)
+        ]
 
     def early(self, name: str) -> float | None:
         """Return the median of the first fifth of a metric's values, or None where there are too few of them."""
@@ -96,7 +100,9 @@ def read_run(folder: Path) -> Curves:
         config = plain_data.read_yaml(found / CONFIG)
     else:
         config = {}
-    return Curves(columns=_columns(found / METRICS), config=config if isinstance(config, Mapping) else {})
+    return Curves(
+        columns=_columns(found / METRICS), config=config if isinstance(config, Mapping) else {}
+    )
 
 
 def _number(text: str | None) -> float | None:

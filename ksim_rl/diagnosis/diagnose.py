@@ -39,7 +39,9 @@ def findings(curves: Curves) -> list[Finding]:
         if fault not in follow:
             # The docstring's first paragraph is the reason, the second the change.
             reason, _, change = inspect.cleandoc(fault.__doc__ or "").partition("\n\n")
-            found.append(Finding(name=fault.__name__, seen=text, reason=_line(reason), change=_line(change)))
+            found.append(
+                Finding(name=fault.__name__, seen=text, reason=_line(reason), change=_line(change))
+            )
     return found
 
 
@@ -64,7 +66,9 @@ def command(arguments: Sequence[str]) -> int:
         prog="ksim-rl diagnose",
         description="Name the faults of learning that the metrics of a run show; the run may be under way.",
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints")
+    parser.add_argument(
+        "run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints"
+    )
     folder = parser.parse_args(arguments).run
     curves = read_run(folder)
     found = findings(curves)

@@ -63,7 +63,9 @@ class Report:
 def examine(*, test_devices: bool = True) -> Report:
     """Look at everything; without `test_devices` nothing is simulated."""
     report = Report()
-    report.say("versions", ", ".join(f"{name} {version}" for name, version in record.versions().items()))
+    report.say(
+        "versions", ", ".join(f"{name} {version}" for name, version in record.versions().items())
+    )
     hardware = record.hardware()
     # A bug report needs no name of a machine.
     hardware.pop("host", None)
@@ -100,7 +102,9 @@ def _look_at_caches(report: Report) -> bool:
         # Caches go below HOME where nothing else says so.
         else:
             stands = f"is {home}, where nothing can be written"
-        report.say("HOME", f"{stands}: set it to a folder of yours, where caches are kept", wrong=True)
+        report.say(
+            "HOME", f"{stands}: set it to a folder of yours, where caches are kept", wrong=True
+        )
     wrong = None
     try:
         start_warp()
@@ -151,7 +155,10 @@ def _refusal(folder: Path) -> str | None:
 
 
 def _devices() -> list[torch.device]:
-    return [torch.device("cpu"), *(torch.device("cuda", index) for index in range(torch.cuda.device_count()))]
+    return [
+        torch.device("cpu"),
+        *(torch.device("cuda", index) for index in range(torch.cuda.device_count())),
+    ]
 
 
 def _look_at_gpus(report: Report) -> None:
@@ -162,7 +169,9 @@ def _look_at_gpus(report: Report) -> None:
             driver = " ".join(NVIDIA.read_text().splitlines()[0].split())
             change = "install a torch that is built for CUDA, or a driver that is new enough for it"
             report.say(
-                "GPU", f"{driver} is here, and torch {torch.__version__} finds no GPU: {change}", wrong=True
+                "GPU",
+                f"{driver} is here, and torch {torch.__version__} finds no GPU: {change}",
+                wrong=True,
             )
         else:
             report.say("GPU", "none; training runs on the CPU, in one Warp graph per control step")
@@ -202,7 +211,9 @@ def _look_at_opengl(report: Report) -> None:
         return
     # In a child: a broken OpenGL aborts the whole process.
     try:
-        tried = run_python(["-c", _DRAWS], environment={"MUJOCO_GL": platform}, seconds=_DRAW_SECONDS)
+        tried = run_python(
+            ["-c", _DRAWS], environment={"MUJOCO_GL": platform}, seconds=_DRAW_SECONDS
+        )
         if tried.returncode == 0:
             said = ""
         else:
@@ -213,10 +224,10 @@ def _look_at_opengl(report: Report) -> None:
     if not said:
         report.say("OpenGL", f"{platform} draws")
         return
-    change = (
-        "unset MUJOCO_GL, or install that platform (Debian: libegl1 libgles2 for egl, libosmesa6 for osmesa)"
+    change = "unset MUJOCO_GL, or install that platform (Debian: libegl1 libgles2 for egl, libosmesa6 for osmesa)"
+    report.say(
+        "OpenGL", f"MUJOCO_GL is {platform!r}, and MuJoCo says: {said}; {change}", wrong=True
     )
-    report.say("OpenGL", f"MUJOCO_GL is {platform!r}, and MuJoCo says: {said}; {change}", wrong=True)
 
 
 def _try_device(report: Report, device: torch.device) -> None:
@@ -230,7 +241,8 @@ def _try_device(report: Report, device: torch.device) -> None:
             report.say(f"test on {device}", f"{name}: {wrong}", wrong=True)
     passed = [name for name, wrong in done if wrong is None]
     report.say(
-        f"test on {device}", f"{', '.join(passed) or 'nothing'} passed in {time.monotonic() - began:.0f} s"
+        f"test on {device}",
+        f"{', '.join(passed) or 'nothing'} passed in {time.monotonic() - began:.0f} s",
     )
 
 

@@ -10,7 +10,9 @@ def warnings_of(losses: Sequence[str], metrics: Mapping[str, float]) -> dict[str
         for text in losses
     }
     if failed := metrics.get("sum/termination/non_finite"):
-        texts["non_finite"] = f"{failed:.0f} envs ended with non-finite physics or actions; they were reset"
+        texts["non_finite"] = (
+            f"{failed:.0f} envs ended with non-finite physics or actions; they were reset"
+        )
     if skipped := metrics["update/skipped_steps"]:
         texts["skipped"] = f"{skipped:.0f} gradient steps were not finite and were skipped"
     return texts

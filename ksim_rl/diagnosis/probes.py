@@ -33,7 +33,9 @@ def probed(update: Any, env: EnvBase, rollout_ET: TensorDictBase | None) -> dict
     if rollout_ET is None:
         return {}
     networks = [
-        network for name in ("actor", "critic") if (network := getattr(update, name, None)) is not None
+        network
+        for name in ("actor", "critic")
+        if (network := getattr(update, name, None)) is not None
     ]
     ranges: list[Tensor] = []
     squares: list[Tensor] = []

@@ -36,7 +36,9 @@ def try_device(device: torch.device) -> list[tuple[str, str | None]]:
     for name, trial in trials.items():
         try:
             wrong = trial()
-        except Exception as error:  # whatever a broken installation raises is what the report is for
+        except (
+            Exception
+        ) as error:  # whatever a broken installation raises is what the report is for
             wrong = f"{type(error).__name__}: {' '.join(str(error).split())}"
         done.append((name, wrong))
     return done
@@ -92,7 +94,9 @@ def _update(device: torch.device) -> str | None:
 
     cfg = PPOCfg()
     spec = Unbounded(torch.Size([2]), device=device)
-    actor = make_actor(ActorCfg(hidden_dims=(16,)), obs_dim=3, action_dim=2, action_spec=spec, device=device)
+    actor = make_actor(
+        ActorCfg(hidden_dims=(16,)), obs_dim=3, action_dim=2, action_spec=spec, device=device
+    )
     critic = make_critic(CriticCfg(hidden_dims=(16,)), obs_dim=3, device=device)
     minibatch_B = actor(
         # As a rollout would hold it: observations, action and its log-probability, without gradients.
@@ -104,7 +108,9 @@ def _update(device: torch.device) -> str | None:
     guard = StepGuard(device=device)
     ppo_step(make_loss(cfg, actor, critic), optimizer, minibatch_B, cfg=cfg, guard=guard)
     # Parameters have to move, and the guard has to see finite gradients.
-    moved = any(not torch.equal(old, new) for old, new in zip(before, actor.parameters(), strict=True))
+    moved = any(
+        not torch.equal(old, new) for old, new in zip(before, actor.parameters(), strict=True)
+    )
     if moved and not int(guard.skipped):
         return None
     return "a gradient step changed nothing"

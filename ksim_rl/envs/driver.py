@@ -23,7 +23,9 @@ class EnvDriver(Simulation):
     The `parts` are the other arguments of the view; see `WorldView`.
     """
 
-    def __init__(self, world: World, *, step_dt: float, max_episode_length: int = 0, **parts: Any) -> None:
+    def __init__(
+        self, world: World, *, step_dt: float, max_episode_length: int = 0, **parts: Any
+    ) -> None:
         super().__init__(world, step_dt=step_dt, max_episode_length=max_episode_length)
         # Before the view, which shows them to terms.
         self.readings = Readings(self)

@@ -38,7 +38,12 @@ def explain(
     """
     output = io.StringIO()
     console = Console(
-        file=output, force_jupyter=False, width=width, highlight=False, markup=False, color_system=None
+        file=output,
+        force_jupyter=False,
+        width=width,
+        highlight=False,
+        markup=False,
+        color_system=None,
     )
     show = partial(_show, console)
     # Inputs and outputs of the policy first, then what rates and disturbs it.
@@ -62,7 +67,9 @@ def explain(
             whole = (sum(shape[0] for shape in widths),)
         show(f"observations/{group} {whole}", ("term", "shape", "chain", "parameters"), rows)
 
-    rows = [(name, f"({action_sizes[name]},)", _described(term)) for name, term in cfg.actions.items()]
+    rows = [
+        (name, f"({action_sizes[name]},)", _described(term)) for name, term in cfg.actions.items()
+    ]
     show(f"actions ({sum(action_sizes.values())},)", ("term", "shape", "parameters"), rows)
 
     rows = [
@@ -75,9 +82,12 @@ def explain(
     weights = driver.readings.reward_weights
     # The present weights, which a curriculum may have changed.
     shown = {
-        name: f"{float(weights[name]):g}" if name in weights else "0: not computed" for name in cfg.rewards
+        name: f"{float(weights[name]):g}" if name in weights else "0: not computed"
+        for name in cfg.rewards
     }
-    rows = [(name, shown[name], _described(term, ("weight",))) for name, term in cfg.rewards.items()]
+    rows = [
+        (name, shown[name], _described(term, ("weight",))) for name, term in cfg.rewards.items()
+    ]
     if cfg.scale_rewards_by_dt:
         # Weights are per second then, and a step adds this share.
         scaled = f"times {driver.step_dt:g} s"
@@ -98,7 +108,12 @@ def explain(
     show("terminations", ("term", "marks", "parameters"), rows)
 
     rows = [
-        (name, term.mode, _seconds(term.interval_range_s, ""), _described(term, ("mode", "interval_range_s")))
+        (
+            name,
+            term.mode,
+            _seconds(term.interval_range_s, ""),
+            _described(term, ("mode", "interval_range_s")),
+        )
         for name, term in events.items()
     ]
     show("events", ("term", "mode", "every", "parameters"), rows)
@@ -106,7 +121,9 @@ def explain(
     rows = [(name, f"{levels[name]:g}", _described(term)) for name, term in cfg.curriculum.items()]
     show("curriculum", ("term", "level", "parameters"), rows)
 
-    rows = [(name, term.reduce, _described(term, ("reduce",))) for name, term in cfg.metrics.items()]
+    rows = [
+        (name, term.reduce, _described(term, ("reduce",))) for name, term in cfg.metrics.items()
+    ]
     show("metrics", ("term", "reduced by", "parameters"), rows)
 
     # Groups first, as observations pass them first.
@@ -139,7 +156,10 @@ def _hooks(driver: EnvDriver) -> list[str]:
 
 def _keys(transform: Transform) -> str:
     """Return the keys that a transform reads and, if they differ, the keys that it writes."""
-    keys = [[*transform.in_keys, *transform.in_keys_inv], [*transform.out_keys, *transform.out_keys_inv]]
+    keys = [
+        [*transform.in_keys, *transform.in_keys_inv],
+        [*transform.out_keys, *transform.out_keys_inv],
+    ]
     reads, writes = (", ".join(map(spell, part)) for part in keys)
     # A transform in place needs no arrow.
     if reads == writes:
@@ -152,8 +172,12 @@ def _call(described: TransformCfg) -> str:
     return f"{described.transform.__name__}({', '.join(parts)})"
 
 
-def _show(console: Console, title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
-    table = Table(title=title, title_justify="left", title_style="", box=SIMPLE_HEAD, pad_edge=False)
+def _show(
+    console: Console, title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]
+) -> None:
+    table = Table(
+        title=title, title_justify="left", title_style="", box=SIMPLE_HEAD, pad_edge=False
+    )
     table.add_column("index", justify="right", no_wrap=True)
     for column in columns:
         table.add_column(column, no_wrap=column == "term", overflow="fold")

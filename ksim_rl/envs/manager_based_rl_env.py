@@ -19,7 +19,13 @@ from ksim_rl import dims
 from ksim_rl.device.state_tree import State, copy_into
 from ksim_rl.device.streams import checked_device
 from ksim_rl.envs.closed import Closed
-from ksim_rl.envs.contract import DifficultyLevels, EpisodeClock, EpisodeSums, Pictures, SimulatedWorld
+from ksim_rl.envs.contract import (
+    DifficultyLevels,
+    EpisodeClock,
+    EpisodeSums,
+    Pictures,
+    SimulatedWorld,
+)
 from ksim_rl.envs.drawing import Drawing, draw, drawings
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.explain import WIDTH, explain
@@ -50,7 +56,9 @@ from ksim_rl.scene.scene import load_scene, warp_alone
 RENDER_MODES = (None, "rgb_array")
 
 
-class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels, SimulatedWorld, Pictures):
+class ManagerBasedRlEnv(
+    MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels, SimulatedWorld, Pictures
+):
     """E parallel worlds that emit EnvStates `["E"]`; a ValueError names the field of `cfg` that is wrong.
 
     Keys of a root: `("obs", term)` and `("command", name)`, float32 [E, L]; `"action"`, float32 [E, L]; and under
@@ -69,7 +77,10 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
     }
 
     def __init__(
-        self, cfg: ManagerBasedRlEnvCfg, device: str | torch.device = "cpu", render_mode: str | None = None
+        self,
+        cfg: ManagerBasedRlEnvCfg,
+        device: str | torch.device = "cpu",
+        render_mode: str | None = None,
     ) -> None:
         if render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode={render_mode!r}: expected one of {RENDER_MODES}")
@@ -109,7 +120,11 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         readings = {"obs": observed, "command": self.command_manager.values}
         actions = self.action_manager
         observation, action, reward, done = make_specs(
-            readings, actions.size, actions.bounds_L2, batch_size=self.batch_size, device=self.device
+            readings,
+            actions.size,
+            actions.bounds_L2,
+            batch_size=self.batch_size,
+            device=self.device,
         )
         self.observation_spec = observation
         self.full_action_spec = action
@@ -119,7 +134,12 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         rehearse(
             self.driver,
             laws=self.joint_drives,
-            writing=(self.event_manager, self.curriculum_manager, self.command_manager, self.action_manager),
+            writing=(
+                self.event_manager,
+                self.curriculum_manager,
+                self.command_manager,
+                self.action_manager,
+            ),
             reading=(
                 self.observation_manager,
                 self.reward_manager,
@@ -153,13 +173,20 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         self.action_manager = ActionManager(cfg.actions, driver)
         self.observation_manager = ObservationManager(cfg.observations, driver)
         scale = self.step_dt if cfg.scale_rewards_by_dt else 1.0
-        self.reward_manager = RewardManager(cfg.rewards, driver, scale=scale, curriculum=cfg.curriculum)
+        self.reward_manager = RewardManager(
+            cfg.rewards, driver, scale=scale, curriculum=cfg.curriculum
+        )
         self.termination_manager = TerminationManager(
-            cfg.terminations, driver, is_finite_horizon=cfg.is_finite_horizon, curriculum=cfg.curriculum
+            cfg.terminations,
+            driver,
+            is_finite_horizon=cfg.is_finite_horizon,
+            curriculum=cfg.curriculum,
         )
         self.metric_manager = MetricManager(cfg.metrics, driver)
         self.curriculum_manager = CurriculumManager(cfg.curriculum, driver)
-        self._log = EpisodeLog(driver, self.reward_manager, self.termination_manager, self.metric_manager)
+        self._log = EpisodeLog(
+            driver, self.reward_manager, self.termination_manager, self.metric_manager
+        )
 
     @property
     def unwrapped(self) -> "ManagerBasedRlEnv":
@@ -280,7 +307,9 @@ class ManagerBasedRlEnv(MaskedReset, EpisodeClock, EpisodeSums, DifficultyLevels
         commands = self.command_manager.values
         if commands:
             data["command"] = {name: value.clone() for name, value in commands.items()}
-        return TensorDict(data | leaves, batch_size=self.batch_size, device=self.device, names=[dims.E])
+        return TensorDict(
+            data | leaves, batch_size=self.batch_size, device=self.device, names=[dims.E]
+        )
 
     # -- seeds ---------------------------------------------------------------------------------------------------
 

@@ -103,7 +103,9 @@ class MaskedReset(EnvBase):
             return super().maybe_reset(tensordict)
         # A copy: an env may clear its own done buffer in place while transforms still read the mask.
         mask_E1 = tensordict.get("done").clone()
-        reset_td = TensorDict({_RESET: mask_E1}, batch_size=tensordict.batch_size, device=tensordict.device)
+        reset_td = TensorDict(
+            {_RESET: mask_E1}, batch_size=tensordict.batch_size, device=tensordict.device
+        )
         root = self._merge(tensordict, self._fresh(reset_td), mask_E1)
         self._remember(root)
         return root
@@ -130,7 +132,9 @@ class MaskedReset(EnvBase):
                 hint = checks.near(keyword, _RESET_KEYWORDS)
                 raise TypeError(f"reset() got an unexpected keyword {keyword!r}: {hint}")
         if options:
-            raise ValueError(f"options={options!r}: this env has no reset options; use seed= or env_ids=")
+            raise ValueError(
+                f"options={options!r}: this env has no reset options; use seed= or env_ids="
+            )
         if seed is not None:
             self.seed(seed)
         # From here on there are masks only.
@@ -241,7 +245,10 @@ class MaskedReset(EnvBase):
     def _complete_with_last_root(self, tensordict: TensorDictBase) -> None:
         """Give a partial reset the root values that it was not given."""
         # The parts of a root: observations and flags of done.
-        root_keys = [*self.full_observation_spec.keys(True, True), *self.full_done_spec.keys(True, True)]
+        root_keys = [
+            *self.full_observation_spec.keys(True, True),
+            *self.full_done_spec.keys(True, True),
+        ]
         missing = [key for key in root_keys if tensordict.get(key, None) is None]
         if missing and self.last_root is None:
             raise RuntimeError(
@@ -280,13 +287,19 @@ class MaskedReset(EnvBase):
 
 
 def mask_from_env_ids(
-    env_ids: Sequence[int] | Shaped[Tensor, "*rows"], batch_size: torch.Size, device: torch.device | None
+    env_ids: Sequence[int] | Shaped[Tensor, "*rows"],
+    batch_size: torch.Size,
+    device: torch.device | None,
 ) -> Bool[Tensor, " E"]:
     """Return the mask of the rows `env_ids`; a ValueError unless they are distinct integers in [0, E)."""
     if len(batch_size) != 1:
-        raise ValueError(f"env_ids need one batch dim, and this env has batch_size {tuple(batch_size)}")
+        raise ValueError(
+            f"env_ids need one batch dim, and this env has batch_size {tuple(batch_size)}"
+        )
     num_envs = batch_size[0]
-    if isinstance(env_ids, Tensor) and (env_ids.dtype.is_floating_point or env_ids.dtype == torch.bool):
+    if isinstance(env_ids, Tensor) and (
+        env_ids.dtype.is_floating_point or env_ids.dtype == torch.bool
+    ):
         raise ValueError(
             f"env_ids has dtype {env_ids.dtype}: expected integers; a mask goes to tensordict['_reset']"
         )
@@ -309,7 +322,10 @@ def mask_from_env_ids(
 
 
 def _mask_like(
-    leaf: Tensor, mask_E1: Bool[Tensor, "*batch 1"], batch_size: torch.Size, masks: dict[int, Tensor]
+    leaf: Tensor,
+    mask_E1: Bool[Tensor, "*batch 1"],
+    batch_size: torch.Size,
+    masks: dict[int, Tensor],
 ) -> Tensor:
     """Return the mask with as many dims as `leaf`; `masks` keeps them."""
     if leaf.ndim not in masks:
@@ -324,11 +340,18 @@ def _shared_rows(new: Tensor, old: Tensor) -> tuple[Tensor, Tensor] | None:
         return None
     new_base = base_of(new)
     old_base = base_of(old)
-    if new_base is None or old_base is None or new_base.ndim != 2 or new_base.shape != old_base.shape:
+    if (
+        new_base is None
+        or old_base is None
+        or new_base.ndim != 2
+        or new_base.shape != old_base.shape
+    ):
         return None
     # Both leaves must be the same columns of tables that are whole and of one shape.
     same_place = new.stride() == old.stride() and new.storage_offset() == old.storage_offset()
-    whole = all(base.is_contiguous() and base.storage_offset() == 0 for base in (new_base, old_base))
+    whole = all(
+        base.is_contiguous() and base.storage_offset() == 0 for base in (new_base, old_base)
+    )
     columns = new.ndim == 2 and new.shape == old.shape and new.shape[0] == new_base.shape[0]
     if same_place and whole and columns and new.dtype == old.dtype:
         return (new_base, old_base)

@@ -45,7 +45,9 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         super().__init__(base_env, transform, *args, **kwargs)
         # A base env that draws its own random actions keeps doing so.
         if type(base_env).rand_action is not EnvBase.rand_action:
-            object.__setattr__(self, "rand_action", functools.partial(TransformedEnv.rand_action, self))
+            object.__setattr__(
+                self, "rand_action", functools.partial(TransformedEnv.rand_action, self)
+            )
 
     # Not TorchRL's for transformed envs: a stock `TransformedEnv` around that one refuses random actions.
     rand_action = EnvBase.rand_action
@@ -75,7 +77,10 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         }
         if self.last_root is not None:
             # Without the policy's leaves, which are no state of the env.
-            keys = [*self.full_observation_spec.keys(True, True), *self.full_done_spec.keys(True, True)]
+            keys = [
+                *self.full_observation_spec.keys(True, True),
+                *self.full_done_spec.keys(True, True),
+            ]
             parts[_ROOT] = self.last_root.select(*keys, strict=False).flatten_keys("/")
         return OrderedDict(
             (f"{prefix}{key}", value.clone() if isinstance(value, Tensor) else value)
@@ -85,7 +90,9 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
 
     def load_state_dict(self, state_dict: State, strict: bool = True, **kwargs: Any) -> None:
         """Load a `state_dict` of this env; a KeyError names an entry that belongs to no part of the env."""
-        parts: dict[str, OrderedDict[str, Any]] = {p: OrderedDict() for p in (_BASE, _TRANSFORM, _ROOT)}
+        parts: dict[str, OrderedDict[str, Any]] = {
+            p: OrderedDict() for p in (_BASE, _TRANSFORM, _ROOT)
+        }
         for key, value in state_dict.items():
             # The first part of each name says whose entry it is.
             prefix = next((prefix for prefix in parts if key.startswith(prefix)), None)
@@ -101,5 +108,7 @@ class MaskedTransformedEnv(MaskedReset, TransformedEnv):
         if parts[_ROOT]:
             # Clones: the saved tensors must not change with the next step.
             leaves = {key: value.clone() for key, value in parts[_ROOT].items()}
-            root = TensorDict(leaves, batch_size=self.batch_size, device=self.device).unflatten_keys("/")
+            root = TensorDict(
+                leaves, batch_size=self.batch_size, device=self.device
+            ).unflatten_keys("/")
             self.last_root = self._labelled(root)

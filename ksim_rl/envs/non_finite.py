@@ -12,7 +12,9 @@ from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments
 _NEVER = 2**62
 
 
-_ARGUMENTS = arguments_of((int, "width num_envs"), (ADDRESS, "table term_of_column step first count"))
+_ARGUMENTS = arguments_of(
+    (int, "width num_envs"), (ADDRESS, "table term_of_column step first count")
+)
 _quick = QuickLaunch(
     _ARGUMENTS,
     """
@@ -32,14 +34,18 @@ _quick = QuickLaunch(
 )
 
 
-def _count_now(table_EL: Tensor, term_L: Tensor, step: Tensor, first_N: Tensor, count_N: Tensor) -> None:
+def _count_now(
+    table_EL: Tensor, term_L: Tensor, step: Tensor, first_N: Tensor, count_N: Tensor
+) -> None:
     num_rows, width = table_EL.shape
     tensors = table_EL, term_L, step, first_N, count_N
     # One thread for each number of the table.
     _quick(table_EL.device, (num_rows, width), width, num_rows, *map(address, tensors))
 
 
-_count = as_operator("count_non_finite", _count_now, lambda *_: None, mutates=("first_N", "count_N"))
+_count = as_operator(
+    "count_non_finite", _count_now, lambda *_: None, mutates=("first_N", "count_N")
+)
 
 
 class NonFiniteTerms:
@@ -55,14 +61,20 @@ class NonFiniteTerms:
         self._count_N = self._first_N = torch.zeros(0, dtype=torch.int64, device=self._device)
 
     def watch(
-        self, kind: str, table_EL: Float[Tensor, "E L"], names: Sequence[str], widths: Sequence[int] = ()
+        self,
+        kind: str,
+        table_EL: Float[Tensor, "E L"],
+        names: Sequence[str],
+        widths: Sequence[int] = (),
     ) -> None:
         """Look at the values of some terms of a kind, side by side; before `start` it only learns their names."""
         key = kind, *names
         if self._is_learning:
             # For each column of the table the number of its term; a term may have several columns.
             columns = [
-                len(self._names) + i for i, n in enumerate(widths or [1] * len(names)) for _ in range(n)
+                len(self._names) + i
+                for i, n in enumerate(widths or [1] * len(names))
+                for _ in range(n)
             ]
             self._columns[key] = torch.tensor(columns, dtype=torch.int32, device=self._device)
             self._names += [f"{kind} {name!r}" for name in names]

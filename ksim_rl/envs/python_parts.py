@@ -32,7 +32,14 @@ _MANAGERS = (
 _CACHES = frozenset({"cache", "command_cache", "_has_warned", "_accepts_any", "_arrived"})
 # TorchRL's own, of the keys of specs.
 _KEYS_OF_SPECS = "_cache"
-_OF_DRIVER = ("ground", "before_substep", "after_substep", "substep_sensors", "step_dt", "max_episode_length")
+_OF_DRIVER = (
+    "ground",
+    "before_substep",
+    "after_substep",
+    "substep_sensors",
+    "step_dt",
+    "max_episode_length",
+)
 # Fields of terms that managers read when the env is built.
 _READ_ONCE: tuple[tuple[type, frozenset[str], str], ...] = (
     (RewardTerm, frozenset({"weight"}), "write env.view.reward_weights[name] in place (`fill_`)"),

@@ -48,7 +48,9 @@ class RecordedPython:
     the recording are compared with Python's, `is_compared`, the comparison decides; else it is refused as well.
     """
 
-    def __init__(self, env: EnvBase, others: Parts | None = None, *, is_compared: bool = False) -> None:
+    def __init__(
+        self, env: EnvBase, others: Parts | None = None, *, is_compared: bool = False
+    ) -> None:
         self._env = env
         self._others = dict(others or {})
         self._is_compared = is_compared
@@ -79,7 +81,9 @@ class RecordedPython:
             if self._is_compared:
                 self._replaced = {_place(change) for change in changes if change.is_of_tensors}
             # Replaced tensors are judged by the comparison of numbers, if there is one.
-            self._refuse(calls, [change for change in changes if _place(change) not in self._replaced])
+            self._refuse(
+                calls, [change for change in changes if _place(change) not in self._replaced]
+            )
         self._calls += 1
         # Values as they are after this step: later changes come from outside.
         self._watch.look(self._parts())

@@ -39,7 +39,9 @@ def _tasks_with(_named: tuple[str, ...]) -> dict[str, Task]:
     found: dict[str, tuple[str, Task]] = {}
     packages = map(importlib.import_module, OWN_TASKS)
     # Ours first, so that a task of another package cannot take the place of one of ours.
-    inside = (info for own in packages for info in pkgutil.iter_modules(own.__path__, f"{own.__name__}."))
+    inside = (
+        info for own in packages for info in pkgutil.iter_modules(own.__path__, f"{own.__name__}.")
+    )
     ours = ((info.name, importlib.import_module(info.name)) for info in inside)
     for origin, module in (*ours, *plugins.modules(plugins.TASKS)):
         held = [value for value in vars(module).values() if isinstance(value, Task)]
@@ -159,7 +161,12 @@ def _writes(transform: Transform, key: NestedKey) -> bool:
 
 def _check_reads(transform: Transform, env: MaskedTransformedEnv) -> None:
     """Refuse a transform that reads a key that the env does not emit; TorchRL would fail in the first step only."""
-    specs = (env.full_observation_spec, env.full_reward_spec, env.full_done_spec, env.full_action_spec)
+    specs = (
+        env.full_observation_spec,
+        env.full_reward_spec,
+        env.full_done_spec,
+        env.full_action_spec,
+    )
     known = {unravel_key(key) for spec in specs for key in spec.keys(True, True)}
     for key in transform.in_keys or ():
         if unravel_key(key) not in known:

@@ -68,12 +68,17 @@ def with_room(make: Callable[[], EnvBase], *, note: Callable[[str], None]) -> En
 def _room_of(env: ManagerBasedRlEnv) -> _Room:
     world = env.world
     return _Room(
-        njmax=world.njmax, nconmax=world.nconmax, one_kernel_unavailable=world.one_kernel_unavailable
+        njmax=world.njmax,
+        nconmax=world.nconmax,
+        one_kernel_unavailable=world.one_kernel_unavailable,
     )
 
 
 def _grown(first: _Room, last: _Room) -> str:
-    numbers = {"task.sim.njmax": (first.njmax, last.njmax), "task.sim.nconmax": (first.nconmax, last.nconmax)}
+    numbers = {
+        "task.sim.njmax": (first.njmax, last.njmax),
+        "task.sim.nconmax": (first.nconmax, last.nconmax),
+    }
     grown = [f"{name} {old} -> {new}" for name, (old, new) in numbers.items() if new != old]
     text = f"room for contacts and constraint rows has grown after a rehearsal: {', '.join(grown)}"
     if last.one_kernel_unavailable and not first.one_kernel_unavailable:

@@ -49,7 +49,12 @@ def make_specs(
         name: Binary(n=1, shape=shape_E1, dtype=torch.bool, device=device)
         for name in ("done", "terminated", "truncated")
     }
-    leaves = (groups, {"action": action}, {"reward": Unbounded(shape=shape_E1, device=device)}, flags)
+    leaves = (
+        groups,
+        {"action": action},
+        {"reward": Unbounded(shape=shape_E1, device=device)},
+        flags,
+    )
     specs = tuple(map(composite, leaves))
     for spec in specs:
         # Labels, so that EnvStates made from specs are labelled, too.

@@ -151,7 +151,9 @@ class CommandTerm(Term):
     def __call__(self, view: EnvView) -> Float[Tensor, "E K"]:
         """Return the command of the current state and targets, float32 [E, K]."""
 
-    def set(self, view: EnvView, value_EK: Float[Tensor, "*rows K"], mask_E: Bool[Tensor, " E"]) -> None:
+    def set(
+        self, view: EnvView, value_EK: Float[Tensor, "*rows K"], mask_E: Bool[Tensor, " E"]
+    ) -> None:
         """Take values from outside for the rows of `mask_E`; a ValueError if this kind of command is drawn instead."""
         raise ValueError(
             f"a {type(self).__name__} draws its values; a JoystickCommand takes them from outside"

@@ -78,10 +78,16 @@ class EnvView(WorldView):
         self.command_ranges: Mapping[str, Mapping[str, Float[Tensor, " 2"]]] = MappingProxyType(
             readings.command_ranges
         )
-        self.reward_weights: Mapping[str, Float[Tensor, ""]] = MappingProxyType(readings.reward_weights)
+        self.reward_weights: Mapping[str, Float[Tensor, ""]] = MappingProxyType(
+            readings.reward_weights
+        )
         self.stages: Mapping[str, Float[Tensor, ""]] = MappingProxyType(readings.stages)
-        self.episode_rewards: Mapping[str, Float[Tensor, " E"]] = MappingProxyType(readings.episode_rewards)
-        self.terminations: Mapping[str, Bool[Tensor, " E"]] = MappingProxyType(readings.terminations)
+        self.episode_rewards: Mapping[str, Float[Tensor, " E"]] = MappingProxyType(
+            readings.episode_rewards
+        )
+        self.terminations: Mapping[str, Bool[Tensor, " E"]] = MappingProxyType(
+            readings.terminations
+        )
         self.terminated_E = readings.terminated_E
         self.truncated_E = readings.truncated_E
         # The same tensor for the life of the env, so it needs no property.

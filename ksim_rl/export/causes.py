@@ -44,8 +44,13 @@ def find_causes(meta: Json, trace: Arrays, replay: Arrays) -> list[Cause]:
     recorded_s = float(trace["trace/dt"]) * int(trace["trace/decimation"])
     step_s = float(replay["dt"]) * int(replay["decimation"])
     substep_s = float(replay["dt"])
-    if abs(step_s / recorded_s - 1.0) > 1e-6 or abs(substep_s / float(trace["trace/dt"]) - 1.0) > 1e-6:
-        evidence = f"{step_s:g} s in steps of {substep_s:g} s, trained with {recorded_s:g} s in steps of "
+    if (
+        abs(step_s / recorded_s - 1.0) > 1e-6
+        or abs(substep_s / float(trace["trace/dt"]) - 1.0) > 1e-6
+    ):
+        evidence = (
+            f"{step_s:g} s in steps of {substep_s:g} s, trained with {recorded_s:g} s in steps of "
+        )
         found.append(Cause("rate", "env step", evidence + f"{float(trace['trace/dt']):g} s"))
 
     signal = partial(_pairs, trace=trace, replay=replay)
@@ -68,11 +73,15 @@ def find_causes(meta: Json, trace: Arrays, replay: Arrays) -> list[Cause]:
     if _error(ours, theirs) > SAME and not (remembers and obs_differs):
         # Columns in another order are the most common mistake, and would also look like a wrong normalizer.
         if order := _order(ours, theirs):
-            found.append(Cause("joint order", "policy.onnx", f"its actions match ours in the order {order}"))
+            found.append(
+                Cause("joint order", "policy.onnx", f"its actions match ours in the order {order}")
+            )
         else:
             found.append(
                 Cause(
-                    "normalizer", "policy.onnx", f"same observation, actions {_error(ours, theirs):.0%} off"
+                    "normalizer",
+                    "policy.onnx",
+                    f"same observation, actions {_error(ours, theirs):.0%} off",
                 )
             )
     # An actuator that drives another joint explains all motion, so nothing else is looked for then.
@@ -132,7 +141,9 @@ def _of_motion(meta: Json, signal: Any, *, rates: bool) -> Cause | None:
     return Cause("mass or inertia", "robot.xml", evidence)
 
 
-def _of_observation(name: str, ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray) -> list[Cause]:
+def _of_observation(
+    name: str, ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray
+) -> list[Cause]:
     if _error(ours, theirs) <= SAME:
         return []
     about = f"observation {name!r}"
@@ -149,14 +160,26 @@ def _of_observation(name: str, ours: np.ndarray, theirs: np.ndarray, episode: np
         lengths = [np.linalg.norm(x.reshape(-1, 3), axis=1) for x in (ours, theirs)]
         # A sensor that does not sit in the body's origin feels its turning too.
         if _error(*lengths) <= max(LIKE, 0.3 * _error(ours, theirs)):
-            return [Cause("frame", about, "lengths agree, directions do not: it is given in other axes")]
+            return [
+                Cause("frame", about, "lengths agree, directions do not: it is given in other axes")
+            ]
     # After removing the means, only a constant difference is explained.
     if _error(ours - ours.mean(0), theirs - theirs.mean(0)) <= LIKE:
-        return [Cause("offset", about, f"shifted by {np.round((theirs - ours).mean(0), 3).tolist()}")]
-    return [Cause("observation", about, f"{_error(ours, theirs):.0%} off, for no reason that is known here")]
+        return [
+            Cause("offset", about, f"shifted by {np.round((theirs - ours).mean(0), 3).tolist()}")
+        ]
+    return [
+        Cause(
+            "observation",
+            about,
+            f"{_error(ours, theirs):.0%} off, for no reason that is known here",
+        )
+    ]
 
 
-def _of_targets(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, joints: list[str]) -> Cause:
+def _of_targets(
+    ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, joints: list[str]
+) -> Cause:
     # Columns are position, velocity and effort of all joints, hence the remainder.
     if order := _order(ours, theirs):
         moved = [joints[a % len(joints)] for a, b in enumerate(order) if a != b]
@@ -169,10 +192,14 @@ def _of_targets(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, joint
         if np.abs(ratios - 1.0).max() <= LIKE:
             return Cause("offset", "targets", "they move as ours do about another default pose")
         return Cause(
-            "scale", "targets", f"x {ratios[np.abs(ratios - 1.0).argmax()]:.3g} about the default pose"
+            "scale",
+            "targets",
+            f"x {ratios[np.abs(ratios - 1.0).argmax()]:.3g} about the default pose",
         )
     return Cause(
-        "delay", "targets", f"{_error(ours, theirs):.0%} off, and more as actions change: a filter or a lag"
+        "delay",
+        "targets",
+        f"{_error(ours, theirs):.0%} off, and more as actions change: a filter or a lag",
     )
 
 
@@ -187,7 +214,9 @@ def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.nda
     # Each possible lag was replayed, under "<lag>/<episode>/<signal>".
     lags = sorted({key.split("/")[0] for key in replay if "/" in key})
     for number, recorded in enumerate(trace[f"trace/{name}"]):
-        fits = [replay[f"{lag}/{number}/{name}"] for lag in lags if f"{lag}/{number}/{name}" in replay]
+        fits = [
+            replay[f"{lag}/{number}/{name}"] for lag in lags if f"{lag}/{number}/{name}" in replay
+        ]
         # Up to the first end; the appended True ends an episode that has none.
         length = int(np.argmax(np.append(trace["trace/done"][number].ravel() > 0, True))) + 1
         flat = recorded[:length].reshape(min(length, len(recorded)), -1)
@@ -253,7 +282,9 @@ def _order(ours: np.ndarray, theirs: np.ndarray) -> list[int] | None:
     return None
 
 
-def _shift(ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, tolerance: float = LIKE) -> int | None:
+def _shift(
+    ours: np.ndarray, theirs: np.ndarray, episode: np.ndarray, tolerance: float = LIKE
+) -> int | None:
     """Return by how many steps theirs is late, negative where it is early; None where no shift explains it."""
     best = _error(ours, theirs)
     found = None

@@ -148,7 +148,11 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
     }
     if isinstance(term, mdp.JointPositionVelocityAction):
         # The velocity half has no offset: its rest is 0 rad/s.
-        found["velocity"] = {**shared, "scale": _numbers(view, term, "velocity_scale"), "offset": 0.0}
+        found["velocity"] = {
+            **shared,
+            "scale": _numbers(view, term, "velocity_scale"),
+            "offset": 0.0,
+        }
     return found
 
 

@@ -17,7 +17,14 @@ from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.export.refusal import NotDescribedError
 from ksim_rl.export.standalone.files import Json
 from ksim_rl.modules.upstream import TensorModule
-from ksim_rl.transforms import ActionClip, ActionDelay, ActionLowPass, ActionScale, DelayCfg, ObservationNoise
+from ksim_rl.transforms import (
+    ActionClip,
+    ActionDelay,
+    ActionLowPass,
+    ActionScale,
+    DelayCfg,
+    ObservationNoise,
+)
 from ksim_rl.transforms.elementwise import ObservationMap
 
 Plain = Json
@@ -102,7 +109,9 @@ class PerObservation(nn.Module):
         super().__init__()
         self.transform = transform
 
-    def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> tuple[Float[Tensor, "*batch ?M"], ...]:
+    def forward(
+        self, *observations: Float[Tensor, "*batch ?L"]
+    ) -> tuple[Float[Tensor, "*batch ?M"], ...]:
         """Return the new observations."""
         if isinstance(self.transform, ObservationMap):
             return tuple(self.transform.new_value(*indexed) for indexed in enumerate(observations))
@@ -132,7 +141,9 @@ def sort_transforms(cfg: ManagerBasedRlEnvCfg, groups: Sequence[NestedKey]) -> T
         # Rewards, counters and other keys that the policy does not read are no matter of an export.
         if not read & {unravel_key(key) for key in transform.out_keys or ()}:
             continue
-        if isinstance(transform, ObservationNoise) or getattr(transform, "acts_in_training_only", False):
+        if isinstance(transform, ObservationNoise) or getattr(
+            transform, "acts_in_training_only", False
+        ):
             training_only.insert(0, name)
             continue
         _check_per_observation(transform, where)
@@ -154,7 +165,9 @@ def _check_per_observation(transform: Transform, where: str) -> None:
         return
     # Whoever has more than a function of one observation may keep something from step to step.
     own = [
-        name for name in ("_call", "_step", "forward") if getattr(kind, name) is not getattr(Transform, name)
+        name
+        for name in ("_call", "_step", "forward")
+        if getattr(kind, name) is not getattr(Transform, name)
     ]
     if kind._apply_transform is Transform._apply_transform:
         own.append("no _apply_transform")
@@ -173,7 +186,10 @@ def with_transforms(actor: TensorDictModuleBase, sorted_: TaskTransforms) -> Ten
         return actor
     parts: list[Any] = []
     for transform in sorted_.in_policy.values():
-        keys: dict[str, Any] = {"in_keys": list(transform.in_keys), "out_keys": list(transform.out_keys)}
+        keys: dict[str, Any] = {
+            "in_keys": list(transform.in_keys),
+            "out_keys": list(transform.out_keys),
+        }
         parts.append(TensorModule(PerObservation(transform).eval(), **keys))
     parts.append(actor)
     return TensorDictSequential(*parts)
@@ -188,7 +204,9 @@ def check_equal(
     Both envs have the same seed and size; `reduced` has none of `sorted_.removed`. A NotDescribedError names them.
     """
     names = ", ".join(f"task.transforms.{name}" for name in sorted_.in_policy)
-    run = with_transforms(TensorDictModule(nn.Identity(), in_keys=["done"], out_keys=["done"]), sorted_)
+    run = with_transforms(
+        TensorDictModule(nn.Identity(), in_keys=["done"], out_keys=["done"]), sorted_
+    )
     whole.eval()
     reduced.eval()
     one = whole.reset()

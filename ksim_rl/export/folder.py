@@ -13,7 +13,12 @@ import numpy as np
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.contract import part
 from ksim_rl.export import controls, policy
-from ksim_rl.export.exported_transforms import TaskTransforms, check_equal, sort_transforms, with_transforms
+from ksim_rl.export.exported_transforms import (
+    TaskTransforms,
+    check_equal,
+    sort_transforms,
+    with_transforms,
+)
 from ksim_rl.export.metadata import metadata
 from ksim_rl.export.onnx_file import attach
 from ksim_rl.export.record import Kept, Recording
@@ -53,8 +58,21 @@ FILES = (
 )
 # The entries of export.json that controllers for mjlab's policies look for in the ONNX file, and more of the kind.
 ATTACHED = (
-    *("run_path", "joint_names", "joint_stiffness", "joint_damping", "default_joint_pos", "action_scale"),
-    *("command_names", "observation_names", "observation_history_lengths", "physics_dt", "decimation"),
+    *(
+        "run_path",
+        "joint_names",
+        "joint_stiffness",
+        "joint_damping",
+        "default_joint_pos",
+        "action_scale",
+    ),
+    *(
+        "command_names",
+        "observation_names",
+        "observation_history_lengths",
+        "physics_dt",
+        "decimation",
+    ),
     *("step_dt", "task", "iteration", "commit"),
 )
 EXTRA = ("onnx", "onnxruntime", "onnxscript")
@@ -162,18 +180,24 @@ def _fill(
 ) -> None:
     """Write the files of an export into a folder that is empty."""
     # A curriculum would change weights and ranges while episodes are recorded.
-    cfg = dataclasses.replace(trained.cfg, task=dataclasses.replace(trained.cfg.task, curriculum={}))
+    cfg = dataclasses.replace(
+        trained.cfg, task=dataclasses.replace(trained.cfg.task, curriculum={})
+    )
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET
     groups: list[Any] = cfg.modules.observation_keys("actor")
     transforms = sort_transforms(cfg.task, groups)
     for name in transforms.training_only:
         note(f"task.transforms.{name} acts in training only, and is left out")
-    kept = {name: one for name, one in cfg.task.transforms.items() if name not in transforms.removed}
+    kept = {
+        name: one for name, one in cfg.task.transforms.items() if name not in transforms.removed
+    }
     whole = cfg
     cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, transforms=kept))
     if transforms.in_policy:
-        note(f"made a part of the policy: task.transforms.{', task.transforms.'.join(transforms.in_policy)}")
+        note(
+            f"made a part of the policy: task.transforms.{', task.transforms.'.join(transforms.in_policy)}"
+        )
         _check_transforms(whole, cfg, transforms, groups, seed)
     actor = with_transforms(trained.actor.cpu(), transforms)
     # At least as many envs as episodes are traced.
@@ -217,7 +241,9 @@ def _fill(
     # Actuators of the model in the order of the policy's actions; those that no action names follow.
     first = [name for law in meta["actuators"] for name in law["actuators"]]
     asked = [name for action in meta["actions"] for name in action["names"]]
-    by_joint = dict(zip((j for law in meta["actuators"] for j in law["joints"]), first, strict=True))
+    by_joint = dict(
+        zip((j for law in meta["actuators"] for j in law["joints"]), first, strict=True)
+    )
     # The scene's spec once more: the env's own was compiled, and XML is written of a spec.
     spec = build_spec(cfg.task.scene)
     cfg.task.sim.apply_to(spec)
@@ -229,7 +255,11 @@ def _fill(
     order = write_robot(spec, ours.world.mj_model, list(wanted), folder / "robot.xml")
     states = [dataclasses.asdict(state) for state in exported.states]
     own = {"inputs": exported.input_names, "outputs": exported.output_names, "states": states}
-    own |= {"num_actions": ours.action_manager.size, "obs_dim": exported.obs_dim, "difference": difference}
+    own |= {
+        "num_actions": ours.action_manager.size,
+        "obs_dim": exported.obs_dim,
+        "difference": difference,
+    }
     meta |= {"policy": own, "task": cfg.task_name, "iteration": trained.iteration, **origin}
     meta |= {"seed": seed, "ours": None, "noisy": noise}
     # In training mode the sensors have noise, in evaluation mode they have none.
@@ -248,8 +278,13 @@ def _fill(
         np.savez_compressed(folder / "episodes.npz", **recorded.arrays)  # pyright: ignore
         # Traces have no noise: single steps have to agree to the digit.
         env.eval()
-        traced = Recording(env, ours, actor, kept, steps=min(steps, TRACED_STEPS), seed=seed, traces=TRACED)
-        rates = {"trace/dt": np.array(ours.physics_dt), "trace/decimation": np.array(ours.cfg.decimation)}
+        traced = Recording(
+            env, ours, actor, kept, steps=min(steps, TRACED_STEPS), seed=seed, traces=TRACED
+        )
+        rates = {
+            "trace/dt": np.array(ours.physics_dt),
+            "trace/decimation": np.array(ours.cfg.decimation),
+        }
         np.savez_compressed(folder / "trace.npz", **traced.arrays, **rates)  # pyright: ignore
     env.close(raise_if_closed=False)
     for path in sorted(folder.glob("*.onnx")):
@@ -260,13 +295,17 @@ def _fill(
     (folder / "README.md").write_text(
         README.format(
             **{**meta, **own, "joints": ", ".join(meta["joint_names"])},
-            state="; " + ", ".join(exported.input_names[1:]) + " carry its recurrent state" if states else "",
+            state="; " + ", ".join(exported.input_names[1:]) + " carry its recurrent state"
+            if states
+            else "",
             checked=policy.CHECKED,
         )
     )
 
 
-def _traced(cfg: RunCfg, groups: Sequence[str], seed: int, note: Callable[[str], None]) -> TracedTask:
+def _traced(
+    cfg: RunCfg, groups: Sequence[str], seed: int, note: Callable[[str], None]
+) -> TracedTask:
     """Trace the terms of a task in an env of its own, of one row on the CPU, as the files are for one robot."""
     env = build_env(dataclasses.replace(cfg, device="cpu"), num_envs=1, seed=seed)
     ours = part(env, ManagerBasedRlEnv)
@@ -298,5 +337,7 @@ def runner_source() -> str:
     inner = [re.sub(r'\A""".*?"""\n', "", text, flags=re.DOTALL) for text in parts]
     # Imports of the package go, on one line or several: all names are in the one file then.
     return (
-        doc + "\n" + re.sub(r"from ksim_rl\S* import (\([^)]*\)|[^\n]*)\n", "", "\n\n".join([*inner, body]))
+        doc
+        + "\n"
+        + re.sub(r"from ksim_rl\S* import (\([^)]*\)|[^\n]*)\n", "", "\n\n".join([*inner, body]))
     )

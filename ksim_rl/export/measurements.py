@@ -113,7 +113,9 @@ def _measured_by(part: Part) -> set[str]:
     """Return the keys of a part's cache that are measurements."""
     if isinstance(part, WorldView):
         return {
-            key for key in part.cache if key == "episode_time_E" or key.startswith(("sensor/", "contact/"))
+            key
+            for key in part.cache
+            if key == "episode_time_E" or key.startswith(("sensor/", "contact/"))
         }
     if isinstance(part, Entity):
         return set(_OF_ROOT)
@@ -247,7 +249,9 @@ def _of_worlds(view: EnvView) -> Iterator[Measurement]:
     for name in ARRAYS:
         if name in shown:
             yield Measurement(
-                node={"quantity": "data", "field": name}, value=shown[name], read=_of_same_array(name)
+                node={"quantity": "data", "field": name},
+                value=shown[name],
+                read=_of_same_array(name),
             )
     actuators = view.resolver.names("actuator")
     for name in OF_ACTUATORS:

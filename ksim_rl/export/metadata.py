@@ -31,7 +31,9 @@ def metadata(
     actions = controls.actions(ours)
     laws = controls.actuators(ours)
     # Joints of the actions first, in their order; then the others, which observations may name.
-    asked = list(dict.fromkeys(n for action in actions if action["kind"] != "ctrl" for n in action["names"]))
+    asked = list(
+        dict.fromkeys(n for action in actions if action["kind"] != "ctrl" for n in action["names"])
+    )
     names = [*asked, *(n for n in joint_names(view, None) if n not in asked)]
     # Controllers for mjlab's policies read the first entries, by these names.
     gains = _gains(ours, laws, names)

@@ -46,7 +46,11 @@ def _state(name: str, shape: tuple[int, ...], columns: tuple[int, int] | None = 
     # A history begins with the first frame in all places, a recurrent state with zeros.
     starts_with = "frame" if columns else "zeros"
     return StateSpec(
-        input=f"{name}_in", output=f"{name}_out", shape=shape, starts_with=starts_with, columns=columns
+        input=f"{name}_in",
+        output=f"{name}_out",
+        shape=shape,
+        starts_with=starts_with,
+        columns=columns,
     )
 
 
@@ -67,7 +71,9 @@ class ExportedPolicy(nn.Module):
     reads. Raises ValueError where the actor has a part that has no such form.
     """
 
-    def __init__(self, actor: TensorDictModuleBase, groups: Mapping[NestedKey, Sequence[Column]]) -> None:
+    def __init__(
+        self, actor: TensorDictModuleBase, groups: Mapping[NestedKey, Sequence[Column]]
+    ) -> None:
         super().__init__()
         self.actor = actor
         # The sequence of modules is run by hand in `forward`: exporters know no TensorDict.
@@ -248,13 +254,18 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
     # Weights are copied into the files; `eval` stops normalizers from learning.
     policy = policy.to("cpu").eval()
     # Two rows: a batch of one would be taken for a constant.
-    example = (torch.zeros(2, policy.obs_dim), *(torch.zeros(2, *state.shape) for state in policy.states))
+    example = (
+        torch.zeros(2, policy.obs_dim),
+        *(torch.zeros(2, *state.shape) for state in policy.states),
+    )
     batch = torch.export.Dim("batch", min=1, max=2**20)
     # One entry per parameter of `forward`; the states are one parameter, a tuple.
     shapes: tuple[Any, ...] = ({0: batch}, tuple({0: batch} for _ in policy.states))
     # No gradients; warnings of the exporter are not for users.
     with torch.no_grad(), quiet():
-        program = torch.export.export(policy, example, dynamic_shapes=shapes if policy.states else shapes[:1])
+        program = torch.export.export(
+            policy, example, dynamic_shapes=shapes if policy.states else shapes[:1]
+        )
     # They name the folders of this machine, in files that are made to be given away.
     for node in program.graph.nodes:
         node.meta.pop("stack_trace", None)
@@ -263,7 +274,11 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
     torch.export.save(program, memory)
     (folder / "policy.pt2").write_bytes(memory.getvalue())
     write_onnx(
-        program, example, folder / "policy.onnx", inputs=policy.input_names, outputs=policy.output_names
+        program,
+        example,
+        folder / "policy.onnx",
+        inputs=policy.input_names,
+        outputs=policy.output_names,
     )
 
 
@@ -285,7 +300,9 @@ def greatest_difference(policy: ExportedPolicy, path: Path) -> float:
     frames: list[np.ndarray] = []
     # Batches of ROWS make CHECKED observations; each batch is one step of all episodes.
     for step in range(CHECKED // ROWS):
-        frames.append((mean + std * draws.standard_normal((ROWS, policy.obs_dim))).astype(np.float32))
+        frames.append(
+            (mean + std * draws.standard_normal((ROWS, policy.obs_dim))).astype(np.float32)
+        )
         # States begin with the first frame, as they do on a robot.
         if not step:
             states = [_first(state, frames[0]) for state in policy.states]
@@ -312,7 +329,9 @@ def greatest_difference(policy: ExportedPolicy, path: Path) -> float:
             answer = policy.actor(asked)
         # TorchRL's modules give the state of the next step under "next".
         carried = {
-            key: answer["next", *key] for part in policy.parts for key in getattr(part, "state_keys", ())
+            key: answer["next", *key]
+            for part in policy.parts
+            for key in getattr(part, "state_keys", ())
         }
         wanted = torch.cat([_row(answer[key]) for key in policy.action_keys], -1).numpy()
         # Also where one of the two is NaN, which numpy's `max` passes on, and Python's may not.

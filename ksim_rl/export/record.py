@@ -126,7 +126,9 @@ class Recording:
     def _keep(self, kind: str, values: Mapping[str, Tensor]) -> None:
         for name, value in values.items():
             # Copied, since the env writes the next step into the same memory.
-            self._seen.setdefault(f"{kind}/{name}", []).append(value.detach().float().cpu().numpy().copy())
+            self._seen.setdefault(f"{kind}/{name}", []).append(
+                value.detach().float().cpu().numpy().copy()
+            )
 
     def _state(self, order: Sequence[int]) -> dict[str, Tensor]:
         """Return the state that a step begins from, actuators in `order`."""
@@ -146,7 +148,9 @@ class Recording:
             found |= {name: world.view(name) for name in ("mocap_pos", "mocap_quat")}
         by_joint = {"encoder_bias": view.encoder_bias_EL, "default_pos": view.default_joint_pos_EL}
         # 1e30 for infinity, as in export.json: the runner refuses numbers that are not finite.
-        by_joint |= {f"actuator/{name}": view.actuator_param(name).clamp(max=1e30) for name in params}
+        by_joint |= {
+            f"actuator/{name}": view.actuator_param(name).clamp(max=1e30) for name in params
+        }
         found |= {name: value[:, self._columns] for name, value in by_joint.items()}
         for name, value in world.per_world_fields().items():
             if name not in (*FIELDS, CHOICE, "gravity"):
@@ -155,7 +159,9 @@ class Recording:
                 # Fields of actuators follow the order that robot.xml gives them.
                 value = value[:, list(order)]
             found["gravity" if name == "gravity" else f"model/{name}"] = value
-        return {f"start/{name}": value.detach().cpu().numpy().copy() for name, value in found.items()}
+        return {
+            f"start/{name}": value.detach().cpu().numpy().copy() for name, value in found.items()
+        }
 
     def _reached(self, stepped: Any) -> dict[str, Tensor]:
         view = self._ours.view
@@ -181,10 +187,16 @@ class Recording:
         now["return"] = sum(now.values(), torch.zeros_like(step_E))
         now |= {"length": step_E, "fell": view.terminated_E.float()}
         now |= dict(
-            zip((f"metric/{name}" for name in metrics.names), metrics.reduced_EM.unbind(-1), strict=True)
+            zip(
+                (f"metric/{name}" for name in metrics.names),
+                metrics.reduced_EM.unbind(-1),
+                strict=True,
+            )
         )
         effort_EL = view.joints(self._joints).effort_EL.abs()
-        mean = dict(zip((f"torque/{name}" for name in self._joints), effort_EL.unbind(-1), strict=True))
+        mean = dict(
+            zip((f"torque/{name}" for name in self._joints), effort_EL.unbind(-1), strict=True)
+        )
         for name in self._sensors:
             found = view.contact(name).found_EN.unbind(-1)
             mean |= {f"contact/{name}/{k}": found_E for k, found_E in enumerate(found)}

@@ -15,7 +15,9 @@ EXACT = ("gainprm", "biasprm", "dynprm", "ctrlrange", "forcerange", "actrange")
 EXACT_OF_KEYS = ("qpos", "qvel", "act", "ctrl", "mpos", "mquat")
 
 
-def write_robot(spec: mujoco.MjSpec, mj_model: mujoco.MjModel, first: Sequence[str], path: Path) -> list[int]:
+def write_robot(
+    spec: mujoco.MjSpec, mj_model: mujoco.MjModel, first: Sequence[str], path: Path
+) -> list[int]:
     """Write a spec that compiles to `mj_model`, and return its actuators' old ids in their new order.
 
     The actuators in `first` stand in front, in this order, the others follow. Meshes, height fields and textures are
@@ -48,7 +50,9 @@ def write_robot(spec: mujoco.MjSpec, mj_model: mujoco.MjModel, first: Sequence[s
         if controls := key.get("ctrl"):
             key.set("ctrl", " ".join(np.array(controls.split())[order]))
         if activations := key.get("act"):
-            key.set("act", " ".join(np.array(activations.split())[activation_order(mj_model, order)]))
+            key.set(
+                "act", " ".join(np.array(activations.split())[activation_order(mj_model, order)])
+            )
     _bring_files(root, Path(spec.modelfiledir), path.parent)
     ElementTree.indent(root)
     path.write_text(ElementTree.tostring(root, encoding="unicode") + "\n")

@@ -48,9 +48,13 @@ class Report:
 
     def table(self) -> str:
         """Return the report as text."""
-        lines = [f"{self.task}: {self.episodes} episodes on MuJoCo's C engine, beside the recorded ones"]
+        lines = [
+            f"{self.task}: {self.episodes} episodes on MuJoCo's C engine, beside the recorded ones"
+        ]
         if self.physics:
-            lines.append(f"which trained it: {self.physics}; single steps are compared in the same physics")
+            lines.append(
+                f"which trained it: {self.physics}; single steps are compared in the same physics"
+            )
         lines.append(f"{'':<44}{'recorded':>12}{'C engine':>12}{'difference':>12}")
         # A return without some terms is another one than training prints.
         without = lacking({"left_out": self.left_out})
@@ -65,7 +69,9 @@ class Report:
                 line = f"{name:<44}{own:>12.4g}{value:>12.4g}{share:>12}"
                 lines.append(line + without if name == "return" else line)
         lines += [f"left out, since it cannot be traced: {name}" for name in self.left_out]
-        lines.append(f"return ratio {self.return_ratio:.4f} +- {self.standard_error:.4f} (standard error)")
+        lines.append(
+            f"return ratio {self.return_ratio:.4f} +- {self.standard_error:.4f} (standard error)"
+        )
         if self.causes:
             lines.append("likely causes:")
             lines += [f"  {cause}" for cause in self.causes]
@@ -100,7 +106,9 @@ def sim2sim(
     note(f"running {episodes} episodes")
     # Our own runner, not the folder's, which may be a stranger's.
     with tempfile.TemporaryDirectory() as temporary:
-        program, output, replay = (Path(temporary) / name for name in ("runner.py", "out.json", "replay.npz"))
+        program, output, replay = (
+            Path(temporary) / name for name in ("runner.py", "out.json", "replay.npz")
+        )
         program.write_text(runner_source())
         arguments = [str(folder.absolute()), "--episodes", str(episodes), "--seed", str(seed)]
         arguments += ["--output", str(output), "--replay", str(replay), *physics]
@@ -148,7 +156,9 @@ def _other_physics(meta: Json, option: mujoco.MjOption) -> tuple[list[str], str]
     integrator, words = other_integrator(option)
     laws = meta.get("actuators")
     # Lags of actuators count substeps: half the step would be half the lag.
-    late = isinstance(laws, list) and any(isinstance(law, dict) and law.get("delay") for law in laws)
+    late = isinstance(laws, list) and any(
+        isinstance(law, dict) and law.get("delay") for law in laws
+    )
     if late:
         return ["--integrator", integrator], f"{words}, {same_time_step(option.timestep)}"
     arguments = ["--integrator", integrator, "--refine", "2"]
@@ -170,7 +180,9 @@ def _recorded(meta: Json, folder: Path) -> dict[str, np.ndarray]:
         count = 0
     found = {}
     for name, values in ours.items():
-        numbers = isinstance(values, list) and all(isinstance(value, int | float) for value in values)
+        numbers = isinstance(values, list) and all(
+            isinstance(value, int | float) for value in values
+        )
         if not numbers or len(values) != count:
             raise ValueError(
                 f"{folder}: export.json: ours.{name}: expected a number for each recorded episode"
@@ -185,19 +197,32 @@ def ratio_error(ours: np.ndarray, theirs: np.ndarray) -> float:
     if len(ours) < 2 or mean == 0.0:
         return float("nan")
     # Delta method: the spread of theirs around the ratio's line through the pairs.
-    return float(np.std(theirs - ours * theirs.mean() / mean, ddof=1) / np.sqrt(len(ours)) / abs(mean))
+    return float(
+        np.std(theirs - ours * theirs.mean() / mean, ddof=1) / np.sqrt(len(ours)) / abs(mean)
+    )
 
 
 def run_export(arguments: Sequence[str]) -> int:
     """Run `ksim-rl export RUN`."""
     parser = OneLineParser(
-        prog="ksim-rl export", description="Write a policy into a folder that runs without this library."
+        prog="ksim-rl export",
+        description="Write a policy into a folder that runs without this library.",
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="default: export in the run folder")
-    parser.add_argument("--episodes", type=int, default=100, help="to record for sim2sim; 0 for none")
-    parser.add_argument("--seed", type=int, help="of the recorded episodes; default: that of evaluations")
-    parser.add_argument("--device", default="cpu", help="of the recorded episodes: cpu, cuda or auto")
+    parser.add_argument(
+        "run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints"
+    )
+    parser.add_argument(
+        "--output", type=Path, metavar="DIR", help="default: export in the run folder"
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=100, help="to record for sim2sim; 0 for none"
+    )
+    parser.add_argument(
+        "--seed", type=int, help="of the recorded episodes; default: that of evaluations"
+    )
+    parser.add_argument(
+        "--device", default="cpu", help="of the recorded episodes: cpu, cuda or auto"
+    )
     parser.add_argument(
         "--no-noise", dest="noise", action="store_false", help="record without sensors' noise"
     )
@@ -211,7 +236,8 @@ def run_export(arguments: Sequence[str]) -> int:
 def run_sim2sim(arguments: Sequence[str]) -> int:
     """Run `ksim-rl sim2sim DIR`; the code is 1 where single steps differ."""
     parser = OneLineParser(
-        prog="ksim-rl sim2sim", description="Run an exported policy on MuJoCo's C engine, and compare."
+        prog="ksim-rl sim2sim",
+        description="Run an exported policy on MuJoCo's C engine, and compare.",
     )
     parser.add_argument("folder", type=Path, metavar="DIR", help="what `ksim-rl export` wrote")
     parser.add_argument("--episodes", type=int, default=100)

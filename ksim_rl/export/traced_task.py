@@ -44,10 +44,15 @@ class TracedTask:
 
     def described(self) -> Json:
         """Return the entries of `export.json`."""
-        return {"obs": self.obs.described(), "scores": self.scores.described() if self.scores else None}
+        return {
+            "obs": self.obs.described(),
+            "scores": self.scores.described() if self.scores else None,
+        }
 
 
-def trace_task(env: ManagerBasedRlEnv, groups: Sequence[str], note: Callable[[str], None]) -> TracedTask:
+def trace_task(
+    env: ManagerBasedRlEnv, groups: Sequence[str], note: Callable[[str], None]
+) -> TracedTask:
     """Trace the terms of an env; rewards, metrics and terminations that cannot be traced are noted and left out.
 
     Raises NotDescribedError, naming the term, for one that the policy observes.
@@ -90,7 +95,9 @@ def _scoring(cfg: ManagerBasedRlEnvCfg) -> dict[str, dict[str, Called]]:
     """Return the terms that rate an episode, by kind and name, in the order in which they run."""
     return {
         # The runner knows the time limit from `episode_steps`.
-        "terminations": {n: term for n, term in cfg.terminations.items() if type(term).__name__ != "TimeOut"},
+        "terminations": {
+            n: term for n, term in cfg.terminations.items() if type(term).__name__ != "TimeOut"
+        },
         # A reward of weight 0 is not computed.
         "rewards": {n: term for n, term in cfg.rewards.items() if term.weight != 0.0},
         "metrics": {n: term for n, term in cfg.metrics.items() if term.reduce == "mean"},
@@ -98,7 +105,9 @@ def _scoring(cfg: ManagerBasedRlEnvCfg) -> dict[str, dict[str, Called]]:
 
 
 @torch.no_grad()
-def greatest_difference(traced: Traced, env: ManagerBasedRlEnv, path: Path, names: Sequence[str]) -> float:
+def greatest_difference(
+    traced: Traced, env: ManagerBasedRlEnv, path: Path, names: Sequence[str]
+) -> float:
     """Return the greatest difference of a file's observations from the env's own, over some steps of some rows.
 
     It is relative to observations above 1. Actions are random, so that episodes end meanwhile; `names` are the terms in

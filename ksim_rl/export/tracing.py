@@ -220,14 +220,18 @@ class _Tracer:
 
     # -- the graph -----------------------------------------------------------------------------------------------
 
-    def _call(self, function: torch._ops.OpOverload, args: tuple[PyTree, ...], kwargs: PyTree) -> fx.Node:
+    def _call(
+        self, function: torch._ops.OpOverload, args: tuple[PyTree, ...], kwargs: PyTree
+    ) -> fx.Node:
         return self._graph.call_function(function, args, kwargs)
 
     def _add_operation(self, operation: Operation) -> None:
         if operation.name == "draw":
             raise NotDescribedError("draws random numbers")
         if operation.function.namespace != "aten":
-            raise NotDescribedError(f"uses the operator {operation.function}, which an export has not")
+            raise NotDescribedError(
+                f"uses the operator {operation.function}, which an export has not"
+            )
         for tensor in operation.written:
             self._check_written(tensor)
         args = tree_map_only(Tensor, self._node, operation.args)
@@ -320,7 +324,9 @@ class _Tracer:
         given = self._placeholder(f"{called}_in", before=self._end_of_states)
         # A copy, which the term's writes in place change: inputs stay as they are.
         node = self._call(torch.ops.aten.clone.default, (given,), {})
-        state = TracedState(input=f"{called}_in", output=f"{called}_out", example=torch.zeros_like(tensor))
+        state = TracedState(
+            input=f"{called}_in", output=f"{called}_out", example=torch.zeros_like(tensor)
+        )
         self._states.append((state, node))
         self._nodes[key_of(tensor)] = node
         self._alive.append(tensor)
@@ -332,7 +338,10 @@ class _Tracer:
 
     def _named(self, node: Json) -> str:
         """Return a new name for an input, which says what it is."""
-        words = [node["quantity"], *(node[word] for word in ("sensor", "command", "field") if word in node)]
+        words = [
+            node["quantity"],
+            *(node[word] for word in ("sensor", "command", "field") if word in node),
+        ]
         if node.get("frame") == "world":
             words.append("world")
         name = re.sub(r"\W+", "_", "_".join(words))

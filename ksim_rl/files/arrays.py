@@ -31,10 +31,15 @@ def read_arrays(
             # Sizes after unpacking, which a small archive may make huge.
             if sum(entry.file_size for entry in entries) > limit:
                 raise ValueError(f"its arrays are larger than {limit} bytes")
-            return {entry.filename.removesuffix(SUFFIX): _read_array(archive, entry) for entry in entries}
+            return {
+                entry.filename.removesuffix(SUFFIX): _read_array(archive, entry)
+                for entry in entries
+            }
     except ValueError:
         raise
-    except Exception as error:  # zipfile, its compressions and numpy's parser of headers raise a dozen kinds
+    except (
+        Exception
+    ) as error:  # zipfile, its compressions and numpy's parser of headers raise a dozen kinds
         what = f"{type(error).__name__} {error}"
         raise ValueError(f"no archive of arrays: {' '.join(what.split())}") from error
 
@@ -61,6 +66,10 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
             )
         content = file.read(wanted)
     if len(content) != wanted:
-        raise ValueError(f"{entry.filename}: {len(content)} bytes, where its header claims {wanted}")
+        raise ValueError(
+            f"{entry.filename}: {len(content)} bytes, where its header claims {wanted}"
+        )
     # A copy, since an array over bytes cannot be written.
-    return np.frombuffer(content, dtype=dtype).reshape(shape, order="F" if in_columns else "C").copy()
+    return (
+        np.frombuffer(content, dtype=dtype).reshape(shape, order="F" if in_columns else "C").copy()
+    )

@@ -35,7 +35,9 @@ def open_regular(path: Path, *, limit: int, follows_links: bool = False) -> Bina
     on_disk = 512 * about.st_blocks  # blocks are counted in this unit, whatever their size is
     if about.st_size > MOST_SPARSE_BYTES and on_disk < LEAST_SHARE * about.st_size:
         file.close()
-        raise ValueError(f"{path}: damaged: of its {about.st_size} bytes only {on_disk} were ever written")
+        raise ValueError(
+            f"{path}: damaged: of its {about.st_size} bytes only {on_disk} were ever written"
+        )
     return file
 
 
@@ -48,6 +50,8 @@ def read_bytes(path: Path, *, limit: int, follows_links: bool = False) -> bytes:
     """Read a file that `open_regular` opens."""
     with open_regular(path, limit=limit, follows_links=follows_links) as file:
         try:
-            return file.read(os.fstat(file.fileno()).st_size)  # Python takes memory for all that is asked for
+            return file.read(
+                os.fstat(file.fileno()).st_size
+            )  # Python takes memory for all that is asked for
         except OSError as error:
             raise ValueError(f"{path}: cannot be read: {error.strerror}") from error

@@ -29,7 +29,9 @@ def identify(arguments: Sequence[str]) -> int:
     if options.propose is not None:
         return _propose(options)
     if options.robot is None:
-        raise ValueError(f"--robot: which robot is {options.log} of? A name, or the path of a model")
+        raise ValueError(
+            f"--robot: which robot is {options.log} of? A name, or the path of a model"
+        )
     return _find(options)
 
 
@@ -39,7 +41,9 @@ def _propose(options: Any) -> int:
             raise ValueError(f"--{name}: it is of logs; --propose has the name of the robot itself")
     check_in_range("--seconds", options.seconds, low=LEAST_S, high=3600.0)
     robot = hold(options.propose, quat=options.base)
-    targets = propose(robot, _kinds(options.targets, robot), seconds=options.seconds, seed=options.seed)
+    targets = propose(
+        robot, _kinds(options.targets, robot), seconds=options.seconds, seed=options.seed
+    )
     path = options.output or Path(f"{Path(options.propose).stem}_plan.csv")
     write_whole(path, _plan(robot, targets))
     seconds = targets.time_T[-1]
@@ -110,7 +114,9 @@ def _quaternion(text: str) -> list[float]:
         found = []
     length = float(np.linalg.norm(found))
     if len(found) != 4 or not 0.5 < length < 2.0:
-        raise ValueError(f"--base {text}: expected a unit quaternion w,x,y,z, such as 1,0,0,0 for upright")
+        raise ValueError(
+            f"--base {text}: expected a unit quaternion w,x,y,z, such as 1,0,0,0 for upright"
+        )
     return [value / length for value in found]
 
 
@@ -122,13 +128,21 @@ def _parser() -> OneLineParser:
     parser.add_argument(
         "log", nargs="?", type=Path, metavar="LOG", help="commands and encoders: .csv or .parquet"
     )
-    parser.add_argument("--robot", help="that the log is of: a name of the package, or the path of a model")
-    parser.add_argument("--task", help="whose training gets what was found: also write overrides for it")
-    parser.add_argument("--propose", metavar="ROBOT", help="write what to command, in place of reading a log")
+    parser.add_argument(
+        "--robot", help="that the log is of: a name of the package, or the path of a model"
+    )
+    parser.add_argument(
+        "--task", help="whose training gets what was found: also write overrides for it"
+    )
+    parser.add_argument(
+        "--propose", metavar="ROBOT", help="write what to command, in place of reading a log"
+    )
     parser.add_argument(
         "--targets", help="of the proposal: pos,vel,effort; default: what the robot's motors take"
     )
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="of the proposal; default: 60")
+    parser.add_argument(
+        "--seconds", type=float, default=SECONDS, help="of the proposal; default: 60"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the proposal")
     parser.add_argument(
         "--base", metavar="W,X,Y,Z", help="how the held base is turned; default: as it stands"

@@ -109,7 +109,9 @@ def _sines(rng: np.random.Generator, time_T: Array, num: int, slope: float) -> F
     return np.stack(columns, axis=1) * (faded_T**2 * (3.0 - 2.0 * faded_T))[:, None]
 
 
-def _places(robot: HeldRobot, rng: np.random.Generator) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
+def _places(
+    robot: HeldRobot, rng: np.random.Generator
+) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
     """Return about which position each joint moves and how far it may, between the default pose and mid-range.
 
     It is the nearest to the default pose of a few in which the robot's parts meet least.
@@ -149,14 +151,18 @@ def _free_ranges(robot: HeldRobot) -> tuple[Float[Array, " N"], Float[Array, " N
     return low_N + margin_N, high_N - margin_N
 
 
-def _simulated(robot: HeldRobot, targets: Targets, start_N: Float[Array, " N"]) -> Float[Array, "T N"]:
+def _simulated(
+    robot: HeldRobot, targets: Targets, start_N: Float[Array, " N"]
+) -> Float[Array, "T N"]:
     """Return the joints' positions under targets, of the robot as its files have it."""
     simulation = Simulation(robot, targets, num_candidates=1)
     as_filed = Candidate(numbers_NP=robot.nominal_NP(), delay_s=0.0)
     return simulation.positions([as_filed], targets.time_T, start_N)[0]
 
 
-def _too_much(robot: HeldRobot, targets: Targets, pos_TN: Float[Array, "T N"]) -> tuple[set[int], str]:
+def _too_much(
+    robot: HeldRobot, targets: Targets, pos_TN: Float[Array, "T N"]
+) -> tuple[set[int], str]:
     """Return the places of joints that move or push too much, and a line about the first."""
     vel_TN = np.gradient(pos_TN, targets.time_T, axis=0)
     effort_TN = efforts(robot.nominal_NP(), targets.by_kind, pos_TN, vel_TN)
@@ -166,12 +172,16 @@ def _too_much(robot: HeldRobot, targets: Targets, pos_TN: Float[Array, "T N"]) -
         if pos_TN[:, place].min() < low_N[place] or pos_TN[:, place].max() > high_N[place]:
             found[place] = f"joint {joint.name!r} comes near the end of its range"
         elif np.abs(effort_TN[:, place]).max() > MOST_EFFORT * joint.effort_limit:
-            found[place] = f"joint {joint.name!r} needs more than {MOST_EFFORT:.0%} of its effort limit"
+            found[place] = (
+                f"joint {joint.name!r} needs more than {MOST_EFFORT:.0%} of its effort limit"
+            )
     seen = _touching(robot, pos_TN[:: int(RATE / SEEN_HZ)])
     # What touches at the start is meant to, as a foot that hangs in a frame.
     met = set().union(*seen[1:]) - seen[0]
     for place in _joints_of(robot, met):
-        found.setdefault(place, f"joint {robot.joint_names[place]!r} brings parts of the robot together")
+        found.setdefault(
+            place, f"joint {robot.joint_names[place]!r} brings parts of the robot together"
+        )
     return set(found), next(iter(found.values()), "")
 
 

@@ -64,7 +64,9 @@ class Findings:
         width = max(len(name) for name in self.joints) + 2
         lines = [" " * width + "".join(f"{kind:>24}" for kind in KINDS)]
         for name, numbers in self.joints.items():
-            lines.append(f"{name:<{width}}" + "".join(f"{_short(numbers[kind]):>24}" for kind in KINDS))
+            lines.append(
+                f"{name:<{width}}" + "".join(f"{_short(numbers[kind]):>24}" for kind in KINDS)
+            )
         delay = self.delay_s
         lines.append(f"delay {delay.value * 1e3:.2f} +- {delay.half_width * 1e3:.2f} ms")
         remarks = {}

@@ -38,7 +38,9 @@ MOST_UNEXPLAINED = 0.1
 """Share of a joint's motion."""
 
 
-def fit(robot: HeldRobot, log: JointLog, *, note: Callable[[str], None] = lambda _: None) -> Findings:
+def fit(
+    robot: HeldRobot, log: JointLog, *, note: Callable[[str], None] = lambda _: None
+) -> Findings:
     """Return the numbers of a robot's joints by a log of them.
 
     The parts of a robot whose base is held are fitted one by one. A ValueError says that the extra is missing.
@@ -121,7 +123,12 @@ def _fit_limb(robot: HeldRobot, log: JointLog) -> _LimbFindings:
     for number in free:
         params.add(sysid.Parameter(number.name, number.start, 0.0, number.highest))
     # It would print each step.
-    how: dict[str, Any] = {"verbose": False, "output": io.StringIO(), "eps": DIFFERENCE, "xtol": 1e-3}
+    how: dict[str, Any] = {
+        "verbose": False,
+        "output": io.StringIO(),
+        "eps": DIFFERENCE,
+        "xtol": 1e-3,
+    }
     steps = MOST_STEPS
     if log.time_T[-1] > FIRST_S:
         first = Misfit(robot, log, free, until_s=FIRST_S)
@@ -140,7 +147,9 @@ def _fit_limb(robot: HeldRobot, log: JointLog) -> _LimbFindings:
         joints=_estimates(robot, log, free, x_P, half_P),
         # The delay is the last of the free numbers.
         delay_s=_estimate(free[-1], x_P[-1], half_P[-1], ""),
-        unexplained=dict(zip(robot.joint_names, np.sqrt(np.mean(left_RN**2, axis=0)).tolist(), strict=True)),
+        unexplained=dict(
+            zip(robot.joint_names, np.sqrt(np.mean(left_RN**2, axis=0)).tolist(), strict=True)
+        ),
     )
 
 
@@ -205,7 +214,9 @@ def _estimate(number: FreeNumber, value: float, half: float, remark: str) -> Est
     if not half <= WIDEST * max(value, 1.0):
         wide = f"the log leaves it open by +- {half * number.scale:.2g}: more motion, faster and slower"
         return Estimate(remark=wide)
-    return Estimate(value=float(value * number.scale), half_width=float(half * number.scale), remark=remark)
+    return Estimate(
+        value=float(value * number.scale), half_width=float(half * number.scale), remark=remark
+    )
 
 
 def _joined(delays: Sequence[Estimate]) -> Estimate:

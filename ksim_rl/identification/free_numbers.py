@@ -53,13 +53,17 @@ def free_numbers(robot: HeldRobot, targets: Targets) -> list[FreeNumber]:
                 start = max(joint.nominal[kind] / scales[kind], 0.1)
                 free.append(FreeNumber(joint=place, kind=kind, scale=scales[kind], start=start))
     highest = LONGEST_DELAY_S / _DELAY_SCALE_S
-    free.append(FreeNumber(joint=None, kind=DELAY, scale=_DELAY_SCALE_S, start=0.5, highest=highest))
+    free.append(
+        FreeNumber(joint=None, kind=DELAY, scale=_DELAY_SCALE_S, start=0.5, highest=highest)
+    )
     return free
 
 
 def untold(joint: DrivenJoint, targets: Targets, place: int) -> dict[str, str]:
     """Return the numbers of a joint that these targets cannot tell, with the reasons."""
-    asked = {kind for kind, values_TN in targets.by_kind.items() if np.ptp(values_TN[:, place]) > 0.0}
+    asked = {
+        kind for kind, values_TN in targets.by_kind.items() if np.ptp(values_TN[:, place]) > 0.0
+    }
     held = {}
     if "pos" not in asked:
         held["stiffness"] = _NO_POSITIONS

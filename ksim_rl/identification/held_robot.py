@@ -86,7 +86,9 @@ class HeldRobot:
             others = beginnings[mj_model.body_treeid[beginnings] != limb]
             drop_bodies(spec, [mj_model.body(int(body)).name for body in others])
             joints = tuple(joint for joint in self.joints if joint.limb == limb)
-            found.append(HeldRobot(name=self.name, spec=spec, mj_model=spec.compile(), joints=joints))
+            found.append(
+                HeldRobot(name=self.name, spec=spec, mj_model=spec.compile(), joints=joints)
+            )
         return found
 
 
@@ -142,7 +144,9 @@ class _Motor:
     takes: frozenset[TargetKind]
 
 
-def _motors(robot: str, mj_model: mujoco.MjModel, actuators: Sequence[Actuator]) -> dict[str, _Motor]:
+def _motors(
+    robot: str, mj_model: mujoco.MjModel, actuators: Sequence[Actuator]
+) -> dict[str, _Motor]:
     """Return the motors by the names of their joints, in the model's order."""
     names = [mj_model.joint(i).name for i in scalar_joint_ids(mj_model)]
     laws = {}
@@ -156,7 +160,9 @@ def _motors(robot: str, mj_model: mujoco.MjModel, actuators: Sequence[Actuator])
         if not of_joint:
             continue
         if len(of_joint) > 1:
-            raise ValueError(f"--robot {robot}: joint {name!r} has {len(of_joint)} actuators: expected one")
+            raise ValueError(
+                f"--robot {robot}: joint {name!r} has {len(of_joint)} actuators: expected one"
+            )
         law = laws.get(name)
         if isinstance(law, ExplicitActuator):
             found[name] = _explicit(robot, name, law)
@@ -217,7 +223,9 @@ def _builtin(robot: str, name: str, mj_model: mujoco.MjModel, actuator: int) -> 
     if mj_model.actuator_forcelimited[actuator]:
         # The force goes through the gear.
         limit = float(
-            np.abs(mj_model.actuator_forcerange[actuator] * mj_model.actuator_gear[actuator, 0]).min()
+            np.abs(
+                mj_model.actuator_forcerange[actuator] * mj_model.actuator_gear[actuator, 0]
+            ).min()
         )
     elif control.kind == "effort" and mj_model.actuator_ctrllimited[actuator]:
         # A motor's control is its effort, before gear and gain.

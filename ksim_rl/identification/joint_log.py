@@ -93,7 +93,9 @@ def read_log(path: Path, robot: HeldRobot) -> JointLog:
         read.update(names)
     if not by_kind:
         wanted = ", ".join(f"{robot.joint_names[0]}.{ending}" for ending in TARGET_COLUMNS.values())
-        raise ValueError(f"{path}: no column says what was commanded: expected some of {wanted}, ...")
+        raise ValueError(
+            f"{path}: no column says what was commanded: expected some of {wanted}, ..."
+        )
     _check_numbers(path, {name: columns[name] for name in sorted(read)})
     _check_time(path, time_T)
     log = JointLog(
@@ -228,9 +230,13 @@ def _check_joint(path: Path, joint: DrivenJoint, log: JointLog, place: int) -> N
             f"{path}: joint {joint.name!r} moves by {motion:.2g} only, from which nothing can be told: move it as "
             "`ksim-rl identify --propose` does"
         )
-    asked = [kind for kind, values_TN in log.targets.by_kind.items() if np.ptp(values_TN[:, place]) > 0.0]
+    asked = [
+        kind for kind, values_TN in log.targets.by_kind.items() if np.ptp(values_TN[:, place]) > 0.0
+    ]
     if not asked:
-        raise ValueError(f"{path}: joint {joint.name!r}: its commands never change: move it by commands")
+        raise ValueError(
+            f"{path}: joint {joint.name!r}: its commands never change: move it by commands"
+        )
     if joint.nominal["stiffness"] == 0.0 and asked == ["pos"]:
         raise ValueError(
             f"{path}: joint {joint.name!r} has commands of its position, and its motor in the robot's files no "

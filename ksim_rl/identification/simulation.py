@@ -12,7 +12,11 @@ from ksim_rl.identification.held_robot import KINDS, TIME_STEP, HeldRobot
 from ksim_rl.scene.state.joint_control import TargetKind
 
 Array = np.ndarray
-FACTORS: Mapping[TargetKind, str] = {"pos": "stiffness", "vel": "servo_damping", "effort": "torque_constant"}
+FACTORS: Mapping[TargetKind, str] = {
+    "pos": "stiffness",
+    "vel": "servo_damping",
+    "effort": "torque_constant",
+}
 """The number that turns each kind of target into an effort."""
 # Fields that MuJoCo derives from the armature.
 _DERIVED = ("dof_invweight0", "body_invweight0", "actuator_acc0", "dof_M0")
@@ -30,7 +34,9 @@ class Targets:
     time_T: Float[Array, " T"]
     by_kind: Mapping[TargetKind, Float[Array, "T N"]]
 
-    def of_steps(self, start_s: float, count: int, delay_s: float) -> dict[TargetKind, Float[Array, "S N"]]:
+    def of_steps(
+        self, start_s: float, count: int, delay_s: float
+    ) -> dict[TargetKind, Float[Array, "S N"]]:
         """Return the means of the targets over `count` time steps from `start_s` on, as they arrive, late."""
         edges_S = start_s - delay_s + TIME_STEP * np.arange(count + 1)
         means = {}
@@ -44,7 +50,9 @@ class Targets:
             early_S = np.minimum(edges_S - self.time_T[0], 0.0)
             late_S = np.maximum(edges_S - self.time_T[-1], 0.0)
             columns = []
-            for column_T, first, last in zip(integral_TN.T, values_TN[0], values_TN[-1], strict=True):
+            for column_T, first, last in zip(
+                integral_TN.T, values_TN[0], values_TN[-1], strict=True
+            ):
                 inside_S = np.interp(edges_S, self.time_T, column_T)
                 columns.append(np.diff(inside_S + early_S * first + late_S * last) / TIME_STEP)
             means[kind] = np.stack(columns, axis=1)
@@ -91,11 +99,20 @@ class Simulation:
         self._qpos = np.array([model.joint(name).qposadr[0] for name in robot.joint_names])
         self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
         self._batch = mujoco.batch.Batch(model, num_candidates)
-        for name in ("dof_armature", "dof_damping", "dof_frictionloss", "actuator_biasprm", *_DERIVED):
+        for name in (
+            "dof_armature",
+            "dof_damping",
+            "dof_frictionloss",
+            "actuator_biasprm",
+            *_DERIVED,
+        ):
             self._batch.expand(name)
 
     def positions(
-        self, candidates: Sequence[Candidate], read_s_R: Float[Array, " R"], start_N: Float[Array, " N"]
+        self,
+        candidates: Sequence[Candidate],
+        read_s_R: Float[Array, " R"],
+        start_N: Float[Array, " N"],
     ) -> Float[Array, "K R N"]:
         """Return the joints' positions at some times, rad or m, of robots that rest at `start_N` at the first time."""
         first = float(read_s_R[0])

@@ -38,7 +38,9 @@ def overrides(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> list[str]:
     # Servos of a model's own file have no entry that could be late.
     if actuators and findings.delay_s.is_told:
         late = _late(actuators, findings.delay_s, cfg.sim.timestep)
-        found.append(f"task.scene.robots.{key}.actuators={_value(to_tree(late, Sequence[Actuator]))}")
+        found.append(
+            f"task.scene.robots.{key}.actuators={_value(to_tree(late, Sequence[Actuator]))}"
+        )
     # Of several robots each has its name before those of its joints.
     prefix = "" if len(cfg.scene.robots) == 1 else f"{key}/"
     for name, event in _events(findings, prefix).items():
@@ -55,13 +57,18 @@ def _robot_of(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> str:
     )
 
 
-def _late(actuators: Sequence[Actuator], delay_s: Estimate, timestep: float | None) -> list[Actuator]:
+def _late(
+    actuators: Sequence[Actuator], delay_s: Estimate, timestep: float | None
+) -> list[Actuator]:
     """Return actuators whose targets arrive late by what was found, in whole physics steps from below to above."""
     if timestep is None:
         raise ValueError(
             "--task: it leaves its time step to the model, and delays count in these: choose a task that sets one"
         )
-    lags = {"min_lag": math.floor(delay_s.low / timestep), "max_lag": math.ceil(delay_s.high / timestep)}
+    lags = {
+        "min_lag": math.floor(delay_s.low / timestep),
+        "max_lag": math.ceil(delay_s.high / timestep),
+    }
     late: list[Actuator] = []
     for entry in actuators:
         # A delay that the robot had before is replaced.

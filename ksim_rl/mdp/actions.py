@@ -76,7 +76,9 @@ class JointAction(ActionTerm):
         return filtered_EK.lerp_(action_EK, smoothing(self.cutoff_hz, view.step_dt))
 
 
-def per_joint(view: EnvView, field: str, value: PerJoint, joints: Patterns) -> float | Float[Tensor, " K"]:
+def per_joint(
+    view: EnvView, field: str, value: PerJoint, joints: Patterns
+) -> float | Float[Tensor, " K"]:
     """Return the number for all joints, or those by joint."""
     if not isinstance(value, Mapping):
         return float(value)
@@ -182,7 +184,9 @@ class ActuatorAction(ActionTerm):
         view.targets.check_no_law(ids)
         return len(ids)
 
-    def numbers(self, view: EnvView, field: Literal["scale", "offset"]) -> float | Float[Tensor, " K"]:
+    def numbers(
+        self, view: EnvView, field: Literal["scale", "offset"]
+    ) -> float | Float[Tensor, " K"]:
         """Return the scale or the offset: the number for all actuators, or those by column."""
         value = getattr(self, field)
         if not isinstance(value, Mapping):

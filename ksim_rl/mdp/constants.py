@@ -46,7 +46,9 @@ def _index_constant(ids: tuple[int, ...], device: torch.device) -> Index:
     return index
 
 
-def values_by_name(field: str, table: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:
+def values_by_name(
+    field: str, table: Mapping[str, float], names: Sequence[str]
+) -> tuple[float, ...]:
     """Spread a table of patterns (regular expressions, full match) over names, which must match one each."""
     return _values_by_name(field, tuple(table.items()), tuple(names))
 
@@ -58,7 +60,9 @@ def _values_by_name(
     for pattern, _ in table:
         # A pattern without a match is most likely a mistyped name.
         if not any(re.fullmatch(pattern, name) for name in names):
-            raise ValueError(f"{field}: pattern {pattern!r} matches nothing: {near(pattern, names)}")
+            raise ValueError(
+                f"{field}: pattern {pattern!r} matches nothing: {near(pattern, names)}"
+            )
     values = []
     for name in names:
         matches = [(pattern, value) for pattern, value in table if re.fullmatch(pattern, name)]

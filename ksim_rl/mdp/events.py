@@ -246,7 +246,9 @@ class PushByForce(EventTerm):
         super()._check_fields()
         # In other modes it would not be called at each step, and a push would never end.
         if self.mode != "interval":
-            raise ValueError(f"mode={self.mode!r}: expected 'interval', which also says when a push ends")
+            raise ValueError(
+                f"mode={self.mode!r}: expected 'interval', which also says when a push ends"
+            )
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Begin a push in the rows of `mask_E`, and go on with or end the other rows' pushes; once per env step."""

@@ -119,7 +119,9 @@ class FramedObservation(InFrame, ObservationTerm):
             pos_EN3 = pos_EN3 - view.entity(self.entity).root_pos_EL[:, None]
         return self.vectors(view, pos_EN3)
 
-    def rotations6d(self, view: EnvView, axes_EN33: Float[Tensor, "E N 3 3"]) -> Float[Tensor, "E L"]:
+    def rotations6d(
+        self, view: EnvView, axes_EN33: Float[Tensor, "E N 3 3"]
+    ) -> Float[Tensor, "E L"]:
         """Return the x axis, then the y axis, of frames whose axes are the rows, in the term's axes, flat, [E, 6N]."""
         # [E, N, 2, 3] as [E, 2N, 3]: each axis is a vector to rotate.
         return self.vectors(view, axes_EN33[:, :, :2].flatten(start_dim=1, end_dim=2))
@@ -128,7 +130,9 @@ class FramedObservation(InFrame, ObservationTerm):
         """Return vectors of the world in the term's axes, flat, [E, 3N]."""
         if self.frame == "root":
             # Rotations from world to root; [E, 1, 4] broadcasts over N.
-            vector_EN3 = quaternion.rotate_inverse(view.entity(self.entity).root_quat_EL[:, None], vector_EN3)
+            vector_EN3 = quaternion.rotate_inverse(
+                view.entity(self.entity).root_quat_EL[:, None], vector_EN3
+            )
         # Observations are flat per env: x, y, z of the first point, then of the second.
         return vector_EN3.flatten(start_dim=1)
 

@@ -45,7 +45,9 @@ class AngularVelocityError(OfCommand, OfEntity, MetricTerm):
     """|c_z - w_z| of a command (vx, vy, wz) and the root velocity, both in the root's frame, rad/s; velocity stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        return (view.command(self.command)[:, 2] - view.entity(self.entity).root_ang_vel_b_EL[:, 2]).abs()
+        return (
+            view.command(self.command)[:, 2] - view.entity(self.entity).root_ang_vel_b_EL[:, 2]
+        ).abs()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,13 +117,17 @@ class CostOfTransport(OfJoints, OfEntity, MetricTerm):
         # From the model on the host: randomized masses do not count, so that envs can be compared.
         weight = float(model.body_subtreemass[robot.root.id] * np.linalg.norm(model.opt.gravity))
         if weight == 0.0:
-            raise ValueError("CostOfTransport without gravity: a weight of 0 N has no cost of transport")
+            raise ValueError(
+                "CostOfTransport without gravity: a weight of 0 N has no cost of transport"
+            )
         # Buffers start at zero in each episode, so that these are sums over it.
         energy_E = view.buffer("energy_E")
         distance_E = view.buffer("distance_E")
         energy_E.add_(mechanical_power(view, self.joints) * view.step_dt)
         # Horizontal path, summed up: a robot that walks in a circle has moved too.
-        distance_E.add_(torch.linalg.vector_norm(robot.root_lin_vel_w_EL[:, :2], dim=-1) * view.step_dt)
+        distance_E.add_(
+            torch.linalg.vector_norm(robot.root_lin_vel_w_EL[:, :2], dim=-1) * view.step_dt
+        )
         return energy_E / (weight * distance_E.clamp(min=self.min_distance))
 
 
@@ -141,7 +147,9 @@ class Success(MetricTerm):
         # `wanted` by name, `others` by exclusion: an episode may end by several terminations in the same
         # step.
         wanted = [flag_E for name, flag_E in view.terminations.items() if name in self.terminations]
-        others = [flag_E for name, flag_E in view.terminations.items() if name not in self.terminations]
+        others = [
+            flag_E for name, flag_E in view.terminations.items() if name not in self.terminations
+        ]
         succeeds_E = torch.stack(wanted).any(0)
         if others:
             succeeds_E = succeeds_E & ~torch.stack(others).any(0)

@@ -32,7 +32,9 @@ from ksim_rl.transforms import (
 from ksim_rl.transforms.mirror.mirror import concatenate
 
 _SENSORS = {
-    **dict.fromkeys(("GYRO", "TORQUE", "FRAMEANGVEL", "FRAMEANGACC", "BALLANGVEL", "SUBTREEANGMOM"), AXIAL),
+    **dict.fromkeys(
+        ("GYRO", "TORQUE", "FRAMEANGVEL", "FRAMEANGACC", "BALLANGVEL", "SUBTREEANGMOM"), AXIAL
+    ),
     **dict.fromkeys(
         ("VELOCIMETER", "ACCELEROMETER", "FORCE", "FRAMELINVEL", "FRAMELINACC", "FRAMEPOS"), POLAR
     ),
@@ -68,7 +70,8 @@ def mirror_maps(
         terms = inner.cfg.observations[str(group)].terms
         # A group's terms, each with its own image; `mirror_group` puts them together by the group's spec.
         images: dict[NestedKey, MirrorMap] = {
-            name: _named(f"observations.{group}.{name}", cfg.term, inner) for name, cfg in terms.items()
+            name: _named(f"observations.{group}.{name}", cfg.term, inner)
+            for name, cfg in terms.items()
         }
         maps[group] = mirror_group(specs[group], images)
     maps["action"] = _action(inner)
@@ -169,7 +172,9 @@ def _(term: JointAction, env: ManagerBasedRlEnv) -> MirrorMap:
 
 
 def _action(env: ManagerBasedRlEnv) -> MirrorMap:
-    return concatenate([_named(f"actions.{name}", term, env) for name, term in env.cfg.actions.items()])
+    return concatenate(
+        [_named(f"actions.{name}", term, env) for name, term in env.cfg.actions.items()]
+    )
 
 
 def _joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
@@ -186,7 +191,9 @@ def _relative_joints(env: ManagerBasedRlEnv, joints: Patterns) -> MirrorMap:
 
 def _check_symmetric(what: str, value_K: Tensor, image_K: Tensor) -> None:
     if float((value_K - image_K).abs().max()) > _TOLERANCE:
-        raise ValueError(f"{what} {value_K.tolist()} is not its own mirror image {image_K.tolist()}")
+        raise ValueError(
+            f"{what} {value_K.tolist()} is not its own mirror image {image_K.tolist()}"
+        )
 
 
 # Bodies, feet and contacts: one number or vector for each name.
@@ -221,7 +228,9 @@ def _of_names(term: Any, env: ManagerBasedRlEnv) -> MirrorMap:
             patterns = term.sites
         names = [resolver.names(kind)[i] for i in resolver.ids(kind, patterns)]
     # The first kind that fits: images of vectors are polar or axial, None keeps single numbers as they are.
-    return mirror_by_name(names, next(image for kind, image in _BY_NAME.items() if isinstance(term, kind)))
+    return mirror_by_name(
+        names, next(image for kind, image in _BY_NAME.items() if isinstance(term, kind))
+    )
 
 
 for _kind in _BY_NAME:

@@ -153,7 +153,10 @@ class ResetToMotion(OfMotion, EventTerm):
     Episodes begin in `start_range`, shares of its duration. On a terrain all free roots move with the env's origin.
     """
 
-    start_range: Annotated[tuple[float, float], Within(low=0.0, high=1.0, ordered=True)] = (0.0, 1.0)
+    start_range: Annotated[tuple[float, float], Within(low=0.0, high=1.0, ordered=True)] = (
+        0.0,
+        1.0,
+    )
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         motion = view.motion(self.file)

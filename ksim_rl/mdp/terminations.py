@@ -98,9 +98,13 @@ class RootVelocityAbove(OfEntity, TerminationTerm):
         # Both limits are optional; either one ends the episode.
         if self.linear is not None:
             # A NaN compares as False here; the env itself ends worlds whose state is not finite.
-            ends_E = ends_E | (torch.linalg.vector_norm(root.root_lin_vel_w_EL, dim=-1) > self.linear)
+            ends_E = ends_E | (
+                torch.linalg.vector_norm(root.root_lin_vel_w_EL, dim=-1) > self.linear
+            )
         if self.angular is not None:
-            ends_E = ends_E | (torch.linalg.vector_norm(root.root_ang_vel_b_EL, dim=-1) > self.angular)
+            ends_E = ends_E | (
+                torch.linalg.vector_norm(root.root_ang_vel_b_EL, dim=-1) > self.angular
+            )
         return ends_E
 
 

@@ -39,7 +39,9 @@ class GaussianHead(nn.Module):
     kind: type[VectorDistribution] = DiagonalGaussian
     bounds: tuple[Tensor, ...] = ()
 
-    def __init__(self, cfg: ActorCfg, feature_dim: int, action_dim: int, *, device: Device = None) -> None:
+    def __init__(
+        self, cfg: ActorCfg, feature_dim: int, action_dim: int, *, device: Device = None
+    ) -> None:
         super().__init__()
         self.std_type = cfg.std_type
         self.min_std = cfg.min_std
@@ -69,12 +71,18 @@ class GaussianHead(nn.Module):
         """Return `loc`, and `scale` of at least `cfg.min_std`; autocast, which would move narrow policies, is off."""
         # The context is entered only under autocast, since it costs time in every call.
         kind = features.device.type
-        with torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext():
+        with (
+            torch.autocast(kind, enabled=False)
+            if torch.is_autocast_enabled(kind)
+            else nullcontext()
+        ):
             features = features.to(self.loc.weight.dtype)
             loc = self.loc(features)
             return loc, self.scale(features).expand_as(loc)
 
-    def scale(self, features: Float[Tensor, "*batch L"] | None = None) -> Float[Tensor, "*own action_dim"]:
+    def scale(
+        self, features: Float[Tensor, "*batch L"] | None = None
+    ) -> Float[Tensor, "*own action_dim"]:
         """Return the `scale`; where it does not depend on the state it is [action_dim], and needs no features."""
         # One standard deviation per action for all states, or a second layer's output for each.
         if self.std_layer is None:
@@ -94,7 +102,9 @@ class GaussianHead(nn.Module):
         # passes the bound (a plain clamp stops it), so that a std below it can come back.
         return scale + (scale.clamp_min(self.min_std) - scale).detach()
 
-    def distribution(self, loc: Float[Tensor, "*batch L"], scale: Float[Tensor, "*batch L"]) -> Distribution:
+    def distribution(
+        self, loc: Float[Tensor, "*batch L"], scale: Float[Tensor, "*batch L"]
+    ) -> Distribution:
         """Return the distribution of the action."""
         return self.kind(loc, scale, *self.bounds)
 
@@ -151,7 +161,13 @@ class CategoricalHead(nn.Module):
     parameter_names = ("logits",)
 
     def __init__(
-        self, cfg: ActorCfg, feature_dim: int, num_options: int, *, device: Device = None, **options: Any
+        self,
+        cfg: ActorCfg,
+        feature_dim: int,
+        num_options: int,
+        *,
+        device: Device = None,
+        **options: Any,
     ) -> None:
         super().__init__()
         self.logits = linear(feature_dim, num_options, gain=cfg.output_gain, device=device)
@@ -186,7 +202,9 @@ class MixedHead(nn.Module):
             for name in head.parameter_names  # type: ignore[union-attr]
         ]
 
-    def forward(self, features: Float[Tensor, "*batch L"]) -> tuple[Float[Tensor, "*batch ?N"], ...]:
+    def forward(
+        self, features: Float[Tensor, "*batch L"]
+    ) -> tuple[Float[Tensor, "*batch ?N"], ...]:
         """Return the parameters in the order of `parameter_keys`."""
         return tuple(parameter for head in self.heads for parameter in head(features))
 
@@ -243,9 +261,13 @@ def make_head(
     # One head per action; several are joined in a `MixedHead`.
     leaves = _leaves(action_spec)
     # Discrete actions need no setting next to continuous ones, but a gaussian for them only is a mistake.
-    if cfg.distribution != "categorical" and all(isinstance(leaf, DISCRETE) for leaf, _ in leaves.values()):
+    if cfg.distribution != "categorical" and all(
+        isinstance(leaf, DISCRETE) for leaf, _ in leaves.values()
+    ):
         names = " and ".join(f"the action {key!r}" for key in leaves)
-        raise ValueError(f"distribution={cfg.distribution!r}, but {names} is discrete: use 'categorical'")
+        raise ValueError(
+            f"distribution={cfg.distribution!r}, but {names} is discrete: use 'categorical'"
+        )
     heads: dict[NestedKey, nn.Module] = {}
     for key, (leaf, shape) in leaves.items():
         if isinstance(leaf, DISCRETE):

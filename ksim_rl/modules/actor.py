@@ -17,12 +17,16 @@ from ksim_rl.modules.upstream import TensorModule
 class PolicyNetwork(ObservingNetwork):
     """Maps observations [..., L_i] to the parameters of the action's distribution, which its `head` knows."""
 
-    def __init__(self, cfg: ActorCfg, *, obs_dim: int, head: nn.Module, device: Device = None) -> None:
+    def __init__(
+        self, cfg: ActorCfg, *, obs_dim: int, head: nn.Module, device: Device = None
+    ) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
         self.trunk, self.feature_dim = built(cfg, obs_dim, None, device=device)
         self.head = head
 
-    def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> tuple[Float[Tensor, "*batch ?N"], ...]:
+    def forward(
+        self, *observations: Float[Tensor, "*batch ?L"]
+    ) -> tuple[Float[Tensor, "*batch ?N"], ...]:
         """Return the parameters, such as `(loc, scale)`, for observations that stand side by side."""
         return self.head(self.trunk(self.observe(*observations)))
 
@@ -55,7 +59,10 @@ def make_actor(
 
 
 def make_probabilistic(
-    network: nn.Module, in_keys: list[NestedKey], action_keys: list[NestedKey], action_spec: TensorSpec | None
+    network: nn.Module,
+    in_keys: list[NestedKey],
+    action_keys: list[NestedKey],
+    action_spec: TensorSpec | None,
 ) -> ProbabilisticActor:
     """Wrap a network with a `head` from `make_head` as TorchRL's `ProbabilisticActor`."""
     head = network.head

@@ -27,7 +27,9 @@ class ActorCfg(OnPolicyNetworkCfg):
             pose of a robot), or the center of the range, in every state.
     """
 
-    distribution: Literal["gaussian", "tanh_gaussian", "truncated_gaussian", "categorical"] = "gaussian"
+    distribution: Literal["gaussian", "tanh_gaussian", "truncated_gaussian", "categorical"] = (
+        "gaussian"
+    )
     action_bound: Positive | None = None
     init_std: Positive = 1.0
     min_std: Positive = MIN_STD
@@ -38,7 +40,10 @@ class ActorCfg(OnPolicyNetworkCfg):
     def _check_fields(self) -> None:
         """Refuse a bound that does nothing."""
         super()._check_fields()
-        if self.action_bound is not None and self.distribution not in ("tanh_gaussian", "truncated_gaussian"):
+        if self.action_bound is not None and self.distribution not in (
+            "tanh_gaussian",
+            "truncated_gaussian",
+        ):
             raise ValueError(
                 f"action_bound={self.action_bound!r} does nothing with distribution={self.distribution!r}: "
                 "use 'tanh_gaussian' or 'truncated_gaussian', or leave it out"

@@ -68,7 +68,9 @@ class BoundedActor(ObservingNetwork):
         low, high = action_range(action_spec, cfg.action_bound, device=device)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
-        self.layers = cfg.build(obs_dim, self.outputs_per_action * action_spec.shape[-1], device=device)
+        self.layers = cfg.build(
+            obs_dim, self.outputs_per_action * action_spec.shape[-1], device=device
+        )
 
     def output(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch output_dim"]:
         """Return the outputs of the last layer, in float32 at least."""

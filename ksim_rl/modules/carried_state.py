@@ -61,7 +61,9 @@ class CarriedState:
             state_E = self._state_E[key]
             # The state before a step is the one after the step before it, and zero where an episode begins.
             before_ET = torch.cat([state_E.unsqueeze(1), after_ET[:, :-1]], 1)
-            rollout_ET.set(key, before_ET.masked_fill_(rollout_ET.get(RESET_KEY).unsqueeze(-1), 0.0))
+            rollout_ET.set(
+                key, before_ET.masked_fill_(rollout_ET.get(RESET_KEY).unsqueeze(-1), 0.0)
+            )
             state_E.copy_(after_ET[:, -1])
 
     def state_dict(self) -> dict[str, Float[Tensor, "E N H"]]:
@@ -105,6 +107,8 @@ def burnt_in(
             unrolled_BT = module(before_BT.select(*module.in_keys))
         for state_key in carried_keys(module):
             renewed_B = unrolled_BT.get(unravel_key(("next", state_key)))[:, -1]
-            state_B = torch.where(renewed_B1.unsqueeze(-1), renewed_B, before_BT.get(state_key)[:, 0])
+            state_B = torch.where(
+                renewed_B1.unsqueeze(-1), renewed_B, before_BT.get(state_key)[:, 0]
+            )
             rest_BT.set(state_key, state_B.unsqueeze(1).expand_as(rest_BT.get(state_key)))
     return rest_BT

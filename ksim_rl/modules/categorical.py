@@ -34,7 +34,9 @@ class Categorical(Distribution):
         dtype: torch.dtype | None = None,
     ) -> None:
         if sizes is not None and sum(sizes) != logits.shape[-1]:
-            raise ValueError(f"sizes={tuple(sizes)}: they must sum to the {logits.shape[-1]} logits")
+            raise ValueError(
+                f"sizes={tuple(sizes)}: they must sum to the {logits.shape[-1]} logits"
+            )
         self.logits = logits
         if sizes is None:
             self.sizes = None
@@ -77,7 +79,9 @@ class Categorical(Distribution):
         """The mode, which TorchRL takes under `ExplorationType.DETERMINISTIC`."""
         return self.mode
 
-    def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> "Categorical":
+    def expand(
+        self, batch_shape: Sequence[int], _instance: Distribution | None = None
+    ) -> "Categorical":
         """Return the distribution with a larger batch shape."""
         logits = self.logits.expand(torch.Size(batch_shape) + self.logits.shape[-1:])
         return Categorical(logits, self.sizes, self.one_hot, self.dtype)

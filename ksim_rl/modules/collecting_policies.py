@@ -55,10 +55,14 @@ class ExploringPolicy(TensorDictModuleBase):
         # Policies that draw their own actions, as SAC's, add no noise here.
         if self.noise_max > 0.0:
             half_range = (self._high_L - self._low_L) / 2
-            noise = ranks.randn(action.shape, device=action.device) * self.noise_scale_E1 * half_range
+            noise = (
+                ranks.randn(action.shape, device=action.device) * self.noise_scale_E1 * half_range
+            )
             action = torch.maximum(torch.minimum(action + noise, self._high_L), self._low_L)
         # Uniform actions are drawn always: a branch on `random` would read it on the host.
-        anything = self._low_L + ranks.rand(action.shape, device=action.device) * (self._high_L - self._low_L)
+        anything = self._low_L + ranks.rand(action.shape, device=action.device) * (
+            self._high_L - self._low_L
+        )
         return tensordict.set("action", torch.where(self.random, anything, action))
 
     @torch.no_grad()
@@ -110,7 +114,9 @@ class MixedPolicy(TensorDictModuleBase):
         """Write "action" [E, action_dim], and all other outputs of the student."""
         # Before the student writes, which may change keys that the teacher reads.
         seen = tensordict.select(*self._teacher_keys)
-        with set_exploration_type(exploration_type() if self.explores else ExplorationType.DETERMINISTIC):
+        with set_exploration_type(
+            exploration_type() if self.explores else ExplorationType.DETERMINISTIC
+        ):
             acted = self.student(tensordict)
         if self.teacher is None:
             return acted

@@ -39,7 +39,9 @@ class ValueNetwork(LayeredNetwork):
     """Maps observations [..., L_i] to a state value [..., 1]."""
 
     def __init__(self, cfg: CriticCfg, *, obs_dim: int, device: Device = None) -> None:
-        super().__init__(cfg, obs_dim=obs_dim, output_dim=1, output_gain=cfg.output_gain, device=device)
+        super().__init__(
+            cfg, obs_dim=obs_dim, output_dim=1, output_gain=cfg.output_gain, device=device
+        )
 
 
 class Critic(TensorModule, ValueOperator):
@@ -85,7 +87,9 @@ class QNetwork(ObservingNetwork):
 
     support: Tensor | None
 
-    def __init__(self, cfg: QNetworkCfg, *, obs_dim: int, action_dim: int, device: Device = None) -> None:
+    def __init__(
+        self, cfg: QNetworkCfg, *, obs_dim: int, action_dim: int, device: Device = None
+    ) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
         self.cfg = cfg
         support = torch.linspace(cfg.v_min, cfg.v_max, cfg.num_atoms, device=device)
@@ -104,7 +108,11 @@ class QNetwork(ObservingNetwork):
         features = torch.cat((self.observe(obs), action), dim=-1)
         batch = features.shape[:-1]
         # One copy of the features for all networks, then [N, B, A] to [..., N, A].
-        out = self.layers(features.reshape(1, -1, features.shape[-1])).transpose(0, 1).unflatten(0, batch)
+        out = (
+            self.layers(features.reshape(1, -1, features.shape[-1]))
+            .transpose(0, 1)
+            .unflatten(0, batch)
+        )
         if self.support is None:
             return out.squeeze(-1)
         return out

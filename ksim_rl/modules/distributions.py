@@ -32,7 +32,9 @@ class VectorDistribution(Distribution):
     has_rsample = True
     _bounds: tuple[Bound, ...] = ()
 
-    def __init__(self, loc: Float[Tensor, "#*batch #L"], scale: Float[Tensor, "#*batch #L"]) -> None:
+    def __init__(
+        self, loc: Float[Tensor, "#*batch #L"], scale: Float[Tensor, "#*batch #L"]
+    ) -> None:
         self.loc, self.scale = torch.broadcast_tensors(loc, scale)
         # Argument checks compare all values and read the answer on the host.
         super().__init__(self.loc.shape[:-1], self.loc.shape[-1:], validate_args=False)
@@ -102,7 +104,9 @@ class DiagonalGaussian(VectorDistribution):
         """Draw by reparametrization: gradients reach `loc` and `scale`."""
         # Ranks draw for their own rows, so that a run does not depend on how envs are spread.
         shape = torch.Size(sample_shape) + self.loc.shape
-        noise = ranks.randn(shape, dim=len(sample_shape), dtype=self.loc.dtype, device=self.loc.device)
+        noise = ranks.randn(
+            shape, dim=len(sample_shape), dtype=self.loc.dtype, device=self.loc.device
+        )
         return self.loc + self.scale * noise
 
     def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
@@ -252,7 +256,9 @@ class TruncatedGaussian(BoundedDistribution):
             a = self._a
             b = self._b
             eps = torch.finfo(self.loc.dtype).eps
-            share = ranks.rand(shape, dim=len(sample_shape), dtype=self.loc.dtype, device=self.loc.device)
+            share = ranks.rand(
+                shape, dim=len(sample_shape), dtype=self.loc.dtype, device=self.loc.device
+            )
             # Zero would be the lower bound itself, whose logarithm may be minus infinity.
             share = share.clamp_min(eps)
             # The share is mapped between both ends of the distribution function, in logarithms.
@@ -266,7 +272,11 @@ class TruncatedGaussian(BoundedDistribution):
             by_loc = 1.0 - weight_a - weight_b
             by_scale = self._sign * (z - a * weight_a - b * weight_b)
         # Value zero, slope one: the terms add gradients to a value that was drawn without any.
-        return value + (self.loc - self.loc.detach()) * by_loc + (self.scale - self.scale.detach()) * by_scale
+        return (
+            value
+            + (self.loc - self.loc.detach()) * by_loc
+            + (self.scale - self.scale.detach()) * by_scale
+        )
 
     def log_prob(self, value: Float[Tensor, "*value L"]) -> Float[Tensor, "*shape"]:
         """Return the log density of `value` in nats; minus infinity outside of the bounds."""

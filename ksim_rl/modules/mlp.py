@@ -93,7 +93,13 @@ class EnsembleLinear(nn.Module):
     """
 
     def __init__(
-        self, num_networks: int, input_dim: int, output_dim: int, *, gain: float, device: Device = None
+        self,
+        num_networks: int,
+        input_dim: int,
+        output_dim: int,
+        *,
+        gain: float,
+        device: Device = None,
     ) -> None:
         super().__init__()
         self.gain = gain
@@ -132,7 +138,9 @@ class EnsembleLayerNorm(nn.Module):
 
     def forward(self, features_NBL: Float[Tensor, "N B L"]) -> Float[Tensor, "N B L"]:
         """Normalize the last dim, and apply each network's own scale and offset."""
-        return torch.addcmul(self.bias, functional.layer_norm(features_NBL, (self.dim,)), self.weight)
+        return torch.addcmul(
+            self.bias, functional.layer_norm(features_NBL, (self.dim,)), self.weight
+        )
 
 
 class Layers(nn.Sequential):
@@ -206,7 +214,9 @@ class _Product(Function):
     """
 
     @staticmethod
-    def forward(ctx: _MatmulContext, features_NBK: Tensor, weight: Tensor, rounded: Tensor) -> Tensor:
+    def forward(
+        ctx: _MatmulContext, features_NBK: Tensor, weight: Tensor, rounded: Tensor
+    ) -> Tensor:
         ctx.alone = weight.dim() == 2
         fan_in, fan_out = ctx.sizes = weight.mT.shape if ctx.alone else weight.shape[1:]
         networks = len(rounded)
@@ -233,7 +243,9 @@ class _Product(Function):
             networks, rows = features.shape[:2]
             # The split has to divide the rows, since each part is one product of a batch.
             splits = math.gcd(SPLITS * max(OUTPUTS // rounded.numel(), 1), rows)
-            parts = [part.reshape(networks * splits, rows // splits, -1) for part in (features, d_out)]
+            parts = [
+                part.reshape(networks * splits, rows // splits, -1) for part in (features, d_out)
+            ]
             if ctx.alone:
                 parts = parts[::-1]
                 fan_in, fan_out = fan_out, fan_in

@@ -19,8 +19,12 @@ from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.ranks.running_moments import RunningMoments, publish
 
 ObservationKey = str | tuple[str, ...]
-_NestedKey = Annotated[tuple[Name, ...], Filled("expected a name, or a list of names for a nested key")]
-ObservationKeys = Annotated[tuple[Name | _NestedKey, ...], Filled("expected one observation group or more")]
+_NestedKey = Annotated[
+    tuple[Name, ...], Filled("expected a name, or a list of names for a nested key")
+]
+ObservationKeys = Annotated[
+    tuple[Name | _NestedKey, ...], Filled("expected one observation group or more")
+]
 
 
 def observation_dim(spec: Composite, keys: Sequence[ObservationKey]) -> int:
@@ -28,7 +32,9 @@ def observation_dim(spec: Composite, keys: Sequence[ObservationKey]) -> int:
     there = list(spec.keys(True, True))
     for key in keys:
         if key not in there:
-            raise ValueError(f"in_keys: the env has no observation {key!r}; it has {sorted(map(str, there))}")
+            raise ValueError(
+                f"in_keys: the env has no observation {key!r}; it has {sorted(map(str, there))}"
+            )
     return sum(spec[key].shape[-1] for key in keys)
 
 
@@ -77,12 +83,16 @@ def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None
         for module in network.modules():
             # A TensorDict module holds the network as its `module`: only it knows the keys of the observations.
             normalizer = getattr(getattr(module, "module", None), "normalizer", None)
-            if not isinstance(module, TensorDictModule) or not isinstance(normalizer, ObservationNormalizer):
+            if not isinstance(module, TensorDictModule) or not isinstance(
+                normalizer, ObservationNormalizer
+            ):
                 continue
             if id(normalizer) not in seen:
                 seen[id(normalizer)] = normalizer
                 # Step by step, as the memory of a rollout is.
-                normalizer.count_rows(_observation(tensordict, module, normalizer.dim).transpose(0, -2))
+                normalizer.count_rows(
+                    _observation(tensordict, module, normalizer.dim).transpose(0, -2)
+                )
     # All at the end: ranks merge all statistics in one collective.
     publish([*seen.values()])
 
@@ -132,7 +142,9 @@ class NetworkCfg(Checked):
         return mlp(input_dim, self.hidden_dims, output_dim, activation=self.activation, **options)
 
 
-def built(cfg: NetworkCfg, input_dim: int, output_dim: int | None, **options: Any) -> tuple[nn.Module, int]:
+def built(
+    cfg: NetworkCfg, input_dim: int, output_dim: int | None, **options: Any
+) -> tuple[nn.Module, int]:
     """Return the layers that a config builds, and the width of their outputs.
 
     A ValueError tells where they give another shape than [..., output_dim].
@@ -147,7 +159,9 @@ def built(cfg: NetworkCfg, input_dim: int, output_dim: int | None, **options: An
         with torch.no_grad():
             outputs = layers(torch.zeros(2, input_dim, device=options.get("device")))
     except (RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(f"{maker}: it cannot map observations [2, {input_dim}]: {error}") from error
+        raise ValueError(
+            f"{maker}: it cannot map observations [2, {input_dim}]: {error}"
+        ) from error
     finally:
         layers.train()
     expected = "[2, number of features]" if output_dim is None else f"[2, {output_dim}]"
@@ -155,7 +169,9 @@ def built(cfg: NetworkCfg, input_dim: int, output_dim: int | None, **options: An
         raise ValueError(f"{maker}: it gives a {type(outputs).__name__}, and no tensor {expected}")
     fits = outputs.ndim == 2 and len(outputs) == 2 and output_dim in (None, outputs.shape[-1])
     if not fits:
-        raise ValueError(f"{maker}: it maps [2, {input_dim}] to {list(outputs.shape)}: expected {expected}")
+        raise ValueError(
+            f"{maker}: it maps [2, {input_dim}] to {list(outputs.shape)}: expected {expected}"
+        )
     return layers, outputs.shape[-1]
 
 
@@ -248,7 +264,13 @@ class LayeredNetwork(ObservingNetwork):
     """Maps observations [..., L_i] to the outputs of the layers that the config builds; `options` are for `build`."""
 
     def __init__(
-        self, cfg: NetworkCfg, *, obs_dim: int, output_dim: int | None, device: Device = None, **options: Any
+        self,
+        cfg: NetworkCfg,
+        *,
+        obs_dim: int,
+        output_dim: int | None,
+        device: Device = None,
+        **options: Any,
     ) -> None:
         super().__init__(cfg, obs_dim=obs_dim, device=device)
         self.layers, self.output_dim = built(cfg, obs_dim, output_dim, device=device, **options)
@@ -258,7 +280,9 @@ class LayeredNetwork(ObservingNetwork):
         return self.layers(self.observe(*observations))
 
 
-def make_shared_trunk(cfg: SharedTrunkCfg, *, obs_dim: int, device: Device = None) -> TensorDictModule:
+def make_shared_trunk(
+    cfg: SharedTrunkCfg, *, obs_dim: int, device: Device = None
+) -> TensorDictModule:
     """Build the layers that write "features" [..., L], the common part of TorchRL's `ActorValueOperator`."""
     network = LayeredNetwork(cfg, obs_dim=obs_dim, output_dim=None, device=device)
     return TensorModule(network, in_keys=list(cfg.in_keys), out_keys=[FEATURES])

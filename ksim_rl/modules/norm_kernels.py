@@ -84,7 +84,9 @@ def normalize_rows(
         square = 0.0
         for chunk in tl.static_range(CHUNKS):
             at, keep = _chunk(row, num_rows, chunk, WIDTH, LANES)  # pyright: ignore[reportGeneralTypeIssues]
-            values = values + (tl.load(features + at, mask=keep, other=0.0).to(tl.float32) + biases[chunk],)
+            values = values + (
+                tl.load(features + at, mask=keep, other=0.0).to(tl.float32) + biases[chunk],
+            )
             total += values[chunk]
         mean = tl.sum(total, 1) / WIDTH
         for chunk in tl.static_range(CHUNKS):
@@ -248,7 +250,11 @@ class Normalized(Function):
         sums = weights[0].new_empty(3, networks, width)
         launch = sum_parts[-(-width // SUMMED), 3 * networks]
         launch(partials, sums, programs, width, ROWS=256, COLUMNS=SUMMED, num_warps=8)
-        return d_features, *(own.view_as(weight) for own, weight in zip(sums, weights, strict=True)), None
+        return (
+            d_features,
+            *(own.view_as(weight) for own, weight in zip(sums, weights, strict=True)),
+            None,
+        )
 
 
 def _cut(networks: int, rows: int, width: int, most: int) -> tuple[int, dict[str, int]]:

@@ -102,7 +102,12 @@ class RecurrentNetwork(nn.Module):
     """
 
     def __init__(
-        self, cfg: RecurrentCfg, *, obs_dim: int, obs_normalization: bool = False, device: Device = None
+        self,
+        cfg: RecurrentCfg,
+        *,
+        obs_dim: int,
+        obs_normalization: bool = False,
+        device: Device = None,
     ) -> None:
         super().__init__()
         self.cfg = cfg
@@ -138,10 +143,16 @@ class RecurrentNetwork(nn.Module):
             features_TBH = states_N[-1][0]
         if len(states_N) == 1:
             return features_TBH, tuple(part_TB.unsqueeze(-2) for part_TB in states_N[0])
-        return features_TBH, tuple(torch.stack(parts_N, -2) for parts_N in zip(*states_N, strict=True))
+        return features_TBH, tuple(
+            torch.stack(parts_N, -2) for parts_N in zip(*states_N, strict=True)
+        )
 
     def _layer(
-        self, layer: int, features_TBH: Tensor, state_BH: tuple[Tensor, ...], reset_TB1: Tensor | None
+        self,
+        layer: int,
+        features_TBH: Tensor,
+        state_BH: tuple[Tensor, ...],
+        reset_TB1: Tensor | None,
     ) -> tuple[Tensor, ...]:
         weight_ih, weight_hh, bias_ih, bias_hh = (
             self.get_parameter(f"{name}_l{layer}")
@@ -149,7 +160,9 @@ class RecurrentNetwork(nn.Module):
         )
         # The input projection of all steps is one product; only the recurrent part runs step by step.
         lstm = self.cfg.kind == "lstm"
-        gates_TBG = functional.linear(features_TBH, weight_ih, bias_ih + bias_hh if lstm else bias_ih)
+        gates_TBG = functional.linear(
+            features_TBH, weight_ih, bias_ih + bias_hh if lstm else bias_ih
+        )
         # Under autocast only the projection is rounded: errors of a state add up over the steps.
         with torch.autocast(gates_TBG.device.type, enabled=False):
             gates_TBG = gates_TBG.to(weight_hh.dtype)
@@ -185,7 +198,9 @@ class RecurrentModule(TensorDictModule):
         obs_normalization: bool = False,
         device: Device = None,
     ) -> None:
-        network = RecurrentNetwork(cfg, obs_dim=obs_dim, obs_normalization=obs_normalization, device=device)
+        network = RecurrentNetwork(
+            cfg, obs_dim=obs_dim, obs_normalization=obs_normalization, device=device
+        )
         self.obs_keys = list(in_keys)
         self.state_keys = state_keys(cfg, name)
         self.feature_key = (FEATURE_KEY, name)
@@ -233,7 +248,9 @@ class RecurrentModule(TensorDictModule):
         features_1B, states_1B = self.module(
             obs_1B, tuple(part.reshape(-1, *part.shape[-2:]) for part in state), reset_1B1
         )
-        return tuple(part.reshape(*batch_size, *part.shape[2:]) for part in (features_1B, *states_1B))
+        return tuple(
+            part.reshape(*batch_size, *part.shape[2:]) for part in (features_1B, *states_1B)
+        )
 
     def _sequences(
         self, obs: Tensor, reset: Tensor | None, state: list[Tensor], batch_size: torch.Size
@@ -282,7 +299,9 @@ def recurrent_modules(*networks: nn.Module) -> list[Any]:
     found = [module for network in networks for module in network.modules() if carried_keys(module)]
     # A sequence of modules carries the states of those that it holds.
     holders = {
-        module for module in found if any(carried_keys(m) for m in module.modules() if m is not module)
+        module
+        for module in found
+        if any(carried_keys(m) for m in module.modules() if m is not module)
     }
     return [module for module in dict.fromkeys(found) if module not in holders]
 
@@ -308,12 +327,20 @@ def state_spec(cfg: RecurrentCfg, name: str) -> Composite:
 
 
 def _made_behind(
-    make: Any, cfg: RecurrentCfg, network: AnyCfg, *, obs_dim: int, name: str, options: dict[str, Any]
+    make: Any,
+    cfg: RecurrentCfg,
+    network: AnyCfg,
+    *,
+    obs_dim: int,
+    name: str,
+    options: dict[str, Any],
 ) -> Any:
     """Return a network that `make` builds, behind a recurrent module whose features it reads, not observations."""
     # The module in front takes over observations and normalizer; the network then reads features.
     reads = {"in_keys": network.in_keys, "obs_normalization": network.obs_normalization}
-    recurrent = RecurrentModule(cfg, obs_dim=obs_dim, name=name, device=options.get("device"), **reads)
+    recurrent = RecurrentModule(
+        cfg, obs_dim=obs_dim, name=name, device=options.get("device"), **reads
+    )
     network = replace(network, in_keys=(recurrent.feature_key,), obs_normalization=False)
     return behind(recurrent, make(network, obs_dim=cfg.hidden_dim, **options))
 
@@ -327,8 +354,12 @@ def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:
         # The forget gate is the second of torch's four: input, forget, cell, output.
         bias_hh[1] = 1.0
     return {
-        "weight_ih": torch.cat([nn.init.orthogonal_(torch.empty(hidden, input_dim)) for _ in range(gates)]),
-        "weight_hh": torch.cat([nn.init.orthogonal_(torch.empty(hidden, hidden)) for _ in range(gates)]),
+        "weight_ih": torch.cat(
+            [nn.init.orthogonal_(torch.empty(hidden, input_dim)) for _ in range(gates)]
+        ),
+        "weight_hh": torch.cat(
+            [nn.init.orthogonal_(torch.empty(hidden, hidden)) for _ in range(gates)]
+        ),
         "bias_ih": torch.zeros(gates * hidden),
         "bias_hh": bias_hh.flatten(),
     }

@@ -99,7 +99,9 @@ class GRU(Function):
         steps: list[tuple[Tensor, Tensor]] = []
         for t, gates_BG in enumerate(gates_TBG.unbind(0)):
             h_BH = _kept(h_BH, reset_TB1, t)
-            h_BH, workspace_BG = _gru_step(gates_BG, torch.addmm(bias_hh_G, h_BH, weight_hh_GH.t()), h_BH)
+            h_BH, workspace_BG = _gru_step(
+                gates_BG, torch.addmm(bias_hh_G, h_BH, weight_hh_GH.t()), h_BH
+            )
             steps.append((h_BH, workspace_BG))
         h_TBH, workspace_TBG = (torch.stack(column) for column in zip(*steps, strict=True))
         ctx.save_for_backward(weight_hh_GH, h0_BH, h_TBH, workspace_TBG, reset_TB1)
@@ -117,7 +119,9 @@ class GRU(Function):
         # Input and recurrent gates differ in the new gate, whose recurrent part the reset gate scales.
         drecurrent: list[Tensor] = []
         for t in reversed(range(h_TBH.shape[0])):
-            dinput_BG, drecurrent_BG, dh_BH = _gru_step_backward(dh_BH + grad_h_TBH[t], workspace_TBG[t])
+            dinput_BG, drecurrent_BG, dh_BH = _gru_step_backward(
+                dh_BH + grad_h_TBH[t], workspace_TBG[t]
+            )
             dinput.append(dinput_BG)
             drecurrent.append(drecurrent_BG)
             dh_BH = _kept(torch.addmm(dh_BH, drecurrent_BG, weight_hh_GH), reset_TB1, t)
@@ -150,7 +154,9 @@ def _outer(left_TBH: Tensor, right_TBH: Tensor) -> Tensor:
 # On CUDA these are the fused kernels behind torch.nn.LSTMCell and torch.nn.GRUCell; they have none for the CPU.
 
 
-def _lstm_step(gates_BG: Tensor, recurrent_BG: Tensor, c_BH: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _lstm_step(
+    gates_BG: Tensor, recurrent_BG: Tensor, c_BH: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return h and c after the step, and the activated gates."""
     if gates_BG.is_cuda:
         return upstream.fused_lstm_cell(gates_BG, recurrent_BG, c_BH)
@@ -209,4 +215,8 @@ def _gru_step_backward(dh_BH: Tensor, workspace_BG: Tensor) -> tuple[Tensor, Ten
     dn_BH = dh_BH * (1.0 - z_BH) * (1.0 - n_BH.square())
     dz_BH = dh_BH * (h_BH - n_BH) * z_BH * (1.0 - z_BH)
     dr_BH = dn_BH * nh_BH * r_BH * (1.0 - r_BH)
-    return torch.cat([dr_BH, dz_BH, dn_BH], -1), torch.cat([dr_BH, dz_BH, dn_BH * r_BH], -1), dh_BH * z_BH
+    return (
+        torch.cat([dr_BH, dz_BH, dn_BH], -1),
+        torch.cat([dr_BH, dz_BH, dn_BH * r_BH], -1),
+        dh_BH * z_BH,
+    )

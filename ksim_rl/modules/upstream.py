@@ -37,6 +37,8 @@ class TensorModule(TensorDictModule):
             into = tensordict
         else:
             into = tensordict_out
-        for key, tensor in zip(self.out_keys_source if out_keys is None else out_keys, tensors, strict=True):
+        for key, tensor in zip(
+            self.out_keys_source if out_keys is None else out_keys, tensors, strict=True
+        ):
             into.set(key, tensor)
         return into

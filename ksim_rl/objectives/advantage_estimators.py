@@ -7,7 +7,11 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from tensordict import TensorDictBase
-from tensordict.nn import CompositeDistribution, ProbabilisticTensorDictSequential, set_composite_lp_aggregate
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictSequential,
+    set_composite_lp_aggregate,
+)
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import value
@@ -49,7 +53,9 @@ def _discounted_errors(
 
 
 def _with_own_targets(
-    estimate: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], lmbda: Tensor, value_lmbda: float | None
+    estimate: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]],
+    lmbda: Tensor,
+    value_lmbda: float | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the results of `estimate(lmbda)`, with the value targets of another lambda if there is one."""
     adv_ET, target_ET, finite_ET = estimate(lmbda)
@@ -73,10 +79,14 @@ class GAE(RolloutEstimator, value.GAE):
         normalize_advantage: bool = False,
         **options: Any,
     ) -> None:
-        super().__init__(lmbda=lmbda, normalize_advantage=normalizes(normalize_advantage, options), **options)
+        super().__init__(
+            lmbda=lmbda, normalize_advantage=normalizes(normalize_advantage, options), **options
+        )
         self._value_lmbda = value_lmbda
 
-    def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    def _estimate(
+        self, signals: Signals, tensordict: TensorDictBase
+    ) -> tuple[Tensor, Tensor, Tensor]:
         def estimate(lmbda: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             return _discounted_errors(signals, self.gamma, lmbda)
 
@@ -96,15 +106,23 @@ class TDLambda(RolloutEstimator, value.TDLambdaEstimator):
         super().__init__(lmbda=lmbda, **options)
         self._value_lmbda = value_lmbda
 
-    def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    def _estimate(
+        self, signals: Signals, tensordict: TensorDictBase
+    ) -> tuple[Tensor, Tensor, Tensor]:
         # G_{t+1} is V_{t+1} + A_{t+1}: TD errors with this mean of both values after a step sum up to G_t - V_t.
         after_ET = signals.value_ET_t_plus_1
         # A value that is not finite must not spoil the step before it, whose mean would be NaN.
-        following_ET = _shifted(signals.value_ET_t.nan_to_num(0.0, 0.0, 0.0), after_ET, signals.time_dim)
+        following_ET = _shifted(
+            signals.value_ET_t.nan_to_num(0.0, 0.0, 0.0), after_ET, signals.time_dim
+        )
 
         def estimate(lmbda: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            mean_ET = torch.where(signals.done_ET, after_ET, after_ET + lmbda * (following_ET - after_ET))
-            return _discounted_errors(replace(signals, value_ET_t_plus_1=mean_ET), self.gamma, lmbda)
+            mean_ET = torch.where(
+                signals.done_ET, after_ET, after_ET + lmbda * (following_ET - after_ET)
+            )
+            return _discounted_errors(
+                replace(signals, value_ET_t_plus_1=mean_ET), self.gamma, lmbda
+            )
 
         return _with_own_targets(estimate, self.lmbda, self._value_lmbda)
 
@@ -139,7 +157,9 @@ class VTrace(RolloutEstimator, value.VTrace):
                 "actor=None: V-trace needs the present policy, whose log-probabilities it compares"
             )
         super().__init__(
-            actor_network=actor, normalize_advantage=normalizes(normalize_advantage, options), **options
+            actor_network=actor,
+            normalize_advantage=normalizes(normalize_advantage, options),
+            **options,
         )
         self.register_buffer("lmbda", torch.tensor(lmbda, device=self.gamma.device))
 
@@ -159,7 +179,9 @@ class VTrace(RolloutEstimator, value.VTrace):
         following = [("next", key) for key in [*observed, *flags]]
         return list(dict.fromkeys([*read, *following]))
 
-    def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    def _estimate(
+        self, signals: Signals, tensordict: TensorDictBase
+    ) -> tuple[Tensor, Tensor, Tensor]:
         time_dim = signals.time_dim
         value_ET_t_plus_1 = signals.value_ET_t_plus_1
         # Truncated importance weights: rho scales the error of a step, c how far later errors reach back.

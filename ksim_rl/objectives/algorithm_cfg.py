@@ -36,7 +36,8 @@ class AlgorithmCfg(Checked):
     def with_absolute_paths(self) -> Self:
         """Return the same settings with paths that lead to the same files from any folder."""
         return replace(
-            self, **{name: str(Path(getattr(self, name)).resolve()) for name in self.checkpoint_fields}
+            self,
+            **{name: str(Path(getattr(self, name)).resolve()) for name in self.checkpoint_fields},
         )
 
 
@@ -167,7 +168,10 @@ class PPOCfg(OnPolicyCfg):
                 "the policies: leave it out, or use advantage='gae'"
             )
         # A setting without effect is refused, so that nobody believes in a floor that is not there.
-        if self.min_advantage_std != PPOCfg.min_advantage_std and self.normalize_advantage != "dataset":
+        if (
+            self.min_advantage_std != PPOCfg.min_advantage_std
+            and self.normalize_advantage != "dataset"
+        ):
             raise ValueError(
                 f"min_advantage_std={self.min_advantage_std!r} does nothing with normalize_advantage="
                 f"{self.normalize_advantage!r}: use 'dataset', or leave it out"
@@ -207,7 +211,9 @@ class AMPCfg(PPOCfg):
     discriminator_activation: str = "relu"
     discriminator_learning_rate: Positive = 3e-4
     discriminator_weight_decay: NonNegative = 1e-4
-    gradient_penalty: NonNegative = 10.0  # of the discriminator's squared gradient at reference transitions
+    gradient_penalty: NonNegative = (
+        10.0  # of the discriminator's squared gradient at reference transitions
+    )
     logit_decay: NonNegative = 0.05  # of the squares of its last layer's weights
     num_discriminator_steps: Repeats = 10  # per rollout
     num_transitions_per_step: Count = 4096
@@ -309,4 +315,6 @@ class TD3Cfg(OffPolicyCfg):
 
     def _check_fields(self) -> None:
         super()._check_fields()
-        check_in_range("exploration_noise_max", self.exploration_noise_max, low=self.exploration_noise_min)
+        check_in_range(
+            "exploration_noise_max", self.exploration_noise_max, low=self.exploration_noise_min
+        )

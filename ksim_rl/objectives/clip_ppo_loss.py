@@ -4,7 +4,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
-from tensordict.nn import CompositeDistribution, ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    dispatch,
+)
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution
@@ -53,7 +58,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
         **kwargs: Any,
     ) -> None:
         # TorchRL keeps clip_value in a buffer and tests it in an `if`, which is a host sync.
-        super().__init__(actor_network, critic_network, clip_epsilon=clip_epsilon, clip_value=None, **kwargs)
+        super().__init__(
+            actor_network, critic_network, clip_epsilon=clip_epsilon, clip_value=None, **kwargs
+        )
         if clip_value is True:
             if isinstance(clip_epsilon, (tuple, list)):
                 raise ValueError(
@@ -66,7 +73,9 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
             self.clip_value = None
         # TorchRL names heads by their log-probabilities where it samples entropies; here one name serves.
         if self._entropy_coeff_map is not None:
-            self._entropy_coeff_map = {_head(key): coeff for key, coeff in self._entropy_coeff_map.items()}
+            self._entropy_coeff_map = {
+                _head(key): coeff for key, coeff in self._entropy_coeff_map.items()
+            }
         self.log_ratio_statistics = log_ratio_statistics
 
     @property
@@ -302,4 +311,8 @@ def _ratio_statistics(log_weight: Tensor) -> dict[str, Tensor]:
     # The logarithm of (sum w)^2 / sum w^2, which does not overflow for large ratios.
     log_size = 2.0 * log_weight_B.logsumexp(0) - (2.0 * log_weight_B).logsumexp(0)
     ratio = log_weight.exp()
-    return {"ESS": log_size.exp() / log_weight.shape[0], "max_ratio": ratio.max(), "mean_ratio": ratio.mean()}
+    return {
+        "ESS": log_size.exp() / log_weight.shape[0],
+        "max_ratio": ratio.max(),
+        "mean_ratio": ratio.mean(),
+    }

@@ -5,7 +5,11 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import CompositeDistribution, ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+)
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution
@@ -15,7 +19,12 @@ from torchrl.modules import set_recurrent_mode
 from ksim_rl.checked import check_value
 from ksim_rl.objectives.algorithm_cfg import DistillationKind
 from ksim_rl.objectives.masked import mask_of, masked_mean
-from ksim_rl.objectives.policy_kl import distribution_keys, observation_keys, policy_kl, stored_distribution
+from ksim_rl.objectives.policy_kl import (
+    distribution_keys,
+    observation_keys,
+    policy_kl,
+    stored_distribution,
+)
 from ksim_rl.transforms.specs import path_of
 
 TEACHER = "teacher"
@@ -47,12 +56,18 @@ class DistillationLoss(nn.Module):
         self.label_keys: list[NestedKey] = ["action"]
         if loss == "kl":
             if not isinstance(teacher, ProbabilisticTensorDictSequential):
-                raise ValueError("loss='kl': the teacher's policy has no distribution; use loss='mse'")
+                raise ValueError(
+                    "loss='kl': the teacher's policy has no distribution; use loss='mse'"
+                )
             # The divergence needs the teacher's parameters; an action alone has no spread.
             self.label_keys += distribution_keys(teacher)
-        self._has_choices = any(path_of(key)[-1] == "logits" for key in distribution_keys(actor_network))
+        self._has_choices = any(
+            path_of(key)[-1] == "logits" for key in distribution_keys(actor_network)
+        )
         if loss == "mse" and self._has_choices:
-            raise ValueError("loss='mse': the actions are choices, which have no distance; use loss='kl'")
+            raise ValueError(
+                "loss='mse': the actions are choices, which have no distance; use loss='kl'"
+            )
 
     @property
     def dataset_keys(self) -> list[NestedKey]:

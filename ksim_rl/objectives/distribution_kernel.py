@@ -73,15 +73,21 @@ def compare_rows(
         _, of_next, sum_next, peak = _exponentials(following + atom, keep)
         # Mass that moves beyond the ends goes to the end atoms; the loop below sees neighbours only.
         target = tl.where(atom == 0, tl.sum(of_next * _within(-moved, 1.0), 1)[:, None], 0.0)
-        target += tl.where(atom == last, tl.sum(of_next * _within(moved - last, 1.0), 1)[:, None], 0.0)
+        target += tl.where(
+            atom == last, tl.sum(of_next * _within(moved - last, 1.0), 1)[:, None], 0.0
+        )
         # Atoms that come to lie within one spacing of this one are its neighbours, and are read again.
         apart = tl.where(scale > 0.0, scale, 2.0)
         first = tl.floor((atom - 1.0 - start) * (1.0 / apart)) + 1.0
         near = tl.minimum(tl.maximum(first, 0.0), COUNT).to(tl.uint32)
         distance = start + scale * near - atom
         for _ in range(tl.max(tl.minimum(tl.ceil(2.0 / apart), COUNT).to(tl.int32))):
-            near_logit = tl.load(following + near, mask=there & (near < COUNT), other=-1e30).to(tl.float32)
-            target += tl.exp2(near_logit * LOG2_E - peak * LOG2_E) * _within(1.0 - tl.abs(distance), 1.0)
+            near_logit = tl.load(following + near, mask=there & (near < COUNT), other=-1e30).to(
+                tl.float32
+            )
+            target += tl.exp2(near_logit * LOG2_E - peak * LOG2_E) * _within(
+                1.0 - tl.abs(distance), 1.0
+            )
             near = near + 1
             distance = distance + scale
         # Where nothing of the future counts, all atoms move to one place.
@@ -134,7 +140,9 @@ class Compared(Function):
         tall = max(LANES // lanes, 2)
         warps = max(lanes // LANES, 1)
         launch: Any = compare_rows[-(-rows // tall), networks]
-        launch(*given, rows, len(targets) > 0, lowest, networks, count, tall, lanes, num_warps=warps)
+        launch(
+            *given, rows, len(targets) > 0, lowest, networks, count, tall, lanes, num_warps=warps
+        )
         ctx.save_for_backward(slope)
         ctx.others = (None,) * (1 + len(targets))
         return loss_NB.T, mean_NB.T

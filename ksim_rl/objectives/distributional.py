@@ -39,7 +39,9 @@ def compare(
     return losses_BN, mean_of(logits_BNA.detach().softmax(-1), support_A)
 
 
-def mean_returns(logits_BNA: Float[Tensor, "B N A"], support_A: Float[Tensor, " A"]) -> Float[Tensor, "B N"]:
+def mean_returns(
+    logits_BNA: Float[Tensor, "B N A"], support_A: Float[Tensor, " A"]
+) -> Float[Tensor, "B N"]:
     """Return the means of the distributions with these logits, by one kernel on CUDA."""
     if logits_BNA.is_cuda:
         return _by_kernel(logits_BNA, support_A)[0]
@@ -86,7 +88,9 @@ def project_distribution(
     return projected
 
 
-def mean_of(probs: Float[Tensor, "*batch A"], support_A: Float[Tensor, " A"]) -> Float[Tensor, "*batch"]:
+def mean_of(
+    probs: Float[Tensor, "*batch A"], support_A: Float[Tensor, " A"]
+) -> Float[Tensor, "*batch"]:
     """Return the means of distributions."""
     # No product of matrices: autocast would round it to bfloat16.
     return (probs * support_A).sum(-1)

@@ -5,7 +5,10 @@ from typing import Any
 IN_ROWS = "all env states are in one batch, which the critic takes at once"
 NO_GRADIENT = "advantages are constants of the losses here; TorchRL's estimators track gradients"
 REFUSED: dict[str, tuple[tuple[Any, ...], str]] = {
-    "shifted": ((False, None), "the critic sees both observations of each step, so that no step is left out"),
+    "shifted": (
+        (False, None),
+        "the critic sees both observations of each step, so that no step is left out",
+    ),
     "shifted_budget": ((1,), "it goes with shifted=True"),
     "differentiable": ((False, None), NO_GRADIENT),
     "vectorized": (
@@ -13,7 +16,10 @@ REFUSED: dict[str, tuple[tuple[Any, ...], str]] = {
         "the loop over steps gives the same numbers, and never waits for the device",
     ),
     "average_rewards": ((False, None), "scale rewards in the env, or by its transforms"),
-    "auto_reset_env": ((False, None), "the value after a step is that of its true next observation"),
+    "auto_reset_env": (
+        (False, None),
+        "the value after a step is that of its true next observation",
+    ),
     "group_key": ((None,), "advantages are standardized over all env states"),
     "deactivate_vmap": ((False, True, None), ""),
     "value_chunk_size": ((None,), IN_ROWS),

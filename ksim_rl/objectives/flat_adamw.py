@@ -48,7 +48,9 @@ class FlatAdamW(torch.optim.Optimizer):
         self._change_ = compiled(_change_, device=device, wanted=cfg.compile)
 
     def _parts(self, flat: Tensor) -> list[Tensor]:
-        sizes = [own.numel() + gap.numel() for own, gap in zip(self._learning, self._gaps, strict=True)]
+        sizes = [
+            own.numel() + gap.numel() for own, gap in zip(self._learning, self._gaps, strict=True)
+        ]
         parts = zip(flat.split(sizes), self._learning, strict=True)
         return [part[: own.numel()].view_as(own) for part, own in parts]
 

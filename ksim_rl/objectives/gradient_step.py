@@ -47,7 +47,10 @@ class StepGuard(nn.Module):
 
 @torch.no_grad()
 def clip_and_guard(
-    parameters: Iterable[nn.Parameter], max_grad_norm: float | None, *, loss: Float[Tensor, ""] | None = None
+    parameters: Iterable[nn.Parameter],
+    max_grad_norm: float | None,
+    *,
+    loss: Float[Tensor, ""] | None = None,
 ) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
     """Scale the gradients down to a total norm of at most `max_grad_norm`, in place, and tell if they are finite.
 
@@ -103,7 +106,9 @@ def rate_bounds(cfg: OnPolicyCfg, optimizer: torch.optim.Optimizer) -> Float32[T
 
 
 @torch.no_grad()
-def anneal_learning_rate_(cfg: OnPolicyCfg, optimizer: torch.optim.Optimizer, *, done: float) -> None:
+def anneal_learning_rate_(
+    cfg: OnPolicyCfg, optimizer: torch.optim.Optimizer, *, done: float
+) -> None:
     """Bound the learning rate for the rest of a run after a share `done`, in [0, 1], if `cfg` anneals it."""
     if not 0.0 <= done <= 1.0:
         raise ValueError(f"done={done!r}: expected the share of the run that is done, in [0, 1]")
@@ -122,7 +127,9 @@ def make_optimizer(cfg: OnPolicyCfg, *modules: nn.Module) -> torch.optim.Adam:
     `optimizer.param_groups[0]["lr"]` is a float32 tensor [] on the device that changes in place.
     """
     # A trunk that actor and critic share must be stepped once.
-    parameters = list(dict.fromkeys(parameter for module in modules for parameter in module.parameters()))
+    parameters = list(
+        dict.fromkeys(parameter for module in modules for parameter in module.parameters())
+    )
     device = parameters[0].device
     return torch.optim.Adam(
         [{"params": parameters, "initial_lr": cfg.learning_rate}],

@@ -11,7 +11,12 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    dispatch,
+)
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.modules.distributions.utils import rsample_and_log_prob
@@ -143,7 +148,9 @@ class OffPolicyLoss(LossModule):
         """Return the actions of targets for the next observations, and the bonus on their values, [B] or None."""
 
     @abstractmethod
-    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
+    def actor_losses(
+        self, tensordict: TensorDictBase
+    ) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
         """Return the other losses, each with gradients for its own network alone, and the quantities to log."""
 
     @dispatch  # type: ignore[arg-type]
@@ -167,7 +174,9 @@ class OffPolicyLoss(LossModule):
     def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
         """There is no value estimator."""
 
-    def _predict(self, critic: TensorDictModule, observed: TensorDictBase, action: Tensor) -> Tensor:
+    def _predict(
+        self, critic: TensorDictModule, observed: TensorDictBase, action: Tensor
+    ) -> Tensor:
         """Return N critics' predictions for an action: values [B, N], or logits [B, N, A] in the layers' dtype."""
         keys = [key for key in critic.in_keys if key != self.tensor_keys.action]
         # A selection is a new TensorDict, so the minibatch keeps the action of the data.
@@ -196,7 +205,9 @@ class OffPolicyLoss(LossModule):
         following = tensordict.get("next")
         with torch.no_grad():
             # Targets: the policy's action at the next observation, judged by the slow copy of the critics.
-            next_action, next_bonus_B = self._next_action(following.select(*self.actor_network.in_keys))
+            next_action, next_bonus_B = self._next_action(
+                following.select(*self.actor_network.in_keys)
+            )
             reward_B1 = following.get(keys.reward)
             # Only terminations end the future; after a truncation the value of the last observation still counts.
             going_B1 = 1.0 - following.get(keys.terminated).to(reward_B1.dtype)
@@ -251,7 +262,9 @@ class OffPolicyLoss(LossModule):
         column_B = torch.where(weight_B > 0.0, column_B * weight_B, 0.0)
         # In two steps: the compiler makes one block of a sum to 8192 numbers, which takes three times as long.
         parts = math.gcd(len(column_B), 64)
-        column_sum, weight_sum = (own.reshape(parts, -1).sum(-1).sum() for own in (column_B, weight_B))
+        column_sum, weight_sum = (
+            own.reshape(parts, -1).sum(-1).sum() for own in (column_B, weight_B)
+        )
         # If no env state takes part both sums are zero, and so is the mean.
         return column_sum / weight_sum.clamp_min(torch.finfo(torch.float32).tiny)
 
@@ -297,7 +310,9 @@ class SACLoss(OffPolicyLoss):
         next_action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(following))
         return next_action, -self.alpha * log_prob_B
 
-    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
+    def actor_losses(
+        self, tensordict: TensorDictBase
+    ) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
         """Return the losses of actor and temperature, each with gradients for it alone, and the quantities to log."""
         observed = tensordict.select(*self.actor_network.in_keys)
         action, log_prob_B = rsample_and_log_prob(self.actor_network.get_dist(observed))
@@ -352,7 +367,9 @@ class TD3Loss(OffPolicyLoss):
         # Noise may leave the box of the env's actions, beyond which the critics have learned nothing.
         return torch.maximum(torch.minimum(action, self.high_L), self.low_L), None
 
-    def actor_losses(self, tensordict: TensorDictBase) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
+    def actor_losses(
+        self, tensordict: TensorDictBase
+    ) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
         """Return the loss of the actor, which has gradients for it alone, and an empty dict."""
         observed = tensordict.select(*self.actor_network.in_keys)
         action = self.actor_network(observed).get(self.tensor_keys.action)

@@ -87,7 +87,9 @@ def policy_kl(old: Distribution, new: Distribution) -> Float[Tensor, "*batch"] |
         # Parts may keep dims of their action, over which independent components add up.
         dims = len(old.batch_shape)
         known = [
-            part.flatten(dims).sum(-1) if part.ndim > dims else part for part in parts if part is not None
+            part.flatten(dims).sum(-1) if part.ndim > dims else part
+            for part in parts
+            if part is not None
         ]
         # One part without a closed form makes the sum unknown.
         if len(known) == len(parts):

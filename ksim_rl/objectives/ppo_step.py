@@ -16,7 +16,13 @@ from torch import Tensor
 from ksim_rl.objectives.advantage_estimators import GAE, TDLambda, VTrace
 from ksim_rl.objectives.algorithm_cfg import OnPolicyCfg, PPOCfg
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
-from ksim_rl.objectives.gradient_step import StepGuard, adapt_learning_rate_, go_back, rate_bounds, step
+from ksim_rl.objectives.gradient_step import (
+    StepGuard,
+    adapt_learning_rate_,
+    go_back,
+    rate_bounds,
+    step,
+)
 from ksim_rl.objectives.masked import MASK_KEY
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator
 from ksim_rl.objectives.symmetry import Loss, SymmetricAugmentation, mirror_loss
@@ -66,10 +72,14 @@ def make_advantage(
     }
     if cfg.advantage == "vtrace":
         return VTrace(actor=actor, rho_thresh=cfg.rho_thresh, c_thresh=cfg.c_thresh, **options)
-    return {"gae": GAE, "td_lambda": TDLambda}[cfg.advantage](value_lmbda=cfg.value_lmbda, **options)
+    return {"gae": GAE, "td_lambda": TDLambda}[cfg.advantage](
+        value_lmbda=cfg.value_lmbda, **options
+    )
 
 
-def make_loss(cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule) -> ClipPPOLoss:
+def make_loss(
+    cfg: PPOCfg, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule
+) -> ClipPPOLoss:
     """Build the loss of `cfg`. It uses the modules themselves: a change in them is a change in the loss."""
     return ClipPPOLoss(
         actor,
@@ -108,7 +118,9 @@ def make_symmetric(
     def with_mirror_loss(minibatch_B: TensorDictBase) -> TensorDictBase:
         # The mirror loss gets its coefficient here; PPO's own losses come with theirs.
         losses = loss(minibatch_B)
-        return losses.set("loss_mirror", cfg.symmetry_coeff * mirror_loss(actor, minibatch_B, mirror))
+        return losses.set(
+            "loss_mirror", cfg.symmetry_coeff * mirror_loss(actor, minibatch_B, mirror)
+        )
 
     return with_mirror_loss
 

@@ -96,7 +96,9 @@ class RolloutEstimator(ValueEstimatorBase):
         self.min_advantage_std = min_advantage_std
 
     @abstractmethod
-    def _estimate(self, signals: Signals, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    def _estimate(
+        self, signals: Signals, tensordict: TensorDictBase
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the advantages, the value targets, and which steps are finite: advantages elsewhere are ignored."""
 
     @dispatch  # type: ignore[arg-type]
@@ -116,7 +118,9 @@ class RolloutEstimator(ValueEstimatorBase):
         value, the reward or a flag is missing, or their shapes differ.
         """
         # Values first, then the recursion over time, then the standardization of finite advantages.
-        signals = self._signals(tensordict, params, target_params, self._resolved(time_dim, tensordict))
+        signals = self._signals(
+            tensordict, params, target_params, self._resolved(time_dim, tensordict)
+        )
         adv_ET, target_ET, finite_ET = self._estimate(signals, tensordict)
         if self.normalize_advantage:
             adv_ET = standardized(adv_ET, finite_ET, lowest_std=self.min_advantage_std)
@@ -174,7 +178,9 @@ class RolloutEstimator(ValueEstimatorBase):
         for signal in read:
             shapes.append(None if signal is None else tuple(signal.shape))
         if None in shapes or len(set(shapes)) != 1:
-            got = ", ".join(f"{place!r} {shape}" for place, shape in zip(places, shapes, strict=True))
+            got = ", ".join(
+                f"{place!r} {shape}" for place, shape in zip(places, shapes, strict=True)
+            )
             raise ValueError(
                 f"{type(self).__name__} needs these signals, all in one shape [*batch, 1]; got {got}"
             )
@@ -201,7 +207,10 @@ class RolloutEstimator(ValueEstimatorBase):
         """Return the values of a recurrent critic from the first step's state on, and leave its states under "next"."""
         critic = self.value_network
         assert isinstance(critic, TensorDictModule)
-        with nullcontext() if params is None else params.to_module(critic), set_recurrent_mode(True):
+        with (
+            nullcontext() if params is None else params.to_module(critic),
+            set_recurrent_mode(True),
+        ):
             unrolled = critic(tensordict.select(*critic.in_keys))
         tensordict.get("next").update(unrolled.get("next"))
         return unrolled.get(self.tensor_keys.value)

@@ -37,7 +37,9 @@ class SymmetricAugmentation:
         maps = maps or {}
         missing = [key for key in dict.fromkeys([*read, "action"]) if key not in maps]
         if missing:
-            raise ValueError(f"symmetry={symmetry!r} needs the mirror image of {missing}: add it to the maps")
+            raise ValueError(
+                f"symmetry={symmetry!r} needs the mirror image of {missing}: add it to the maps"
+            )
         device = torch.device("cpu" if device is None else device)
         self._images = {key: mirror.tensors(device) for key, mirror in maps.items()}
         source_L, signs_L = self._images["action"]
@@ -45,7 +47,9 @@ class SymmetricAugmentation:
         self._images["loc"] = (source_L, signs_L)
         self._images["scale"] = (source_L, torch.ones_like(signs_L))
 
-    def image_of(self, key: NestedKey, leaf_BL: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch L"]:
+    def image_of(
+        self, key: NestedKey, leaf_BL: Float[Tensor, "*batch L"]
+    ) -> Float[Tensor, "*batch L"]:
         """Return the mirror image of vectors of a kind that has a map."""
         return image(leaf_BL, *self._images[key])
 
@@ -83,7 +87,9 @@ class SymmetricAugmentation:
 
 
 def mirror_loss(
-    actor: ProbabilisticTensorDictSequential, minibatch_B: TensorDictBase, mirror: SymmetricAugmentation
+    actor: ProbabilisticTensorDictSequential,
+    minibatch_B: TensorDictBase,
+    mirror: SymmetricAugmentation,
 ) -> Float[Tensor, ""]:
     """Return the mean squared difference between pi(mirror(s)) and mirror(pi(s)) (Yu et al., arXiv 1801.08093).
 

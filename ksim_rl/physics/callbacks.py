@@ -20,7 +20,9 @@ class Callbacks:
     def of_program(self) -> tuple[str, ...]:
         """Return the names of the callbacks that a program has set and not taken away."""
         present = vars(self._callback).items()
-        return tuple(name for name, callback in present if callback and callback is not self._own[name])
+        return tuple(
+            name for name, callback in present if callback and callback is not self._own[name]
+        )
 
     def keep_ours(self) -> None:
         """Let our callbacks run before those that a program has set in their place.

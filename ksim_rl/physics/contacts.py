@@ -50,7 +50,9 @@ def follow_the_c_engine(warp_model: mjw.Model) -> None:
     # The next one takes pairs away.
     ways = (take_over_height_fields, take_over_measured_boxes, rows_left_out)
     always = tuple(filter(None, [way(warp_model) for way in ways]))
-    of_theirs = corrections(warp_model, warp_model.nxn_geom_pair_filtered, warp_model.nxn_pairid_filtered)
+    of_theirs = corrections(
+        warp_model, warp_model.nxn_geom_pair_filtered, warp_model.nxn_pairid_filtered
+    )
     # Last, when it is known which contacts have rows.
     loosen = loose_contacts(warp_model)
     at_last = () if loosen is None else (loosen,)
@@ -70,13 +72,23 @@ def corrections(warp_model: mjw.Model, pairs: wp.array, pair_ids: wp.array) -> t
 def align_steep_capsules(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     """Launch the turning of contacts of steep capsules with planes, which our own narrow phase need not."""
     contact = warp_data_E.contact
-    inputs = [warp_model.geom_type, warp_data_E.geom_xmat, contact.geom, contact.worldid, warp_data_E.nacon]
+    inputs = [
+        warp_model.geom_type,
+        warp_data_E.geom_xmat,
+        contact.geom,
+        contact.worldid,
+        warp_data_E.nacon,
+    ]
     inputs.append(bool(warp_model.flg_surfacevel))
     outputs = [contact.frame, contact.surfacevel]
-    wp.launch(kernels.align_steep_capsules, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs)
+    wp.launch(
+        kernels.align_steep_capsules, dim=warp_data_E.naconmax, inputs=inputs, outputs=outputs
+    )
 
 
-def _have_capsules_on_planes(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray) -> bool:
+def _have_capsules_on_planes(
+    warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray
+) -> bool:
     # Sorted by type, since a pair may name either geom first.
     types = np.sort(warp_model.geom_type.numpy()[pairs])
     return bool((types == (kernels.PLANE, kernels.CAPSULE)).all(-1).any())
@@ -87,7 +99,9 @@ def drop_upper_corners(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
     contact = warp_data_E.contact
     inputs = [warp_model.geom_type, warp_data_E.geom_xpos, warp_data_E.geom_xmat]
     inputs += [contact.geom, contact.worldid, contact.dist, warp_data_E.nacon]
-    wp.launch(kernels.drop_upper_corners, dim=warp_data_E.naconmax, inputs=inputs, outputs=[contact.type])
+    wp.launch(
+        kernels.drop_upper_corners, dim=warp_data_E.naconmax, inputs=inputs, outputs=[contact.type]
+    )
 
 
 def _have_boxes_on_planes(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray) -> bool:
@@ -105,7 +119,9 @@ def take_the_law_of_priority(warp_model: mjw.Model, warp_data_E: mjw.Data) -> No
     wp.launch(kernels.take_the_law_of_priority, dim=dim, inputs=inputs, outputs=[contact.solref])
 
 
-def _have_direct_laws_of_priority(warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray) -> bool:
+def _have_direct_laws_of_priority(
+    warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray
+) -> bool:
     """Return whether geoms of different priority may touch, one of which gives stiffness and damping directly."""
     # A <pair> has a law of its own, which no priority changes.
     pairs = pairs[pair_ids[:, 0] == upstream.NO_PAIR]

@@ -36,10 +36,26 @@ def check_effects(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
     # Each with the elements that lack the memory for it.
     lacking = {
         "jnt_springyield": (mj_model.jnt_plasticadr < 0, "no joint yields", "give one springyield"),
-        "tendon_springyield": (mj_model.tendon_plasticadr < 0, "no tendon yields", "give one springyield"),
-        "actuator_delay": (mj_model.actuator_history[:, 0] < 1, "no actuator is delayed", "give one nsample"),
-        "sensor_delay": (mj_model.sensor_history[:, 0] < 1, "no sensor is delayed", "give one nsample"),
-        "sensor_interval": (mj_model.sensor_history[:, 0] < 1, "no sensor is delayed", "give one nsample"),
+        "tendon_springyield": (
+            mj_model.tendon_plasticadr < 0,
+            "no tendon yields",
+            "give one springyield",
+        ),
+        "actuator_delay": (
+            mj_model.actuator_history[:, 0] < 1,
+            "no actuator is delayed",
+            "give one nsample",
+        ),
+        "sensor_delay": (
+            mj_model.sensor_history[:, 0] < 1,
+            "no sensor is delayed",
+            "give one nsample",
+        ),
+        "sensor_interval": (
+            mj_model.sensor_history[:, 0] < 1,
+            "no sensor is delayed",
+            "give one nsample",
+        ),
     }
     for field, (lacks, what, remedy) in lacking.items():
         if field in expanded and lacks.all():
@@ -62,7 +78,9 @@ def check_effects(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:
         raise _not_simple(mj_model, "jnt_axis", int(slides.argmax()), "with slides at right angles")
     turns = _turns_about_centre(mj_model)
     if "jnt_pos" in expanded and turns.any():
-        raise _not_simple(mj_model, "jnt_pos", int(turns.argmax()), "turning about its centre of mass")
+        raise _not_simple(
+            mj_model, "jnt_pos", int(turns.argmax()), "turning about its centre of mass"
+        )
 
 
 def _warn_of_still_air(mj_model: mujoco.MjModel, expanded: Collection[str]) -> None:

@@ -20,14 +20,23 @@ _FIELDS_OF_GROUPS = {
     KIN0 | INERT0: "qpos0 body_ipos body_pos body_quat jnt_pos jnt_axis",
     INERT0: "body_inertia body_iquat dof_armature tendon_armature actuator_armature actuator_gear",
 }
-GROUPS_OF_FIELD = {name: groups for groups, names in _FIELDS_OF_GROUPS.items() for name in names.split()}
+GROUPS_OF_FIELD = {
+    name: groups for groups, names in _FIELDS_OF_GROUPS.items() for name in names.split()
+}
 DERIVED_FIELDS = {
     FIXED: "body_subtreemass geom_aabb geom_rbound",
     KIN0: "tendon_length0 eq_data cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0",
     INERT0: "dof_invweight0 body_invweight0 tendon_invweight0 actuator_acc0",
 }
 # The elements that paths pass: tendons over sites and geoms, and transmissions from sites.
-_PATH_FIELDS = {"geom_size", "geom_pos", "geom_quat", "site_pos", "site_quat", "actuator_cranklength"}
+_PATH_FIELDS = {
+    "geom_size",
+    "geom_pos",
+    "geom_quat",
+    "site_pos",
+    "site_quat",
+    "actuator_cranklength",
+}
 _PATH_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK)
 # Not a field of the model but of its options, which put_model cannot expand.
 GRAVITY = "gravity"
@@ -48,13 +57,17 @@ def const_groups(fields: Iterable[str], mj_model: mujoco.MjModel) -> int:
 
 def derived_fields(groups: int) -> tuple[str, ...]:
     """Return the names of the constants of these `SetConstGroup` bits."""
-    return tuple(name for group, names in DERIVED_FIELDS.items() if groups & group for name in names.split())
+    return tuple(
+        name for group, names in DERIVED_FIELDS.items() if groups & group for name in names.split()
+    )
 
 
 def fields_to_expand(fields: Sequence[str], mj_model: mujoco.MjModel) -> tuple[str, ...]:
     """Return `fields` and, after them, the fields that are derived from them and so must differ as well."""
     if isinstance(fields, str):
-        raise ValueError(f"per_world_fields={fields!r}: expected a sequence of names, such as ({fields!r},)")
+        raise ValueError(
+            f"per_world_fields={fields!r}: expected a sequence of names, such as ({fields!r},)"
+        )
     valid = per_world_fields()
     for field in fields:
         check_known("per-world model field", field, (*valid, GRAVITY))

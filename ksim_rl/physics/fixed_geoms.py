@@ -38,7 +38,15 @@ def placing_of_fixed_geoms(
     if not FIELDS.intersection(expanded) or not ids.size:
         return None
     geoms = wp.array(ids, dtype=int, device=d.qpos.device)
-    inputs = [m.body_parentid, m.geom_bodyid, geoms, m.body_pos, m.body_quat, m.geom_pos, m.geom_quat]
+    inputs = [
+        m.body_parentid,
+        m.geom_bodyid,
+        geoms,
+        m.body_pos,
+        m.body_quat,
+        m.geom_pos,
+        m.geom_quat,
+    ]
 
     def place() -> None:
         outputs = [d.geom_xpos, d.geom_xmat]

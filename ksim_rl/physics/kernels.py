@@ -225,7 +225,9 @@ def gather_controls(
 
 
 @wp.kernel(enable_backward=False)
-def shifted_time(before: wp.array[float], timestep: wp.array[float], fraction: float, time: wp.array[float]):
+def shifted_time(
+    before: wp.array[float], timestep: wp.array[float], fraction: float, time: wp.array[float]
+):
     """Write each world's time, some timesteps later."""
     world = wp.tid()
     time[world] = before[world] + fraction * timestep[world % timestep.shape[0]]

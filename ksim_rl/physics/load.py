@@ -21,7 +21,9 @@ from ksim_rl.physics.sim_cfg import SimCfg
 Source = str | Path | mujoco.MjSpec
 
 _ELEMENT = re.compile(r"Element '(?P<tag>[^']*)', line (?P<line>\d+)")
-_NAMED_ELEMENT = re.compile(r"Element name '(?P<name>[^']*)', id (?P<id>-?\d+)(, line (?P<line>\d+))?")
+_NAMED_ELEMENT = re.compile(
+    r"Element name '(?P<name>[^']*)', id (?P<id>-?\d+)(, line (?P<line>\d+))?"
+)
 _FILE_IN_MESSAGE = re.compile(r"file '(?P<file>[^']+)'")
 _SINGULAR = re.compile(r"Inertia matrix is too close to singular.* DOF (?P<dof>\d+)")
 _NAN_ATTRIBUTE = re.compile(r"=\s*[\"'][^\"']*\b[nN][aA][nN]\b")
@@ -127,7 +129,9 @@ def _readable(message: str, label: str, text: str) -> str:
         return f"{label}: {what} (element {called}{_at_line(text, int(found['line'] or 0))})"
     # A missing file has no element: the first line that names it is shown.
     if found := _FILE_IN_MESSAGE.search(message):
-        lines = [number for number, line in enumerate(text.splitlines(), 1) if found["file"] in line]
+        lines = [
+            number for number, line in enumerate(text.splitlines(), 1) if found["file"] in line
+        ]
         return f"{label}: {what}{_at_line(text, lines[0]) if lines else ''}"
     return f"{label}: {what}"
 
@@ -150,7 +154,11 @@ def _refuse_serious(message: str, mj_model: mujoco.MjModel, label: str, text: st
             f"{label}: the inertia that joint {joint!r} moves is not positive at the initial pose"
         )
     if "contains a 'NaN'" in message:
-        lines = [number for number, line in enumerate(text.splitlines(), 1) if _NAN_ATTRIBUTE.search(line)]
+        lines = [
+            number
+            for number, line in enumerate(text.splitlines(), 1)
+            if _NAN_ATTRIBUTE.search(line)
+        ]
         raise ValueError(f"{label}: a value is NaN{_at_line(text, lines[0]) if lines else ''}")
 
 

@@ -14,7 +14,17 @@ from ksim_rl.physics.sensors.sensor_checks import check_sensors
 TYPES_OF_PREFIXES = {"jnt": "joint", "cam": "camera", "mat": "material", "eq": "equality"}
 # The largest number that the float32 of the GPU holds.
 LARGEST = float(np.finfo(np.float32).max)
-DERIVED = ("invweight0", "acc0", "aabb", "rbound", "length0", "subtreemass", "mat0", "pos0", "poscom0")
+DERIVED = (
+    "invweight0",
+    "acc0",
+    "aabb",
+    "rbound",
+    "length0",
+    "subtreemass",
+    "mat0",
+    "pos0",
+    "poscom0",
+)
 # Fields whose enum values tell which elements use a feature that Warp lacks.
 ENUM_FIELDS = {
     "actuator_trntype": mujoco.mjtTrn,
@@ -68,7 +78,8 @@ def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
             raise ValueError(f"{source}: option.{name}={value:g} in <option>: expected at least 0")
     # The first parameter of these gains is a factor; other gains use it in their own way.
     direct = np.isin(
-        mj_model.actuator_gaintype, (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
+        mj_model.actuator_gaintype,
+        (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)),
     )
     fields = {name: np.asarray(getattr(mj_model, name)) for name in NOT_NEGATIVE_FIELDS}
     fields["actuator_gainprm"] = np.where(direct[:, None], mj_model.actuator_gainprm[:, :1], 0.0)
@@ -76,7 +87,9 @@ def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
         bad = np.flatnonzero(values < 0.0)
         if bad.size:
             where = _element_of(mj_model, field, int(bad[0]), values.shape)
-            raise ValueError(f"{source}: {field}={values.flat[bad[0]]:g} in {where}: expected at least 0")
+            raise ValueError(
+                f"{source}: {field}={values.flat[bad[0]]:g} in {where}: expected at least 0"
+            )
     # Without a callback, such an actuator has no law.
     for field, callback in CALLBACKS.items():
         user = ENUM_FIELDS[f"actuator_{field}type"].__members__[f"mj{field.upper()}_USER"]
@@ -123,7 +136,9 @@ def check_flags(mj_model: mujoco.MjModel) -> None:
             if is_flag and flags & int(bit) and int(bit) not in known:
                 names.append(name)
     if names:
-        raise NotImplementedError(f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} unsupported.")
+        raise NotImplementedError(
+            f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} unsupported."
+        )
 
 
 def check_fluid(mj_model: mujoco.MjModel) -> None:
@@ -134,7 +149,9 @@ def check_fluid(mj_model: mujoco.MjModel) -> None:
     """
     opt = mj_model.opt
     # Without a fluid, or with another integrator, nothing is computed wrong.
-    if opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICIT or not (opt.density > 0 or opt.viscosity > 0):
+    if opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICIT or not (
+        opt.density > 0 or opt.viscosity > 0
+    ):
         return
     for geom in np.flatnonzero(mj_model.geom_fluid[:, 0] > 0):
         body = int(mj_model.geom_bodyid[geom])
@@ -177,7 +194,9 @@ def _check_still_tendons(mj_model: mujoco.MjModel) -> None:
             )
 
 
-def _constraint_of_still_tendon(mj_model: mujoco.MjModel, tendon: int, still: Collection[int]) -> str | None:
+def _constraint_of_still_tendon(
+    mj_model: mujoco.MjModel, tendon: int, still: Collection[int]
+) -> str | None:
     m = mj_model
     if m.tendon_frictionloss[tendon] > 0.0:
         return "it has a frictionloss"
@@ -268,7 +287,9 @@ def _float_fields(mj_model: mujoco.MjModel) -> Iterator[tuple[str, float | np.nd
             yield name, value
 
 
-def _element_of(mj_model: mujoco.MjModel, field: str, flat_index: int, shape: tuple[int, ...]) -> str:
+def _element_of(
+    mj_model: mujoco.MjModel, field: str, flat_index: int, shape: tuple[int, ...]
+) -> str:
     """Name the element that a number of a field belongs to."""
     if field.startswith("option."):
         return "<option>"
@@ -308,7 +329,9 @@ def _with_elements(mj_model: mujoco.MjModel, message: str) -> str:
         plugins = np.flatnonzero(mj_model.actuator_plugin != -1)
         users += [_element(mj_model, "actuator", int(i)) for i in plugins]
     for name in ("Integrator", "Cone", "Solver", "DisableBit", "EnableBit"):
-        users += ["<option>" for member in getattr(mujoco, f"mjt{name}").__members__ if member in message]
+        users += [
+            "<option>" for member in getattr(mujoco, f"mjt{name}").__members__ if member in message
+        ]
     if users:
         used_by = f" Used by {', '.join(users[:5])}."
     else:

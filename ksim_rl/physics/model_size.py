@@ -45,10 +45,14 @@ class _Files:
     folder: Path  # of the model itself
     counts: dict[Path, tuple[int, int]] = field(default_factory=dict)
     folders: set[Path] = field(default_factory=set)
-    below: set[str] = field(default_factory=lambda: {""})  # folders of assets, as any of the texts has them
+    below: set[str] = field(
+        default_factory=lambda: {""}
+    )  # folders of assets, as any of the texts has them
     named: set[str] = field(default_factory=set)
     included: list[Path] = field(default_factory=list)
-    recoded: dict[str, bytes] = field(default_factory=dict)  # UTF-8, by the path under which MuJoCo looks
+    recoded: dict[str, bytes] = field(
+        default_factory=dict
+    )  # UTF-8, by the path under which MuJoCo looks
 
     def text(self, path: Path, called: str) -> str:
         """Read a file that is included or attached, which MuJoCo looks for under `called`."""
@@ -149,10 +153,14 @@ def _count(text: str, folder: Path, read: _Files, within: tuple[Path, ...]) -> t
             attachments += times[-1]
         # Each element of the model may hold so much user data.
         elif tag == "size":
-            user += sum(_product(n) for name, n in attributes.items() if name.startswith(("nuser", "nkey")))
+            user += sum(
+                _product(n) for name, n in attributes.items() if name.startswith(("nuser", "nkey"))
+            )
         elif tag in _NUMBERS:
             names, power, each = _NUMBERS[tag]
-            numbers += each * math.prod(_product(attributes.get(name, "")) for name in names) ** power
+            numbers += (
+                each * math.prod(_product(attributes.get(name, "")) for name in names) ** power
+            )
         elif tag in ("include", "model") and "file" in attributes:
             # Resolved, so that a circle through links is found.
             path = (folder / attributes["file"]).resolve()

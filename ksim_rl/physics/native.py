@@ -27,7 +27,11 @@ def source_of(folder: str, parts: tuple[str, ...]) -> str:
 
 def names_of(*enums: Any) -> dict[str, int]:
     """Return the members of enums of MuJoCo's, without the prefixes of their names."""
-    return {name.partition("_")[2]: int(kind) for enum in enums for name, kind in enum.__members__.items()}
+    return {
+        name.partition("_")[2]: int(kind)
+        for enum in enums
+        for name, kind in enum.__members__.items()
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +103,9 @@ def _kernel(
     struct = wp.struct(Problem)
     # Constants of C++, not arguments: loops over them are unrolled.
     named = "".join(f"constexpr int {name} = {value};\n" for name, value in constants)
-    named += "__builtin_assume(lane >= 0 && lane < LANES);\n"  # or else loops over nothing are compiled
+    named += (
+        "__builtin_assume(lane >= 0 && lane < LANES);\n"  # or else loops over nothing are compiled
+    )
 
     @wp.func_native(named + source)
     def body(world: int, lane: int, problem: struct) -> None: ...

@@ -24,7 +24,9 @@ OUT_OF = {
 OF_ROWS = ("NEFC", "NJMAX_NNZ")
 OF_POOL = ("BROADPHASE", "NARROWPHASE", "CCD")
 # In the order of the bits, lowest first.
-BIT_NAMES = tuple(name for name, bit in mjw.OverflowType.__members__.items() if bit and bit & (bit - 1) == 0)
+BIT_NAMES = tuple(
+    name for name, bit in mjw.OverflowType.__members__.items() if bit and bit & (bit - 1) == 0
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -139,5 +141,10 @@ class OverflowRecord:
         # Contacts and candidate pairs share the pool, which needed room for the larger number.
         ncon = max(numbers[len(BIT_NAMES) + 1 :])
         return OverflowReport(
-            worlds=worlds, nefc=nefc, njmax=d.njmax, ncon=ncon, naconmax=d.naconmax, num_envs=d.nworld
+            worlds=worlds,
+            nefc=nefc,
+            njmax=d.njmax,
+            ncon=ncon,
+            naconmax=d.naconmax,
+            num_envs=d.nworld,
         )

@@ -44,7 +44,9 @@ class RayBatch:
         shape = (world.num_envs, num_rays)
         # Arrays are allocated once: graphs keep their addresses.
         with warp_scope(world.device):
-            self._start, self._direction, self._normal = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
+            self._start, self._direction, self._normal = (
+                wp.zeros(shape, dtype=wp.vec3) for _ in range(3)
+            )
             self._distance = wp.zeros(shape, dtype=float)
             self._geom = wp.zeros(shape, dtype=int)
             self._exclude = wp.array(np.full(num_rays, exclude_body, dtype=np.int32), dtype=int)

@@ -53,7 +53,9 @@ class Refresh:
         # A delayed sensor samples at substeps: no refresh may change it.
         has_history = np.any(mj_model.sensor_history > 0, axis=-1)
         self._warp_model, self.kept_by_substep = upstream.sensors_by_refresh(
-            warp_model, skip=has_history | np.isin(sensor_type, COLLISION_SENSORS), sensor_type=sensor_type
+            warp_model,
+            skip=has_history | np.isin(sensor_type, COLLISION_SENSORS),
+            sensor_type=sensor_type,
         )
         if dynamics is not None:
             # It sums the momenta itself.
@@ -63,12 +65,16 @@ class Refresh:
         self._sensors_sum_momenta = reads_sensors and bool(self._warp_model.sensor_subtree_vel)
         # The lengths and moments of actuators are computed only where a sensor reads them.
         self._transmit = self._transmissions(warp_model, sensor_type)
-        self._actuators_act = not int(mj_model.opt.disableflags) & mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        self._actuators_act = (
+            not int(mj_model.opt.disableflags) & mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        )
         objects = (*mj_model.sensor_objtype, *mj_model.sensor_reftype)
         self.needs_cameras = mujoco.mjtObj.mjOBJ_CAMERA in objects
         self.on_demand = self._read_by_sensors(warp_model, sensor_type)
 
-    def _transmissions(self, warp_model: mjw.Model, sensor_type: np.ndarray) -> Callable[[], None] | None:
+    def _transmissions(
+        self, warp_model: mjw.Model, sensor_type: np.ndarray
+    ) -> Callable[[], None] | None:
         if not np.isin(sensor_type, TRANSMISSION_SENSORS).any():
             return None
         return transmissions_of_refresh(warp_model, self._warp_data_E)

@@ -82,7 +82,9 @@ def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Call
         # Empty arrays have no address.
         used = [array for array in arrays if array.size]
         # Widths count floats: every type here has 4 bytes for each number.
-        widths = [array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // rows for array in used]
+        widths = [
+            array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // rows for array in used
+        ]
         places = wp.array([array.ptr for array in used], dtype=wp.uint64, device=device)
         return places, wp.array(widths, dtype=int, device=device)
 
@@ -93,7 +95,9 @@ def resets(warp_model: mjw.Model, warp_data_E: mjw.Data, mask: wp.array) -> Call
         of_adhesion = ()
     of_worlds = table([getattr(d, name) for name in (*ZEROED, *of_adhesion)], d.nworld)
     of_pool = table([getattr(contact, name) for name in sorted(names)], d.naconmax)
-    has_more = any(getattr(m, name) for name in HAS_MORE) or bool(m.opt.enableflags & mjw.EnableBit.SLEEP)
+    has_more = any(getattr(m, name) for name in HAS_MORE) or bool(
+        m.opt.enableflags & mjw.EnableBit.SLEEP
+    )
 
     def launch() -> None:
         # Models with more state need MuJoCo Warp's own reset; ours then zeroes the arrays that it leaves.

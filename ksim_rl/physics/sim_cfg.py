@@ -75,7 +75,14 @@ class SimCfg(Checked):
             option = target.option
         else:
             option = target.opt
-        for field in ("timestep", "impratio", "tolerance", "iterations", "ls_iterations", "ccd_iterations"):
+        for field in (
+            "timestep",
+            "impratio",
+            "tolerance",
+            "iterations",
+            "ls_iterations",
+            "ccd_iterations",
+        ):
             value = getattr(self, field)
             if value is not None:
                 setattr(option, field, value)

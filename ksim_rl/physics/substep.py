@@ -123,7 +123,10 @@ def _act_and_solve(stages: Stages, warp_model: mjw.Model, warp_data_E: mjw.Data)
     is_theirs = stages.dynamics is None
     if is_theirs:
         # Callbacks of controls come before actuation, as in MuJoCo.
-        if warp_model.callback.control and not warp_model.opt.disableflags & mjw.DisableBit.ACTUATION:
+        if (
+            warp_model.callback.control
+            and not warp_model.opt.disableflags & mjw.DisableBit.ACTUATION
+        ):
             warp_model.callback.control(warp_model, warp_data_E)
         mjw.fwd_actuation(warp_model, warp_data_E)
         mjw.fwd_acceleration(warp_model, warp_data_E, factorize=True)
@@ -147,11 +150,18 @@ def _read_state(stages: Stages, warp_model: mjw.Model, warp_data_E: mjw.Data) ->
 
 
 def _read_forces(
-    stages: Stages, warp_model: mjw.Model, warp_data_E: mjw.Data, *, sensors: bool, accelerometers: bool
+    stages: Stages,
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    *,
+    sensors: bool,
+    accelerometers: bool,
 ) -> None:
     """Launch the sensors that accelerations and forces decide, and those forces of bodies that something reads."""
     # Accelerations and forces of all bodies are computed only where something reads them.
-    runs_rne = warp_model.opt.run_rne_postconstraint or (sensors and warp_model.sensor_rne_postconstraint)
+    runs_rne = warp_model.opt.run_rne_postconstraint or (
+        sensors and warp_model.sensor_rne_postconstraint
+    )
     if runs_rne and stages.contacts is not None:
         stages.contacts.rne_postconstraint(warp_model)
     elif runs_rne:

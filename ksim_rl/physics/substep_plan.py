@@ -44,7 +44,10 @@ class SubstepPlan:
         )
         if not self.callbacks:
             return found
-        return (*found, f"callbacks of the program run in each substep: {', '.join(self.callbacks)}")
+        return (
+            *found,
+            f"callbacks of the program run in each substep: {', '.join(self.callbacks)}",
+        )
 
 
 def _whose(unavailable: str | None, theirs: str = "kernels") -> str:
@@ -58,7 +61,9 @@ def substep_plan(
 ) -> SubstepPlan:
     """Return the plan of a world whose model and data are in their final place, without callbacks of a program."""
     # Each stage needs the one before: the reasons follow from each other.
-    dynamics = stages.one_kernel_dynamics_unavailable(warp_model, sim, solver_unavailable=solver_unavailable)
+    dynamics = stages.one_kernel_dynamics_unavailable(
+        warp_model, sim, solver_unavailable=solver_unavailable
+    )
     rows = one_kernel_rows_unavailable(warp_model, dynamics_unavailable=dynamics)
     broad_phase = broad_phase_unavailable(warp_model, warp_data_E, rows_unavailable=rows)
     return SubstepPlan(
@@ -68,7 +73,9 @@ def substep_plan(
         collisions=broad_phase or pairs_left(warp_model),
         rows=rows,
         solver=solver_unavailable,
-        integration=stages.one_kernel_integration_unavailable(warp_model, dynamics_unavailable=dynamics),
+        integration=stages.one_kernel_integration_unavailable(
+            warp_model, dynamics_unavailable=dynamics
+        ),
     )
 
 

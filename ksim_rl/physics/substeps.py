@@ -67,7 +67,12 @@ class Substeps:
         else:
             dynamics = None
         self._refresh = Refresh(
-            mj_model, warp_model, warp_data_E, dynamics, limits, place_fixed_geoms=self._place_fixed_geoms
+            mj_model,
+            warp_model,
+            warp_data_E,
+            dynamics,
+            limits,
+            place_fixed_geoms=self._place_fixed_geoms,
         )
         everything = upstream.without_limit_sensors(warp_model)
         self._models: dict[Sensors, mjw.Model] = dict.fromkeys(get_args(Sensors), everything)
@@ -95,9 +100,13 @@ class Substeps:
                 collide = collisions(warp_model, warp_data_E, self.contact_lists)
         # Sensors that our kernels read, and those that are mended, must not be computed again by MuJoCo Warp's.
         ours = [] if contacts is None else contacts.sensors
-        mended = mend_sensors(mj_model, warp_model, warp_data_E, read=ours, lists=self.contact_lists)
+        mended = mend_sensors(
+            mj_model, warp_model, warp_data_E, read=ours, lists=self.contact_lists
+        )
         if ours or mended:
-            self._models = {which: upstream.without(ours + mended, m) for which, m in self._models.items()}
+            self._models = {
+                which: upstream.without(ours + mended, m) for which, m in self._models.items()
+            }
         self._reads_contacts = bool(mended)
         if warp_model.opt.run_rne_postconstraint or self._models["kept"].sensor_rne_postconstraint:
             # A sensor is left that needs forces of all bodies: our own kernels read accelerometers without them.
@@ -128,7 +137,9 @@ class Substeps:
 
     def _alter(self, **fields: wp.array | mjw.Option) -> None:
         """Change fields of the models of substeps, which share all else with `warp_model`."""
-        self._models = {which: dataclasses.replace(m, **fields) for which, m in self._models.items()}
+        self._models = {
+            which: dataclasses.replace(m, **fields) for which, m in self._models.items()
+        }
 
     def advance(self, *, sensors: Sensors, is_last: bool = True) -> None:
         """Launch one physics step. Sensors never change the state that it reaches; after the last, all may be read."""
@@ -211,7 +222,10 @@ def _solve_as_they_do(
 
 
 def _mending(
-    mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, expanded: Collection[str]
+    mj_model: mujoco.MjModel,
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    expanded: Collection[str],
 ) -> Callable[[], None] | None:
     """Return a launcher of the corrections that MuJoCo Warp's solver needs before it; None where all is right."""
     # The first ones change rows of MuJoCo Warp's; the last one appends rows.

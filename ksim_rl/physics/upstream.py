@@ -173,7 +173,14 @@ def give_velocities_of_surfaces(warp_model: mjw.Model, warp_data_E: mjw.Data) ->
     """Launch the velocities of surfaces of all contacts again: those that we append come after its own launch."""
     d = warp_data_E
     contact = d.contact
-    inputs = [warp_model.geom_surfacevel, d.geom_xpos, d.geom_xmat, contact.pos, contact.frame, contact.geom]
+    inputs = [
+        warp_model.geom_surfacevel,
+        d.geom_xpos,
+        d.geom_xmat,
+        contact.pos,
+        contact.frame,
+        contact.geom,
+    ]
     inputs += [contact.worldid, d.naconmax, d.nacon]
     wp.launch(velocities_of_surfaces, dim=d.naconmax, inputs=inputs, outputs=[contact.surfacevel])
 
@@ -203,9 +210,14 @@ def sensors_by_refresh(
     """
     none = wp.zeros(0, dtype=int)
     # Lists of ids, which are split by whether a refresh may compute the sensor.
-    stages = {name: getattr(warp_model, name).numpy() for name in ("sensor_pos_adr", "sensor_vel_adr")}
+    stages = {
+        name: getattr(warp_model, name).numpy() for name in ("sensor_pos_adr", "sensor_vel_adr")
+    }
     refreshed, kept = (
-        {name: wp.array([i for i in ids if skip[i] == skips], dtype=int) for name, ids in stages.items()}
+        {
+            name: wp.array([i for i in ids if skip[i] == skips], dtype=int)
+            for name, ids in stages.items()
+        }
         for skips in (False, True)
     )
     lists = ("limitpos", "limitvel", "contact_pos", "contact_vel", "stage_pos", "stage_vel")
@@ -223,7 +235,9 @@ def sensors_by_refresh(
     )
     # Only sensors of the refresh read these sums.
     sums = dict.fromkeys(("sensor_subtree_vel", "sensor_e_potential", "sensor_e_kinetic"), False)
-    of_substep = dataclasses.replace(warp_model, **kept, **sums, nrangefinder=rays if keeps_rays else 0)
+    of_substep = dataclasses.replace(
+        warp_model, **kept, **sums, nrangefinder=rays if keeps_rays else 0
+    )
     return of_refresh, of_substep
 
 
@@ -231,7 +245,12 @@ def with_contact_sensors_only(warp_model: mjw.Model) -> mjw.Model:
     """Return a model on the same arrays that computes contact sensors only."""
     none = wp.zeros(0, dtype=int)
     lists = ("pos", "vel", "acc", "touch", "limitpos", "limitvel", "limitfrc", "tendonactfrc")
-    flags = ("sensor_rne_postconstraint", "sensor_subtree_vel", "sensor_e_potential", "sensor_e_kinetic")
+    flags = (
+        "sensor_rne_postconstraint",
+        "sensor_subtree_vel",
+        "sensor_e_potential",
+        "sensor_e_kinetic",
+    )
     counts = dict.fromkeys(("nrangefinder", "nsensorcollision", "nsensortaxel"), 0)
     own = {f"sensor_{name}_adr": none for name in lists} | dict.fromkeys(flags, False)
     return dataclasses.replace(warp_model, **own, **counts)

@@ -12,7 +12,9 @@ from torch import Tensor
 from ksim_rl.checks import check_known
 
 # Left as they were by mujoco_warp.reset_data, though they belong to the episode that ended.
-_ACCELERATION_STAGE = "actuator_force qfrc_actuator qfrc_constraint qfrc_passive cacc cfrc_int cfrc_ext"
+_ACCELERATION_STAGE = (
+    "actuator_force qfrc_actuator qfrc_constraint qfrc_passive cacc cfrc_int cfrc_ext"
+)
 # The arrays that a substep depends on: integrated, or set by the user.
 _INPUTS = "time qpos qvel act ctrl qfrc_applied xfrc_applied mocap_pos mocap_quat qacc_warmstart"
 # The rest of the state of a world, then results of the last substep that `refresh` does not recompute, but terms may

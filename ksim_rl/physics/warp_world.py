@@ -67,7 +67,9 @@ class WarpWorld(World):
         expanded = self._expanded
         self.njmax, self.nconmax = capacity.capacities(self.mj_model, self.sim, expanded)
         capacity.check_countable(self.njmax, self.nconmax, num_envs=num_envs)
-        self.one_kernel_unavailable = one_kernel_unavailable(self.mj_model, self.sim, njmax=self.njmax)
+        self.one_kernel_unavailable = one_kernel_unavailable(
+            self.mj_model, self.sim, njmax=self.njmax
+        )
         stored_mj_model = stored_form(self.mj_model, is_sparse=self.has_one_kernel_solver)
         self._graphs = WarpGraphs(self.device, require_graphs=self.sim.require_graphs)
         with memory_for(num_envs, self.device), warp_scope(self.device):
@@ -80,7 +82,11 @@ class WarpWorld(World):
                 )
             nonzeros = room_for_nonzeros(self.warp_model, expanded, njmax=self.njmax)
             self.warp_data_E = mjw.make_data(
-                stored_mj_model, nworld=num_envs, nconmax=self.nconmax, njmax=self.njmax, njmax_nnz=nonzeros
+                stored_mj_model,
+                nworld=num_envs,
+                nconmax=self.nconmax,
+                njmax=self.njmax,
+                njmax_nnz=nonzeros,
             )
             upstream.drop_unread(self.warp_model, self.warp_data_E)
             gravity_EL = upstream.expand_gravity(self.warp_model, num_envs)
@@ -96,7 +102,9 @@ class WarpWorld(World):
             self.one_kernel_collisions_unavailable = plan.collisions
             self.one_kernel_integration_unavailable = plan.integration
             # One of torch's, since Warp's own wait for the default stream, which no capture allows.
-            aside = None if self.device.type == "cpu" else warp_stream(torch.cuda.Stream(self.device))
+            aside = (
+                None if self.device.type == "cpu" else warp_stream(torch.cuda.Stream(self.device))
+            )
             with as_if_drawn(m, expanded):
                 self._substeps = Substeps(
                     *(self.mj_model, m, d),
@@ -115,7 +123,12 @@ class WarpWorld(World):
             state = views.state_tensors(self.warp_data_E)
             with warp_scope(self.device):
                 self._nan_guard = NanGuard(
-                    self.sim.nan_guard, self.mj_model, state, self._fields, num_envs=num_envs, by_warp=True
+                    self.sim.nan_guard,
+                    self.mj_model,
+                    state,
+                    self._fields,
+                    num_envs=num_envs,
+                    by_warp=True,
                 )
         self.gravity_EL = gravity_EL
         # From here on, callbacks that appear are the program's.
@@ -164,7 +177,9 @@ class WarpWorld(World):
                 for hook in before:
                     hook()
                 which = self._sensors_of(substep, n, sensors)
-                self._run_substeps(("substep", which), lambda which=which: self._launch_substep(which))
+                self._run_substeps(
+                    ("substep", which), lambda which=which: self._launch_substep(which)
+                )
                 for hook in after:
                     hook()
         if self._nan_guard is not None:
@@ -395,7 +410,9 @@ class WarpWorld(World):
         tensors = views.state_tensors(self.warp_data_E)
         tensors |= {f"field/{name}": tensor for name, tensor in self._fields.items()}
         overflow = self._overflow.arrays
-        return tensors | {f"overflow/{name}": wp.to_torch(array) for name, array in overflow.items()}
+        return tensors | {
+            f"overflow/{name}": wp.to_torch(array) for name, array in overflow.items()
+        }
 
     def _run_substeps(self, key: Hashable, launches: Callable[[], None]) -> None:
         """Run launches of MuJoCo Warp's stages, among which callbacks may stand.

@@ -93,12 +93,16 @@ class World(views.DataViews):
         # Arguments are checked before anything is allocated or compiled.
         check_count("num_envs", num_envs)
         if not isinstance(mj_model, mujoco.MjModel):
-            raise ValueError(f"mj_model={mj_model!r}: expected a mujoco.MjModel, as load_model returns it")
+            raise ValueError(
+                f"mj_model={mj_model!r}: expected a mujoco.MjModel, as load_model returns it"
+            )
         if sim is not None and not isinstance(sim, SimCfg):
             raise ValueError(f"sim={sim!r}: expected a SimCfg, or None")
         self.device = checked_device(device)
         # Once more, since a subclass may be called directly.
-        name, why = _choice(mj_model, num_envs=num_envs, device=device, sim=sim, warp_alone=warp_alone)
+        name, why = _choice(
+            mj_model, num_envs=num_envs, device=device, sim=sim, warp_alone=warp_alone
+        )
         if name == self.engine:
             self.engine_because = why
         else:

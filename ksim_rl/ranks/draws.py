@@ -22,7 +22,9 @@ class TensorOptions(TypedDict, total=False):
     device: torch.device | str
 
 
-def rand(shape: Sequence[int], *, dim: int = 0, **options: Unpack[TensorOptions]) -> Shaped[Tensor, "*shape"]:
+def rand(
+    shape: Sequence[int], *, dim: int = 0, **options: Unpack[TensorOptions]
+) -> Shaped[Tensor, "*shape"]:
     """Draw from the uniform distribution on [0, 1)."""
     return _own(torch.rand, shape, dim, options)
 
@@ -45,10 +47,14 @@ def exponential(
     shape: Sequence[int], *, dim: int = 0, **options: Unpack[TensorOptions]
 ) -> Shaped[Tensor, "*shape"]:
     """Draw from the exponential distribution of mean 1."""
-    return _own(lambda whole, **options: torch.empty(whole, **options).exponential_(), shape, dim, options)
+    return _own(
+        lambda whole, **options: torch.empty(whole, **options).exponential_(), shape, dim, options
+    )
 
 
-def _own(draw: Callable[..., Tensor], shape: Sequence[int], dim: int, options: TensorOptions) -> Tensor:
+def _own(
+    draw: Callable[..., Tensor], shape: Sequence[int], dim: int, options: TensorOptions
+) -> Tensor:
     if size() == 1:
         return draw(shape, **options)
     # As many rows as all ranks have together.

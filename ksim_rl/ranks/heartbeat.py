@@ -114,7 +114,9 @@ class Heartbeat:
             except Exception as error:
                 if not self._stop.is_set():
                     reason = " ".join(str(error).split())
-                    self._give_up(f"the store of the run is gone, and with it its rank or torchrun: {reason}")
+                    self._give_up(
+                        f"the store of the run is gone, and with it its rank or torchrun: {reason}"
+                    )
 
     def _give_up(self, why: str) -> None:
         """End this process immediately: its main thread may wait in a collective that nothing can interrupt."""

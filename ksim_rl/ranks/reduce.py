@@ -92,7 +92,9 @@ def combined(
 ) -> dict[str, Num[Tensor, ""]]:
     """Return metrics of all ranks, by one collective: sums of `added`, maxima of `most` (prefixes), and else means."""
     # In the order of the mapping, which is the same on all ranks.
-    values_M = torch.stack([value.detach().to(torch.float64).reshape(()) for value in metrics.values()])
+    values_M = torch.stack(
+        [value.detach().to(torch.float64).reshape(()) for value in metrics.values()]
+    )
     values_RM = torch.stack(gather(values_M))
     whole = {}
     for name, column_R in zip(metrics, values_RM.unbind(1), strict=True):

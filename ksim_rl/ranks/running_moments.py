@@ -8,7 +8,14 @@ from torch import Tensor, nn
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.device import group
-from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator, source_of
+from ksim_rl.device.quick_launch import (
+    ADDRESS,
+    QuickLaunch,
+    address,
+    arguments_of,
+    as_operator,
+    source_of,
+)
 from ksim_rl.ranks.reduce import merged
 
 # Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows. Short ones hold up
@@ -28,7 +35,12 @@ _quick = QuickLaunch(
 
 
 def _count(
-    values_NL: Tensor, valid_N: Tensor | None, count: Tensor, mean_L: Tensor, squares_L: Tensor, until: int
+    values_NL: Tensor,
+    valid_N: Tensor | None,
+    count: Tensor,
+    mean_L: Tensor,
+    squares_L: Tensor,
+    until: int,
 ) -> None:
     """Count rows into moments, in place: all numbers are added in one order, in float64."""
     num_rows, dim = values_NL.shape
@@ -40,15 +52,35 @@ def _count(
     # Stage 0 sets the rows to 0 that do not count.
     counts_N = torch.ones(num_rows, dtype=torch.uint8, device=count.device)
     # Mean and squares of each column, and one weight, for each part and group; the total at the end.
-    moments = torch.empty((2 * dim + 1) * (parts + groups) + 1, dtype=torch.float64, device=count.device)
+    moments = torch.empty(
+        (2 * dim + 1) * (parts + groups) + 1, dtype=torch.float64, device=count.device
+    )
     at = [address(own) for own in (values_NL, valid_N, counts_N, moments, count, mean_L, squares_L)]
     for stage, size in enumerate(((num_rows, dim // span), (parts, dim), (groups, dim), (1, dim))):
-        _quick(count.device, size, stage, num_rows, dim, rows, parts, groups, group.size(), span, until, *at)
+        _quick(
+            count.device,
+            size,
+            stage,
+            num_rows,
+            dim,
+            rows,
+            parts,
+            groups,
+            group.size(),
+            span,
+            until,
+            *at,
+        )
     count.copy_(moments[-1])
 
 
 def _count_in_torch(
-    values_NL: Tensor, valid_N: Tensor | None, count: Tensor, mean_L: Tensor, squares_L: Tensor, until: int
+    values_NL: Tensor,
+    valid_N: Tensor | None,
+    count: Tensor,
+    mean_L: Tensor,
+    squares_L: Tensor,
+    until: int,
 ) -> None:
     """Do the same as the kernel: the moments of the batch by two passes, merged with all earlier ones."""
     # A row counts as a whole or not at all.
@@ -113,14 +145,20 @@ class RunningMoments(nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.int64, device=device))
         # Of squared deviations from the mean. float32 would stop growing after some 10^7 rows.
         self.register_buffer("exact_mean", torch.zeros(dim, dtype=torch.float64, device=device))
-        self.register_buffer("exact_sum_of_squares", torch.zeros(dim, dtype=torch.float64, device=device))
+        self.register_buffer(
+            "exact_sum_of_squares", torch.zeros(dim, dtype=torch.float64, device=device)
+        )
 
-    def normalized(self, values: Float[Tensor, "*batch L"], eps: float) -> Float[Tensor, "*batch L"]:
+    def normalized(
+        self, values: Float[Tensor, "*batch L"], eps: float
+    ) -> Float[Tensor, "*batch L"]:
         """Return `(values - mean) / sqrt(var + eps)`."""
         return (values - self.mean).mul_(torch.rsqrt(self.var + eps))
 
     @torch.no_grad()
-    def update(self, values: Float[Tensor, "*batch L"], valid: Bool[Tensor, "*rows"] | None = None) -> None:
+    def update(
+        self, values: Float[Tensor, "*batch L"], valid: Bool[Tensor, "*rows"] | None = None
+    ) -> None:
         """Count every row of `values` once, and publish.
 
         Rows with a non-finite element, and rows that `valid` ([...] or [..., 1]) marks False, are left out.
@@ -134,7 +172,9 @@ class RunningMoments(nn.Module):
     ) -> None:
         """Count every row of `values` once, as `update` does, and leave `mean` and `var` as they are."""
         if values.shape[-1] != self.dim:
-            raise ValueError(f"obs has shape {tuple(values.shape)}: the last dim must be {self.dim}")
+            raise ValueError(
+                f"obs has shape {tuple(values.shape)}: the last dim must be {self.dim}"
+            )
         values_NL = values.reshape(-1, self.dim)
         if valid is not None and valid.numel() != len(values_NL):
             raise ValueError(

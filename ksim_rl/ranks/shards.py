@@ -137,7 +137,9 @@ def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
 def _merged_moments(prefix: str, parts: list[Tensors]) -> Tensors:
     """Give rank 0 the counts of all ranks, and the others nothing; `mean` and `var` are of all ranks already."""
     merged = {
-        leaf.removeprefix(prefix): tensor for leaf, tensor in parts[0].items() if leaf.startswith(prefix)
+        leaf.removeprefix(prefix): tensor
+        for leaf, tensor in parts[0].items()
+        if leaf.startswith(prefix)
     }
     if rank():
         zeros = {name: torch.zeros_like(merged[name]) for name in (_COUNT, _MEAN, _SQUARES)}
@@ -147,7 +149,9 @@ def _merged_moments(prefix: str, parts: list[Tensors]) -> Tensors:
         added = part[f"{prefix}{_COUNT}"].double()
         share = added / (count + added).clamp_min(1)
         delta = part[f"{prefix}{_MEAN}"] - merged[_MEAN]
-        merged[_SQUARES] = merged[_SQUARES] + part[f"{prefix}{_SQUARES}"] + delta.square() * share * count
+        merged[_SQUARES] = (
+            merged[_SQUARES] + part[f"{prefix}{_SQUARES}"] + delta.square() * share * count
+        )
         merged[_MEAN] = merged[_MEAN] + delta * share
         merged[_COUNT] = merged[_COUNT] + part[f"{prefix}{_COUNT}"]
     return merged

@@ -63,10 +63,16 @@ def joined(command: str) -> Iterator[None]:
     try:
         _attempts[:] = [store.attempt(_runs[0], rank=rank, size=size)]
         dist.init_process_group(
-            backend, store=_of_attempt(_runs[0]), rank=rank, world_size=size, timeout=timedelta(minutes=30)
+            backend,
+            store=_of_attempt(_runs[0]),
+            rank=rank,
+            world_size=size,
+            timeout=timedelta(minutes=30),
         )
     except RuntimeError as error:
-        raise RuntimeError(f"the other ranks cannot be reached: {' '.join(str(error).split())}") from error
+        raise RuntimeError(
+            f"the other ranks cannot be reached: {' '.join(str(error).split())}"
+        ) from error
     # Before the first collective on CUDA, which would run on GPU 0 otherwise.
     if backend != "gloo":
         torch.cuda.set_device(number("LOCAL_RANK"))

@@ -32,8 +32,12 @@ def connected(*, serves: bool = False) -> dist.TCPStore:
         reason = " ".join(str(error).split())
         # The user's mistake, which waiting does not mend.
         if "EADDRINUSE" in reason or "address already in use" in reason.lower():
-            raise ValueError(f"MASTER_PORT={port} is in use on {host}: choose another one") from error
-        raise RuntimeError(f"the other ranks cannot be reached at {host}:{port}: {reason}") from error
+            raise ValueError(
+                f"MASTER_PORT={port} is in use on {host}: choose another one"
+            ) from error
+        raise RuntimeError(
+            f"the other ranks cannot be reached at {host}:{port}: {reason}"
+        ) from error
 
 
 def is_served_by_rank() -> bool:

@@ -6,7 +6,16 @@ from pathlib import Path
 from ksim_rl.config.plain_data import flat, read_yaml
 from ksim_rl.runs import curves
 from ksim_rl.runs.csv_table import STEP
-from ksim_rl.runs.listing import CONFIG, HEADS, METRICS, line, metric_rows, numbers, summarize, written
+from ksim_rl.runs.listing import (
+    CONFIG,
+    HEADS,
+    METRICS,
+    line,
+    metric_rows,
+    numbers,
+    summarize,
+    written,
+)
 from ksim_rl.runs.plotting import Figure, FigureCanvasAgg, plain_style
 from ksim_rl.terminal import printable
 
@@ -40,7 +49,10 @@ def figures(folders: Sequence[Path]) -> list[list[str]]:
     A ValueError names a folder that is no run, or whose config cannot be read.
     """
     configs = [_config(folder) for folder in folders]
-    lines = [line(summarize(folder), name=name) for folder, name in zip(folders, names(folders), strict=True)]
+    lines = [
+        line(summarize(folder), name=name)
+        for folder, name in zip(folders, names(folders), strict=True)
+    ]
     rows = [[head, *cells] for head, *cells in zip(HEADS, *lines, strict=True)]
     returns = [
         # Evaluations where there are any, else training episodes.
@@ -80,7 +92,9 @@ def draw(folders: Sequence[Path], picture: Path) -> None:
         for name, rows in zip(names(folders), tables, strict=True):
             # Rows that have both, so that the two lists fit.
             points = [row for row in rows if numbers([row], over) and numbers([row], metric)]
-            axes.plot(numbers(points, over), numbers(points, metric), label=printable(name), linewidth=1.6)
+            axes.plot(
+                numbers(points, over), numbers(points, metric), label=printable(name), linewidth=1.6
+            )
         if title == PANELS[-1][0]:
             # Where iterations overlap, one that waited for a graph to be recorded makes the next one look short.
             speeds = sorted(speed for rows in tables for speed in numbers(rows, metric)) or [1.0]

@@ -35,7 +35,9 @@ class CsvTable:
             pass
         # The last row, and those before it that could not be written yet.
         self._rows: list[dict[str, str]] = []
-        self._last_begins: int | None = None  # its place in the file; None: the whole table has to be copied
+        self._last_begins: int | None = (
+            None  # its place in the file; None: the whole table has to be copied
+        )
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
         """Append one row, or complete the last one."""
@@ -135,7 +137,9 @@ def _opened(path: Path) -> Iterator[tuple[list[str], Iterator[dict[str, str]]]]:
         if head.count(",") >= MOST_COLUMNS:
             raise ValueError(f"{path}: damaged: more than {MOST_COLUMNS} columns")
         # A last line without its end was cut off by a crash.
-        reader = csv.DictReader(line for line in itertools.chain([head], lines) if line.endswith("\n"))
+        reader = csv.DictReader(
+            line for line in itertools.chain([head], lines) if line.endswith("\n")
+        )
         # Rows with too few or too many cells are damaged.
         rows = (row for row in reader if row.get(STEP) and None not in row.values())
         yield list(reader.fieldnames or [STEP]), rows

@@ -9,7 +9,10 @@ from ksim_rl.runs.plotting import Axes, EngFormatter, Figure, FigureCanvasAgg, p
 PANELS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     (
         "Return",
-        (("episode/return", "training episodes"), ("evaluation/return_mean", "evaluation, deterministic")),
+        (
+            ("episode/return", "training episodes"),
+            ("evaluation/return_mean", "evaluation, deterministic"),
+        ),
     ),
     ("Episode length (env steps)", (("episode/length", "training episodes"),)),
     ("Value loss", (("loss/value", "value"),)),
@@ -29,7 +32,9 @@ def draw(table: Path, picture: Path, *, title: str, solved_at: float | None = No
     _, rows = read_table(table)
     # Only panels with data: algorithms log different metrics.
     present = [
-        (name, series) for name, series in PANELS if any(row.get(key) for row in rows for key, _ in series)
+        (name, series)
+        for name, series in PANELS
+        if any(row.get(key) for row in rows for key, _ in series)
     ]
     if not present:
         raise ValueError(f"{table}: no rows to draw")
@@ -64,7 +69,11 @@ def _draw_panel(
     # Only in the panel of returns.
     if solved_at is not None:
         axes.axhline(
-            solved_at, color="#4e9a06", linestyle="--", linewidth=1.2, label=f"solved at {solved_at:g}"
+            solved_at,
+            color="#4e9a06",
+            linestyle="--",
+            linewidth=1.2,
+            label=f"solved at {solved_at:g}",
         )
     dress(axes, name)
     if len(axes.lines) > 1:

@@ -67,7 +67,9 @@ def find(folder: Path) -> list[Path]:
 def _walk(folder: Path) -> Iterator[Path]:
     for root, folders, files in os.walk(folder):
         # The config alone is not enough: a folder of configs has one, too.
-        if CONFIG in files and ("checkpoint" in folders or record.RECORD in files or METRICS in files):
+        if CONFIG in files and (
+            "checkpoint" in folders or record.RECORD in files or METRICS in files
+        ):
             folders.clear()  # a run holds no other
             yield Path(root)
 

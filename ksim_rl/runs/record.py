@@ -179,7 +179,9 @@ def _code(folder: Path, session: int) -> dict[str, dict[str, str]]:
             else:
                 found[name]["changed"] = "too much to keep"
         # Files that git does not know are named, not copied.
-        if new := ask_git(top, "ls-files", "--others", "--exclude-standard", "--exclude=__pycache__"):
+        if new := ask_git(
+            top, "ls-files", "--others", "--exclude-standard", "--exclude=__pycache__"
+        ):
             found[name]["not in git"] = ", ".join(new.decode(errors="replace").splitlines()[:20])
     return found
 

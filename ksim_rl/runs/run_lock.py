@@ -30,7 +30,9 @@ def locked(folder: Path, *, note: Callable[[str], None]) -> Iterator[None]:
     except OSError as error:
         if error.errno not in WITHOUT_LOCKS:
             raise
-        note(f"warning: {folder} cannot be locked ({error.strerror}): see that no other process writes it")
+        note(
+            f"warning: {folder} cannot be locked ({error.strerror}): see that no other process writes it"
+        )
         yield
         return
     try:
@@ -71,9 +73,13 @@ def _take(folder: Path) -> IO[str]:
                     if os.path.samestat(os.fstat(file.fileno()), os.stat(folder / LOCK)):
                         return file
             elif (holder := file.read(MOST_LETTERS)) or attempt == 20:
-                raise ValueError(f"{folder}: {_described(holder)} writes this run: wait for it, or end it")
+                raise ValueError(
+                    f"{folder}: {_described(holder)} writes this run: wait for it, or end it"
+                )
             else:
-                time.sleep(0.05)  # another looks whether it is locked, or is about to write its name
+                time.sleep(
+                    0.05
+                )  # another looks whether it is locked, or is about to write its name
         except BaseException:
             file.close()
             raise

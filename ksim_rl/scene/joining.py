@@ -76,7 +76,10 @@ def _keep_masses(spec: mujoco.MjSpec, mj_model: mujoco.MjModel) -> None:
     """Write down the inertias that the compiler's settings make of bodies, which a joined model does not have."""
     compiler = spec.compiler
     if not (
-        compiler.settotalmass > 0.0 or compiler.boundmass or compiler.boundinertia or compiler.balanceinertia
+        compiler.settotalmass > 0.0
+        or compiler.boundmass
+        or compiler.boundinertia
+        or compiler.balanceinertia
     ):
         return
     for number, body in enumerate(spec.bodies):
@@ -101,7 +104,9 @@ def _check(mj_model: mujoco.MjModel, parts: list[_Part]) -> None:
     for kind, count in COUNTS.items():
         rows_of = _rows(mj_model, kind, parts)
         fields = [
-            name for name in dir(mj_model) if name.startswith(f"{kind}_") and not PLACES.fullmatch(name)
+            name
+            for name in dir(mj_model)
+            if name.startswith(f"{kind}_") and not PLACES.fullmatch(name)
         ]
         for part, rows in zip(parts, rows_of, strict=True):
             # An element that is missing or doubled would shift all rows after it.
@@ -155,7 +160,9 @@ def _rows(mj_model: mujoco.MjModel, kind: str, parts: list[_Part]) -> Iterator[l
         own = _own_rows(part.mj_model, kind)
         rows: list[int] = []
         for row in own:
-            stands_in_world = kind in ("geom", "site") and getattr(part.mj_model, f"{kind}_bodyid")[row] == 0
+            stands_in_world = (
+                kind in ("geom", "site") and getattr(part.mj_model, f"{kind}_bodyid")[row] == 0
+            )
             if stands_in_world:
                 rows.append(in_world)
                 in_world += 1

@@ -26,8 +26,12 @@ def complete_keyframes(spec: mujoco.MjSpec) -> None:
     MuJoCo would read zeros, which throw the joints to where servos have their zero.
     """
     # Without activations there is nothing that a keyframe could leave out of them.
-    has_activations = any(actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE for actuator in spec.actuators)
-    silent = [key for key in spec.keys if not len(key.ctrl) or (has_activations and not len(key.act))]
+    has_activations = any(
+        actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE for actuator in spec.actuators
+    )
+    silent = [
+        key for key in spec.keys if not len(key.ctrl) or (has_activations and not len(key.act))
+    ]
     if not silent or not len(spec.actuators):
         return
     # Whoever compiles the spec in the end passes the warnings on.

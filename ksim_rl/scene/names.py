@@ -30,7 +30,13 @@ class NameResolver:
     def __init__(self, mj_model: mujoco.MjModel, device: torch.device) -> None:
         self._device = device
         m = mj_model
-        counts = {"body": m.nbody, "geom": m.ngeom, "site": m.nsite, "actuator": m.nu, "sensor": m.nsensor}
+        counts = {
+            "body": m.nbody,
+            "geom": m.ngeom,
+            "site": m.nsite,
+            "actuator": m.nu,
+            "sensor": m.nsensor,
+        }
         counts |= {"tendon": m.ntendon, "pair": m.npair, "camera": m.ncam, "light": m.nlight}
         counts["material"] = m.nmat
         # Rows of each table; joints are hinges and slides only, as actions and observations know them.

@@ -21,4 +21,6 @@ class NearNames:
             if name.startswith("_"):
                 raise AttributeError(f"{kind} has no {name!r}")
             names = [other for other in dir(self) if not other.startswith("_")]
-            raise AttributeError(f"{kind} has no {name!r}: {near(name, names)} (all of them: docs/view.md)")
+            raise AttributeError(
+                f"{kind} has no {name!r}: {near(name, names)} (all of them: docs/view.md)"
+            )

@@ -67,7 +67,9 @@ def yaw(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
 
 
 def from_euler_xyz(
-    roll: Float[Tensor, "*batch"], pitch: Float[Tensor, "*batch"], yaw_angle: Float[Tensor, "*batch"]
+    roll: Float[Tensor, "*batch"],
+    pitch: Float[Tensor, "*batch"],
+    yaw_angle: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch 4"]:
     """Return Rz(yaw) Ry(pitch) Rx(roll) as quaternions [..., 4]; angles in rad, [...]."""
     half = 0.5 * torch.stack((roll, pitch, yaw_angle), dim=-1)
@@ -90,7 +92,9 @@ def wrap_to_pi(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
 
 
-def turn_planar(v: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2"]:
+def turn_planar(
+    v: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 2"]:
     """Turn vectors of the xy plane about z by an angle, rad, counterclockwise seen from above."""
     cos = torch.cos(angle)
     sin = torch.sin(angle)

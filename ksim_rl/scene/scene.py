@@ -40,7 +40,14 @@ class Placement(Checked):
         # Elements inside of a frame move with that frame.
         loose = [
             element
-            for kind in (world.frames, world.bodies, world.geoms, world.sites, world.cameras, world.lights)
+            for kind in (
+                world.frames,
+                world.bodies,
+                world.geoms,
+                world.sites,
+                world.cameras,
+                world.lights,
+            )
             for element in kind
             if element.frame is None
         ]
@@ -91,14 +98,20 @@ class SceneCfg(Checked):
     `view.contact(name)` and its kin; sensors of the MJCF need no entry here.
     """
 
-    robots: Annotated[Mapping[str, Robot], Filled("name at least one robot")]  # the first is what terms mean
+    robots: Annotated[
+        Mapping[str, Robot], Filled("name at least one robot")
+    ]  # the first is what terms mean
     objects: Mapping[str, Robot] = field(default_factory=dict)  # cubes, balls, doors
-    placements: Mapping[str, Placement] = field(default_factory=dict)  # of robots and objects, by name
+    placements: Mapping[str, Placement] = field(
+        default_factory=dict
+    )  # of robots and objects, by name
     terrain: Terrain | None = None  # None: the robot's own model has its ground
     sensors: Mapping[str, Sensor] = field(default_factory=dict)  # of contacts, rays, cameras, IMUs
     num_envs: Count = 1  # a run's own number takes its place
     spacing: NonNegative = 2.0  # m between neighbouring envs when several are drawn in one picture
-    soft_joint_pos_limit_factor: Share = 1.0  # of each joint's range, about its middle: the soft limits
+    soft_joint_pos_limit_factor: Share = (
+        1.0  # of each joint's range, about its middle: the soft limits
+    )
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return the numbers of the smallest worlds."""
@@ -111,7 +124,9 @@ class SceneCfg(Checked):
                 raise ValueError(f"objects: {name!r} is the name of a robot: give it another")
         for name in self.placements:
             if name not in self.entities:
-                raise ValueError(f"placements: no robot or object {name!r}: {near(name, self.entities)}")
+                raise ValueError(
+                    f"placements: no robot or object {name!r}: {near(name, self.entities)}"
+                )
 
     @property
     def entities(self) -> Mapping[str, Robot]:
@@ -147,7 +162,9 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     return spec
 
 
-def load_scene(cfg: SceneCfg, sim: SimCfg, *, per_world_fields: Iterable[str] = ()) -> mujoco.MjModel:
+def load_scene(
+    cfg: SceneCfg, sim: SimCfg, *, per_world_fields: Iterable[str] = ()
+) -> mujoco.MjModel:
     """Return the model of a scene under the options of `sim`, in which worlds may differ in some fields."""
     spec = build_spec(cfg)
     sim.apply_to(spec)

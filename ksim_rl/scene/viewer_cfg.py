@@ -19,9 +19,15 @@ class ViewerCfg(Checked):
     """
 
     body: str | None = None  # the body that it follows
-    lookat: tuple[float, float, float] = (0.0, 0.0, 0.5)  # where no body is followed: m, world frame
+    lookat: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.5,
+    )  # where no body is followed: m, world frame
     distance: Positive = 3.0  # m from the body or point that it looks at
-    elevation: Annotated[float, Within(low=-90.0, high=90.0)] = -20.0  # degrees, as in MuJoCo's free camera
+    elevation: Annotated[
+        float, Within(low=-90.0, high=90.0)
+    ] = -20.0  # degrees, as in MuJoCo's free camera
     azimuth: Annotated[float, Within(low=-360.0, high=360.0)] = 120.0  # degrees
     width: Count = 640  # pixels
     height: Count = 480  # pixels

@@ -11,5 +11,7 @@ def package_folder(package: str, *, of: str, extra: str) -> Path:
     """Return where a package of models lies, which is not imported; a ValueError says how to install it."""
     found = find_spec(package.replace("-", "_"))
     if found is None or not found.submodule_search_locations:
-        raise ValueError(f"{of} need the models of the package {package}: pip install 'ksim_rl[{extra}]'")
+        raise ValueError(
+            f"{of} need the models of the package {package}: pip install 'ksim_rl[{extra}]'"
+        )
     return Path(found.submodule_search_locations[0])

@@ -30,7 +30,11 @@ def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | Non
         if points[-1]["env_states"] < point["env_states"] + HELD_STATES:
             return None
         # From this point on, for as many env states as have to be held.
-        held = [other for other in points[index:] if other["env_states"] <= point["env_states"] + HELD_STATES]
+        held = [
+            other
+            for other in points[index:]
+            if other["env_states"] <= point["env_states"] + HELD_STATES
+        ]
         means = means_of(held, levels)
         if all(means.get(name, -math.inf) >= level for name, level in levels.items()):
             return held[-1]
@@ -61,7 +65,9 @@ def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
     found = []
     if row.goal is not None:
         # Seconds should be few, returns and shares many.
-        is_good = value is not None and (value <= row.goal if row.measure == "seconds" else value >= row.goal)
+        is_good = value is not None and (
+            value <= row.goal if row.measure == "seconds" else value >= row.goal
+        )
         found.append(is_good)
     # With seconds the levels are the measure itself; else each seed has to have them.
     for name, level in row.levels.items() if row.measure != "seconds" else ():

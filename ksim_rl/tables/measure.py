@@ -53,7 +53,11 @@ def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -
     """
     # The same words as on a command line, so that a row can be repeated by hand.
     words = [f"task={row.task}", f"objective={row.objective}", f"seed={seed}", f"device={device}"]
-    words += [*FIXED.split(), *row.overrides, f"trainer.eval_episodes={8 if smoke else row.episodes}"]
+    words += [
+        *FIXED.split(),
+        *row.overrides,
+        f"trainer.eval_episodes={8 if smoke else row.episodes}",
+    ]
     cfg = conf.compose([*words, *(SMOKE.split() if smoke else ())])
     # A table may be a stranger's file.
     for path, value in reaching_outside(cfg.to_tree()):
@@ -115,8 +119,14 @@ class _Judge(Hook):
             sums = episodes.episode_log()
         else:
             sums = {}
-        metrics = {name: float(sums[name] / sums["episodes"]) for name in sums if name.startswith("metric/")}
-        self.found["means"] = {f"evaluation/{name}": round(mean, 4) for name, mean in metrics.items()}
+        metrics = {
+            name: float(sums[name] / sums["episodes"])
+            for name in sums
+            if name.startswith("metric/")
+        }
+        self.found["means"] = {
+            f"evaluation/{name}": round(mean, 4) for name, mean in metrics.items()
+        }
         # Trials are run by the trained policy, in envs of their own.
         if self._trials:
             how = {"trials": self._trials, "note": trainer.progress.note}
@@ -146,7 +156,9 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
     else:
         end = None
     # The last env states of training, in which levels should hold.
-    last = [point for point in points if point["env_states"] >= points[-1]["env_states"] - HELD_STATES]
+    last = [
+        point for point in points if point["env_states"] >= points[-1]["env_states"] - HELD_STATES
+    ]
     session = record.read(run_folder)[-1]
     # Where the package is installed without git, the environment may name the commit.
     code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})
@@ -169,12 +181,16 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
     }
 
 
-def main(name: str, row: str, seed: str, result: str, run_folder: str, device: str, smoke: str = "") -> None:
+def main(
+    name: str, row: str, seed: str, result: str, run_folder: str, device: str, smoke: str = ""
+) -> None:
     """Measure and write; the result appears whole or not at all."""
     go_to_parents_folder()  # the table, and the paths of the command, are as they were given there
     plugins.load([])  # from KSIM_RL_PLUGINS, where `ksim-rl --plugin` has put its own
     # The child composes the row itself: it gets names only.
-    found = measure(load(name).rows[row], int(seed), Path(run_folder), device=device, smoke=bool(smoke))
+    found = measure(
+        load(name).rows[row], int(seed), Path(run_folder), device=device, smoke=bool(smoke)
+    )
     path = Path(result)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(found, indent=1) + "\n")

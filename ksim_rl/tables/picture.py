@@ -35,7 +35,9 @@ def draw(table: Table, rows: Mapping[str, Sequence[Result]], path: Path) -> None
             # Each seed is a dot, their summary a line.
             for result in (*[[one] for one in rows[name]], rows[name]):
                 if (value := value_of(table.rows[name], result)) is not None:
-                    axes.plot([value], [line], "|" if result is rows[name] else ".", color=OURS, ms=12)
+                    axes.plot(
+                        [value], [line], "|" if result is rows[name] else ".", color=OURS, ms=12
+                    )
         # Each publication keeps its marker and colour within a panel.
         others = list(dict.fromkeys(key for name in names for key in table.rows[name].published))
         for other, (marker, color) in zip(others, OTHERS, strict=False):

@@ -38,7 +38,11 @@ def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
     for mean_name, mean in table.means.items():
         found = {}
         for group, names in table.groups().items():
-            keys = [f"{table.name}/{name}" for name in names if name.rpartition("/")[2] not in mean.without]
+            keys = [
+                f"{table.name}/{name}"
+                for name in names
+                if name.rpartition("/")[2] not in mean.without
+            ]
             # Only over whole groups: means over different rows cannot be compared.
             if all(key in figures for key in keys):
                 found[group] = round(statistics.fmean(figures[key] for key in keys), 2)
@@ -58,7 +62,9 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
         **{key: newest.get(key, "") for key in ("commit", "date", "device", "versions")},
         "command": f"ksim-rl reproduce {table.source}",
         "commits": sorted({result["commit"] for result in counted}),
-        "seeds": sorted({s for row in table.rows.values() for s in row.seeds if not seeds or s in seeds}),
+        "seeds": sorted(
+            {s for row in table.rows.values() for s in row.seeds if not seeds or s in seeds}
+        ),
         "figures": figures_of(table, rows),
         "seconds_in_all": round(sum(result["seconds"] for result in counted), 1),
         "rows": {
@@ -67,7 +73,9 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
                 "value": value_of(table.rows[name], results),
                 "goal": table.rows[name].goal,
                 # Curves are for the picture only.
-                "runs": [{k: v for k, v in r.items() if k not in ("curve", "versions")} for r in results],
+                "runs": [
+                    {k: v for k, v in r.items() if k not in ("curve", "versions")} for r in results
+                ],
             }
             for name, results in rows.items()
         },
@@ -90,21 +98,44 @@ def _markdown(table: Table, rows: Mapping[str, Results], tree: Tree) -> str:
     for group, names in table.groups().items():
         # One column for each publication that any row of the group has.
         others = list(dict.fromkeys(key for name in names for key in table.rows[name].published))
-        head = [group or table.name, *others, "ours", "seeds", "env states", "seconds + before", "reached"]
+        head = [
+            group or table.name,
+            *others,
+            "ours",
+            "seeds",
+            "env states",
+            "seconds + before",
+            "reached",
+        ]
         lines += [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
         for name in names:
             published = [f"{table.rows[name].published.get(other, '-')}" for other in others]
-            cells = [name.rpartition("/")[2], *published, *_cells(table.rows[name], rows.get(name, ()))]
+            cells = [
+                name.rpartition("/")[2],
+                *published,
+                *_cells(table.rows[name], rows.get(name, ())),
+            ]
             lines.append(f"| {' | '.join(cells)} |")
         lines.append("")
     for key, value in tree["figures"].items():
         group, _, name = key.removeprefix(f"{table.name}/").rpartition("/")
         if name in table.means:
             goal = table.means[name].at_least.get(group)
-            lines.append(f"* {group}, {name}: {value:.0f}" + (f", at least {goal:g} asked" if goal else ""))
+            lines.append(
+                f"* {group}, {name}: {value:.0f}" + (f", at least {goal:g} asked" if goal else "")
+            )
     where = ", ".join(sorted({result["device"] for results in rows.values() for result in results}))
-    what = f"{len(rows)} of {len(table.rows)} rows, {tree['seconds_in_all']:,.0f} s of training in all"
-    lines += ["", PROTOCOL, "", table.notes, "", f"{what}; {where}; commits {', '.join(tree['commits'])}"]
+    what = (
+        f"{len(rows)} of {len(table.rows)} rows, {tree['seconds_in_all']:,.0f} s of training in all"
+    )
+    lines += [
+        "",
+        PROTOCOL,
+        "",
+        table.notes,
+        "",
+        f"{what}; {where}; commits {', '.join(tree['commits'])}",
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -135,4 +166,10 @@ def _cells(row: Row, results: Results) -> list[str]:
     seconds = statistics.fmean(result["seconds"] for result in results)
     before = statistics.fmean(result["seconds_before"] for result in results)
     verdict = {True: "yes", False: "no", None: ""}[is_reached(row, results)]
-    return [ours, str(len(results)), f"{states / 1e6:.1f} M", f"{seconds:.0f} + {before:.0f}", verdict]
+    return [
+        ours,
+        str(len(results)),
+        f"{states / 1e6:.1f} M",
+        f"{seconds:.0f} + {before:.0f}",
+        verdict,
+    ]

@@ -28,9 +28,13 @@ def reproduce(arguments: Sequence[str]) -> int:
     # Seeds of the table only: others would be chosen by their results.
     known = sorted({seed for row in rows.values() for seed in row.seeds})
     if not rows:
-        raise ValueError(f"--rows {options.rows}: {table.name} has no such: {near(options.rows, table.rows)}")
+        raise ValueError(
+            f"--rows {options.rows}: {table.name} has no such: {near(options.rows, table.rows)}"
+        )
     if strangers := set(seeds) - set(known):
-        raise ValueError(f"--seeds: {strangers} are none of {known}; try other seeds with ksim-rl train")
+        raise ValueError(
+            f"--seeds: {strangers} are none of {known}; try other seeds with ksim-rl train"
+        )
     # Times are measured: another run on the GPU would lengthen them.
     timed = [name for name, row in rows.items() if row.measure == "seconds"]
     check_in_range("--per-gpu", options.per_gpu, low=1)
@@ -69,7 +73,9 @@ def reproduce(arguments: Sequence[str]) -> int:
     ]
     # One seed is enough to check a row's config.
     for name in {name for name, _ in jobs}:
-        run_cfg(rows[name], 1, device="cpu", smoke=smoke)  # what is wrong is said before anything runs
+        run_cfg(
+            rows[name], 1, device="cpu", smoke=smoke
+        )  # what is wrong is said before anything runs
     gpus = gpus_for(device, per_gpu=options.per_gpu)
     left = runs.run(jobs, gpus=gpus, until=began + 60.0 * options.minutes, note=write)
     write(f"{left} runs are missing; the table is {output / table.name}.md")
@@ -84,12 +90,22 @@ def _parser() -> OneLineParser:
         description="Run what is missing of a table of results, and write the table. Results that are there stay.",
     )
     parser.add_argument("table", help=f"one of {', '.join(shipped())}, or a YAML file of yours")
-    parser.add_argument("--rows", default=".*", help="regular expression of rows, such as 'ppo/Walker.*'")
+    parser.add_argument(
+        "--rows", default=".*", help="regular expression of rows, such as 'ppo/Walker.*'"
+    )
     parser.add_argument("--seeds", default="", help="some of the table's, such as 1,2")
     parser.add_argument("--device", default="cuda", help="cpu, or cuda where there is a GPU")
-    parser.add_argument("--per-gpu", type=int, default=1, help="runs that share a GPU, if none is timed")
-    parser.add_argument("--output", type=Path, help="default: benchmarks/results/tables, or tables elsewhere")
+    parser.add_argument(
+        "--per-gpu", type=int, default=1, help="runs that share a GPU, if none is timed"
+    )
+    parser.add_argument(
+        "--output", type=Path, help="default: benchmarks/results/tables, or tables elsewhere"
+    )
     parser.add_argument("--runs", type=Path, default=Path("runs/tables"), help="where the runs lie")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="end then; 0 writes what is there")
-    parser.add_argument("--smoke", action="store_true", help="two iterations each: does it run at all?")
+    parser.add_argument(
+        "--minutes", type=float, default=math.inf, help="end then; 0 writes what is there"
+    )
+    parser.add_argument(
+        "--smoke", action="store_true", help="two iterations each: does it run at all?"
+    )
     return parser

@@ -29,12 +29,16 @@ def check_override(text: str) -> None:
     try:
         parsed = OverridesParser.create().parse_override(text)
     except HydraException as error:
-        raise ValueError(f"overrides: {text!r} does not parse: {str(error).splitlines()[0]}") from None
+        raise ValueError(
+            f"overrides: {text!r} does not parse: {str(error).splitlines()[0]}"
+        ) from None
     key = parsed.key_or_group
     if key in OF_ROWS:
         raise ValueError(f"overrides: {text!r} has a field of its own in the row")
     if parsed.is_sweep_override():
         raise ValueError(f"overrides: {text!r} has several values: write a row for each")
     if parsed.is_hydra_override() or key.partition("/")[0] == "hydra" or parsed.package is not None:
-        raise ValueError(f"overrides: {text!r} is for Hydra itself, and a table holds fields of runs only")
+        raise ValueError(
+            f"overrides: {text!r} is for Hydra itself, and a table holds fields of runs only"
+        )
     check_plain(parsed.value(), f"overrides: {key}")

@@ -48,7 +48,9 @@ class Runs:
             else:
                 own = ""
             # A result of other settings is no result of this row.
-            found[name] = {seed: result for seed, result in present.items() if result["settings"] == own}
+            found[name] = {
+                seed: result for seed, result in present.items() if result["settings"] == own
+            }
         return found
 
     def complete(self, seeds: Sequence[int]) -> dict[str, list[Result]]:

@@ -60,7 +60,9 @@ class Row(Checked):
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds={self.seeds!r}: expected at least one, and each once")
         if self.measure == "seconds" and not self.levels:
-            raise ValueError("levels={}: measure=seconds waits until metrics reach some; give one at least")
+            raise ValueError(
+                "levels={}: measure=seconds waits until metrics reach some; give one at least"
+            )
         check_name("task", self.task)
         check_name("objective", self.objective)
         # Names and words go into paths and command lines: signs with a meaning there are refused.

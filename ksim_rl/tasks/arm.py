@@ -46,9 +46,14 @@ def _cfg(
         decimation=4,
         scene=scene,
         sim=SimCfg(iterations=10, ls_iterations=20),
-        observations={"actor": ObservationGroupCfg(terms=terms), "critic": ObservationGroupCfg(terms=terms)},
+        observations={
+            "actor": ObservationGroupCfg(terms=terms),
+            "critic": ObservationGroupCfg(terms=terms),
+        },
         # A target is at most half a radian from where the joint is, so that the first policy moves slowly.
-        actions={"joints": mdp.RelativeJointPositionAction(joints=joints, scale=0.2, clip=(-2.5, 2.5))},
+        actions={
+            "joints": mdp.RelativeJointPositionAction(joints=joints, scale=0.2, clip=(-2.5, 2.5))
+        },
         events={"arm": mdp.ResetJoints(joints=joints, position_range=(-0.1, 0.1)), **events},
         commands={COMMAND: command},
         rewards={
@@ -135,7 +140,9 @@ def _training(num_iterations: int) -> TrainingCfg:
         num_envs=2048,
         objective=PPOCfg(entropy_coeff=0.003, clip_value=False),
         data=DatasetCfg(num_env_states_per_minibatch=12288, num_minibatches=4),
-        modules=ModulesCfg(actor=ActorCfg(hidden_dims=(256, 128)), critic=CriticCfg(hidden_dims=(256, 128))),
+        modules=ModulesCfg(
+            actor=ActorCfg(hidden_dims=(256, 128)), critic=CriticCfg(hidden_dims=(256, 128))
+        ),
         trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=50),
     )
 

@@ -39,14 +39,21 @@ def _groups(**terms: ObservationTerm) -> dict[str, ObservationGroupCfg]:
 
 
 def _training(
-    *, num_envs: int, data: DatasetCfg, num_iterations: int, eval_interval: int = 10, **objective: Any
+    *,
+    num_envs: int,
+    data: DatasetCfg,
+    num_iterations: int,
+    eval_interval: int = 10,
+    **objective: Any,
 ) -> TrainingCfg:
     return TrainingCfg(
         num_envs=num_envs,
         # Values reach 100 here: clipping their change to 0.2 would stop the critic from learning.
         objective=PPOCfg(clip_value=False, schedule="fixed", **objective),
         data=data,
-        modules=ModulesCfg(actor=ActorCfg(hidden_dims=(64, 64)), critic=CriticCfg(hidden_dims=(64, 64))),
+        modules=ModulesCfg(
+            actor=ActorCfg(hidden_dims=(64, 64)), critic=CriticCfg(hidden_dims=(64, 64))
+        ),
         trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=eval_interval),
     )
 
@@ -124,7 +131,9 @@ def _cartpole_cfg(reset: ResetCartpole, **terminations: TerminationTerm) -> Mana
     return ManagerBasedRlEnvCfg(
         decimation=1,
         scene=SceneCfg(robots={"cartpole": Cartpole()}, num_envs=1024),
-        observations=_groups(position=CartpolePosition(), velocity=mdp.JointVel(joints=("slider", "hinge"))),
+        observations=_groups(
+            position=CartpolePosition(), velocity=mdp.JointVel(joints=("slider", "hinge"))
+        ),
         actions={"force": mdp.JointEffortAction(joints="slider")},
         events={"reset": reset},
         rewards={"balance": CartpoleReward()},
@@ -210,7 +219,9 @@ class PendulumReward(RewardTerm):
         cosine_E = torch.cos(view.joint_pos_EL[:, 0])
         speed_E = view.joint_vel_EL[:, 0]
         # Linear all the way down, so that there is a slope to climb from hanging.
-        up_E = tolerance(cosine_E, low=UPRIGHT, margin=1.0 + UPRIGHT, value_at_margin=0.0, shape="linear")
+        up_E = tolerance(
+            cosine_E, low=UPRIGHT, margin=1.0 + UPRIGHT, value_at_margin=0.0, shape="linear"
+        )
         return up_E * (1.0 + 4.0 * tolerance(speed_E, low=0.0, high=0.0, margin=5.0)) / 5.0
 
 
@@ -307,7 +318,9 @@ class ReacherTarget(HeldCommand):
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         x, y = self.held(view)[env_index].tolist()
         # In the finger's plane.
-        visualizer.sphere((x, y, Reacher.plane_height), radius=TARGET_RADIUS, rgba=(0.2, 0.6, 0.2, 0.8))
+        visualizer.sphere(
+            (x, y, Reacher.plane_height), radius=TARGET_RADIUS, rgba=(0.2, 0.6, 0.2, 0.8)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -352,7 +365,9 @@ def reacher() -> ManagerBasedRlEnvCfg:
     return ManagerBasedRlEnvCfg(
         decimation=2,
         scene=SceneCfg(robots={"reacher": Reacher()}, num_envs=1024),
-        observations=_groups(pose=ReacherPose(), velocity=mdp.JointVel(), to_target=FingerToTarget()),
+        observations=_groups(
+            pose=ReacherPose(), velocity=mdp.JointVel(), to_target=FingerToTarget()
+        ),
         actions={"torque": mdp.JointEffortAction(joints=("shoulder", "wrist"))},
         events={
             "shoulder": mdp.ResetJoints(joints="shoulder", position_range=(-torch.pi, torch.pi)),

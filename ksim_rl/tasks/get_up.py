@@ -110,7 +110,9 @@ def get_up_cfg(
         sim=dataclasses.replace(velocity.sim(), njmax=njmax),
         scene=velocity.on_plane(robot),
         observations=_observations(robot),
-        actions={"joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=action_scale)},
+        actions={
+            "joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=action_scale)
+        },
         rewards={
             "upright": Uprightness(weight=1.0),
             "height": RisenHeight(weight=1.0, standing_height=standing_height),

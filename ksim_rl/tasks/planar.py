@@ -58,10 +58,14 @@ def small_effort(view: EnvView) -> Float[Tensor, " E"]:
     return (1.0 - view.action_EL.clamp(-1.0, 1.0).square()).mean(-1)
 
 
-def _fast(view: EnvView, speed: float, *, margin: float, value_at_margin: float = 0.0) -> Float[Tensor, " E"]:
+def _fast(
+    view: EnvView, speed: float, *, margin: float, value_at_margin: float = 0.0
+) -> Float[Tensor, " E"]:
     """Return 1 from a forward speed (m/s) on, falling linearly to `value_at_margin` a margin below it."""
     forward_E = forward_speed(view)
-    return tolerance(forward_E, low=speed, margin=margin, value_at_margin=value_at_margin, shape="linear")
+    return tolerance(
+        forward_E, low=speed, margin=margin, value_at_margin=value_at_margin, shape="linear"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +87,12 @@ def _own_state(motors: str) -> dict[str, ObservationTermCfg]:
 
 
 def planar_cfg(
-    robot: Cheetah | Hopper | Walker, *, reward: RewardTerm, decimation: int, step_dt: float, distance: float
+    robot: Cheetah | Hopper | Walker,
+    *,
+    reward: RewardTerm,
+    decimation: int,
+    step_dt: float,
+    distance: float,
 ) -> ManagerBasedRlEnvCfg:
     """Put a planar task together; an env step lasts `step_dt`, s, and the camera's `distance` is in m."""
     motors = robot.joints
@@ -99,7 +108,9 @@ def planar_cfg(
             # A little above the ground, so that no foot starts inside of it.
             "height": mdp.ResetJoints(joints="root_z", position_range=(0.02, 0.08)),
             "pitch": mdp.ResetJoints(joints="root_y", position_range=(-0.1, 0.1)),
-            "legs": mdp.ResetJoints(joints=motors, position_range=(-0.1, 0.1), velocity_range=(-0.1, 0.1)),
+            "legs": mdp.ResetJoints(
+                joints=motors, position_range=(-0.1, 0.1), velocity_range=(-0.1, 0.1)
+            ),
         },
         rewards={"task": reward},
         terminations={"time_out": mdp.TimeOut(time_out=True)},
@@ -122,7 +133,8 @@ def training(*, num_iterations: int = 500, objective: PPOCfg | None = None) -> T
         objective=objective or PPOCfg(**OBJECTIVE),
         data=DatasetCfg(num_env_states_per_minibatch=16384, num_minibatches=4),
         modules=ModulesCfg(
-            actor=ActorCfg(hidden_dims=(256, 128), init_std=0.6), critic=CriticCfg(hidden_dims=(256, 128))
+            actor=ActorCfg(hidden_dims=(256, 128), init_std=0.6),
+            critic=CriticCfg(hidden_dims=(256, 128)),
         ),
         trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=50),
     )
@@ -234,9 +246,13 @@ def walker(speed: float) -> ManagerBasedRlEnvCfg:
 
 
 # Upright from 1.25 s on (950 of 1000 steps), with nothing before that.
-WALKER_STAND = _task("walker_stand", partial(walker, 0.0), "a planar biped stands upright", solved_at=950.0)
+WALKER_STAND = _task(
+    "walker_stand", partial(walker, 0.0), "a planar biped stands upright", solved_at=950.0
+)
 # At full speed from 3 s on (880 of 1000 steps), and standing before that (1 / 6 in 120).
-WALKER_WALK = _task("walker_walk", partial(walker, 1.0), "a planar biped walks at 1 m/s", solved_at=900.0)
+WALKER_WALK = _task(
+    "walker_walk", partial(walker, 1.0), "a planar biped walks at 1 m/s", solved_at=900.0
+)
 WALKER_RUN = _task("walker_run", partial(walker, 5.0), "a planar biped runs at 5 m/s", 1000)
 
 # -- a recorded walk ---------------------------------------------------------------------------------------------
@@ -283,7 +299,9 @@ class PoseDistance(MetricTerm):
 
 
 def _motion_cfg(
-    terms: Mapping[str, ObservationTermCfg], groups: Sequence[str] = ("actor", "critic"), **parts: Any
+    terms: Mapping[str, ObservationTermCfg],
+    groups: Sequence[str] = ("actor", "critic"),
+    **parts: Any,
 ) -> ManagerBasedRlEnvCfg:
     """Put together the parts that both tasks share: the robot, its servos, and its observations with `terms`."""
     robot = Walker(actuators=WALKER_SERVOS)
@@ -330,11 +348,17 @@ def walker_track() -> ManagerBasedRlEnvCfg:
         # The last tenth is left out, so that an episode has something to follow.
         events={"reset": mdp.ResetToMotion(file=MOTION, start_range=(0.0, 0.9))},
         rewards={
-            "joint_pos": mdp.TrackMotionJointPos(file=MOTION, joints=Walker.joints, std=0.7, weight=0.65),
-            "joint_vel": mdp.TrackMotionJointVel(file=MOTION, joints=Walker.joints, std=3.2, weight=0.1),
+            "joint_pos": mdp.TrackMotionJointPos(
+                file=MOTION, joints=Walker.joints, std=0.7, weight=0.65
+            ),
+            "joint_vel": mdp.TrackMotionJointVel(
+                file=MOTION, joints=Walker.joints, std=3.2, weight=0.1
+            ),
             "feet": mdp.TrackMotionBodyPos(file=MOTION, bodies=FEET, std=0.16, weight=0.15),
             "root": mdp.TrackMotionBodyPos(file=MOTION, bodies="torso", std=0.32, weight=0.05),
-            "root_rotation": mdp.TrackMotionBodyQuat(file=MOTION, bodies="torso", std=0.32, weight=0.05),
+            "root_rotation": mdp.TrackMotionBodyQuat(
+                file=MOTION, bodies="torso", std=0.32, weight=0.05
+            ),
             "action_rate": mdp.ActionRateL2(weight=-0.001),
         },
         terminations={

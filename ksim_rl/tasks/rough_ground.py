@@ -34,7 +34,10 @@ def on_rough_ground(
     scan = mdp.HeightScan(offset=root_height)
     terrain = terrains.TerrainGrid(patches=PATCHES)
     groups = {}
-    for name, seen in (("actor", velocity.noisy(scan, 0.1)), ("critic", ObservationTermCfg(term=scan))):
+    for name, seen in (
+        ("actor", velocity.noisy(scan, 0.1)),
+        ("critic", ObservationTermCfg(term=scan)),
+    ):
         group = flat.observations[name]
         groups[name] = dataclasses.replace(group, terms={**group.terms, "height_scan": seen})
     return dataclasses.replace(
@@ -43,5 +46,8 @@ def on_rough_ground(
         scene=dataclasses.replace(flat.scene, terrain=terrain, spacing=terrain.size),
         observations={**flat.observations, **groups},
         terminations={**flat.terminations, "outside_terrain": mdp.OutsideTerrain()},
-        curriculum={**flat.curriculum, "terrain_level": mdp.TerrainLevels(command=velocity.COMMAND)},
+        curriculum={
+            **flat.curriculum,
+            "terrain_level": mdp.TerrainLevels(command=velocity.COMMAND),
+        },
     )

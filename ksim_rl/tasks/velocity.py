@@ -107,7 +107,9 @@ def rewards(
     sites = robot.foot_sites
     return {
         "track_linear_velocity": mdp.TrackLinearVelocity(weight=2.0, command=COMMAND, std=0.5),
-        "track_angular_velocity": mdp.TrackAngularVelocity(weight=2.0, command=COMMAND, std=math.sqrt(0.5)),
+        "track_angular_velocity": mdp.TrackAngularVelocity(
+            weight=2.0, command=COMMAND, std=math.sqrt(0.5)
+        ),
         "upright": mdp.Upright(weight=1.0, std=math.sqrt(0.2), body=torso),
         "pose": mdp.Pose(
             weight=1.0,
@@ -130,7 +132,9 @@ def rewards(
             command=COMMAND,
             command_threshold=0.5,
         ),
-        "foot_clearance": mdp.FootClearance(weight=-2.0, sites=sites, target_height=foot_height, **MOVING),
+        "foot_clearance": mdp.FootClearance(
+            weight=-2.0, sites=sites, target_height=foot_height, **MOVING
+        ),
         "foot_swing_height": mdp.FootSwingHeight(
             weight=-0.25, sensor=FEET, sites=sites, target_height=foot_height, **MOVING
         ),
@@ -143,7 +147,11 @@ def self_contact(robot: LeggedRobot) -> dict[str, Sensor]:
     """Return the sensor of the robot's strongest contact with itself, in every substep."""
     root = robot.root_body
     sensor = ContactSensor(
-        subtrees=(root,), against=root, against_kind="subtree", reduce="strongest", every_substep=True
+        subtrees=(root,),
+        against=root,
+        against_kind="subtree",
+        reduce="strongest",
+        every_substep=True,
     )
     return {SELF: sensor}
 
@@ -252,7 +260,9 @@ def velocity_cfg(
         sim=sim,
         scene=on_plane(robot, {FEET: feet, **(sensors or {})}),
         observations=observations,
-        actions={"joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=robot.action_scale)},
+        actions={
+            "joint_pos": mdp.JointPositionAction(joints=robot.joint_names, scale=robot.action_scale)
+        },
         commands={COMMAND: velocity_command()},
         rewards=rewards,
         events=events,
@@ -270,7 +280,9 @@ def velocity_cfg(
     )
 
 
-def with_command(cfg: ManagerBasedRlEnvCfg, command: mdp.UniformVelocityCommand) -> ManagerBasedRlEnvCfg:
+def with_command(
+    cfg: ManagerBasedRlEnvCfg, command: mdp.UniformVelocityCommand
+) -> ManagerBasedRlEnvCfg:
     """Return a velocity task's config with another command."""
     return dataclasses.replace(cfg, commands={COMMAND: command})
 
@@ -306,7 +318,9 @@ def flat_cfg(
     earned = rewards(robot, pose=pose, torso=torso, foot_height=foot_height, **calm)
     if is_biped:
         earned["self_collisions"] = mdp.SelfCollision(weight=-1.0, sensor=SELF)
-    slip = {"foot_friction": foot_friction(robot, low=0.3, high=1.2)} if friction is None else friction
+    slip = (
+        {"foot_friction": foot_friction(robot, low=0.3, high=1.2)} if friction is None else friction
+    )
     return velocity_cfg(
         robot,
         sim=physics or sim(),
@@ -360,7 +374,9 @@ class VelocityTask(Task):
             description=f"{own} follows a velocity command on flat ground",
             cfg=cfg,
             training=training(num_iterations=num_iterations),
-            other_trainings=(fast_sac_training(symmetry="none"),),  # left and right are seldom quite equal
+            other_trainings=(
+                fast_sac_training(symmetry="none"),
+            ),  # left and right are seldom quite equal
         )
 
 
@@ -377,7 +393,9 @@ def _proposed_cfg(proposed: ModelRobot, analysis: RobotAnalysis) -> ManagerBased
         moving = analysis.by_joint(0.6, 0.3, 0.15)
         speed = 1.0
     pose = PoseStd(standing={".*": 0.05}, walking=moving, running=analysis.by_joint(0.6, 0.3, 0.4))
-    slow = dataclasses.replace(velocity_command(), lin_vel_x=(-speed, speed), lin_vel_y=(-speed, speed))
+    slow = dataclasses.replace(
+        velocity_command(), lin_vel_x=(-speed, speed), lin_vel_y=(-speed, speed)
+    )
     cfg = flat_cfg(
         robot,
         pose,

@@ -99,7 +99,9 @@ def quadruped_velocity_flat() -> ManagerBasedRlEnvCfg:
         _four_legs_pose(".*_(roll|hip)", ".*_knee"),
         feet=ContactSensor(geoms=QUADRUPED_ROBOT.foot_geoms),
         foot_height=0.08,
-        viewer=ViewerCfg(body=QUADRUPED_ROBOT.root_body, distance=1.6, elevation=-15.0, azimuth=120.0),
+        viewer=ViewerCfg(
+            body=QUADRUPED_ROBOT.root_body, distance=1.6, elevation=-15.0, azimuth=120.0
+        ),
     )
 
 
@@ -111,11 +113,16 @@ def quadruped_velocity_delayed() -> ManagerBasedRlEnvCfg:
 
 
 GO1 = _task(
-    go1_velocity_flat, "Unitree Go1", num_iterations=10_000, others=(velocity_training.fast_td3_training(),)
+    go1_velocity_flat,
+    "Unitree Go1",
+    num_iterations=10_000,
+    others=(velocity_training.fast_td3_training(),),
 )
 GO2 = _task(go2_velocity_flat, "Unitree Go2", num_iterations=10_000)
 QUADRUPED = _task(quadruped_velocity_flat, "our quadruped", num_iterations=2_000)
-DELAYED = _task(quadruped_velocity_delayed, "our quadruped", "with late actions", num_iterations=2_000)
+DELAYED = _task(
+    quadruped_velocity_delayed, "our quadruped", "with late actions", num_iterations=2_000
+)
 
 
 # -- two legs ----------------------------------------------------------------------------------------------------
@@ -208,7 +215,9 @@ def humanoid_velocity_flat() -> ManagerBasedRlEnvCfg:
         feet=ContactSensor(bodies=HUMANOID_ROBOT.foot_bodies),
         torso=HUMANOID_ROBOT.torso_body,
         foot_height=0.06,
-        viewer=ViewerCfg(body=HUMANOID_ROBOT.root_body, distance=2.2, elevation=-12.0, azimuth=130.0),
+        viewer=ViewerCfg(
+            body=HUMANOID_ROBOT.root_body, distance=2.2, elevation=-12.0, azimuth=130.0
+        ),
     )
 
 

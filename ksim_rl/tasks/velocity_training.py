@@ -41,7 +41,11 @@ def fast_sac_training(*, symmetry: Literal["none", "augment"] = "augment") -> Tr
     half its atoms; with such an actor one seed of five never walked.
     """
     objective = FastSACCfg(
-        target_entropy_per_action=-1.0, policy_delay=2, symmetry=symmetry, autocast=True, compile=True
+        target_entropy_per_action=-1.0,
+        policy_delay=2,
+        symmetry=symmetry,
+        autocast=True,
+        compile=True,
     )
     data = dataclasses.replace(_REPLAY, num_env_states_per_minibatch=8192, num_minibatches=48)
     critic = dataclasses.replace(fast_sac.CRITIC, hidden_dims=(512, 256, 128), num_atoms=51)
@@ -51,7 +55,9 @@ def fast_sac_training(*, symmetry: Literal["none", "augment"] = "augment") -> Tr
 def fast_td3_training() -> TrainingCfg:
     """Return the training settings of FastTD3, with noise near the paper's for quadrupeds (arXiv 2505.22642)."""
     objective = FastTD3Cfg(target_noise=0.1, autocast=True)
-    return _off_policy(objective=objective, data=_REPLAY, actor=fast_td3.ACTOR, critic=fast_td3.CRITIC)
+    return _off_policy(
+        objective=objective, data=_REPLAY, actor=fast_td3.ACTOR, critic=fast_td3.CRITIC
+    )
 
 
 # 2.2 GB for Go1; without it a resumed run fills the replay again.
@@ -68,5 +74,7 @@ def _off_policy(*, objective: Any, data: Any, actor: Any, critic: QNetworkCfg) -
             actor=dataclasses.replace(actor, action_bound=2.0),
             critic=dataclasses.replace(critic, v_min=-2.0, v_max=6.0),
         ),
-        trainer=TrainerCfg(num_iterations=6_000, eval_interval=500, checkpoint_interval=500, log_interval=10),
+        trainer=TrainerCfg(
+            num_iterations=6_000, eval_interval=500, checkpoint_interval=500, log_interval=10
+        ),
     )

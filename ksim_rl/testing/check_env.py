@@ -104,4 +104,6 @@ def check_env(env: EnvBase, *, num_steps: int = 4, skip: Collection[str] = ()) -
             notes = " ".join(getattr(error, "__notes__", []))
             findings.append(f"[{name}] {type(error).__name__}: {first} {notes}".rstrip())
     if findings:
-        raise AssertionError("\n".join((f"{type(env).__name__} has {len(findings)} findings:", *findings)))
+        raise AssertionError(
+            "\n".join((f"{type(env).__name__} has {len(findings)} findings:", *findings))
+        )

@@ -52,11 +52,15 @@ def check_c_engine(env: EnvBase, num_steps: int) -> None:
     env.reset()
     scale_E1 = 1.0 + np.abs(expected_EL).max(axis=-1, keepdims=True)
     # [2, E, nv]: against the C engine as configured, and against one that solves to the end.
-    errors_EL = np.stack([np.abs(actual_EL - each_EL) / scale_E1 for each_EL in (expected_EL, solved_EL)])
+    errors_EL = np.stack(
+        [np.abs(actual_EL - each_EL) / scale_E1 for each_EL in (expected_EL, solved_EL)]
+    )
     # For each row the engine that agrees better, by its worst joint.
     error_EL = errors_EL[errors_EL.max(axis=-1).argmin(axis=0), np.arange(len(actual_EL))]
     # How chaotic each row is: the change by states that were moved a little.
-    spread_E = np.max([np.abs(other_EL - expected_EL) / scale_E1 for other_EL in moved], axis=(0, -1))
+    spread_E = np.max(
+        [np.abs(other_EL - expected_EL) / scale_E1 for other_EL in moved], axis=(0, -1)
+    )
     error_E = error_EL.max(axis=-1)
     allowed_E = TOLERANCE + ALLOWANCE * spread_E
     worst = int(np.argmax(error_E - allowed_E))

@@ -52,8 +52,12 @@ def check_partial_reset(env: EnvBase, num_steps: int) -> None:
     root = reset_rows(env, root, [0])
     after = _rows_of_state(env)
     changed = [key for key, value in before.items() if _others_changed(value, after[key], num_envs)]
-    advice = "Write through the mask only: `torch.where(mask, new, old)`, or `view.write_*(mask_E, ...)`"
-    _refuse(changed, f"of the state change in rows that a reset of row 0 should leave alone. {advice}")
+    advice = (
+        "Write through the mask only: `torch.where(mask, new, old)`, or `view.write_*(mask_E, ...)`"
+    )
+    _refuse(
+        changed, f"of the state change in rows that a reset of row 0 should leave alone. {advice}"
+    )
     # Keys that only one of the two roots has are not compared.
     kept = root_before.select(*root.keys(True, True), strict=False)
     _refuse(
@@ -116,7 +120,8 @@ def _others_changed(before: Tensor, after: Tensor, num_envs: int) -> bool:
     """Whether anything but row 0 changed, for each dim that may be the env dim (a ring may have E frames)."""
     dims = [dim for dim, size in enumerate(before.shape) if size == num_envs]
     return all(
-        not same_bits(before.narrow(dim, 1, num_envs - 1), after.narrow(dim, 1, num_envs - 1)) for dim in dims
+        not same_bits(before.narrow(dim, 1, num_envs - 1), after.narrow(dim, 1, num_envs - 1))
+        for dim in dims
     )
 
 

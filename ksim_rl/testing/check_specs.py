@@ -11,25 +11,29 @@ from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.specs import misfit
 
-_NOT_FINITE = (
-    "Look for a division by zero, a root of a negative number or an uninitialized buffer where it is computed"
-)
+_NOT_FINITE = "Look for a division by zero, a root of a negative number or an uninitialized buffer where it is computed"
 
 
 def assert_dims(td: TensorDictBase, *names: str) -> None:
     """Check that the batch dims of `td`, and of each tensordict inside, bear `names`, such as "E", "T"."""
-    inside = ((f"[{key!r}]", node) for key, node in td.items(True) if isinstance(node, TensorDictBase))
+    inside = (
+        (f"[{key!r}]", node) for key, node in td.items(True) if isinstance(node, TensorDictBase)
+    )
     for where, node in (("", td), *inside):
         assert node.names[: len(names)] == [*names], (
             f"the tensordict{where} has dims {node.names} (batch size {tuple(node.batch_size)}): expected {[*names]}"
         )
-    assert td.batch_dims == len(names), f"the tensordict has dims {td.names}: expected exactly {[*names]}"
+    assert td.batch_dims == len(names), (
+        f"the tensordict has dims {td.names}: expected exactly {[*names]}"
+    )
 
 
 def assert_leaf(td: TensorDictBase, key: str | tuple[str, ...], *leaf_shape: int) -> None:
     """Check the shape of a leaf beyond the batch dims: `assert_leaf(rollout_ET, "actor", 48)` for [E, T, 48]."""
     found = tuple(td[key].shape[td.batch_dims :])
-    assert found == leaf_shape, f"{key!r} has shape {found} beyond {td.names}: expected {leaf_shape}"
+    assert found == leaf_shape, (
+        f"{key!r} has shape {found} beyond {td.names}: expected {leaf_shape}"
+    )
 
 
 SPECS = ("full_observation_spec", "full_action_spec", "full_reward_spec", "full_done_spec")
@@ -117,10 +121,17 @@ def _check_values(tensordict: TensorDictBase, env: EnvBase, when: str) -> None:
         if value is None:  # `check_env_specs` lists keys that are missing or too many
             continue
         if reason := misfit(value, spec[key]):
-            raise AssertionError(f"observation {key!r}, {_written_by(env, key)}, {reason} (at {when})")
+            raise AssertionError(
+                f"observation {key!r}, {_written_by(env, key)}, {reason} (at {when})"
+            )
         # Before the range, as NaN is outside of every range, too.
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-            rows = (~torch.isfinite(value.reshape(value.shape[0], -1)).all(-1)).nonzero().flatten().tolist()
+            rows = (
+                (~torch.isfinite(value.reshape(value.shape[0], -1)).all(-1))
+                .nonzero()
+                .flatten()
+                .tolist()
+            )
             where = f"at {when}, in the rows {rows}, {_written_by(env, key)}"
             raise AssertionError(f"observation {key!r} is not finite {where}. {_NOT_FINITE}")
         if not spec[key].is_in(value):

@@ -108,7 +108,11 @@ class CounterEnv(EnvBase):
         self.count_E.copy_(torch.where(mask_E, 0, self.count_E))
         self.episode_E.add_(mask_E)
         flag = torch.zeros((*self.batch_size, 1), dtype=torch.bool, device=self.device)
-        values = self._observe() | {"done": flag, "terminated": flag.clone(), "truncated": flag.clone()}
+        values = self._observe() | {
+            "done": flag,
+            "terminated": flag.clone(),
+            "truncated": flag.clone(),
+        }
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:

@@ -59,7 +59,9 @@ class SyncCount:
     def report(self) -> str:
         """Return the distinct syncs with their counts, the most frequent first."""
         distinct = sorted(set(self.calls), key=self.calls.count, reverse=True)
-        return "\n".join(f"{self.calls.count(call)} x {call}" for call in distinct) or "no host sync"
+        return (
+            "\n".join(f"{self.calls.count(call)} x {call}" for call in distinct) or "no host sync"
+        )
 
 
 @contextmanager
@@ -100,7 +102,11 @@ class _Methods(_Counting, TorchFunctionMode):
 
 class _Operations(_Counting, TorchDispatchMode):
     def __torch_dispatch__(
-        self, func: OpOverload, types: Sequence[type], args: OpArgs = (), kwargs: OpKwargs | None = None
+        self,
+        func: OpOverload,
+        types: Sequence[type],
+        args: OpArgs = (),
+        kwargs: OpKwargs | None = None,
     ) -> PyTree:
         kwargs = kwargs or {}
         self.note(_why_it_syncs(func, args, kwargs))
@@ -113,7 +119,9 @@ def _why_it_syncs(func: OpOverload, args: OpArgs, kwargs: OpKwargs) -> str | Non
     if name in _ALWAYS:
         return _ALWAYS[name]
     # The number of rows that a mask selects is known to the device only.
-    if name in _INDEXING and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
+    if name in _INDEXING and any(
+        i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]
+    ):
         return "indexing by a mask"
     if (
         name == "aten::repeat_interleave"
@@ -124,7 +132,11 @@ def _why_it_syncs(func: OpOverload, args: OpArgs, kwargs: OpKwargs) -> str | Non
     if name == "aten::_to_copy" and _differs(args[0].device, kwargs.get("device")):
         return "copy to another device"
     # `a.copy_(b)` has the target first.
-    if name == "aten::copy_" and isinstance(args[1], Tensor) and _differs(args[0].device, args[1].device):
+    if (
+        name == "aten::copy_"
+        and isinstance(args[1], Tensor)
+        and _differs(args[0].device, args[1].device)
+    ):
         # `copy_(source, non_blocking=True)` into pinned memory returns before the copy is done.
         into_pinned = len(args) > 2 and args[2] and args[0].is_cpu and args[0].is_pinned()
         if into_pinned:

@@ -76,7 +76,10 @@ def demand(
         # The model belongs to the caller.
         model.opt.disableflags = flags
     return Demand(
-        zmp_F2=np.array(zmp), com_F3=np.array(com), force_F3=np.array(force), torque_FM=np.array(torque)
+        zmp_F2=np.array(zmp),
+        com_F3=np.array(com),
+        force_F3=np.array(force),
+        torque_FM=np.array(torque),
     )
 
 
@@ -124,7 +127,9 @@ def _joint_torques(
     for foot, place_3, share in zip(standing, places_N3, shares, strict=True):
         # On the ground, z = 0, below the sole.
         point_3 = np.append(place_3[:2] + beside_2, 0.0)
-        mujoco.mj_jac(mj_model, data, jacobian_3M, turn_3M, point_3, int(mj_model.site(foot).bodyid[0]))
+        mujoco.mj_jac(
+            mj_model, data, jacobian_3M, turn_3M, point_3, int(mj_model.site(foot).bodyid[0])
+        )
         # Take off the joint torques that the ground's push on this foot already gives.
         torque_M -= share * (jacobian_3M.T @ force_3 + turn_3M[2] * spin)
     return torque_M[6:]

@@ -46,7 +46,9 @@ def model() -> mujoco.MjModel:
 def _swing(times: list[float], amplitude: float, *, first: float = 1.0) -> Keys:
     """Return keys that are zero at the first and last time, and `amplitude` with alternating signs between them."""
     # The keys inside swing to one side and the other in turn.
-    inner = [(time, first * amplitude * (-1.0) ** number) for number, time in enumerate(times[1:-1])]
+    inner = [
+        (time, first * amplitude * (-1.0) ** number) for number, time in enumerate(times[1:-1])
+    ]
     return ((times[0], 0.0), *inner, (times[-1], 0.0))
 
 

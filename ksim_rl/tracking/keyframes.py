@@ -182,7 +182,9 @@ def zmp_plan(
     return np.stack(columns, axis=-1)
 
 
-def pendulum(zmp_F2: Float[Array, "F 2"], height_F: Float[Array, " F"], fps: float) -> Float[Array, "F 2"]:
+def pendulum(
+    zmp_F2: Float[Array, "F 2"], height_F: Float[Array, " F"], fps: float
+) -> Float[Array, "F 2"]:
     """Return the centre of mass that moves as a pendulum over a zero-moment point; it rests at both ends.
 
     It solves x - z x'' / (g + z'') = p with x'' as the second difference of x.
@@ -237,7 +239,9 @@ def perform(
     # The pendulum has no arms and legs: their swing shifts the zero-moment point, and the aim corrects it.
     for _ in range(rounds + 1):
         com_F2 = pendulum(aim_F2, height_F, fps)
-        qpos_FL = _solved(solver, figure, paths_FN5, com_F2, root_F, lean_F, heading_F, posture_FL, weight_M)
+        qpos_FL = _solved(
+            solver, figure, paths_FN5, com_F2, root_F, lean_F, heading_F, posture_FL, weight_M
+        )
         asked = demand(mj_model, qpos_FL, fps, feet=figure.feet, planted_FN=planted_FN)
         height_F = asked.com_F3[:, 2]
         # Move the aim against the error, blurred as frames next to each other disagree.
@@ -283,12 +287,20 @@ def _solved(
         for foot, (x, y, z, heading, pitch) in zip(figure.feet, paths_FN5[frame], strict=True):
             place_3 = np.array((x, y, z + figure.sole_z))
             # Feet weigh most: a sole that slides or tilts cannot be balanced away.
-            goals.append(PoseGoal(name=foot, pos_3=place_3, quat_4=turned(heading, pitch), weight=3.0))
+            goals.append(
+                PoseGoal(name=foot, pos_3=place_3, quat_4=turned(heading, pitch), weight=3.0)
+            )
         height_3 = np.array((0.0, 0.0, root_F[frame]))
         level = turned(heading_F[frame], 0.0)
         goals += [
             # Only the height of the root counts; x and y follow from the balance.
-            PoseGoal(name=figure.root, pos_3=height_3, quat_4=level, weight=(0.0, 0.0, 1.0), turn_weight=0.1),
+            PoseGoal(
+                name=figure.root,
+                pos_3=height_3,
+                quat_4=level,
+                weight=(0.0, 0.0, 1.0),
+                turn_weight=0.1,
+            ),
             PoseGoal(
                 name=figure.torso,
                 pos_3=height_3,

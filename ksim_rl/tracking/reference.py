@@ -29,7 +29,9 @@ class Poses(NamedTuple):
 
 
 # Per view, the velocities of bodies in each frame of a motion, by file and bodies.
-_VELOCITIES: WeakKeyDictionary[EnvView, dict[tuple[str, tuple[int, ...]], Tensor]] = WeakKeyDictionary()
+_VELOCITIES: WeakKeyDictionary[EnvView, dict[tuple[str, tuple[int, ...]], Tensor]] = (
+    WeakKeyDictionary()
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +128,9 @@ def body_velocities(
         mujoco.mj_comPos(mj_model, data)
         mujoco.mj_comVel(mj_model, data)
         for place, body in enumerate(bodies):
-            mujoco.mj_objectVelocity(mj_model, data, mujoco.mjtObj.mjOBJ_XBODY, body, turn_and_move, 0)
+            mujoco.mj_objectVelocity(
+                mj_model, data, mujoco.mjtObj.mjOBJ_XBODY, body, turn_and_move, 0
+            )
             # From (angular, linear) to (linear, angular).
             found_FN6[frame, place] = np.roll(turn_and_move, 3)
     return found_FN6

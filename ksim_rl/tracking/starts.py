@@ -57,7 +57,9 @@ class StartInMotion(ResetToMotion):
         lin_vel_E3 = robot.root_lin_vel_w_EL
         ang_vel_E3 = robot.root_ang_vel_w_EL
         # Read before the pose is written, since velocities in the world follow from it.
-        moved_E6, kick_E6 = (draw_by_axis(view, ranges) for ranges in (self.pose_range, self.velocity_range))
+        moved_E6, kick_E6 = (
+            draw_by_axis(view, ranges) for ranges in (self.pose_range, self.velocity_range)
+        )
         # The error turns the robot about world axes.
         quat_E4 = quaternion.multiply(
             quaternion.from_euler_xyz(*moved_E6[:, 3:].unbind(-1)), robot.root_quat_EL
@@ -124,6 +126,8 @@ class FailedParts(OfMotion, CurriculumTerm):
         mixed_B = failed_B + (counts_B - failed_B) / self.memory
         failed_B.copy_(torch.where(ranks.any_of(lived_E), mixed_B, failed_B))
         # A share is even over all parts, so that none is forgotten.
-        chance_B = self.uniform / parts + (1.0 - self.uniform) * failed_B / failed_B.sum().clamp(min=1e-9)
+        chance_B = self.uniform / parts + (1.0 - self.uniform) * failed_B / failed_B.sum().clamp(
+            min=1e-9
+        )
         weights_EB.copy_(torch.where(mask_E[:, None], chance_B, weights_EB))
         return chance_B.max() / chance_B.sum()

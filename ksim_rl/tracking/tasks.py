@@ -173,7 +173,9 @@ def training() -> TrainingCfg:
         num_envs=4096,
         seed=42,
         objective=PPOCfg(entropy_coeff=0.005, precision="auto"),
-        data=DatasetCfg(num_env_states_per_minibatch=ENV_STATES_PER_ITERATION // 4, num_minibatches=4),
+        data=DatasetCfg(
+            num_env_states_per_minibatch=ENV_STATES_PER_ITERATION // 4, num_minibatches=4
+        ),
         modules=ModulesCfg(actor=ActorCfg(init_std=0.5)),
         trainer=TrainerCfg(num_iterations=ITERATIONS),
     )

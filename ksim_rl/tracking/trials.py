@@ -51,7 +51,9 @@ class TrialRunner(Evaluator):
         num_envs = self.length_E.shape[0]
         # float64 sums: thousands of steps lose digits in float32.
         self.ended_well_E = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self.errors_EM = torch.zeros(num_envs, len(base.cfg.metrics), dtype=torch.float64, device=device)
+        self.errors_EM = torch.zeros(
+            num_envs, len(base.cfg.metrics), dtype=torch.float64, device=device
+        )
 
     def _start(self) -> None:
         super()._start()
@@ -88,7 +90,9 @@ def trial_cfg(cfg: ManagerBasedRlEnvCfg, *, pushes: bool = False) -> ManagerBase
         # From the first frame, and not from the parts of the curriculum.
         events[name] = dataclasses.replace(events[name], start_range=(0.0, 0.0), part_s=None)
     if not pushes:
-        events = {name: event for name, event in events.items() if not isinstance(event, PushByVelocity)}
+        events = {
+            name: event for name, event in events.items() if not isinstance(event, PushByVelocity)
+        }
     return dataclasses.replace(cfg, events=events, curriculum={})
 
 
@@ -111,12 +115,18 @@ def run_trials(
     env = with_room(partial(build_env, of_trials, num_envs=trials, seed=seed), note=note)
     base = part(env, ManagerBasedRlEnv)
     assert base is not None
-    files = {event.file for event in (base.cfg.events or {}).values() if isinstance(event, StartInMotion)}
+    files = {
+        event.file for event in (base.cfg.events or {}).values() if isinstance(event, StartInMotion)
+    }
     # The longest motion that any start may choose.
     duration_s = max(base.view.motion(file).duration_s for file in files)
     # Rounded up, but not for a rounding error of the division.
     runner = TrialRunner(
-        base, env=env, policy=actor, max_steps=math.ceil(duration_s / base.step_dt - 1e-6), seed=seed
+        base,
+        env=env,
+        policy=actor,
+        max_steps=math.ceil(duration_s / base.step_dt - 1e-6),
+        seed=seed,
     )
     runner()
     for text in losses_of(env):
@@ -126,4 +136,6 @@ def run_trials(
     errors = (runner.errors_EM.sum(0) / steps).tolist()
     success = float(runner.ended_well_E.double().mean())
     env.close(raise_if_closed=False)
-    return Trials(trials=trials, success=success, errors=dict(zip(base.cfg.metrics, errors, strict=True)))
+    return Trials(
+        trials=trials, success=success, errors=dict(zip(base.cfg.metrics, errors, strict=True))
+    )

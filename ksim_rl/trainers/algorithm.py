@@ -115,12 +115,20 @@ class Algorithm:
     """
 
     name: str  # as in `objective=<name>`
-    cfg: type[AlgorithmCfg]  # a run whose objective is one of these, or of a subclass, is trained by it
+    cfg: type[
+        AlgorithmCfg
+    ]  # a run whose objective is one of these, or of a subclass, is trained by it
     update: Callable[[RunCfg, EnvBase, State | None], Update]
-    policy: Callable[[RunCfg, EnvBase], TensorDictModuleBase]  # its weights: `update/actor` of a checkpoint
-    data: DatasetCfg | ReplayCfg  # chosen by `objective=<name>` along with its settings, as are the modules
+    policy: Callable[
+        [RunCfg, EnvBase], TensorDictModuleBase
+    ]  # its weights: `update/actor` of a checkpoint
+    data: (
+        DatasetCfg | ReplayCfg
+    )  # chosen by `objective=<name>` along with its settings, as are the modules
     modules: ModulesCfg = field(default_factory=ModulesCfg)
-    on_ranks: bool = False  # whether several ranks may train with it: its update takes means over them
+    on_ranks: bool = (
+        False  # whether several ranks may train with it: its update takes means over them
+    )
 
 
 def part_of(cfg: RunCfg, field: str, kind: type[Part]) -> Part:
@@ -145,7 +153,9 @@ def make_update(cfg: RunCfg, env: EnvBase, *, resumed: State | None = None) -> U
     algorithm = algorithm_of(cfg)
     # Without means over ranks each would train a different policy, unnoticed.
     if ranks.size() > 1 and not algorithm.on_ranks:
-        raise ValueError(f"objective={algorithm.name} trains on one rank only: start it without torchrun")
+        raise ValueError(
+            f"objective={algorithm.name} trains on one rank only: start it without torchrun"
+        )
     return algorithm.update(cfg, env, resumed)
 
 

@@ -60,8 +60,12 @@ def build(
     # "auto" may choose the C engine for few envs, which kernels cannot step.
     if cfg.collector.compile and cfg.task.sim.engine == "auto":
         cfg = with_engine(cfg, "warp")
-        said.append("collector.compile=true: MuJoCo Warp simulates, as no kernel steps MuJoCo's C engine")
-    env = envs.with_room(partial(build_env, cfg, num_envs=cfg.num_envs, seed=cfg.seed), note=said.append)
+        said.append(
+            "collector.compile=true: MuJoCo Warp simulates, as no kernel steps MuJoCo's C engine"
+        )
+    env = envs.with_room(
+        partial(build_env, cfg, num_envs=cfg.num_envs, seed=cfg.seed), note=said.append
+    )
     # The engine that was chosen for these envs is also the one of evaluations, which are fewer, and of resumed runs.
     simulated = part(env, SimulatedWorld)
     if simulated is not None:
@@ -114,7 +118,9 @@ def _check_rollout(cfg: RunCfg, env: EnvBase, keys: Sequence[NestedKey]) -> None
     """Refuse rollouts whose observations alone no memory holds, before the first of their steps."""
     observations = env.observation_spec.items(include_nested=True, leaves_only=True)
     # Of one step of all envs.
-    stored = sum(leaf.shape.numel() * leaf.dtype.itemsize for key, leaf in observations if key in keys)
+    stored = sum(
+        leaf.shape.numel() * leaf.dtype.itemsize for key, leaf in observations if key in keys
+    )
     length = cfg.data.rollout_length(cfg.num_envs)
     check_bytes(
         f"rollouts of {length} steps, by {cfg.data}",

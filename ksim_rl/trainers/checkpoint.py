@@ -126,8 +126,12 @@ def own_part(state: State, live: Callable[[], State]) -> State:
     """Return this rank's part of a checkpoint's state; `live` returns the state of the run that loads it."""
     if RANKS not in state and ranks.size() == 1:
         return state
-    tensors, values = state_tree.split({name: part for name, part in state.items() if name != RANKS})
-    return state_tree.join(ranks.dealt(tensors, state.get(RANKS), state_tree.split(live())[0]), values)
+    tensors, values = state_tree.split(
+        {name: part for name, part in state.items() if name != RANKS}
+    )
+    return state_tree.join(
+        ranks.dealt(tensors, state.get(RANKS), state_tree.split(live())[0]), values
+    )
 
 
 def load(path: Path) -> Checkpoint:
@@ -141,7 +145,9 @@ def load(path: Path) -> Checkpoint:
             f"{path}: unexpected file {sorted(surplus)[0]!r}; a checkpoint holds only its own"
         )
     # The limit keeps a forged manifest from filling the memory.
-    tensor_bytes = _read_regular_file(path / TENSORS, limit=min(files[TENSORS]["bytes"], MOST_TENSOR_BYTES))
+    tensor_bytes = _read_regular_file(
+        path / TENSORS, limit=min(files[TENSORS]["bytes"], MOST_TENSOR_BYTES)
+    )
     # Size before hash, as it tells a truncated copy apart from other damage.
     if len(tensor_bytes) != files[TENSORS]["bytes"]:
         raise CheckpointError(
@@ -172,14 +178,18 @@ def fitting(path: Path) -> Iterator[None]:
         yield
     except MISFITS as error:
         what = f"{type(error).__name__}: {error}"
-        raise CheckpointError(f"{path}: it holds another state than such a run has: {what}") from error
+        raise CheckpointError(
+            f"{path}: it holds another state than such a run has: {what}"
+        ) from error
 
 
 def saved(folder: Path) -> list[Path]:
     """Return the checkpoints in `folder`, oldest first."""
     if not folder.is_dir():
         return []
-    found = [entry for entry in folder.iterdir() if _order(entry.name) is not None and entry.is_dir()]
+    found = [
+        entry for entry in folder.iterdir() if _order(entry.name) is not None and entry.is_dir()
+    ]
     return sorted(found, key=lambda entry: _order(entry.name) or (0, 0))
 
 
@@ -264,7 +274,9 @@ def _read_manifest(path: Path) -> Tree:
         # Sealed again and compared byte by byte, so there is only one spelling of a manifest.
         intact = _seal(manifest) == raw
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise CheckpointError(f"{path / MANIFEST}: damaged: {type(error).__name__}: {error}") from error
+        raise CheckpointError(
+            f"{path / MANIFEST}: damaged: {type(error).__name__}: {error}"
+        ) from error
     if not intact:
         raise CheckpointError(f"{path / MANIFEST}: damaged: its SHA-256 does not match its content")
     if isinstance(manifest, dict):
@@ -280,7 +292,8 @@ def _read_manifest(path: Path) -> Tree:
     else:
         of_tensors = None
     if not (
-        _has(manifest, iteration=int, config=dict, values=dict) and _has(of_tensors, bytes=int, sha256=str)
+        _has(manifest, iteration=int, config=dict, values=dict)
+        and _has(of_tensors, bytes=int, sha256=str)
     ):
         raise CheckpointError(
             f"{path / MANIFEST}: not a checkpoint manifest: a field is missing or of another type"
@@ -294,7 +307,8 @@ def _has(tree: Plain, **kinds: type) -> bool:
     # A truth value is a whole number in Python.
     found = {name: tree.get(name) for name in kinds}
     return all(
-        isinstance(found[name], kind) and not isinstance(found[name], bool) for name, kind in kinds.items()
+        isinstance(found[name], kind) and not isinstance(found[name], bool)
+        for name, kind in kinds.items()
     )
 
 

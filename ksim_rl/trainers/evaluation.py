@@ -33,7 +33,9 @@ class Evaluator:
     After a call `length_E`, float64 [E], has the steps of each episode.
     """
 
-    def __init__(self, env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int, seed: int) -> None:
+    def __init__(
+        self, env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int, seed: int
+    ) -> None:
         self.env = env
         self.policy = policy
         self._signals = signal_keys(env)
@@ -62,7 +64,9 @@ class Evaluator:
         # Of all ranks, in one order, so that each rank computes the same figures.
         own = self._return_E, self.length_E, self._running_E.to(torch.float64)
         return_E, length_E, running_E = (torch.cat(ranks.gather(figure_E)) for figure_E in own)
-        figures = torch.stack([*torch.std_mean(return_E, correction=0), length_E.mean(), running_E.sum()])
+        figures = torch.stack(
+            [*torch.std_mean(return_E, correction=0), length_E.mean(), running_E.sum()]
+        )
         std, mean, length, unfinished = figures.tolist()
         return Evaluation(
             return_mean=mean,

@@ -8,7 +8,9 @@ from ksim_rl.device.state_tree import State
 H = TypeVar("H")
 
 
-def paired(hooks: Sequence[H], saved: State, *, keeps: Callable[[H], bool]) -> list[tuple[H, State]]:
+def paired(
+    hooks: Sequence[H], saved: State, *, keeps: Callable[[H], bool]
+) -> list[tuple[H, State]]:
     """Pair hooks, in their order, with the states saved by number; a ValueError where they are of another run.
 
     Hooks that keep nothing, such as a viewer's, may come and go between the sessions of a run; `keeps` knows others.

@@ -12,7 +12,9 @@ class InterruptRequest:
     `said` is printed at the first one. Outside the main thread, where Python allows no handlers, nothing is installed.
     """
 
-    def __init__(self, said: str = "the run ends after this iteration; once more ends it at once") -> None:
+    def __init__(
+        self, said: str = "the run ends after this iteration; once more ends it at once"
+    ) -> None:
         self._said = said
         self.signal: signal.Signals | None = None
         self._previous: dict[signal.Signals, object] = {}

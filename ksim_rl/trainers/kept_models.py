@@ -63,7 +63,9 @@ def keep_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None]) -
         write_whole(run_folder / RECORD, json.dumps(plain, indent=2) + "\n")
 
 
-def with_kept_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None] | None = None) -> RunCfg:
+def with_kept_models(
+    cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None] | None = None
+) -> RunCfg:
     """Return a run's config with the models that it began with.
 
     Where a model's file is not there any more, or has changed, the run's own copy takes its place, and `note` (by
@@ -201,7 +203,9 @@ def _sources(cfg: RunCfg) -> Iterator[tuple[str, str]]:
 def _with_source(entity: MjcfRobot | MenagerieRobot, source: str) -> MjcfRobot | ModelRobot:
     if isinstance(entity, MjcfRobot):
         return dataclasses.replace(entity, source=source)
-    assert isinstance(entity, ModelRobot)  # others name a model of the menagerie, of which no copy is kept
+    assert isinstance(
+        entity, ModelRobot
+    )  # others name a model of the menagerie, of which no copy is kept
     return dataclasses.replace(entity, model=source)
 
 

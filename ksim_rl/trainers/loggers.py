@@ -44,7 +44,9 @@ class WandbCfg(Checked):
     entity: str | None = None
     name: str | None = None
     tags: tuple[str, ...] = ()
-    offline: bool = False  # write into the run folder only; `wandb sync RUN/wandb/offline-*` sends it later
+    offline: bool = (
+        False  # write into the run folder only; `wandb sync RUN/wandb/offline-*` sends it later
+    )
 
 
 def open_wandb(cfg: WandbCfg, run_folder: Path, config: Tree) -> MetricLogger:
@@ -144,10 +146,14 @@ def check_installed(cfg: LoggerCfg) -> None:
     """Refuse loggers whose packages are missing, with the command that installs the package."""
     for name in ("wandb", "mlflow"):
         if getattr(cfg, name) is not None and importlib.util.find_spec(name) is None:
-            raise ValueError(f"logger.{name}: the package {name} is missing: pip install 'ksim_rl[{name}]'")
+            raise ValueError(
+                f"logger.{name}: the package {name} is missing: pip install 'ksim_rl[{name}]'"
+            )
 
 
-def make_loggers(cfg: LoggerCfg, run_folder: Path, *, config: Tree | None = None) -> list[MetricLogger]:
+def make_loggers(
+    cfg: LoggerCfg, run_folder: Path, *, config: Tree | None = None
+) -> list[MetricLogger]:
     """Open the loggers of a run, some of which show its `config`; a RuntimeError names a service that refuses."""
     loggers: list[MetricLogger] = []
     if cfg.csv:

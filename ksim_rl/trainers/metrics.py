@@ -36,7 +36,9 @@ class PendingMetrics:
         return dict(zip(self.names, self.values_M.tolist(), strict=True))
 
 
-def start_copy(metrics: Mapping[str, Shaped[Tensor, ""]], *, device: torch.device) -> PendingMetrics:
+def start_copy(
+    metrics: Mapping[str, Shaped[Tensor, ""]], *, device: torch.device
+) -> PendingMetrics:
     """Begin to copy 0-dim tensors to the host, as one vector.
 
     On CUDA the copy goes to pinned memory and does not wait for the device: work that is queued after it may start
@@ -92,7 +94,11 @@ def episode_means(sums: Mapping[str, float], *, max_episode_length_s: float) -> 
     episodes. `reward/<term>` is the weighted sum over an episode, per second of the longest possible episode (or as it
     is where episodes have no limit), so that a term of weight w that is always 1 reads w.
     """
-    metrics = {name: value for name, value in sums.items() if not name.startswith(("sum/", _OVERFLOW, _NAN))}
+    metrics = {
+        name: value
+        for name, value in sums.items()
+        if not name.startswith(("sum/", _OVERFLOW, _NAN))
+    }
     episodes = sums.get("sum/episodes")
     if episodes is None:
         return metrics
@@ -127,7 +133,9 @@ def read_physics(env: EnvBase) -> dict[str, Int64[Tensor, ""]]:
     if simulated is None:
         return {}
     world = simulated.world
-    counts = {f"{_OVERFLOW}{index}": count for index, count in enumerate(world.overflow_counts().unbind())}
+    counts = {
+        f"{_OVERFLOW}{index}": count for index, count in enumerate(world.overflow_counts().unbind())
+    }
     return counts | {_NAN: world.nan_count()}
 
 

@@ -73,7 +73,9 @@ def same_time_step(timestep: float) -> str:
     return f"with its time step of {timestep:g} s, in which its actuators count their lags"
 
 
-def _changes(task: ManagerBasedRlEnvCfg, given: Collection[str]) -> tuple[dict[str, Any], list[str]]:
+def _changes(
+    task: ManagerBasedRlEnvCfg, given: Collection[str]
+) -> tuple[dict[str, Any], list[str]]:
     """Return the fields of `SimCfg` to change, and how to say that."""
     # The model's own options count where the config leaves them open.
     spec = build_spec(task.scene)

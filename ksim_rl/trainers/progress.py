@@ -9,7 +9,14 @@ from contextlib import ExitStack, contextmanager, suppress
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -99,7 +106,9 @@ class RunProgress:
             self._live.stop()
             self._live = None
 
-    def update(self, iteration: int, metrics: Mapping[str, float], *, seconds_left: float | None) -> None:
+    def update(
+        self, iteration: int, metrics: Mapping[str, float], *, seconds_left: float | None
+    ) -> None:
         """Show the state after `iteration`."""
         self.done = iteration
         self._moved = time.monotonic()
@@ -181,14 +190,20 @@ class RunProgress:
             self._watched = False
 
     def _figures(self, metrics: Mapping[str, float]) -> list[tuple[str, str]]:
-        return [(label, pattern.format(metrics[name])) for name, label, pattern in SHOWN if name in metrics]
+        return [
+            (label, pattern.format(metrics[name]))
+            for name, label, pattern in SHOWN
+            if name in metrics
+        ]
 
     def _panel(self) -> Group:
         figures = self._figures(self._metrics)
         table = Table.grid(padding=(0, 2))
         # Three columns keep the panel a few lines high.
         for start in range(0, len(figures), 3):
-            table.add_row(*(f"[dim]{label}[/dim] {text}" for label, text in figures[start : start + 3]))
+            table.add_row(
+                *(f"[dim]{label}[/dim] {text}" for label, text in figures[start : start + 3])
+            )
         return Group(self._bar, table, *([Text(printable(self._status))] if self._status else []))
 
 

@@ -38,7 +38,12 @@ PLUGINS = "plugins"
 # It becomes part of the path of the run folder.
 TASK_NAME = re.compile(r"\w[\w.+-]*")
 # Fields that reach beyond the run folder, to write or to listen, and the variables of those that have one.
-WRITTEN = ("logger.mlflow.tracking_uri", "task.sim.nan_guard.folder", "viewer.browser", "viewer.host")
+WRITTEN = (
+    "logger.mlflow.tracking_uri",
+    "task.sim.nan_guard.folder",
+    "viewer.browser",
+    "viewer.host",
+)
 VOUCHED_BY = {"logger.mlflow.tracking_uri": "MLFLOW_TRACKING_URI"}
 
 
@@ -69,7 +74,9 @@ class TrainerCfg(Checked):
     warm_up: bool = False  # compile and capture updates before the first env step and its seconds
     # Where threads cannot be made, torch ends the process instead of raising.
     num_threads: Annotated[int, Within(low=1, high=1024)] | None = None
-    matmul_precision: Literal["highest", "high", "medium"] = "high"  # of float32 on CUDA; "high" is TF32
+    matmul_precision: Literal["highest", "high", "medium"] = (
+        "high"  # of float32 on CUDA; "high" is TF32
+    )
     video: bool = True  # of the final policy
     video_s: Annotated[float, Within(low=0.0, high=3600.0, low_open=True)] = 10.0  # its length, s
 
@@ -182,7 +189,9 @@ class RunCfg(TrainingCfg):
     task_name: str  # the registered task that `task` began as; names the run and its threshold
     task: ManagerBasedRlEnvCfg  # the env; its number of envs and its seed are set to the run's
     device: str = "auto"  # "cpu", "cuda", "cuda:<index>", or "auto" for CUDA where there is a GPU
-    checkpoint: str | None = None  # a run folder or a checkpoint: its networks and normalizers are the start
+    checkpoint: str | None = (
+        None  # a run folder or a checkpoint: its networks and normalizers are the start
+    )
     logger: LoggerCfg = field(default_factory=LoggerCfg)
     viewer: BrowserCfg = field(default_factory=BrowserCfg)
 
@@ -194,10 +203,14 @@ class RunCfg(TrainingCfg):
                 f"task_name={self.task_name!r}: expected letters, digits and _.+-, as it names a folder"
             )
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
-            raise ValueError(f"device={self.device!r}: expected 'auto', 'cpu', 'cuda' or 'cuda:<index>'")
+            raise ValueError(
+                f"device={self.device!r}: expected 'auto', 'cpu', 'cuda' or 'cuda:<index>'"
+            )
         # "auto" passes, as it falls back to the CPU.
         if self.device.startswith("cuda") and not torch.cuda.is_available():
-            raise ValueError(f"device={self.device!r}: torch finds no CUDA device here; use device=cpu")
+            raise ValueError(
+                f"device={self.device!r}: torch finds no CUDA device here; use device=cpu"
+            )
         if not self.task.actions:
             raise ValueError(
                 "task.actions is empty: a policy needs one at least, which says what it controls"
@@ -221,7 +234,9 @@ class RunCfg(TrainingCfg):
     def _check_sequences(self) -> None:
         """Refuse sequences for networks that are not recurrent, recurrent ones without, and sizes that do not fit."""
         if not self.modules.recurrent:
-            if isinstance(self.data, DatasetCfg) and (self.data.sequence_length or self.data.burn_in):
+            if isinstance(self.data, DatasetCfg) and (
+                self.data.sequence_length or self.data.burn_in
+            ):
                 raise ValueError(
                     f"data.sequence_length={self.data.sequence_length}, data.burn_in={self.data.burn_in}: only "
                     "recurrent networks learn on sequences; use modules=lstm or modules=gru, or null and 0"
@@ -284,7 +299,9 @@ def check_run_tree(tree: Tree, where: Path, *, given: Collection[str] = ()) -> N
     known = {*(entry.name for entry in fields(RunCfg)), PLUGINS}
     for name in tree:
         if name not in known:
-            raise ValueError(f"{where}: {name!r} is no field of a run's config, and it may hold nothing else")
+            raise ValueError(
+                f"{where}: {name!r} is no field of a run's config, and it may hold nothing else"
+            )
     check_plain(tree, str(where))
     for path, value in reaching_outside(tree, given=given):
         raise ValueError(
@@ -320,7 +337,10 @@ def without_env_size(tree: Tree) -> Tree:
         return dict(tree)
     scene = dict(task["scene"])
     task = {**task, "scene": scene}
-    for where, name, below in (("task.scene.num_envs", "num_envs", scene), ("task.seed", "seed", task)):
+    for where, name, below in (
+        ("task.scene.num_envs", "num_envs", scene),
+        ("task.seed", "seed", task),
+    ):
         # Older trees repeat the run's numbers here; other numbers are a mistake.
         value = below.pop(name, None)
         if value is not None and value != tree.get(name):

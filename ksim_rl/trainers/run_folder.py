@@ -135,7 +135,9 @@ def _run_locked(
         # A run that was asked to stop does not begin to draw.
         if cfg.trainer.video and outcome.interrupted_by is None:
             path = run_folder / VIDEO
-            record_video(cfg, trainer.update.actor, path, note=progress.note, status=progress.status)
+            record_video(
+                cfg, trainer.update.actor, path, note=progress.note, status=progress.status
+            )
     _close(trainer)
     return outcome
 
@@ -157,7 +159,9 @@ def load_policy(path: Path, *, device: str = "auto", plugins: Sequence[str] = ()
     return policy_of(checkpoint.load_latest(path), device=device)
 
 
-def policy_of(saved: checkpoint.Checkpoint, *, device: str = "auto", cfg: RunCfg | None = None) -> Policy:
+def policy_of(
+    saved: checkpoint.Checkpoint, *, device: str = "auto", cfg: RunCfg | None = None
+) -> Policy:
     """Rebuild the policy of a checkpoint that was read; see `load_policy`. A `cfg` stands in for the run's own.
 
     Its models are those that the run began with, see `kept_models`.

@@ -23,7 +23,10 @@ def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
     """
     check_installed(cfg.logger)
     named = {"checkpoint": cfg.checkpoint}
-    named |= {f"objective.{name}": getattr(cfg.objective, name) for name in cfg.objective.checkpoint_fields}
+    named |= {
+        f"objective.{name}": getattr(cfg.objective, name)
+        for name in cfg.objective.checkpoint_fields
+    }
     for field, path in named.items():
         # Read as a whole, hashes included: a damaged file must fail now and not after minutes.
         if path is not None and not resumes:

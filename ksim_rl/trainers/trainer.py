@@ -33,7 +33,12 @@ from ksim_rl.trainers.metrics import (
 )
 from ksim_rl.trainers.outcome import Outcome
 from ksim_rl.trainers.progress import RunClock, RunProgress
-from ksim_rl.trainers.restoring import load_env_state, load_networks, load_random_state, random_state
+from ksim_rl.trainers.restoring import (
+    load_env_state,
+    load_networks,
+    load_random_state,
+    random_state,
+)
 from ksim_rl.trainers.run_cfg import TrainerCfg
 from ksim_rl.trainers.said_once import SaidOnce
 from ksim_rl.trainers.suspect_iterations import with_iterations
@@ -175,7 +180,9 @@ class Trainer:
         self.interrupt = InterruptRequest()
         self.clock = RunClock()
         self.progress = RunProgress(cfg.num_iterations, enabled=False)
-        self.watch: Callable[[], None] = lambda: None  # called in each iteration, before anything is written
+        self.watch: Callable[[], None] = lambda: (
+            None
+        )  # called in each iteration, before anything is written
         self.notes: Sequence[str] = ()
         self._own_hooks = tuple(hooks)
         self._hooks: list[Hook] = [*hooks, CheckpointHook(interval=cfg.checkpoint_interval)]
@@ -189,7 +196,9 @@ class Trainer:
         self._unread: list[tuple[int, PendingMetrics]] = []  # oldest first
         self.collecting = ranks.Timing(update.device)
         self._target_met = False
-        self._warnings = SaidOnce(lambda text: self.progress.note(text))  # of the progress at that time
+        self._warnings = SaidOnce(
+            lambda text: self.progress.note(text)
+        )  # of the progress at that time
         self._told_to_end = False  # by any rank
 
     @property
@@ -227,7 +236,9 @@ class Trainer:
             for text in (*missing_parts(self.collector.env), *notes):  # what this env cannot do
                 self.progress.note(text)
             if self.warm_up_s:
-                self.progress.note(f"compiled and captured in {self.warm_up_s:.1f} s, before training")
+                self.progress.note(
+                    f"compiled and captured in {self.warm_up_s:.1f} s, before training"
+                )
             self.clock.begin()  # compiling before this does not count
             try:
                 while not self._is_over():
@@ -275,7 +286,9 @@ class Trainer:
         env = self.collector.env
         metrics = read_episode_sums(env, rollout_ET) | read_physics(env) | self.update.metrics()
         if ranks.size() > 1:
-            metrics[INTERRUPTED] = torch.full((), float(bool(self.interrupt)), device=self.update.device)
+            metrics[INTERRUPTED] = torch.full(
+                (), float(bool(self.interrupt)), device=self.update.device
+            )
             metrics = ranks.combined(metrics, added=ADDED, most=MOST)
         self._unread.append((self.iteration, start_copy(metrics, device=self.update.device)))
         self._report(all_but=1 if self._overlaps else 0)
@@ -291,7 +304,9 @@ class Trainer:
         self._look_at_target()
 
     def _is_over(self) -> bool:
-        ended = self._target_met or self.interrupted or bool(self.cfg.stop_when_solved and self.solved)
+        ended = (
+            self._target_met or self.interrupted or bool(self.cfg.stop_when_solved and self.solved)
+        )
         return ended or self.iteration >= self.cfg.num_iterations
 
     def _why_it_is_over(self) -> str:
@@ -304,7 +319,9 @@ class Trainer:
             )
             return f"stop_at is met ({', '.join(targets)})"
         if self.cfg.stop_when_solved and self.solved and self.evaluation is not None:
-            return f"solved (return {self.evaluation.return_mean:.1f}, threshold {self.solved_at:g})"
+            return (
+                f"solved (return {self.evaluation.return_mean:.1f}, threshold {self.solved_at:g})"
+            )
         return f"all {self.cfg.num_iterations} iterations are done"
 
     def _report(self, *, all_but: int) -> None:
@@ -328,7 +345,9 @@ class Trainer:
             longest_s = 0.0  # rewards are then per episode, not per second
         else:
             longest_s = clock.max_episode_length_s
-        self.metrics = episode_means(read, max_episode_length_s=longest_s)  # sums become means of episodes
+        self.metrics = episode_means(
+            read, max_episode_length_s=longest_s
+        )  # sums become means of episodes
         self.metrics |= physics.metrics | {
             "iteration": iteration,
             "seconds": self.clock.total,
@@ -343,7 +362,9 @@ class Trainer:
     def _write(self, metrics: dict[str, float], iteration: int) -> None:
         env_states = iteration * self.num_env_states
         for logger in self.loggers:
-            self._warnings.call(logger, logger.log_metrics, metrics, env_states, iteration=self.iteration)
+            self._warnings.call(
+                logger, logger.log_metrics, metrics, env_states, iteration=self.iteration
+            )
         self.progress.update(
             iteration,
             {"env_states": env_states, **metrics},
@@ -352,12 +373,16 @@ class Trainer:
 
     def _look_at_target(self) -> None:
         targets = self.cfg.stop_at or {}
-        reached = [self.metrics.get(name, float("-inf")) >= value for name, value in targets.items()]
+        reached = [
+            self.metrics.get(name, float("-inf")) >= value for name, value in targets.items()
+        ]
         self._target_met |= bool(targets) and all(reached)
         for name in targets:
             known = name in self.metrics or name.startswith("evaluation/")
             if not known and "episode/return" in self.metrics:  # else terms have no metrics yet
-                self._warnings.warn(name, f"stop_at: {name!r} is no metric: {near(name, self.metrics)}")
+                self._warnings.warn(
+                    name, f"stop_at: {name!r} is no metric: {near(name, self.metrics)}"
+                )
 
     def save(self) -> Path:
         """Write a checkpoint of everything that the next iteration depends on, of all ranks; see `checkpoint.save`."""
@@ -382,7 +407,9 @@ class Trainer:
     def load_weights(self, path: Path) -> None:
         """Start from the networks and normalizers of a checkpoint of any task, if they fit here; all else stays new."""
         state = checkpoint.load_latest(path).state
-        checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
+        checkpoint.check_columns(
+            state["observation_columns"], observation_columns(self.collector.env)
+        )
         load_networks(self.update, state["update"], path)
 
     def state_dict(self) -> State:
@@ -400,7 +427,9 @@ class Trainer:
 
     def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; a ValueError where networks, observations or env are others."""
-        checkpoint.check_columns(state["observation_columns"], observation_columns(self.collector.env))
+        checkpoint.check_columns(
+            state["observation_columns"], observation_columns(self.collector.env)
+        )
         hooks = paired(self._own_hooks, state["hooks"], keeps=_keeps)
         # A first reset allocates the state of collector and transforms, before the saved values go in.
         self.collector.reset()

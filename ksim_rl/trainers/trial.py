@@ -29,7 +29,9 @@ ITERATIONS = 8  # the first ones run eagerly or fill a replay, the next ones rec
 SPARE = 0.1  # of the memory that was free
 
 
-def first_that_fits(cfg: RunCfg, numbers: Iterable[int], *, note: Callable[[str], None]) -> int | None:
+def first_that_fits(
+    cfg: RunCfg, numbers: Iterable[int], *, note: Callable[[str], None]
+) -> int | None:
     """Return the first of some numbers of envs with which the run trains and leaves a tenth of the memory, or None.
 
     Numbers that do not divide the data are passed over. `note` is told what is tried, and why it does not fit.
@@ -50,7 +52,9 @@ def first_that_fits(cfg: RunCfg, numbers: Iterable[int], *, note: Callable[[str]
             said = ended.stdout
         else:
             said = ended.stderr
-        note(f"num_envs={num_envs} does not train: {(said.strip() or 'no reason').splitlines()[-1]}")
+        note(
+            f"num_envs={num_envs} does not train: {(said.strip() or 'no reason').splitlines()[-1]}"
+        )
         if ended.returncode > 0 and ended.returncode != DOES_NOT:
             break  # the config cannot even be built there, and nobody knows whether memory suffices
     return None
@@ -73,7 +77,10 @@ def main() -> int:
         trainer = build(cfg)
         for _ in range(ITERATIONS):
             trainer.iterate()
-    except (RuntimeError, ValueError) as error:  # where memory lacks, libraries have many words for it
+    except (
+        RuntimeError,
+        ValueError,
+    ) as error:  # where memory lacks, libraries have many words for it
         print(" ".join(str(error).split()), flush=True)
         return DOES_NOT
     left = free_bytes(device)

@@ -15,7 +15,17 @@ from ksim_rl.transfer.judge import Judged
 
 GOOD = 0.9
 """The share from which on a condition counts as passed."""
-_HEAD = ("condition", "return", "of as trained", "upright", "effort", "speed", "power W", "jerk", "impact N")
+_HEAD = (
+    "condition",
+    "return",
+    "of as trained",
+    "upright",
+    "effort",
+    "speed",
+    "power W",
+    "jerk",
+    "impact N",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,10 +107,17 @@ class TransferCard:
         for condition in CONDITIONS:
             name = condition.name
             if name in self.refused:
-                lines.append(f"| {name} | cannot apply: {self.refused[name]} |{' |' * (len(head) - 2)}")
+                lines.append(
+                    f"| {name} | cannot apply: {self.refused[name]} |{' |' * (len(head) - 2)}"
+                )
                 continue
             found = self.judged[name]
-            cells = [name, _short(found.return_mean), f"{self.share(name):.2f}", f"{found.upright:.0%}"]
+            cells = [
+                name,
+                _short(found.return_mean),
+                f"{self.share(name):.2f}",
+                f"{found.upright:.0%}",
+            ]
             felt = (found.effort, found.speed, found.power, found.jerk, found.impact)
             cells += [_short(value) for value in felt]
             cells += [_short(found.errors[error]) for error in errors]

@@ -24,14 +24,21 @@ def card(arguments: Sequence[str]) -> int:
         prog="ksim-rl card",
         description="Judge a policy under all that it may meet on a robot, in MuJoCo's C engine, on the CPU.",
     )
-    parser.add_argument("run", metavar="RUN", help="a run folder, one of its checkpoints, or zoo:NAME")
+    parser.add_argument(
+        "run", metavar="RUN", help="a run folder, one of its checkpoints, or zoo:NAME"
+    )
     parser.add_argument(
         "--episodes", type=int, default=EPISODES, help=f"of each condition; default: {EPISODES}"
     )
     parser.add_argument(
-        "--seconds", type=float, default=MOST_SECONDS, help=f"of each episode; default: {MOST_SECONDS:g}"
+        "--seconds",
+        type=float,
+        default=MOST_SECONDS,
+        help=f"of each episode; default: {MOST_SECONDS:g}",
     )
-    parser.add_argument("--output", type=Path, metavar="DIR", help="default: card in the run folder")
+    parser.add_argument(
+        "--output", type=Path, metavar="DIR", help="default: card in the run folder"
+    )
     options: Any = parser.parse_args(arguments)
     check_count("--episodes", options.episodes)
     check_in_range("--seconds", options.seconds, low=0.0, low_open=True)
@@ -70,7 +77,9 @@ def judge_all(
             if number == 1:
                 raise
             refused[condition.name] = " ".join(str(error).split())
-            note(f"{number}/{len(CONDITIONS)} {condition.name}: cannot apply: {refused[condition.name]}")
+            note(
+                f"{number}/{len(CONDITIONS)} {condition.name}: cannot apply: {refused[condition.name]}"
+            )
             continue
         judged[condition.name] = found
         note(

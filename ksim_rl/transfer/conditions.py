@@ -127,7 +127,9 @@ def _rough_geoms(cfg: ManagerBasedRlEnvCfg) -> tuple[str, ...]:
 
 def _masses(factor: float) -> Change:
     return _event(
-        lambda cfg: RandomizeBodyMass(bodies=_bodies(cfg), operation="scale", ranges=(factor, factor))
+        lambda cfg: RandomizeBodyMass(
+            bodies=_bodies(cfg), operation="scale", ranges=(factor, factor)
+        )
     )
 
 
@@ -153,7 +155,9 @@ def _centre(axis: int, share: float) -> Change:
 def _gains(factor: float) -> Change:
     """Return the change of the gains of servos; of motors without any, of the effort that a command gives."""
     pair = (factor, factor)
-    of_servos = _event(lambda cfg: RandomizeActuatorGains(joints=_driven(cfg), stiffness=pair, damping=pair))
+    of_servos = _event(
+        lambda cfg: RandomizeActuatorGains(joints=_driven(cfg), stiffness=pair, damping=pair)
+    )
 
     def change(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
         if _has_motors_alone(cfg):
@@ -166,7 +170,9 @@ def _gains(factor: float) -> Change:
 def _limits(factor: float) -> Change:
     """Return the change of the limits of effort; of motors without any, of the range of their commands."""
     pair = (factor, factor)
-    of_servos = _event(lambda cfg: RandomizeEffortLimit(joints=_driven(cfg), operation="scale", ranges=pair))
+    of_servos = _event(
+        lambda cfg: RandomizeEffortLimit(joints=_driven(cfg), operation="scale", ranges=pair)
+    )
 
     def change(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
         if _has_motors_alone(cfg):
@@ -177,7 +183,9 @@ def _limits(factor: float) -> Change:
 
 
 def _has_motors_alone(cfg: ManagerBasedRlEnvCfg) -> bool:
-    return all(isinstance(entry, GearedMotor) for entry in entries(next(iter(cfg.scene.robots.values()))))
+    return all(
+        isinstance(entry, GearedMotor) for entry in entries(next(iter(cfg.scene.robots.values())))
+    )
 
 
 def _scaled(motor: Actuator, *, gain: float = 1.0, limit: float = 1.0) -> Actuator:
@@ -205,7 +213,9 @@ def _actuators(kind: type[Actuator]) -> Change:
             return kind(**same)
         if inner.effort_limit is None:
             raise ValueError("nothing limits the effort of its servos")
-        return DCMotorActuator(**same, saturation_effort=inner.effort_limit, velocity_limit=NO_LOAD_SPEED)
+        return DCMotorActuator(
+            **same, saturation_effort=inner.effort_limit, velocity_limit=NO_LOAD_SPEED
+        )
 
     return lambda cfg: _with_actuators(cfg, swap)
 
@@ -334,4 +344,6 @@ def _driven(cfg: ManagerBasedRlEnvCfg) -> tuple[str, ...]:
     """Return the joints with an actuator."""
     mj_model = build_spec(cfg.scene).compile()
     driven = set(mj_model.actuator_trnid[:, 0].tolist())
-    return tuple(mj_model.joint(joint).name for joint in scalar_joint_ids(mj_model) if joint in driven)
+    return tuple(
+        mj_model.joint(joint).name for joint in scalar_joint_ids(mj_model) if joint in driven
+    )

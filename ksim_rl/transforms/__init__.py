@@ -14,8 +14,17 @@ from ksim_rl.transforms.elementwise import (
     RewardClip,
     RewardScale,
 )
-from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg, compile_groups
-from ksim_rl.transforms.groups.groups import GroupSpec, ObservationGroups, group_specs, observation_columns
+from ksim_rl.transforms.groups.group_cfg import (
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    compile_groups,
+)
+from ksim_rl.transforms.groups.groups import (
+    GroupSpec,
+    ObservationGroups,
+    group_specs,
+    observation_columns,
+)
 from ksim_rl.transforms.history import HistoryCfg, ObservationHistory
 from ksim_rl.transforms.low_pass import ActionLowPass
 from ksim_rl.transforms.mirror.mirror import (
@@ -27,7 +36,12 @@ from ksim_rl.transforms.mirror.mirror import (
     MirrorMap,
     mirrored,
 )
-from ksim_rl.transforms.mirror.robot_mirror import mirror_by_name, mirror_group, mirror_joints, mirror_name
+from ksim_rl.transforms.mirror.robot_mirror import (
+    mirror_by_name,
+    mirror_group,
+    mirror_joints,
+    mirror_name,
+)
 from ksim_rl.transforms.noise.cfg import ConstantNoise, GaussianNoise, NoiseCfg, UniformNoise
 from ksim_rl.transforms.noise.observation_noise import ObservationNoise
 from ksim_rl.transforms.normalization import ObservationNormalization
@@ -35,4 +49,6 @@ from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, follo
 from ksim_rl.transforms.trackers import EpisodeTracker, SuccessTracker, TimeAwareObservation
 from ksim_rl.transforms.transform_cfg import TransformCfg
 
-__all__ = sorted(name for name, value in globals().items() if name[0] != "_" and not inspect.ismodule(value))  # pyright: ignore
+__all__ = sorted(
+    name for name, value in globals().items() if name[0] != "_" and not inspect.ismodule(value)
+)  # pyright: ignore

@@ -59,7 +59,9 @@ class CheckedKeys(Transform):
 
     def _check_floating(self, key: NestedKey, dtype: torch.dtype) -> None:
         if not dtype.is_floating_point:
-            raise ValueError(f"{type(self).__name__}: {key!r} is {dtype}: expected floating-point values")
+            raise ValueError(
+                f"{type(self).__name__}: {key!r} is {dtype}: expected floating-point values"
+            )
 
     def _replace_leaves(
         self,
@@ -129,7 +131,9 @@ def checked_out_keys(
     else:
         out = as_keys(out_keys)
     if is_paired and len(out) != len(in_keys):
-        raise ValueError(f"out_keys={out} has {len(out)} keys for the {len(in_keys)} of in_keys={in_keys}")
+        raise ValueError(
+            f"out_keys={out} has {len(out)} keys for the {len(in_keys)} of in_keys={in_keys}"
+        )
     if len(set(out)) != len(out):
         raise ValueError(f"out_keys={out} repeats a key: each needs its own place")
     return out
@@ -140,5 +144,7 @@ def one_per_key(name: str, value: Any, keys: Sequence[NestedKey]) -> list[Any]:
     if not isinstance(value, Mapping):
         return [value] * len(keys)
     if set(value) != set(keys):
-        raise ValueError(f"{name} has the keys {list(value)}, but in_keys={list(keys)}: give one per key")
+        raise ValueError(
+            f"{name} has the keys {list(value)}, but in_keys={list(keys)}: give one per key"
+        )
     return [value[key] for key in keys]

@@ -9,7 +9,9 @@ from torch import Tensor
 from ksim_rl.transforms import upstream
 
 
-def side_by_side(values: Sequence[Shaped[Tensor, "*?leaf"]], num_rows: int) -> Shaped[Tensor, "E L"]:
+def side_by_side(
+    values: Sequence[Shaped[Tensor, "*?leaf"]], num_rows: int
+) -> Shaped[Tensor, "E L"]:
     """Return values [E, ...] as the columns of one tensor [E, L], without a copy where they are that already.
 
     So values that one transform has split, the next one need not join. The result may share memory with the values.
@@ -51,7 +53,9 @@ def split(
 ) -> list[Shaped[Tensor, "*?leaf"]]:
     """Return views of the columns in the shapes of these values, which `side_by_side` has joined."""
     if len(likes) == 1:
-        return [joined_EL if joined_EL.shape == likes[0].shape else joined_EL.reshape(likes[0].shape)]
+        return [
+            joined_EL if joined_EL.shape == likes[0].shape else joined_EL.reshape(likes[0].shape)
+        ]
     # At least 1, as there may be no rows.
     sizes = [like.numel() // max(joined_EL.shape[0], 1) for like in likes]
     parts = joined_EL.split(sizes, dim=1)

@@ -14,7 +14,12 @@ from ksim_rl.device import random
 from ksim_rl.transforms import ring
 from ksim_rl.transforms.checked_keys import Keys
 from ksim_rl.transforms.history import RingTransform
-from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, RowTransform, checked_action
+from ksim_rl.transforms.row_transform import (
+    FollowsLevel,
+    KeyedTransform,
+    RowTransform,
+    checked_action,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +62,9 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
     shared_count: Tensor
     shared_age: Tensor
 
-    def __init__(self, delay: DelayCfg, seed: int | None, stream: str | None, **keys: Keys | None) -> None:
+    def __init__(
+        self, delay: DelayCfg, seed: int | None, stream: str | None, **keys: Keys | None
+    ) -> None:
         super().__init__(**keys, seed=seed, stream=stream)  # pyright: ignore[reportArgumentType]
         self._register_rows("lag_E")
         self._register_rings()
@@ -107,7 +114,9 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
         drawn_E = self._draw(self._step_keys("step/lag", shared=not delay.per_env))
         self.lag_E.copy_(torch.where(due, drawn_E, self.lag_E))
 
-    def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
+    def _rows_that_reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> Tensor:
         """Return which rows reset, bool [E], and draw their lags where the rings do not."""
         # The ring draws and counts these resets itself, in the launch that begins the rows.
         if self._draws_in_ring:
@@ -145,7 +154,11 @@ class LaggedTransform(FollowsLevel, KeyedTransform, RingTransform):
     def _draws(self, index: int) -> tuple[Any, ...]:
         if index > 0 or not self._draws_in_ring:
             return ring.NO_DRAWS
-        state = self._buffers["seed_value"], self._buffers["reset_count_E"], self._stream_ids["reset/lag"]
+        state = (
+            self._buffers["seed_value"],
+            self._buffers["reset_count_E"],
+            self._stream_ids["reset/lag"],
+        )
         return *state, self.delay.min_lag, self.delay.max_lag
 
 
@@ -200,7 +213,9 @@ class ActionDelay(LaggedTransform):
         self.initial = initial
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
-        self._size_rings(action_spec, self._replace_leaves(action_spec, is_inverse=True), joins=False)
+        self._size_rings(
+            action_spec, self._replace_leaves(action_spec, is_inverse=True), joins=False
+        )
         return action_spec
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:

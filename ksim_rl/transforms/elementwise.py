@@ -54,7 +54,9 @@ class ObservationMap(_Outward):
         self._replace_leaves(observation_spec, self.new_spec, is_floating=True)
         return observation_spec
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         return self._call(tensordict_reset)
 
 
@@ -77,7 +79,9 @@ class ActionMap(_Map):
         # Samples of a replay hold the policy's actions, which must not be mapped a second time.
         if self._is_for_samples:
             return tensordict
-        for index, (key, out_key) in enumerate(zip(self.in_keys_inv, self.out_keys_inv, strict=True)):
+        for index, (key, out_key) in enumerate(
+            zip(self.in_keys_inv, self.out_keys_inv, strict=True)
+        ):
             tensordict.set(key, self.new_value(index, tensordict.get(out_key)))
         return tensordict
 
@@ -104,7 +108,11 @@ class ObservationClip(_Clip, ObservationMap):
     """
 
     def __init__(
-        self, in_keys: Keys, out_keys: Keys | None = None, *, clip: Range | Mapping[NestedKey, Range]
+        self,
+        in_keys: Keys,
+        out_keys: Keys | None = None,
+        *,
+        clip: Range | Mapping[NestedKey, Range],
     ) -> None:
         super().__init__(in_keys, out_keys)
         # One range per key, so that units may differ from key to key.
@@ -120,7 +128,9 @@ class RewardClip(_Clip, RewardMap):
         >>> clip = RewardClip(clip=(0.0, None))
     """
 
-    def __init__(self, in_keys: Keys = "reward", out_keys: Keys | None = None, *, clip: Range) -> None:
+    def __init__(
+        self, in_keys: Keys = "reward", out_keys: Keys | None = None, *, clip: Range
+    ) -> None:
         super().__init__(in_keys, out_keys)
         check_clip("clip", clip)
         self.ranges = [clip] * len(self.in_keys)
@@ -165,7 +175,11 @@ class ObservationScale(ObservationMap):
     """
 
     def __init__(
-        self, in_keys: Keys, out_keys: Keys | None = None, *, scale: PerDim | Mapping[NestedKey, PerDim]
+        self,
+        in_keys: Keys,
+        out_keys: Keys | None = None,
+        *,
+        scale: PerDim | Mapping[NestedKey, PerDim],
     ) -> None:
         super().__init__(in_keys, out_keys)
         factors = one_per_key("scale", scale, self.in_keys)
@@ -180,7 +194,9 @@ class ObservationScale(ObservationMap):
         # A factor per element has to fit the last dim of the leaf.
         if factor.ndim:
             leaf = spec.shape[self.batch_dims[index] :]
-            _check_per_dim(f"scale of {self.in_keys[index]!r}", factor.shape[0], "observation", leaf)
+            _check_per_dim(
+                f"scale of {self.in_keys[index]!r}", factor.shape[0], "observation", leaf
+            )
         factors = factor.expand(spec.shape), factor.expand(spec.shape)
         # A negative factor turns the bounds around.
         low, high = multiply_bounds(bounds(spec), factors)
@@ -297,11 +313,14 @@ class ActionScale(ActionMap):
             if isinstance(value, Sequence):
                 _check_per_dim(name, len(value), f"action {key!r}", leaf)
         scale, offset = (
-            torch.tensor(value, dtype=spec.dtype, device=spec.device) for value in (self.scale, self.offset)
+            torch.tensor(value, dtype=spec.dtype, device=spec.device)
+            for value in (self.scale, self.offset)
         )
         return scale, offset
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         if self._buffers["scale_0"] is None:
             # The action's bounds are in the specs only.
             assert self.container is not None and self.container.input_spec is not None
@@ -311,14 +330,18 @@ class ActionScale(ActionMap):
         scale = self._buffers[f"scale_{index}"]
         offset = self._buffers[f"offset_{index}"]
         if scale is None or offset is None:
-            raise RuntimeError("ActionScale knows its numbers once an env holds it and has made its specs")
+            raise RuntimeError(
+                "ActionScale knows its numbers once an env holds it and has made its specs"
+            )
         return torch.addcmul(offset, value, scale)
 
 
 def check_scale(field: str, scale: PerDim) -> None:
     """Refuse all but a finite number or a tuple of them."""
     for index, factor in enumerate(scale if isinstance(scale, tuple | list) else [scale]):
-        checks.check_in_range(f"{field}[{index}]" if isinstance(scale, tuple | list) else field, factor)
+        checks.check_in_range(
+            f"{field}[{index}]" if isinstance(scale, tuple | list) else field, factor
+        )
 
 
 def _check_per_dim(field: str, count: int, owner: str, leaf: torch.Size) -> None:

@@ -47,7 +47,9 @@ class RingTransform(RowTransform):
     def _advance(self) -> None:
         """Prepare for the env step to come."""
 
-    def _size_rings(self, specs: Composite, leaves: Sequence[TensorSpec], *, joins: bool = True) -> None:
+    def _size_rings(
+        self, specs: Composite, leaves: Sequence[TensorSpec], *, joins: bool = True
+    ) -> None:
         """Make one ring [E, M, ...] per signal, or with `joins` one for all signals where they are of one dtype."""
         self._size_rows(specs)
         self._size_buffer("age_E", torch.int64)
@@ -59,7 +61,9 @@ class RingTransform(RowTransform):
             sizes = [shape.numel() for shape in shapes]
             # With one frame the order in memory is the order of the signals, and no parts are needed.
             if self.num_frames > 1:
-                part_bytes = torch.tensor([size * dtypes[0].itemsize for size in sizes], dtype=torch.int32)
+                part_bytes = torch.tensor(
+                    [size * dtypes[0].itemsize for size in sizes], dtype=torch.int32
+                )
                 self._buffers["part_bytes"] = part_bytes.to(self._row_device)
             shapes = [torch.Size([sum(sizes)])]
             dtypes = dtypes[:1]
@@ -78,7 +82,9 @@ class RingTransform(RowTransform):
         else:
             found = [self._through(index, value, mask_E) for index, value in enumerate(values)]
         for index, out_key in enumerate(self.out_keys):
-            tensordict.set(out_key, self._shaped(index, found[index], values[index], tensordict.batch_size))
+            tensordict.set(
+                out_key, self._shaped(index, found[index], values[index], tensordict.batch_size)
+            )
         return tensordict
 
     def _through(self, index: int, value: Tensor, mask_E: Tensor | None) -> Tensor:
@@ -97,14 +103,21 @@ class RingTransform(RowTransform):
         else:
             draws = ring.NO_DRAWS
         # All rings share one age, which only the last launch of a step counts on.
-        layout = self.num_frames, self.stride, buffers["part_bytes"], begins or index == self._num_rings - 1
+        layout = (
+            self.num_frames,
+            self.stride,
+            buffers["part_bytes"],
+            begins or index == self._num_rings - 1,
+        )
         return ring.turn(ring_EM, age_E, value_E, buffers.get("lag_E"), mask_E, *layout, *draws)
 
     def _draws(self, index: int) -> tuple[Any, ...]:
         """Return the last arguments of `ring.turn` for rows that begin, which draw their lags in this ring or not."""
         return ring.NO_DRAWS
 
-    def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
+    def _shaped(
+        self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size
+    ) -> Tensor:
         """Return the frames in the shape that the env emits."""
         if found_EL.shape == value.shape:
             return found_EL
@@ -139,7 +152,13 @@ class ObservationHistory(RingTransform):
     """
 
     def __init__(
-        self, in_keys: Keys, out_keys: Keys | None = None, *, length: int, stride: int = 1, flat: bool = True
+        self,
+        in_keys: Keys,
+        out_keys: Keys | None = None,
+        *,
+        length: int,
+        stride: int = 1,
+        flat: bool = True,
     ) -> None:
         cfg = HistoryCfg(length=length, stride=stride, flat=flat)
         super().__init__(in_keys, out_keys)
@@ -169,7 +188,9 @@ class ObservationHistory(RingTransform):
         low, high = (end.reshape(shape) for end in bounds(stacked))
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
-    def _shaped(self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size) -> Tensor:
+    def _shaped(
+        self, index: int, found_EL: Tensor, value: Tensor, batch_size: torch.Size
+    ) -> Tensor:
         outer = len(batch_size)
         inner = self.batch_dims[index]
         if self.flat and outer == inner == 1:

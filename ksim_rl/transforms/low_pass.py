@@ -58,7 +58,9 @@ class ActionLowPass(RowTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._sized()
-        for index, (key, out_key) in enumerate(zip(self.in_keys_inv, self.out_keys_inv, strict=True)):
+        for index, (key, out_key) in enumerate(
+            zip(self.in_keys_inv, self.out_keys_inv, strict=True)
+        ):
             filtered_E: Tensor = getattr(self, f"filtered_{index}")
             action = checked_action(tensordict, out_key, filtered_E.shape[1:], filtered_E.dtype)
             action_E = action.reshape(filtered_E.shape)

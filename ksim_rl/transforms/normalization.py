@@ -91,7 +91,9 @@ class ObservationNormalization(RowTransform):
     def _size_moments(self, sizes: list[int], device: Device) -> None:
         # Statistics of the same sizes are kept: specs are made more than once.
         if [moments.dim for moments in self._each_moments()] != sizes:
-            self.moments = nn.ModuleList(RunningMoments(n, until=self.until, device=device) for n in sizes)
+            self.moments = nn.ModuleList(
+                RunningMoments(n, until=self.until, device=device) for n in sizes
+            )
 
     def _each_moments(self) -> list[RunningMoments]:
         return list(self.moments)  # pyright: ignore[reportReturnType]
@@ -116,11 +118,15 @@ class ObservationNormalization(RowTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Normalize a batch of samples by the statistics as they are."""
         if not len(self.moments):
-            raise RuntimeError("there are no statistics yet: an env, or `load_state_dict`, gives them")
+            raise RuntimeError(
+                "there are no statistics yet: an env, or `load_state_dict`, gives them"
+            )
         self._check_samples(tensordict)
         return self._normalize(tensordict)
 
-    def _flat(self, tensordict: TensorDictBase, num_rows: int) -> list[tuple[Tensor, RunningMoments]]:
+    def _flat(
+        self, tensordict: TensorDictBase, num_rows: int
+    ) -> list[tuple[Tensor, RunningMoments]]:
         values = [tensordict.get(key).reshape(num_rows, -1) for key in self.in_keys]
         return list(zip(values, self._each_moments(), strict=True))
 

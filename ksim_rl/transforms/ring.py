@@ -12,11 +12,21 @@ from torch import Tensor
 
 from ksim_rl import ranks
 from ksim_rl.device import draws_in_torch as in_torch
-from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator, source_of
+from ksim_rl.device.quick_launch import (
+    ADDRESS,
+    QuickLaunch,
+    address,
+    arguments_of,
+    as_operator,
+    source_of,
+)
 from ksim_rl.device.random import DRAWS
 
 _ARGUMENTS = arguments_of(
-    (int, "width lanes num_bytes value_stride num_slots num_frames stride num_parts counts first_row"),
+    (
+        int,
+        "width lanes num_bytes value_stride num_slots num_frames stride num_parts counts first_row",
+    ),
     ("uint32", "stream"),
     (int, "lowest span"),
     (ADDRESS, "seed draw_count age lag mask parts value ring out"),
@@ -97,7 +107,9 @@ def _launch(
     first_row = ranks.first_row(num_rows)
     draws = first_row, stream, lowest, highest - lowest + 1, address(seed), address(draw_count_E)
     tensors = age_E.data_ptr(), address(lag_E), address(mask_E), address(parts), value
-    _quick(device, (num_rows, lanes), *layout, *draws, *tensors, ring_EM.data_ptr(), out_EL.data_ptr())
+    _quick(
+        device, (num_rows, lanes), *layout, *draws, *tensors, ring_EM.data_ptr(), out_EL.data_ptr()
+    )
     return out_EL
 
 

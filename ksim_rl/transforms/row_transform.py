@@ -59,7 +59,11 @@ class RowTransform(CheckedKeys, ABC):
             self._buffers[name] = torch.zeros(shape, dtype=dtype, device=self._row_device)
 
     def _size_leaves(
-        self, name: str, specs: Composite, leaves: Sequence[TensorSpec], dtype: torch.dtype | None = None
+        self,
+        name: str,
+        specs: Composite,
+        leaves: Sequence[TensorSpec],
+        dtype: torch.dtype | None = None,
     ) -> None:
         """Make a buffer `<name>_<index>` per leaf, in its dtype or another."""
         for index, spec in enumerate(leaves):
@@ -81,7 +85,9 @@ class RowTransform(CheckedKeys, ABC):
                 assert env.output_spec is not None and env.input_spec is not None
         return self._buffers
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         self._sized()
         return self._begin(tensordict_reset, self._rows_that_reset(tensordict, tensordict_reset))
 
@@ -89,7 +95,9 @@ class RowTransform(CheckedKeys, ABC):
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         """Let the masked rows begin an episode."""
 
-    def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
+    def _rows_that_reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> Tensor:
         """Return which rows reset, bool [E]; all of them where there is no mask."""
         # Nearly every reset has one mask and nothing else: a look-up spares a walk through the keys.
         if len(tensordict.keys()) == 1 and (only := tensordict.get("_reset", None)) is not None:
@@ -176,7 +184,9 @@ class KeyedTransform(RowTransform):
         else:
             self.stream = stream
         # Streams are named, so that one more transform in a chain changes no draws of the others.
-        self._stream_ids = {name: random.stream_id(f"{self.stream}/{name}") for name in self.purposes}
+        self._stream_ids = {
+            name: random.stream_id(f"{self.stream}/{name}") for name in self.purposes
+        }
         self._is_seeded = seed is not None
         self.register_buffer("seed_value", torch.tensor(_NO_SEED if seed is None else seed))
         self.register_buffer("step_count", torch.zeros((), dtype=torch.int64))
@@ -195,7 +205,9 @@ class KeyedTransform(RowTransform):
         super().set_container(container)
         upstream.hear_seeds(upstream.env_of(self), seed_transforms)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         self._take_seed()
         return super()._reset(tensordict, tensordict_reset)
 
@@ -213,7 +225,9 @@ class KeyedTransform(RowTransform):
         super()._size_rows(specs)
         self._size_buffer("reset_count_E", torch.int64)
 
-    def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
+    def _rows_that_reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> Tensor:
         mask_E = super()._rows_that_reset(tensordict, tensordict_reset)
         self.reset_count_E.add_(mask_E)
         return mask_E
@@ -225,7 +239,9 @@ class KeyedTransform(RowTransform):
         return random.row_keys(self.seed_value, stream, self.step_count, rows, shared=shared)
 
     def _reset_keys(self, purpose: str) -> random.RowKeys:
-        return random.row_keys(self.seed_value, self._stream_ids[purpose], self.reset_count_E, self.num_rows)
+        return random.row_keys(
+            self.seed_value, self._stream_ids[purpose], self.reset_count_E, self.num_rows
+        )
 
 
 def held_transforms(env: EnvBase, kind: type[Held]) -> Iterator[Held]:

@@ -81,13 +81,19 @@ def bounded(
     # Specs are made before the first step, where reading the device does no harm.
     if bool(torch.isinf(low).all()) and bool(torch.isinf(high).all()):
         return Unbounded(shape=low.shape, dtype=dtype, device=device)
-    return Bounded(low=low.to(dtype), high=high.to(dtype), shape=low.shape, dtype=dtype, device=device)
+    return Bounded(
+        low=low.to(dtype), high=high.to(dtype), shape=low.shape, dtype=dtype, device=device
+    )
 
 
 def multiply_bounds(a: Ends, b: Ends) -> Ends:
     """Return the range of x * y for x in a, y in b; 0 times infinity is 0, as no finite x exceeds it."""
     # The extremes of a product over two intervals lie at their ends.
     corners = torch.stack(
-        [torch.nan_to_num(x * y, nan=0.0, posinf=torch.inf, neginf=-torch.inf) for x in a for y in b]
+        [
+            torch.nan_to_num(x * y, nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+            for x in a
+            for y in b
+        ]
     )
     return corners.amin(0), corners.amax(0)

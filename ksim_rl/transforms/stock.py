@@ -18,7 +18,9 @@ DATA = tuple(_DATA.split())
 """Transforms of an env whose arguments are numbers, names, keys and lists of these."""
 
 _NO_DATA = "and a config holds data only; write a transform of your own in a plug-in"
-_DRAWS = "its draws come from torch's global generator, so that a resumed run would not continue exactly"
+_DRAWS = (
+    "its draws come from torch's global generator, so that a resumed run would not continue exactly"
+)
 _NAMELESS = "it takes its keys without names, which a config cannot give"
 _BATCH = "it works on batches of samples or whole trajectories, not in an env"
 _FUNCTION = f"it takes a function, {_NO_DATA}"

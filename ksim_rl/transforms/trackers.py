@@ -37,10 +37,14 @@ class _Tracker(RowTransform):
             kept_E.masked_fill_(mask_E.reshape(-1, *[1] * (kept_E.ndim - 1)), 0)
         return self._write(tensordict_reset)
 
-    def _write(self, tensordict: TensorDictBase, copies: Sequence[Tensor] | None = None) -> TensorDictBase:
+    def _write(
+        self, tensordict: TensorDictBase, copies: Sequence[Tensor] | None = None
+    ) -> TensorDictBase:
         batch = tensordict.batch_size
         for key, copy in zip(self.out_keys, copies or [kept_E.clone() for kept_E in self._kept()]):  # noqa: B905 (the length may have no key)
-            tensordict.set(key, copy if len(batch) == 1 else copy.reshape((*batch, *copy.shape[1:])))
+            tensordict.set(
+                key, copy if len(batch) == 1 else copy.reshape((*batch, *copy.shape[1:]))
+            )
         return tensordict
 
 
@@ -88,7 +92,9 @@ class EpisodeTracker(_Tracker):
             if spec.dtype == torch.bool:
                 raise ValueError(f"EpisodeTracker: {key!r} is {spec.dtype}: expected numbers")
         for key, spec in zip(self.out_keys, leaves, strict=False):
-            set_leaf_spec(observations, key, Unbounded(spec.shape, dtype=spec.dtype, device=spec.device))
+            set_leaf_spec(
+                observations, key, Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
+            )
         if self.length_key is not None:
             # int64, as episodes have no longest length.
             shape = torch.Size([*observations.shape, 1])
@@ -128,7 +134,10 @@ class EpisodeTracker(_Tracker):
         return self._write(tensordict, (total_E, step_E.unsqueeze(1)))
 
     def _kept(self) -> list[Tensor]:
-        return [*(getattr(self, name) for name in self._per_key("return")), self.step_E.unsqueeze(1)]
+        return [
+            *(getattr(self, name) for name in self._per_key("return")),
+            self.step_E.unsqueeze(1),
+        ]
 
 
 class SuccessTracker(_Tracker):
@@ -230,7 +239,9 @@ class TimeAwareObservation(_Tracker):
         # Asked for once: the answer cannot change while the env lives.
         if self.horizon is None:
             if self.container is None:
-                raise ValueError("horizon=None asks the env for its horizon: use the transform in an env")
+                raise ValueError(
+                    "horizon=None asks the env for its horizon: use the transform in an env"
+                )
             env = innermost(self.container)
             # Ours say it themselves; Gymnasium keeps it in the spec of its env.
             if isinstance(env, EpisodeLimit):
@@ -249,7 +260,9 @@ class TimeAwareObservation(_Tracker):
         self.step_E.add_(1.0)
         return self._write(next_tensordict)
 
-    def _write(self, tensordict: TensorDictBase, copies: Sequence[Tensor] | None = None) -> TensorDictBase:
+    def _write(
+        self, tensordict: TensorDictBase, copies: Sequence[Tensor] | None = None
+    ) -> TensorDictBase:
         horizon = self._horizon()
         # The remaining time is made from the count, so that only the count is kept.
         left_E1 = time_left(horizon, self.step_E).unsqueeze(1)

@@ -36,7 +36,9 @@ class TransformCfg(OwnTree):
 
     def __init__(self, transform: type[Transform], /, **arguments: Any) -> None:
         if not (isinstance(transform, type) and issubclass(transform, Transform)):
-            raise ValueError(f"{transform!r}: expected a class of transforms, with its arguments beside it")
+            raise ValueError(
+                f"{transform!r}: expected a class of transforms, with its arguments beside it"
+            )
         stock.check(transform)
         parameters = _parameters(transform)
         # An unknown name is refused with the near ones.
@@ -71,7 +73,9 @@ class TransformCfg(OwnTree):
     def to_tree(self) -> Tree:
         """Return the plain tree: the path of the class, and all arguments."""
         parameters = _parameters(self.transform)
-        arguments = {name: to_tree(value, parameters[name][0]) for name, value in self.arguments.items()}
+        arguments = {
+            name: to_tree(value, parameters[name][0]) for name, value in self.arguments.items()
+        }
         return {TARGET: class_paths.public_path(self.transform), **arguments}
 
     @classmethod
@@ -81,9 +85,15 @@ class TransformCfg(OwnTree):
             return tree
         # Without a class there is nothing to check the arguments by.
         if not isinstance(tree, Mapping) or TARGET not in tree:
-            raise ValueError(f"{path}: needs {TARGET}, the class of this transform, and its arguments")
+            raise ValueError(
+                f"{path}: needs {TARGET}, the class of this transform, and its arguments"
+            )
         transform = class_paths.find(
-            tree[TARGET], path, kind="transform", accepts=_is_transform, besides=frozenset({stock.PACKAGE})
+            tree[TARGET],
+            path,
+            kind="transform",
+            accepts=_is_transform,
+            besides=frozenset({stock.PACKAGE}),
         )
         with naming(f"{path}.{TARGET}"):
             stock.check(transform)
@@ -99,7 +109,9 @@ class TransformCfg(OwnTree):
     def given(self) -> dict[str, Any]:
         """Return the arguments that differ from their defaults."""
         parameters = _parameters(self.transform)
-        return {name: value for name, value in self.arguments.items() if value != parameters[name][1]}
+        return {
+            name: value for name, value in self.arguments.items() if value != parameters[name][1]
+        }
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, TransformCfg):
@@ -135,7 +147,9 @@ def _parameters(transform: type[Transform]) -> dict[str, tuple[Annotation, Any]]
 def _annotation(transform: type[Transform], name: str, where: str) -> Annotation:
     parameters = _parameters(transform)
     if name not in parameters:
-        raise ValueError(f"unknown field {where!r} of {transform.__name__}: {near(str(name), parameters)}")
+        raise ValueError(
+            f"unknown field {where!r} of {transform.__name__}: {near(str(name), parameters)}"
+        )
     return parameters[name][0]
 
 
@@ -144,7 +158,9 @@ def _as_data(annotation: Annotation) -> Annotation:
     # Both spellings of a union, `Union[A, B]` and `A | B`.
     is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     options = [
-        option for option in (typing.get_args(annotation) if is_union else (annotation,)) if _is_data(option)
+        option
+        for option in (typing.get_args(annotation) if is_union else (annotation,))
+        if _is_data(option)
     ]
     if options:
         return functools.reduce(operator.or_, options)
@@ -170,7 +186,12 @@ def _is_data(option: Annotation) -> bool:
         return all(_is_data(entry) or entry is Ellipsis for entry in typing.get_args(option))
     if origin in (typing.Union, types.UnionType):
         return all(map(_is_data, typing.get_args(option)))
-    return origin is Literal or option in _PLAIN or option is NestedKey or dataclasses.is_dataclass(option)
+    return (
+        origin is Literal
+        or option in _PLAIN
+        or option is NestedKey
+        or dataclasses.is_dataclass(option)
+    )
 
 
 def _check_data(name: str, value: Any) -> None:
@@ -178,10 +199,14 @@ def _check_data(name: str, value: Any) -> None:
     if isinstance(value, Mapping):
         for key, entry in value.items():
             if not isinstance(key, str):
-                raise ValueError(f"{name}: key {key!r}: the keys of a mapping are strings in a config")
+                raise ValueError(
+                    f"{name}: key {key!r}: the keys of a mapping are strings in a config"
+                )
             _check_data(f"{name}.{key}", entry)
     elif isinstance(value, (list, tuple)):
         for index, entry in enumerate(value):
             _check_data(f"{name}[{index}]", entry)
-    elif not isinstance(value, _PLAIN) and (isinstance(value, type) or not dataclasses.is_dataclass(value)):
+    elif not isinstance(value, _PLAIN) and (
+        isinstance(value, type) or not dataclasses.is_dataclass(value)
+    ):
         raise ValueError(f"{name}={value!r}: expected data, which a config can hold")

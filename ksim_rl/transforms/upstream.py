@@ -47,7 +47,9 @@ def is_in_env(transform: Transform) -> bool:
 class _SetSeed:
     """The `set_seed` of a stock env, which reaches its transforms too."""
 
-    def __init__(self, env: TransformedEnv, seed_transforms: Callable[[TransformedEnv, int], None]) -> None:
+    def __init__(
+        self, env: TransformedEnv, seed_transforms: Callable[[TransformedEnv, int], None]
+    ) -> None:
         # A strong reference would be a cycle: an env of worker processes would not be closed with its last user.
         self.env = weakref.ref(env)
         self.seed_transforms = seed_transforms
@@ -96,7 +98,10 @@ def fresh_seed() -> int:
         generator = None
     else:
         generator = _generator_of_worker
-    return int(torch.randint(1 << 31, (), generator=generator)) << 31 | zlib.crc32(repr(place).encode()) >> 1
+    return (
+        int(torch.randint(1 << 31, (), generator=generator)) << 31
+        | zlib.crc32(repr(place).encode()) >> 1
+    )
 
 
 def gym_horizon(env: EnvBase) -> int | None:

@@ -28,7 +28,9 @@ class BrowserViewer:
     cannot be.
     """
 
-    def __init__(self, *, host: str = "127.0.0.1", port: int = 8080, label: str = "ksim_rl") -> None:
+    def __init__(
+        self, *, host: str = "127.0.0.1", port: int = 8080, label: str = "ksim_rl"
+    ) -> None:
         # Before the server is made, for an error in plain words.
         check_listens(host, port)
         self._gate = Gate(host)
@@ -67,7 +69,12 @@ class BrowserViewer:
             self._plots = Plots(server.gui, plots, session)
         # One port further, so that both can be forwarded together.
         self._pad = Pad(
-            self._panel, session, self._gate, host=self._host, port=self.port + 1, viewer_port=self.port
+            self._panel,
+            session,
+            self._gate,
+            host=self._host,
+            port=self.port + 1,
+            viewer_port=self.port,
         )
         self._built = 0
         self._scene: BrowserScene | None = None
@@ -90,7 +97,9 @@ class BrowserViewer:
                 self._env_scene = SceneOfEnv(session.ours)
                 self._scene = BrowserScene(self.server.scene, self._env_scene.mj_model)
             assert self._scene is not None
-            self._env_scene.fill(session.env_index, drawn=self._panel.drawn, contacts=self._panel.contacts)
+            self._env_scene.fill(
+                session.env_index, drawn=self._panel.drawn, contacts=self._panel.contacts
+            )
             if self._panel.follows:
                 center = self._env_scene.center(session.ours.cfg.viewer.body)
             else:
@@ -135,7 +144,11 @@ def _aim(server: viser.ViserServer, cfg: ViewerCfg) -> None:
     azimuth = np.radians(cfg.azimuth)
     elevation = np.radians(cfg.elevation)
     ahead = np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
     )
     # Above the origin: the scene is moved so that the robot stands there.
     target = np.array([0.0, 0.0, cfg.lookat[2]])

@@ -54,7 +54,9 @@ class SceneOfEnv:
         # No camera and no mouse: a browser has its own of both.
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         nothing = (mujoco.MjvPerturb(), mujoco.MjvCamera())
-        mujoco.mjv_updateScene(self.mj_model, self.data, self.option, *nothing, everything, self.mjv)
+        mujoco.mjv_updateScene(
+            self.mj_model, self.data, self.option, *nothing, everything, self.mjv
+        )
         # Drawn behind the model's own geoms, into the same list.
         visualizer = DebugVisualizer(self.mj_model, self.mjv)
         self._env.update_visualizers(visualizer, env_index, drawn=drawn)
@@ -211,7 +213,12 @@ class BrowserScene:
             width = 2 * float(geom.size[0])
             height = 2 * float(geom.size[1])
         place = {"wxyz": quat, "position": np.asarray(position, dtype=np.float64)}
-        extent = {"width": width, "height": height, "infinite_grid": infinite, "fade_distance": 30.0}
+        extent = {
+            "width": width,
+            "height": height,
+            "infinite_grid": infinite,
+            "fade_distance": 30.0,
+        }
         grid = self._scene.add_grid(f"/env/plane_{geom.objid}", **extent, **_GROUND, **place)
         self._planes[geom.objid] = grid
 
@@ -276,12 +283,16 @@ def _of_trimesh(*bodies: trimesh.Trimesh) -> Mesh:
 
 
 def _tube(start: float, end: float) -> trimesh.Trimesh:
-    return trimesh.creation.cylinder(radius=1.0, segment=[[0, 0, start], [0, 0, end]], sections=_SHADES)
+    return trimesh.creation.cylinder(
+        radius=1.0, segment=[[0, 0, start], [0, 0, end]], sections=_SHADES
+    )
 
 
 _BALL = _of_trimesh(trimesh.creation.icosphere(subdivisions=3))
 # As wide beside its shaft as MuJoCo draws it.
-_HEAD = trimesh.creation.cone(radius=1.75, height=0.25, sections=_SHADES).apply_translation([0, 0, 0.75])
+_HEAD = trimesh.creation.cone(radius=1.75, height=0.25, sections=_SHADES).apply_translation(
+    [0, 0, 0.75]
+)
 _PRIMITIVES: dict[int, Mesh] = {
     int(_KIND.mjGEOM_SPHERE): _BALL,
     int(_KIND.mjGEOM_ELLIPSOID): _BALL,

@@ -76,7 +76,9 @@ class Gate:
         first = request.path.partition("?")[0].split("/")[1:2]
         # In constant time, so that the token cannot be guessed letter by letter.
         if not hmac.compare_digest("".join(first).encode(), self.token.encode()):
-            return _forbidden("open the address that the command printed, with all that follows the port")
+            return _forbidden(
+                "open the address that the command printed, with all that follows the port"
+            )
         return None
 
     def without_token(self, request: Request) -> Request:

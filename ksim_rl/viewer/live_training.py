@@ -128,13 +128,17 @@ def main(folder: Path) -> None:
     go_to_parents_folder()
     plugins.load(())
     # On the CPU and without weights of a checkpoint: the policy comes from the training.
-    cfg = RunCfg.from_tree({**json.loads((folder / CONFIG).read_text()), "device": "cpu", "checkpoint": None})
+    cfg = RunCfg.from_tree(
+        {**json.loads((folder / CONFIG).read_text()), "device": "cpu", "checkpoint": None}
+    )
     viewer = BrowserViewer(host=cfg.viewer.address, port=cfg.viewer.port, label="training")
     # A policy needs an env for its shapes.
     probe = build_env(cfg, num_envs=1, seed=cfg.seed)
     actor = make_policy(cfg, probe)
     probe.close()
-    session = session_of(Played(cfg=cfg, title=cfg.task_name, folder=folder, actor=actor), num_envs=4, seed=0)
+    session = session_of(
+        Played(cfg=cfg, title=cfg.task_name, folder=folder, actor=actor), num_envs=4, seed=0
+    )
     viewer.open(session)
     # Flushed, as a pipe is no terminal; the training shows these lines.
     print(*addresses(viewer.address, viewer.pad_address), sep="\n", flush=True)

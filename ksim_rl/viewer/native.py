@@ -23,7 +23,9 @@ def check_display() -> None:
     # GLFW warns where there is no display; our error says it better.
     with warnings.catch_warnings(category=glfw.GLFWError, action="ignore"):
         if not glfw.init():
-            raise ValueError("--viewer native: no display to open a window on; --viewer browser needs none")
+            raise ValueError(
+                "--viewer native: no display to open a window on; --viewer browser needs none"
+            )
     glfw.terminate()
 
 

@@ -57,10 +57,14 @@ class Pad:
         # The next free port, as viser does.
         for candidate in range(port, port + 100):
             try:
-                return serve(self._listen, host, candidate, process_request=self._answer, max_size=MOST_BYTES)
+                return serve(
+                    self._listen, host, candidate, process_request=self._answer, max_size=MOST_BYTES
+                )
             except OSError:
                 continue
-        raise OSError(f"ports {port} to {port + 99} of {host} are all taken: choose another with --port")
+        raise OSError(
+            f"ports {port} to {port + 99} of {host} are all taken: choose another with --port"
+        )
 
     def _answer(self, _: ServerConnection, request: Request) -> Response | None:
         # The same check for the page and for its connection.
@@ -129,7 +133,9 @@ def parsed(message: str | bytes) -> dict[str, Any] | None:
         ):
             return None
         # Shares beyond the range would drive beyond the command's range.
-        found["axes"] = {int(number): clamped(float(share), -1.0, 1.0) for number, share in axes.items()}
+        found["axes"] = {
+            int(number): clamped(float(share), -1.0, 1.0) for number, share in axes.items()
+        }
     if "do" in asked:
         if asked["do"] not in DOES:
             return None

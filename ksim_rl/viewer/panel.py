@@ -9,7 +9,9 @@ import viser
 from ksim_rl.viewer.session import SPEEDS, Conditions, Session
 from ksim_rl.viewer.shown_text import as_html, paragraph
 
-_SPEED_NAMES = {("1/8", "1/4", "1/2", "1", "2", "4", "8")[i]: speed for i, speed in enumerate(SPEEDS)}
+_SPEED_NAMES = {
+    ("1/8", "1/4", "1/2", "1", "2", "4", "8")[i]: speed for i, speed in enumerate(SPEEDS)
+}
 
 
 class Panel:
@@ -28,7 +30,9 @@ class Panel:
         self.follows = True
         self.contacts = False
         self.drawn: set[str] = set()
-        self._steering: dict[str, tuple[viser.GuiCheckboxHandle, dict[str, viser.GuiSliderHandle]]] = {}
+        self._steering: dict[
+            str, tuple[viser.GuiCheckboxHandle, dict[str, viser.GuiSliderHandle]]
+        ] = {}
         self._status = gui.add_html("")
         self._error = gui.add_html("", visible=False)
         self._play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
@@ -39,7 +43,9 @@ class Panel:
         runs.on_click(lambda event: session.ask(calls[str(_value(event))]))
         self._speed = gui.add_button_group("Speed", tuple(_SPEED_NAMES))
         # A plain number, read between steps: no request is needed.
-        self._speed.on_click(lambda event: setattr(session, "speed", _SPEED_NAMES[str(_value(event))]))
+        self._speed.on_click(
+            lambda event: setattr(session, "speed", _SPEED_NAMES[str(_value(event))])
+        )
         self._env = gui.add_number("Env", 0, min=0, max=session.ours.num_envs - 1, step=1)
         self._env.on_update(lambda _: session.ask(partial(session.choose, int(self._env.value))))
         follow = gui.add_checkbox("Camera follows", True)
@@ -53,7 +59,9 @@ class Panel:
             with gui.add_folder("Commands"):
                 for name, term in steerable.items():
                     # Names of commands only where there are several.
-                    self._add_command(name, term.ranges, prefix=f"{name}." if len(steerable) > 1 else "")
+                    self._add_command(
+                        name, term.ranges, prefix=f"{name}." if len(steerable) > 1 else ""
+                    )
         with gui.add_folder("Conditions", expand_by_default=False):
             for field in dataclasses.fields(Conditions):
                 self._add_condition(field.name)
@@ -115,10 +123,14 @@ class Panel:
 
     def _error_html(self) -> str:
         told = as_html(f"{self._session.error}\n\n{self._session.trace}")
-        listing = f'<pre style="margin:0;padding:0 1em;overflow-x:auto;font-size:0.8em">{told}</pre>'
+        listing = (
+            f'<pre style="margin:0;padding:0 1em;overflow-x:auto;font-size:0.8em">{told}</pre>'
+        )
         return paragraph("<b>Paused by an error</b>") + listing
 
-    def _add_command(self, name: str, ranges: Mapping[str, tuple[float, float]], *, prefix: str) -> None:
+    def _add_command(
+        self, name: str, ranges: Mapping[str, tuple[float, float]], *, prefix: str
+    ) -> None:
         gui = self._gui
         by_hand = gui.add_checkbox(f"{name} by hand", False)
         by_hand.on_update(lambda _: self._session.ask(partial(self._steer, name)))
@@ -147,7 +159,9 @@ class Panel:
         widget = self._gui.add_checkbox(name, getattr(self._session.conditions, name))
 
         def change() -> None:
-            self._session.change(dataclasses.replace(self._session.conditions, **{name: widget.value}))
+            self._session.change(
+                dataclasses.replace(self._session.conditions, **{name: widget.value})
+            )
 
         widget.on_update(lambda _: self._session.ask(change))
 

@@ -136,7 +136,9 @@ def _parser() -> OneLineParser:
     parser.add_argument(
         "--viewer", choices=("browser", "native"), help="look and drive; native is MuJoCo's window"
     )
-    parser.add_argument("--agent", choices=AGENTS, help="act without a policy: not at all, or at random")
+    parser.add_argument(
+        "--agent", choices=AGENTS, help="act without a policy: not at all, or at random"
+    )
     parser.add_argument(
         "--motion",
         help="play a reference motion in the scene of a task, without physics: its name, or a file",
@@ -145,7 +147,9 @@ def _parser() -> OneLineParser:
         "--num-envs", type=int, default=4, help="of a viewer, which shows one at a time; default: 4"
     )
     parser.add_argument(
-        "--host", default="127.0.0.1", help="where the browser viewer listens; default: this machine"
+        "--host",
+        default="127.0.0.1",
+        help="where the browser viewer listens; default: this machine",
     )
     parser.add_argument(
         "--port", type=int, default=8080, help="of the browser viewer, or the next that is free"
@@ -153,11 +157,17 @@ def _parser() -> OneLineParser:
     parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     parser.add_argument("--seed", type=int, default=0, help="of the initial state")
     parser.add_argument(
-        "--seconds", type=float, help="of a video, simulated time; default: as the run was configured"
+        "--seconds",
+        type=float,
+        help="of a video, simulated time; default: as the run was configured",
     )
-    parser.add_argument("--fps", type=float, help=f"of a video, pictures per second; default: {FPS:g}")
     parser.add_argument(
-        "--output", type=Path, help="of a video: an .mp4 or .gif file; default: play.mp4 in the run folder"
+        "--fps", type=float, help=f"of a video, pictures per second; default: {FPS:g}"
+    )
+    parser.add_argument(
+        "--output",
+        type=Path,
+        help="of a video: an .mp4 or .gif file; default: play.mp4 in the run folder",
     )
     return parser
 
@@ -194,7 +204,9 @@ def _find(options: argparse.Namespace) -> Played:
             raise ValueError(
                 f"{first!r}: expected a run folder, or task=NAME with --agent zero or random, as it has no policy"
             )
-        return _without_policy(conf.compose([*options.what, f"device={options.device}"]), options.agent)
+        return _without_policy(
+            conf.compose([*options.what, f"device={options.device}"]), options.agent
+        )
     changed = None
     physics = ""
     # `locate` also takes names of the zoo.
@@ -220,9 +232,13 @@ def _find(options: argparse.Namespace) -> Played:
 def _motion(options: argparse.Namespace) -> Played:
     """Return a motion to play in the scene of a task."""
     if not any(text.startswith("task=") for text in options.what):
-        raise ValueError(f"--motion {options.motion}: name a task with the motion's robot: task=NAME")
+        raise ValueError(
+            f"--motion {options.motion}: name a task with the motion's robot: task=NAME"
+        )
     if options.agent is not None:
-        raise ValueError(f"--motion {options.motion} with --agent {options.agent}: nothing acts in a motion")
+        raise ValueError(
+            f"--motion {options.motion} with --agent {options.agent}: nothing acts in a motion"
+        )
     cfg = conf.compose([*options.what, f"device={options.device}"])
     shown = dataclasses.replace(cfg, task=showing_motion(cfg.task, options.motion))
     played = _without_policy(shown, "zero")
@@ -231,7 +247,10 @@ def _motion(options: argparse.Namespace) -> Played:
 
 def _without_policy(cfg: RunCfg, agent: str) -> Played:
     return Played(
-        cfg=without_nan_guard(cfg), title=f"{cfg.task_name}, {agent} actions", folder=Path(), agent=agent
+        cfg=without_nan_guard(cfg),
+        title=f"{cfg.task_name}, {agent} actions",
+        folder=Path(),
+        agent=agent,
     )
 
 
@@ -244,7 +263,12 @@ def _record(played: Played, options: argparse.Namespace, progress: RunProgress) 
     probe = build_env(played.cfg, num_envs=1, seed=options.seed)
     actor = played.policy(probe)
     probe.close()
-    how = {"note": progress.note, "seconds": options.seconds, "fps": options.fps or FPS, "seed": options.seed}
+    how = {
+        "note": progress.note,
+        "seconds": options.seconds,
+        "fps": options.fps or FPS,
+        "seed": options.seed,
+    }
     with progress.console.status("drawing the video") as spinner:
         if progress.console.is_terminal:
             status = spinner.update

@@ -60,7 +60,9 @@ class Curves:
         if self._chart is None:
             series = [uplot.Series(label="s")]
             for column, name in enumerate(shown):
-                series.append(uplot.Series(label=name, stroke=COLORS[column % len(COLORS)], width=1.5))
+                series.append(
+                    uplot.Series(label=name, stroke=COLORS[column % len(COLORS)], width=1.5)
+                )
             with self._folder:
                 self._chart = self._gui.add_uplot(
                     data,

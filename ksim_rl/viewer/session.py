@@ -56,7 +56,9 @@ class Conditions:
         # Transforms of the user's own stay, whatever they do.
         dropped = () if self.noise else (ObservationNoise,)
         dropped += () if self.delay else (ObservationDelay, ActionDelay)
-        kept = [name for name, own in cfg.transforms.items() if not issubclass(own.transform, dropped)]
+        kept = [
+            name for name, own in cfg.transforms.items() if not issubclass(own.transform, dropped)
+        ]
         transforms = {name: cfg.transforms[name] for name in kept}
         # None stands for a task without events.
         events = cfg.events
@@ -67,7 +69,9 @@ class Conditions:
                 if (self.pushes or event.mode != "interval")
                 and (self.randomization or not (event.per_world_fields or event.mode == "startup"))
             }
-        return replace(cfg, observations=groups, transforms=transforms, events=events, curriculum={})
+        return replace(
+            cfg, observations=groups, transforms=transforms, events=events, curriculum={}
+        )
 
 
 def showing_motion(cfg: ManagerBasedRlEnvCfg, file: str) -> ManagerBasedRlEnvCfg:
@@ -155,7 +159,9 @@ class Session:
         """The env inside of all transforms."""
         found = part(self.env, ManagerBasedRlEnv)
         if found is None:
-            raise ValueError(f"{type(self.env).__name__}: the viewer shows envs of this package only")
+            raise ValueError(
+                f"{type(self.env).__name__}: the viewer shows envs of this package only"
+            )
         return found
 
     @property
@@ -163,12 +169,17 @@ class Session:
         """The clean reading of each observation term that is a vector, of the shown env."""
         # The root of the next step: the policy's present input. Images are left out.
         terms = self._root_E.get("obs")
-        return {key: terms.get(key)[self.env_index] for key in terms.keys() if terms.get(key).ndim == 2}
+        return {
+            key: terms.get(key)[self.env_index] for key in terms.keys() if terms.get(key).ndim == 2
+        }
 
     @property
     def commands(self) -> Mapping[str, Float[Tensor, " ?L"]]:
         """The present command vectors of the shown env."""
-        return {name: value_EK[self.env_index] for name, value_EK in self.ours.command_manager.values.items()}
+        return {
+            name: value_EK[self.env_index]
+            for name, value_EK in self.ours.command_manager.values.items()
+        }
 
     def ask(self, request: Callable[[], None]) -> None:
         """Let `request` run between two steps, if fewer than `MOST_REQUESTS` wait; from any thread."""

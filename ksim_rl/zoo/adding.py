@@ -42,8 +42,13 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
         # The actor is all that playing needs, and matrices in half precision halve its size.
         with checkpoint.fitting(saved.path):
             actor = dict(saved.state["update"]["actor"])
-            actor |= {key: x.half() for key, x in actor.items() if x.is_floating_point() and x.ndim > 1}
-            state = {"observation_columns": saved.state["observation_columns"], "update": {"actor": actor}}
+            actor |= {
+                key: x.half() for key, x in actor.items() if x.is_floating_point() and x.ndim > 1
+            }
+            state = {
+                "observation_columns": saved.state["observation_columns"],
+                "update": {"actor": actor},
+            }
         entry.mkdir()
         checkpoint.save(entry / CHECKPOINT, state, iteration=saved.iteration, config=saved.config)
         # Of the training, not of this command.
@@ -59,7 +64,9 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
         # Hashes of all files but the card, which holds them.
         card = replace(card, sim2sim={**ratio, "episodes": float(episodes)}, files=hashes(entry))
         (entry / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n")
-        if (size := sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())) > MOST_BYTES:
+        if (
+            size := sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())
+        ) > MOST_BYTES:
             raise ValueError(f"{run}: {size:,} bytes, above {MOST_BYTES:,}: train a smaller actor")
         entry.rename(folder / name)
     return read_card(name, folder)
@@ -71,11 +78,15 @@ def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
     summary = listing.summarize(saved.run_folder)
     codes = [session.code.get("ksim_rl", {}) for session in record.read(run)] or [{}]
     # A run that was resumed may have been made by several commits.
-    made = {code.get("commit", "no commit") + " with changes" * ("changed" in code) for code in codes}
+    made = {
+        code.get("commit", "no commit") + " with changes" * ("changed" in code) for code in codes
+    }
     commit = " and ".join(sorted(made))
     # Only a clean commit can be repeated.
     if not re.fullmatch("[0-9a-f]{40}", commit):
-        raise ValueError(f"{run}: made of {commit}: train in a clean clone of one commit, and add that run")
+        raise ValueError(
+            f"{run}: made of {commit}: train in a clean clone of one commit, and add that run"
+        )
     rows = listing.metric_rows(run)
     earned = [(int(row[STEP]), value) for row in rows for value in listing.numbers([row], RETURN)]
     # Every so many points, so that the card stays small.

@@ -69,7 +69,9 @@ def read_card(name: str, folder: Path = FOLDER) -> Card:
         raise ValueError(f"{path}: no card: {printable(str(error))}") from error
     # A changed or missing file would be another policy under the same name.
     if card.name != name or hashes(path.parent) != dict(card.files):
-        raise ValueError(f"{path.parent}: its files are not those of its card: install the package once more")
+        raise ValueError(
+            f"{path.parent}: its files are not those of its card: install the package once more"
+        )
     return card
 
 

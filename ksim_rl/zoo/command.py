@@ -20,9 +20,14 @@ def zoo(arguments: Sequence[str]) -> int:
     parser.add_argument(
         "words", nargs="*", metavar="NAME | add RUN NAME", help="show a card, or make an entry"
     )
-    parser.add_argument("--folder", type=Path, default=FOLDER, help="of the zoo; default: the package's own")
     parser.add_argument(
-        "--episodes", type=int, default=100, help="of `add`, in our physics and in MuJoCo's C engine"
+        "--folder", type=Path, default=FOLDER, help="of the zoo; default: the package's own"
+    )
+    parser.add_argument(
+        "--episodes",
+        type=int,
+        default=100,
+        help="of `add`, in our physics and in MuJoCo's C engine",
     )
     options: Any = parser.parse_args(arguments)
     match options.words:

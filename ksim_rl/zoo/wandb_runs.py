@@ -14,7 +14,9 @@ from ksim_rl.trainers.loggers import LoggerCfg, WandbCfg, check_installed, kept_
 KIND = "ksim_rl_run"
 ADDRESS = re.compile(r"[\w.-]+/[\w.-]+/[\w-]+", re.ASCII)
 # The files of an artifact of ours; any other name is refused before a download.
-FILES = re.compile(r"(config\.yaml|video\.mp4|policy\.onnx|checkpoint/\d+/[a-z]+\.(json|safetensors))")
+FILES = re.compile(
+    r"(config\.yaml|video\.mp4|policy\.onnx|checkpoint/\d+/[a-z]+\.(json|safetensors))"
+)
 
 
 def upload(cfg: WandbCfg, run: Path, *, note: Callable[[str], None]) -> None:
@@ -26,7 +28,9 @@ def upload(cfg: WandbCfg, run: Path, *, note: Callable[[str], None]) -> None:
     try:
         import wandb  # pyright: ignore[reportMissingImports]
 
-        files = {name: run / name for name in ("config.yaml", "video.mp4") if (run / name).is_file()}
+        files = {
+            name: run / name for name in ("config.yaml", "video.mp4") if (run / name).is_file()
+        }
         newest = checkpoint.load_latest(run, note=note).path
         files |= {f"checkpoint/{newest.name}/{path.name}": path for path in newest.iterdir()}
         mode = "offline" if cfg.offline else None
@@ -64,7 +68,9 @@ def download(address: str, folder: Path, *, note: Callable[[str], None]) -> Path
         import wandb  # pyright: ignore[reportMissingImports]
 
         # Newest last.
-        found = [entry for entry in wandb.Api().run(address).logged_artifacts() if entry.type == KIND]
+        found = [
+            entry for entry in wandb.Api().run(address).logged_artifacts() if entry.type == KIND
+        ]
     except Exception as error:
         raise ValueError(f"wandb:{address}: {type(error).__name__}: {error}") from error
     if not found:

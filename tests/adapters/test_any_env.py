@@ -33,7 +33,9 @@ def test_gymnasiums_interface(make):
     obs, _ = env.reset(seed=3)
     again, _ = env.reset(seed=3)
     assert obs in env.observation_space
-    leaves = zip(torch.utils._pytree.tree_leaves(obs), torch.utils._pytree.tree_leaves(again), strict=True)
+    leaves = zip(
+        torch.utils._pytree.tree_leaves(obs), torch.utils._pytree.tree_leaves(again), strict=True
+    )
     assert all(np.array_equal(one, other) for one, other in leaves)
     for _ in range(12):
         obs, reward, terminated, truncated, infos = env.step(env.action_space.sample())
@@ -130,5 +132,7 @@ def test_one_key_may_be_given_as_it_is(adapter):
 def test_a_step_by_an_action_alone_says_how_envs_of_torchrl_are_stepped():
     env = MaskedTransformedEnv(CounterEnv(LENGTHS))
     for action in (torch.zeros(3, 2), np.zeros((3, 2))):
-        with pytest.raises(ValueError, match=r'env.step\(td.set\("action", action\)\).*ksim_rl.adapters'):
+        with pytest.raises(
+            ValueError, match=r'env.step\(td.set\("action", action\)\).*ksim_rl.adapters'
+        ):
             env.step(action)

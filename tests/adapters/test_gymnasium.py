@@ -27,7 +27,9 @@ def test_spaces_pass_gymnasiums_checks(cartpole: GymnasiumVectorEnv) -> None:
     passive_env_checker.check_space(
         cartpole.observation_space, "observation", passive_env_checker.check_observation_space
     )
-    passive_env_checker.check_space(cartpole.action_space, "action", passive_env_checker.check_action_space)
+    passive_env_checker.check_space(
+        cartpole.action_space, "action", passive_env_checker.check_action_space
+    )
     assert cartpole.observation_space == gym.vector.utils.batch_space(
         cartpole.single_observation_space, NUM_ENVS
     )

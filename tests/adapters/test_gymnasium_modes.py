@@ -43,7 +43,9 @@ class Counter(gym.Env):
 
 
 def pair(mode: AutoresetMode) -> tuple[GymnasiumVectorEnv, SyncVectorEnv]:
-    ours = GymnasiumVectorEnv(CounterEnv(LENGTHS, action_size=1), keys=["count"], autoreset_mode=mode)
+    ours = GymnasiumVectorEnv(
+        CounterEnv(LENGTHS, action_size=1), keys=["count"], autoreset_mode=mode
+    )
     theirs = SyncVectorEnv([lambda row=row: Counter(row) for row in range(3)], autoreset_mode=mode)
     ours.reset(seed=0)
     theirs.reset(seed=0)
@@ -64,11 +66,15 @@ def test_modes_are_gymnasiums(mode):
         assert ("final_obs" in infos) == ("final_obs" in their_infos)
         if mode is AutoresetMode.DISABLED and (terminated | truncated).any():
             mask = {"reset_mask": terminated | truncated}
-            np.testing.assert_array_equal(ours.reset(options=mask)[0], theirs.reset(options=mask)[0])
+            np.testing.assert_array_equal(
+                ours.reset(options=mask)[0], theirs.reset(options=mask)[0]
+            )
 
 
 def test_the_step_of_a_reset_has_no_reward():
-    made = envs.make("cartpole_balance", num_envs=2, seed=0, overrides=["task.episode_length_s=0.02"])
+    made = envs.make(
+        "cartpole_balance", num_envs=2, seed=0, overrides=["task.episode_length_s=0.02"]
+    )
     env = GymnasiumVectorEnv(made, keys=["actor"], autoreset_mode="NEXT_STEP")
     env.reset(seed=1)
     rewards = []

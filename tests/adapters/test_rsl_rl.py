@@ -70,7 +70,9 @@ def test_steps_are_those_of_torchrl() -> None:
 
 
 def test_time_outs_and_the_log_of_episodes() -> None:
-    env = envs.make("cartpole_balance", num_envs=2, seed=0, overrides=["task.episode_length_s=0.03"])
+    env = envs.make(
+        "cartpole_balance", num_envs=2, seed=0, overrides=["task.episode_length_s=0.03"]
+    )
     vec_env = RslRlVecEnv(env, log_interval=3)
     for _ in range(3):
         *_, done_E, extras = vec_env.step(torch.zeros(2, 1))
@@ -124,7 +126,12 @@ def test_the_runner_of_rsl_rl_learns_cartpole(tmp_path: Path) -> None:
     torch.manual_seed(0)
     vec_env = RslRlVecEnv(envs.make("cartpole_balance", num_envs=256, seed=0), log_interval=64)
     cfg = runner_cfg(num_steps=64)
-    cfg["algorithm"] |= {"schedule": "fixed", "num_mini_batches": 8, "gamma": 0.99, "entropy_coef": 0.0}
+    cfg["algorithm"] |= {
+        "schedule": "fixed",
+        "num_mini_batches": 8,
+        "gamma": 0.99,
+        "entropy_coef": 0.0,
+    }
     runner = OnPolicyRunner(vec_env, cfg, log_dir=str(tmp_path), device="cpu")
     runner.learn(60)
 
@@ -137,6 +144,8 @@ def test_the_runner_of_rsl_rl_learns_cartpole(tmp_path: Path) -> None:
             obs, reward_E, done_E, _ = vec_env.step(policy(obs))
             return_E += alive_E * reward_E
             alive_E *= 1 - done_E
-    print(f"rsl_rl PPO, 983,040 env states: mean return of 256 fresh episodes {return_E.mean():.1f}")
+    print(
+        f"rsl_rl PPO, 983,040 env states: mean return of 256 fresh episodes {return_E.mean():.1f}"
+    )
     assert return_E.mean() > 900.0
     vec_env.close()

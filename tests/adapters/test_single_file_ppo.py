@@ -32,7 +32,12 @@ class Agent(nn.Module):
     def act(self, obs, action=None):
         dist = Normal(self.mean(obs), self.log_std.expand(len(obs), -1).exp())
         action = dist.sample() if action is None else action
-        return action, dist.log_prob(action).sum(1), dist.entropy().sum(1), self.critic(obs).flatten()
+        return (
+            action,
+            dist.log_prob(action).sum(1),
+            dist.entropy().sum(1),
+            self.critic(obs).flatten(),
+        )
 
 
 def train(envs_, *, iterations):
@@ -67,7 +72,9 @@ def train(envs_, *, iterations):
             delta = reward_T[t] + GAMMA * (1 - done_T[t]) * value_after - value_T[t]
             running = delta + GAMMA * LAMBDA * (1 - done_T[t]) * running
             adv_T[t], value_after = running, value_T[t]
-        data = [part.flatten(0, 1) for part in (obs_T, action_T, log_prob_T, adv_T, adv_T + value_T)]
+        data = [
+            part.flatten(0, 1) for part in (obs_T, action_T, log_prob_T, adv_T, adv_T + value_T)
+        ]
         for _ in range(EPOCHS):
             for index in torch.randperm(len(data[0])).chunk(MINIBATCHES):
                 obs_B, action_B, log_prob_B, adv_B, target_B = (part[index] for part in data)
@@ -75,7 +82,9 @@ def train(envs_, *, iterations):
                 ratio = (new_log_prob - log_prob_B).exp()
                 adv_B = (adv_B - adv_B.mean()) / (adv_B.std() + 1e-8)
                 gain = torch.minimum(ratio * adv_B, ratio.clamp(1 - CLIP, 1 + CLIP) * adv_B)
-                loss = -gain.mean() - 0.001 * entropy.mean() + 0.5 * (value - target_B).square().mean()
+                loss = (
+                    -gain.mean() - 0.001 * entropy.mean() + 0.5 * (value - target_B).square().mean()
+                )
                 optimizer.zero_grad()
                 loss.backward()
                 nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
@@ -85,7 +94,9 @@ def train(envs_, *, iterations):
 
 @pytest.mark.parametrize("iterations", [2, pytest.param(30, marks=pytest.mark.full)])
 def test_a_single_file_of_ppo_learns_to_balance(iterations):
-    made = envs.make("cartpole_balance", num_envs=NUM_ENVS, seed=0, overrides=["task.episode_length_s=2"])
+    made = envs.make(
+        "cartpole_balance", num_envs=NUM_ENVS, seed=0, overrides=["task.episode_length_s=2"]
+    )
     vector = gym.wrappers.vector.RecordEpisodeStatistics(GymnasiumVectorEnv(made, keys=["actor"]))
     agent, lengths = train(vector, iterations=iterations)
     assert all(parameter.isfinite().all() for parameter in agent.parameters())

@@ -53,7 +53,11 @@ class Value(DeterministicMixin, Model):
 def trained(env, *, rollouts, timesteps, folder):
     torch.manual_seed(0)
     cfg = PPO_CFG(
-        rollouts=rollouts, learning_epochs=8, mini_batches=8, discount_factor=0.98, learning_rate=1e-3
+        rollouts=rollouts,
+        learning_epochs=8,
+        mini_batches=8,
+        discount_factor=0.98,
+        learning_rate=1e-3,
     )
     cfg.experiment.directory, cfg.experiment.write_interval, cfg.experiment.checkpoint_interval = (
         str(folder),

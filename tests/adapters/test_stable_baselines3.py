@@ -35,14 +35,19 @@ def test_one_observation_is_a_box_and_several_are_a_dict() -> None:
     several = StableBaselines3VecEnv(CounterEnv(LENGTHS), keys=["count", "row"])
     assert set(several.reset()) == {"count", "row"}
     assert set(several.observation_space.spaces) == {"count", "row"}
-    assert StableBaselines3VecEnv(CounterEnv(LENGTHS), keys=["count"]).observation_space.shape == (1,)
+    assert StableBaselines3VecEnv(CounterEnv(LENGTHS), keys=["count"]).observation_space.shape == (
+        1,
+    )
 
 
 def test_unbounded_actions_get_the_limit_and_others_keep_theirs() -> None:
     unbounded = CounterEnv(LENGTHS)
     unbounded.action_spec = Unbounded(unbounded.action_spec.shape)
     env = StableBaselines3VecEnv(unbounded, keys=["count"], action_limit=2.0)
-    assert env.action_space.low.tolist() == [-2.0, -2.0] and env.action_space.high.tolist() == [2.0, 2.0]
+    assert env.action_space.low.tolist() == [-2.0, -2.0] and env.action_space.high.tolist() == [
+        2.0,
+        2.0,
+    ]
     cartpole = StableBaselines3VecEnv(
         envs.make("cartpole_balance", num_envs=2, seed=0), keys=["actor"], action_limit=2.0
     )
@@ -73,9 +78,13 @@ def test_ppo_of_stable_baselines3_learns_cartpole() -> None:
     env = VecMonitor(
         StableBaselines3VecEnv(envs.make("cartpole_balance", num_envs=64, seed=0), keys=["actor"])
     )
-    model = PPO("MlpPolicy", env, n_steps=64, batch_size=512, n_epochs=8, gamma=0.98, seed=0, device="cpu")
+    model = PPO(
+        "MlpPolicy", env, n_steps=64, batch_size=512, n_epochs=8, gamma=0.98, seed=0, device="cpu"
+    )
     model.learn(300_000)
     mean, std = evaluate_policy(model, env, n_eval_episodes=64)
-    print(f"stable-baselines3 PPO, 300,000 env states: return of 64 episodes {mean:.1f} +- {std:.1f}")
+    print(
+        f"stable-baselines3 PPO, 300,000 env states: return of 64 episodes {mean:.1f} +- {std:.1f}"
+    )
     assert mean > 900.0
     env.close()

@@ -21,11 +21,15 @@ DATA = DatasetCfg(**SIZES)
 HIDDEN = (32, 32, 16)
 # Blocks that do not divide the 24 rows of a minibatch or the layers; few, since the interpreter is slow.
 LOWER = {"lower": 16, "lower_depth": 16, "lower_stages": 1}
-TUNING = Tuning(block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024, **LOWER)
+TUNING = Tuning(
+    block=16, chunk=16, stages=1, depth=16, tile=32, tile_stages=1, splits=2, size=1024, **LOWER
+)
 # A layer is a grid of programs; few of them are still more than one in each direction.
 LAYERED = Tuning(block=32, stages=1, depth=32, tile=32, tile_stages=1, splits=2, size=4096)
 MIRROR = {
-    "actor": MirrorMap(source=(1, 0, *range(2, ACTOR_OBS)), signs=(1, 1, -1, *[1] * (ACTOR_OBS - 3))),
+    "actor": MirrorMap(
+        source=(1, 0, *range(2, ACTOR_OBS)), signs=(1, 1, -1, *[1] * (ACTOR_OBS - 3))
+    ),
     "critic": MirrorMap(source=(*range(CRITIC_OBS - 2), CRITIC_OBS - 1, CRITIC_OBS - 2)),
     "action": MirrorMap(source=(1, 0, 2), signs=(-1, -1, -1)),
 }
@@ -35,7 +39,9 @@ needs_interpreter = pytest.mark.skipif(
 )
 
 
-def networks(*, action_dim=ACTIONS, hidden=HIDDEN, critic=None, actor_obs=ACTOR_OBS, **actor_options):
+def networks(
+    *, action_dim=ACTIONS, hidden=HIDDEN, critic=None, actor_obs=ACTOR_OBS, **actor_options
+):
     torch.manual_seed(3)
     activation = actor_options.pop("activation", "elu")
     cfg = ActorCfg(hidden_dims=hidden, activation=activation, output_gain=0.5, **actor_options)
@@ -103,7 +109,9 @@ def column(name):
 
 def flat(state, path=""):
     if isinstance(state, dict):
-        return {k: v for name, entry in state.items() for k, v in flat(entry, f"{path}/{name}").items()}
+        return {
+            k: v for name, entry in state.items() for k, v in flat(entry, f"{path}/{name}").items()
+        }
     return {path: torch.as_tensor(state)}
 
 

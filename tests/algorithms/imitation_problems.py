@@ -165,7 +165,9 @@ def make_distillation(
     actor = student or ActorCfg(hidden_dims=(), obs_normalization=False, init_std=0.5)
     data = DatasetCfg(num_env_states_per_minibatch=2 * num_envs, num_minibatches=4, shards=shards)
     update = DistillationUpdate(
-        DistillationCfg(**{"teacher": "toy", "learning_rate": 0.05, "num_epochs": 4, **(cfg or {})}),
+        DistillationCfg(
+            **{"teacher": "toy", "learning_rate": 0.05, "num_epochs": 4, **(cfg or {})}
+        ),
         actor=make_actor(actor, obs_dim=len(BINS), action_dim=1),
         teacher=teacher or linear_teacher(),
         data=data,
@@ -206,6 +208,8 @@ def make_amp(folder=None, *, seed=0, iterations=6, num_envs=64, reference=None, 
 
 def _trainer(env, update, data, folder, iterations):
     length = data.rollout_length(env.batch_size[0])
-    collector = RolloutCollector(env, update.behavior, rollout_length=length, keys=update.rollout_keys)
+    collector = RolloutCollector(
+        env, update.behavior, rollout_length=length, keys=update.rollout_keys
+    )
     cfg = TrainerCfg(num_iterations=iterations, eval_interval=0, checkpoint_interval=0)
     return Trainer(cfg, collector=collector, update=update, folder=folder)

@@ -25,13 +25,25 @@ OBJECTIVES = {
     "fast_sac": SACCfg(
         alpha_init=0.02, alpha_learning_rate=0.0, value_reduction="mean", policy_delay=2, **SHARED
     ),
-    "td3": TD3Cfg(exploration_noise_min=0.05, exploration_noise_max=0.3, target_noise=0.05, **SHARED),
-    "fast_td3": TD3Cfg(exploration_noise_min=0.05, exploration_noise_max=0.3, target_noise=0.05, **SHARED),
+    "td3": TD3Cfg(
+        exploration_noise_min=0.05, exploration_noise_max=0.3, target_noise=0.05, **SHARED
+    ),
+    "fast_td3": TD3Cfg(
+        exploration_noise_min=0.05, exploration_noise_max=0.3, target_noise=0.05, **SHARED
+    ),
 }
 
 
 def make_update(
-    name, env, *, device="cpu", objective=None, obs_dim=1, support=(-15.0, 15.0), signals=STANDARD, **data
+    name,
+    env,
+    *,
+    device="cpu",
+    objective=None,
+    obs_dim=1,
+    support=(-15.0, 15.0),
+    signals=STANDARD,
+    **data,
 ):
     """Return the update of an algorithm for an env with actions of one number; `data` are fields of `ReplayCfg`."""
     cfg = objective or OBJECTIVES[name]
@@ -48,16 +60,24 @@ def make_update(
         if isinstance(cfg, SACCfg)
         else (make_deterministic_actor, DeterministicActorCfg)
     )
-    actor = make(kind(hidden_dims=(32,), activation="silu", action_bound=2.0, layer_norm=True), **sizes)
+    actor = make(
+        kind(hidden_dims=(32,), activation="silu", action_bound=2.0, layer_norm=True), **sizes
+    )
     # The support reaches beyond the best value of each probe.
-    atoms = {"num_atoms": 41, "v_min": support[0], "v_max": support[1]} if name.startswith("fast") else {}
+    atoms = (
+        {"num_atoms": 41, "v_min": support[0], "v_max": support[1]}
+        if name.startswith("fast")
+        else {}
+    )
     critic = make_q_network(
         QNetworkCfg(hidden_dims=(64, 64), activation="silu", **atoms),
         obs_dim=obs_dim,
         action_dim=1,
         device=device,
     )
-    low, high = torch.full((2, 1), 2.0, device=device) * torch.tensor([[-1.0], [1.0]], device=device)
+    low, high = torch.full((2, 1), 2.0, device=device) * torch.tensor(
+        [[-1.0], [1.0]], device=device
+    )
     shared = {
         "support_A": critic.module.support,
         "gamma": cfg.gamma,
@@ -74,7 +94,9 @@ def make_update(
             **shared,
         )
     else:
-        loss = TD3Loss(actor, critic, low_L=low, high_L=high, target_noise=cfg.target_noise, **shared)
+        loss = TD3Loss(
+            actor, critic, low_L=low, high_L=high, target_noise=cfg.target_noise, **shared
+        )
         noise = {"noise_min": cfg.exploration_noise_min, "noise_max": cfg.exploration_noise_max}
     num_envs = env.batch_size[0]
     behavior = ExploringPolicy(actor, low_L=low, high_L=high, num_envs=num_envs, **noise)
@@ -89,7 +111,9 @@ def make_update(
     )
 
 
-def make_trainer(name, folder=None, *, seed=0, iterations=6, env=None, objective=None, data=None, **cfg):
+def make_trainer(
+    name, folder=None, *, seed=0, iterations=6, env=None, objective=None, data=None, **cfg
+):
     """Return a trainer for `TargetEnv`; `cfg` are fields of `TrainerCfg`, `data` fields of `ReplayCfg`."""
     torch.manual_seed(seed)
     env = make_env(32, seed=seed) if env is None else env

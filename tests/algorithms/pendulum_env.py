@@ -37,7 +37,9 @@ class PendulumEnv(MaskedReset):
 
     def _observe(self, **more):
         seen = torch.cat((self.angle_E1.cos(), self.angle_E1.sin(), self.speed_E1 / 8.0), -1)
-        return TensorDict({"actor": seen, "critic": seen.clone(), **more}, batch_size=self.batch_size)
+        return TensorDict(
+            {"actor": seen, "critic": seen.clone(), **more}, batch_size=self.batch_size
+        )
 
     def _step(self, tensordict):
         torque = tensordict["action"].clamp(-2.0, 2.0)
@@ -50,7 +52,10 @@ class PendulumEnv(MaskedReset):
         self.step_E1 = self.step_E1 + 1
         truncated = self.step_E1 >= LENGTH
         return self._observe(
-            reward=reward, done=truncated, truncated=truncated.clone(), terminated=torch.zeros_like(truncated)
+            reward=reward,
+            done=truncated,
+            truncated=truncated.clone(),
+            terminated=torch.zeros_like(truncated),
         )
 
     def _reset(self, tensordict=None, **_):

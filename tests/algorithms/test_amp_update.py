@@ -47,13 +47,17 @@ def test_both_rewards_are_summed_for_ppo_and_the_rollout_keeps_its_own():
     rollout_ET["next", "reward"].normal_()
     own_ET = rollout_ET["next", "reward"].clone()
     seen = []
-    update.ppo = type("Watched", (), {"__call__": lambda _, td: seen.append(td), "metrics": lambda _: {}})()
+    update.ppo = type(
+        "Watched", (), {"__call__": lambda _, td: seen.append(td), "metrics": lambda _: {}}
+    )()
     with torch.no_grad():
         pairs = torch.stack((rollout_ET["style"], rollout_ET["next", "style"]), -2)
         score_ET = update.discriminator(pairs)
     update(rollout_ET)
     style_ET = (1.0 - 0.25 * (score_ET - 1.0) ** 2).clamp_min(0.0)
-    torch.testing.assert_close(seen[0]["next", "reward"][..., 0], 0.25 * own_ET[..., 0] + 2.0 * style_ET)
+    torch.testing.assert_close(
+        seen[0]["next", "reward"][..., 0], 0.25 * own_ET[..., 0] + 2.0 * style_ET
+    )
     assert torch.equal(rollout_ET["next", "reward"], own_ET)
 
 
@@ -128,7 +132,9 @@ def test_weights_of_plain_ppo_are_a_start():
     trainer = make_amp()
     discriminator = trainer.update.discriminator.layers[0].weight.clone()
     trainer.update.load_weights(state)
-    assert torch.equal(next(trainer.update.actor.parameters()), next(trained.update.actor.parameters()))
+    assert torch.equal(
+        next(trainer.update.actor.parameters()), next(trained.update.actor.parameters())
+    )
     assert torch.equal(trainer.update.discriminator.layers[0].weight, discriminator)
     trainer.update.load_weights(trained.update.state_dict())
     assert not torch.equal(trainer.update.discriminator.layers[0].weight, discriminator)

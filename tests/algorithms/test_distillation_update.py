@@ -45,11 +45,15 @@ def test_a_linear_student_becomes_its_linear_teacher():
         old = trainer.update
         torch.manual_seed(3)
         student = make_actor(
-            ActorCfg(in_keys=("privileged",), hidden_dims=(), obs_normalization=False, output_gain=1.0),
+            ActorCfg(
+                in_keys=("privileged",), hidden_dims=(), obs_normalization=False, output_gain=1.0
+            ),
             obs_dim=1,
             action_dim=1,
         )
-        trainer.update = DistillationUpdate(old.cfg, actor=student, teacher=old.teacher, data=old.dataset.cfg)
+        trainer.update = DistillationUpdate(
+            old.cfg, actor=student, teacher=old.teacher, data=old.dataset.cfg
+        )
         trainer.collector.policy = trainer.update.behavior
         trainer.collector._keys = trainer.update.rollout_keys
         for _ in range(8):
@@ -67,7 +71,9 @@ def test_dagger_stays_on_the_road_that_behavior_cloning_drifts_off():
         iterations=12, cfg={**BINNED, "teacher_share": 1.0, "teacher_share_decay": 1.0}
     )
     visited = make_distillation(iterations=12, cfg=BINNED)
-    mixed = make_distillation(iterations=12, cfg={**BINNED, "teacher_share": 0.8, "teacher_share_decay": 0.7})
+    mixed = make_distillation(
+        iterations=12, cfg={**BINNED, "teacher_share": 0.8, "teacher_share_decay": 0.7}
+    )
     for trainer in (cloned, visited, mixed):
         trainer.train()
     # On its own data each does what the teacher does.
@@ -125,7 +131,9 @@ def test_an_update_makes_no_host_sync_and_skips_what_is_not_finite(cfg):
 
 
 def assert_same(one, other):
-    (tensors, values), (others, other_values) = (state_tree.split(t.state_dict()) for t in (one, other))
+    (tensors, values), (others, other_values) = (
+        state_tree.split(t.state_dict()) for t in (one, other)
+    )
     for found in (values, other_values):
         del found["/seconds"]
     assert values == other_values and tensors.keys() == others.keys()
@@ -178,12 +186,19 @@ def teacher_run(tmp_path_factory):
 
 
 def compose(teacher, *overrides, iterations=2):
-    overrides = [*STUDENT, f"objective.teacher={teacher}", f"trainer.num_iterations={iterations}", *overrides]
+    overrides = [
+        *STUDENT,
+        f"objective.teacher={teacher}",
+        f"trainer.num_iterations={iterations}",
+        *overrides,
+    ]
     return conf.compose(overrides)
 
 
 @pytest.mark.parametrize("modules", [pytest.param("mlp", marks=pytest.mark.full), "gru"])
-def test_a_student_of_a_run_goes_on_without_the_folder_of_its_teacher(modules, teacher_run, tmp_path):
+def test_a_student_of_a_run_goes_on_without_the_folder_of_its_teacher(
+    modules, teacher_run, tmp_path
+):
     teacher = tmp_path / "teacher"
     shutil.copytree(teacher_run, teacher)
     memory = ["modules.recurrent_actor.hidden_dim=6"] if modules == "gru" else []

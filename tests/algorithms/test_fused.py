@@ -127,15 +127,27 @@ def moments(made):
 @pytest.mark.parametrize(
     ("options", "actor_options"),
     [
-        ({}, {"hidden": (48, 16), "critic": (40, 32), "activation": "silu", "state_dependent_std": True}),
+        (
+            {},
+            {
+                "hidden": (48, 16),
+                "critic": (40, 32),
+                "activation": "silu",
+                "state_dependent_std": True,
+            },
+        ),
         full({"symmetry": "augment"}, {}),
         full({"clip_value": False}, {"std_type": "log", "activation": "relu"}),
     ],
 )
-def test_updates_of_squashed_policies_equal_those_of_torch(fused_ppo, options, actor_options, monkeypatch):
+def test_updates_of_squashed_policies_equal_those_of_torch(
+    fused_ppo, options, actor_options, monkeypatch
+):
     """Torch's entropy is that of a sample, unless the distribution has one; TorchRL remembers which ones have."""
     monkeypatch.setattr(TanhGaussian, "entropy", exact_entropy, raising=False)
-    monkeypatch.setattr("ksim_rl.objectives.clip_ppo_loss.has_analytic_entropy", lambda policy: True)
+    monkeypatch.setattr(
+        "ksim_rl.objectives.clip_ppo_loss.has_analytic_entropy", lambda policy: True
+    )
     cfg = PPOCfg(num_epochs=1, learning_rate=3e-3, schedule="fixed", entropy_coeff=0.5, **options)
     bounded = {"distribution": "tanh_gaussian", "action_bound": BOUND, "init_std": 0.7}
     actor, critic = networks(**{**bounded, **actor_options})
@@ -243,7 +255,8 @@ def test_steps_that_are_not_finite_change_nothing_and_are_counted(fused_ppo):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"hidden": (40, 70), "critic": (100, 16), "state_dependent_std": True, "actor_obs": 298}]
+    "options",
+    [{}, {"hidden": (40, 70), "critic": (100, 16), "state_dependent_std": True, "actor_obs": 298}],
 )
 def test_layout_places_every_parameter_once(options):
     made = fused_networks(*networks(**options))
@@ -297,9 +310,16 @@ def test_what_tensor_cores_would_cut_off_is_rounded(fused_ppo, hidden):
     for one in (made, exact):
         one(data.clone())
     parameters = made.fused.parameters
-    torch.testing.assert_close(parameters.weights, to_eleven_bits(parameters.exact), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(
+        parameters.weights, to_eleven_bits(parameters.exact), rtol=0.0, atol=0.0
+    )
     arguments = made.fused._arguments
-    for operands in (made.fused.dataset.obs, parameters.weights, arguments["inputs"], arguments["slopes"]):
+    for operands in (
+        made.fused.dataset.obs,
+        parameters.weights,
+        arguments["inputs"],
+        arguments["slopes"],
+    ):
         assert operands.count_nonzero() and not (operands.view(torch.int32) & 0x1FFF).any()
     ours, theirs = (
         torch.cat([one.optimizer.state[own]["exp_avg"].flatten() for own in one.loss.parameters()])
@@ -310,7 +330,9 @@ def test_what_tensor_cores_would_cut_off_is_rounded(fused_ppo, hidden):
 
 def test_rounding_keeps_what_is_not_finite(fused_ppo):
     as_tf32 = importlib.import_module("ksim_rl.objectives.fused_ppo.dataset").as_tf32
-    odd = torch.tensor([0x7FFFFFFF, -1, 0x7F800000, -0x800000], dtype=torch.int32).view(torch.float32)
+    odd = torch.tensor([0x7FFFFFFF, -1, 0x7F800000, -0x800000], dtype=torch.int32).view(
+        torch.float32
+    )
     assert as_tf32(odd)[:2].isnan().all() and torch.equal(as_tf32(odd)[2:], odd[2:])
 
 
@@ -338,7 +360,9 @@ def test_what_the_kernels_cannot_do_is_said():
     assert "Gaussian" in fused_networks(policy, critic).reason
     squashed = fused_networks(*networks(distribution="tanh_gaussian", action_bound=1.0))
     assert why_not_fused(PPOCfg(precision="bfloat16"), squashed, **SIZES) is None
-    assert "squashed" in why_not_fused(PPOCfg(precision="bfloat16", symmetry="loss"), squashed, **SIZES)
+    assert "squashed" in why_not_fused(
+        PPOCfg(precision="bfloat16", symmetry="loss"), squashed, **SIZES
+    )
     cfg = PPOCfg(precision="bfloat16")
     for options, reason in (
         ({"critic": (32, 32)}, "hidden layers of [32, 32, 16] and [32, 32]"),
@@ -346,11 +370,18 @@ def test_what_the_kernels_cannot_do_is_said():
         ({"action_dim": 65}, "more than 64 actions"),
     ):
         assert reason in why_not_fused(cfg, fused_networks(*networks(**options)), **SIZES)
-    assert "too many" in why_not_fused(cfg, made, num_env_states_per_minibatch=2**25, num_minibatches=2)
+    assert "too many" in why_not_fused(
+        cfg, made, num_env_states_per_minibatch=2**25, num_minibatches=2
+    )
     # Symmetry doubles the rows of a minibatch.
-    rows = {"num_env_states_per_minibatch": 2**31 // (2 * made_columns(made)) + 1, "num_minibatches": 1}
+    rows = {
+        "num_env_states_per_minibatch": 2**31 // (2 * made_columns(made)) + 1,
+        "num_minibatches": 1,
+    }
     assert why_not_fused(cfg, made, **rows) is None
-    assert "too many" in why_not_fused(PPOCfg(precision="bfloat16", symmetry="augment"), made, **rows)
+    assert "too many" in why_not_fused(
+        PPOCfg(precision="bfloat16", symmetry="augment"), made, **rows
+    )
     assert isinstance(fused_networks(actor, torch.nn.Identity()), NotFused)
     assert update(PPOCfg(), actor, critic).metrics()["update/fused"] == 0.0
 
@@ -373,7 +404,9 @@ def test_on_the_cpu_torch_makes_the_steps():
     assert make_fused_ppo(made) == made.fused == NotFused("they need CUDA and Triton")
     assert made.notes == []
     made.device = torch.device("cuda")
-    assert made.notes == ["torch makes the gradient steps, not the fused kernels: they need CUDA and Triton"]
+    assert made.notes == [
+        "torch makes the gradient steps, not the fused kernels: they need CUDA and Triton"
+    ]
 
 
 def test_bfloat16_products_change_a_gradient_step_a_little():
@@ -386,6 +419,8 @@ def test_bfloat16_products_change_a_gradient_step_a_little():
     for precision in ("float32", "bfloat16"):
         made = update(PPOCfg(precision=precision, **one), actor, critic, data=sizes)
         made(data.clone())
-        moved[precision] = torch.cat([entry["exp_avg"].flatten() for entry in made.optimizer.state.values()])
+        moved[precision] = torch.cat(
+            [entry["exp_avg"].flatten() for entry in made.optimizer.state.values()]
+        )
     error = (moved["bfloat16"] - moved["float32"]).norm() / moved["float32"].norm()
     assert 1e-5 < error < 0.03

@@ -56,7 +56,9 @@ def test_who_collects_is_the_policy_of_the_first_gradient_step(fused_ppo, precis
 
 
 @needs_interpreter
-def test_who_collects_has_the_weights_of_the_modules_at_each_call_or_where_a_steady_begins(fused_ppo):
+def test_who_collects_has_the_weights_of_the_modules_at_each_call_or_where_a_steady_begins(
+    fused_ppo,
+):
     actor, critic = networks()
     made = update(PPOCfg(), actor, critic, fused_ppo)
     behavior, data = made.behavior, rollout(actor).select("actor").apply(finite)

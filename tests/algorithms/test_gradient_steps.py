@@ -30,7 +30,9 @@ class Nothing(RolloutUpdate):
 def test_the_limit_counts_all_steps_in_a_row():
     metrics = {"update/skipped_in_a_row": 4.0, "update/skipped_steps": 9.0}
     Nothing({}, max_skipped_steps=5, device="cpu", logged={}).check(metrics)
-    with pytest.raises(NonFiniteStepsError, match="4 gradient steps in a row.*limit 4, 9 since the start"):
+    with pytest.raises(
+        NonFiniteStepsError, match="4 gradient steps in a row.*limit 4, 9 since the start"
+    ):
         Nothing({}, max_skipped_steps=4, device="cpu", logged={}).check(metrics)
 
 

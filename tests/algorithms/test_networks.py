@@ -16,7 +16,14 @@ from torchrl.modules import (
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs import MaskedTransformedEnv
-from ksim_rl.modules import ActorCfg, CriticCfg, SharedTrunkCfg, make_actor, make_critic, make_shared_trunk
+from ksim_rl.modules import (
+    ActorCfg,
+    CriticCfg,
+    SharedTrunkCfg,
+    make_actor,
+    make_critic,
+    make_shared_trunk,
+)
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.testing import count_syncs
 from ksim_rl.trainers import Evaluator, PPOUpdate
@@ -73,7 +80,9 @@ def critic(**options):
 
 def test_mixed_actions_learn():
     torch.manual_seed(0)
-    env = MaskedTransformedEnv(MixedEnv(), ObservationNoise(["actor"], noise=GaussianNoise(std=0.0)))
+    env = MaskedTransformedEnv(
+        MixedEnv(), ObservationNoise(["actor"], noise=GaussianNoise(std=0.0))
+    )
     cfg = ActorCfg(hidden_dims=(32,), distribution="tanh_gaussian", init_std=0.3)
     actor = make_actor(cfg, obs_dim=1, action_spec=env.full_action_spec)
     before = evaluate(env, actor)
@@ -95,10 +104,14 @@ def test_modules_that_are_not_ours_learn():
         return_log_prob=True,
         default_interaction_type="random",
     )
-    value = ValueOperator(nn.Sequential(nn.Linear(1, 16), nn.ELU(), nn.Linear(16, 1)), in_keys=["critic"])
+    value = ValueOperator(
+        nn.Sequential(nn.Linear(1, 16), nn.ELU(), nn.Linear(16, 1)), in_keys=["critic"]
+    )
     before = evaluate(env, actor)
     update = PPOUpdate(
-        PPOCfg(num_epochs=4, learning_rate=1e-2, schedule="adaptive", desired_kl=0.03, clip_value=False),
+        PPOCfg(
+            num_epochs=4, learning_rate=1e-2, schedule="adaptive", desired_kl=0.03, clip_value=False
+        ),
         actor=actor,
         critic=value,
         data=DATA,
@@ -117,7 +130,9 @@ def test_a_shared_trunk_learns_and_counts_observations_once():
     env = make_env()
     trunk = make_shared_trunk(SharedTrunkCfg(hidden_dims=(32,)), obs_dim=1)
     own = {"hidden_dims": (), "obs_normalization": False}
-    actor = make_actor(ActorCfg(**own, in_keys=("features",), init_std=0.5), obs_dim=32, action_dim=1)
+    actor = make_actor(
+        ActorCfg(**own, in_keys=("features",), init_std=0.5), obs_dim=32, action_dim=1
+    )
     # The critic sees what it alone may see beside the features.
     value = make_critic(CriticCfg(**own, in_keys=("features", "critic")), obs_dim=33)
     both = ActorValueOperator(trunk, actor, value)
@@ -130,7 +145,9 @@ def test_a_shared_trunk_learns_and_counts_observations_once():
 def test_groups_can_be_joined_and_nested():
     torch.manual_seed(0)
     env = make_env()
-    actor = make_actor(ActorCfg(hidden_dims=(8,), in_keys=("critic", "actor")), obs_dim=2, action_dim=1)
+    actor = make_actor(
+        ActorCfg(hidden_dims=(8,), in_keys=("critic", "actor")), obs_dim=2, action_dim=1
+    )
     update, _ = learn(env, actor, critic(in_keys=("actor",)), iterations=2)
     assert {"actor", "critic", ("next", "actor")} < set(update.rollout_keys)
     assert ("next", "critic") not in update.rollout_keys
@@ -139,7 +156,10 @@ def test_groups_can_be_joined_and_nested():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"actor": ActorCfg(in_keys=("features",))}, r"actor.in_keys=\('features',\): .*only with one"),
+        (
+            {"actor": ActorCfg(in_keys=("features",))},
+            r"actor.in_keys=\('features',\): .*only with one",
+        ),
         ({"trunk": SharedTrunkCfg()}, r"actor.in_keys=\('actor',\): .*modules=shared_trunk"),
         (
             {"trunk": SharedTrunkCfg(), "actor": ActorCfg(in_keys=("features",))},

@@ -16,7 +16,9 @@ OBJECTIVES = {
     "fast_sac": SACCfg(
         alpha_init=1.0, alpha_learning_rate=1e-3, value_reduction="mean", policy_delay=2, **SHARED
     ),
-    "fast_td3": TD3Cfg(exploration_noise_min=0.05, exploration_noise_max=0.5, target_noise=0.1, **SHARED),
+    "fast_td3": TD3Cfg(
+        exploration_noise_min=0.05, exploration_noise_max=0.5, target_noise=0.1, **SHARED
+    ),
 }
 
 

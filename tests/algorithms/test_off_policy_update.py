@@ -50,7 +50,9 @@ def test_random_actions_until_learning_starts(name):
         # Uniform actions in [-2, 2] have a std of 1.15; the first policy acts around zero.
         assert (spread > 1.0) == (number < 2)
         update(rollout)
-        same = all(torch.equal(a, b) for a, b in zip(before, update.actor.parameters(), strict=True))
+        same = all(
+            torch.equal(a, b) for a, b in zip(before, update.actor.parameters(), strict=True)
+        )
         assert same == (number == 0)
     assert update.metrics()["replay/env_states"] == 3 * 4 * 32
 
@@ -70,7 +72,9 @@ def test_noise_differs_by_env_and_changes_with_the_episode():
     trainer = make_trainer("fast_td3")
     scales = trainer.update.behavior.noise_scale_E1
     first = scales.clone()
-    assert first.unique().shape[0] == 32 and float(first.min()) >= 0.05 and float(first.max()) <= 0.3
+    assert (
+        first.unique().shape[0] == 32 and float(first.min()) >= 0.05 and float(first.max()) <= 0.3
+    )
     trainer.iterate()
     assert torch.equal(scales, first)
     trainer.iterate()  # step 8 ends the episodes
@@ -129,7 +133,8 @@ def test_the_actor_makes_a_step_for_so_many_of_the_critics():
         trainer.iterate()
     update = trainer.update
     steps = {
-        name: next(iter(optimizer.state.values()))["step"] for name, optimizer in update.optimizers.items()
+        name: next(iter(optimizer.state.values()))["step"]
+        for name, optimizer in update.optimizers.items()
     }
     assert update.cfg.policy_delay == 2 and steps["critic"] == 2 * steps["actor"] > 0
 
@@ -178,7 +183,9 @@ def test_a_resumed_run_is_the_same_run(name, prioritized, tmp_path):
 
 
 def _compare(one, other, path=""):
-    assert type(one) is type(other) and (not isinstance(one, dict) or one.keys() == other.keys()), path
+    assert type(one) is type(other) and (not isinstance(one, dict) or one.keys() == other.keys()), (
+        path
+    )
     if isinstance(one, dict):
         return sum(_compare(one[key], other[key], f"{path}/{key}") for key in one)
     if isinstance(one, torch.Tensor):

@@ -84,7 +84,9 @@ def test_an_optimizer_of_another_size_is_refused(trainer):
     trainer.update(trainer.collector.collect())
     state = trainer.update.state_dict()
     state["optimizer"]["moments"].popitem()
-    with pytest.raises(ValueError, match=r"optimizer: \d+ parameters in the checkpoint, \d+ in this run"):
+    with pytest.raises(
+        ValueError, match=r"optimizer: \d+ parameters in the checkpoint, \d+ in this run"
+    ):
         trainer.update.load_state_dict(state)
 
 
@@ -114,7 +116,9 @@ def test_advantages_are_estimated_once_or_before_each_epoch(ppo, estimates, monk
     trainer.update(rollout_ET)
     assert len(targets) == estimates
     # Each with the present networks; the env state that is not finite is counted once.
-    assert all(not torch.equal(one, other) for one, other in zip(targets, targets[1:], strict=False))
+    assert all(
+        not torch.equal(one, other) for one, other in zip(targets, targets[1:], strict=False)
+    )
     assert trainer.update.metrics()["update/non_finite_env_states"] == 1
     with count_syncs() as syncs:
         trainer.update(rollout_ET)
@@ -129,7 +133,8 @@ UP, DOWN = {"desired_kl": 1e3}, {"desired_kl": 1e-12}
 def test_annealing_at_the_start_of_a_run_changes_no_bit(ppo):
     limits = {"learning_rate_min": 1e-3, "learning_rate_max": 5e-3}
     plain, annealed = (
-        make_trainer(ppo={**ppo, **limits, "anneal_learning_rate": anneals}) for anneals in (False, True)
+        make_trainer(ppo={**ppo, **limits, "anneal_learning_rate": anneals})
+        for anneals in (False, True)
     )
     for trainer in (plain, annealed):
         torch.manual_seed(1)
@@ -158,6 +163,8 @@ def test_gradient_steps_keep_to_the_bounds_of_their_share_of_the_run(ppo, rates)
     for done, rate in zip((0.0, 0.5, 0.75), rates, strict=True):
         trainer.update.set_progress(done)
         trainer.update(trainer.collector.collect())
-        assert trainer.update.metrics()["update/learning_rate"].item() == pytest.approx(rate, rel=1e-6)
+        assert trainer.update.metrics()["update/learning_rate"].item() == pytest.approx(
+            rate, rel=1e-6
+        )
     with pytest.raises(ValueError, match="share of the run"):
         trainer.update.set_progress(1.5)

@@ -126,7 +126,9 @@ def parts(trainer):
 
 
 @pytest.mark.parametrize(
-    "networks", [pytest.param(["modules=lstm"], marks=pytest.mark.full), SEQUENCES], ids=["lstm", "gru"]
+    "networks",
+    [pytest.param(["modules=lstm"], marks=pytest.mark.full), SEQUENCES],
+    ids=["lstm", "gru"],
 )
 def test_a_resumed_run_is_bit_identical(networks, tmp_path):
     straight = make(*networks, iterations=4)
@@ -138,16 +140,22 @@ def test_a_resumed_run_is_bit_identical(networks, tmp_path):
     (tensors, values), (others, other_values) = parts(straight), parts(resumed)
     assert values == other_values and tensors.keys() == others.keys()
     assert [name for name in tensors if not torch.equal(tensors[name], others[name])] == []
-    for state in ("/collector/recurrent_state.actor.h", "/update/recurrent_state/recurrent_state.critic.h"):
+    for state in (
+        "/collector/recurrent_state.actor.h",
+        "/update/recurrent_state/recurrent_state.critic.h",
+    ):
         assert tensors[state].abs().max() > 0.0, state
     assert load_policy(tmp_path, device="cpu").actor.in_keys == resumed.update.actor.in_keys
 
 
 def test_only_the_critic_may_remember():
-    trainer = make("modules=lstm", "~modules.recurrent_actor.hidden_dim", "modules.recurrent_actor=null")
+    trainer = make(
+        "modules=lstm", "~modules.recurrent_actor.hidden_dim", "modules.recurrent_actor=null"
+    )
     trainer.train()
     assert (
-        recurrent_modules(trainer.update.actor) == [] and len(recurrent_modules(trainer.update.critic)) == 1
+        recurrent_modules(trainer.update.actor) == []
+        and len(recurrent_modules(trainer.update.critic)) == 1
     )
 
 

@@ -83,7 +83,9 @@ def write_package(site):
     assert source.count("\n") <= 60
     (package / "__init__.py").write_text(source)
     (package / "conf" / "__init__.py").write_text("")
-    (package / "conf" / "objective" / "slow.yaml").write_text("defaults: [mine]\nlearning_rate: 1.0e-5\n")
+    (package / "conf" / "objective" / "slow.yaml").write_text(
+        "defaults: [mine]\nlearning_rate: 1.0e-5\n"
+    )
     return site
 
 
@@ -125,14 +127,20 @@ def test_a_run_of_another_package_is_resumed_and_evaluated(site, tmp_path):
     resumed = ksim_rl(site, "resume", str(tmp_path / "run"), "--num-iterations", "3")
     assert resumed.returncode in (0, 1) and "3 iterations" in resumed.stdout, resumed.stderr
     judged = ksim_rl(site, "eval", str(tmp_path / "run"), "--episodes", "2")
-    assert "cartpole_balance, iteration 3: evaluation over 2 episodes" in judged.stdout, judged.stderr
+    assert "cartpole_balance, iteration 3: evaluation over 2 episodes" in judged.stdout, (
+        judged.stderr
+    )
 
 
 @pytest.mark.full
 def test_a_plugin_is_named_and_its_settings_are_varied_like_ours(tmp_path):
     site, named = write_package(tmp_path), ("--plugin", "my_learning")
-    shown = ksim_rl(site, "train", *named, "objective=slow", *SMALL, "--cfg", "job", "--package", "objective")
-    assert "_target_: my_learning.MineCfg" in shown.stdout and "learning_rate: 1.0e-05" in shown.stdout
+    shown = ksim_rl(
+        site, "train", *named, "objective=slow", *SMALL, "--cfg", "job", "--package", "objective"
+    )
+    assert (
+        "_target_: my_learning.MineCfg" in shown.stdout and "learning_rate: 1.0e-05" in shown.stdout
+    )
     wrong = ksim_rl(site, "train", *named, "objective=mine", "objective.learning_rat=1", *SMALL)
     assert wrong.returncode == 2 and "did you mean 'learning_rate'" in wrong.stderr
     unknown = ksim_rl(site, "train", "objective=mine", *SMALL)

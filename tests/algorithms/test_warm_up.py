@@ -30,7 +30,11 @@ def numbers_after(trainer, iterations):
         trainer.iterate()
         trainer.settle()
         logged.append(
-            {name: trainer.metrics[name] for name in sorted(trainer.metrics) if name not in OF_THE_CLOCK}
+            {
+                name: trainer.metrics[name]
+                for name in sorted(trainer.metrics)
+                if name not in OF_THE_CLOCK
+            }
         )
     return state_of(trainer), logged
 

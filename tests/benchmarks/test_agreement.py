@@ -21,7 +21,9 @@ def check(name: str, num_worlds: int) -> agreement.Agreement:
     for quantity, values in found.errors.items():
         judged = case(name).start != "thrown" or quantity == "qpos"
         assert not judged or agreement.agrees(case(name), values), f"{name}: {quantity}: {values}"
-    assert agreement.agrees(case(name), found.errors_as_trained["qpos"]), f"{name}: {found.errors_as_trained}"
+    assert agreement.agrees(case(name), found.errors_as_trained["qpos"]), (
+        f"{name}: {found.errors_as_trained}"
+    )
     return found
 
 
@@ -56,8 +58,12 @@ def test_a_robot_in_contact_agrees_after_20_substeps():
 
 
 @pytest.mark.full
-@pytest.mark.skipif("MENAGERIE_ROOT" not in os.environ, reason="MENAGERIE_ROOT names no folder of robots")
-@pytest.mark.parametrize("name", [case.name for case in agreement.CASES if case.start != "anywhere"])
+@pytest.mark.skipif(
+    "MENAGERIE_ROOT" not in os.environ, reason="MENAGERIE_ROOT names no folder of robots"
+)
+@pytest.mark.parametrize(
+    "name", [case.name for case in agreement.CASES if case.start != "anywhere"]
+)
 def test_robots_agree_as_they_train(name):
     check(name, num_worlds=64)
 
@@ -79,7 +85,9 @@ def test_what_is_committed_is_within_the_limits_for_every_robot():
 def test_any_file_is_a_model(tmp_path, monkeypatch):
     monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
     path = tmp_path / "ball.xml"
-    path.write_text("<mujoco><worldbody><body><freejoint/><geom size='0.1'/></body></worldbody></mujoco>")
+    path.write_text(
+        "<mujoco><worldbody><body><freejoint/><geom size='0.1'/></body></worldbody></mujoco>"
+    )
     (chosen,) = agreement.chosen_cases([str(path)])
     assert chosen.name == "ball" and chosen.load().nv == 6
     assert chosen.states(chosen.load(), 2).qpos_EL.shape == (2, 7)
@@ -114,7 +122,10 @@ def test_an_error_is_relative_to_the_scale_of_the_quantity():
 
 def test_a_wrong_sensor_is_not_hidden_by_large_ones():
     mj_model = load_model(agreement.CARTPOLE)
-    count = {name: np.ones((4, 2)) for name in ("qpos", "qvel", "xpos", "actuator_force", "qfrc_constraint")}
+    count = {
+        name: np.ones((4, 2))
+        for name in ("qpos", "qvel", "xpos", "actuator_force", "qfrc_constraint")
+    }
     expected = {**count, "sensordata": np.tile([1000.0, 0.01, 1.0, 1.0, 1.0, 1.0], (4, 1))}
     actual = {name: values.copy() for name, values in expected.items()}
     actual["sensordata"][:, 1] *= 1.5

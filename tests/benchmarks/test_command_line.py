@@ -4,7 +4,9 @@ from benchmarks import command_line
 
 
 def test_own_options_are_taken_out_and_the_rest_are_overrides():
-    own, others = command_line.split(["seeds=1,2", "task=a", "x.y=b=c"], {"seeds": "1", "steps": "32"})
+    own, others = command_line.split(
+        ["seeds=1,2", "task=a", "x.y=b=c"], {"seeds": "1", "steps": "32"}
+    )
     assert own == {"seeds": "1,2", "steps": "32"}
     assert others == ["task=a", "x.y=b=c"]
 

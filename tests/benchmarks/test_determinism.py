@@ -39,17 +39,33 @@ def test_equal_runs_have_equal_hashes_and_a_planted_bit_is_found_and_named():
 def test_everything_is_looked_at():
     look = determinism.train(command_line.compose(TINY), iterations=1).looks[1]
     prefixes = ("actor", "critic", "optimizer", "sampler")
-    for prefix in (*(f"/update/{name}" for name in prefixes), "/rollout", "/dataset", "/metrics", "/random"):
+    for prefix in (
+        *(f"/update/{name}" for name in prefixes),
+        "/rollout",
+        "/dataset",
+        "/metrics",
+        "/random",
+    ):
         assert any(path.startswith(prefix) for path in look), prefix
-    for path in ("/world/qpos", "/world/efc.force", "/world/contact.dist", "/env/base_env.world.qpos"):
+    for path in (
+        "/world/qpos",
+        "/world/efc.force",
+        "/world/contact.dist",
+        "/env/base_env.world.qpos",
+    ):
         assert any(known.startswith(path) for known in look), path
     assert not any("seconds" in path for path in look)
 
 
 def test_each_run_is_composed_and_the_clutter_has_cubes_of_one_size_that_are_apart():
-    cfgs = {name: command_line.compose([*words, "device=cpu"]) for name, words in determinism.TASKS.items()}
+    cfgs = {
+        name: command_line.compose([*words, "device=cpu"])
+        for name, words in determinism.TASKS.items()
+    }
     scene = cfgs["arm_clutter"].task.scene
-    assert len(scene.objects) == 7 and {box.size for box in scene.objects.values()} == {(0.06, 0.06, 0.06)}
+    assert len(scene.objects) == 7 and {box.size for box in scene.objects.values()} == {
+        (0.06, 0.06, 0.06)
+    }
     diagonal, places = 0.06 * math.sqrt(2.0), [place.pos[:2] for place in scene.placements.values()]
     assert all(math.dist(*pair) > diagonal for pair in itertools.combinations(places, 2))
 
@@ -75,7 +91,9 @@ def test_a_hash_sees_each_bit_and_its_place():
     )
     hashes = {int(determinism.hash_of(tensor)) for tensor in (numbers, *changed)}
     assert len(hashes) == 4
-    assert determinism.hash_of(numbers) == determinism.hash_of(torch.stack([numbers, numbers], 1)[:, 1])
+    assert determinism.hash_of(numbers) == determinism.hash_of(
+        torch.stack([numbers, numbers], 1)[:, 1]
+    )
     flags = torch.zeros(9, dtype=torch.bool)
     assert determinism.hash_of(flags) != determinism.hash_of(flags.logical_not())
 
@@ -108,7 +126,9 @@ def test_the_command_writes_figures_and_hashes(monkeypatch, capsys):
     figures = written["figures"]
     assert figures["cpu/tiny/on_over_off"] > 0.0
     assert figures["cpu/tiny/tensors_that_differ"] == 0 and figures["cpu/tiny/tensors"] > 100
-    assert len(set(written["hashes"]["cpu/tiny"])) == 1 and written["first_differences"] == {"cpu/tiny": []}
+    assert len(set(written["hashes"]["cpu/tiny"])) == 1 and written["first_differences"] == {
+        "cpu/tiny": []
+    }
     assert "0 of " in capsys.readouterr().out
     for words, message in (
         (["tasks=tinny"], "tasks.*tiny"),

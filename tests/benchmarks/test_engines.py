@@ -7,7 +7,13 @@ from benchmarks.engines import measure
 
 
 def test_both_engines_are_timed_and_compared():
-    words = ["task=cartpole_balance", "num_envs=8", "device=cpu", "logger=none", "trainer.eval_episodes=0"]
+    words = [
+        "task=cartpole_balance",
+        "num_envs=8",
+        "device=cpu",
+        "logger=none",
+        "trainer.eval_episodes=0",
+    ]
     words += ["collector.rollout_length=2", "data.num_minibatches=1", "collector.compile=false"]
     figures = measure(command_line.compose(words), repeats=1)
     for name in ("rollout", "physics"):

@@ -189,17 +189,23 @@ def resets_forget(patch):
 
 @sabotage("same_seed")
 def seeds_of_the_process(patch):
-    patch.setattr(torch, "manual_seed", lambda seed: torch.default_generator.manual_seed(os.getpid()))
+    patch.setattr(
+        torch, "manual_seed", lambda seed: torch.default_generator.manual_seed(os.getpid())
+    )
 
 
 @sabotage("threads")
 def as_many_as_there_are(patch):
-    patch.setattr(sys.modules["ksim_rl.trainers.build"], "default_threads", lambda device: os.cpu_count() - 1)
+    patch.setattr(
+        sys.modules["ksim_rl.trainers.build"], "default_threads", lambda device: os.cpu_count() - 1
+    )
 
 
 @sabotage("payloads")
 def configs_are_not_checked(patch):
-    without_the_check_of_config(patch)  # the short form always has the first of the families that it stops
+    without_the_check_of_config(
+        patch
+    )  # the short form always has the first of the families that it stops
 
 
 @sabotage("data_files")
@@ -227,7 +233,9 @@ def as_mujoco_takes_them(patch):
 
 @sabotage("hostile_folder")
 def commands_and_children_begin_where_the_user_stands(patch):
-    patch.setattr(hostile_folder, "PROGRAM", [word for word in hostile_folder.PROGRAM if word != "-P"])
+    patch.setattr(
+        hostile_folder, "PROGRAM", [word for word in hostile_folder.PROGRAM if word != "-P"]
+    )
 
 
 @sabotage("viewer_markup")
@@ -283,9 +291,7 @@ def errors_as_warp_raises_them(patch):
 
 @sabotage("environments")
 def limits_are_not_looked_at(patch):
-    program = (
-        "from ksim_rl.cli import main, process; main.check_process = lambda: None; main.main(sys.argv[1:])"
-    )
+    program = "from ksim_rl.cli import main, process; main.check_process = lambda: None; main.main(sys.argv[1:])"
     patch.setattr(environments, "PROGRAM", ("-P", "-c", f"import sys; {program}"))
 
 
@@ -382,7 +388,9 @@ def test_a_figure_that_is_changed_fails_its_row():
     assert page.passed(saved)["corruption"] is False
 
 
-def test_rows_side_by_side_are_merged_and_the_page_waits_for_those_that_are_committed(tmp_path, monkeypatch):
+def test_rows_side_by_side_are_merged_and_the_page_waits_for_those_that_are_committed(
+    tmp_path, monkeypatch
+):
     committed, elsewhere = tmp_path / "results", tmp_path / "elsewhere"
     made = json.loads(RESULTS.read_text())
     label = "cpu/latest/"
@@ -401,7 +409,9 @@ def test_rows_side_by_side_are_merged_and_the_page_waits_for_those_that_are_comm
             folder=Path(env["BENCHMARK_RESULTS"]),
         )
         assert env["CUDA_VISIBLE_DEVICES"] == "" and form == "form=long"
-        return subprocess.CompletedProcess(words, returncode=int(name != "latest"), stdout=f"{name}\n")
+        return subprocess.CompletedProcess(
+            words, returncode=int(name != "latest"), stdout=f"{name}\n"
+        )
 
     monkeypatch.setattr(command.subprocess, "run", in_a_process)
     monkeypatch.setattr(page.report, "RESULTS", elsewhere)

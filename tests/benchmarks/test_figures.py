@@ -15,7 +15,9 @@ def checkout(tmp_path):
 
     def git(*words):
         own = ("-c", "user.name=a", "-c", "user.email=a@b.c")
-        done = subprocess.run(["git", *own, *words], cwd=tmp_path, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ["git", *own, *words], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
         return done.stdout.strip()
 
     for path in ("ksim_rl/physics/world.py", "ksim_rl/transforms/noise.py", "docs/page.md"):
@@ -25,7 +27,11 @@ def checkout(tmp_path):
     git("add", "-A")
     git("commit", "-qm", "first")
     for name in ("agreement", "transforms"):
-        run = {"command": f"python -m benchmarks.{name}", "commit": git("rev-parse", "HEAD"), "date": "2026"}
+        run = {
+            "command": f"python -m benchmarks.{name}",
+            "commit": git("rev-parse", "HEAD"),
+            "date": "2026",
+        }
         (tmp_path / f"{name}.json").write_text(json.dumps({**run, "runs": {"cpu/a": run}}))
     return tmp_path, git
 
@@ -42,7 +48,10 @@ def test_figures_are_new_until_what_they_measure_changes(checkout):
     (root / "ksim_rl" / "physics" / "world.py").write_text("new")
     git("commit", "-qam", "physics")
     (entry,) = figures.old(root, root)
-    assert entry.figures == "agreement.json cpu/a" and entry.command == "python -m benchmarks.agreement"
+    assert (
+        entry.figures == "agreement.json cpu/a"
+        and entry.command == "python -m benchmarks.agreement"
+    )
     assert "ksim_rl/physics/world.py changed since" in entry.because
 
 

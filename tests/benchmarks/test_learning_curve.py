@@ -12,7 +12,12 @@ PREFIX = "cpu/quadruped_velocity_flat/4"
 
 def curve(*rewards):
     return [
-        {"env_states": 1e6 * i, "seconds": 10.0 * i, "episode/return": 5.0, "reward/upright": reward}
+        {
+            "env_states": 1e6 * i,
+            "seconds": 10.0 * i,
+            "episode/return": 5.0,
+            "reward/upright": reward,
+        }
         for i, reward in enumerate(rewards)
     ]
 
@@ -37,7 +42,9 @@ def learn(monkeypatch, tmp_path):
 
         monkeypatch.setattr(learning_curve, "_start", Process)
         monkeypatch.setattr(report, "write", functools.partial(report.write, folder=tmp_path))
-        monkeypatch.setattr(sys, "argv", ["benchmark", *WORDS, f"seeds={','.join(map(str, outcomes))}"])
+        monkeypatch.setattr(
+            sys, "argv", ["benchmark", *WORDS, f"seeds={','.join(map(str, outcomes))}"]
+        )
         if ending is None:
             learning_curve.main()
         else:

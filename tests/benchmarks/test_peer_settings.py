@@ -13,10 +13,24 @@ from matplotlib.image import imread
 from torch import nn
 
 from benchmarks import peer_settings, report
-from benchmarks.peer_settings import LEVELS, VARIANTS, FirstPolicy, Run, initialize_as_torch, run_cfg
+from benchmarks.peer_settings import (
+    LEVELS,
+    VARIANTS,
+    FirstPolicy,
+    Run,
+    initialize_as_torch,
+    run_cfg,
+)
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.trainers import Trainer
-from tests.algorithms.fused_problem import column, finite, needs_interpreter, networks, rollout, update
+from tests.algorithms.fused_problem import (
+    column,
+    finite,
+    needs_interpreter,
+    networks,
+    rollout,
+    update,
+)
 from tests.trainers.target_env import make_trainer
 
 WORDS = ("device=cpu", "num_envs=16", "collector.rollout_length=24")
@@ -25,7 +39,11 @@ LINEAR, ANGULAR = LEVELS
 
 def flat(tree, path=""):
     if isinstance(tree, dict):
-        return {key: v for name, entry in tree.items() for key, v in flat(entry, f"{path}.{name}").items()}
+        return {
+            key: v
+            for name, entry in tree.items()
+            for key, v in flat(entry, f"{path}.{name}").items()
+        }
     return {path.removeprefix("."): tree}
 
 
@@ -71,7 +89,9 @@ def test_the_weights_are_those_that_torch_gives_a_new_layer():
     std = made.actor[0].module.head.std.clone()
     initialize_as_torch(made, seed=1)
     assert {id(layer.weight) for layer in layers(made)} == before  # in place, where kernels look
-    assert torch.equal(torch.get_rng_state(), drawn) and torch.equal(made.actor[0].module.head.std, std)
+    assert torch.equal(torch.get_rng_state(), drawn) and torch.equal(
+        made.actor[0].module.head.std, std
+    )
     assert [layer.out_features for layer in layers(made)] == [256, 256, 128, 3, 256, 256, 128, 1]
     for layer in layers(made):
         bound = 1.0 / math.sqrt(layer.in_features)
@@ -111,7 +131,9 @@ def test_fused_kernels_collect_and_begin_to_learn_with_these_weights():
         acted = behavior(data.select("actor"))
     observed = data.select("actor")
     with torch.no_grad():
-        torch.testing.assert_close(acted["loc"], made.actor.get_dist(observed).mean, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(
+            acted["loc"], made.actor.get_dist(observed).mean, atol=1e-4, rtol=1e-4
+        )
         assert (acted["loc"] - old.get_dist(observed).mean).abs().mean() > 0.1
     made(data.update(acted))
     # Outside of the clip interval is a ratio that is not one to rounding.
@@ -180,7 +202,9 @@ def test_a_run_is_judged_by_the_mean_of_a_million_env_states():
     """A mean over a window of a million that ends at s is that of its middle: s - 0.5 million; see `reached`."""
     found = made_up(rises_by=0.1).found
     assert found["env_states_to_levels"] == pytest.approx(13.9e6 + 0.5e6, abs=1e5)
-    assert found["seconds_to_levels"] == pytest.approx(0.05 * found["env_states_to_levels"] / 1e5, abs=0.01)
+    assert found["seconds_to_levels"] == pytest.approx(
+        0.05 * found["env_states_to_levels"] / 1e5, abs=0.01
+    )
     assert found["means"][LINEAR] == pytest.approx(0.1 * 39.5, abs=0.01)
     assert made_up(rises_by=0.01).found["env_states_to_levels"] is None
 
@@ -190,9 +214,9 @@ def test_the_curve_that_is_drawn_is_the_mean_that_is_judged():
     at = {point["env_states"]: point for point in peer_settings.held_means(run.points)}
     end = at[run.found["env_states_to_levels"]]
     assert end[LINEAR] >= LEVELS[LINEAR] > at[end["env_states"] - 1e5][LINEAR]
-    assert peer_settings.median_curve([[{"env_states": 1.0, "a": v}] for v in (3.0, 1.0, 2.0)], "a") == [
-        (1.0, 2.0)
-    ]
+    assert peer_settings.median_curve(
+        [[{"env_states": 1.0, "a": v}] for v in (3.0, 1.0, 2.0)], "a"
+    ) == [(1.0, 2.0)]
 
 
 class _Pool:
@@ -232,4 +256,7 @@ def test_figures_seeds_curves_and_picture_are_written(monkeypatch, tmp_path):
     curve = saved["curves"][f"{prefix}/all/seed_3"]
     assert 40 <= len(curve) <= 42 and curve[-1]["env_states"] == 4e7
     picture = imread(tmp_path / "peer_settings.png")
-    assert picture.shape[0] > 400 and len({tuple(pixel) for pixel in picture[::4, ::4].reshape(-1, 4)}) > 20
+    assert (
+        picture.shape[0] > 400
+        and len({tuple(pixel) for pixel in picture[::4, ::4].reshape(-1, 4)}) > 20
+    )

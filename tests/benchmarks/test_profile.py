@@ -24,7 +24,13 @@ def test_kernels_go_to_the_innermost_room_that_launched_them():
         }
         return [
             launch,
-            {"name": name, "cat": "kernel", "ts": 900, "dur": us, "args": {"correlation": correlation}},
+            {
+                "name": name,
+                "cat": "kernel",
+                "ts": 900,
+                "dur": us,
+                "args": {"correlation": correlation},
+            },
         ]
 
     events = [span("update", 0, 100), span("physics", 10, 20)]
@@ -34,14 +40,27 @@ def test_kernels_go_to_the_innermost_room_that_launched_them():
         + kernel(3, 60, 7.0, "estimate_advantages")
         + kernel(4, 200, 1.0)
     )
-    assert by_room(events) == {"physics": (1, 3.0), "update": (1, 5.0), "gae": (1, 7.0), "other": (1, 1.0)}
+    assert by_room(events) == {
+        "physics": (1, 3.0),
+        "update": (1, 5.0),
+        "gae": (1, 7.0),
+        "other": (1, 1.0),
+    }
 
 
 def test_an_iteration_of_a_compiled_step_is_laid_to_its_rooms():
-    fixed = "device=cpu", "num_envs=64", "logger=none", "trainer.eval_episodes=0", "collector.compile=true"
+    fixed = (
+        "device=cpu",
+        "num_envs=64",
+        "logger=none",
+        "trainer.eval_episodes=0",
+        "collector.compile=true",
+    )
     figures = measure(command_line.compose(["task=pendulum_swingup", *fixed]))
     shares = {name: value for name, value in figures.items() if name.endswith("_share")}
     rooms = {"physics", "refresh", "resets", "terms", "policy", "storage", "update", "log"}
     assert shares.keys() == {f"{room}_share" for room in rooms}
     assert min(shares.values()) > 0.0 and abs(sum(shares.values()) - 1.0) < 1e-6
-    assert figures["terms_ms"] < figures["iteration_ms"] / 2, "what is inside is not taken out of the rollout"
+    assert figures["terms_ms"] < figures["iteration_ms"] / 2, (
+        "what is inside is not taken out of the rollout"
+    )

@@ -32,16 +32,24 @@ def test_equal_states_differ_in_nothing_and_each_leaf_is_counted_but_the_seconds
 def test_each_kind_of_difference_is_seen():
     weight = {"weight": torch.tensor([1.0, 2.0])}
     for other, path in (
-        (changed(env={"base_env.world.qpos": torch.tensor([0.0, -0.0])}), "/env/base_env.world.qpos"),
+        (
+            changed(env={"base_env.world.qpos": torch.tensor([0.0, -0.0])}),
+            "/env/base_env.world.qpos",
+        ),
         (changed(env={"base_env.world.qpos": torch.zeros(2, 1)}), "/env/base_env.world.qpos"),
         (changed(env={"base_env.world.qpos": torch.zeros(2).double()}), "/env/base_env.world.qpos"),
         (changed(update={**STATE["update"], "actor": weight}), "/update/actor/weight"),
-        (changed(update={**STATE["update"], "optimizer": {"rate": 0.25}}), "/update/optimizer/rate"),
+        (
+            changed(update={**STATE["update"], "optimizer": {"rate": 0.25}}),
+            "/update/optimizer/rate",
+        ),
         (changed(iteration=5), "/iteration"),
         (changed(hooks={}), "/hooks"),
     ):
         for one, two in ((STATE, other), (other, STATE)):
-            differing = [path for paths in resume.compare(one, two).differing.values() for path in paths]
+            differing = [
+                path for paths in resume.compare(one, two).differing.values() for path in paths
+            ]
             assert differing == [path]
 
 

@@ -18,5 +18,7 @@ def test_one_number_of_envs_leaves_an_earlier_chart_as_it_is(tmp_path):
     path = tmp_path / "chart.png"
     path.write_bytes(b"of an earlier run")
     row = {"env_states_per_s": 4e5, "physics_env_states_per_s": 5e5}
-    assert "left as it is" in draw({32768: row}, path, task_name="go1_velocity_flat", device="a GPU")
+    assert "left as it is" in draw(
+        {32768: row}, path, task_name="go1_velocity_flat", device="a GPU"
+    )
     assert path.read_bytes() == b"of an earlier run"

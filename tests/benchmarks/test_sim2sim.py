@@ -8,7 +8,9 @@ from benchmarks.sim2sim import OPTIONS, Episodes, compared, differs, group, meas
 
 def episodes(returns: list[float]) -> Episodes:
     return Episodes(
-        return_N=np.array(returns), length_N=np.full(len(returns), 30.0), fell_N=np.zeros(len(returns))
+        return_N=np.array(returns),
+        length_N=np.full(len(returns), 30.0),
+        fell_N=np.zeros(len(returns)),
     )
 
 

@@ -56,7 +56,10 @@ def test_what_fails_is_in_its_row_and_the_rest_goes_on(tmp_path, monkeypatch, ca
     code, saved = run(tmp_path / "broken", "tasks=cartpole_balance")
     assert code == 1
     found = saved["outcomes"]["cpu/cartpole_balance/4"]
-    assert (found["check_env"], found["findings"]) == ("failed", ["[check_env] RuntimeError: no kernel"])
+    assert (found["check_env"], found["findings"]) == (
+        "failed",
+        ["[check_env] RuntimeError: no kernel"],
+    )
     assert saved["figures"]["cpu/cartpole_balance/4/syncs"] == 0
     assert "cpu/arm_push/4: RuntimeError: no such cube" in capsys.readouterr().out
 

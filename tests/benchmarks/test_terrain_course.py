@@ -69,9 +69,13 @@ def throw(policy, first, later):
 def test_the_course_of_go1_asks_for_one_speed_and_pushes_nobody():
     task = envs.task("go1_velocity_rough").cfg()
     course = course_of(task)
-    assert course.grid.columns == tuple(task.scene.terrain.patches) and len(course.grid.columns) == 8
+    assert (
+        course.grid.columns == tuple(task.scene.terrain.patches) and len(course.grid.columns) == 8
+    )
     assert course.grid.seed != task.scene.terrain.seed and course.grid.num_levels == 10
-    assert course.distance == pytest.approx(3.2) and course.cfg.episode_length_s == pytest.approx(10.0)
+    assert course.distance == pytest.approx(3.2) and course.cfg.episode_length_s == pytest.approx(
+        10.0
+    )
     assert task.events.keys() - course.cfg.events.keys() == {"push_robot"}
     command = course.cfg.commands["twist"]
     ranges = (command.lin_vel_x, command.lin_vel_y, command.ang_vel_z)
@@ -103,7 +107,11 @@ def test_robots_are_spread_evenly_and_an_untrained_policy_gets_nowhere(untrained
 @pytest.mark.full
 def test_what_is_drawn_does_not_depend_on_the_seed_of_the_run(untrained):
     one, other = (
-        throw(dataclasses.replace(untrained, cfg=dataclasses.replace(untrained.cfg, seed=seed)), SOME, SOME)
+        throw(
+            dataclasses.replace(untrained, cfg=dataclasses.replace(untrained.cfg, seed=seed)),
+            SOME,
+            SOME,
+        )
         for seed in (1, 2)
     )
     assert 0 < int(one.fell_E.sum()) < NUM_ENVS
@@ -149,7 +157,9 @@ def test_the_level_of_training_is_that_of_the_last_million_env_states_of_the_pol
     assert trained(tmp_path, 3) == {}
     table = CsvTable(tmp_path / "metrics.csv")
     for iteration, level in enumerate((1.0, 2.0, 4.0, 9.0), start=1):
-        table.log_metrics({"iteration": iteration, terrain_course.LEVEL: level}, iteration * 600_000)
+        table.log_metrics(
+            {"iteration": iteration, terrain_course.LEVEL: level}, iteration * 600_000
+        )
     checkpoint = tmp_path / "checkpoint" / "3"
     for path in (tmp_path, tmp_path / "checkpoint", checkpoint):
         assert trained(path, 3) == {"env_states": 1_800_000, "trained_level": 3.0}

@@ -87,7 +87,13 @@ def test_the_id_of_a_run_is_no_path(tmp_path, text):
 
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "builtins.eval", "ksim_rl.envs.make", "ksim_rl.trainers.run_folder.json", "pathlib.Path"],
+    [
+        "os.system",
+        "builtins.eval",
+        "ksim_rl.envs.make",
+        "ksim_rl.trainers.run_folder.json",
+        "pathlib.Path",
+    ],
 )
 def test_targets_are_classes_of_allowed_packages_and_never_functions(target):
     with pytest.raises(ValueError, match="_target_"):
@@ -130,7 +136,9 @@ def test_a_run_goes_on_only_among_files_of_its_own(place, name, kind, capsys):
 
 def test_policies_are_loaded_without_a_folder_for_failures(place, monkeypatch):
     seen = []
-    monkeypatch.setattr(run_folder, "build_env", lambda cfg, **_: seen.append(cfg) or pytest.skip.Exception)
+    monkeypatch.setattr(
+        run_folder, "build_env", lambda cfg, **_: seen.append(cfg) or pytest.skip.Exception
+    )
     task = copy.deepcopy(place.tree["task"])
     task["sim"]["nan_guard"] = {"folder": str(place.outside / "written")}
     place.write_checkpoint({"observation_columns": {}}, task=task)
@@ -149,5 +157,7 @@ def test_a_link_to_itself_is_refused_by_name(tmp_path):
     loop.symlink_to(loop)
     # It leads nowhere, and is refused where it is read.
     check_links(tmp_path, below=())
-    with pytest.raises(ValueError, match=r"config\.yaml: cannot be read: Too many levels of symbolic links"):
+    with pytest.raises(
+        ValueError, match=r"config\.yaml: cannot be read: Too many levels of symbolic links"
+    ):
         read_yaml(loop)

@@ -31,13 +31,17 @@ def work(tmp_path, monkeypatch):
 
 def test_the_package_has_robot_task_test_and_readme(work, capsys):
     assert run("new", "robot", "tin_man.xml") == 0
-    files = {path.relative_to(work / "tin_man").as_posix() for path in (work / "tin_man").rglob("*.*")}
+    files = {
+        path.relative_to(work / "tin_man").as_posix() for path in (work / "tin_man").rglob("*.*")
+    }
     package = {f"tin_man/{name}" for name in ("__init__.py", "robot.py", "tasks.py", "tin_man.xml")}
     assert files == package | {"pyproject.toml", "README.md", "tests/test_tin_man.py"}
     for file in (work / "tin_man").rglob("*.py"):
         ast.parse(file.read_text())
         assert "$" not in file.read_text()
-    declared = tomllib.loads((work / "tin_man" / "pyproject.toml").read_text())["project"]["entry-points"]
+    declared = tomllib.loads((work / "tin_man" / "pyproject.toml").read_text())["project"][
+        "entry-points"
+    ]
     assert declared == {"ksim_rl.tasks": {"tin_man": "tin_man.tasks"}}
     readme = (work / "tin_man" / "README.md").read_text()
     assert "--plugin tin_man task=tin_man_velocity_flat" in readme and "stands for 5 s" in readme
@@ -47,9 +51,15 @@ def test_the_package_has_robot_task_test_and_readme(work, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["tin_man.xml", "--name", "Tin-Man"], "--name Tin-Man: expected a name for a Python package"),
+        (
+            ["tin_man.xml", "--name", "Tin-Man"],
+            "--name Tin-Man: expected a name for a Python package",
+        ),
         (["tin_man.xml", "--name", "numpy"], "Python knows a package of this name already"),
-        (["tin_man.xml", "--name", "quadruped"], "there is a task 'quadruped_velocity_flat' already"),
+        (
+            ["tin_man.xml", "--name", "quadruped"],
+            "there is a task 'quadruped_velocity_flat' already",
+        ),
         (["tin_man.xml", "--output", "."], "exists already"),
         (["nowhere.xml"], "nowhere.xml"),
         (["tin_man.xml", "--pose", "home"], "the model has no pose 'home': valid: qpos0"),
@@ -99,7 +109,9 @@ def test_files_of_one_name_in_two_folders_stay_two(tmp_path):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("model", "name"), [("tin_man.xml", "tin_man"), ("unitree_a1/a1", "my_a1")])
+@pytest.mark.parametrize(
+    ("model", "name"), [("tin_man.xml", "tin_man"), ("unitree_a1/a1", "my_a1")]
+)
 def test_it_trains_at_once_and_its_own_test_passes(work, model, name):
     if "/" in model:
         from ksim_rl.physics import load_spec
@@ -117,7 +129,9 @@ def test_it_trains_at_once_and_its_own_test_passes(work, model, name):
         *QUICK.split(),
     ]
     trained = guide.run(*command, site=work / "site", cwd=work / name)
-    assert trained.returncode == 0 and "2 iterations" in trained.stdout, trained.stdout + trained.stderr
+    assert trained.returncode == 0 and "2 iterations" in trained.stdout, (
+        trained.stdout + trained.stderr
+    )
     tested = guide.run("-m", "pytest", "-q", "tests", site=work / "site", cwd=work / name)
     assert tested.returncode == 0 and "2 passed" in tested.stdout, tested.stdout
 
@@ -129,9 +143,7 @@ def test_a_task_in_one_file_trains(work, monkeypatch, capsys):
     ast.parse(text)
     assert "$" not in text
     monkeypatch.setattr(sys, "argv", ["ksim-rl"])
-    settings = (
-        "num_envs=16 data.num_env_states_per_minibatch=64 data.num_minibatches=2 trainer.num_iterations=1"
-    )
+    settings = "num_envs=16 data.num_env_states_per_minibatch=64 data.num_minibatches=2 trainer.num_iterations=1"
     words = f"{settings} trainer.video=false trainer.eval_episodes=0 hydra.run.dir=run".split()
     assert run("train", "--plugin", "push_it", "task=push_it", *words) == 0
     assert (work / "run" / "metrics.csv").exists()

@@ -19,7 +19,9 @@ def test_a_payload_is_refused_in_one_line_and_does_nothing(name, place, capsys):
     error = capsys.readouterr().err
     assert error.startswith("ksim-rl: error: ") and error.count("\n") == 1, error
     assert signs(place, error) == []
-    after = sorted(str(path) for path in place.run.parent.rglob("*") if "__pycache__" not in str(path))
+    after = sorted(
+        str(path) for path in place.run.parent.rglob("*") if "__pycache__" not in str(path)
+    )
     assert after == before, "nothing is written"
 
 

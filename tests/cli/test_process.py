@@ -7,7 +7,11 @@ import sys
 
 import pytest
 
-COMMAND = ("-P", "-c", "import sys; sys.argv[0] = 'ksim-rl'; from ksim_rl.cli.main import main; main()")
+COMMAND = (
+    "-P",
+    "-c",
+    "import sys; sys.argv[0] = 'ksim-rl'; from ksim_rl.cli.main import main; main()",
+)
 
 
 def run(words, **options):
@@ -37,7 +41,9 @@ def test_python_without_docstrings_is_refused_in_one_line():
 
 def test_usage_needs_no_room():
     limit = 300 * 2**20
-    ended = run(["--help"], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)))
+    ended = run(
+        ["--help"], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    )
     assert ended.returncode == 0 and "usage: ksim-rl" in ended.stdout
 
 

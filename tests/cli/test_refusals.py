@@ -20,9 +20,18 @@ def work(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["checkpoint=nowhere"], "checkpoint=nowhere: nowhere: no checkpoint here; expected a run folder"),
-        (["--multirun", "checkpoint=nowhere,there"], "checkpoint=nowhere: nowhere: no checkpoint here"),
-        ([*DISTIL, "objective.teacher=expert"], "objective.teacher=expert: expert: no checkpoint here"),
+        (
+            ["checkpoint=nowhere"],
+            "checkpoint=nowhere: nowhere: no checkpoint here; expected a run folder",
+        ),
+        (
+            ["--multirun", "checkpoint=nowhere,there"],
+            "checkpoint=nowhere: nowhere: no checkpoint here",
+        ),
+        (
+            [*DISTIL, "objective.teacher=expert"],
+            "objective.teacher=expert: expert: no checkpoint here",
+        ),
         (
             ["trainer.stop_at={reward/balnce: 1}"],
             "no metric is called 'reward/balnce': did you mean 'reward/balance'",
@@ -36,11 +45,17 @@ def work(tmp_path, monkeypatch):
         (["task=go1_velocity_flat"], "task.scene.robots."),
         (["--num_envs=4"], "--num_envs=4: fields are set without dashes: num_envs=4"),
         (["--num-envs", "4"], "--num-envs: fields are set without dashes: num_envs=4"),
-        (["--task", "cartpole_swingup"], "--task: fields are set without dashes: task=cartpole_swingup"),
+        (
+            ["--task", "cartpole_swingup"],
+            "--task: fields are set without dashes: task=cartpole_swingup",
+        ),
         (["--num_iterations=9"], "fields are set without dashes: trainer.num_iterations=9"),
         (["--objective.gamma", "0.9"], "fields are set without dashes: objective.gamma=0.9"),
         (["--num_env=4"], "no such flag, and no field 'num_env': did you mean 'num_envs'"),
-        (["cartpole_swingup"], "'cartpole_swingup': expected name=value: did you mean task=cartpole_swingup"),
+        (
+            ["cartpole_swingup"],
+            "'cartpole_swingup': expected name=value: did you mean task=cartpole_swingup",
+        ),
         (["cartpole_swingpu"], "did you mean task=cartpole_swingup"),
     ],
 )
@@ -88,11 +103,19 @@ def resumed(work, monkeypatch):
 
 
 def test_resume_takes_overrides(resumed, capsys):
-    changes = ("objective.learning_rate=1e-5", "trainer.num_iterations=50", "task.rewards.balance.weight=2.0")
+    changes = (
+        "objective.learning_rate=1e-5",
+        "trainer.num_iterations=50",
+        "task.rewards.balance.weight=2.0",
+    )
     assert run(capsys, "resume", "run", *changes)[0] == 0
     assert run(capsys, "resume", "run", "--num-iterations", "7", "objective.gamma=0.9")[0] == 0
     first, second = resumed
-    assert (first.objective.learning_rate, first.trainer.num_iterations, first.num_envs) == (1e-5, 50, 64)
+    assert (first.objective.learning_rate, first.trainer.num_iterations, first.num_envs) == (
+        1e-5,
+        50,
+        64,
+    )
     assert first.task.rewards["balance"].weight == 2.0
     assert (second.trainer.num_iterations, second.objective.gamma) == (7, 0.9)
 

@@ -32,7 +32,9 @@ def run(*arguments):
 
 def rows(folder):
     with open(folder / "metrics.csv", newline="") as file:
-        return [{name: row[name] for name in row if name not in TIMES} for row in csv.DictReader(file)]
+        return [
+            {name: row[name] for name in row if name not in TIMES} for row in csv.DictReader(file)
+        ]
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,9 @@ def test_overrides_lie_over_a_run_that_is_made_again(first, tmp_path):
         ("task=cartpole_swingup", "a run's config has no groups"),
     ],
 )
-def test_a_wrong_override_of_a_run_is_one_line(first, tmp_path, monkeypatch, capsys, override, message):
+def test_a_wrong_override_of_a_run_is_one_line(
+    first, tmp_path, monkeypatch, capsys, override, message
+):
     monkeypatch.chdir(tmp_path)
     assert run("--config-dir", str(first), override) == 2
     error = capsys.readouterr().err
@@ -82,10 +86,16 @@ def test_a_wrong_override_of_a_run_is_one_line(first, tmp_path, monkeypatch, cap
         ("elsewhere/config.yaml", "task_name: a\ntask: {}\n", "expected a run folder"),
         ("config.yaml", "foo: 1", "expected a run folder"),
         ("config.yaml", "a: [1", "config.yaml: cannot be read: "),
-        ("config.yaml", "task_name: a\ntask: null", "config.yaml: task=None: expected the config of an env"),
+        (
+            "config.yaml",
+            "task_name: a\ntask: null",
+            "config.yaml: task=None: expected the config of an env",
+        ),
     ],
 )
-def test_a_folder_without_a_run_is_refused_instead_of_ignored(tmp_path, capsys, name, text, message):
+def test_a_folder_without_a_run_is_refused_instead_of_ignored(
+    tmp_path, capsys, name, text, message
+):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text(text)
     assert run("--config-dir", str(tmp_path), f"hydra.run.dir={tmp_path / 'run'}") == 2
@@ -97,7 +107,10 @@ def test_a_folder_without_a_run_is_refused_instead_of_ignored(tmp_path, capsys, 
 def test_config_groups_of_ones_own_lie_beside_ours(tmp_path, capsys):
     (tmp_path / "logger").mkdir()
     (tmp_path / "logger" / "quiet.yaml").write_text("csv: false\ntensorboard: false\n")
-    assert run("--config-dir", str(tmp_path), "logger=quiet", "--cfg", "job", "--package", "logger") == 0
+    assert (
+        run("--config-dir", str(tmp_path), "logger=quiet", "--cfg", "job", "--package", "logger")
+        == 0
+    )
     assert "csv: false" in capsys.readouterr().out
 
 
@@ -108,21 +121,34 @@ def test_a_new_run_starts_from_the_weights_of_another(first, tmp_path):
         "objective.learning_rate_min=1e-30",
     )
     code = run(
-        *SMALL, *frozen, f"checkpoint={first}", "task=cartpole_swingup", "seed=9", f"hydra.run.dir={tmp_path}"
+        *SMALL,
+        *frozen,
+        f"checkpoint={first}",
+        "task=cartpole_swingup",
+        "seed=9",
+        f"hydra.run.dir={tmp_path}",
     )
     assert code == 0
     began, ended = (checkpoint.load_latest(folder) for folder in (first, tmp_path))
     assert ended.iteration == 2, "counted from its own start"
     assert ended.config["checkpoint"] == str(first)
-    weights = {name for name, value in began.state["update"]["actor"].items() if value.dtype == torch.float32}
+    weights = {
+        name
+        for name, value in began.state["update"]["actor"].items()
+        if value.dtype == torch.float32
+    }
     learned = {name for name in weights if "weight" in name or "bias" in name}
     assert len(learned) >= 4
     for name in learned:
-        assert torch.equal(began.state["update"]["actor"][name], ended.state["update"]["actor"][name]), name
+        assert torch.equal(
+            began.state["update"]["actor"][name], ended.state["update"]["actor"][name]
+        ), name
 
 
 def test_weights_for_other_observations_are_refused_with_the_names(first, tmp_path, capsys):
-    code = run(*SMALL, f"checkpoint={first}", "task=pendulum_swingup", f"hydra.run.dir={tmp_path / 'run'}")
+    code = run(
+        *SMALL, f"checkpoint={first}", "task=pendulum_swingup", f"hydra.run.dir={tmp_path / 'run'}"
+    )
     assert code == 2
     error = capsys.readouterr().err
     assert "the checkpoint is of other observations: group 'actor': " in error
@@ -152,7 +178,9 @@ def test_a_run_names_its_teacher_so_that_it_is_found_from_anywhere(tmp_path, mon
 
 @pytest.mark.full
 def test_a_run_is_made_again_from_its_own_weights(first, tmp_path):
-    code = run("--config-dir", str(first), f"checkpoint={first}", "seed=5", f"hydra.run.dir={tmp_path}")
+    code = run(
+        "--config-dir", str(first), f"checkpoint={first}", "seed=5", f"hydra.run.dir={tmp_path}"
+    )
     config = checkpoint.load_latest(tmp_path).config
     assert code == 0 and (config["seed"], config["checkpoint"]) == (5, str(first))
 
@@ -198,7 +226,11 @@ def test_a_run_keeps_its_model_in_other_folders_and_after_edits(tmp_path, monkey
     robot = tmp_path / "robot.xml"
     robot.write_text(files("ksim_rl.scene.robots").joinpath("cartpole.xml").read_text())
     described = "{_target_:ksim_rl.scene.scene.MjcfRobot,source:robot.xml}"
-    own = ("task=cartpole_swingup", "~task.scene.robots.cartpole", f"+task.scene.robots.cartpole={described}")
+    own = (
+        "task=cartpole_swingup",
+        "~task.scene.robots.cartpole",
+        f"+task.scene.robots.cartpole={described}",
+    )
     assert run(*SMALL, *own, "hydra.run.dir=run") == 0
     robot.write_text(robot.read_text().replace('mass="0.1"', 'mass="0.2"'))
     capsys.readouterr()
@@ -207,7 +239,10 @@ def test_a_run_keeps_its_model_in_other_folders_and_after_edits(tmp_path, monkey
     assert said.count("robot.xml has changed since the run began: the run's own copy is used") == 1
     assert rows(tmp_path / "again") == rows(tmp_path / "run")
     monkeypatch.chdir(tmp_path / "elsewhere")
-    for command in (["eval", "../run", "--episodes", "1"], ["resume", "../run", "--num-iterations", "3"]):
+    for command in (
+        ["eval", "../run", "--episodes", "1"],
+        ["resume", "../run", "--num-iterations", "3"],
+    ):
         with (
             pytest.warns(UserWarning) if command[0] == "eval" else nullcontext(),
             pytest.raises(SystemExit) as stopped,

@@ -17,7 +17,10 @@ def work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     make_run(tmp_path / "runs" / "cartpole_balance" / "a", returns=(9.0,), seed=1)
     make_run(
-        tmp_path / "runs" / "pendulum_swingup" / "b", returns=(3.0, 4.0), seed=2, task="pendulum_swingup"
+        tmp_path / "runs" / "pendulum_swingup" / "b",
+        returns=(3.0, 4.0),
+        seed=2,
+        task="pendulum_swingup",
     )
     return tmp_path
 
@@ -47,7 +50,8 @@ def test_runs_are_compared_in_a_table_and_a_picture(work, capsys):
     output = capsys.readouterr().out
     assert output.splitlines()[0].split() == ["run", "a", "b"] and output.endswith("compare.png\n")
     assert any(
-        line.split() == ["task_name", "cartpole_balance", "pendulum_swingup"] for line in output.splitlines()
+        line.split() == ["task_name", "cartpole_balance", "pendulum_swingup"]
+        for line in output.splitlines()
     )
     assert (work / "compare.png").stat().st_size > 10_000
 

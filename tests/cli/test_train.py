@@ -72,13 +72,19 @@ def test_eval_repeats_the_evaluation_of_the_run(trained, capsys):
     _, folder = trained
     figures = json.loads((folder / "evaluation.json").read_text())
     assert run("eval", str(folder)) == 1
-    assert f"return {figures['return_mean']:.1f} +- {figures['return_std']:.1f}" in capsys.readouterr().out
+    assert (
+        f"return {figures['return_mean']:.1f} +- {figures['return_std']:.1f}"
+        in capsys.readouterr().out
+    )
 
 
 def test_eval_in_the_c_engine_says_which_physics_judges(trained, capsys):
     _, folder = trained
     assert run("eval", str(folder), "task.sim.engine=c", "--episodes", "4") == 1
-    assert "on MuJoCo's C engine (trained on MuJoCo Warp): evaluation over 4" in capsys.readouterr().out
+    assert (
+        "on MuJoCo's C engine (trained on MuJoCo Warp): evaluation over 4"
+        in capsys.readouterr().out
+    )
     assert run("eval", str(folder), "task.decimation=2") == 2
     assert "task.decimation: `ksim-rl eval` changes only how worlds" in capsys.readouterr().err
 
@@ -99,7 +105,16 @@ def test_a_run_that_the_c_engine_trained_is_judged_in_other_physics(trained, tmp
 
 def test_play_records_a_video_or_says_why_not(trained, capsys, tmp_path):
     _, folder = trained
-    code = run("play", str(folder), "--seconds", "0.1", "--fps", "50", "--output", str(tmp_path / "clip.gif"))
+    code = run(
+        "play",
+        str(folder),
+        "--seconds",
+        "0.1",
+        "--fps",
+        "50",
+        "--output",
+        str(tmp_path / "clip.gif"),
+    )
     output = capsys.readouterr().out
     if code == 0:
         assert len(imageio.mimread(tmp_path / "clip.gif")) == 5  # of 10 steps
@@ -112,7 +127,9 @@ def test_play_records_a_video_or_says_why_not(trained, capsys, tmp_path):
 def test_a_run_of_another_device_plays_here_with_changes(trained, tmp_path, capsys):
     saved = checkpoint.load_latest(trained[1])
     elsewhere = {**saved.config, "device": "cuda:7"}
-    checkpoint.save(tmp_path / "checkpoint", saved.state, iteration=saved.iteration, config=elsewhere)
+    checkpoint.save(
+        tmp_path / "checkpoint", saved.state, iteration=saved.iteration, config=elsewhere
+    )
     words = ("--device", "cpu", "--seconds", "0.1", "--output", str(tmp_path / "clip.mp4"))
     assert run("play", str(tmp_path), "task.viewer.width=64", *words) in (0, 3)
     assert "device=" not in capsys.readouterr().err
@@ -128,13 +145,18 @@ def test_resume_continues_in_the_same_folder(trained):
 def test_fewer_iterations_than_are_done_are_refused(trained, capsys):
     _, folder = trained
     assert run("resume", str(folder), "--num-iterations", "1") == 2
-    assert "trainer.num_iterations=1: expected at least 3, those that are done" in capsys.readouterr().err
+    assert (
+        "trainer.num_iterations=1: expected at least 3, those that are done"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.full
 def test_a_sweep_runs_one_job_for_each_combination_and_ends_with_a_table(tmp_path, capsys):
     quick = ("trainer.num_iterations=1", "trainer.eval_episodes=0", "trainer.video=false")
-    assert run("train", "--multirun", *SMALL, *quick, "seed=1,2", f"hydra.sweep.dir={tmp_path}") == 0
+    assert (
+        run("train", "--multirun", *SMALL, *quick, "seed=1,2", f"hydra.sweep.dir={tmp_path}") == 0
+    )
     seeds = {
         folder.name: checkpoint.load_latest(folder).config["seed"]
         for folder in tmp_path.iterdir()
@@ -160,7 +182,11 @@ def test_a_damaged_checkpoint_is_one_line(trained, capsys, tmp_path):
 
 
 def test_ctrl_c_saves_and_exits_with_130(tmp_path, monkeypatch, capsys):
-    endless = ("trainer.num_iterations=100000", "trainer.eval_interval=0", f"hydra.run.dir={tmp_path}")
+    endless = (
+        "trainer.num_iterations=100000",
+        "trainer.eval_interval=0",
+        f"hydra.run.dir={tmp_path}",
+    )
     iterate = Trainer.iterate
 
     def iterate_until_ctrl_c(trainer):
@@ -175,10 +201,15 @@ def test_ctrl_c_saves_and_exits_with_130(tmp_path, monkeypatch, capsys):
     assert checkpoint.load_latest(tmp_path).iteration >= 2
     (session,) = record.read(tmp_path)
     assert (session.status, session.why) == ("interrupted", "SIGINT")
-    assert session.command.endswith(f"hydra.run.dir={tmp_path}") and " train num_envs=16 " in session.command
+    assert (
+        session.command.endswith(f"hydra.run.dir={tmp_path}")
+        and " train num_envs=16 " in session.command
+    )
 
 
-def test_what_an_export_will_leave_out_is_said_before_the_first_iteration(tmp_path, monkeypatch, capsys):
+def test_what_an_export_will_leave_out_is_said_before_the_first_iteration(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     own = "+task.rewards.force={_target_:ksim_rl.mdp.ActuatorForceL2,weight:-0.001}"
     quick = (

@@ -6,7 +6,16 @@ import pytest
 
 from ksim_rl.cli import upstream
 
-FLAGS = ("help", "hydra_help", "shell_completion", "cfg", "info", "multirun", "config_dir", "config_name")
+FLAGS = (
+    "help",
+    "hydra_help",
+    "shell_completion",
+    "cfg",
+    "info",
+    "multirun",
+    "config_dir",
+    "config_name",
+)
 
 
 @pytest.mark.parametrize("flag", [*FLAGS, "config_path", "overrides"])

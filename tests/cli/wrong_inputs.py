@@ -124,7 +124,10 @@ TRANSFORMS: Sequence[tuple[str, str]] = (
     ("+task.transforms.lag={_target_: ksim_rl.envs.transforms.ActionDelay}", "delay"),
     ("+task.transforms.lag={_target_: ksim_rl.envs.transforms.ActionDelays}", "ActionDelay"),
     ("+task.transforms.lag={_target_: ksim_rl.envs.transforms.ActionDelay, delay: 2}", "delay"),
-    ("+task.transforms.lag={_target_: ksim_rl.envs.transforms.ActionDelay, delay: {max_lag: -1}}", "max_lag"),
+    (
+        "+task.transforms.lag={_target_: ksim_rl.envs.transforms.ActionDelay, delay: {max_lag: -1}}",
+        "max_lag",
+    ),
     (
         "+task.transforms.lag={_target_: ksim_rl.envs.transforms.ActionDelay, delay: {max_lag: 100}}",
         "max_lag",
@@ -170,7 +173,9 @@ def train(words: Sequence[str], folder: Path) -> int:
     given = [word.partition("=")[0] for word in words]
     few = ["trainer.num_iterations=1", "trainer.eval_episodes=0", f"hydra.run.dir={folder / 'run'}"]
     own = [word for word in children.SMALLEST if word.partition("=")[0] not in given]
-    own = [word for word in own if word.partition("=")[0] not in [one.partition("=")[0] for one in few]]
+    own = [
+        word for word in own if word.partition("=")[0] not in [one.partition("=")[0] for one in few]
+    ]
     few = [word for word in few if word.partition("=")[0] not in given]
     return _exit_code(["train", *own, *few, *words])
 
@@ -228,7 +233,11 @@ def verdict(ended: children.Ended, named: str, *, own_error: bool = False) -> st
 
 
 def figures(
-    folder: Path, *, parts: Sequence[str] = (), inputs: int = 10**6, note: Callable[[str], None] = print
+    folder: Path,
+    *,
+    parts: Sequence[str] = (),
+    inputs: int = 10**6,
+    note: Callable[[str], None] = print,
 ):
     """Try inputs, each in a process of its own; count those that work, are refused in one clear line, or neither."""
     found = {"inputs": 0, "work": 0, "one_clear_line": 0, "neither": 0}

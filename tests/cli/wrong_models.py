@@ -18,7 +18,10 @@ MODELS: dict[str, tuple[str | bytes, str]] = {
     "unknown element": (f"<mujoco><worldbody>{BODY}<cube/></worldbody></mujoco>", "cube"),
     "unknown attribute": ('<mujoco><worldbody><body weight="1"/></worldbody></mujoco>', "weight"),
     "no mass": ('<mujoco><worldbody><body><joint name="j"/></body></worldbody></mujoco>', "mass"),
-    "a size of NaN": ('<mujoco><worldbody><body><geom size="nan"/></body></worldbody></mujoco>', "NaN.xml"),
+    "a size of NaN": (
+        '<mujoco><worldbody><body><geom size="nan"/></body></worldbody></mujoco>',
+        "NaN.xml",
+    ),
     "a name twice": (f"<mujoco><worldbody>{BODY}{BODY}</worldbody></mujoco>", "'b'"),
     "no feet": (
         f'<mujoco><worldbody>{BODY}</worldbody><actuator><motor joint="knee"/></actuator></mujoco>',

@@ -12,7 +12,11 @@ UPRIGHT = (np.pi / 2, 0.0, 0.0)
 def saved(tmp_path, **changes):
     poses = np.zeros((3, 156))
     poses[:, :3] = UPRIGHT
-    arrays = {"poses": poses, "trans": np.tile((1.0, 2.0, 0.9), (3, 1)), "mocap_framerate": np.array(120.0)}
+    arrays = {
+        "poses": poses,
+        "trans": np.tile((1.0, 2.0, 0.9), (3, 1)),
+        "mocap_framerate": np.array(120.0),
+    }
     path = tmp_path / "person.npz"
     np.savez(path, **{key: value for key, value in (arrays | changes).items() if value is not None})
     return path, poses
@@ -27,8 +31,12 @@ def test_a_person_at_rest_stands_with_arms_stretched_out(tmp_path):
     assert (found.fps, found.names) == (120.0, JOINTS)
     assert at(found, "pelvis") == pytest.approx((1.0, 2.0, 0.9))
     # Facing -y, left is +x.
-    assert at(found, "left_ankle") == pytest.approx((1.0 + 0.05 * HEIGHT, 2.0, 0.9 - 0.521 * HEIGHT))
-    assert at(found, "left_wrist") == pytest.approx((1.0 + 0.41 * HEIGHT, 2.0, 0.9 + 0.255 * HEIGHT))
+    assert at(found, "left_ankle") == pytest.approx(
+        (1.0 + 0.05 * HEIGHT, 2.0, 0.9 - 0.521 * HEIGHT)
+    )
+    assert at(found, "left_wrist") == pytest.approx(
+        (1.0 + 0.41 * HEIGHT, 2.0, 0.9 + 0.255 * HEIGHT)
+    )
     assert at(found, "right_wrist")[0] == pytest.approx(1.0 - 0.41 * HEIGHT)
     assert at(found, "left_foot")[1] == pytest.approx(2.0 - 0.07 * HEIGHT), "toes point ahead"
 

@@ -40,7 +40,9 @@ def test_two_bones_hang_and_swing(tmp_path):
     assert (found.fps, found.names) == (50.0, ("hips", "knee", "knee_end"))
     assert found.pos_FN3[0] == pytest.approx(np.array(((0, 1, 0), (0, 0.5, 0), (0, 0.1, 0))))
     # The hips turn by 90 degrees about x, which brings -y to -z; the knee turns back, about x as well.
-    assert found.pos_FN3[1] == pytest.approx(np.array(((0.05, 1, 0.2), (0.05, 1, -0.3), (0.05, 0.6, -0.3))))
+    assert found.pos_FN3[1] == pytest.approx(
+        np.array(((0.05, 1, 0.2), (0.05, 1, -0.3), (0.05, 0.6, -0.3)))
+    )
     degrees = np.radians((90.0, -90.0, 30.0))
     hips, back, about_y = (
         from_rotation_vector(np.array(turn))

@@ -6,7 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from ksim_rl.clips.recording import Recording, between, chain, from_rotation_vector, multiply, rotate, slerp
+from ksim_rl.clips.recording import (
+    Recording,
+    between,
+    chain,
+    from_rotation_vector,
+    multiply,
+    rotate,
+    slerp,
+)
 
 
 def test_quaternions_are_those_of_mujoco():
@@ -42,7 +50,9 @@ def test_a_chain_of_two_bones():
 def test_other_rates_meet_a_motion_of_constant_speed():
     time_F = np.arange(31) / 30.0
     pos_FN3 = np.stack((2.0 * time_F, -time_F, 0.0 * time_F), axis=-1)[:, None]
-    quat_FN4 = from_rotation_vector(np.stack((0 * time_F, 0 * time_F, 3.0 * time_F), axis=-1))[:, None]
+    quat_FN4 = from_rotation_vector(np.stack((0 * time_F, 0 * time_F, 3.0 * time_F), axis=-1))[
+        :, None
+    ]
     played = Recording(fps=30.0, names=("a",), pos_FN3=pos_FN3, quat_FN4=quat_FN4).resampled(50.0)
     at_F = np.arange(51) / 50.0
     assert played.pos_FN3.shape == (51, 1, 3)

@@ -11,7 +11,12 @@ from ksim_rl.clips.retarget import Pair, Retarget, read_retarget, retargeted
 from ksim_rl.scene.motions.motion import motion_path
 from tests.tracking.g1 import g1_model
 
-ENDS = ("left_ankle_roll_link", "right_ankle_roll_link", "left_wrist_yaw_link", "right_wrist_yaw_link")
+ENDS = (
+    "left_ankle_roll_link",
+    "right_ankle_roll_link",
+    "left_wrist_yaw_link",
+    "right_wrist_yaw_link",
+)
 BODIES = (
     "pelvis",
     "torso_link",

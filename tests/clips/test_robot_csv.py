@@ -69,7 +69,9 @@ def test_angular_velocity_is_in_the_body_frame_as_the_engine_integrates_it(model
     for _ in range(5):
         frames.append(qpos_L.copy())
         mujoco.mj_integratePos(model, qpos_L, qvel_M, 0.02)
-    assert velocities(model, np.array(frames), 50.0) == pytest.approx(np.tile(qvel_M, (5, 1)), abs=1e-6)
+    assert velocities(model, np.array(frames), 50.0) == pytest.approx(
+        np.tile(qvel_M, (5, 1)), abs=1e-6
+    )
 
 
 def test_columns_may_be_named_and_others_rest(model, tmp_path):
@@ -88,7 +90,10 @@ def test_columns_may_be_named_and_others_rest(model, tmp_path):
         (lambda line: line + ",1", r"line 2 has \d+ columns: expected \d+: 3 of position"),
         (lambda line: "up" + line[line.index(",") :], "line 2: could not convert.*no header"),
         (lambda line: "nan" + line[line.index(",") :], "line 2 holds a number that is not finite"),
-        (lambda line: "9," * line.count(",") + "9", "line 2, columns 4 to 7: a quaternion of length 18"),
+        (
+            lambda line: "9," * line.count(",") + "9",
+            "line 2, columns 4 to 7: a quaternion of length 18",
+        ),
     ],
 )
 def test_what_is_wrong_in_a_line_is_named(model, tmp_path, change, message):

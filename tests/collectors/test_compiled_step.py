@@ -31,7 +31,9 @@ def policy(env):
 def rollouts(task, *, compile, count=2, **overrides):
     env = envs.make(task, num_envs=ROWS, seed=3, device="cpu", **overrides)
     torch.manual_seed(0)
-    collector = RolloutCollector(env, policy(env), rollout_length=STEPS, cfg=CollectorCfg(compile=compile))
+    collector = RolloutCollector(
+        env, policy(env), rollout_length=STEPS, cfg=CollectorCfg(compile=compile)
+    )
     return [collector.collect().clone() for _ in range(count)], env.state_dict()
 
 
@@ -42,7 +44,11 @@ def check(task, **overrides):
     for own, true in zip(found, expected, strict=True):
         for key in true.keys(True, True):
             torch.testing.assert_close(
-                own[key], true[key], rtol=1e-3, atol=2e-3, msg=lambda text, key=key: f"{key}: {text}"
+                own[key],
+                true[key],
+                rtol=1e-3,
+                atol=2e-3,
+                msg=lambda text, key=key: f"{key}: {text}",
             )
     assert own_state.keys() == state.keys()
     return expected

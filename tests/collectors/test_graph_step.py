@@ -31,5 +31,7 @@ def test_what_the_env_gives_otherwise_than_the_graph_is_named(monkeypatch):
 
     given = env.base_env.reward_manager.step
     monkeypatch.setattr(step, "_replayed", replayed)
-    monkeypatch.setattr(env.base_env.reward_manager, "step", lambda finite_E: given(finite_E) * factor[0])
+    monkeypatch.setattr(
+        env.base_env.reward_manager, "step", lambda finite_E: given(finite_E) * factor[0]
+    )
     assert step.differences()[0].startswith("next.reward in")

@@ -222,10 +222,22 @@ def change_iterations(env):
 
 
 WITHOUT_EFFECT = {
-    "a weight of the config": (change_weight, r"rewards\.term\.weight was 1\.0 and is 2\.0, without effect"),
-    "a field of the config": (change_length, r"cfg\.episode_length_s was 0\.0 and is 1\.0, without effect"),
-    "a term more": (add_term, r"cfg\.rewards\['other'\] was \(absent\) and is a Constant, without effect"),
-    "an option of the world": (change_iterations, r"world\.warp_model\.opt\.iterations was \d+ and is 1"),
+    "a weight of the config": (
+        change_weight,
+        r"rewards\.term\.weight was 1\.0 and is 2\.0, without effect",
+    ),
+    "a field of the config": (
+        change_length,
+        r"cfg\.episode_length_s was 0\.0 and is 1\.0, without effect",
+    ),
+    "a term more": (
+        add_term,
+        r"cfg\.rewards\['other'\] was \(absent\) and is a Constant, without effect",
+    ),
+    "an option of the world": (
+        change_iterations,
+        r"world\.warp_model\.opt\.iterations was \d+ and is 1",
+    ),
 }
 
 

@@ -21,10 +21,15 @@ STEPS = 12
 def noisy_env(seed=5):
     """A puck with noise, commands, random starts, and episodes that end at different times."""
     terms = {
-        "position": envs.ObservationTermCfg(term=JointPos(), noise=UniformNoise(low=-0.1, high=0.1)),
+        "position": envs.ObservationTermCfg(
+            term=JointPos(), noise=UniformNoise(low=-0.1, high=0.1)
+        ),
         "velocity": envs.ObservationTermCfg(term=JointVel(), history=3),
     }
-    groups = {"actor": envs.ObservationGroupCfg(terms=terms), "critic": envs.ObservationGroupCfg(terms=terms)}
+    groups = {
+        "actor": envs.ObservationGroupCfg(terms=terms),
+        "critic": envs.ObservationGroupCfg(terms=terms),
+    }
     cfg = puck_cfg(
         events={"launch": RandomLaunch()},
         limit=0.05,
@@ -65,7 +70,9 @@ class SteadyPolicy(RandomPolicy):
 
 def assert_same(actual: TensorDictBase, expected: TensorDictBase, ignore=()):
     keys = {
-        key for key in expected.keys(True, True) if (key if isinstance(key, str) else key[0]) not in ignore
+        key
+        for key in expected.keys(True, True)
+        if (key if isinstance(key, str) else key[0]) not in ignore
     }
     assert keys <= set(actual.keys(True, True))
     for key in keys:
@@ -106,7 +113,9 @@ def test_equals_the_stock_collector():
 
 def test_a_policy_is_steady_once_for_all_steps_of_a_rollout():
     policy = SteadyPolicy()
-    collector = RolloutCollector(noisy_env(), policy, rollout_length=STEPS, cfg=CollectorCfg(compile=False))
+    collector = RolloutCollector(
+        noisy_env(), policy, rollout_length=STEPS, cfg=CollectorCfg(compile=False)
+    )
     collector.collect()
     collector.collect()
     assert policy.calls == [1] * STEPS + [2] * STEPS
@@ -122,7 +131,9 @@ def test_dims_are_named_and_memory_is_reused():
 
 def test_keys_choose_what_is_stored():
     keys = ["actor", "action", ("next", "reward")]
-    rollout_ET = RolloutCollector(noisy_env(), RandomPolicy(), rollout_length=2, keys=keys).collect()
+    rollout_ET = RolloutCollector(
+        noisy_env(), RandomPolicy(), rollout_length=2, keys=keys
+    ).collect()
     assert set(rollout_ET.keys(True, True)) == set(keys)
 
 
@@ -137,7 +148,8 @@ def test_a_rollout_needs_a_length():
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("warmup", 0), ("warmup", True), ("require_graphs", "no"), ("stagger_episodes", 1)]
+    ("field", "value"),
+    [("warmup", 0), ("warmup", True), ("require_graphs", "no"), ("stagger_episodes", 1)],
 )
 def test_options_of_another_kind_are_refused(field, value):
     with pytest.raises(ValueError, match=f"{field}={value!r}: expected"):
@@ -174,7 +186,8 @@ def test_a_state_of_other_shapes_or_names_is_refused():
     collector.reset()
     state = collector.state_dict()
     with pytest.raises(
-        ValueError, match=r"same num_envs.*'actor' is float32\[1, .*in the checkpoint and float32\[4, "
+        ValueError,
+        match=r"same num_envs.*'actor' is float32\[1, .*in the checkpoint and float32\[4, ",
     ):
         collector.load_state_dict(state | {"actor": state["actor"][:1] + 1.0})
     with pytest.raises(ValueError, match="'other' is unknown"):

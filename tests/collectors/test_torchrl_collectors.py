@@ -15,7 +15,9 @@ E, T = 3, 6
 
 
 def make():
-    return MaskedTransformedEnv(CounterEnv((3, 5, 4)), ActionDelay(delay=DelayCfg(min_lag=0, max_lag=1)))
+    return MaskedTransformedEnv(
+        CounterEnv((3, 5, 4)), ActionDelay(delay=DelayCfg(min_lag=0, max_lag=1))
+    )
 
 
 def make_single():
@@ -46,7 +48,9 @@ KINDS = {
 
 
 def test_no_class_is_left_out():
-    offered = {name for name in collectors.__all__ if name.endswith("Collector")} - {"BaseCollector"}
+    offered = {name for name in collectors.__all__ if name.endswith("Collector")} - {
+        "BaseCollector"
+    }
     assert offered == {name.split()[0] for name in KINDS} - {"split"}
 
 
@@ -56,7 +60,11 @@ def test_no_class_is_left_out():
         "Collector",
         "Collector of a creator",
         "split",
-        *(pytest.param(name, marks=pytest.mark.full) for name in KINDS if "Async" in name or "Multi" in name),
+        *(
+            pytest.param(name, marks=pytest.mark.full)
+            for name in KINDS
+            if "Async" in name or "Multi" in name
+        ),
     ],
 )
 def test_it_collects_what_the_env_does(kind):

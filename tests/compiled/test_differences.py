@@ -11,7 +11,10 @@ ROWS = 1000
 def found_in(found, true, moved=None):
     """Return what differs, where inputs that have moved change nothing unless `moved` says so."""
     return differences(
-        {"x": found}, {"x": true}, num_rows=ROWS, moved=lambda _: {"x": true if moved is None else moved}
+        {"x": found},
+        {"x": true},
+        num_rows=ROWS,
+        moved=lambda _: {"x": true if moved is None else moved},
     )
 
 
@@ -37,9 +40,9 @@ def test_what_moved_inputs_do_to_a_row_explains_an_error_in_this_row_alone():
     found = with_row(with_row(true, 7, 1, 2.0), 8, 1, 2.0)
     assert found_in(found, true, with_row(true, 7, 1, 2.0)) == {"x": 1}
     assert found_in(found, true, with_row(with_row(true, 7, 1, 2.0), 8, 1, 2.0)) == {}
-    assert found_in(found, true, with_row(with_row(true, 7, 1, 2.0), 8, 1, float(true[8, 1]) + 1e-3)) == {
-        "x": 1
-    }
+    assert found_in(
+        found, true, with_row(with_row(true, 7, 1, 2.0), 8, 1, float(true[8, 1]) + 1e-3)
+    ) == {"x": 1}
 
 
 def test_each_move_is_another_one():
@@ -49,7 +52,9 @@ def test_each_move_is_another_one():
         numbers.append(number)
         return {"x": with_row(true, 7, 0, 2.0) if number == 3 else true}
 
-    assert differences({"x": with_row(true, 7, 0, 2.0)}, {"x": true}, num_rows=ROWS, moved=moved) == {}
+    assert (
+        differences({"x": with_row(true, 7, 0, 2.0)}, {"x": true}, num_rows=ROWS, moved=moved) == {}
+    )
     assert numbers == [0, 1, 2, 3]
 
 

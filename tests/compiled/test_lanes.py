@@ -37,7 +37,9 @@ def emulate(monkeypatch, order):
         for level in levels:
             yield f"for (int lane = first; lane >= 0 && lane < {NUMBER}; lane += step) {{ {lanes.DEAL}"
             for line in level:
-                yield re.sub(r"\b([mc]\d+)\[", lambda m: f"{m[1]}[lane][" if m[1] in own else m[0], line)
+                yield re.sub(
+                    r"\b([mc]\d+)\[", lambda m: f"{m[1]}[lane][" if m[1] in own else m[0], line
+                )
             yield "}"
         sources.append(lines)
 

@@ -79,7 +79,13 @@ def closing_over(value):
 
 def test_nothing_has_changed_as_long_as_nothing_changes():
     part = Base(
-        a=1, b=[1.0, "x"], c={"k": (1, 2)}, d=torch.zeros(3), e=np.ones(3), f=float("nan"), g=Slotted()
+        a=1,
+        b=[1.0, "x"],
+        c={"k": (1, 2)},
+        d=torch.zeros(3),
+        e=np.ones(3),
+        f=float("nan"),
+        g=Slotted(),
     )
     watch = watched(part=part)
     part.d.add_(1.0)  # recordings read tensors anew

@@ -12,10 +12,15 @@ def generator():
 def test_each_number_moves_to_a_neighbour():
     x = torch.randn(1000)
     moved = nudged(x, generator())
-    up, down = torch.nextafter(x, torch.tensor(torch.inf)), torch.nextafter(x, torch.tensor(-torch.inf))
+    up, down = (
+        torch.nextafter(x, torch.tensor(torch.inf)),
+        torch.nextafter(x, torch.tensor(-torch.inf)),
+    )
     assert ((moved == up) | (moved == down)).all()
     assert 400 < int((moved == up).sum()) < 600
-    assert torch.equal(nudged(torch.tensor([torch.inf, 1.0]), generator())[:1], torch.tensor([torch.inf]))
+    assert torch.equal(
+        nudged(torch.tensor([torch.inf, 1.0]), generator())[:1], torch.tensor([torch.inf])
+    )
 
 
 def test_whole_numbers_stay():
@@ -28,7 +33,9 @@ def test_a_result_shows_the_last_places_of_what_it_is_made_of():
     with Nudging(generator()):
         sensitive, steady = 1.0 + x.cos(), x.square()
     # Moving x itself hardly changes its cosine there.
-    assert ((1.0 + torch.nextafter(x, torch.tensor(4.0)).cos()) - (1.0 + x.cos())).abs().max() < 1e-9
+    assert (
+        (1.0 + torch.nextafter(x, torch.tensor(4.0)).cos()) - (1.0 + x.cos())
+    ).abs().max() < 1e-9
     assert (sensitive - (1.0 + x.cos())).abs().max() > 1e-8
     assert ((steady - x.square()) / x.square()).abs().max() < 2e-7
 

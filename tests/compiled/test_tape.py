@@ -67,7 +67,17 @@ UNARY = (
     "square",
     "tan",
 )
-UNARY += ("tanh", "isnan", "isfinite", "isinf", "logical_not", "nan_to_num", "relu", "clone", "reciprocal")
+UNARY += (
+    "tanh",
+    "isnan",
+    "isfinite",
+    "isinf",
+    "logical_not",
+    "nan_to_num",
+    "relu",
+    "clone",
+    "reciprocal",
+)
 
 
 @pytest.mark.parametrize("name", UNARY)
@@ -165,7 +175,9 @@ CASES = {
     "cat": lambda x: torch.cat((x, x[:, 1:3], x * 2), dim=1),
     "stack": lambda x: torch.stack((x, -x), dim=1),
     "stack at the end": lambda x: torch.stack((x, -x), dim=-1),
-    "split": lambda x: torch.cat([part * k for k, part in enumerate(x.split([1, 3], dim=1))], dim=1),
+    "split": lambda x: torch.cat(
+        [part * k for k, part in enumerate(x.split([1, 3], dim=1))], dim=1
+    ),
     "cross": lambda x: torch.linalg.cross(x[:, :3], x[:, 1:]),
     "columns by number": lambda x: x[:, torch.tensor([2, 0, -1])],
     "columns that are written": lambda x: put(x),
@@ -295,7 +307,10 @@ def test_what_the_host_reads_is_refused():
 
 def test_draws_are_part_of_the_kernel_and_follow_their_counters():
     def draw(value, seed, count, counts):
-        by_step, by_row = random.RowKeys(seed, 5, count, E, 3), random.RowKeys(seed, 9, counts, E, 0)
+        by_step, by_row = (
+            random.RowKeys(seed, 5, count, E, 3),
+            random.RowKeys(seed, 9, counts, E, 0),
+        )
         parts = (
             random.uniform(by_step, 2, -1.0, 3.0),
             random.normal(by_row, 3),
@@ -321,7 +336,9 @@ def test_equal_functions_have_equal_sources(monkeypatch):
 
     monkeypatch.setattr("ksim_rl.compiled.tape.QuickLaunch", noted)
     for _ in range(2):
-        taped_once(lambda x: torch.cat((x, torch.zeros(E, 0), (x * 2).sum(-1, keepdim=True)), dim=1))
+        taped_once(
+            lambda x: torch.cat((x, torch.zeros(E, 0), (x * 2).sum(-1, keepdim=True)), dim=1)
+        )
     assert sources[0] == sources[1]
 
 

@@ -62,7 +62,14 @@ def test_a_change_from_outside_is_followed_and_said():
     with pytest.warns(
         RuntimeWarning, match=r"loss\.clip_epsilon was 0\.2 and is 0\.1 since .* recorded anew"
     ):
-        assert calling(graph, watched, (0.2, 0.2, 0.2, 0.1, 0.1, 0.1)) == [0.2, 0.2, 0.2, 0.1, 0.1, 0.1]
+        assert calling(graph, watched, (0.2, 0.2, 0.2, 0.1, 0.1, 0.1)) == [
+            0.2,
+            0.2,
+            0.2,
+            0.1,
+            0.1,
+            0.1,
+        ]
     assert graph.ready
 
 

@@ -26,7 +26,10 @@ WRONG = [
     ("gamma=0.9", "unknown field 'gamma': did you mean 'objective.gamma'"),
     ("objective=ppoo", "unknown objective 'ppoo': did you mean 'ppo'"),
     ("nun_envs=3", "did you mean 'num_envs'"),
-    ("objective.learning_rat=1", "objective has no field 'learning_rat': did you mean 'learning_rate'"),
+    (
+        "objective.learning_rat=1",
+        "objective has no field 'learning_rat': did you mean 'learning_rate'",
+    ),
     ("task.rewards.balanc.weight=2", "task.rewards has no field 'balanc': did you mean 'balance'"),
     ("+objective.learn=1", "unknown field 'objective.learn' of PPOCfg"),
     ("num_envs=abc", "num_envs='abc': expected int"),
@@ -44,12 +47,17 @@ WRONG = [
     ("just_a_word", "does not parse"),
     ("task_name=cartpole_swingup", "the name comes with the task; choose that with task=name"),
     ("~logger", "a run needs each group; choose another with logger=name: local, "),
-    ("trainer.num_threads=100000", "trainer.num_threads=100000: expected a whole number of at most 1024"),
+    (
+        "trainer.num_threads=100000",
+        "trainer.num_threads=100000: expected a whole number of at most 1024",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("override", "message"), WRONG)
-def test_a_wrong_override_is_one_line_with_the_way_out(capsys, tmp_path, monkeypatch, override, message):
+def test_a_wrong_override_is_one_line_with_the_way_out(
+    capsys, tmp_path, monkeypatch, override, message
+):
     monkeypatch.chdir(tmp_path)
     code, output = run(capsys, "train", override)
     assert code == 2
@@ -80,7 +88,9 @@ def test_a_traceback_is_shown_on_request(capsys, monkeypatch):
     assert code == 2 and "Traceback" in output.err and "did you mean 'num_envs'" in output.err
 
 
-def test_an_error_that_nobody_foresaw_shows_its_traceback_and_is_not_an_unsolved_run(capsys, monkeypatch):
+def test_an_error_that_nobody_foresaw_shows_its_traceback_and_is_not_an_unsolved_run(
+    capsys, monkeypatch
+):
     def fault(_):
         raise KeyError("weight")
 
@@ -136,7 +146,10 @@ def test_usage_names_every_command(capsys, arguments):
 
 def test_an_unknown_command_is_answered_with_the_near_one(capsys):
     code, output = run(capsys, "trian")
-    assert (code, output.err) == (2, "ksim-rl: error: unknown command 'trian': did you mean 'train'?\n")
+    assert (code, output.err) == (
+        2,
+        "ksim-rl: error: unknown command 'trian': did you mean 'train'?\n",
+    )
 
 
 def test_envs_lists_each_task_in_one_line(capsys):
@@ -178,7 +191,9 @@ finally:
 
 
 def test_the_command_starts_without_what_only_later_parts_need(tmp_path):
-    done = subprocess.run([sys.executable, "-c", START], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", START], cwd=tmp_path, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -46,7 +46,9 @@ def test_a_logger_is_chosen_by_name(name, cfg):
 # The tasks of a suite share their settings but for a few numbers: two of them, and all in full runs.
 QUICK = ("dm_control_ball_in_cup_catch", "playground_humanoid_walk")
 NAMES = [
-    pytest.param(name, marks=pytest.mark.full) if envs.task(name).suite and name not in QUICK else name
+    pytest.param(name, marks=pytest.mark.full)
+    if envs.task(name).suite and name not in QUICK
+    else name
     for name in envs.names()
 ]
 
@@ -62,7 +64,9 @@ def test_each_task_composes_with_its_training(name):
 
 # All of those with such settings in full runs.
 TRAINED_OTHERWISE = [
-    name if name in ("go1_velocity_flat", "walker_walk") else pytest.param(name, marks=pytest.mark.full)
+    name
+    if name in ("go1_velocity_flat", "walker_walk")
+    else pytest.param(name, marks=pytest.mark.full)
     for name in envs.names()
     if envs.task(name).other_trainings
 ]
@@ -81,20 +85,31 @@ def test_each_task_composes_with_its_training_by_other_algorithms(name):
 def test_what_a_task_sets_lies_over_other_networks(name):
     cfg, choice = conf.compose(["task=walker_walk", f"modules={name}"]), CHOICES["modules"][name]
     assert cfg.modules.actor.hidden_dims == (256, 128) and cfg.modules.actor.init_std == 0.6
-    assert cfg.modules.recurrent_actor == choice.recurrent_actor and cfg.modules.trunk == choice.trunk
+    assert (
+        cfg.modules.recurrent_actor == choice.recurrent_actor and cfg.modules.trunk == choice.trunk
+    )
 
 
 def test_a_task_with_settings_as_they_were_in_0_1_is_refused(monkeypatch):
-    old = Task(name="old", description="", cfg=envs.task("arm_reach").cfg, training={"objective.gamma": 0.9})
+    old = Task(
+        name="old",
+        description="",
+        cfg=envs.task("arm_reach").cfg,
+        training={"objective.gamma": 0.9},
+    )
     monkeypatch.setattr(envs, "task", lambda name: old)
     from ksim_rl.conf import choices
 
-    with pytest.raises(ValueError, match="task 'old': training is a dict; expected a .*TrainingCfg"):
+    with pytest.raises(
+        ValueError, match="task 'old': training is a dict; expected a .*TrainingCfg"
+    ):
         choices.training_defaults("old")
 
 
 def test_the_command_line_overrides_the_tasks_defaults():
-    cfg = conf.compose(["task=cartpole_swingup", "num_envs=128", "trainer.num_iterations=7", "seed=5"])
+    cfg = conf.compose(
+        ["task=cartpole_swingup", "num_envs=128", "trainer.num_iterations=7", "seed=5"]
+    )
     assert (cfg.num_envs, cfg.task.scene.num_envs) == (128, 128)
     assert (cfg.trainer.num_iterations, cfg.seed, cfg.task.seed) == (7, 5, 5)
 

@@ -77,8 +77,13 @@ def test_the_page_has_values_and_texts_of_the_composed_config():
 
 def test_completions_have_choices_and_fields():
     words = conf.completions()
-    assert {"task=go1_velocity_flat", "objective=ppo", "objective.gamma=", "trainer.num_iterations="} <= set(
-        words
+    assert {
+        "task=go1_velocity_flat",
+        "objective=ppo",
+        "objective.gamma=",
+        "trainer.num_iterations=",
+    } <= set(words)
+    assert "objective.target_entropy_per_action=" in words, (
+        "of an algorithm that is not the default"
     )
-    assert "objective.target_entropy_per_action=" in words, "of an algorithm that is not the default"
     assert not any(" " in word or "_target_" in word for word in words)

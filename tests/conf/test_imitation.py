@@ -26,7 +26,12 @@ def test_settings_of_ppo_hold_for_amp_wholly_and_for_a_student_in_data_and_netwo
     amp = conf.compose(["task=walker_amp", "objective=amp"])
     student = conf.compose(["task=walker_amp", *TEACHER])
     other = conf.compose(
-        ["task=hopper_hop", "objective=amp", "objective.motions=[m.npz]", "objective.style_group=actor"]
+        [
+            "task=hopper_hop",
+            "objective=amp",
+            "objective.motions=[m.npz]",
+            "objective.style_group=actor",
+        ]
     )
     assert ppo.data == amp.data == student.data and ppo.modules == amp.modules == student.modules
     assert amp.objective.motions == ("walker_walk",)
@@ -38,7 +43,10 @@ def test_settings_of_ppo_hold_for_amp_wholly_and_for_a_student_in_data_and_netwo
     ("overrides", "message"),
     [
         (["objective=distillation"], "objective.teacher='': name a run folder"),
-        (["task=walker_track", "objective=amp"], "objective.motions=.*: name at least one reference motion"),
+        (
+            ["task=walker_track", "objective=amp"],
+            "objective.motions=.*: name at least one reference motion",
+        ),
         (
             ["task=walker_track", "objective=amp", "objective.motions=[walker_walk]"],
             "no group 'style', which modules.*.in_keys or objective.style_group name",

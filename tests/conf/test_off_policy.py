@@ -32,7 +32,9 @@ def test_an_objective_brings_the_data_and_the_networks_that_it_needs(objective):
 
 
 def test_the_command_line_goes_over_what_an_objective_chooses():
-    cfg = conf.compose(["task=pendulum_swingup", "objective=sac", "data=off_policy", "data.capacity=77"])
+    cfg = conf.compose(
+        ["task=pendulum_swingup", "objective=sac", "data=off_policy", "data.capacity=77"]
+    )
     assert cfg.data.num_env_states_per_minibatch == 32768 and cfg.data.capacity == 77
 
 

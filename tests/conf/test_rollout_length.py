@@ -38,5 +38,8 @@ def test_a_length_far_from_the_tasks_own_is_said():
     far, near = conf.compose(few), conf.compose([*few, "collector.rollout_length=24"])
     length = far.data.rollout_length(16)
     assert length > 1000
-    assert report._far_from(far, length) == "24 that quadruped_velocity_flat is tuned for, with 4096 envs"
+    assert (
+        report._far_from(far, length)
+        == "24 that quadruped_velocity_flat is tuned for, with 4096 envs"
+    )
     assert report._far_from(near, 24) == ""

@@ -16,7 +16,9 @@ from ksim_rl.conf import spelling
     ],
 )
 def test_a_flag_is_answered_with_the_override(flag, arguments, answer):
-    assert str(spelling.of_flag(flag, arguments)).endswith(f"fields are set without dashes: {answer}")
+    assert str(spelling.of_flag(flag, arguments)).endswith(
+        f"fields are set without dashes: {answer}"
+    )
 
 
 def test_words_that_name_nothing_are_left_to_the_parser():

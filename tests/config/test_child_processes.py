@@ -18,7 +18,11 @@ STARTS = {"config/child_processes.py"}
 # It runs without this library, and its workers are as isolated as it is; one that asks which process it is; and one
 # that waits in the event loop of a server.
 OTHERS = {
-    "export/standalone/command.py": {"multiprocessing", "concurrent.futures", "concurrent.futures.process"},
+    "export/standalone/command.py": {
+        "multiprocessing",
+        "concurrent.futures",
+        "concurrent.futures.process",
+    },
     "transforms/upstream.py": {"multiprocessing"},
     "viewer/guarded_server.py": {"asyncio"},
 }
@@ -106,7 +110,9 @@ def test_the_marks_are_left_without_the_flag(stranger, monkeypatch):
     monkeypatch.setattr(child_processes, "START", os.getcwd())
     real = child_processes.subprocess.Popen
     monkeypatch.setattr(
-        child_processes.subprocess, "Popen", lambda words, **how: real([words[0], *words[2:]], **how)
+        child_processes.subprocess,
+        "Popen",
+        lambda words, **how: real([words[0], *words[2:]], **how),
     )
     run_python(["-c", "import mujoco"])
     assert stranger() == ["mujoco"]
@@ -136,14 +142,14 @@ def test_a_child_finds_plug_ins_by_their_absolute_path(tmp_path, monkeypatch):
     assert said == [
         f"--plugin mine_for_children: taken from {tmp_path}, where Python finds modules from now on"
     ]
-    program = (
-        "from ksim_rl.config import plugins; plugins.load(()); import mine_for_children as m; print(m.NAME)"
-    )
+    program = "from ksim_rl.config import plugins; plugins.load(()); import mine_for_children as m; print(m.NAME)"
     done = run_python(["-c", program])
     assert done.stdout == "found\n", done.stderr
 
 
-def test_a_child_stands_where_nothing_of_ours_lies_until_it_goes_to_its_parents_folder(tmp_path, monkeypatch):
+def test_a_child_stands_where_nothing_of_ours_lies_until_it_goes_to_its_parents_folder(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     program = (
         "import os; print(os.getcwd()); from ksim_rl.config.child_processes import go_to_parents_folder as go; "

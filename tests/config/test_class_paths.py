@@ -43,7 +43,9 @@ def test_each_path_that_0_1_wrote_leads_to_its_class(target):
     found = class_paths.find(target, "x", kind="class", accepts=lambda value: True)
     assert found.__name__ == target.rpartition(".")[2]
     assert (
-        class_paths.find(class_paths.public_path(found), "x", kind="class", accepts=lambda value: True)
+        class_paths.find(
+            class_paths.public_path(found), "x", kind="class", accepts=lambda value: True
+        )
         is found
     )
 
@@ -55,7 +57,9 @@ def test_a_task_config_that_0_1_wrote_builds_the_same_task(name):
     if name in ROUGH:
         # A foot on rough ground has more contacts than 0.1 found, and today's task has room for them.
         assert found.sim.njmax < expected.sim.njmax
-        found = dataclasses.replace(found, sim=dataclasses.replace(found.sim, njmax=expected.sim.njmax))
+        found = dataclasses.replace(
+            found, sim=dataclasses.replace(found.sim, njmax=expected.sim.njmax)
+        )
     assert found == expected
 
 
@@ -69,11 +73,23 @@ def test_fields_that_are_gone_are_ignored_and_only_where_they_were():
 
 
 def test_classes_that_the_command_line_could_not_load_are_noted():
-    here, plugged = {"_target_": "__main__.Mine"}, {"_target_": "some_package.terms.Alive", "weight": 1.0}
-    own = {"_target_": "ksim_rl.mdp.Alive", "inside": [{"_target_": "torchrl.envs.transforms.InitTracker"}]}
+    here, plugged = (
+        {"_target_": "__main__.Mine"},
+        {"_target_": "some_package.terms.Alive", "weight": 1.0},
+    )
+    own = {
+        "_target_": "ksim_rl.mdp.Alive",
+        "inside": [{"_target_": "torchrl.envs.transforms.InitTracker"}],
+    }
     in_a_function = {"_target_": "other_package.build.<locals>.Term"}
-    rewards = {"a": here, "b": plugged, "c": [plugged, {**plugged, "_target_": "some_package.more.Dead"}]}
-    notes = class_paths.loading_notes({"task": {"rewards": rewards, "own": own, "f": in_a_function}})
+    rewards = {
+        "a": here,
+        "b": plugged,
+        "c": [plugged, {**plugged, "_target_": "some_package.more.Dead"}],
+    }
+    notes = class_paths.loading_notes(
+        {"task": {"rewards": rewards, "own": own, "f": in_a_function}}
+    )
     assert [note.split(":")[0] for note in notes] == [
         "this run names __main__.Mine, which no other process can import",
         "this run names some_package.terms.Alive",

@@ -53,7 +53,9 @@ def written(value):
         return "[" + ", ".join(written(entry) for entry in value) + "]"
     if isinstance(value, Mapping):
         return (
-            "{" + ", ".join(f"{_escaped(str(key))}: {written(entry)}" for key, entry in value.items()) + "}"
+            "{"
+            + ", ".join(f"{_escaped(str(key))}: {written(entry)}" for key, entry in value.items())
+            + "}"
         )
     return repr(value)
 
@@ -76,7 +78,9 @@ def tree_of(name):
 
 # One task of each kind in every run, the others in full ones: Hydra's parser takes its time.
 QUICK = ("arm_push", "cartpole_balance", "go1_velocity_rough", "walker_track")
-NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in envs.names()]
+NAMES = [
+    name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in envs.names()
+]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -12,9 +12,13 @@ from ksim_rl.config import upstream
 def test_hydra_stores_nodes_of_these_fields_in_nested_dicts():
     moved = f"Hydra {version('hydra-core')}: ConfigStore.repo or ConfigNode"
     assert isinstance(ConfigStore.instance().repo, dict), moved
-    assert {field.name for field in fields(ConfigNode)} == {"name", "node", "group", "package", "provider"}, (
-        moved
-    )
+    assert {field.name for field in fields(ConfigNode)} == {
+        "name",
+        "node",
+        "group",
+        "package",
+        "provider",
+    }, moved
 
 
 def test_a_config_is_made_once_when_it_is_loaded_first(monkeypatch):

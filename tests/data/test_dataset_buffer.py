@@ -171,10 +171,14 @@ def test_state_dict_continues_exactly(fresh):
 
 @pytest.mark.parametrize(("num_envs", "size"), [(4096, 24576), (16, 96)])
 def test_the_size_follows_from_a_rollout_length(num_envs, size):
-    cfg = DatasetCfg(num_env_states_per_minibatch=7, num_minibatches=4).with_rollout_length(24, num_envs)
+    cfg = DatasetCfg(num_env_states_per_minibatch=7, num_minibatches=4).with_rollout_length(
+        24, num_envs
+    )
     assert (cfg.num_env_states_per_minibatch, cfg.rollout_length(num_envs)) == (size, 24)
 
 
 def test_a_rollout_length_that_does_not_split_is_refused_with_those_that_do():
-    with pytest.raises(ValueError, match=r"rollout_length=7 \* num_envs=6 = 42 .*rollout_length=6 or 8 are"):
+    with pytest.raises(
+        ValueError, match=r"rollout_length=7 \* num_envs=6 = 42 .*rollout_length=6 or 8 are"
+    ):
         DatasetCfg(num_env_states_per_minibatch=7, num_minibatches=4).with_rollout_length(7, 6)

@@ -29,14 +29,18 @@ def test_refusal_has_the_three_numbers_and_working_values():
 
 
 def _suggestions(message, field):
-    return [int(number) for number in re.findall(rf"{field}=(\d+)(?: or (\d+))?", message)[-1] if number]
+    return [
+        int(number) for number in re.findall(rf"{field}=(\d+)(?: or (\d+))?", message)[-1] if number
+    ]
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 3000), st.integers(1, 40), st.integers(1, 3000))
 def test_every_suggested_value_works_and_is_the_nearest(per_minibatch, minibatches, envs):
     try:
-        assert rollout_length(per_minibatch, minibatches, envs) * envs == per_minibatch * minibatches
+        assert (
+            rollout_length(per_minibatch, minibatches, envs) * envs == per_minibatch * minibatches
+        )
         return
     except ValueError as error:
         message = str(error)

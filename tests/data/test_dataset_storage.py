@@ -67,7 +67,9 @@ def test_rows_that_are_not_finite_are_replaced_masked_and_counted(bad):
         kept = leaf.flatten(0, 1)
         assert torch.equal(content[key][~removed.flatten()], kept[~removed.flatten()])
         # Row 0 is removed, so row 1 is the first finite one. Flags stay.
-        replaced = kept[removed.flatten()] if leaf.dtype == torch.bool else kept[1:2].expand_as(kept[:3])
+        replaced = (
+            kept[removed.flatten()] if leaf.dtype == torch.bool else kept[1:2].expand_as(kept[:3])
+        )
         assert torch.equal(content[key][removed.flatten()], replaced)
     storage.write(clean)
     assert int(storage.non_finite_count) == 3
@@ -95,8 +97,12 @@ def test_a_mask_that_the_data_brings_is_kept(trailing):
     storage.write(rollout)
     content = _content(storage)
     assert content[MASK_KEY].flatten().tolist() == [False, True, True, False]
-    assert torch.equal(content["obs"][0], rollout["obs"][0, 0]), "a masked but finite row keeps its data"
-    assert torch.equal(content["obs"][3], rollout["obs"][0, 1]), "the donor is a row that takes part"
+    assert torch.equal(content["obs"][0], rollout["obs"][0, 0]), (
+        "a masked but finite row keeps its data"
+    )
+    assert torch.equal(content["obs"][3], rollout["obs"][0, 1]), (
+        "the donor is a row that takes part"
+    )
     assert int(storage.non_finite_count) == 1
 
 

@@ -13,7 +13,9 @@ from ksim_rl.testing import count_syncs
 
 def _buffer(size=12, batch_size=4, ndim=1, cls=ReplayBuffer, **kwargs):
     buffer = cls(
-        storage=LazyTensorStorage(size, ndim=ndim), sampler=EpochSampler(**kwargs), batch_size=batch_size
+        storage=LazyTensorStorage(size, ndim=ndim),
+        sampler=EpochSampler(**kwargs),
+        batch_size=batch_size,
     )
     shape = (size,) if ndim == 1 else (size // 3, 3)
     buffer.extend(TensorDict({"row": torch.arange(size).view(shape)}, shape))
@@ -36,12 +38,16 @@ def test_each_epoch_of_a_stock_buffer_covers_it_once_in_another_order(cls):
 
 def test_stops_iterating_where_torchrls_sampler_does():
     reference = ReplayBuffer(
-        storage=LazyTensorStorage(10), sampler=SamplerWithoutReplacement(shuffle=False), batch_size=4
+        storage=LazyTensorStorage(10),
+        sampler=SamplerWithoutReplacement(shuffle=False),
+        batch_size=4,
     )
     ours = _buffer(size=10, batch_size=4, shuffle=False)
     reference.extend(TensorDict({"row": torch.arange(10)}, [10]))
     for _ in range(2):
-        one, other = ([minibatch["row"].tolist() for minibatch in buffer] for buffer in (reference, ours))
+        one, other = (
+            [minibatch["row"].tolist() for minibatch in buffer] for buffer in (reference, ours)
+        )
         assert one == other == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
 
 
@@ -62,7 +68,9 @@ def test_every_order_is_about_equally_likely():
     orders = [tuple(buffer.sample()["row"].tolist()) for _ in range(2400)]
     counts = [orders.count(order) for order in itertools.permutations(range(4))]
     chi_square = sum((count - 100) ** 2 / 100 for count in counts)
-    assert chi_square < 49.7, f"23 degrees of freedom: 49.7 is exceeded once in 1000, got {chi_square:.1f}"
+    assert chi_square < 49.7, (
+        f"23 degrees of freedom: 49.7 is exceeded once in 1000, got {chi_square:.1f}"
+    )
 
 
 def test_seed_fixes_the_orders():
@@ -142,7 +150,9 @@ def test_orders_of_several_epochs_are_those_of_one_after_the_other(shards, shuff
         singles = [apart.epoch_orders(1, 24, device=torch.device("cpu"))[0] for _ in range(count)]
         assert torch.equal(orders_KD, torch.stack(singles))
         assert together.state_dict() == apart.state_dict()
-    buffer = _buffer(size=24, batch_size=6, seed=3, shards=shards, num_minibatches=4, shuffle=shuffle)
+    buffer = _buffer(
+        size=24, batch_size=6, seed=3, shards=shards, num_minibatches=4, shuffle=shuffle
+    )
     drawn = [_epoch(buffer) for _ in range(2)]
     apart.set_seed(3)
     assert torch.equal(torch.stack(drawn), apart.epoch_orders(2, 24, device=torch.device("cpu")))

@@ -22,7 +22,12 @@ INHERITED: list[tuple[type, str, str | None, str]] = [
     (Sampler, "_empty", "self", "overridden: what `empty` of a buffer calls"),
     (Sampler, "_remaining_batches", None, "set: what iterating over a buffer reads"),
     (Storage, "_empty", "self", "overridden: what `empty` of a buffer calls"),
-    (TensorStorage, "_bump_mutation_revision", "self", "tells who caches that the content is another"),
+    (
+        TensorStorage,
+        "_bump_mutation_revision",
+        "self",
+        "tells who caches that the content is another",
+    ),
     (Writer, "_empty", "self empty_write_count", "overridden: what `empty` of a buffer calls"),
 ]
 # Instance attributes of a TensorStorage that `DatasetStorage` sets when it allocates and writes.
@@ -34,7 +39,9 @@ def test_inherited_members_are_what_they_were(kind, name, arguments):
     member = getattr(kind, name, None)
     assert member is not None, f"{kind.__name__}.{name} is gone"
     if arguments is not None:
-        assert " ".join(inspect.signature(member).parameters) == arguments, f"{kind.__name__}.{name} changed"
+        assert " ".join(inspect.signature(member).parameters) == arguments, (
+            f"{kind.__name__}.{name} changed"
+        )
 
 
 def test_a_storage_keeps_its_content_and_length_where_they_were():

@@ -94,7 +94,11 @@ def test_a_storage_of_two_dims_is_refused():
 
 def test_in_a_ring_only_env_states_are_drawn_without_syncs():
     sizes = ReplayCfg(
-        num_env_states_per_minibatch=3000, num_minibatches=1, num_steps=5, capacity=20, prioritized=True
+        num_env_states_per_minibatch=3000,
+        num_minibatches=1,
+        num_steps=5,
+        capacity=20,
+        prioritized=True,
     )
     ring = ReplayRing(sizes, num_envs=NUM_ENVS, observations=["actor", "critic"])
     history = _History(end=0.4)
@@ -119,7 +123,11 @@ def test_in_a_ring_only_env_states_are_drawn_without_syncs():
 
 def test_a_ring_without_a_finite_env_state_gives_masked_rows_of_finite_weight():
     sizes = ReplayCfg(
-        num_env_states_per_minibatch=8, num_minibatches=1, num_steps=2, capacity=20, prioritized=True
+        num_env_states_per_minibatch=8,
+        num_minibatches=1,
+        num_steps=2,
+        capacity=20,
+        prioritized=True,
     )
     ring = ReplayRing(sizes, num_envs=NUM_ENVS, observations=["actor", "critic"])
     rollout = _History().rollout(2)

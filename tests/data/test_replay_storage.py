@@ -77,7 +77,11 @@ class _History:
 
 def _storage(n_step=1, capacity=CAPACITY):
     return ReplayStorage(
-        num_envs=NUM_ENVS, capacity=capacity, observations=["actor", "critic"], n_step=n_step, gamma=GAMMA
+        num_envs=NUM_ENVS,
+        capacity=capacity,
+        observations=["actor", "critic"],
+        n_step=n_step,
+        gamma=GAMMA,
     )
 
 
@@ -105,9 +109,13 @@ def test_each_env_state_comes_with_what_followed_it(n_step, lengths):
     assert kept.sum() == storage.available.sum()
     seen = set()
     for row in sample[kept]:
-        reward, following, done, terminated, steps = history.expected(row["actor"][0].item(), n_step)
+        reward, following, done, terminated, steps = history.expected(
+            row["actor"][0].item(), n_step
+        )
         assert row["next", "reward"].item() == pytest.approx(reward)
-        assert (row["next", "actor"] == following).all() and (row["next", "critic"] == following).all()
+        assert (row["next", "actor"] == following).all() and (
+            row["next", "critic"] == following
+        ).all()
         assert (row["critic"] == row["actor"][0]).all() and row["action"] == -row["actor"][:1]
         assert bool(row["next", "done"]) == done and bool(row["next", "terminated"]) == terminated
         assert row["steps_to_next_obs"].item() == steps
@@ -124,7 +132,9 @@ def test_each_env_state_comes_with_what_followed_it(n_step, lengths):
 
 def test_sampling_is_uniform_over_what_is_stored_and_makes_no_sync():
     ring = ReplayRing(
-        ReplayCfg(num_env_states_per_minibatch=4000, num_minibatches=1, num_steps=5, capacity=CAPACITY),
+        ReplayCfg(
+            num_env_states_per_minibatch=4000, num_minibatches=1, num_steps=5, capacity=CAPACITY
+        ),
         num_envs=NUM_ENVS,
         observations=["actor", "critic"],
     )
@@ -158,7 +168,9 @@ def test_env_states_that_are_not_finite_are_refused_and_counted(leaf, bad):
     assert int(storage.non_finite_count) == 1
     assert int(storage.available.sum()) == 8 * NUM_ENVS - 1
     sample = storage.get(torch.arange(len(storage)))
-    assert all(value.isfinite().all() for value in sample.values(True, True) if value.is_floating_point())
+    assert all(
+        value.isfinite().all() for value in sample.values(True, True) if value.is_floating_point()
+    )
     kept = sample[sample[MASK_KEY].squeeze(-1)]
     refused = history.log[1][2]["obs"]
     assert not (kept["actor"][:, 0] == refused).any()
@@ -204,7 +216,9 @@ def test_writes_keep_the_addresses_and_state_continues_exactly():
 def test_observations_cost_their_bytes_once():
     storage = _storage()
     storage.write(_History().rollout(2))
-    per_place = sum(leaf.numel() * leaf.element_size() for leaf in storage.content.values(True, True))
+    per_place = sum(
+        leaf.numel() * leaf.element_size() for leaf in storage.content.values(True, True)
+    )
     # Observations 5 floats, action and reward one each, two flags.
     assert per_place / (NUM_ENVS * (CAPACITY + 1)) == 7 * 4 + 2
 

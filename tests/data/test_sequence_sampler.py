@@ -20,14 +20,18 @@ def rollout():
 
 def ours(*, burn_in=0, length=4, seed=0):
     cfg = DatasetCfg(num_env_states_per_minibatch=24, num_minibatches=3)
-    dataset = DatasetBuffer(cfg, sampler=SequenceSampler(sequence_length=length, burn_in=burn_in, seed=seed))
+    dataset = DatasetBuffer(
+        cfg, sampler=SequenceSampler(sequence_length=length, burn_in=burn_in, seed=seed)
+    )
     dataset.extend(rollout())
     return lambda: list(dataset.epoch())
 
 
 def stock(*, burn_in=0, length=4, seed=0):
     sampler = SequenceSampler(sequence_length=length, burn_in=burn_in, seed=seed)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(E * T, ndim=2), sampler=sampler, batch_size=24)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(E * T, ndim=2), sampler=sampler, batch_size=24
+    )
     buffer.extend(rollout())
     return lambda: list(buffer)
 
@@ -113,11 +117,16 @@ def test_no_host_sync():
 
 
 def test_orders_continue_from_a_state_dict_and_another_seed_gives_others():
-    one, other = SequenceSampler(sequence_length=4, seed=3), SequenceSampler(sequence_length=4, seed=9)
+    one, other = (
+        SequenceSampler(sequence_length=4, seed=3),
+        SequenceSampler(sequence_length=4, seed=9),
+    )
     storage = LazyTensorStorage(E * T, ndim=2)
     storage.set(torch.arange(T), rollout().transpose(0, 1).contiguous())
     draw = [one.sample(storage, 24)[0] for _ in range(4)][-1]
-    assert not all(torch.equal(a, b) for a, b in zip(draw, other.sample(storage, 24)[0], strict=True))
+    assert not all(
+        torch.equal(a, b) for a, b in zip(draw, other.sample(storage, 24)[0], strict=True)
+    )
     other.load_state_dict(one.state_dict())
     for _ in range(5):
         drawn, expected = other.sample(storage, 24)[0], one.sample(storage, 24)[0]
@@ -141,7 +150,8 @@ def test_a_minibatch_that_is_no_whole_number_of_sequences_is_refused_with_the_nu
     cfg = DatasetCfg(num_env_states_per_minibatch=18, num_minibatches=4)
     dataset = DatasetBuffer(cfg, sampler=SequenceSampler(sequence_length=4))
     with pytest.raises(
-        ValueError, match=r"sequence_length=4: num_env_states_per_minibatch=18 is no whole number .* \(4.5\)"
+        ValueError,
+        match=r"sequence_length=4: num_env_states_per_minibatch=18 is no whole number .* \(4.5\)",
     ):
         dataset.extend(rollout())
 

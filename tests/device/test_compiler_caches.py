@@ -44,7 +44,9 @@ def _compiled_by_triton(cache: Path) -> subprocess.CompletedProcess[str]:
     """Compile a kernel in a process of its own: where kernels were interpreted, Triton's language stays changed."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     environment |= {"TRITON_CACHE_DIR": str(cache), "PYTHONPATH": str(ROOT)}
-    return subprocess.run([sys.executable, "-c", COMPILE], env=environment, capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, "-c", COMPILE], env=environment, capture_output=True, text=True
+    )
 
 
 @pytest.mark.parametrize(("pattern", "damage"), [("__grp__*.json", "[]"), ("twice.json", "{")])

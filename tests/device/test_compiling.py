@@ -19,5 +19,9 @@ def test_the_compiler_knows_the_option_that_it_is_given(monkeypatch):
     given = {}
     monkeypatch.setattr(torch, "compile", lambda work, **options: given.update(options) or work)
     assert compiled(_work, device=torch.device("cuda")) is _work
-    assert given["fullgraph"] and given["dynamic"] is False and given["options"]["deterministic"] is True
+    assert (
+        given["fullgraph"]
+        and given["dynamic"] is False
+        and given["options"]["deterministic"] is True
+    )
     assert set(given["options"]) <= set(torch._inductor.list_options())

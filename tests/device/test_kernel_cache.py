@@ -74,7 +74,9 @@ def test_what_cannot_be_deleted_names_the_cache_and_the_fix(files, tmp_path, mon
     monkeypatch.setattr(shutil, "rmtree", refuse)
     for path in files:
         empty(path)
-    with pytest.raises(RuntimeError, match=rf"Warp's cache: {tmp_path}.*nor deleted.*set WARP_CACHE_PATH"):
+    with pytest.raises(
+        RuntimeError, match=rf"Warp's cache: {tmp_path}.*nor deleted.*set WARP_CACHE_PATH"
+    ):
         run()
 
 
@@ -82,7 +84,9 @@ def test_what_stays_damaged_ends_in_one_line(files, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "rmtree", lambda folder: None)
     for path in files:
         empty(path)
-    with pytest.raises(RuntimeError, match=rf"Warp's cache: {tmp_path}.*read or written.*WARP_CACHE_PATH"):
+    with pytest.raises(
+        RuntimeError, match=rf"Warp's cache: {tmp_path}.*read or written.*WARP_CACHE_PATH"
+    ):
         run()
 
 

@@ -49,7 +49,9 @@ def two_kernels(module: str, *, adds: float = 2.0) -> tuple[wp.Kernel, wp.Kernel
     def increase(values: wp.array[float]):
         values[wp.tid()] = add(values[wp.tid()])
 
-    return wp.Kernel(double, key="double", module=own), wp.Kernel(increase, key="increase", module=own)
+    return wp.Kernel(double, key="double", module=own), wp.Kernel(
+        increase, key="increase", module=own
+    )
 
 
 def launch(*kernels: wp.Kernel, values: wp.array) -> list[float]:
@@ -111,10 +113,16 @@ def test_a_module_that_another_device_has_loaded_is_loaded_whole(values):
 
 def test_a_module_of_the_same_content_has_the_same_name_and_hash_and_another_constant_another_hash():
     """The next process finds it in Warp's cache; names are told apart here, as a process has one of each."""
-    made = {name: two_kernels(name, adds=adds) for name, adds in (("a", 2.0), ("b", 2.0), ("c", 3.0))}
+    made = {
+        name: two_kernels(name, adds=adds) for name, adds in (("a", 2.0), ("b", 2.0), ("c", 3.0))
+    }
     load(*(increase for _, increase in made.values()))
     modules = {name: increase.module for name, (_, increase) in made.items()}
-    assert [module.name for module in modules.values()] == ["a.increase", "b.increase", "c.increase"]
+    assert [module.name for module in modules.values()] == [
+        "a.increase",
+        "b.increase",
+        "c.increase",
+    ]
     hashes = {name: module.get_module_hash(1) for name, module in modules.items()}
     assert hashes["a"] == hashes["b"] != hashes["c"]
 
@@ -194,7 +202,9 @@ def test_a_loaded_kernel_is_told_in_the_format_that_the_notice_reads(tmp_path):
     lines: list[str] = []
     try:
         with compile_notice(lines.append):
-            wp.launch(increment, dim=1, inputs=[wp.zeros(1, dtype=float, device="cpu")], device="cpu")
+            wp.launch(
+                increment, dim=1, inputs=[wp.zeros(1, dtype=float, device="cpu")], device="cpu"
+            )
     finally:
         wp.config.kernel_cache_dir = cache
     assert len(lines) == 1

@@ -127,7 +127,9 @@ def test_a_world_that_does_not_fit_says_so(monkeypatch):
     # With 16 envs Warp's arrays take 66,027 bytes, with 8 of them 34,787; a tenth of the room has to be left.
     [(80_000, 16), (71_000, 8)],
 )
-def test_a_run_whose_envs_do_not_fit_names_a_number_that_trained_elsewhere(tmp_path, monkeypatch, room, fits):
+def test_a_run_whose_envs_do_not_fit_names_a_number_that_trained_elsewhere(
+    tmp_path, monkeypatch, room, fits
+):
     smaller = f"from tests.device.small_machine import hold_at_most; hold_at_most({room}); "
     monkeypatch.setattr(trial, "PROGRAM", smaller + trial.PROGRAM)
 

@@ -33,7 +33,9 @@ def line(launch: QuickLaunch, size: int, slope: float, *numbers: int) -> list[fl
 
 
 def test_each_launch_has_its_own_numbers_and_size(launch):
-    assert line(launch, 3, 0.5, -(2**52), 2**32 - 1, -7) == [i / 2 - 2**52 + 2**32 - 8 for i in range(3)]
+    assert line(launch, 3, 0.5, -(2**52), 2**32 - 1, -7) == [
+        i / 2 - 2**52 + 2**32 - 8 for i in range(3)
+    ]
     assert line(launch, 3, 2.0, 1, 0, 0) == [1, 3, 5]
     assert line(launch, 2, 1.0, 0, 0, 10) == [10, 11]
     assert line(launch, 3, 0.0, 4, 0, 0) == [4, 4, 4]
@@ -74,5 +76,7 @@ def test_arguments_that_an_operator_changes_have_no_default():
     def fill(out_N: torch.Tensor, count_N: torch.Tensor | None = None) -> None:
         out_N.fill_(1.0)
 
-    with pytest.raises(AssertionError, match="fill_counted: arguments that are changed have no default"):
+    with pytest.raises(
+        AssertionError, match="fill_counted: arguments that are changed have no default"
+    ):
         as_operator("fill_counted", fill, lambda *_: None, mutates=("out_N", "count_N"))

@@ -37,11 +37,19 @@ def exact_uniform(seed: int, stream: int, row: int, counter: int, index: int) ->
 
 @pytest.mark.parametrize(
     ("seed", "stream", "counter"),
-    [(0, 0, 0), (5, 1, 3), (2**31 - 1, 2**31 - 1, 2**31), (2**62 + 12345, 77, 2**40 + 9), (1, 2, 2**32 - 1)],
+    [
+        (0, 0, 0),
+        (5, 1, 3),
+        (2**31 - 1, 2**31 - 1, 2**31),
+        (2**62 + 12345, 77, 2**40 + 9),
+        (1, 2, 2**32 - 1),
+    ],
 )
 def test_it_is_the_hash_that_it_says_it_is(seed, stream, counter):
     drawn = random.uniform(random.row_keys(torch.tensor(seed), stream, torch.tensor(counter), 3), 5)
-    expected = [[exact_uniform(seed, stream, row, counter, index) for index in range(5)] for row in range(3)]
+    expected = [
+        [exact_uniform(seed, stream, row, counter, index) for index in range(5)] for row in range(3)
+    ]
     assert drawn.tolist() == expected
 
 
@@ -57,7 +65,9 @@ def test_each_coordinate_matters(other):
 
 def test_a_row_does_not_depend_on_the_others():
     one_E, other_E = torch.tensor([3, 0, 8, 1]), torch.tensor([3, 5, 8, 2])
-    one, other = (random.uniform(random.row_keys(SEED, 1, counter_E, 4), 6) for counter_E in (one_E, other_E))
+    one, other = (
+        random.uniform(random.row_keys(SEED, 1, counter_E, 4), 6) for counter_E in (one_E, other_E)
+    )
     assert torch.equal(one[[0, 2]], other[[0, 2]])
     assert not (one[[1, 3]] == other[[1, 3]]).any()
     fewer = random.uniform(random.row_keys(SEED, 1, one_E[:2], 2), 6)
@@ -108,7 +118,9 @@ def test_integers_include_both_ends_and_are_equally_likely():
     for value in range(-2, 5):
         assert_mean((sample == value).float(), 1 / 7, math.sqrt(6) / 7)
     assert bool((random.integers(keys(), 9, 3, 3) == 3).all())
-    per_row = random.integers(keys(), 50, torch.zeros(4, 1, dtype=torch.int64), torch.arange(4)[:, None])
+    per_row = random.integers(
+        keys(), 50, torch.zeros(4, 1, dtype=torch.int64), torch.arange(4)[:, None]
+    )
     assert bool((per_row <= torch.arange(4)[:, None]).all()) and int(per_row[3].max()) == 3
 
 
@@ -120,7 +132,9 @@ def test_neighbours_are_independent(along):
         sample = random.uniform(keys(rows=50), 4000).T
     else:
         name = {"counters": "counter", "streams": "stream", "seeds": "seed"}[along]
-        sample = torch.stack([random.uniform(keys(rows=50, **{name: i}), 1)[:, 0] for i in range(4000)])
+        sample = torch.stack(
+            [random.uniform(keys(rows=50, **{name: i}), 1)[:, 0] for i in range(4000)]
+        )
     centred = sample - 0.5
     for distance in (1, 2, 64):
         assert_mean(centred[:-distance] * centred[distance:], 0.0, 1 / 12)
@@ -128,7 +142,9 @@ def test_neighbours_are_independent(along):
 
 def test_rows_and_counters_do_not_trade_places():
     """Row i at count j and row j at count i are different draws."""
-    counters = torch.stack([random.uniform(keys(counter=count, rows=64), 1)[:, 0] for count in range(64)])
+    counters = torch.stack(
+        [random.uniform(keys(counter=count, rows=64), 1)[:, 0] for count in range(64)]
+    )
     off_diagonal = ~torch.eye(64, dtype=torch.bool)
     assert not (counters == counters.T)[off_diagonal].any()
     assert counters.unique().numel() > 0.999 * counters.numel()
@@ -151,10 +167,16 @@ def test_it_compiles_without_a_graph_break_to_the_same_numbers():
 
 @pytest.mark.parametrize(
     "counter_E",
-    [torch.zeros(3, dtype=torch.int64), torch.zeros(4, dtype=torch.int32), torch.zeros(1, 4).long()],
+    [
+        torch.zeros(3, dtype=torch.int64),
+        torch.zeros(4, dtype=torch.int32),
+        torch.zeros(1, 4).long(),
+    ],
 )
 def test_counters_that_would_be_misread_are_refused(counter_E):
-    with pytest.raises(ValueError, match=r"expected torch.int64, and a counter of shape \(\) or \(4,\)"):
+    with pytest.raises(
+        ValueError, match=r"expected torch.int64, and a counter of shape \(\) or \(4,\)"
+    ):
         random.uniform(random.row_keys(SEED, 1, counter_E, 4), 2)
 
 
@@ -185,7 +207,9 @@ def exact_permutation(row: int, n: int, bits: int, rounds: int) -> list[int]:
     base = mix(seed ^ stream)
     first = mix(base) ^ mix(row + 1)
     second = mix((first + row * golden + golden) & MASK) ^ mix(stream)
-    round_keys = [mix(mix(mix(first) ^ ((i + 1) * golden & MASK)) ^ mix(second)) for i in range(rounds)]
+    round_keys = [
+        mix(mix(mix(first) ^ ((i + 1) * golden & MASK)) ^ mix(second)) for i in range(rounds)
+    ]
 
     def through(number: int) -> int:
         low, high = number & masks[0], number >> low_bits
@@ -203,7 +227,9 @@ def exact_permutation(row: int, n: int, bits: int, rounds: int) -> list[int]:
     return numbers
 
 
-@pytest.mark.parametrize(("n", "bits", "rounds"), [(3, 2, 24), (50, 6, 24), (100, 7, 8), (1000, 10, 8)])
+@pytest.mark.parametrize(
+    ("n", "bits", "rounds"), [(3, 2, 24), (50, 6, 24), (100, 7, 8), (1000, 10, 8)]
+)
 def test_a_permutation_is_the_network_that_it_says_it_is(n, bits, rounds):
     assert random.permutations(keys(), n).tolist() == [
         exact_permutation(row, n, bits, rounds) for row in range(4)

@@ -44,24 +44,34 @@ def test_kernels_tell_their_module_and_whether_they_are_generic() -> None:
 def test_modules_list_their_kernels_and_what_is_loaded_and_take_others() -> None:
     module = wp.get_module("some_module")
     assert wp.get_module("some_module") is module and module.name == "some_module"
-    assert module.execs == {} and isinstance(module.options, dict), "warp.Module.execs or options are others"
-    assert module.has_unresolved_static_expressions is False, "warp.Module resolves wp.static otherwise"
+    assert module.execs == {} and isinstance(module.options, dict), (
+        "warp.Module.execs or options are others"
+    )
+    assert module.has_unresolved_static_expressions is False, (
+        "warp.Module resolves wp.static otherwise"
+    )
     module.register_kernel(take_pair)
     assert module.kernels == {take_pair.key: take_pair}, "warp.Module.kernels is something else"
 
 
 def test_modules_load_by_device_and_block_from_a_folder_of_the_cache() -> None:
     parameters = list(inspect.signature(inspect.unwrap(wp.Module.load)).parameters)
-    assert parameters[:3] == ["self", "device", "block_dim"], "warp.Module.load takes other arguments"
+    assert parameters[:3] == ["self", "device", "block_dim"], (
+        "warp.Module.load takes other arguments"
+    )
     wp.init()
-    assert isinstance(wp.config.kernel_cache_dir, str), "warp.config.kernel_cache_dir is something else"
+    assert isinstance(wp.config.kernel_cache_dir, str), (
+        "warp.config.kernel_cache_dir is something else"
+    )
     folder = take_pair.module.get_module_identifier(1)
     assert folder.startswith("wp_"), "warp.Module.get_module_identifier names something else"
 
 
 def test_diversion_ends_with_its_block() -> None:
     before, seen = wp.launch, []
-    with upstream.launches_diverted(lambda kernel, dim, block_dim: seen.append((kernel, dim, block_dim))):
+    with upstream.launches_diverted(
+        lambda kernel, dim, block_dim: seen.append((kernel, dim, block_dim))
+    ):
         wp.launch(take_pair, 3, block_dim=64)
         wp.capture_while(None, lambda times: seen.append(times), times=1)
     assert seen == [(take_pair, 3, 64), 1] and wp.launch is before
@@ -70,7 +80,9 @@ def test_diversion_ends_with_its_block() -> None:
 def test_a_recorded_launch_has_its_struct_as_the_second_parameter() -> None:
     launch = wp.launch(take_pair, 1, inputs=[Pair()], device="cpu", record_cmd=True)
     fields = upstream.recorded_arguments(launch)._fields_
-    assert [name for name, _ in fields] == ["first", "second"], "warp.Launch.params is laid out otherwise"
+    assert [name for name, _ in fields] == ["first", "second"], (
+        "warp.Launch.params is laid out otherwise"
+    )
 
 
 def test_warp_logs_modules_as_before(capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,7 +107,9 @@ def test_warp_logs_modules_as_before(capsys: pytest.CaptureFixture[str]) -> None
         wp.set_logger(before)
     load = [line for line in lines if "Module " in line and "took" in line]
     assert load, "Warp logs no module loads"
-    assert re.search(r"\((compiled|cached)\)", load[0]), f"Warp ends a load line otherwise: {load[0]!r}"
+    assert re.search(r"\((compiled|cached)\)", load[0]), (
+        f"Warp ends a load line otherwise: {load[0]!r}"
+    )
     assert upstream.COMPILED_LINE.match(load[0].replace("(cached)", "(compiled)")), (
         f"COMPILED_LINE misses {load[0]!r}"
     )
@@ -113,11 +127,15 @@ def test_a_default_logger_is_recognized() -> None:
 def test_torch_says_what_it_could_not_allocate() -> None:
     with pytest.raises(RuntimeError) as refusal:
         torch.empty(1 << 50)
-    assert re.search(upstream.ALLOCATION_REFUSALS[2], str(refusal.value)), f"torch says now: {refusal.value}"
+    assert re.search(upstream.ALLOCATION_REFUSALS[2], str(refusal.value)), (
+        f"torch says now: {refusal.value}"
+    )
 
 
 @pytest.mark.gpu
 def test_torch_has_the_handle_of_its_current_stream() -> None:
     device = torch.device("cuda", torch.cuda.current_device())
-    assert hasattr(torch._C, "_cuda_getCurrentRawStream"), "torch._C._cuda_getCurrentRawStream is gone"
+    assert hasattr(torch._C, "_cuda_getCurrentRawStream"), (
+        "torch._C._cuda_getCurrentRawStream is gone"
+    )
     assert upstream.current_stream_handle(device) == torch.cuda.current_stream(device).cuda_stream

@@ -19,7 +19,8 @@ def recorded(group):
     """Return the curves of `healthy` or of `faults`, by name."""
     runs = json.loads((RESULTS / "diagnosis.json").read_text())[group]
     found = {
-        name: Curves(columns=_columns(run["metrics"]), config=run["config"]) for name, run in runs.items()
+        name: Curves(columns=_columns(run["metrics"]), config=run["config"])
+        for name, run in runs.items()
     }
     if group == "faults":
         healthy = recorded("healthy")["cartpole_swingup_ppo_1"]

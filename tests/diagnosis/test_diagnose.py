@@ -13,7 +13,9 @@ def write_run(folder, curves, *, rows=None, tail=""):
     """Write a run folder with the curves; JSON is YAML."""
     names = list(curves.columns)
     table = [
-        ",".join("" if (cell := curves.columns[name][row]) is None else repr(cell) for name in names)
+        ",".join(
+            "" if (cell := curves.columns[name][row]) is None else repr(cell) for name in names
+        )
         for row in range(rows or curves.num_rows)
     ]
     folder.mkdir(parents=True)
@@ -43,7 +45,9 @@ def test_a_healthy_run_has_one_line(tmp_path, capsys):
 
 
 def test_a_run_that_was_killed_in_the_middle_of_a_row_is_read(tmp_path, capsys):
-    folder = write_run(tmp_path / "run", recorded("faults")["std_at_floor"], rows=15, tail="123456,0.1")
+    folder = write_run(
+        tmp_path / "run", recorded("faults")["std_at_floor"], rows=15, tail="123456,0.1"
+    )
     (folder / "checkpoint" / "5").mkdir(parents=True)
     assert run("diagnose", folder / "checkpoint" / "5") == 1
     assert "std at floor" in capsys.readouterr().out

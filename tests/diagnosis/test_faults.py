@@ -33,7 +33,9 @@ def test_what_a_run_does_not_log_is_not_judged():
 
 def test_too_few_rows_say_nothing():
     curves = recorded("faults")["std_at_floor"]
-    assert names(Curves(columns={name: column[:5] for name, column in curves.columns.items()})) == []
+    assert (
+        names(Curves(columns={name: column[:5] for name, column in curves.columns.items()})) == []
+    )
 
 
 def test_values_that_are_not_finite_do_not_count():

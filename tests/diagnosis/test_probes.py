@@ -8,7 +8,14 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 
 from ksim_rl.diagnosis.probes import probed
-from ksim_rl.modules import ActorCfg, CriticCfg, RecurrentCfg, make_actor, make_critic, make_recurrent_actor
+from ksim_rl.modules import (
+    ActorCfg,
+    CriticCfg,
+    RecurrentCfg,
+    make_actor,
+    make_critic,
+    make_recurrent_actor,
+)
 
 E, T = 16, 8
 
@@ -49,7 +56,9 @@ def test_the_size_of_normalized_observations_is_one_where_statistics_fit():
         for module in network.modules():
             if hasattr(module, "until"):
                 module.update(rollout()["actor"])
-    assert measured(actor, critic, rollout())["policy/observation_rms"] == pytest.approx(1.0, abs=1e-3)
+    assert measured(actor, critic, rollout())["policy/observation_rms"] == pytest.approx(
+        1.0, abs=1e-3
+    )
     far = measured(actor, critic, rollout(scale=7.0))["policy/observation_rms"]
     assert far == pytest.approx(7.0, rel=0.1)
 
@@ -68,7 +77,9 @@ def test_recurrent_networks_are_not_probed():
 def test_what_an_update_lacks_is_left_out():
     actor, _ = networks()
     assert "policy/dead_units" in measured(actor, None, rollout())
-    assert measured(actor, None, rollout().select("critic")) == measured(None, None, rollout()) == {}
+    assert (
+        measured(actor, None, rollout().select("critic")) == measured(None, None, rollout()) == {}
+    )
     assert probed(None, env(Unbounded((E, 2))), None) == {}
 
 

@@ -12,7 +12,9 @@ DOCS = REPOSITORY / "docs"
 
 def files(name: str) -> dict[str, str]:
     """Return the files that a guide has the reader write, by path: the blocks under `<!-- file: path -->`."""
-    found = re.findall(r"<!-- file: (\S+) -->\n```\w*\n(.*?)```", (DOCS / name).read_text(), re.DOTALL)
+    found = re.findall(
+        r"<!-- file: (\S+) -->\n```\w*\n(.*?)```", (DOCS / name).read_text(), re.DOTALL
+    )
     assert found, f"{name} shows no files"
     return dict(found)
 

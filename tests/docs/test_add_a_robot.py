@@ -44,7 +44,9 @@ def test_the_robot_stands_and_is_drawn(folder: Path) -> None:
 
 @pytest.mark.full
 def test_its_unit_tests_pass(folder: Path) -> None:
-    assert "2 passed" in run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_stool.py")
+    assert "2 passed" in run(
+        folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_stool.py"
+    )
 
 
 @pytest.mark.full
@@ -71,14 +73,15 @@ def test_the_report_is_what_the_guide_says(folder: Path) -> None:
 def test_a_velocity_task_takes_at_most_40_lines() -> None:
     files = guide.files(GUIDE)
     assert (
-        sum(files[name].count("\n") for name in ("stool/tasks.py", "stool/__init__.py", "pyproject.toml"))
+        sum(
+            files[name].count("\n")
+            for name in ("stool/tasks.py", "stool/__init__.py", "pyproject.toml")
+        )
         <= 40
     )
 
 
 @pytest.mark.full
 def test_the_robot_made_by_hand_weighs_what_its_model_does(folder: Path) -> None:
-    script = (
-        "from stool.by_hand import TASK, ROBOT; TASK.cfg(); print(ROBOT.spec().compile().body_subtreemass[0])"
-    )
+    script = "from stool.by_hand import TASK, ROBOT; TASK.cfg(); print(ROBOT.spec().compile().body_subtreemass[0])"
     assert float(run(folder, "-c", script)) == pytest.approx(5.7)

@@ -22,7 +22,9 @@ THEIRS = {"puck_center", "stool_velocity_flat", "my_task"}
 def train_commands() -> list[str]:
     """The overrides of each `ksim-rl train` that a page shows, with one value of each sweep."""
     found = re.findall(r"ksim-rl train ([^`\n#]*)", ALL.replace("\\\n", " "))
-    return sorted({text.strip() for text in found if "--config-dir" not in text and "--help" not in text})
+    return sorted(
+        {text.strip() for text in found if "--config-dir" not in text and "--help" not in text}
+    )
 
 
 def overrides(command: str) -> list[str]:
@@ -47,14 +49,20 @@ def test_the_fields_of_a_command_exist(command: str) -> None:
 
 
 def test_the_commands_exist() -> None:
-    named = set(re.findall(r"(?:^|[`$ ])ksim-rl ((?:--plugin \w+ )?[a-z_0-9]+)(?=[ `\n])", ALL, re.MULTILINE))
+    named = set(
+        re.findall(
+            r"(?:^|[`$ ])ksim-rl ((?:--plugin \w+ )?[a-z_0-9]+)(?=[ `\n])", ALL, re.MULTILINE
+        )
+    )
     commands = {words.rpartition(" ")[2] for words in named}
     assert len(commands) > 12
     assert commands <= {*COMMANDS, "help"}
 
 
 def test_fields_in_the_text_exist() -> None:
-    fields = set(re.findall(r"`'?((?:objective|data|trainer|collector|task\.sim)\.(?!py\b)\w+)[=`]", ALL))
+    fields = set(
+        re.findall(r"`'?((?:objective|data|trainer|collector|task\.sim)\.(?!py\b)\w+)[=`]", ALL)
+    )
     fields.remove("trainer.loggers")  # of a Trainer
     choices = (
         [],

@@ -41,7 +41,12 @@ def test_the_mended_version_keeps_the_contract_and_the_original_reward(gentle) -
 @pytest.mark.full
 def test_the_commands_train_both_versions_and_compare_them(tmp_path: Path) -> None:
     guide.write_files("first_hour.md", tmp_path)
-    small = ["num_envs=16", "trainer.num_iterations=2", "trainer.eval_episodes=2", "trainer.video=false"]
+    small = [
+        "num_envs=16",
+        "trainer.num_iterations=2",
+        "trainer.eval_episodes=2",
+        "trainer.video=false",
+    ]
     commands = re.findall(r"^    ksim-rl (train [^\\\n]*(?:\\\n.*)?)$", PAGE, re.MULTILINE)
     assert len(commands) == 2
     for command in commands:
@@ -50,6 +55,12 @@ def test_the_commands_train_both_versions_and_compare_them(tmp_path: Path) -> No
         # Two iterations solve nothing, which the exit code says, too.
         assert done.returncode == 1 and "NOT SOLVED" in done.stdout, done.stdout + done.stderr
     done = guide.run(
-        "-m", "ksim_rl.cli.main", "compare", "runs/first", "runs/second", site=tmp_path, cwd=tmp_path
+        "-m",
+        "ksim_rl.cli.main",
+        "compare",
+        "runs/first",
+        "runs/second",
+        site=tmp_path,
+        cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr

@@ -17,7 +17,9 @@ def test_every_choice_of_a_group_is_in_its_table(group):
     conf.register()
     choices = {name.removesuffix(".yaml") for name in ConfigStore.instance().repo[group]}
     table = PAGE.split(f"| `{group}=` |")[1].split("\n\n")[0]
-    listed = {name for row in table.splitlines()[1:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
+    listed = {
+        name for row in table.splitlines()[1:] for name in re.findall(r"`(\w+)`", row.split("|")[1])
+    }
     assert listed == choices
 
 

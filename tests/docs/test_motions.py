@@ -22,7 +22,9 @@ def test_seconds_and_speeds_are_those_of_the_file(name):
     assert found is not None
     with np.load(motion_path(name)) as file:
         assert float(found[1]) == pytest.approx((len(file["qpos"]) - 1) / file["fps"], abs=0.06)
-        assert float(found[2]) == pytest.approx(np.percentile(np.abs(file["qvel"][:, 6:]), 95.0), abs=0.06)
+        assert float(found[2]) == pytest.approx(
+            np.percentile(np.abs(file["qvel"][:, 6:]), 95.0), abs=0.06
+        )
 
 
 def test_the_pairs_of_the_page_let_g1_stand_and_lift_a_knee_as_a_person_does(tmp_path):
@@ -42,7 +44,8 @@ def test_the_pairs_of_the_page_let_g1_stand_and_lift_a_knee_as_a_person_does(tmp
     qpos_FL = retargeted(recording, model, cfg, fps=50.0)
     done = of_robot(model, qpos_FL, 50.0)
     left, right = (
-        done.pos_FN3[:, done.names.index(f"{side}_ankle_roll_link"), 2] for side in ("left", "right")
+        done.pos_FN3[:, done.names.index(f"{side}_ankle_roll_link"), 2]
+        for side in ("left", "right")
     )
     ankle = recording.resampled(50.0).pos_FN3[:, JOINTS.index("left_ankle"), 2]
     assert np.ptp(left) == pytest.approx(cfg.scale * np.ptp(ankle), rel=0.15)

@@ -43,17 +43,28 @@ def test_the_task_is_listed_with_ours(installed: Installed) -> None:
 
 @pytest.mark.full
 def test_its_unit_test_passes(installed: Installed) -> None:
-    done = installed.run("-m", "pytest", "-q", "-p", "no:cacheprovider", installed.folder / "test_puck.py")
+    done = installed.run(
+        "-m", "pytest", "-q", "-p", "no:cacheprovider", installed.folder / "test_puck.py"
+    )
     assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
 
 
 @pytest.mark.full
 def test_training_takes_overrides_of_its_terms_and_its_own_configs(installed: Installed) -> None:
     done = installed.ksim_rl(
-        "train", "task=puck_center", "+experiment=heavy", "task.rewards.near_center.std=0.3", "--cfg", "job"
+        "train",
+        "task=puck_center",
+        "+experiment=heavy",
+        "task.rewards.near_center.std=0.3",
+        "--cfg",
+        "job",
     )
     assert done.returncode == 0, done.stderr
-    assert "mass: 2.0" in done.stdout and "std: 0.3" in done.stdout and "num_iterations: 60" in done.stdout
+    assert (
+        "mass: 2.0" in done.stdout
+        and "std: 0.3" in done.stdout
+        and "num_iterations: 60" in done.stdout
+    )
 
 
 @pytest.mark.full
@@ -83,7 +94,11 @@ def test_a_broken_package_is_named(tmp_path: Path) -> None:
     broken.install()
     done = broken.ksim_rl("envs")
     assert done.returncode == 2
-    assert "puck_rink" in done.stderr and "no_such_module" in done.stderr and "uninstall" in done.stderr
+    assert (
+        "puck_rink" in done.stderr
+        and "no_such_module" in done.stderr
+        and "uninstall" in done.stderr
+    )
 
 
 @pytest.mark.full
@@ -101,7 +116,9 @@ def test_its_env_is_made_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     guide.write_files("own_task.md", tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     text = (guide.DOCS / "own_task.md").read_text()
-    (example,) = re.findall(r"<!-- example: env_in_python -->\n```python\n(.*?)```", text, re.DOTALL)
+    (example,) = re.findall(
+        r"<!-- example: env_in_python -->\n```python\n(.*?)```", text, re.DOTALL
+    )
     names: dict[str, Any] = {}
     exec(compile(example, "docs/own_task.md", "exec"), names)  # noqa: S102
     assert names["env"].batch_size[0] == 256

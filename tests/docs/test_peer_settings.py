@@ -13,15 +13,31 @@ def run(*, env_states_to_levels=None, seconds_to_levels=None, linear=1.6, angula
 
 @pytest.mark.parametrize("at_once", [1, 5])
 def test_a_table_has_medians_and_says_where_a_level_was_not_reached(at_once):
-    reached = [run(env_states_to_levels=states, seconds_to_levels=states / 1e6) for states in (3e7, 1e7, 2e7)]
+    reached = [
+        run(env_states_to_levels=states, seconds_to_levels=states / 1e6)
+        for states in (3e7, 1e7, 2e7)
+    ]
     never = [reached[0], run(linear=1.2, angular=0.9), run(linear=1.0, angular=0.8)]
-    prefix, made = "h200/go1_velocity_flat/4096", {"device": "NVIDIA H200", "command": "python -m it"}
+    prefix, made = (
+        "h200/go1_velocity_flat/4096",
+        {"device": "NVIDIA H200", "command": "python -m it"},
+    )
     saved = {
         "runs": {
             f"{prefix}/ours": {**made, "commit": "abcdef012", "date": "2"},
             f"{prefix}/all": {**made, "commit": "abcdef012", "date": "2"},
-            "h100/go1_velocity_flat/4096/ours": {**made, "commit": "1", "date": "1", "device": "older"},
-            "cpu/go1_velocity_flat/16/ours": {**made, "commit": "2", "date": "3", "device": "a CPU"},
+            "h100/go1_velocity_flat/4096/ours": {
+                **made,
+                "commit": "1",
+                "date": "1",
+                "device": "older",
+            },
+            "cpu/go1_velocity_flat/16/ours": {
+                **made,
+                "commit": "2",
+                "date": "3",
+                "device": "a CPU",
+            },
         },
         "seeds": {
             f"{prefix}/{name}": {"at_once": at_once, "runs": dict(zip("123", found, strict=True))}

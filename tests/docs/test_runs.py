@@ -10,7 +10,9 @@ from tests.docs.guide import DOCS
 
 def examples(page):
     return dict(
-        re.findall(r"<!-- example: (\w+) -->\n```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+        re.findall(
+            r"<!-- example: (\w+) -->\n```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL
+        )
     )
 
 

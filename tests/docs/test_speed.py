@@ -24,8 +24,12 @@ def in_rooms(prefix: str, figure: str) -> str:
     """Return the cells of the profile's rooms; before, the step was not compiled, and terms were in three of them."""
     profile = results("profile")
     rooms = [("terms", "transforms", "rollout") if room == "terms" else (room,) for room in ROOMS]
-    found = [sum(profile.get(f"{prefix}{own}_{figure}", 0) for own in together) for together in rooms]
-    return " | ".join(f"{value:,.0f}" if figure == "kernels" else f"{100 * value:.0f} %" for value in found)
+    found = [
+        sum(profile.get(f"{prefix}{own}_{figure}", 0) for own in together) for together in rooms
+    ]
+    return " | ".join(
+        f"{value:,.0f}" if figure == "kernels" else f"{100 * value:.0f} %" for value in found
+    )
 
 
 def said() -> dict[str, tuple[str, str]]:
@@ -36,7 +40,10 @@ def said() -> dict[str, tuple[str, str]]:
     transforms = results("transforms")
     memory = [round(speed[f"{GO1}{part}_bytes_per_world"] / 1000) for part in MEMORY]
     return {
-        "first": (README, f"trains at {speed[GO1 + 'env_states_per_s'] / 1e6:.2f} million env states"),
+        "first": (
+            README,
+            f"trains at {speed[GO1 + 'env_states_per_s'] / 1e6:.2f} million env states",
+        ),
         "scaling": (
             PAGE,
             f"{scaling['h200/go1_velocity_flat/32768/env_states_per_s'] / 1e6:.2f} million env states per second",
@@ -72,7 +79,10 @@ def said() -> dict[str, tuple[str, str]]:
             f"of Go1 is {results('determinism')['h200/go1_velocity_flat/on_over_off']:.3f} times as fast with it",
         ),
         "guards": (PAGE, f"{100 * speed[GO1 + 'guards_share']:.1f} % of an iteration"),
-        "chain": (PAGE, f"+ {100 * transforms['h200/4096/chain_share_of_go1_step']:.1f} % of a control step"),
+        "chain": (
+            PAGE,
+            f"+ {100 * transforms['h200/4096/chain_share_of_go1_step']:.1f} % of a control step",
+        ),
         "randomization": (
             PAGE,
             f"+ {100 * results('randomization')[GO1 + 'reset_share']:.1f} % of a control step",
@@ -83,7 +93,10 @@ def said() -> dict[str, tuple[str, str]]:
         "profile before": (NOTE, f"| share | {in_rooms(f'{GO1}before/', 'share')} |"),
         "kernels before": (NOTE, f"| kernels | {in_rooms(f'{GO1}before/', 'kernels')} |"),
         "collector": (PAGE, f"x {collector['h200/cartpole/4096/captured_over_stock']:.1f} |"),
-        "its graphs": (PAGE, f"x {collector['h200/cartpole/4096/captured_over_stock_with_graphs']:.1f} |"),
+        "its graphs": (
+            PAGE,
+            f"x {collector['h200/cartpole/4096/captured_over_stock_with_graphs']:.1f} |",
+        ),
         "update": (PAGE, f"x {update['h200/98304/stock_eager_over_update']:.1f} |"),
     }
 
@@ -91,4 +104,6 @@ def said() -> dict[str, tuple[str, str]]:
 @pytest.mark.parametrize("what", said())
 def test_a_figure_in_the_text(what: str) -> None:
     page, words = said()[what]
-    assert words in " ".join(page.split()), f"{words!r} is not there: the results have changed, or the text"
+    assert words in " ".join(page.split()), (
+        f"{words!r} is not there: the results have changed, or the text"
+    )

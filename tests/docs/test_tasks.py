@@ -43,7 +43,12 @@ def test_what_was_learned_is_what_the_tables_have():
     tables = {
         "tasks": {
             "rows": {
-                "velocity/go2_velocity_flat": {"reached": False, "value": 82.0, "goal": None, "runs": go2},
+                "velocity/go2_velocity_flat": {
+                    "reached": False,
+                    "value": 82.0,
+                    "goal": None,
+                    "runs": go2,
+                },
                 "control/reacher": {
                     "reached": True,
                     "value": 941.6,

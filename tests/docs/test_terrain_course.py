@@ -11,13 +11,21 @@ def test_a_row_shows_the_last_run_on_a_gpu_and_no_other():
 
     def run(label: str, date: str, success: float) -> tuple[dict[str, Any], dict[str, Any]]:
         prefix = f"{label}/go1_velocity_rough"
-        own = {f"{prefix}/{kind}/{name}": value for kind in PATCHES for name, value in figures.items()}
-        own |= {f"{prefix}/{name}": value for name, value in (figures | {"success": success}).items()}
+        own = {
+            f"{prefix}/{kind}/{name}": value for kind in PATCHES for name, value in figures.items()
+        }
+        own |= {
+            f"{prefix}/{name}": value for name, value in (figures | {"success": success}).items()
+        }
         own |= {f"{prefix}/env_states": 250_085_376, f"{prefix}/trained_level": 5.61}
         made = {"date": date, "device": label.upper(), "commit": "0123456789-dirty"}
         return own, {prefix: made, f"{prefix}/flat": made}
 
-    runs = [run("h200", "2026-01-01", 0.1), run("h100", "2026-01-02", 0.875), run("cpu", "2026-01-03", 0.3)]
+    runs = [
+        run("h200", "2026-01-01", 0.1),
+        run("h100", "2026-01-02", 0.875),
+        run("cpu", "2026-01-03", 0.3),
+    ]
     saved = {"figures": {}, "runs": {}}
     for own, made in runs:
         saved["figures"] |= own

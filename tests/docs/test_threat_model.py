@@ -38,7 +38,9 @@ def section(title: str) -> str:
 def named(title: str) -> list[tuple[str, str]]:
     """Return the pairs of a function and its file that a section names, where several may have one file."""
     found = []
-    for functions, file in re.findall(r"((?:`\w+`(?:, | and )?)+) \(`([\w/]+\.py)`\)", section(title)):
+    for functions, file in re.findall(
+        r"((?:`\w+`(?:, | and )?)+) \(`([\w/]+\.py)`\)", section(title)
+    ):
         found += [(name, file) for name in re.findall(r"`(\w+)`", functions)]
     return found
 
@@ -88,6 +90,9 @@ def test_each_module_that_opens_a_port_is_named():
 
 def test_what_is_left_out_is_found(monkeypatch):
     monkeypatch.setitem(globals(), "section", lambda title: "")
-    for test in (test_each_module_that_reads_a_file_is_named, test_each_module_that_opens_a_port_is_named):
+    for test in (
+        test_each_module_that_reads_a_file_is_named,
+        test_each_module_that_opens_a_port_is_named,
+    ):
         with pytest.raises(AssertionError):
             test()

@@ -8,8 +8,12 @@ import pytest
 
 from tests.docs.guide import DOCS
 
-TEXTS = dict(re.findall(r"^## (.*)\n((?:(?!## ).*\n)*)", (DOCS / "upstream.md").read_text(), re.MULTILINE))
-BLOCKS = {title: re.findall(r"```python\n(.*?)```", text, re.DOTALL) for title, text in TEXTS.items()}
+TEXTS = dict(
+    re.findall(r"^## (.*)\n((?:(?!## ).*\n)*)", (DOCS / "upstream.md").read_text(), re.MULTILINE)
+)
+BLOCKS = {
+    title: re.findall(r"```python\n(.*?)```", text, re.DOTALL) for title, text in TEXTS.items()
+}
 REPRODUCED = [title for title, blocks in BLOCKS.items() if blocks]
 
 

@@ -61,7 +61,9 @@ def parts(tmp_path_factory):
 def test_the_page_has_all_that_a_part_has(parts, part) -> None:
     listed = {row.name for row in view.rows(part.owner)}
     listed |= {re.match(r"`(\w+)", cell)[1] for cell, _ in view.methods(part.owner)}
-    ignored = {"count", "index"} if hasattr(part.owner, "_fields") else set(vars(view.SensorTracker))
+    ignored = (
+        {"count", "index"} if hasattr(part.owner, "_fields") else set(vars(view.SensorTracker))
+    )
     present = {name for name in dir(parts[part.spelled]) if not name.startswith("_")} - ignored
     assert listed == present
 

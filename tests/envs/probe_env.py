@@ -53,7 +53,9 @@ class Launch(EventTerm):
     speed: float = 1.0
 
     def __call__(self, view: EnvView, mask_E: Tensor) -> None:
-        speed_E1 = self.speed * torch.arange(1, view.num_envs + 1, device=view.device).float()[:, None]
+        speed_E1 = (
+            self.speed * torch.arange(1, view.num_envs + 1, device=view.device).float()[:, None]
+        )
         view.joints().write_pos(mask_E, torch.zeros_like(speed_E1))
         view.joints().write_vel(mask_E, speed_E1)
 

@@ -67,7 +67,9 @@ def engine(bench: Bench, read: Callable[[Any, Any], Any]) -> Tensor:
     return torch.tensor(np.stack(rows), dtype=torch.float32)
 
 
-def velocity(model: Any, data: Any, ids: Sequence[int], *, part: str, kind: Any = BODY) -> np.ndarray:
+def velocity(
+    model: Any, data: Any, ids: Sequence[int], *, part: str, kind: Any = BODY
+) -> np.ndarray:
     """Return world-frame velocities of frame origins, [N, 3], from `mj_objectVelocity`: (angular, linear)."""
     result, six = [], np.zeros(6)
     for i in ids:

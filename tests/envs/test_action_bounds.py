@@ -17,7 +17,14 @@ from ksim_rl.adapters.gymnasium import GymnasiumVectorEnv
 from ksim_rl.testing import count_syncs
 
 CONTROL = (
-    *("cartpole_balance", "cartpole_swingup", "pendulum_swingup", "reacher", "cheetah_run", "hopper_stand"),
+    *(
+        "cartpole_balance",
+        "cartpole_swingup",
+        "pendulum_swingup",
+        "reacher",
+        "cheetah_run",
+        "hopper_stand",
+    ),
     *("hopper_hop", "walker_stand", "walker_walk", "walker_run"),
 )
 E = 3
@@ -57,7 +64,9 @@ def test_a_tanh_normal_with_the_bounds_of_the_spec_acts_within_them(make):
     env = make()
     spec = env.action_spec
     net = TensorDictModule(torch.nn.Linear(5, 2), in_keys=["actor"], out_keys=["both"])
-    split = TensorDictModule(lambda both: (both[..., :1], both[..., 1:].exp()), ["both"], ["loc", "scale"])
+    split = TensorDictModule(
+        lambda both: (both[..., :1], both[..., 1:].exp()), ["both"], ["loc", "scale"]
+    )
     policy = ProbabilisticActor(
         TensorDictSequential(net, split),
         in_keys=["loc", "scale"],
@@ -92,4 +101,6 @@ def test_a_batch_of_actions_that_are_not_finite_is_spoken_of_once(make):
             _, root = env.step_and_maybe_reset(root.set("action", some.fill_(torch.nan)))
     assert syncs.total == 0, syncs.report()
     (warning,) = caught
-    assert "no env's action is finite" in str(warning.message) and warning.category is RuntimeWarning
+    assert (
+        "no env's action is finite" in str(warning.message) and warning.category is RuntimeWarning
+    )

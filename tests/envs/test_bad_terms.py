@@ -66,7 +66,9 @@ def test_an_observation_that_is_no_tensor_is_refused_with_its_term():
         envs.build(config(observations={"actor": group}))
 
 
-@pytest.mark.parametrize("error", [KeyError("own"), RuntimeError("own"), ZeroDivisionError("own")], ids=repr)
+@pytest.mark.parametrize(
+    "error", [KeyError("own"), RuntimeError("own"), ZeroDivisionError("own")], ids=repr
+)
 def test_what_a_term_raises_is_told_with_its_term(error, capsys):
     with pytest.raises(type(error)) as raised:
         envs.build(config(rewards={"riddle": Riddle(given=error)}))
@@ -132,7 +134,9 @@ def test_complex_values_and_other_devices_are_refused_with_their_term():
 
 
 def test_a_level_that_is_no_tensor_is_refused_with_its_term():
-    with pytest.raises(ValueError, match="curriculum term 'steps' returns float: expected a tensor"):
+    with pytest.raises(
+        ValueError, match="curriculum term 'steps' returns float: expected a tensor"
+    ):
         envs.build(config(curriculum={"steps": Level()}))
 
 

@@ -119,7 +119,18 @@ def test_buffers_advance_once_per_env_step(way):
         assert rollout_ET["next", "obs", "count"][row, :, 0].tolist() == NEXTS[row]
         assert rollout_ET["command", "count"][row, :, 0].tolist() == ROOTS[row]
     # A row that ends keeps the command that its policy saw.
-    assert rollout_ET["next", "command", "count"][0, :, 0].tolist() == [2, 3, 4, 4, 2, 3, 4, 4, 2, 3]
+    assert rollout_ET["next", "command", "count"][0, :, 0].tolist() == [
+        2,
+        3,
+        4,
+        4,
+        2,
+        3,
+        4,
+        4,
+        2,
+        3,
+    ]
     # What outlives episodes is read once per step, and once more where an episode begins.
     assert rollout_ET["obs", "count"][0, :, 1].tolist() == [1, 2, 3, 4, 6, 7, 8, 9, 11, 12]
     # What all envs share advances in steps alone, whoever is reset.
@@ -131,7 +142,12 @@ def test_all_ways_give_the_same_bits():
     expected = stepped_by_hand(counting_env())
     for way, step in WAYS.items():
         found = step(counting_env())
-        for key in (("obs", "count"), ("obs", "position"), ("command", "count"), ("next", "obs", "count")):
+        for key in (
+            ("obs", "count"),
+            ("obs", "position"),
+            ("command", "count"),
+            ("next", "obs", "count"),
+        ):
             assert torch.equal(found[key], expected[key]), (way, key)
 
 
@@ -162,7 +178,9 @@ def test_it_is_a_good_env():
 def test_a_filter_of_the_library_advances_once_per_env_step():
     """As the same filter advances in a loop without any resets."""
     lagging = {"lag": ProjectedGravity(time_constant=0.1), "position": JointPos()}
-    group = ObservationGroupCfg(terms={name: ObservationTermCfg(term=term) for name, term in lagging.items()})
+    group = ObservationGroupCfg(
+        terms={name: ObservationTermCfg(term=term) for name, term in lagging.items()}
+    )
     env = ManagerBasedRlEnv(puck_cfg(observations={"actor": group, "critic": group}, limit=None))
     env.rollout(5, break_when_any_done=False)
     assert env.view.buffers.by_name()["observations/lag.steps_E"].tolist() == [6, 6, 6]

@@ -47,7 +47,10 @@ def env():
 def test_it_is_a_torchrl_env_of_many(env):
     assert isinstance(env, EnvBase) and env.is_vector_env is True
     assert env.unwrapped is env and env.device == torch.device("cpu")
-    assert env.cfg.decimation == 4 and env.num_envs == env.cfg.scene.num_envs == env.batch_size.numel() == 3
+    assert (
+        env.cfg.decimation == 4
+        and env.num_envs == env.cfg.scene.num_envs == env.batch_size.numel() == 3
+    )
     assert env.batch_size == torch.Size([3])
 
 
@@ -60,7 +63,9 @@ def test_metadata_names_the_versions_and_the_render_modes(env):
     }
 
 
-@pytest.mark.parametrize(("seconds", "steps"), [(0.0, 0), (0.19, 10), (0.2, 10), (0.201, 11), (20.0, 1000)])
+@pytest.mark.parametrize(
+    ("seconds", "steps"), [(0.0, 0), (0.19, 10), (0.2, 10), (0.201, 11), (20.0, 1000)]
+)
 def test_an_episode_lasts_the_steps_that_its_seconds_need(seconds, steps):
     cfg = puck_cfg(episode_length_s=seconds)
     env = ManagerBasedRlEnv(cfg)
@@ -114,9 +119,9 @@ NOTED = {
 def noted(base, **fields):
     """Return a term of a kind that notes when it is called."""
     kind, result = NOTED[base]
-    return dataclass(frozen=True, kw_only=True)(type(kind, (base,), {"__call__": _noted(kind, result)}))(
-        **fields
-    )
+    return dataclass(frozen=True, kw_only=True)(
+        type(kind, (base,), {"__call__": _noted(kind, result)})
+    )(**fields)
 
 
 def noted_env():
@@ -201,7 +206,9 @@ def test_managers_name_their_terms(env):
 
 
 def test_terms_draw_the_env_that_the_viewer_shows():
-    reach = mdp.CartesianCommand(resampling_time_range_s=None, position={"x": (0.5, 0.5)}, frame="root")
+    reach = mdp.CartesianCommand(
+        resampling_time_range_s=None, position={"x": (0.5, 0.5)}, frame="root"
+    )
     env = puck_env(limit=None, commands={"reach": reach})
     push(env, env.reset())
     assert "commands/reach" in env.setup_manager_visualizers()
@@ -219,7 +226,8 @@ def test_reset_has_torchrls_parameters_and_ours():
     names = [name for name in parameters if name != "self"]
     assert names[:1] == ["tensordict"] and {"seed", "env_ids", "options", "kwargs"} <= set(names)
     assert all(
-        parameters[name].kind is inspect.Parameter.KEYWORD_ONLY for name in ("seed", "env_ids", "options")
+        parameters[name].kind is inspect.Parameter.KEYWORD_ONLY
+        for name in ("seed", "env_ids", "options")
     )
 
 

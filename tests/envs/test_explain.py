@@ -22,7 +22,10 @@ def explained():
         observations={"actor": ObservationGroupCfg(terms=terms)},
         commands={"target": Target(resampling_time_range_s=(1.0, 2.5))},
         rewards={"position": Position(weight=0.5), "idle": Position(weight=0.0)},
-        events={"launch": Launch(speed=2.0), "kick": Kick(mode="interval", interval_range_s=(1.0, 1.0))},
+        events={
+            "launch": Launch(speed=2.0),
+            "kick": Kick(mode="interval", interval_range_s=(1.0, 1.0)),
+        },
         curriculum={"level": mdp.LinearLevel(end_step=8, initial_level=0.25)},
         metrics={"speed": Speed(reduce="max")},
     ).explain()
@@ -49,7 +52,10 @@ def test_each_manager_is_a_table_of_its_terms():
         ],
         "actions (1,)": ["0 push (1,) JointEffortAction()"],
         "commands": ["0 target (1,) 1 to 2.5 s Target()"],
-        "rewards (times 0.02 s)": ["0 position 0.5 Position()", "1 idle 0: not computed Position()"],
+        "rewards (times 0.02 s)": [
+            "0 position 0.5 Position()",
+            "1 idle 0: not computed Position()",
+        ],
         "terminations": [
             "0 beyond terminated Beyond(limit=0.25)",
             "1 time_out truncated TimeOut()",
@@ -86,7 +92,10 @@ def test_the_next_lines_say_whose_each_stage_of_a_substep_is_and_why():
     assert chosen.endswith("and here are 1 in 3")
     env = puck_env(limit=None, sim=SimCfg(solver="cg", one_kernel_dynamics=True))
     dynamics, _, _, solver, integration = env.explain().splitlines()[1:6]
-    assert solver == "constraints are solved by MuJoCo Warp's own solver, because the solver is not Newton's"
+    assert (
+        solver
+        == "constraints are solved by MuJoCo Warp's own solver, because the solver is not Newton's"
+    )
     for line in (dynamics, integration):
         assert line.endswith("own kernels, because the constraints are not solved by one kernel")
     env = puck_env(limit=None, sim=SimCfg(integrator="implicit", one_kernel_dynamics=True))
@@ -107,11 +116,16 @@ def test_callbacks_and_hooks_show_from_when_they_are_set_until_they_are_taken_aw
     assert lines[0] == f"what precedes constraints is computed by {reason}"
     assert lines[1].startswith("contacts are found by MuJoCo Warp's own kernels")
     assert lines[2] == f"constraint rows are made by {reason}"
-    assert lines[3:5] == ["constraints are solved by one kernel", "the state is advanced by one kernel"]
+    assert lines[3:5] == [
+        "constraints are solved by one kernel",
+        "the state is advanced by one kernel",
+    ]
     assert lines[5] == "callbacks of the program run in each substep: control"
     env.world.warp_model.callback.control = None
     env.world.warp_model.callback.sensor = lambda m, d, stage: None
-    assert env.explain().splitlines()[1] == before.splitlines()[1], "one of sensors has no part in the forces"
+    assert env.explain().splitlines()[1] == before.splitlines()[1], (
+        "one of sensors has no part in the forces"
+    )
     assert "callbacks of the program run in each substep: sensor" in env.explain()
     env.world.warp_model.callback.sensor = None
     assert env.explain() == before

@@ -10,14 +10,26 @@ from torchrl.envs.utils import check_env_specs
 
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.testing import count_syncs
-from tests.envs.probe_env import DT, Kick, Launch, RandomLaunch, Speed, Target, puck_cfg, puck_env, push
+from tests.envs.probe_env import (
+    DT,
+    Kick,
+    Launch,
+    RandomLaunch,
+    Speed,
+    Target,
+    puck_cfg,
+    puck_env,
+    push,
+)
 
 
 def glide(env, root_E, steps):
     """Step without force, resetting envs that end; return the list of `next` tensordicts."""
     nexts = []
     for _ in range(steps):
-        env_state_E, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(env.num_envs, 1)))
+        env_state_E, root_E = env.step_and_maybe_reset(
+            root_E.set("action", torch.zeros(env.num_envs, 1))
+        )
         nexts.append(env_state_E["next"].clone())
     return nexts, root_E
 
@@ -150,7 +162,9 @@ def test_physics_gone_bad_ends_that_env_and_is_gone_after_the_reset(speed):
     env_state_E, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(3, 1)))
     assert env_state_E["next", "terminated"][:, 0].tolist() == [False, False, True]
     assert all(torch.isfinite(leaf).all() for leaf in env_state_E.values(True, True))
-    twin_state_E, twin_root_E = twin.step_and_maybe_reset(twin_root_E.set("action", torch.zeros(3, 1)))
+    twin_state_E, twin_root_E = twin.step_and_maybe_reset(
+        twin_root_E.set("action", torch.zeros(3, 1))
+    )
     after, expected = push(env, root_E)["next"], push(twin, twin_root_E)["next"]
     assert torch.equal(after["obs", "position"][:2], expected["obs", "position"][:2])
     torch.testing.assert_close(after["obs", "position"][2], torch.tensor([3 * DT]))
@@ -234,7 +248,10 @@ def test_seed_returns_and_stores_the_seed_used():
 
 def test_state_dict_continues_bit_exactly():
     def fresh():
-        events = {"launch": RandomLaunch(), "kick": Kick(mode="interval", interval_range_s=(DT, 4 * DT))}
+        events = {
+            "launch": RandomLaunch(),
+            "kick": Kick(mode="interval", interval_range_s=(DT, 4 * DT)),
+        }
         command = {"target": Target(resampling_time_range_s=(DT, 3 * DT))}
         return puck_env(events=events, limit=0.1, commands=command)
 
@@ -257,7 +274,10 @@ def test_state_of_another_env_is_refused():
 
 
 def test_step_and_reset_never_make_the_host_wait():
-    events = {"launch": RandomLaunch(), "kick": Kick(mode="interval", interval_range_s=(DT, 4 * DT))}
+    events = {
+        "launch": RandomLaunch(),
+        "kick": Kick(mode="interval", interval_range_s=(DT, 4 * DT)),
+    }
     env = puck_env(
         events=events,
         limit=0.05,

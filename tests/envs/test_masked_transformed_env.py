@@ -62,7 +62,9 @@ def test_a_bare_masked_env_equals_a_stock_env():
 
 def test_a_stock_transformed_env_around_ours_is_right():
     around_transformed = TransformedEnv(fresh(), StepCounter(), auto_unwrap=False)
-    around_bare = TransformedEnv(MaskedCounterEnv((3, 5, 4, 7)), Compose(*full_chain(), StepCounter()))
+    around_bare = TransformedEnv(
+        MaskedCounterEnv((3, 5, 4, 7)), Compose(*full_chain(), StepCounter())
+    )
     plain = TransformedEnv(CounterEnv((3, 5, 4, 7)), Compose(*full_chain(), StepCounter()))
     for env in (around_transformed, around_bare, plain):
         check_env_specs(env)
@@ -168,10 +170,17 @@ def test_a_partial_reset_needs_a_root():
         ({"env_ids": torch.tensor([True, False, False, False])}, ValueError, "_reset"),
         ({"env_id": [1]}, TypeError, "did you mean 'env_ids'"),
         ({"options": {"a": 1}}, ValueError, "no reset options"),
-        ({"tensordict": TensorDict({"_reset": torch.ones(3, dtype=torch.bool)}, [])}, ValueError, "_reset"),
+        (
+            {"tensordict": TensorDict({"_reset": torch.ones(3, dtype=torch.bool)}, [])},
+            ValueError,
+            "_reset",
+        ),
         ({"tensordict": TensorDict({"_reset": torch.ones(4)}, [4])}, ValueError, "torch.bool"),
         (
-            {"env_ids": [0], "tensordict": TensorDict({"_reset": torch.ones(4, dtype=torch.bool)}, [4])},
+            {
+                "env_ids": [0],
+                "tensordict": TensorDict({"_reset": torch.ones(4, dtype=torch.bool)}, [4]),
+            },
             ValueError,
             "both",
         ),
@@ -208,7 +217,9 @@ def test_seeds_reach_env_and_transforms():
     assert not torch.equal(env.reset(seed=12)["actor"], first["actor"])
     drawn = env.seed()
     assert drawn >= 0
-    assert {int(transform.seed_value) for transform in held_transforms(env, KeyedTransform)} == {drawn}
+    assert {int(transform.seed_value) for transform in held_transforms(env, KeyedTransform)} == {
+        drawn
+    }
 
 
 def test_a_state_dict_continues_bit_exactly():

@@ -76,13 +76,19 @@ class BrokenCommand(Broken, CommandTerm):
 
 
 def group(**terms):
-    return {"actor": ObservationGroupCfg(terms={n: ObservationTermCfg(term=t) for n, t in terms.items()})}
+    return {
+        "actor": ObservationGroupCfg(
+            terms={n: ObservationTermCfg(term=t) for n, t in terms.items()}
+        )
+    }
 
 
 FAULTS = {
     "reward": lambda **at: {"rewards": {"fine": BrokenReward(step=-1), "odd": BrokenReward(**at)}},
     "metric": lambda **at: {"metrics": {"fine": BrokenMetric(step=-1), "odd": BrokenMetric(**at)}},
-    "command": lambda **at: {"commands": {"fine": BrokenCommand(step=-1), "odd": BrokenCommand(**at)}},
+    "command": lambda **at: {
+        "commands": {"fine": BrokenCommand(step=-1), "odd": BrokenCommand(**at)}
+    },
     "observation": lambda **at: {
         "observations": group(fine=BrokenObservation(step=-1, width=3), odd=BrokenObservation(**at))
     },
@@ -105,7 +111,9 @@ def test_the_term_is_named_with_env_and_step(kind, value):
     assert line.startswith(f"{said} 'odd' is not finite: first in env 2 at its step 3, 1 numbers")
     assert float(env.episode_log()["non_finite_terms"]) == 1.0
     env.episode_log_reset_()
-    assert float(env.episode_log()["non_finite_terms"]) == 1.0, "of the env's life, not of a rollout"
+    assert float(env.episode_log()["non_finite_terms"]) == 1.0, (
+        "of the env's life, not of a rollout"
+    )
     assert line in env.explain(width=200)
 
 

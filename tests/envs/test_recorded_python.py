@@ -67,7 +67,9 @@ def test_what_the_first_step_fills_is_a_cache():
 
 def test_what_the_second_step_changes_is_refused():
     env = puck_env(rewards={"remembering": Remembering()})
-    with pytest.raises(FrozenPythonError, match=r"rewards\.remembering\.seen\[\d\] was \(absent\) and is 1"):
+    with pytest.raises(
+        FrozenPythonError, match=r"rewards\.remembering\.seen\[\d\] was \(absent\) and is 1"
+    ):
         known(env)
 
 
@@ -113,7 +115,9 @@ def test_what_others_do_counts_as_well():
 def test_a_policy_that_asks_for_the_time_is_refused():
     env = puck_env()
     python, step = RecordedPython(env, {"policy": time.time}), stepping(env)
-    with pytest.raises(FrozenPythonError, match=r"asks for a clock, by time\.time at test_recorded_python"):
+    with pytest.raises(
+        FrozenPythonError, match=r"asks for a clock, by time\.time at test_recorded_python"
+    ):
         while not python.is_known:
             with python.calling():
                 step()
@@ -138,7 +142,12 @@ def test_parts_have_the_names_of_the_config():
         puck_env(episode_length_s=1.0), ObservationScale([("obs", "position")], scale=2.0)
     )
     names = set(python_parts(env))
-    assert {"rewards.position", "events.launch", "terminations.beyond", "terminations.time_out"} <= names
+    assert {
+        "rewards.position",
+        "events.launch",
+        "terminations.beyond",
+        "terminations.time_out",
+    } <= names
     assert {
         "observations.last_action",
         "actions.push",
@@ -176,7 +185,9 @@ def test_what_managers_have_read_is_refused_with_what_to_do_instead(term, name, 
     python = known(env)
     kind, of = term.split(".")
     object.__setattr__(getattr(env.cfg, kind)[of], name, value)
-    with pytest.raises(FrozenPythonError, match=rf"{term}\.{name} was .*, without effect: .*{instead}"):
+    with pytest.raises(
+        FrozenPythonError, match=rf"{term}\.{name} was .*, without effect: .*{instead}"
+    ):
         python.changes()
 
 
@@ -185,7 +196,10 @@ def test_what_a_step_reads_of_the_config_follows():
     python = known(env)
     object.__setattr__(env.cfg, "decimation", 2)
     object.__setattr__(env.cfg.events["launch"], "speed", 3.0)
-    assert changes(python) == ["events.launch.speed was 1.0 and is 3.0", "env.cfg.decimation was 4 and is 2"]
+    assert changes(python) == [
+        "events.launch.speed was 1.0 and is 3.0",
+        "env.cfg.decimation was 4 and is 2",
+    ]
 
 
 class Graph:

@@ -57,7 +57,9 @@ def test_a_wrong_override_names_the_near_fields(override, message):
 
 
 def test_make_gives_the_env_ready_to_train_on():
-    env = envs.make("cartpole_balance", num_envs=4, seed=3, overrides=["task.episode_length_s=0.05"])
+    env = envs.make(
+        "cartpole_balance", num_envs=4, seed=3, overrides=["task.episode_length_s=0.05"]
+    )
     root_E = env.reset()
     assert root_E["actor"].shape == (4, 5) and root_E["critic"].shape == (4, 5)
     assert env.action_spec.shape == (4, 1) and env.base_env.cfg.seed == 3

@@ -29,7 +29,9 @@ def spoil_caches(env: ManagerBasedRlEnv) -> None:
         cache.update({name: tree_map(spoiled, value) for name, value in cache.items()})
 
 
-def roots(env: ManagerBasedRlEnv, chosen: Tensor, spoil: Callable[[], None]) -> list[dict[str, Tensor]]:
+def roots(
+    env: ManagerBasedRlEnv, chosen: Tensor, spoil: Callable[[], None]
+) -> list[dict[str, Tensor]]:
     env.seed(3)
     root, seen = env.reset(), []
     for action_EL in chosen:
@@ -48,7 +50,9 @@ def test_no_step_reads_what_an_earlier_one_computed(kind, tmp_path):
         chosen = actions(STEPS, env)
     else:
         env = busy_env(write_clip(tmp_path / "clip.npz"))
-        chosen = torch.sin(torch.arange(STEPS * env.num_envs, dtype=torch.float32)).view(STEPS, -1, 1)
+        chosen = torch.sin(torch.arange(STEPS * env.num_envs, dtype=torch.float32)).view(
+            STEPS, -1, 1
+        )
     start = {key: value.clone() for key, value in env.state_dict().items()}
     expected = roots(env, chosen, lambda: None)
     env.load_state_dict(start)

@@ -15,7 +15,9 @@ from ksim_rl.physics.nan_guard.guard import NanGuardCfg
 from tests.envs.probe_env import Kick, RandomLaunch, puck_cfg, puck_env
 
 WALL_AT = 5.0
-BALLS = "".join(f'<geom type="sphere" size="0.1" mass="1" pos="0 {0.3 * index} 0"/>' for index in range(12))
+BALLS = "".join(
+    f'<geom type="sphere" size="0.1" mass="1" pos="0 {0.3 * index} 0"/>' for index in range(12)
+)
 SLED_XML = f"""
 <mujoco model="sled">
   <option timestep="0.005" gravity="0 0 0" integrator="implicitfast"/>
@@ -77,7 +79,10 @@ def test_numbers_of_the_config_stay_and_what_is_lost_is_told():
 
 def test_a_rehearsal_leaves_no_trace(tmp_path):
     fields = {
-        "events": {"launch": RandomLaunch(), "kick": Kick(mode="interval", interval_range_s=(0.04, 0.1))}
+        "events": {
+            "launch": RandomLaunch(),
+            "kick": Kick(mode="interval", interval_range_s=(0.04, 0.1)),
+        }
     }
     sim = SimCfg(nan_guard=NanGuardCfg(folder=str(tmp_path)))
     new, rehearsed = (puck_env(episode_length_s=0.5, sim=sim, **fields) for _ in range(2))

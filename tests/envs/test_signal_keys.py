@@ -29,7 +29,11 @@ NESTED = SignalKeys(*(("agent", name) for name in SignalKeys._fields))
 
 def test_keys_are_the_envs_own_however_it_is_wrapped():
     check_env_specs(NestedSignals(LENGTHS))
-    for wrap in (lambda env: env, MaskedTransformedEnv, lambda env: SerialEnv(2, lambda: CounterEnv(()))):
+    for wrap in (
+        lambda env: env,
+        MaskedTransformedEnv,
+        lambda env: SerialEnv(2, lambda: CounterEnv(())),
+    ):
         assert signal_keys(wrap(CounterEnv(LENGTHS))) == SignalKeys()
     assert (
         signal_keys(NestedSignals(LENGTHS))
@@ -57,7 +61,12 @@ def learned(env, observation):
     critic = make_critic(CriticCfg(**observed), obs_dim=1)
     data = DatasetCfg(num_env_states_per_minibatch=12, num_minibatches=2)
     update = PPOUpdate(
-        PPOCfg(num_epochs=2), actor=actor, critic=critic, data=data, seed=0, signals=signal_keys(env)
+        PPOCfg(num_epochs=2),
+        actor=actor,
+        critic=critic,
+        data=data,
+        seed=0,
+        signals=signal_keys(env),
     )
     collector = RolloutCollector(env, actor, rollout_length=8, keys=update.rollout_keys)
     for _ in range(2):
@@ -93,10 +102,14 @@ def amp(wrap, signals):
 
 def distillation(wrap, signals):
     env = wrap(DriftEnv)(16)
-    student = make_actor(ActorCfg(hidden_dims=(), obs_normalization=False), obs_dim=len(BINS), action_dim=1)
+    student = make_actor(
+        ActorCfg(hidden_dims=(), obs_normalization=False), obs_dim=len(BINS), action_dim=1
+    )
     data = DatasetCfg(num_env_states_per_minibatch=48, num_minibatches=2)
     cfg = DistillationCfg(teacher="toy")
-    return env, DistillationUpdate(cfg, actor=student, teacher=linear_teacher(), data=data, signals=signals)
+    return env, DistillationUpdate(
+        cfg, actor=student, teacher=linear_teacher(), data=data, signals=signals
+    )
 
 
 @pytest.mark.parametrize("problem", [off_policy, amp, distillation])
@@ -111,16 +124,21 @@ def test_other_algorithms_learn_the_same_where_signals_are_nested(problem):
         length = update.num_env_states // 16
         before = {name: net.state_dict() for name, net in update.networks.items()}
         before = {
-            name: {key: value.clone() for key, value in state.items()} for name, state in before.items()
+            name: {key: value.clone() for key, value in state.items()}
+            for name, state in before.items()
         }
-        collector = RolloutCollector(env, update.behavior, rollout_length=length, keys=update.rollout_keys)
+        collector = RolloutCollector(
+            env, update.behavior, rollout_length=length, keys=update.rollout_keys
+        )
         for ends in (False, True):
             rollout_ET = collector.collect()
             assert rollout_ET[signals.following[1]].any() == ends
             update(rollout_ET)
         after = {name: net.state_dict() for name, net in update.networks.items()}
         assert any(
-            not torch.equal(before[name][key], value) for name in after for key, value in after[name].items()
+            not torch.equal(before[name][key], value)
+            for name in after
+            for key, value in after[name].items()
         )
         found.append(update.state_dict())
     torch.testing.assert_close(*(flat(state) for state in found), rtol=0, atol=0)
@@ -130,5 +148,7 @@ def flat(state, name=""):
     if not isinstance(state, Mapping):
         return {name: state}
     return {
-        key: value for part, inner in state.items() for key, value in flat(inner, f"{name}/{part}").items()
+        key: value
+        for part, inner in state.items()
+        for key, value in flat(inner, f"{name}/{part}").items()
     }

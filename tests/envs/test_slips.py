@@ -133,8 +133,18 @@ def adding(kind, term):
 ONE = "one value per env"
 ROW = "one row per env"
 SLIPS = {
-    "reward without return": ("rewards", Reward, nothing, f"reward term 'mine' returns NoneType: .* {ONE}"),
-    "reward of a float": ("rewards", Reward, lambda v: 1.0, f"reward term 'mine' returns float: .* {ONE}"),
+    "reward without return": (
+        "rewards",
+        Reward,
+        nothing,
+        f"reward term 'mine' returns NoneType: .* {ONE}",
+    ),
+    "reward of a float": (
+        "rewards",
+        Reward,
+        lambda v: 1.0,
+        f"reward term 'mine' returns float: .* {ONE}",
+    ),
     "reward of an array": (
         "rewards",
         Reward,
@@ -147,7 +157,12 @@ SLIPS = {
         pos,
         rf"reward term 'mine' returns torch.float32 \(3, 2\): .* {ONE}",
     ),
-    "reward with a leaf dim": ("rewards", Reward, lambda v: pos(v)[:, :1], r"reward term 'mine' .*\(3, 1\)"),
+    "reward with a leaf dim": (
+        "rewards",
+        Reward,
+        lambda v: pos(v)[:, :1],
+        r"reward term 'mine' .*\(3, 1\)",
+    ),
     "reward of all envs": (
         "rewards",
         Reward,
@@ -173,7 +188,12 @@ SLIPS = {
         "'mine' .*expected torch.bool",
     ),
     "metric without return": ("metrics", Metric, nothing, "metric term 'mine' returns NoneType"),
-    "metric by joint": ("metrics", Metric, pos, r"metric term 'mine' returns torch.float32 \(3, 2\)"),
+    "metric by joint": (
+        "metrics",
+        Metric,
+        pos,
+        r"metric term 'mine' returns torch.float32 \(3, 2\)",
+    ),
     "command without return": (
         "commands",
         Command,
@@ -187,7 +207,12 @@ SLIPS = {
         lambda v: pos(v)[:, 0],
         r"'mine' returns shape \(3,\)",
     ),
-    "command that is transposed": ("commands", Command, lambda v: pos(v).T, r"'mine' returns shape \(2, 3\)"),
+    "command that is transposed": (
+        "commands",
+        Command,
+        lambda v: pos(v).T,
+        r"'mine' returns shape \(2, 3\)",
+    ),
     "command that changes": (
         "commands",
         Command,
@@ -207,8 +232,18 @@ SLIPS = {
         "curriculum term 'mine' returns float",
     ),
     "action without a size": ("actions", Action, nothing, r"actions.mine: size\(\) returns None"),
-    "action of a float's size": ("actions", Action, lambda v: 1.0, r"actions.mine: size\(\) returns 1.0"),
-    "action of no column": ("actions", Action, lambda v: 0, "actions.mine: it takes no number of the action"),
+    "action of a float's size": (
+        "actions",
+        Action,
+        lambda v: 1.0,
+        r"actions.mine: size\(\) returns 1.0",
+    ),
+    "action of no column": (
+        "actions",
+        Action,
+        lambda v: 0,
+        "actions.mine: it takes no number of the action",
+    ),
     "event of a wrong width": (
         "events",
         Event,
@@ -219,8 +254,14 @@ SLIPS = {
 OBSERVATIONS = {
     "no return": (nothing, f"observations.mine: returns NoneType: expected a tensor, {ROW}"),
     "a float": (lambda v: 1.0, "observations.mine: returns float"),
-    "transposed": (lambda v: pos(v).T, rf"'mine' returns torch.float32 \(2, 3\): .*\[3, L\], {ROW}"),
-    "no leaf dim": (lambda v: pos(v)[:, 0], r"observation term 'mine' returns torch.float32 \(3,\)"),
+    "transposed": (
+        lambda v: pos(v).T,
+        rf"'mine' returns torch.float32 \(2, 3\): .*\[3, L\], {ROW}",
+    ),
+    "no leaf dim": (
+        lambda v: pos(v)[:, 0],
+        r"observation term 'mine' returns torch.float32 \(3,\)",
+    ),
     "float64": (lambda v: pos(v).double(), "observation term 'mine' returns torch.float64"),
     "another width later": (narrower_later, r"'mine' .* \(3, 1\), and first had shape \(3, 2\)"),
 }
@@ -269,7 +310,10 @@ class Own(Transform):
 
 TRANSFORMS = {
     "wider": (lambda obs: torch.cat((obs, obs), -1), r"is torch.float32 \(3, 10\), and .*\(3, 5\)"),
-    "float64": (lambda obs: obs.double(), r"is torch.float64 \(3, 5\), and .* torch.float32 \(3, 5\)"),
+    "float64": (
+        lambda obs: obs.double(),
+        r"is torch.float64 \(3, 5\), and .* torch.float32 \(3, 5\)",
+    ),
     "no leaf dim": (lambda obs: obs[..., 0], r"is torch.float32 \(3,\), and"),
     "no return": (lambda obs: None, "is NonTensorData, and"),
 }
@@ -282,7 +326,8 @@ def test_a_transform_of_a_wrong_shape_is_named(slip):
     env = envs.build(base())
     env.append_transform(Own(make))
     with pytest.raises(
-        AssertionError, match=rf"\[values\] observation 'actor', written by transform 1, Own, {message}"
+        AssertionError,
+        match=rf"\[values\] observation 'actor', written by transform 1, Own, {message}",
     ):
         check_env(env, skip=SLOW)
 
@@ -312,7 +357,8 @@ class Halving(Own):
 
 def test_a_tasks_own_transform_of_a_wrong_shape_is_refused_by_name():
     with pytest.raises(
-        ValueError, match=r"task.transforms.mine: observation 'actor' is torch.float32 \(3, 10\), and"
+        ValueError,
+        match=r"task.transforms.mine: observation 'actor' is torch.float32 \(3, 10\), and",
     ):
         envs.build(base(transforms={"mine": TransformCfg(Doubling)}))
 
@@ -329,5 +375,7 @@ def test_a_tasks_own_transform_that_fits_changes_no_draw():
 def test_check_env_names_what_is_not_a_number_and_nothing_else(kind, term):
     env = envs.build(adding(kind, term(make=lambda view: pos(view)[:, 0] * torch.nan)))
     name = "reward" if kind == "rewards" else "metric"
-    with pytest.raises(AssertionError, match=rf"has 1 findings:\n\[values\] {name} 'mine' is not finite"):
+    with pytest.raises(
+        AssertionError, match=rf"has 1 findings:\n\[values\] {name} 'mine' is not finite"
+    ):
         check_env(env, skip=SLOW)

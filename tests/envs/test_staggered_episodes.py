@@ -13,7 +13,9 @@ def ends(env, steps):
     root_E, done = env.reset(), []
     env.stagger_episodes_()
     for _ in range(steps):
-        env_state_E, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(env.num_envs, 1)))
+        env_state_E, root_E = env.step_and_maybe_reset(
+            root_E.set("action", torch.zeros(env.num_envs, 1))
+        )
         done.append(env_state_E["next", "done"][:, 0].clone())
     return torch.stack(done)
 

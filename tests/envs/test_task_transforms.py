@@ -6,7 +6,13 @@ import pytest
 import torch
 
 from ksim_rl import envs
-from ksim_rl.envs.transforms import ActionDelay, DelayCfg, EpisodeTracker, ObservationClip, TransformCfg
+from ksim_rl.envs.transforms import (
+    ActionDelay,
+    DelayCfg,
+    EpisodeTracker,
+    ObservationClip,
+    TransformCfg,
+)
 
 LAG = "+task.transforms.lag={_target_: ksim_rl.envs.transforms.ActionDelay, delay: {min_lag: 1, max_lag: 2}}"
 COUNT = "+task.transforms.count={_target_: torchrl.envs.transforms.StepCounter, max_steps: 50}"
@@ -84,7 +90,9 @@ def test_a_stock_transform_that_reads_what_no_env_emits_is_named():
 def test_python_gives_descriptions_rather_than_transforms():
     cfg = envs.make_cfg("cartpole_balance")
     lag = TransformCfg(ActionDelay, delay=DelayCfg(max_lag=2))
-    cfg = dataclasses.replace(cfg, transforms={"lag": lag, "episodes": TransformCfg(EpisodeTracker)})
+    cfg = dataclasses.replace(
+        cfg, transforms={"lag": lag, "episodes": TransformCfg(EpisodeTracker)}
+    )
     tree = envs.to_tree(cfg, envs.ManagerBasedRlEnvCfg)
     assert envs.from_tree(envs.ManagerBasedRlEnvCfg, tree) == cfg
     assert list(tree["transforms"]) == ["lag", "episodes"]

@@ -88,18 +88,24 @@ def test_a_reward_that_moves_the_robot_is_refused_at_build_whatever_the_way(way)
 
 @pytest.mark.parametrize("way", PAST_TORCH)
 def test_a_write_past_torch_that_zeros_would_not_show_is_refused_at_build(way):
-    with pytest.raises(ValueError, match=r"rewards\.bad: BadReward changes view\.world\.qpos_EL past torch"):
+    with pytest.raises(
+        ValueError, match=r"rewards\.bad: BadReward changes view\.world\.qpos_EL past torch"
+    ):
         env_with("rewards", BadReward(deed=PAST_TORCH[way]))
 
 
 @pytest.mark.parametrize("kind", TERMS)
 def test_each_kind_of_term_is_refused(kind):
-    with pytest.raises(ValueError, match=rf"{kind}\.bad: Bad\w+ writes into view\.joint_pos_EL in place"):
+    with pytest.raises(
+        ValueError, match=rf"{kind}\.bad: Bad\w+ writes into view\.joint_pos_EL in place"
+    ):
         env_with(kind, TERMS[kind](deed=by_operator))
 
 
 def test_the_draw_of_a_command_is_refused_too():
-    with pytest.raises(ValueError, match=r"commands\.bad: BadDraw writes into view\.joint_pos_EL in place"):
+    with pytest.raises(
+        ValueError, match=r"commands\.bad: BadDraw writes into view\.joint_pos_EL in place"
+    ):
         env_with("commands", BadDraw(deed=by_operator))
 
 
@@ -150,7 +156,9 @@ def test_no_term_changes_what_others_read(quantity):
     from tests.envs.probe_env import Position
 
     rewards = {"position": Position(), "peak": Peak(), "bad": BadReward(deed=QUANTITIES[quantity])}
-    with pytest.raises(ValueError, match=rf"rewards\.bad: BadReward writes into {quantity} in place"):
+    with pytest.raises(
+        ValueError, match=rf"rewards\.bad: BadReward writes into {quantity} in place"
+    ):
         env_with("rewards", None, rewards=rewards)
 
 
@@ -158,7 +166,9 @@ def test_a_quantity_that_a_term_is_the_first_to_read_is_not_its_own():
     def deed(view: EnvView) -> None:
         view.episode_time_E.numpy()[:] += 1.0
 
-    with pytest.raises(ValueError, match=r"rewards\.bad: BadReward changes view\.episode_time_E past torch"):
+    with pytest.raises(
+        ValueError, match=r"rewards\.bad: BadReward changes view\.episode_time_E past torch"
+    ):
         env_with("rewards", BadReward(deed=deed))
 
 
@@ -173,9 +183,13 @@ def test_what_is_a_terms_own_it_may_write_as_it_likes():
 
 def test_a_reward_may_not_write_state_by_the_view_either():
     def deed(view: EnvView) -> None:
-        view.joints().write_pos(torch.zeros(view.num_envs, dtype=torch.bool), torch.zeros(view.num_envs, 1))
+        view.joints().write_pos(
+            torch.zeros(view.num_envs, dtype=torch.bool), torch.zeros(view.num_envs, 1)
+        )
 
-    with pytest.raises(ValueError, match=r"rewards\.bad: BadReward writes into .* a reward only reads"):
+    with pytest.raises(
+        ValueError, match=r"rewards\.bad: BadReward writes into .* a reward only reads"
+    ):
         env_with("rewards", BadReward(deed=deed))
 
 
@@ -183,7 +197,9 @@ def test_a_reward_may_not_write_state_by_the_view_either():
 
 
 def unmasked(view: EnvView) -> None:
-    view.joints().write_pos(torch.ones(view.num_envs, dtype=torch.bool), torch.full((view.num_envs, 1), 0.5))
+    view.joints().write_pos(
+        torch.ones(view.num_envs, dtype=torch.bool), torch.full((view.num_envs, 1), 0.5)
+    )
 
 
 def press_all(view: EnvView) -> None:
@@ -203,7 +219,8 @@ def test_an_event_writes_positions_and_velocities_by_the_view_only():
         view.world.qvel_EL[:, 0] *= 1.0
 
     with pytest.raises(
-        ValueError, match=r"events\.bad: .*qvel_EL.*Write positions and velocities by `view\.write_qpos`"
+        ValueError,
+        match=r"events\.bad: .*qvel_EL.*Write positions and velocities by `view\.write_qpos`",
     ):
         env_with("events", TERMS["events"](deed=deed))
 
@@ -213,7 +230,9 @@ def test_who_may_write_much_may_not_write_what_managers_keep(kind):
     def deed(view: EnvView) -> None:
         view.action_EL.mul_(2.0)
 
-    with pytest.raises(ValueError, match=rf"{kind}\.bad: Bad\w+ writes into view\.action_EL in place"):
+    with pytest.raises(
+        ValueError, match=rf"{kind}\.bad: Bad\w+ writes into view\.action_EL in place"
+    ):
         env_with(kind, TERMS[kind](deed=deed))
 
 
@@ -232,7 +251,8 @@ def test_a_command_draws_for_the_rows_of_its_mask():
         view.buffer("target_E").add_(1.0)
 
     with pytest.raises(
-        ValueError, match=r"commands\.bad: BadDraw changes the buffer .* in rows outside of its mask"
+        ValueError,
+        match=r"commands\.bad: BadDraw changes the buffer .* in rows outside of its mask",
     ):
         env_with("commands", BadDraw(deed=deed))
 
@@ -265,7 +285,8 @@ class BadMotor:
 def test_the_law_of_an_actuator_is_refused_too():
     scene = SceneCfg(robots={"puck": BadMotor()}, num_envs=2)
     with pytest.raises(
-        ValueError, match=r"actuators\.0: BadActuator writes into .*qpos_EL.* the law of an actuator only"
+        ValueError,
+        match=r"actuators\.0: BadActuator writes into .*qpos_EL.* the law of an actuator only",
     ):
         puck_env(scene=scene, actions={"push": mdp.JointPositionAction(joints="rail")})
 
@@ -333,7 +354,9 @@ def test_a_write_past_torch_is_found_while_a_step_is_compiled(later, monkeypatch
     policy = lambda td: td.set("action", torch.zeros(3, 1))  # noqa: E731
     collector = RolloutCollector(later, policy, rollout_length=2, cfg=CollectorCfg(compile=True))
     later.reset()
-    with pytest.raises(ValueError, match=r"rewards\.bad: BadLater changes view\.world\.qpos_EL past torch"):
+    with pytest.raises(
+        ValueError, match=r"rewards\.bad: BadLater changes view\.world\.qpos_EL past torch"
+    ):
         collector.collect()
 
 
@@ -364,7 +387,9 @@ def test_a_step_of_an_env_that_was_built_is_not_watched(monkeypatch):
 
 def test_the_rehearsal_leaves_no_trace():
     env = env_with("rewards", Peak())
-    assert not env.world.qpos_EL.any() and not env.world.qvel_EL.any() and not env.world.ctrl_EL.any()
+    assert (
+        not env.world.qpos_EL.any() and not env.world.qvel_EL.any() and not env.world.ctrl_EL.any()
+    )
     for name, buffer in env.view.buffers.by_name().items():
         assert not buffer.any(), name
     assert not env.non_finite_terms()

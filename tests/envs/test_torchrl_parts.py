@@ -105,7 +105,9 @@ WRAPS = {
     "bare": lambda cast: TransformedEnv(bounded_puck(), cast()),
     "around ours": lambda cast: TransformedEnv(MaskedTransformedEnv(bounded_puck()), cast()),
     "in ours": lambda cast: MaskedTransformedEnv(bounded_puck(), cast()),
-    "around stock": lambda cast: TransformedEnv(TransformedEnv(bounded_puck(), StepCounter()), cast()),
+    "around stock": lambda cast: TransformedEnv(
+        TransformedEnv(bounded_puck(), StepCounter()), cast()
+    ),
     "appended": lambda cast: TransformedEnv(bounded_puck()).append_transform(cast()),
 }
 
@@ -147,7 +149,9 @@ def test_an_env_with_random_actions_of_its_own_keeps_them():
 @pytest.mark.parametrize("make", [puck_env, pucks])
 @pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, pickle.dumps])
 def test_a_copy_says_how_to_make_a_second_env(make, how):
-    with pytest.raises(TypeError, match=r"make a second one with ksim_rl\.envs\.build\(env\.cfg") as raised:
+    with pytest.raises(
+        TypeError, match=r"make a second one with ksim_rl\.envs\.build\(env\.cfg"
+    ) as raised:
         how(make())
     assert "\n" not in str(raised.value)
 
@@ -245,4 +249,7 @@ def test_an_env_without_terms_glides():
     assert env.full_action_spec["action"].shape == (3, 0)
     check_env_specs(env)
     assert env.rollout(3).shape == (3, 3)
-    assert envs.build(ManagerBasedRlEnvCfg(decimation=2, scene=cfg.scene)).rollout(3).shape == (3, 3)
+    assert envs.build(ManagerBasedRlEnvCfg(decimation=2, scene=cfg.scene)).rollout(3).shape == (
+        3,
+        3,
+    )

@@ -31,7 +31,9 @@ def test_resets_refuse_another_batch_size():
 def test_flags_that_a_reset_left_out_are_completed():
     root = TensorDict({"done": torch.ones(3, 1, dtype=torch.bool)}, [3])
     upstream.complete_done(CounterEnv((3, 4, 5)), root)
-    assert root["terminated"].all() and root["terminated"].shape == (3, 1), f"{TORCHRL}: _complete_done"
+    assert root["terminated"].all() and root["terminated"].shape == (3, 1), (
+        f"{TORCHRL}: _complete_done"
+    )
 
 
 def test_names_are_kept_where_none_is_given():
@@ -49,7 +51,9 @@ def test_the_hooks_that_envs_override_are_called(hook, monkeypatch):
     called = []
     original = getattr(MaskedTransformedEnv, hook)
     monkeypatch.setattr(
-        MaskedTransformedEnv, hook, lambda self, *given: called.append(hook) or original(self, *given)
+        MaskedTransformedEnv,
+        hook,
+        lambda self, *given: called.append(hook) or original(self, *given),
     )
     env = MaskedTransformedEnv(CounterEnv((3, 4)))
     env.rollout(2)

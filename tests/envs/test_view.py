@@ -5,7 +5,16 @@ import math
 import pytest
 import torch
 
-from tests.envs.random_states import FIXED_BASE, SITE, E, close, engine, random_bench, scalar_joints, velocity
+from tests.envs.random_states import (
+    FIXED_BASE,
+    SITE,
+    E,
+    close,
+    engine,
+    random_bench,
+    scalar_joints,
+    velocity,
+)
 from tests.mdp.bench import FREE_BODY
 
 
@@ -26,8 +35,12 @@ def bench(request):
 
 
 def test_joint_quantities(bench):
-    close(bench.view.joint_pos_EL, engine(bench, lambda m, d: d.qpos[m.jnt_qposadr[scalar_joints(m)]]))
-    close(bench.view.joint_vel_EL, engine(bench, lambda m, d: d.qvel[m.jnt_dofadr[scalar_joints(m)]]))
+    close(
+        bench.view.joint_pos_EL, engine(bench, lambda m, d: d.qpos[m.jnt_qposadr[scalar_joints(m)]])
+    )
+    close(
+        bench.view.joint_vel_EL, engine(bench, lambda m, d: d.qvel[m.jnt_dofadr[scalar_joints(m)]])
+    )
     close(bench.view.joint_pos_rel_EL, bench.view.joint_pos_EL - bench.view.default_joint_pos_EL)
 
 
@@ -44,12 +57,19 @@ def test_root_pose(bench):
     root = 1
     close(bench.view.root_pos_EL, engine(bench, lambda m, d: d.xpos[root]))
     quat = engine(bench, lambda m, d: d.xquat[root])
-    close(bench.view.root_quat_EL * torch.sign((bench.view.root_quat_EL * quat).sum(-1, keepdim=True)), quat)
+    close(
+        bench.view.root_quat_EL
+        * torch.sign((bench.view.root_quat_EL * quat).sum(-1, keepdim=True)),
+        quat,
+    )
     close(
         bench.view.projected_gravity_EL,
         engine(bench, lambda m, d: d.xmat[root].reshape(3, 3).T @ [0.0, 0.0, -1.0]),
     )
-    close(bench.view.heading_E, engine(bench, lambda m, d: math.atan2(d.xmat[root][3], d.xmat[root][0])))
+    close(
+        bench.view.heading_E,
+        engine(bench, lambda m, d: math.atan2(d.xmat[root][3], d.xmat[root][0])),
+    )
 
 
 @pytest.mark.parametrize("part", ["linear", "angular"])

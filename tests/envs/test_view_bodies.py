@@ -92,7 +92,9 @@ def test_one_body_and_one_site_by_name(bench):
             assert torch.equal(one, all_of_them[:, number])
     sites = view.sites(".*")
     site = view.site(sites.names[0])
-    assert torch.equal(site.pos_EL, sites.pos_EN3[:, 0]) and torch.equal(site.height_E, sites.height_EN[:, 0])
+    assert torch.equal(site.pos_EL, sites.pos_EN3[:, 0]) and torch.equal(
+        site.height_E, sites.height_EN[:, 0]
+    )
     assert torch.equal(site.lin_vel_EL, sites.lin_vel_EN3[:, 0])
     with pytest.raises(ValueError, match="name one of them"):
         view.body(".*")

@@ -26,7 +26,9 @@ def test_writes_touch_masked_rows_only():
     check_rows(mask_E, world.qpos_EL, qpos, new_qpos)
     view.write_qvel(mask_E, torch.arange(8.0).expand(E, -1))
     check_rows(mask_E, world.qvel_EL, qvel, torch.arange(8.0))
-    view.write_root_pose(mask_E, torch.full((E, 3), 7.0), torch.tensor([0.0, 0, 1, 0]).expand(E, -1))
+    view.write_root_pose(
+        mask_E, torch.full((E, 3), 7.0), torch.tensor([0.0, 0, 1, 0]).expand(E, -1)
+    )
     check_rows(mask_E, world.qpos_EL, qpos, torch.tensor([7.0, 7, 7, 0, 0, 1, 0, 0.1, 0.2]))
 
 

@@ -16,7 +16,9 @@ def said(cell: nbformat.NotebookNode) -> str:
 def test_it_is_committed_without_outputs() -> None:
     cells = nbformat.read(NOTEBOOK, as_version=4).cells
     assert all(
-        not cell.outputs and cell.execution_count is None for cell in cells if cell.cell_type == "code"
+        not cell.outputs and cell.execution_count is None
+        for cell in cells
+        if cell.cell_type == "code"
     )
 
 
@@ -29,7 +31,9 @@ def test_it_runs_from_top_to_bottom(tmp_path: Path) -> None:
     assert "one step late: True" in said(code[3])
     assert "return_mean" in said(code[4])
     pictures = [
-        cell for cell in code if any("image/png" in output.get("data", {}) for output in cell.outputs)
+        cell
+        for cell in code
+        if any("image/png" in output.get("data", {}) for output in cell.outputs)
     ]
     assert len(pictures) == 2
     assert not list(tmp_path.iterdir())  # it leaves nothing behind

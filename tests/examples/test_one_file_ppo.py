@@ -39,7 +39,11 @@ def test_it_trains_cartpole_and_reports_speed_and_return(capsys):
 
 def test_settings_are_the_tasks_but_for_what_is_given():
     settings = _example().read_settings(SMALL)
-    assert (settings.num_envs, settings.data.num_env_states, settings.objective.num_epochs) == (16, 256, 2)
+    assert (settings.num_envs, settings.data.num_env_states, settings.objective.num_epochs) == (
+        16,
+        256,
+        2,
+    )
     assert settings.actor.hidden_dims == (16, 16) and settings.critic.hidden_dims == (64, 64)
     assert settings.objective.clip_value is False
 
@@ -67,9 +71,15 @@ def test_an_update_changes_the_networks_as_the_trainers_update_does():
     torch.manual_seed(0)
     twin = example.PPO(settings, env)
     theirs = PPOUpdate(
-        settings.objective, actor=twin.actor, critic=twin.critic, data=settings.data, seed=settings.seed
+        settings.objective,
+        actor=twin.actor,
+        critic=twin.critic,
+        data=settings.data,
+        seed=settings.seed,
     )
-    rollout_ET = RolloutCollector(env, ours.actor, rollout_length=16, keys=ours.rollout_keys).collect()
+    rollout_ET = RolloutCollector(
+        env, ours.actor, rollout_length=16, keys=ours.rollout_keys
+    ).collect()
     ours.update(rollout_ET.clone())
     theirs(rollout_ET.clone())
     for mine, other in zip(

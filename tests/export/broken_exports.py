@@ -99,7 +99,14 @@ def normalizer(folder):
 
 
 def stale_sensor(folder):
-    late = {"min": 1, "max": 1, "resample_every": 0, "hold_probability": 0.0, "shared": None, "initial": None}
+    late = {
+        "min": 1,
+        "max": 1,
+        "resample_every": 0,
+        "hold_probability": 0.0,
+        "shared": None,
+        "initial": None,
+    }
     change_json(folder, lambda _, terms: terms["base_ang_vel"].update(delay=late))
 
 

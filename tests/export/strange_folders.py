@@ -27,7 +27,9 @@ def change_record(folder, **arrays):
     with np.load(path) as file:
         kept = {name: file[name] for name in file.files}
     added = {name.replace("__", "/"): value for name, value in arrays.items()}
-    np.savez(path, **{name: value for name, value in {**kept, **added}.items() if value is not None})
+    np.savez(
+        path, **{name: value for name, value in {**kept, **added}.items() if value is not None}
+    )
 
 
 def bodies_of_geoms(folder):
@@ -114,7 +116,9 @@ def record_that_is_a_pipe(folder):
 
 def record_of_terabytes(folder):
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)}
+    )
     with zipfile.ZipFile(folder / "episodes.npz", "w") as archive:
         archive.writestr("start/qpos.npy", header.getvalue())
 
@@ -229,7 +233,9 @@ def no_steps(folder):
 STRANGE = {
     name: made
     for name, made in list(globals().items())
-    if callable(made) and getattr(made, "__module__", "") == __name__ and not name.startswith("change_")
+    if callable(made)
+    and getattr(made, "__module__", "") == __name__
+    and not name.startswith("change_")
 }
 
 
@@ -257,7 +263,11 @@ def said_of(folder):
     """Run `ksim-rl sim2sim` on a folder; return its exit code, None where it hangs, and what it said on stderr."""
     said = io.StringIO()
     try:
-        with limit(SECONDS), contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        with (
+            limit(SECONDS),
+            contextlib.redirect_stderr(said),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
             main.main(["sim2sim", str(folder), "--episodes", "2"])
     except Hang:
         return None, said.getvalue()

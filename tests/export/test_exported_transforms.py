@@ -118,11 +118,16 @@ def test_what_acts_on_observations_is_a_part_of_the_policy(tmp_path):
         update_normalizers(env.rollout(20, break_when_any_done=False), actor)
     seen_BL = torch.tensor(np.clip(np.tanh(raw_BL), -0.3, 0.4))
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        expected = actor(envs.make("cartpole_balance", num_envs=5).reset().set("actor", seen_BL))["action"]
+        expected = actor(envs.make("cartpole_balance", num_envs=5).reset().set("actor", seen_BL))[
+            "action"
+        ]
     np.testing.assert_allclose(actions, expected.numpy(), atol=1e-5)
     # Its own program runs it, on raw observations.
     done = subprocess.run(
-        [sys.executable, folder / "runner.py", "--episodes", "1"], capture_output=True, text=True, check=False
+        [sys.executable, folder / "runner.py", "--episodes", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     ours = json.loads((folder / "export.json").read_text())["ours"]["return"][0]
@@ -134,7 +139,9 @@ def test_a_state_that_hides_in_a_function_of_observations_is_found():
     task = envs.task("cartpole_balance").cfg()
     whole = adding(counting=TransformCfg(Counting))(task)
     envs_of = [
-        envs.build(dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, num_envs=2), seed=1))
+        envs.build(
+            dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, num_envs=2), seed=1)
+        )
         for cfg in (whole, task)
     ]
     with pytest.raises(
@@ -168,8 +175,14 @@ def test_actions_meet_the_last_transform_first():
 @pytest.mark.parametrize(
     ("transform", "message"),
     [
-        (TransformCfg(Stepping), r"Stepping acts in evaluation.*it has _step.*acts_in_training_only = True"),
-        (TransformCfg(Halved), r"Halved has no description.*@ksim_rl.export.stage.register\(Halved\)"),
+        (
+            TransformCfg(Stepping),
+            r"Stepping acts in evaluation.*it has _step.*acts_in_training_only = True",
+        ),
+        (
+            TransformCfg(Halved),
+            r"Halved has no description.*@ksim_rl.export.stage.register\(Halved\)",
+        ),
         (TransformCfg(ActionScale), "give scale and offset"),
         (
             TransformCfg(ObservationDelay, in_keys=["actor"], delay=DelayCfg(min_lag=1, max_lag=1)),

@@ -55,7 +55,9 @@ def test_a_reward_that_is_left_out_is_said():
 
 def test_an_observation_that_no_export_can_take_is_said():
     (line,) = lines(observing)
-    assert line.startswith("`ksim-rl export` will refuse this run: task.observations.actor.terms.own: ")
+    assert line.startswith(
+        "`ksim-rl export` will refuse this run: task.observations.actor.terms.own: "
+    )
 
 
 def test_an_actuator_without_a_name_is_no_obstacle():

@@ -25,7 +25,9 @@ from ksim_rl.modules import (
     make_squashed_actor,
 )
 
-onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra: pip install ksim_rl[export]")
+onnxruntime = pytest.importorskip(
+    "onnxruntime", reason="needs the extra: pip install ksim_rl[export]"
+)
 pytest.importorskip("onnxscript", reason="needs the extra: pip install ksim_rl[export]")
 
 from ksim_rl.export import policy as policies  # noqa: E402
@@ -51,7 +53,9 @@ def shared_trunk() -> TensorDictSequential:
     trunk = make_shared_trunk(SharedTrunkCfg(hidden_dims=(16,)), obs_dim=5)
     reads = {"in_keys": ("features",), "obs_normalization": False, "hidden_dims": (16,)}
     actor = make_actor(ActorCfg(**reads), obs_dim=16, action_dim=2)
-    return ActorValueOperator(trunk, actor, make_critic(CriticCfg(**reads), obs_dim=16)).get_policy_operator()
+    return ActorValueOperator(
+        trunk, actor, make_critic(CriticCfg(**reads), obs_dim=16)
+    ).get_policy_operator()
 
 
 KINDS = {
@@ -72,7 +76,9 @@ KINDS = {
         ActorCfg(distribution="categorical", **SMALL), obs_dim=5, action_spec=OneHot(4)
     ),
     "choices": lambda: make_actor(
-        ActorCfg(distribution="categorical", **SMALL), obs_dim=5, action_spec=MultiCategorical((3, 4))
+        ActorCfg(distribution="categorical", **SMALL),
+        obs_dim=5,
+        action_spec=MultiCategorical((3, 4)),
     ),
     "mixed": lambda: make_actor(
         ActorCfg(**SMALL),
@@ -80,7 +86,9 @@ KINDS = {
         action_spec=Composite(aim=Unbounded((2,)), gear=Categorical(3, shape=())),
     ),
     "sac": lambda: make_squashed_actor(SquashedActorCfg(**SMALL), obs_dim=5, action_spec=BOUNDED),
-    "td3": lambda: make_deterministic_actor(DeterministicActorCfg(**SMALL), obs_dim=5, action_spec=BOUNDED),
+    "td3": lambda: make_deterministic_actor(
+        DeterministicActorCfg(**SMALL), obs_dim=5, action_spec=BOUNDED
+    ),
     "shared_trunk": shared_trunk,
     "lstm": lambda: make_recurrent_actor(
         RecurrentCfg(hidden_dim=8, num_layers=2), ActorCfg(**SMALL), obs_dim=5, action_dim=2
@@ -103,7 +111,9 @@ def test_onnx_equals_the_actor_on_10_000_observations(kind, tmp_path):
 
 
 def test_pt2_and_onnx_carry_histories_and_memory_as_inputs_and_outputs(tmp_path):
-    columns = {"actor": [Column(name="joint_pos", size=2, length=3, stride=2), Column(name="gyro", size=1)]}
+    columns = {
+        "actor": [Column(name="joint_pos", size=2, length=3, stride=2), Column(name="gyro", size=1)]
+    }
     recurrent = RecurrentCfg(hidden_dim=4)
     actor = moved(make_recurrent_actor(recurrent, ActorCfg(**SMALL), obs_dim=7, action_dim=2))
     policy = ExportedPolicy(actor, columns)
@@ -115,7 +125,10 @@ def test_pt2_and_onnx_carry_histories_and_memory_as_inputs_and_outputs(tmp_path)
     assert [value.name for value in session.get_outputs()] == policy.output_names
 
     program = torch.export.load(tmp_path / "policy.pt2").module()
-    feeds = [np.ones((5, 3), np.float32), *(np.full((5, *s.shape), 0.1, np.float32) for s in policy.states)]
+    feeds = [
+        np.ones((5, 3), np.float32),
+        *(np.full((5, *s.shape), 0.1, np.float32) for s in policy.states),
+    ]
     found = program(*map(torch.from_numpy, feeds))
     wanted = session.run(None, dict(zip(policy.input_names, feeds, strict=True)))
     for one, other in zip(found, wanted, strict=True):
@@ -134,7 +147,9 @@ def test_a_wrong_file_is_seen(tmp_path):
     policies.write(ExportedPolicy(moved(KINDS["gaussian"]()), PLAIN), tmp_path)
     other = moved(KINDS["gaussian"]())
     other.module[0].module.normalizer.mean += 0.01
-    assert policies.greatest_difference(ExportedPolicy(other, PLAIN), tmp_path / "policy.onnx") > 1e-4
+    assert (
+        policies.greatest_difference(ExportedPolicy(other, PLAIN), tmp_path / "policy.onnx") > 1e-4
+    )
 
 
 def test_a_policy_of_other_parts_is_refused_by_name():

@@ -45,7 +45,10 @@ KEYFRAME = '<keyframe><key qpos="0.1234567891 -0.3 0.2"/></keyframe>'
 
 def exported(folder, keyframe):
     group = ObservationGroupCfg(
-        terms={"pos": ObservationTermCfg(term=mdp.JointPos()), "vel": ObservationTermCfg(term=mdp.JointVel())}
+        terms={
+            "pos": ObservationTermCfg(term=mdp.JointPos()),
+            "vel": ObservationTermCfg(term=mdp.JointVel()),
+        }
     )
     cfg = ManagerBasedRlEnvCfg(
         decimation=4,
@@ -87,7 +90,9 @@ def test_an_export_acts_in_the_c_engine_as_here(tmp_path, with_keyframe, keyfram
     runner = Runner(folder)
     record = read_arrays(folder / "trace.npz")
     replayed = runner.replay(record, 0, 0)
-    assert np.abs(record["start/encoder_bias"]).min() > 1e-3, "servos that know nothing of it show below"
+    assert np.abs(record["start/encoder_bias"]).min() > 1e-3, (
+        "servos that know nothing of it show below"
+    )
     for name in ("target", "effort", "next_qpos", "next_qvel"):
         ours = record[f"trace/{name}"][0][: len(replayed[name])]
         np.testing.assert_allclose(replayed[name], ours, atol=2e-4, err_msg=name)
@@ -104,7 +109,9 @@ def test_a_reset_of_an_export_is_the_default_state(with_keyframe):
     names = [runner.model.actuator(i).name for i in range(3)]
     assert names == ["c", "b", "a"]
     assert runner.data.qpos.tolist() == [0.1234567891, -0.3, 0.2]
-    assert runner.data.ctrl.tolist() == pytest.approx([0.0, (51 + 50 * -0.3) / 0.4, 2 * 0.1234567891])
+    assert runner.data.ctrl.tolist() == pytest.approx(
+        [0.0, (51 + 50 * -0.3) / 0.4, 2 * 0.1234567891]
+    )
     assert runner.data.act.tolist() == pytest.approx([3 * 0.2, 2 * 0.1234567891])
     mujoco.mj_forward(runner.model, runner.data)
     np.testing.assert_allclose(runner.data.qfrc_actuator, 0.0, atol=1e-6)

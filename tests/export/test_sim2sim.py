@@ -82,7 +82,9 @@ def test_cartpole_earns_the_same_from_the_folder_alone(cartpole):
     for name in ("policy.onnx", "obs.onnx", "scores.onnx"):
         model = onnx.load(cartpole / name)
         onnx.checker.check_model(model)
-        assert not any(node.metadata_props for node in model.graph.node), "what the exporter notes is 20 kB"
+        assert not any(node.metadata_props for node in model.graph.node), (
+            "what the exporter notes is 20 kB"
+        )
         stored = {entry.key: entry.value for entry in model.metadata_props}
         assert stored["observation_names"] == "position,velocity"
         assert float(stored["step_dt"]) == pytest.approx(0.01)
@@ -114,19 +116,47 @@ class Everything(ObservationTerm):
         bodies, sites = view.bodies(".*"), view.sites(".*")
         parts = [
             *(joints.pos_EL, joints.pos_rel_EL, joints.vel_EL, joints.acc_EL, joints.effort_EL),
-            *(bodies.pos_EN3, bodies.quat_EN4, bodies.axes_EN33, bodies.lin_vel_EN3, bodies.ang_vel_EN3),
+            *(
+                bodies.pos_EN3,
+                bodies.quat_EN4,
+                bodies.axes_EN33,
+                bodies.lin_vel_EN3,
+                bodies.ang_vel_EN3,
+            ),
             *(bodies.subtree_com_pos_EN3, sites.pos_EN3, sites.axes_EN33, sites.height_EN),
-            *(sites.lin_vel_EN3, sites.lin_vel_of_contacts_EN3, root.root_pos_EL, root.root_quat_EL),
-            *(root.root_height_E, root.projected_gravity_EL, root.root_lin_vel_b_EL, root.root_lin_vel_w_EL),
+            *(
+                sites.lin_vel_EN3,
+                sites.lin_vel_of_contacts_EN3,
+                root.root_pos_EL,
+                root.root_quat_EL,
+            ),
+            *(
+                root.root_height_E,
+                root.projected_gravity_EL,
+                root.root_lin_vel_b_EL,
+                root.root_lin_vel_w_EL,
+            ),
             *(root.root_ang_vel_b_EL, root.root_ang_vel_w_EL),
             root.ground_scan(((0.1, 0.0), (0.0, -0.2))).below_EN,
             *(view.default_joint_pos_EL, view.encoder_bias_EL, view.joint_pos_target_EL),
-            *(view.joint_vel_target_EL, view.joint_effort_target_EL, view.action_EL, view.last_action_EL),
+            *(
+                view.joint_vel_target_EL,
+                view.joint_effort_target_EL,
+                view.action_EL,
+                view.last_action_EL,
+            ),
             *(view.episode_time_E, view.episode_step_E, view.time_out_offset_E, view.terminated_E),
-            *(view.world.qvel_EL, view.world.actuator_force_EL, view.world.ctrl_EL, view.world.sensordata_EL),
+            *(
+                view.world.qvel_EL,
+                view.world.actuator_force_EL,
+                view.world.ctrl_EL,
+                view.world.sensordata_EL,
+            ),
             *(part for name in view.sensors for part in view.contact(name)),
         ]
-        return torch.cat([part.reshape(view.num_envs, -1).to(torch.float32) for part in parts], dim=-1)
+        return torch.cat(
+            [part.reshape(view.num_envs, -1).to(torch.float32) for part in parts], dim=-1
+        )
 
 
 @pytest.mark.full
@@ -159,7 +189,14 @@ def test_all_quantities_are_read_as_here_also_where_default_poses_differ(tmp_pat
 
 
 # `test_tracing` compares the terms of more tasks without an export of each.
-FULL = ("arm_push", "cheetah_run", "hopper_stand", "pendulum_swingup", "quadruped_get_up", "walker_walk")
+FULL = (
+    "arm_push",
+    "cheetah_run",
+    "hopper_stand",
+    "pendulum_swingup",
+    "quadruped_get_up",
+    "walker_walk",
+)
 
 
 @pytest.mark.parametrize(
@@ -230,12 +267,18 @@ def test_the_loop_of_the_examples_runs_an_export(cartpole):
 
 def test_the_loop_in_cpp_compiles(tmp_path):
     roots = [os.environ.get("ONNXRUNTIME_ROOT", ""), "/usr", "/usr/local"]
-    found = [f"{root}/{place}" for root in roots if root for place in ("include", "include/onnxruntime")]
+    found = [
+        f"{root}/{place}" for root in roots if root for place in ("include", "include/onnxruntime")
+    ]
     headers = [place for place in found if os.path.exists(f"{place}/onnxruntime_cxx_api.h")]
     if not headers or shutil.which("g++") is None:
-        pytest.skip("no onnxruntime_cxx_api.h: set ONNXRUNTIME_ROOT to an unpacked release, and install g++")
+        pytest.skip(
+            "no onnxruntime_cxx_api.h: set ONNXRUNTIME_ROOT to an unpacked release, and install g++"
+        )
     command = ["g++", "-std=c++17", "-Wall", "-Werror", "-fsyntax-only", f"-I{headers[0]}"]
-    done = subprocess.run([*command, str(EXAMPLES / "loop.cpp")], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*command, str(EXAMPLES / "loop.cpp")], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert len((EXAMPLES / "loop.cpp").read_text().splitlines()) <= 200
 
@@ -278,7 +321,9 @@ def include(folder):
 
 
 def mesh_outside(folder):
-    (folder / "robot.xml").write_text('<mujoco><asset><mesh file="../../secret.stl"/></asset></mujoco>')
+    (folder / "robot.xml").write_text(
+        '<mujoco><asset><mesh file="../../secret.stl"/></asset></mujoco>'
+    )
 
 
 def entities(folder):
@@ -290,7 +335,9 @@ def pickled(folder):
 
 
 def unknown(folder):
-    change_json(folder, lambda meta, _: measured(meta, "joint_vel").update(quantity="__import__", joints=[]))
+    change_json(
+        folder, lambda meta, _: measured(meta, "joint_vel").update(quantity="__import__", joints=[])
+    )
 
 
 def linked(folder):

@@ -51,13 +51,21 @@ def test_a_strange_folder_is_refused_in_one_line(whole, name, tmp_path):
 def test_fields_that_an_export_may_write_are_numbers_that_differ_between_worlds():
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     floats = {name for name in per_world_fields() if getattr(model, name).dtype.kind == "f"}
-    when = {"actuator_delay", "sensor_delay", "sensor_interval"}  # they say where in a memory C looks
+    when = {
+        "actuator_delay",
+        "sensor_delay",
+        "sensor_interval",
+    }  # they say where in a memory C looks
     assert floats - when == FIELDS
 
 
 def record(**fields):
     """A record of two episodes of `GROUNDS` that writes fields of the model."""
-    own = {"start/qpos": np.zeros((2, 1)), "start/qvel": np.zeros((2, 1)), "pushes": np.zeros((0, 3))}
+    own = {
+        "start/qpos": np.zeros((2, 1)),
+        "start/qvel": np.zeros((2, 1)),
+        "pushes": np.zeros((0, 3)),
+    }
     return own | {f"start/model/{name}": np.array([value, value]) for name, value in fields.items()}
 
 

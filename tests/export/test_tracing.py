@@ -90,7 +90,9 @@ def watch_rewards(env: ManagerBasedRlEnv, task: TracedTask) -> list[float]:
 
 # One of each kind of robot, ground and suite; the others run in full tests.
 QUICK = ("cartpole_balance", "arm_reach", "quadruped_velocity_flat", "walker_walk")
-NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in envs.names()]
+NAMES = [
+    name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in envs.names()
+]
 
 
 @pytest.mark.parametrize("task", NAMES)
@@ -100,7 +102,8 @@ def test_the_observations_and_rewards_of_a_task_are_traced(task):
     # What moment of a motion an episode began at, nobody outside is told.
     if "_track" in task:
         with pytest.raises(
-            NotDescribedError, match=r"terms\.(reference|phase): Motion\w+ reads the buffer 'motion/"
+            NotDescribedError,
+            match=r"terms\.(reference|phase): Motion\w+ reads the buffer 'motion/",
         ):
             trace_task(env, ["actor"], lambda _: None)
         return
@@ -174,9 +177,13 @@ def test_a_network_refuses_what_it_cannot_hold(tmp_path):
     node = onnx.helper.make_node("Identity", ["x"], ["obs"])
     out = onnx.helper.make_tensor_value_info("obs", onnx.TensorProto.FLOAT, [1, 10**9])
     graph = onnx.helper.make_graph([node], "huge", [value], [out])
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
+    model = onnx.helper.make_model(
+        graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9
+    )
     onnx.save(model, tmp_path / "obs.onnx")
-    with pytest.raises(ValueError, match=r"size of x is 1000000000: expected a whole number of 0 to 1000000"):
+    with pytest.raises(
+        ValueError, match=r"size of x is 1000000000: expected a whole number of 0 to 1000000"
+    ):
         Network(tmp_path / "obs.onnx", [], "obs")
 
 

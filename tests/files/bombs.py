@@ -48,7 +48,9 @@ def bomb(write: Callable[[Path], Reads]) -> Callable[[Path], Reads]:
 @bomb
 def yaml_of_4_mib(folder):
     path = folder / "config.yaml"
-    path.write_text("".join(f"key_{number}: {{a: [1.5e-3, x], b: y}}\n" for number in range(110_000)))
+    path.write_text(
+        "".join(f"key_{number}: {{a: [1.5e-3, x], b: y}}\n" for number in range(110_000))
+    )
     return lambda: read_yaml(path)
 
 
@@ -85,7 +87,9 @@ def group_of_references(folder):
     """Each text is the one before it twice, which Hydra writes out."""
     path = folder / "objective" / "long.yaml"
     path.parent.mkdir()
-    path.write_text("a0: xxxxxxxxxx\n" + "".join(f"a{n + 1}: '${{a{n}}}${{a{n}}}'\n" for n in range(30)))
+    path.write_text(
+        "a0: xxxxxxxxxx\n" + "".join(f"a{n + 1}: '${{a{n}}}${{a{n}}}'\n" for n in range(30))
+    )
 
     def read():
         check_groups(folder)
@@ -98,7 +102,9 @@ def group_of_references(folder):
 def group_of_anchors(folder):
     """Each list holds the one before it ten times, which the check of names wrote out."""
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
-    lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]" for level in range(1, 10)]
+    lines += [
+        f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]" for level in range(1, 10)
+    ]
     (folder / "logger").mkdir()
     (folder / "logger" / "mine.yaml").write_text("\n".join(lines))
     return lambda: check_groups(folder)
@@ -184,7 +190,9 @@ def bvh_of_frames_that_are_not_there(folder):
 def claims(path: Path, name: str, shape: tuple[int, ...], **others: np.ndarray) -> None:
     """Write an archive in which the header of one array claims more than its file holds."""
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": shape}
+    )
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(f"{name}.npy", header.getvalue() + bytes(64))
         for other, array in others.items():
@@ -254,7 +262,10 @@ def recording_of_terabytes(folder):
 @bomb
 def recording_that_unpacks_to_gigabytes(folder):
     path = folder / "amass.npz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("poses.npy", "w") as file:
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("poses.npy", "w") as file,
+    ):
         for _ in range(1500):
             file.write(bytes(2**20))
     return lambda: read_amass(path)

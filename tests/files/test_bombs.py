@@ -44,7 +44,9 @@ def test_arrays_are_read_as_numpy_writes_them(tmp_path):
         found = read_arrays(path)
         assert found.keys() == written.keys()
         for name, array in written.items():
-            assert found[name].dtype == np.asarray(array).dtype and np.array_equal(found[name], array)
+            assert found[name].dtype == np.asarray(array).dtype and np.array_equal(
+                found[name], array
+            )
             assert found[name].flags.writeable
 
 

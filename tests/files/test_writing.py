@@ -61,7 +61,9 @@ def writers(tree):
         called = ast.unparse(node.func)
         name = called.rpartition(".")[2]
         modes = [
-            word.value for word in node.args if isinstance(word, ast.Constant) and isinstance(word.value, str)
+            word.value
+            for word in node.args
+            if isinstance(word, ast.Constant) and isinstance(word.value, str)
         ]
         if name in WRITES and (name not in ("copy", "move") or called.startswith("shutil.")):
             found.add(name)
@@ -128,7 +130,9 @@ def test_a_name_that_is_no_utf8_is_refused(tmp_path):
         lambda: open_own(folder / "a"),
         lambda: fill(folder),
     ):
-        with pytest.raises(ValueError, match="bytes that are no UTF-8, with which nothing is written"):
+        with pytest.raises(
+            ValueError, match="bytes that are no UTF-8, with which nothing is written"
+        ):
             write()
     assert list(folder.iterdir()) == []
 
@@ -138,7 +142,10 @@ def test_a_folder_is_filled_wholly_or_not_at_all(trap, tmp_path):
     (folder / "assets").mkdir(parents=True)
     (folder / "a").write_text("old")
     trap(folder / "assets" / "trap")
-    with pytest.raises(ValueError, match=REFUSED), whole_folder(folder, below=tmp_path) as unfinished:
+    with (
+        pytest.raises(ValueError, match=REFUSED),
+        whole_folder(folder, below=tmp_path) as unfinished,
+    ):
         (unfinished / "a").write_text("new")
         (unfinished / "assets").mkdir()
         (unfinished / "assets" / "trap").write_text("x")
@@ -157,7 +164,10 @@ def test_a_folder_that_is_filled_keeps_its_other_files(tmp_path):
 
 
 def test_nothing_is_left_where_filling_fails(tmp_path):
-    with pytest.raises(ZeroDivisionError), whole_folder(tmp_path / "folder", below=tmp_path) as unfinished:
+    with (
+        pytest.raises(ZeroDivisionError),
+        whole_folder(tmp_path / "folder", below=tmp_path) as unfinished,
+    ):
         (unfinished / "a").write_text("new")
         1 / 0  # noqa: B018
     assert list(tmp_path.iterdir()) == []
@@ -171,7 +181,9 @@ def test_folders_are_not_reached_by_links(path, tmp_path):
     (run / path).parent.mkdir(parents=True)
     (run / path).symlink_to(elsewhere)
     for make in (lambda: make_folder(run / "export" / "assets", below=run), lambda: fill(run)):
-        with pytest.raises(ValueError, match=rf"run/{path}: a link, and nothing is written through links"):
+        with pytest.raises(
+            ValueError, match=rf"run/{path}: a link, and nothing is written through links"
+        ):
             make()
     assert list(elsewhere.iterdir()) == []
     (tmp_path / "mine").symlink_to(elsewhere)

@@ -13,7 +13,9 @@ STEPS = 24
 def run(clip: str, *, captured: bool):
     """Roots after each step and the log in the end, on the CPU; `captured` replays a graph from the third step on."""
     env = busy_env(clip, device="cuda", sim=SimCfg())
-    chosen = torch.sin(torch.arange(STEPS * NUM_ENVS, device="cuda", dtype=torch.float32)).view(STEPS, -1, 1)
+    chosen = torch.sin(torch.arange(STEPS * NUM_ENVS, device="cuda", dtype=torch.float32)).view(
+        STEPS, -1, 1
+    )
     root_E, action = env.reset(), torch.zeros(NUM_ENVS, 1, device="cuda")
 
     def body() -> None:
@@ -37,12 +39,19 @@ def run(clip: str, *, captured: bool):
 @pytest.mark.gpu
 def test_a_captured_step_gives_what_an_eager_one_gives(tmp_path):
     clip = write_clip(tmp_path / "sink.npz")
-    (roots, numbers), (expected_roots, expected) = run(clip, captured=True), run(clip, captured=False)
+    (roots, numbers), (expected_roots, expected) = (
+        run(clip, captured=True),
+        run(clip, captured=False),
+    )
     for n, (actual_E, expected_E) in enumerate(zip(roots, expected_roots, strict=True)):
         for key in expected_E.keys(True, True):
-            torch.testing.assert_close(actual_E[key], expected_E[key], rtol=1e-4, atol=1e-4, msg=f"{n} {key}")
+            torch.testing.assert_close(
+                actual_E[key], expected_E[key], rtol=1e-4, atol=1e-4, msg=f"{n} {key}"
+            )
     assert numbers == pytest.approx(expected, rel=1e-3, abs=1e-4)
-    assert roots[-1]["command", "stick"].eq(0.5).all(), "a graph sees what was set between two replays"
+    assert roots[-1]["command", "stick"].eq(0.5).all(), (
+        "a graph sees what was set between two replays"
+    )
 
 
 @pytest.mark.gpu

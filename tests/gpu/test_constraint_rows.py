@@ -26,10 +26,17 @@ def results(world: World, lanes: int) -> dict[str, torch.Tensor]:
         lists = ContactLists(m, d)
         rows.constraint_rows(m, d, lists, lanes=lanes)()
         wp.synchronize()
-    found = {name: wp.to_torch(getattr(d.efc, name)).clone() for name in (*COLUMNS, "J", "J_colind")}
-    found |= {name: wp.to_torch(getattr(d, name)).clone() for name in ("ne", "nf", "nl", "nefc", "overflow")}
+    found = {
+        name: wp.to_torch(getattr(d.efc, name)).clone() for name in (*COLUMNS, "J", "J_colind")
+    }
+    found |= {
+        name: wp.to_torch(getattr(d, name)).clone()
+        for name in ("ne", "nf", "nl", "nefc", "overflow")
+    }
     found["dist"] = wp.to_torch(d.contact.dist)[wp.to_torch(lists.ids).long()]
-    found["dist"][torch.arange(lists.room, device="cuda") >= wp.to_torch(lists.count)[:, None]] = 0.0
+    found["dist"][torch.arange(lists.room, device="cuda") >= wp.to_torch(lists.count)[:, None]] = (
+        0.0
+    )
     return found
 
 
@@ -92,7 +99,9 @@ def test_blocks_of_many_worlds_reach_the_same_bits(monkeypatch):
         for state, scale in ((world.qpos_EL, 0.05), (world.qvel_EL, 0.5)):
             state.add_(scale * torch.randn(state.shape, generator=generator, device="cuda"))
         world.step(4)
-        reached.append([state.clone() for state in (world.qpos_EL, world.qvel_EL, world.sensordata_EL)])
+        reached.append(
+            [state.clone() for state in (world.qpos_EL, world.qvel_EL, world.sensordata_EL)]
+        )
     assert reached[0][2].any()
     for few, many in zip(*reached, strict=True):
         assert torch.equal(few, many)

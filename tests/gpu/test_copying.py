@@ -33,4 +33,7 @@ def test_it_is_one_kernel():
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as recorded:
         copy_rows(to, given)
         torch.cuda.synchronize()
-    assert sum(event.count for event in recorded.key_averages() if event.self_device_time_total > 0) == 1
+    assert (
+        sum(event.count for event in recorded.key_averages() if event.self_device_time_total > 0)
+        == 1
+    )

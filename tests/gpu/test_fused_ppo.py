@@ -22,7 +22,9 @@ DEVICE = torch.device("cuda")
 SQUASHED = {"distribution": "tanh_gaussian", "action_bound": 1.0, "init_std": 0.7}
 
 
-def networks(*, hidden_dims=(512, 256, 128), action_dim=12, obs=OBS, activation="elu", **actor_options):
+def networks(
+    *, hidden_dims=(512, 256, 128), action_dim=12, obs=OBS, activation="elu", **actor_options
+):
     torch.manual_seed(2)
     actor_cfg = ActorCfg(hidden_dims=hidden_dims, activation=activation, **actor_options)
     actor = make_actor(actor_cfg, obs_dim=obs, action_dim=action_dim, device=DEVICE)
@@ -38,7 +40,9 @@ def mirror(obs, actions):
 
 
 def update(actor, critic, *, minibatches=4, **options):
-    data = DatasetCfg(num_env_states_per_minibatch=ENVS * STEPS // minibatches, num_minibatches=minibatches)
+    data = DatasetCfg(
+        num_env_states_per_minibatch=ENVS * STEPS // minibatches, num_minibatches=minibatches
+    )
     cfg = PPOCfg(**({"precision": "bfloat16"} | options))
     network = actor[0].module
     maps = (
@@ -71,7 +75,10 @@ def layers(made, *held):
 def errors(made, exact):
     """Return by layer how far its gradient is from the exact one, relative to that."""
     joined = layers(made, moments(made), moments(exact))
-    return {layer: float((ours - theirs).norm() / theirs.norm()) for layer, (ours, theirs) in joined.items()}
+    return {
+        layer: float((ours - theirs).norm() / theirs.norm())
+        for layer, (ours, theirs) in joined.items()
+    }
 
 
 def parameters(made):
@@ -87,20 +94,39 @@ def parameters(made):
         ({"hidden_dims": (48, 32, 16), "action_dim": 1}, "none"),
         ({}, "loss"),
         ({"hidden_dims": (1024, 1024), "activation": "relu", "obs": 298}, "none"),
-        ({"hidden_dims": (512, 512, 256, 128), "activation": "silu", "state_dependent_std": True}, "augment"),
         (
-            {"hidden_dims": (80, 48), "activation": "tanh", "state_dependent_std": True, "std_type": "log"},
+            {
+                "hidden_dims": (512, 512, 256, 128),
+                "activation": "silu",
+                "state_dependent_std": True,
+            },
+            "augment",
+        ),
+        (
+            {
+                "hidden_dims": (80, 48),
+                "activation": "tanh",
+                "state_dependent_std": True,
+                "std_type": "log",
+            },
             "loss",
         ),
         (
-            {"hidden_dims": (256, 128), "activation": "silu", "state_dependent_std": True, **SQUASHED},
+            {
+                "hidden_dims": (256, 128),
+                "activation": "silu",
+                "state_dependent_std": True,
+                **SQUASHED,
+            },
             "none",
         ),
     ],
 )
 def test_the_gradient_is_that_of_exact_products(network_options, symmetry):
     actor, critic = networks(**network_options)
-    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE, obs=network_options.get("obs", OBS))
+    rollout_ET = make_rollout(
+        actor, num_envs=ENVS, device=DEVICE, obs=network_options.get("obs", OBS)
+    )
     rollout_ET["next", "reward"][3, 4] = float("nan")
     # One step, not clipped: the mean of Adam is then a tenth of the gradient.
     one = {"minibatches": 1, "num_epochs": 1, "max_grad_norm": None, "symmetry": symmetry}
@@ -121,7 +147,9 @@ def test_the_gradient_is_that_of_exact_products(network_options, symmetry):
     assert ours["update/non_finite_env_states"] == theirs["update/non_finite_env_states"] == 1
     for name in ("loss/policy", "loss/value", "loss/entropy", "policy/std"):
         sampled = name == "loss/entropy" and "distribution" in network_options
-        torch.testing.assert_close(ours[name], theirs[name], atol=0.1 if sampled else 1e-3, rtol=1e-2)
+        torch.testing.assert_close(
+            ours[name], theirs[name], atol=0.1 if sampled else 1e-3, rtol=1e-2
+        )
 
 
 @pytest.mark.parametrize(
@@ -135,7 +163,9 @@ def test_the_gradient_is_that_of_exact_products(network_options, symmetry):
 def test_float32_is_rounded_as_by_torch(network_options):
     torch.set_float32_matmul_precision("high")
     actor, critic = networks(**network_options)
-    rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE, obs=network_options.get("obs", OBS))
+    rollout_ET = make_rollout(
+        actor, num_envs=ENVS, device=DEVICE, obs=network_options.get("obs", OBS)
+    )
     one = {"precision": "float32", "minibatches": 1, "num_epochs": 1, "max_grad_norm": None}
     one |= {"entropy_coeff": 1e-6} if "distribution" in network_options else {}
     fused, plain = update(actor, critic, **one), update(actor, critic, kernels="torch", **one)
@@ -153,7 +183,9 @@ def test_float32_is_rounded_as_by_torch(network_options):
 
 
 @pytest.mark.parametrize(
-    ("network_options", "options"), [({}, {}), ({"min_std": 1.0}, {"min_advantage_std": 2.0})], ids=str
+    ("network_options", "options"),
+    [({}, {}), ({"min_std": 1.0}, {"min_advantage_std": 2.0})],
+    ids=str,
 )
 def test_the_fused_kernels_equal_torch_in_bfloat16(network_options, options):
     actor, critic = networks(**network_options)
@@ -170,7 +202,9 @@ def test_the_fused_kernels_equal_torch_in_bfloat16(network_options, options):
         # Adam turns each rounding of a small gradient into a whole step.
         assert (ours - theirs).norm() < 0.2 * (theirs - start).norm(), layer
     for name in ("loss/value", "update/grad_norm", "update/clip_fraction"):
-        torch.testing.assert_close(fused.metrics()[name], plain.metrics()[name], atol=0.01, rtol=0.03)
+        torch.testing.assert_close(
+            fused.metrics()[name], plain.metrics()[name], atol=0.01, rtol=0.03
+        )
 
 
 @pytest.mark.parametrize(
@@ -181,7 +215,10 @@ def test_annealed_rates_are_those_of_torch_also_in_a_graph(options):
     actor, critic = networks()
     rollout_ET = make_rollout(actor, num_envs=ENVS, device=DEVICE)
     annealed = {**limits, **options, "anneal_learning_rate": True}
-    fused, plain = update(actor, critic, **annealed), update(actor, critic, kernels="torch", **annealed)
+    fused, plain = (
+        update(actor, critic, **annealed),
+        update(actor, critic, kernels="torch", **annealed),
+    )
     assert (fused.metrics()["update/fused"], plain.metrics()["update/fused"]) == (1.0, 0.0)
     for done in (0.0, 0.1, 0.4, 0.5, 0.75, 0.9, 1.0):
         high = (3e-3 if "schedule" in options else 4e-3) * (1.0 - done)
@@ -189,7 +226,9 @@ def test_annealed_rates_are_those_of_torch_also_in_a_graph(options):
         for made in (fused, plain):
             made.set_progress(done)
             made(rollout_ET)
-            assert float(made.metrics()["update/learning_rate"]) == pytest.approx(min(low, high), rel=1e-6)
+            assert float(made.metrics()["update/learning_rate"]) == pytest.approx(
+                min(low, high), rel=1e-6
+            )
     # The later ones are replays.
     assert fused._run.ready and plain._run.ready
     with no_syncs():
@@ -205,7 +244,8 @@ def test_annealing_at_the_start_of_a_run_changes_no_bit():
         for made in (annealed, plain):
             made(rollout_ET)
     assert all(
-        torch.equal(one, other) for one, other in zip(parameters(annealed), parameters(plain), strict=True)
+        torch.equal(one, other)
+        for one, other in zip(parameters(annealed), parameters(plain), strict=True)
     )
 
 
@@ -221,11 +261,14 @@ def test_captured_steps_are_the_eager_ones_bit_for_bit(hidden_dims):
         graph()
     assert graph.ready
     assert all(
-        torch.equal(one, other) for one, other in zip(parameters(eager), parameters(captured), strict=True)
+        torch.equal(one, other)
+        for one, other in zip(parameters(eager), parameters(captured), strict=True)
     )
     assert all(parameter.isfinite().all() for parameter in parameters(eager))
     assert captured.metrics()["update/skipped_steps"] == 0
-    assert all(torch.equal(value, captured.metrics()[name]) for name, value in eager.metrics().items())
+    assert all(
+        torch.equal(value, captured.metrics()[name]) for name, value in eager.metrics().items()
+    )
 
 
 @pytest.mark.parametrize("hidden_dims", [(512, 256, 128), (512, 256)])
@@ -265,11 +308,18 @@ def test_the_ratio_at_the_first_step_is_one(network_options):
 
 def test_what_a_graph_of_a_rollout_replays_follows_the_modules():
     made = update(*networks())
-    behavior, seen = made.behavior, TensorDict({"actor": torch.randn(ENVS, OBS, device=DEVICE)}, [ENVS])
+    behavior, seen = (
+        made.behavior,
+        TensorDict({"actor": torch.randn(ENVS, OBS, device=DEVICE)}, [ENVS]),
+    )
     means = torch.empty(ENVS, 12, device=DEVICE)
 
     def act():
-        with torch.no_grad(), behavior.steady(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        with (
+            torch.no_grad(),
+            behavior.steady(),
+            set_exploration_type(ExplorationType.DETERMINISTIC),
+        ):
             means.copy_(behavior(seen.copy())["action"])
 
     graph = Captured(act, device=DEVICE, require_graphs=True)
@@ -293,5 +343,7 @@ def test_steps_that_are_not_finite_are_skipped():
         made.critic.module.layers[0].weight.fill_(1e30)
     before = [parameter.clone() for parameter in made.actor.parameters()]
     made(rollout_ET)
-    assert all(torch.equal(one, other) for one, other in zip(before, made.actor.parameters(), strict=True))
+    assert all(
+        torch.equal(one, other) for one, other in zip(before, made.actor.parameters(), strict=True)
+    )
     assert made.metrics()["update/skipped_steps"] == 4

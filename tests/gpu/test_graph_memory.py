@@ -22,7 +22,9 @@ def squares(kept, first):
 @pytest.mark.gpu
 def test_a_second_graph_takes_no_further_memory_and_both_stay_right():
     kept, reserved = torch.zeros(2, device="cuda"), []
-    graphs = [Captured(squares(kept[i], float(i)), device="cuda", require_graphs=True) for i in range(2)]
+    graphs = [
+        Captured(squares(kept[i], float(i)), device="cuda", require_graphs=True) for i in range(2)
+    ]
     for graph in graphs:
         for _ in range(3):
             graph()
@@ -62,7 +64,9 @@ def test_what_something_refers_to_is_left_alone():
 def test_a_graph_that_is_gone_leaves_its_memory_to_the_others():
     kept = torch.zeros(2, device="cuda")
     for _ in range(2):
-        graphs = [Captured(squares(kept[i], 0.0), device="cuda", require_graphs=True) for i in range(2)]
+        graphs = [
+            Captured(squares(kept[i], 0.0), device="cuda", require_graphs=True) for i in range(2)
+        ]
         for graph in graphs:
             for _ in range(4):
                 graph()

@@ -4,7 +4,15 @@ import pytest
 import torch
 
 from tests.gpu.no_syncs import no_syncs
-from tests.physics.test_height_fields import BODIES, Contacts, check_contacts, lowered, model, noise, poses
+from tests.physics.test_height_fields import (
+    BODIES,
+    Contacts,
+    check_contacts,
+    lowered,
+    model,
+    noise,
+    poses,
+)
 
 pytestmark = pytest.mark.gpu
 

@@ -28,7 +28,12 @@ SMALL = [
 def teacher(tmp_path_factory):
     folder = tmp_path_factory.mktemp("teacher") / "run"
     cfg = conf.compose(
-        [*SMALL, "task=cartpole_balance", "modules.actor.in_keys=[critic]", "trainer.num_iterations=2"]
+        [
+            *SMALL,
+            "task=cartpole_balance",
+            "modules.actor.in_keys=[critic]",
+            "trainer.num_iterations=2",
+        ]
     )
     run(cfg, folder, progress=RunProgress(2, enabled=False))
     return folder

@@ -19,7 +19,9 @@ def solved() -> tuple[World, dict[str, torch.Tensor]]:
     return world, state
 
 
-def results(world: World, state: dict[str, torch.Tensor], lanes: int | None) -> dict[str, torch.Tensor]:
+def results(
+    world: World, state: dict[str, torch.Tensor], lanes: int | None
+) -> dict[str, torch.Tensor]:
     for name, rows in state.items():
         world.last_substep(name).copy_(rows)
     world.last_substep("qacc_warmstart").fill_(7.0)

@@ -28,7 +28,9 @@ SPECS = {
     "several": ("categorical", MultiCategorical([3, 2], shape=(1, 2))),
     "mixed": (
         "tanh_gaussian",
-        Composite(action=Composite(arm=BOX, grip=Categorical(3, shape=(1,)), shape=(1,)), shape=(1,)),
+        Composite(
+            action=Composite(arm=BOX, grip=Categorical(3, shape=(1,)), shape=(1,)), shape=(1,)
+        ),
     ),
 }
 
@@ -44,7 +46,11 @@ def _networks(name):
 
 def _observations():
     return TensorDict(
-        {"actor": torch.randn(SIZE, 5, device="cuda"), "critic": torch.randn(SIZE, 5, device="cuda")}, [SIZE]
+        {
+            "actor": torch.randn(SIZE, 5, device="cuda"),
+            "critic": torch.randn(SIZE, 5, device="cuda"),
+        },
+        [SIZE],
     )
 
 

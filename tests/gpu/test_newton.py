@@ -53,7 +53,9 @@ def standing(cone: str, name: str) -> World:
         device="cuda",
     )
     generator = torch.Generator(device="cuda").manual_seed(0)
-    world.qpos_EL[:, 7:] += 0.2 * torch.randn(world.qpos_EL[:, 7:].shape, generator=generator, device="cuda")
+    world.qpos_EL[:, 7:] += 0.2 * torch.randn(
+        world.qpos_EL[:, 7:].shape, generator=generator, device="cuda"
+    )
     world.qvel_EL.copy_(0.7 * torch.randn(world.qvel_EL.shape, generator=generator, device="cuda"))
     return world
 

@@ -76,14 +76,20 @@ def test_captured_without_syncs_and_learning_what_it_sees(name, options):
         before = [parameter.detach().clone() for parameter in update.loss.parameters()]
         with no_syncs(on=iteration > 3):
             update(rollout)
-        assert not all(torch.equal(a, b) for a, b in zip(before, update.loss.parameters(), strict=True))
+        assert not all(
+            torch.equal(a, b) for a, b in zip(before, update.loss.parameters(), strict=True)
+        )
     assert update._run.ready
     metrics = update.metrics()
-    assert int(metrics["update/non_finite_env_states"]) == 6 and int(metrics["update/skipped_steps"]) == 0
+    assert (
+        int(metrics["update/non_finite_env_states"]) == 6
+        and int(metrics["update/skipped_steps"]) == 0
+    )
     # Each replay wrote to the ring where the last one ended.
     assert int(metrics["replay/env_states"]) == 6 * (NUM_ENVS * LENGTH - 1) - cut
     newest = update.replay.storage.index(
-        torch.arange(NUM_ENVS, device="cuda"), torch.zeros(NUM_ENVS, dtype=torch.int64, device="cuda")
+        torch.arange(NUM_ENVS, device="cuda"),
+        torch.zeros(NUM_ENVS, dtype=torch.int64, device="cuda"),
     )
     going = ~rollout["next", "done"][:, -1, 0]
     stored = update.replay.storage.content["actor"][newest]
@@ -104,7 +110,9 @@ def test_captured_updates_equal_eager_ones():
                 update._rollout_ET = rollout
                 update._update()
             results.append(update.metrics())
-        torch.testing.assert_close(results[0]["loss/value"], results[1]["loss/value"], rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(
+            results[0]["loss/value"], results[1]["loss/value"], rtol=1e-3, atol=1e-4
+        )
     for one, other in zip(captured.loss.parameters(), eager.loss.parameters(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
 
@@ -114,13 +122,18 @@ def test_equal_updates_that_are_compiled_anew_have_equal_bits():
     for _ in range(3):
         torch.compiler.reset()
         # As large as a kernel of many sums needs to be timed by the compiler, if it may.
-        update, rollout = _update("fast_sac_compiled", num_env_states_per_minibatch=32768), _rollout()
+        update, rollout = (
+            _update("fast_sac_compiled", num_env_states_per_minibatch=32768),
+            _rollout(),
+        )
         for _ in range(5):
             rollout.copy_(_rollout())
             update(rollout)
         states.append(state_tree.split(update.state_dict())[0])
     for other in states[1:]:
-        assert [name for name, leaf in other.items() if not torch.equal(leaf, states[0][name])] == []
+        assert [
+            name for name, leaf in other.items() if not torch.equal(leaf, states[0][name])
+        ] == []
 
 
 def test_bfloat16_learns_like_float32():
@@ -193,7 +206,12 @@ def test_distributions_are_compared_as_on_the_cpu_with_the_same_bits_each_time(
 )
 def test_layers_in_half_precision_err_as_torch_does(num_networks, hidden_dims, compiled):
     torch.manual_seed(0)
-    options = {"activation": "silu", "layer_norm": True, "num_networks": num_networks, "device": "cuda"}
+    options = {
+        "activation": "silu",
+        "layer_norm": True,
+        "num_networks": num_networks,
+        "device": "cuda",
+    }
     layers = mlp(315, hidden_dims, 101, **options)
     for parameter in layers.parameters():
         parameter.data.add_(0.1 * torch.randn_like(parameter))
@@ -226,7 +244,9 @@ def test_a_compiled_step_of_flat_memory_is_the_adamw_of_torch():
     twin, target = copy.deepcopy(network), copy.deepcopy(network).requires_grad_(False)
     cfg = SACCfg(betas=(0.9, 0.95), weight_decay=0.1, tau=0.2, max_grad_norm=0.5, compile=True)
     flat = FlatAdamW(cfg, network.parameters(), learning_rate=1e-3, target=target.parameters())
-    reference = torch.optim.AdamW(twin.parameters(), lr=1e-3, betas=cfg.betas, weight_decay=0.1, fused=True)
+    reference = torch.optim.AdamW(
+        twin.parameters(), lr=1e-3, betas=cfg.betas, weight_decay=0.1, fused=True
+    )
     for _ in range(5):
         for one, other in zip(network.parameters(), twin.parameters(), strict=True):
             one.grad = torch.randn_like(one)

@@ -8,7 +8,14 @@ import torch
 from ksim_rl.data import DatasetBuffer, DatasetCfg
 from ksim_rl.device.capture import Captured
 from ksim_rl.modules import update_normalizers
-from ksim_rl.objectives import PPOCfg, StepGuard, make_advantage, make_loss, make_optimizer, ppo_step
+from ksim_rl.objectives import (
+    PPOCfg,
+    StepGuard,
+    make_advantage,
+    make_loss,
+    make_optimizer,
+    ppo_step,
+)
 from tests.gpu.no_syncs import no_syncs
 from tests.objectives.problems import networks, rollout
 
@@ -18,7 +25,11 @@ CFG = PPOCfg(num_epochs=3)
 
 class _Update:
     def __init__(self, actor, critic, data):
-        self.actor, self.critic, self.data = copy.deepcopy(actor), copy.deepcopy(critic), data.clone()
+        self.actor, self.critic, self.data = (
+            copy.deepcopy(actor),
+            copy.deepcopy(critic),
+            data.clone(),
+        )
         self.loss = make_loss(CFG, self.actor, self.critic)
         self.optimizer = make_optimizer(CFG, self.actor, self.critic)
         self.gae = make_advantage(CFG, self.actor, self.critic)
@@ -31,7 +42,9 @@ class _Update:
         self.dataset.extend(self.gae(self.data))
         for _ in range(CFG.num_epochs):
             for minibatch_B in self.dataset.epoch():
-                metrics = ppo_step(self.loss, self.optimizer, minibatch_B, cfg=CFG, guard=self.guard)
+                metrics = ppo_step(
+                    self.loss, self.optimizer, minibatch_B, cfg=CFG, guard=self.guard
+                )
         self.kl.copy_(metrics["kl"])
         update_normalizers(self.data, self.actor, self.critic)
 

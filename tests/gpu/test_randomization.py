@@ -27,7 +27,9 @@ def eager():
 
 
 @pytest.mark.parametrize("name", EVENTS)
-def test_replayed_events_draw_as_eager_ones_and_the_worlds_move_as_in_the_c_engine(replayed, eager, name):
+def test_replayed_events_draw_as_eager_ones_and_the_worlds_move_as_in_the_c_engine(
+    replayed, eager, name
+):
     event, mask_E = EVENTS[name], torch.arange(E, device="cuda") % 3 == 0
     for runners in (replayed, eager):
         runners.restart()
@@ -45,7 +47,9 @@ def test_replayed_events_draw_as_eager_ones_and_the_worlds_move_as_in_the_c_engi
         assert torch.equal(values[~mask_E], replayed.own[f"field/{name}"][~mask_E]), (
             "rows outside of the mask"
         )
-    assert any(not torch.equal(values[0], values[3]) for values in fields.values()), "two rows that draw"
+    assert any(not torch.equal(values[0], values[3]) for values in fields.values()), (
+        "two rows that draw"
+    )
     ends = replayed.run(SUBSTEPS)
     undisturbed = replayed.c_run(replayed.world.mj_model, SUBSTEPS)
     for row in (0, 1, E - 1):
@@ -57,7 +61,9 @@ def test_replayed_events_draw_as_eager_ones_and_the_worlds_move_as_in_the_c_engi
             )
         expected = replayed.c_run(c_model, SUBSTEPS)
         effect = np.abs(expected - undisturbed).max()
-        assert bool(mask_E[row]) == (effect > 1e-3), "the field makes a difference where it was drawn"
+        assert bool(mask_E[row]) == (effect > 1e-3), (
+            "the field makes a difference where it was drawn"
+        )
         assert np.abs(ends[row] - expected).max() < 0.005 * effect + 1e-4, row
 
 

@@ -44,7 +44,9 @@ def env_of(term):
 
 
 def collector_of(term, policy=None, **cfg):
-    return RolloutCollector(env_of(term), policy or Policy(), rollout_length=4, cfg=CollectorCfg(**cfg))
+    return RolloutCollector(
+        env_of(term), policy or Policy(), rollout_length=4, cfg=CollectorCfg(**cfg)
+    )
 
 
 def rewards_of(collector, count):

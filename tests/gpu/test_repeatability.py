@@ -30,7 +30,9 @@ def everything(task: Any, folder: str) -> Any:
     """A velocity task on rough ground, with drawn inertias and friction, and what watches for bad states."""
     rough = on_rough_ground(task, root_height=0.3, njmax=200, nconmax=60)
     events = {
-        "inertia": mdp.RandomizePseudoInertia(bodies="trunk", alpha=(-0.2, 0.2), stretch=(-0.1, 0.1)),
+        "inertia": mdp.RandomizePseudoInertia(
+            bodies="trunk", alpha=(-0.2, 0.2), stretch=(-0.1, 0.1)
+        ),
         "friction": mdp.RandomizeGeomFriction(geoms=".*", ranges={0: (0.5, 1.5)}),
     }
     sim = dataclasses.replace(rough.sim, nan_guard=NanGuardCfg(folder=folder, history=3))
@@ -69,13 +71,17 @@ def walk(
         if number % LOOK_EVERY == 0:
             looks.append({name: world.last_substep(name).cpu().clone() for name in LOOKS})
             looks[-1]["contacts"] = world.last_substep("nacon").cpu().clone()
-            looks[-1] |= {str(key): root_E.get(key).cpu().float() for key in root_E.keys(True, True)}
+            looks[-1] |= {
+                str(key): root_E.get(key).cpu().float() for key in root_E.keys(True, True)
+            }
     assert step.ready == (device == "cuda")
     env.close(raise_if_closed=False)
     return looks
 
 
-def first_difference(one: list[dict[str, torch.Tensor]], other: list[dict[str, torch.Tensor]]) -> str | None:
+def first_difference(
+    one: list[dict[str, torch.Tensor]], other: list[dict[str, torch.Tensor]]
+) -> str | None:
     """Return the step and the names of the arrays at which two runs differ first, with how many worlds do."""
     for number, (mine, theirs) in enumerate(zip(one, other, strict=True), start=1):
         differ = {name: _rows_that_differ(values, theirs[name]) for name, values in mine.items()}
@@ -92,7 +98,11 @@ def _rows_that_differ(one: torch.Tensor, other: torch.Tensor) -> int:
 @pytest.mark.gpu
 @pytest.mark.parametrize(
     ("task", "has_everything"),
-    [("quadruped_velocity_flat", False), ("humanoid_get_up", False), ("quadruped_velocity_flat", True)],
+    [
+        ("quadruped_velocity_flat", False),
+        ("humanoid_get_up", False),
+        ("quadruped_velocity_flat", True),
+    ],
 )
 def test_equal_worlds_stay_equal_bit_for_bit(task, has_everything, tmp_path):
     folder = str(tmp_path) if has_everything else ""
@@ -147,7 +157,10 @@ def mended(device: str, *, one_kernel: bool) -> list[torch.Tensor]:
     world.qpos_EL[:, 3:6] += 0.1 * torch.arange(24.0, device=device).view(8, 3).sin()
     world.step()
     contact, count = world.warp_data_E.contact, int(world.warp_data_E.nacon.numpy()[0])
-    fields = (getattr(contact, name).numpy()[:count] for name in ("geom", "worldid", "type", "pos", "solref"))
+    fields = (
+        getattr(contact, name).numpy()[:count]
+        for name in ("geom", "worldid", "type", "pos", "solref")
+    )
     rows = np.concatenate([field.reshape(count, -1) for field in fields], axis=1)
     return [torch.tensor(sorted(map(tuple, rows))), world.view("sensordata").cpu().clone()]
 
@@ -188,7 +201,8 @@ def driven(device: str, integrator: str) -> list[torch.Tensor]:
     world.step(5)
     world.refresh()
     return [
-        world.view(name).cpu().clone() for name in ("qpos", "qvel", "act", "sensordata", "actuator_velocity")
+        world.view(name).cpu().clone()
+        for name in ("qpos", "qvel", "act", "sensordata", "actuator_velocity")
     ]
 
 
@@ -229,7 +243,9 @@ def varied(device: str) -> list[torch.Tensor]:
 
 def cramped(device: str) -> list[torch.Tensor]:
     """What kernels leave of worlds that have too little room for their ties."""
-    world = World(load_model(VARIED), num_envs=8, device=device, sim=SimCfg(njmax=2, one_kernel_solver=False))
+    world = World(
+        load_model(VARIED), num_envs=8, device=device, sim=SimCfg(njmax=2, one_kernel_solver=False)
+    )
     world.step(2)
     return [world.view(name).cpu().clone() for name in ("qpos", "qvel")]
 
@@ -238,15 +254,22 @@ def single(device: str) -> list[torch.Tensor]:
     """What kernels leave that few models have: contacts of steep rods, in an order of their own, and tendons."""
     mj_model = load_model(THINGS.format(turned=""))
     rods = World(
-        mj_model, num_envs=8, device=device, sim=SimCfg(njmax=120, nconmax=24, one_kernel_dynamics=False)
+        mj_model,
+        num_envs=8,
+        device=device,
+        sim=SimCfg(njmax=120, nconmax=24, one_kernel_dynamics=False),
     )
     rods.qpos_EL.copy_(touching(mj_model, seed=0)[:8])
-    tendons = World(load_model(TENDON), num_envs=8, device=device, sim=SimCfg(one_kernel_dynamics=False))
+    tendons = World(
+        load_model(TENDON), num_envs=8, device=device, sim=SimCfg(one_kernel_dynamics=False)
+    )
     tendons.qvel_EL.copy_(torch.arange(16.0).view(8, 2).sin())
     rods.step()
     tendons.refresh()
     contact, count = rods.warp_data_E.contact, int(rods.warp_data_E.nacon.numpy()[0])
-    fields = (getattr(contact, name).numpy()[:count] for name in ("geom", "worldid", "pos", "frame"))
+    fields = (
+        getattr(contact, name).numpy()[:count] for name in ("geom", "worldid", "pos", "frame")
+    )
     rows = np.concatenate([field.reshape(count, -1) for field in fields], axis=1)
     found = [torch.tensor(sorted(map(tuple, rows))), tendons.view("ten_velocity").cpu().clone()]
     found += driven(device, "implicitfast") + driven(device, "RK4") + varied(device)
@@ -256,7 +279,9 @@ def single(device: str) -> list[torch.Tensor]:
 
 @pytest.mark.gpu
 def test_kernels_of_single_models_give_the_same_bits_again():
-    assert all(torch.equal(one, other) for one, other in zip(single("cuda"), single("cuda"), strict=True))
+    assert all(
+        torch.equal(one, other) for one, other in zip(single("cuda"), single("cuda"), strict=True)
+    )
 
 
 @pytest.mark.full
@@ -275,7 +300,9 @@ def test_single_models_launch_each_kernel_that_is_said_to_be_tested_with_them(
     said = set()
     for file, tests in kernels.TESTS.items():
         # Kernels of C++ are launched elsewhere.
-        of_warp = re.findall(r"@wp\.kernel.*\ndef (\w+)", (REPOSITORY / "ksim_rl" / file).read_text())
+        of_warp = re.findall(
+            r"@wp\.kernel.*\ndef (\w+)", (REPOSITORY / "ksim_rl" / file).read_text()
+        )
         said |= {name for name in of_warp if tests.get(name) == kernels.SINGLE_MODELS}
     assert len(said) > 20
     assert said <= launched, said - launched
@@ -312,5 +339,7 @@ def test_moments_of_equal_rows_are_equal_and_those_of_two_passes_in_float64():
         assert torch.equal(buffer, second.get_buffer(name)), name
     seen = rows[valid & rows.isfinite().all(-1)].double()
     torch.testing.assert_close(first.mean.cpu(), seen.mean(0).float(), rtol=1e-6, atol=0.0)
-    torch.testing.assert_close(first.var.cpu(), seen.var(0, correction=0).float(), rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(
+        first.var.cpu(), seen.var(0, correction=0).float(), rtol=1e-6, atol=0.0
+    )
     assert first.count == 2 * len(seen)

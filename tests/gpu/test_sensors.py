@@ -110,7 +110,10 @@ def picture(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.
     half = math.tan(math.radians(model.cam_fovy[camera]) / 2)
     depth_HW, geom_HW = np.full((height, width), MAX_DEPTH), np.full((height, width), -1)
     for row, column in np.ndindex(height, width):
-        x, y = half * (2 * (column + 0.5) - width) / height, half * (height - 2 * (row + 0.5)) / height
+        x, y = (
+            half * (2 * (column + 0.5) - width) / height,
+            half * (height - 2 * (row + 0.5)) / height,
+        )
         along, geom = np.array([x, y, -1.0]), np.full(1, -1, dtype=np.int32)
         distance = mujoco.mj_ray(model, data, origin, to_world @ along, None, 1, -1, geom)
         if geom[0] >= 0:
@@ -130,7 +133,9 @@ def test_all_sensors_captured_read_what_the_c_engine_says():
                 agrees = np.abs(actual[name].numpy() - values) < 0.02
                 assert agrees.mean() > 0.97, f"{n} {name}"
             else:
-                np.testing.assert_allclose(actual[name], values, rtol=1e-2, atol=0.05, err_msg=f"{n} {name}")
+                np.testing.assert_allclose(
+                    actual[name], values, rtol=1e-2, atol=0.05, err_msg=f"{n} {name}"
+                )
         strongest_color = actual["rgb"].argmax(-1)
         for name, color in (("ball", 0), ("terrain", 1)):
             shown = actual["segmentation"] == model.geom(name).id
@@ -141,13 +146,19 @@ def test_all_sensors_captured_read_what_the_c_engine_says():
 
 @pytest.mark.gpu
 def test_all_sensors_captured_read_what_eager_ones_read():
-    for n, (actual, expected) in enumerate(zip(drop(captured=True)[1], drop(captured=False)[1], strict=True)):
+    for n, (actual, expected) in enumerate(
+        zip(drop(captured=True)[1], drop(captured=False)[1], strict=True)
+    ):
         for name, value in expected.items():
             if name in PICTURES:
-                same = (actual[name].float() - value.float()).abs() <= (3 if name == "rgb" else 0.01)
+                same = (actual[name].float() - value.float()).abs() <= (
+                    3 if name == "rgb" else 0.01
+                )
                 assert same.float().mean() > 0.97, f"{n} {name}"
             else:
-                torch.testing.assert_close(actual[name], value, rtol=1e-2, atol=0.05, msg=f"{n} {name}")
+                torch.testing.assert_close(
+                    actual[name], value, rtol=1e-2, atol=0.05, msg=f"{n} {name}"
+                )
 
 
 @pytest.mark.gpu
@@ -156,7 +167,9 @@ def test_the_nan_guard_records_inside_a_captured_step_without_a_sync(tmp_path):
     bench = SensorBench(sleds.SLEDS, E, {}, device="cuda", sim=SimCfg(nan_guard=guard))
     world = bench.world
     world.ctrl_EL[:, sleds.HEAVY] = 1.0
-    step = Captured(lambda: world.step(sleds.SUBSTEPS), device="cuda", warmup=2, require_graphs=True)
+    step = Captured(
+        lambda: world.step(sleds.SUBSTEPS), device="cuda", warmup=2, require_graphs=True
+    )
     for n in range(6):
         if n == 5:
             world.ctrl_EL[3, sleds.LIGHT] = 1e9
@@ -166,4 +179,6 @@ def test_the_nan_guard_records_inside_a_captured_step_without_a_sync(tmp_path):
     report = world.nan_report()
     assert report.worlds == (3,)
     failure = nan_file.read(report.files[0])
-    assert failure.substep == 5 * sleds.SUBSTEPS + 1 and failure.states["ctrl"][-1, sleds.LIGHT] == 1e9
+    assert (
+        failure.substep == 5 * sleds.SUBSTEPS + 1 and failure.states["ctrl"][-1, sleds.LIGHT] == 1e9
+    )

@@ -90,7 +90,9 @@ def test_a_mask_spares_worlds_and_momenta_are_those_of_mujoco_warp(lanes):
         wp.synchronize()
     for name in ("subtree_linvel", "subtree_angmom"):
         scale = 1.0 + arrays[name].abs().max()
-        torch.testing.assert_close(whole[name] / scale, arrays[name] / scale, atol=3e-6, rtol=0, msg=name)
+        torch.testing.assert_close(
+            whole[name] / scale, arrays[name] / scale, atol=3e-6, rtol=0, msg=name
+        )
 
 
 @pytest.mark.gpu
@@ -101,7 +103,9 @@ def test_captured_steps_reach_what_mujoco_warps_kernels_reach():
         world = World(mixed(), num_envs=NUM_ENVS, sim=sim, device="cuda")
         assert (world.one_kernel_dynamics_unavailable is None) == (one_kernel_dynamics is None)
         generator = torch.Generator(device="cuda").manual_seed(0)
-        world.qvel_EL.copy_(0.1 * torch.randn(world.qvel_EL.shape, generator=generator, device="cuda"))
+        world.qvel_EL.copy_(
+            0.1 * torch.randn(world.qvel_EL.shape, generator=generator, device="cuda")
+        )
         for _ in range(4):
             world.step(4)
         reached.append((world.qpos_EL.clone(), world.qvel_EL.clone()))

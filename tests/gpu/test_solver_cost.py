@@ -16,7 +16,9 @@ def test_the_cost_on_synthetic_models(index):
     check_cost(load_model(SYNTHETIC[index].xml()), num_envs=256, device="cuda")
 
 
-@pytest.mark.skipif("MENAGERIE_ROOT" not in os.environ, reason="MENAGERIE_ROOT names no folder of robots")
+@pytest.mark.skipif(
+    "MENAGERIE_ROOT" not in os.environ, reason="MENAGERIE_ROOT names no folder of robots"
+)
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_cost_on_menagerie_robots(robot):
     check_cost(load_model(robot), num_envs=256, device="cuda")

@@ -8,7 +8,15 @@ from tests.gpu.no_syncs import no_syncs
 from tests.mdp.every_term_env import REWARDS, actions, every_term_env
 
 STEPS = 20
-OF_THE_LAST_SUBSTEP = ("Acc", "Effort", "Force", "Contact", "Energy", "SensorReading", "SoftLanding")
+OF_THE_LAST_SUBSTEP = (
+    "Acc",
+    "Effort",
+    "Force",
+    "Contact",
+    "Energy",
+    "SensorReading",
+    "SoftLanding",
+)
 """Words in the names of terms that read the acceleration stage."""
 
 
@@ -36,7 +44,9 @@ def run(*, captured: bool):
     return seen
 
 
-def check_alike(actual: torch.Tensor, expected: torch.Tensor, again: torch.Tensor, what: str) -> None:
+def check_alike(
+    actual: torch.Tensor, expected: torch.Tensor, again: torch.Tensor, what: str
+) -> None:
     """Allow nine values of ten to differ as much as two eager runs may, and a little of the largest one.
 
     The physics of contacts is not the same from run to run on a GPU, least of all its accelerations and forces.
@@ -44,7 +54,9 @@ def check_alike(actual: torch.Tensor, expected: torch.Tensor, again: torch.Tenso
     actual, expected, again = (value.float().flatten() for value in (actual, expected, again))
     share = 2e-2 if any(word in what for word in OF_THE_LAST_SUBSTEP) else 1e-3
     error, noise = ((value - expected).abs().quantile(0.9) for value in (actual, again))
-    assert error <= 10.0 * noise + share * expected.abs().max() + 1e-4, f"{what}: {error} against {noise}"
+    assert error <= 10.0 * noise + share * expected.abs().max() + 1e-4, (
+        f"{what}: {error} against {noise}"
+    )
 
 
 @pytest.mark.gpu

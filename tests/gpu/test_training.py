@@ -37,7 +37,9 @@ def no_syncs():
 
 
 def random_policy(td):
-    return td.set("action", 0.3 * torch.randn(td["actor"].shape[0], random_policy.size, device="cuda"))
+    return td.set(
+        "action", 0.3 * torch.randn(td["actor"].shape[0], random_policy.size, device="cuda")
+    )
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -67,14 +69,20 @@ def rollouts(name, *, captured, count=3, compile=False):
 
 @pytest.mark.parametrize("name", ("cartpole_balance", "cartpole_swingup"))
 def test_captured_rollouts_equal_eager_ones(name):
-    for actual, expected in zip(rollouts(name, captured=True), rollouts(name, captured=False), strict=True):
+    for actual, expected in zip(
+        rollouts(name, captured=True), rollouts(name, captured=False), strict=True
+    ):
         for key in expected.keys(True, True):
-            torch.testing.assert_close(actual[key], expected[key], rtol=1e-5, atol=1e-5, msg=str(key))
+            torch.testing.assert_close(
+                actual[key], expected[key], rtol=1e-5, atol=1e-5, msg=str(key)
+            )
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_compiled_rollouts_in_a_graph_are_those_of_the_env(name):
-    pairs = zip(rollouts(name, captured=True, compile=True), rollouts(name, captured=False), strict=True)
+    pairs = zip(
+        rollouts(name, captured=True, compile=True), rollouts(name, captured=False), strict=True
+    )
     for actual, expected in pairs:
         for key in expected.keys(True, True):
             # Rounding grows where feet touch the ground, and decides now and then what becomes of an episode.
@@ -87,7 +95,12 @@ def test_captured_rollouts_in_contact_differ_from_eager_ones_no_more_than_eager_
     name = "go1_velocity_flat"
     first, second = rollouts(name, captured=False), rollouts(name, captured=False)
     for actual, expected, again in zip(rollouts(name, captured=True), first, second, strict=True):
-        for key in (("obs", "joint_pos"), ("obs", "joint_vel"), ("obs", "base_lin_vel"), ("next", "reward")):
+        for key in (
+            ("obs", "joint_pos"),
+            ("obs", "joint_vel"),
+            ("obs", "base_lin_vel"),
+            ("next", "reward"),
+        ):
             error = (actual[key] - expected[key]).abs().quantile(0.9)
             noise = (again[key] - expected[key]).abs().quantile(0.9)
             assert error <= 10.0 * noise + 1e-4, f"{key}: {error} against {noise}"
@@ -127,6 +140,8 @@ def test_a_failed_world_is_reset_inside_the_graph():
     env.base_env.episode_log_reset_()
     env.base_env.world.qvel_EL[3] = torch.nan
     rollout_ET = collector.collect()
-    assert rollout_ET["next", "terminated"][3, 0] and not rollout_ET["next", "terminated"][:3, 0].any()
+    assert (
+        rollout_ET["next", "terminated"][3, 0] and not rollout_ET["next", "terminated"][:3, 0].any()
+    )
     assert all(torch.isfinite(leaf).all() for leaf in rollout_ET.values(True, True))
     assert env.base_env.episode_log()["termination/non_finite"] == 1

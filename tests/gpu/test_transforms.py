@@ -66,22 +66,30 @@ def test_steps_and_resets_do_not_synchronize_and_replay_as_they_ran(kind):
             check(step)
 
 
-def begin(ring_EM, age_E, value_E, mask_E, *, num_frames=1, parts=None, lag_E=None, draws=ring.NO_DRAWS):
+def begin(
+    ring_EM, age_E, value_E, mask_E, *, num_frames=1, parts=None, lag_E=None, draws=ring.NO_DRAWS
+):
     """Let the masked rows begin."""
     return ring.turn(ring_EM, age_E, value_E, lag_E, mask_E, num_frames, 0, parts, True, *draws)
 
 
 def push(ring_EM, age_E, value_E, *, num_frames, stride, parts=None):
     """Make a step."""
-    return ring.turn(ring_EM, age_E, value_E, None, None, num_frames, stride, parts, True, *ring.NO_DRAWS)
+    return ring.turn(
+        ring_EM, age_E, value_E, None, None, num_frames, stride, parts, True, *ring.NO_DRAWS
+    )
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.float16, torch.float32, torch.int64])
+@pytest.mark.parametrize(
+    "dtype", [torch.uint8, torch.bool, torch.float16, torch.float32, torch.int64]
+)
 @pytest.mark.parametrize("shape", [(), (3,), (48,), (2, 5)])
 def test_rings_of_any_dtype_and_width_give_back_what_was_pushed(dtype, shape):
     rows, length = 37, 4
-    pushed_TE = torch.randint(0, 2 if dtype == torch.bool else 100, (9, rows, *shape)).to(dtype).cuda()
+    pushed_TE = (
+        torch.randint(0, 2 if dtype == torch.bool else 100, (9, rows, *shape)).to(dtype).cuda()
+    )
     ring_EM = torch.zeros(rows, length, *shape, dtype=dtype, device="cuda")
     # Beyond 32 bits, as after a long run; the ring stands where it stood for an age of 0.
     age_E = torch.zeros(rows, dtype=torch.int64, device="cuda")
@@ -117,7 +125,9 @@ def test_rings_of_several_parts_give_all_frames_of_one_part_after_another(sizes)
     begin(ring_EM, age_E, pushed_TEL[0], torch.ones_like(mask_E), num_frames=length, parts=parts)
     first_E = torch.zeros_like(age_E)
     for step in range(1, 12):
-        found_EL = push(ring_EM, age_E, pushed_TEL[step], num_frames=length, stride=stride, parts=parts)
+        found_EL = push(
+            ring_EM, age_E, pushed_TEL[step], num_frames=length, stride=stride, parts=parts
+        )
         start = 0
         for part_EL in pushed_TEL.split(sizes, dim=2):
             for frame in range(length):
@@ -152,7 +162,8 @@ def test_draws_are_the_hash_that_they_say_they_are():
     seed, counter_E = torch.tensor(5).cuda(), torch.tensor([3, 2**40 + 9, 0]).cuda()
     keys = random.row_keys(seed, 77, counter_E, 3)
     expected = [
-        [exact_uniform(5, 77, row, int(counter_E[row]), index) for index in range(40)] for row in range(3)
+        [exact_uniform(5, 77, row, int(counter_E[row]), index) for index in range(40)]
+        for row in range(3)
     ]
     assert random.uniform(keys, 40).tolist() == expected
     lowest = [[-3 + int(number * 2**24) * 9 // 2**24 for number in row] for row in expected]

@@ -49,7 +49,11 @@ class Secret:
 def hidden_model(secret: Secret) -> mujoco.MjModel:
     """Return the robot with its secret numbers, whose base is held."""
     spec = mujoco.MjSpec.from_string(MODEL)
-    for element in [*spec.keys, *spec.actuators, *(joint for joint in spec.joints if not joint.name)]:
+    for element in [
+        *spec.keys,
+        *spec.actuators,
+        *(joint for joint in spec.joints if not joint.name),
+    ]:
         spec.delete(element)
     spec.option.timestep = PHYSICS_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
@@ -92,4 +96,7 @@ def log_text(time_T: np.ndarray, targets: dict[str, np.ndarray], pos_TN: np.ndar
     names = ["time", *(f"{joint}.position" for joint in JOINTS)]
     names += [f"{joint}.{columns[kind]}" for kind in targets for joint in JOINTS]
     rows = np.hstack((time_T[:, None], pos_TN, *targets.values()))
-    return "\n".join([",".join(names), *(",".join(f"{value:.9g}" for value in row) for row in rows)]) + "\n"
+    return (
+        "\n".join([",".join(names), *(",".join(f"{value:.9g}" for value in row) for row in rows)])
+        + "\n"
+    )

@@ -33,7 +33,9 @@ def test_from_a_plan_to_numbers(tmp_path, capsys):
     assert code == 0, output
     assert "no velocities were commanded (hip, knee)" in output.out
     found = json.loads((tmp_path / "log_found.json").read_text())
-    assert found["joints"]["knee"]["armature"]["value"] == pytest.approx(secret.armature[1], rel=0.05)
+    assert found["joints"]["knee"]["armature"]["value"] == pytest.approx(
+        secret.armature[1], rel=0.05
+    )
     assert found["joints"]["knee"]["torque_constant"]["value"] is None
     assert found["delay_s"]["value"] == pytest.approx(secret.delay_s, abs=1e-3)
 
@@ -45,7 +47,10 @@ REFUSED = {
     "kind": (("--propose", "go2", "--targets", "pos,speed"), "--targets='speed'"),
     "base": (("--propose", "go2", "--base", "1,0,0"), "--base 1,0,0: expected a unit quaternion"),
     "seconds": (("--propose", "go2", "--seconds", "1"), "--seconds=1.0"),
-    "task of a proposal": (("--propose", "go2", "--task", "go2_velocity_flat"), "--task: it is of logs"),
+    "task of a proposal": (
+        ("--propose", "go2", "--task", "go2_velocity_flat"),
+        "--task: it is of logs",
+    ),
 }
 
 

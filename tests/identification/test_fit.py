@@ -42,7 +42,9 @@ def test_all_numbers_of_a_hidden_robot_are_found(robot, tmp_path):
             assert number.half_width < 0.1 * true, (joint, kind)
     assert findings.delay_s.value == pytest.approx(secret.delay_s, abs=1e-3)
     # What is left is what the encoders add.
-    assert max(findings.unexplained.values()) == pytest.approx(np.hypot(NOISE, COUNT / 12**0.5), rel=0.1)
+    assert max(findings.unexplained.values()) == pytest.approx(
+        np.hypot(NOISE, COUNT / 12**0.5), rel=0.1
+    )
     assert not findings.warnings
 
 
@@ -56,7 +58,10 @@ def test_positions_alone_tell_the_sum_of_both_dampings_and_no_torque_constant(ro
         assert numbers["servo_damping"].value == pytest.approx(both, rel=0.05)
         assert "together" in numbers["servo_damping"].remark
         assert not numbers["damping"].is_told and "velocities" in numbers["damping"].remark
-        assert not numbers["torque_constant"].is_told and "efforts" in numbers["torque_constant"].remark
+        assert (
+            not numbers["torque_constant"].is_told
+            and "efforts" in numbers["torque_constant"].remark
+        )
         assert numbers["stiffness"].value == pytest.approx(secret.stiffness[place], rel=0.05)
 
 

@@ -25,7 +25,9 @@ def written(path, time_T=TIME_T, pos_TN=WAVE_TN, targets=None):
 
 def test_a_log_comes_back(robot, tmp_path):
     # The stamps of a clock, which count from another moment.
-    path = written(tmp_path / "a.csv", time_T=TIME_T + 1000.0, targets={"effort": WAVE_TN, "pos": -WAVE_TN})
+    path = written(
+        tmp_path / "a.csv", time_T=TIME_T + 1000.0, targets={"effort": WAVE_TN, "pos": -WAVE_TN}
+    )
     text = path.read_text().splitlines()
     path.write_text("\n".join([f"{text[0]},battery", *(f"{line},24.1" for line in text[1:])]))
     log = read_log(path, robot)
@@ -48,7 +50,9 @@ def test_parquet_is_read_like_csv(robot, tmp_path):
     (tmp_path / "b.parquet").write_bytes(b"PAR1 no table")
     with pytest.raises(ValueError, match="no Parquet file"):
         read_log(tmp_path / "b.parquet", robot)
-    parquet.write_table(pyarrow.table({**columns, "time": ["x"] * len(table)}), tmp_path / "c.parquet")
+    parquet.write_table(
+        pyarrow.table({**columns, "time": ["x"] * len(table)}), tmp_path / "c.parquet"
+    )
     with pytest.raises(ValueError, match="'time' holds something else than numbers"):
         read_log(tmp_path / "c.parquet", robot)
 
@@ -78,8 +82,14 @@ def standing(joint):
 
 
 FAULTS = {
-    "missing encoder": (edited([(0, 2, "kne.position")]), "'knee.position'.*joint 'knee'.*kne.position"),
-    "missing command": (edited([(0, 4, "battery")]), "no column 'knee.target_position', though there is"),
+    "missing encoder": (
+        edited([(0, 2, "kne.position")]),
+        "'knee.position'.*joint 'knee'.*kne.position",
+    ),
+    "missing command": (
+        edited([(0, 4, "battery")]),
+        "no column 'knee.target_position', though there is",
+    ),
     "no commands": (edited([(0, 3, "a"), (0, 4, "b")]), "no column says what was commanded"),
     "no time": (edited([(0, 0, "stamp")]), "no column 'time'"),
     "one name twice": (edited([(0, 2, "hip.position")]), "two columns 'hip.position'"),
@@ -89,12 +99,18 @@ FAULTS = {
     "a gap": (faulty(time_T=TIME_T + (TIME_T > 2.0)), r"for 1 s after 2 s \(line 1002\)"),
     "milliseconds": (faulty(time_T=1e3 * TIME_T), "'time': 2 between lines: expected seconds"),
     "too short": (faulty(time_T=TIME_T / 2.0), "3 s: expected at least 5 s"),
-    "degrees": (faulty(pos_TN=np.rad2deg(WAVE_TN)), "joint 'hip': readings.*degrees: write radians"),
+    "degrees": (
+        faulty(pos_TN=np.rad2deg(WAVE_TN)),
+        "joint 'hip': readings.*degrees: write radians",
+    ),
     "degrees of targets": (
         faulty(targets={"pos": np.rad2deg(WAVE_TN)}),
         "joint 'hip': targets of its position.*degrees: write radians",
     ),
-    "another zero": (faulty(pos_TN=WAVE_TN + 3.0), "joint 'hip': readings.*check its unit, sign and zero"),
+    "another zero": (
+        faulty(pos_TN=WAVE_TN + 3.0),
+        "joint 'hip': readings.*check its unit, sign and zero",
+    ),
     "a joint that stands": (faulty(pos_TN=standing(1)), "joint 'knee' moves by 0 only.*--propose"),
     "a joint without commands": (
         faulty(targets={"pos": standing(0)}),

@@ -20,7 +20,9 @@ def found(robot, names, **left_out):
     }
     joints = {name: {**numbers, **left_out} for name in names}
     delay_s = Estimate(value=0.0082, half_width=0.0005)
-    return Findings(robot=robot, joints=joints, delay_s=delay_s, unexplained=dict.fromkeys(names, 1e-3))
+    return Findings(
+        robot=robot, joints=joints, delay_s=delay_s, unexplained=dict.fromkeys(names, 1e-3)
+    )
 
 
 def test_a_training_takes_them():
@@ -57,8 +59,13 @@ def test_an_env_draws_them():
 
 
 def test_what_was_not_told_is_left_as_it_was():
-    nothing = {"stiffness": Estimate(remark="no positions"), "damping": Estimate(remark="within the servo")}
-    lines = overrides(found("go2", UnitreeGo2.joint_names, **nothing), envs.task("go2_velocity_flat").cfg())
+    nothing = {
+        "stiffness": Estimate(remark="no positions"),
+        "damping": Estimate(remark="within the servo"),
+    }
+    lines = overrides(
+        found("go2", UnitreeGo2.joint_names, **nothing), envs.task("go2_velocity_flat").cfg()
+    )
     assert not any("identified_damping" in line for line in lines)
     gains = [line for line in lines if "identified_gains" in line]
     assert len(gains) == 12 and all("stiffness:null" in line for line in gains)

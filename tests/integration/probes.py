@@ -30,7 +30,12 @@ class ProbeEnv(MaskedReset):
 
     def __init__(self, observe, reward, *, length, truncates=False, num_envs=E):
         super().__init__(device=torch.device("cpu"), batch_size=[num_envs])
-        self.observe, self.reward_of, self.length, self.truncates = observe, reward, length, truncates
+        self.observe, self.reward_of, self.length, self.truncates = (
+            observe,
+            reward,
+            length,
+            truncates,
+        )
         self.seed_value = torch.tensor(0)
         self.step_E = torch.zeros(num_envs, dtype=torch.int64)
         self.episode_E = torch.zeros(num_envs, dtype=torch.int64)
@@ -49,7 +54,9 @@ class ProbeEnv(MaskedReset):
         no_E1 = torch.zeros_like(done_E1)
         flags = {"done": done_E1, "terminated": no_E1, "truncated": no_E1.clone()}
         flags["truncated" if self.truncates else "terminated"] = done_E1.clone()
-        return TensorDict({"actor": obs_EL, "critic": obs_EL.clone(), **flags, **values}, self.batch_size)
+        return TensorDict(
+            {"actor": obs_EL, "critic": obs_EL.clone(), **flags, **values}, self.batch_size
+        )
 
     def _step(self, tensordict):
         action_E = tensordict["action"][:, 0]
@@ -60,7 +67,9 @@ class ProbeEnv(MaskedReset):
 
     def _reset(self, tensordict=None, **_):
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask_E = torch.ones_like(self.step_E, dtype=torch.bool) if mask is None else mask.reshape(-1)
+        mask_E = (
+            torch.ones_like(self.step_E, dtype=torch.bool) if mask is None else mask.reshape(-1)
+        )
         self.episode_E = self.episode_E + mask_E
         keys = random.row_keys(self.seed_value, 1, self.episode_E, len(mask_E))
         drawn_E = torch.where(random.uniform(keys, 1)[:, 0] < 0.5, -1.0, 1.0)
@@ -87,8 +96,12 @@ class Run:
         defaults = {"gamma": GAMMA, "num_epochs": 3, "schedule": "fixed", "learning_rate": 1e-2}
         defaults |= {"clip_value": False, "entropy_coeff": 0.0}
         data = DatasetCfg(num_env_states_per_minibatch=E * T // 2, num_minibatches=2)
-        self.update = PPOUpdate(PPOCfg(**{**defaults, **ppo}), actor=actor, critic=critic, data=data)
-        self.collector = RolloutCollector(env, actor, rollout_length=T, keys=self.update.rollout_keys)
+        self.update = PPOUpdate(
+            PPOCfg(**{**defaults, **ppo}), actor=actor, critic=critic, data=data
+        )
+        self.collector = RolloutCollector(
+            env, actor, rollout_length=T, keys=self.update.rollout_keys
+        )
 
     def iterate(self, times):
         """Collect and learn."""

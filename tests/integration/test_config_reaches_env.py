@@ -16,8 +16,12 @@ DT = 0.01
 E = 2
 
 
-def made(*overrides: str, seed: int | None = 0, render_mode: str | None = None) -> envs.MaskedTransformedEnv:
-    return envs.make("cartpole_balance", num_envs=E, seed=seed, overrides=overrides, render_mode=render_mode)
+def made(
+    *overrides: str, seed: int | None = 0, render_mode: str | None = None
+) -> envs.MaskedTransformedEnv:
+    return envs.make(
+        "cartpole_balance", num_envs=E, seed=seed, overrides=overrides, render_mode=render_mode
+    )
 
 
 def rolled_out(env, steps=1, action=0.5):
@@ -42,7 +46,9 @@ def test_every_field_has_a_test():
 
 def test_decimation():
     once, twice = rolled_out(made(), 2), rolled_out(made("task.decimation=2"), 1)
-    assert torch.equal(twice["next", "obs", "position"][:, 0], once["next", "obs", "position"][:, 1])
+    assert torch.equal(
+        twice["next", "obs", "position"][:, 0], once["next", "obs", "position"][:, 1]
+    )
     assert made("task.decimation=2").base_env.step_dt == pytest.approx(2 * DT)
 
 
@@ -54,7 +60,9 @@ def test_scene_num_envs():
 
 
 def test_scene_robots():
-    with pytest.raises(ValueError, match="did you mean 'other/slider'"):  # several robots have prefixes
+    with pytest.raises(
+        ValueError, match="did you mean 'other/slider'"
+    ):  # several robots have prefixes
         made("+task.scene.robots.other={_target_: ksim_rl.scene.robots.Cartpole}")
 
 
@@ -128,7 +136,9 @@ def test_seed():
     first, used = start("task.seed=5")
     assert used == 5
     assert torch.equal(start(seed=5)[0], first)
-    assert torch.equal(start("task.seed=6", seed=5)[0], first), "the argument of `make` has the last word"
+    assert torch.equal(start("task.seed=6", seed=5)[0], first), (
+        "the argument of `make` has the last word"
+    )
     assert not torch.equal(start("task.seed=6")[0], first)
     drawn, again = start()[1], start()[1]
     assert drawn >= 0 and again >= 0 and drawn != again, "drawn anew, and stored"
@@ -158,10 +168,18 @@ def test_sim_fields_reach_the_physics():
     world = made(*(f"task.sim.{name}={value}" for name, value in SIM.items())).base_env.world
     option, warp_option = world.mj_model.opt, world.warp_model.opt
     assert (option.timestep, option.impratio, option.ccd_iterations) == (0.002, 3.0, 7)
-    named = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtSolver.mjSOL_CG, mujoco.mjtCone.mjCONE_ELLIPTIC)
+    named = (
+        mujoco.mjtIntegrator.mjINT_EULER,
+        mujoco.mjtSolver.mjSOL_CG,
+        mujoco.mjtCone.mjCONE_ELLIPTIC,
+    )
     assert (option.integrator, option.solver, option.cone) == named
     assert (int(warp_option.integrator), int(warp_option.solver), int(warp_option.cone)) == named
-    assert (warp_option.iterations, warp_option.ls_iterations, warp_option.ccd_iterations) == (3, 4, 7)
+    assert (warp_option.iterations, warp_option.ls_iterations, warp_option.ccd_iterations) == (
+        3,
+        4,
+        7,
+    )
     assert warp_option.timestep.numpy().tolist() == pytest.approx([0.002])
     assert warp_option.tolerance.numpy().tolist() == [0.125]
     assert (world.warp_data_E.njmax, world.warp_data_E.naconmax) == (24, 16 * E)
@@ -216,7 +234,11 @@ def test_viewer_camera_and_size(renderer):
     given = [f"task.viewer.{name}={value}" for name, value in fields.items()]
     drawn = renderer(*given, "task.viewer.body=null", "task.viewer.lookat=[1.0, 2.0, 3.0]")
     assert drawn.size == (60, 80)
-    assert (drawn.camera.distance, drawn.camera.elevation, drawn.camera.azimuth) == (7.0, -33.0, 12.0)
+    assert (drawn.camera.distance, drawn.camera.elevation, drawn.camera.azimuth) == (
+        7.0,
+        -33.0,
+        12.0,
+    )
     assert list(drawn.camera.lookat) == [1.0, 2.0, 3.0]
 
 
@@ -248,20 +270,25 @@ def test_terminations():
     ended = rolled_out(made("task.terminations.fallen.limit=0.0001"), 3)["next", "terminated"]
     assert ended.all() and not rolled_out(made(), 3)["next", "terminated"].any()
     falling = rolled_out(made("~task.terminations.fallen"), 120, action=1.0)
-    assert not falling["next", "terminated"].any() and falling["obs", "position"][..., 1].min() < 0.0
+    assert (
+        not falling["next", "terminated"].any() and falling["obs", "position"][..., 1].min() < 0.0
+    )
 
 
 def test_commands(own_terms):
     target = "{_target_: tests.envs.probe_env.Target, resampling_time_range_s: [0.01, 0.01]}"
     rollout_ET = rolled_out(made(f"+task.commands.target={target}"), 3)
-    assert len(rollout_ET["command", "target"].unique()) == 3 * E, "a command of its own at each step"
+    assert len(rollout_ET["command", "target"].unique()) == 3 * E, (
+        "a command of its own at each step"
+    )
     assert "command" not in rolled_out(made()).keys()
 
 
 def test_curriculum(own_terms):
     ramp = "tests.envs.managers.test_curriculum_manager.WeightByEpisodes"
     env = made(
-        f"+task.curriculum.ramp={{_target_: {ramp}, reward: balance}}", f"task.episode_length_s={2 * DT}"
+        f"+task.curriculum.ramp={{_target_: {ramp}, reward: balance}}",
+        f"task.episode_length_s={2 * DT}",
     )
     reward = rolled_out(env, 4)["next", "reward"]
     assert reward[:, :2].eq(0.0).all() and (reward[:, 2:] > 1.0).all(), (

@@ -9,7 +9,16 @@ from tests.integration.alone import run_with
 
 PACKAGES = ("torch", "numpy", "jaxtyping", "mujoco", "mujoco-warp", "warp-lang")
 # What programs beyond the engine's need; a name that is wrongly spelled here would be absent for another reason.
-NOT_LOADED = ("torchrl", "tensordict", "hydra", "omegaconf", "safetensors", "rich", "matplotlib", "imageio")
+NOT_LOADED = (
+    "torchrl",
+    "tensordict",
+    "hydra",
+    "omegaconf",
+    "safetensors",
+    "rich",
+    "matplotlib",
+    "imageio",
+)
 
 ROOMS = """
 import importlib, pathlib, sys
@@ -50,7 +59,15 @@ except ValueError as error:
 
 def test_its_modules_load_no_other_room_and_no_other_package():
     rooms, others = run_with(PACKAGES, ROOMS).splitlines()
-    assert rooms.split() == ["checked", "checks", "compiled", "device", "files", "physics", "terminal"]
+    assert rooms.split() == [
+        "checked",
+        "checks",
+        "compiled",
+        "device",
+        "files",
+        "physics",
+        "terminal",
+    ]
     assert others == ""
 
 
@@ -64,7 +81,9 @@ def test_both_engines_step_worlds():
 
 
 def test_who_asks_for_files_of_the_nan_guard_learns_what_they_need(tmp_path):
-    assert "need the package safetensors" in run_with(PACKAGES, GUARD.replace("FOLDER", repr(str(tmp_path))))
+    assert "need the package safetensors" in run_with(
+        PACKAGES, GUARD.replace("FOLDER", repr(str(tmp_path)))
+    )
 
 
 def test_its_face_is_a_few_names_that_explain_themselves():

@@ -27,7 +27,9 @@ def _targets(*, truncates, advantage):
     """Return a rollout with value targets and V(s) = 3 sign, which is what no reset state says of another episode."""
     run = Run(ProbeEnv(sign_only, the_sign, length=3, truncates=truncates), advantage=advantage)
     with torch.no_grad():
-        layers = [module for module in run.update.critic.modules() if isinstance(module, torch.nn.Linear)]
+        layers = [
+            module for module in run.update.critic.modules() if isinstance(module, torch.nn.Linear)
+        ]
         for layer in layers:
             layer.weight.zero_(), layer.bias.zero_()
         # ELU(x) - ELU(-x) is odd, and 1.632 at 1.
@@ -43,7 +45,9 @@ def check_truncation(advantage):
     """The target of a truncated step is its reward and the value of the state that was reached."""
     rollout_ET, done_ET = _targets(truncates=True, advantage=advantage)
     sign = rollout_ET["actor"][done_ET.squeeze(-1)]
-    torch.testing.assert_close(rollout_ET["value_target"][done_ET.squeeze(-1)], sign + GAMMA * 3.0 * sign)
+    torch.testing.assert_close(
+        rollout_ET["value_target"][done_ET.squeeze(-1)], sign + GAMMA * 3.0 * sign
+    )
 
 
 def check_termination(advantage):
@@ -99,7 +103,9 @@ def test_returns_that_leak_over_the_end_of_an_episode(advantage, monkeypatch):
 
     def buggy(self, *args):
         found = signals(self, *args)
-        object.__setattr__(found, "done_ET", found.terminated_ET)  # "time is up" is taken for "goes on"
+        object.__setattr__(
+            found, "done_ET", found.terminated_ET
+        )  # "time is up" is taken for "goes on"
         return found
 
     monkeypatch.setattr(RolloutEstimator, "_signals", buggy)
@@ -242,6 +248,8 @@ def check_the_entropy_bonus_widens_the_policy():
 def test_an_entropy_bonus_with_the_wrong_sign(monkeypatch):
     check_the_entropy_bonus_widens_the_policy()
     weighted = ClipPPOLoss._weighted_loss_entropy
-    monkeypatch.setattr(ClipPPOLoss, "_weighted_loss_entropy", lambda self, entropy: -weighted(self, entropy))
+    monkeypatch.setattr(
+        ClipPPOLoss, "_weighted_loss_entropy", lambda self, entropy: -weighted(self, entropy)
+    )
     with pytest.raises(AssertionError):
         check_the_entropy_bonus_widens_the_policy()

@@ -10,7 +10,9 @@ SMALL = ("device=cpu", "logger=none", "trainer.eval_episodes=0")
 
 def reward_after(task, iterations, *overrides):
     """Train, and return the mean reward per step of the last three rollouts."""
-    trainer = build(conf.compose([f"task={task}", *overrides, f"trainer.num_iterations={iterations}"]))
+    trainer = build(
+        conf.compose([f"task={task}", *overrides, f"trainer.num_iterations={iterations}"])
+    )
     rewards = []
     for _ in range(iterations):
         rollout_ET = trainer.collector.collect()

@@ -38,7 +38,9 @@ def test_truncation_bootstraps_and_termination_does_not():
         return torch.stack((sign_E, sign_E * step_E.clamp_max(1)), dim=-1)
 
     ended = Run(ProbeEnv(observe, the_sign, length=2), advantage="td_lambda").iterate(12)
-    cut = Run(ProbeEnv(sign_only, the_sign, length=2, truncates=True), advantage="vtrace").iterate(12)
+    cut = Run(ProbeEnv(sign_only, the_sign, length=2, truncates=True), advantage="vtrace").iterate(
+        12
+    )
     for sign in (1.0, -1.0):
         assert ended.values(0, sign) == pytest.approx(1.5 * sign, abs=0.15)
         assert ended.values(1, sign) == pytest.approx(1.0 * sign, abs=0.15)

@@ -59,14 +59,19 @@ class RecallEnv(MaskedReset):
         shown_E1 = torch.where(self.step_E[:, None] == 0, self.cue_E1, 0.0)
         last_E1 = (self.step_E[:, None] == LENGTH - 1).float()
         obs_E = torch.cat([shown_E1, last_E1], -1)
-        return TensorDict({"actor": obs_E, "critic": obs_E.clone(), **values}, batch_size=self.batch_size)
+        return TensorDict(
+            {"actor": obs_E, "critic": obs_E.clone(), **values}, batch_size=self.batch_size
+        )
 
     def _step(self, tensordict):
         self.step_E += 1
         done_E1 = (self.step_E >= LENGTH)[:, None]
         reward_E1 = torch.where(done_E1, 1.0 - (tensordict["action"] - self.cue_E1).square(), 0.0)
         return self._observe(
-            reward=reward_E1, done=done_E1, terminated=done_E1.clone(), truncated=torch.zeros_like(done_E1)
+            reward=reward_E1,
+            done=done_E1,
+            terminated=done_E1.clone(),
+            truncated=torch.zeros_like(done_E1),
         )
 
     def _reset(self, tensordict=None, **_):
@@ -91,7 +96,10 @@ def trained(kind, **sequences):
     actor_cfg = ActorCfg(hidden_dims=hidden_dims, init_std=0.5, obs_normalization=False)
     critic_cfg = CriticCfg(hidden_dims=hidden_dims, obs_normalization=False)
     if kind is None:
-        actor, critic = make_actor(actor_cfg, obs_dim=2, action_dim=1), make_critic(critic_cfg, obs_dim=2)
+        actor, critic = (
+            make_actor(actor_cfg, obs_dim=2, action_dim=1),
+            make_critic(critic_cfg, obs_dim=2),
+        )
     else:
         memory = RecurrentCfg(kind=kind, hidden_dim=16)
         actor = make_recurrent_actor(memory, actor_cfg, obs_dim=2, action_dim=1)

@@ -56,7 +56,9 @@ def rolled_out(env, actions) -> TensorDictBase:
     """Roll out from the seed with given actions, through the ends of episodes."""
     env.set_seed(7)
     steps = iter(actions)
-    return env.rollout(len(actions), lambda td: td.set("action", next(steps)), break_when_any_done=False)
+    return env.rollout(
+        len(actions), lambda td: td.set("action", next(steps)), break_when_any_done=False
+    )
 
 
 def assert_same(actual: TensorDictBase, expected: TensorDictBase) -> None:
@@ -149,7 +151,11 @@ def test_the_stock_collector_with_our_actor_equals_our_collector(env):
     env.set_seed(7)
     # A stock collector that has reached its total closes its env.
     collector = Collector(
-        env, policy, frames_per_batch=E * T, total_frames=2 * E * T, auto_register_policy_transforms=False
+        env,
+        policy,
+        frames_per_batch=E * T,
+        total_frames=2 * E * T,
+        auto_register_policy_transforms=False,
     )
     torch.manual_seed(1)
     batch = next(iter(collector)).clone()

@@ -21,7 +21,12 @@ E, T, ITERATIONS, EPOCHS, B = 64, 32, 14, 4, 256
 def stock_actor_and_critic(env):
     obs_dim, action_dim = env.observation_spec["actor"].shape[-1], env.action_spec.shape[-1]
     network = nn.Sequential(
-        MLP(in_features=obs_dim, out_features=2 * action_dim, num_cells=[64, 64], activation_class=nn.Tanh),
+        MLP(
+            in_features=obs_dim,
+            out_features=2 * action_dim,
+            num_cells=[64, 64],
+            activation_class=nn.Tanh,
+        ),
         NormalParamExtractor(scale_mapping="biased_softplus_0.5"),
     )
     actor = ProbabilisticActor(
@@ -74,4 +79,6 @@ def test_stock_ppo_learns_to_balance():
     assert len(losses) == ITERATIONS * EPOCHS * E * T // B
     assert sum(falls[-3:]) < 0.6 * sum(falls[1:4]), f"falls per step, by iteration: {falls}"
     # Each fall starts another episode, so fewer of them are longer episodes.
-    assert max(lengths[-3:]) > 1.5 * lengths[1], f"mean steps since the reset, by iteration: {lengths}"
+    assert max(lengths[-3:]) > 1.5 * lengths[1], (
+        f"mean steps since the reset, by iteration: {lengths}"
+    )

@@ -10,7 +10,14 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv
-from torchrl.modules import MLP, LSTMModule, ProbabilisticActor, TanhNormal, ValueOperator, set_recurrent_mode
+from torchrl.modules import (
+    MLP,
+    LSTMModule,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+    set_recurrent_mode,
+)
 from torchrl.objectives import ClipPPOLoss, SACLoss, SoftUpdate
 from torchrl.objectives.value import GAE
 
@@ -24,15 +31,23 @@ E = 4
 
 @pytest.fixture(params=["ours", "stock wrapper"])
 def env(request):
-    made = envs.make("cartpole_balance", num_envs=E, seed=0, overrides=["task.episode_length_s=0.2"])
-    yield made if request.param == "ours" else TransformedEnv(made, Compose(RewardSum(), StepCounter()))
+    made = envs.make(
+        "cartpole_balance", num_envs=E, seed=0, overrides=["task.episode_length_s=0.2"]
+    )
+    yield (
+        made
+        if request.param == "ours"
+        else TransformedEnv(made, Compose(RewardSum(), StepCounter()))
+    )
     if not made.is_closed:  # by the collector, at its end
         made.close()
 
 
 def actor_of(env, distribution, **options):
     low_high = {"low": env.action_spec.space.low[0], "high": env.action_spec.space.high[0]}
-    net = nn.Sequential(MLP(in_features=5, out_features=2, num_cells=[32, 32]), NormalParamExtractor())
+    net = nn.Sequential(
+        MLP(in_features=5, out_features=2, num_cells=[32, 32]), NormalParamExtractor()
+    )
     return ProbabilisticActor(
         TensorDictModule(net, in_keys=["actor"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -57,7 +72,9 @@ def copies(*modules):
 def test_sac(env):
     torch.manual_seed(0)
     actor = actor_of(env, TanhNormal)
-    critic = ValueOperator(MLP(in_features=6, out_features=1, num_cells=[32]), in_keys=["actor", "action"])
+    critic = ValueOperator(
+        MLP(in_features=6, out_features=1, num_cells=[32]), in_keys=["actor", "action"]
+    )
     loss = SACLoss(actor, critic, num_qvalue_nets=2, action_spec=env.full_action_spec)
     loss.make_value_estimator(gamma=0.99)
     targets = SoftUpdate(loss, eps=0.95)
@@ -84,7 +101,9 @@ def test_recurrent_ppo(env):
     env = TransformedEnv(env, Compose(InitTracker(), lstm.make_tensordict_primer()))
     head = nn.Sequential(nn.Linear(16, 2), NormalParamExtractor())
     actor = ProbabilisticActor(
-        TensorDictSequential(lstm, TensorDictModule(head, in_keys=["features"], out_keys=["loc", "scale"])),
+        TensorDictSequential(
+            lstm, TensorDictModule(head, in_keys=["features"], out_keys=["loc", "scale"])
+        ),
         in_keys=["loc", "scale"],
         spec=env.full_action_spec,
         distribution_class=TanhNormal,

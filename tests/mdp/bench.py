@@ -90,9 +90,13 @@ class Plateau(Ground):
 class Bench(SensorBench):
     """Worlds and their view, with what the env does around terms; a step takes 20 ms."""
 
-    def __init__(self, source: str, num_envs: int, contacts: Mapping[str, Sensor], **view: float) -> None:
+    def __init__(
+        self, source: str, num_envs: int, contacts: Mapping[str, Sensor], **view: float
+    ) -> None:
         self.per_world = ("geom_friction", "body_ipos")
-        super().__init__(source, num_envs, contacts, step_dt=0.02, view=view, per_world_fields=self.per_world)
+        super().__init__(
+            source, num_envs, contacts, step_dt=0.02, view=view, per_world_fields=self.per_world
+        )
         self.everybody_E = torch.ones(num_envs, dtype=torch.bool)
 
     def command(self, values) -> None:

@@ -46,7 +46,9 @@ def write_clip(file: Path) -> str:
     return str(file)
 
 
-def busy_env(clip: str, *, curricula: bool = True, device: str = "cpu", **fields) -> ManagerBasedRlEnv:
+def busy_env(
+    clip: str, *, curricula: bool = True, device: str = "cpu", **fields
+) -> ManagerBasedRlEnv:
     """Build an env of hoppers with every kind of command, event, termination, metric and curriculum."""
     touch = {"touch": ContactSensor(geoms=("trunk", "foot"))}
     twist = mdp.UniformVelocityCommand(
@@ -60,7 +62,9 @@ def busy_env(clip: str, *, curricula: bool = True, device: str = "cpu", **fields
     cfg = puck_cfg(
         num_envs=NUM_ENVS,
         limit=None,
-        scene=SceneCfg(robots={"hopper": MjcfRobot(source=HOPPER)}, sensors=touch, num_envs=NUM_ENVS),
+        scene=SceneCfg(
+            robots={"hopper": MjcfRobot(source=HOPPER)}, sensors=touch, num_envs=NUM_ENVS
+        ),
         observations={
             "actor": ObservationGroupCfg(
                 terms={
@@ -76,7 +80,9 @@ def busy_env(clip: str, *, curricula: bool = True, device: str = "cpu", **fields
                 resampling_time_range_s=OFTEN, joints=".*", offset=(-1.0, 1.0)
             ),
             "reach": mdp.CartesianCommand(
-                resampling_time_range_s=OFTEN, position={"x": (0.0, 1.0)}, orientation={"yaw": (0.0, 1.0)}
+                resampling_time_range_s=OFTEN,
+                position={"x": (0.0, 1.0)},
+                orientation={"yaw": (0.0, 1.0)},
             ),
             "start": mdp.StartPoseCommand(),
             "gait": mdp.SinusoidalGaitCommand(
@@ -121,7 +127,9 @@ def busy_env(clip: str, *, curricula: bool = True, device: str = "cpu", **fields
             "level": mdp.EpisodeLengthLevel(raise_above=0.2, min_episodes=2),
             "weight": mdp.RewardWeightByLevel(reward="alive", start=0.0, end=1.0),
             "stage": mdp.RewardWeightByStage(reward="upright", stages={10: 2.0}),
-            "ranges": mdp.CommandRangesByStage(command="twist", stages={12: {"lin_vel_x": (0.0, 2.0)}}),
+            "ranges": mdp.CommandRangesByStage(
+                command="twist", stages={12: {"lin_vel_x": (0.0, 2.0)}}
+            ),
             "heights": mdp.CommandRangesByLevel(
                 command="height", start={"height": (0.3, 0.3)}, end={"height": (0.1, 0.5)}
             ),

@@ -19,7 +19,10 @@ def make_bench():
     """Build a bench of another model or size."""
 
     def make(
-        source: str, num_envs: int, contacts: Mapping[str, ContactSensor] | None = None, **view: float
+        source: str,
+        num_envs: int,
+        contacts: Mapping[str, ContactSensor] | None = None,
+        **view: float,
     ) -> Bench:
         return Bench(source, num_envs, contacts or {}, **view)
 

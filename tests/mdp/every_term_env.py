@@ -113,7 +113,9 @@ REWARDS: dict[str, RewardTerm] = {
         mdp.JointVelLimits(weight=-0.1, limits={".*": 1.0}),
         mdp.JointAccL2(weight=-1e-6),
         mdp.JointJerkL2(weight=-1e-9),
-        mdp.UnreachableTargetL2(weight=-1.0, max_velocity={".*": 1.0}, max_acceleration={".*": 10.0}),
+        mdp.UnreachableTargetL2(
+            weight=-1.0, max_velocity={".*": 1.0}, max_acceleration={".*": 10.0}
+        ),
         mdp.JointEffortL2(weight=-1e-4),
         mdp.JointEffortLimits(weight=-1e-2, limits={".*": 5.0}, soft_factor=0.5),
         mdp.ActuatorForceL2(weight=-1e-4),
@@ -160,11 +162,17 @@ def every_term_env(num_envs: int = 3, device: str = "cpu") -> ManagerBasedRlEnv:
         actions={"joints": mdp.JointPositionAction(joints=".*", scale=0.3)},
         commands={
             "twist": mdp.UniformVelocityCommand(
-                lin_vel_x=(-1, 1), lin_vel_y=(-1, 1), ang_vel_z=(-1, 1), rel_standing_envs=0.3, **often
+                lin_vel_x=(-1, 1),
+                lin_vel_y=(-1, 1),
+                ang_vel_z=(-1, 1),
+                rel_standing_envs=0.3,
+                **often,
             ),
             "height": mdp.BaseHeightCommand(height=(0.3, 0.5), **often),
             "joints": mdp.JointPositionCommand(joints=".*", offset=(-0.2, 0.2), **often),
-            "target": mdp.CartesianCommand(position={"x": (0.1, 0.3)}, orientation={"yaw": (-1, 1)}, **often),
+            "target": mdp.CartesianCommand(
+                position={"x": (0.1, 0.3)}, orientation={"yaw": (-1, 1)}, **often
+            ),
             "gait": mdp.SinusoidalGaitCommand(frequency=(1.0, 2.0), offsets=(0.0, 0.5, 0.5, 0.0)),
         },
         rewards=REWARDS,

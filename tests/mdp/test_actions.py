@@ -68,7 +68,9 @@ def test_position_targets_reach_the_servos_of_their_joints(arms):
 
 
 def test_columns_follow_the_order_of_the_term(arms):
-    ctrl = run(arms, mdp.JointPositionAction(joints=("elbow", "shoulder"), use_default_offset=False))
+    ctrl = run(
+        arms, mdp.JointPositionAction(joints=("elbow", "shoulder"), use_default_offset=False)
+    )
     torch.testing.assert_close(ctrl[:, [ELBOW, SHOULDER]], ACTION)
 
 
@@ -129,7 +131,9 @@ def test_the_filter_answers_a_step_like_a_first_order_system(arms):
 
 def test_some_joints_leave_the_other_controls_alone(arms):
     arms.world.ctrl_EL.fill_(7.0)
-    ctrl = run(arms, mdp.JointPositionAction(joints="elbow", use_default_offset=False), ACTION[:, :1])
+    ctrl = run(
+        arms, mdp.JointPositionAction(joints="elbow", use_default_offset=False), ACTION[:, :1]
+    )
     torch.testing.assert_close(ctrl[:, ELBOW], ACTION[:, 0])
     assert (ctrl[:, [GRIP, WRIST, SHOULDER, BRAKE]] == 7.0).all()
 
@@ -170,10 +174,14 @@ TENDONS = """
 def test_tendons_and_sites_take_controls_with_scale_and_offset_by_name():
     bench = Bench(TENDONS, 3, {})
     term = mdp.ActuatorAction(
-        actuators=("thrust", "cord"), scale={"cord": 0.5, "thrust": 2.0}, offset={"cord": 0.3, "thrust": 0.0}
+        actuators=("thrust", "cord"),
+        scale={"cord": 0.5, "thrust": 2.0},
+        offset={"cord": 0.3, "thrust": 0.0},
     )
     ctrl = run(bench, term)
-    torch.testing.assert_close(ctrl, torch.stack((0.5 * ACTION[:, 1] + 0.3, 2.0 * ACTION[:, 0]), dim=-1))
+    torch.testing.assert_close(
+        ctrl, torch.stack((0.5 * ACTION[:, 1] + 0.3, 2.0 * ACTION[:, 0]), dim=-1)
+    )
     # The site's y axis points against x: a force of 3 per unit of control, against the gear's sign, on 2 kg.
     bench.place(qpos=[[0.0]], qvel=[[0.0]])
     run(bench, mdp.ActuatorAction(actuators="thrust"), ACTION[:, :1])
@@ -196,9 +204,18 @@ def test_tendons_and_sites_take_controls_with_scale_and_offset_by_name():
     ("term", "message"),
     [
         (mdp.JointPositionAction(joints="grip"), "'grip' is asked for a position.*takes an effort"),
-        (mdp.JointEffortAction(joints="shoulder"), "'shoulder' is asked for an effort.*takes a position"),
-        (mdp.JointVelocityAction(joints="shoulder"), "'shoulder' is asked for a velocity.*takes a position"),
-        (mdp.JointPositionAction(joints="wrist"), "'wrist' is asked for a position.*takes a velocity"),
+        (
+            mdp.JointEffortAction(joints="shoulder"),
+            "'shoulder' is asked for an effort.*takes a position",
+        ),
+        (
+            mdp.JointVelocityAction(joints="shoulder"),
+            "'shoulder' is asked for a velocity.*takes a position",
+        ),
+        (
+            mdp.JointPositionAction(joints="wrist"),
+            "'wrist' is asked for a position.*takes a velocity",
+        ),
     ],
 )
 def test_an_actuator_that_takes_another_kind_of_target_refuses(arms, term, message):
@@ -239,14 +256,18 @@ def bounds(bench, term):
 def test_bounds_are_the_actions_that_reach_the_control_range(arms):
     effort = mdp.JointEffortAction(joints="grip")
     assert bounds(arms, effort) == [[-2.0, 3.0]]
-    assert bounds(arms, mdp.JointEffortAction(joints="grip", scale=-2.0, offset=1.0)) == [[-1.0, 1.5]]
+    assert bounds(arms, mdp.JointEffortAction(joints="grip", scale=-2.0, offset=1.0)) == [
+        [-1.0, 1.5]
+    ]
     assert bounds(arms, mdp.JointEffortAction(joints="grip", clip=(-1.0, 5.0))) == [[-1.0, 3.0]]
     assert bounds(arms, mdp.JointEffortAction(joints="grip", tanh=True)) is None
     assert bounds(arms, mdp.ActuatorAction(actuators=("grip", "wrist"), scale=0.5)) == [
         [-4.0, 6.0],
         [-math.inf, math.inf],
     ]
-    assert bounds(arms, mdp.ActuatorAction(actuators="grip", scale=-1.0, offset=0.5)) == [[-2.5, 2.5]]
+    assert bounds(arms, mdp.ActuatorAction(actuators="grip", scale=-1.0, offset=0.5)) == [
+        [-2.5, 2.5]
+    ]
     servos = mdp.JointPositionVelocityAction(joints="elbow", clip=(-1.0, 2.0))
     assert bounds(arms, servos) == [[-1.0, 2.0]] * 2
     assert bounds(arms, mdp.JointPositionAction(joints="elbow")) is None

@@ -22,7 +22,9 @@ def test_values_follow_the_names():
     assert values_by_name("std", table, ["knee", "left_hip", "right_hip"]) == (2.0, 1.0, 1.0)
 
 
-@pytest.mark.parametrize("table", [{"hip": 1.0}, {".*": 1.0, "hip": 2.0}, {".*": 1.0, "ankle": 2.0}])
+@pytest.mark.parametrize(
+    "table", [{"hip": 1.0}, {".*": 1.0, "hip": 2.0}, {".*": 1.0, "ankle": 2.0}]
+)
 def test_each_name_needs_exactly_one_value(table):
     with pytest.raises(ValueError, match="std"):
         values_by_name("std", table, ["hip", "knee"])

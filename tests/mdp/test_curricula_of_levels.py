@@ -38,7 +38,9 @@ def test_stock_resets_and_masked_ones_give_the_same_levels():
     root_E, seen = stock.reset(), []
     for _ in range(9):
         next_E = stock.step(root_E.set("action", torch.zeros(3, 1)))["next"].clone()
-        root_E = stock.reset(next_E.set("_reset", next_E["done"])) if next_E["done"].any() else next_E
+        root_E = (
+            stock.reset(next_E.set("_reset", next_E["done"])) if next_E["done"].any() else next_E
+        )
         seen.append(round(float(stock.view.level), 4))
     assert seen == levels == [0, 0, 0, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5]
 
@@ -93,7 +95,9 @@ def test_saturation_is_what_the_log_shows_of_a_reward():
     # Positions 0.02 (e + 1) and 0.04 (e + 1): mean 0.06 per second of the longest episode, times the weight 2.
     rewards = {"position": Position(weight=2.0)}
     for threshold, level in ((0.119, 0.1), (0.121, 0.0)):
-        env = leveled(mdp.SaturationLevel(reward="position", raise_above=threshold), rewards=rewards)
+        env = leveled(
+            mdp.SaturationLevel(reward="position", raise_above=threshold), rewards=rewards
+        )
         assert run(env, 2)[-1] == level
         log = env.episode_log()
         assert float(log["reward/position"] / log["episodes"]) / (2 * DT) == pytest.approx(0.12)
@@ -128,7 +132,10 @@ def test_the_level_and_what_it_waits_for_are_part_of_the_state():
         (lambda: mdp.DistanceLevel(raise_above=1.0, lower_below=2.0), r"lower_below=2\.0"),
         (lambda: mdp.DistanceLevel(raise_above=1.0, num_levels=0), "num_levels=0"),
         (lambda: mdp.DistanceLevel(raise_above=1.0, min_episodes=0), "min_episodes=0"),
-        (lambda: leveled(mdp.SaturationLevel(reward="positon", raise_above=1.0)), "unknown reward 'positon'"),
+        (
+            lambda: leveled(mdp.SaturationLevel(reward="positon", raise_above=1.0)),
+            "unknown reward 'positon'",
+        ),
         (
             lambda: puck_env(limit=None, curriculum={"level": mdp.EpisodeLengthLevel()}),
             "EpisodeLengthLevel with episode_length_s=0",

@@ -44,13 +44,17 @@ def test_weights_follow_their_stages_when_envs_reset():
 
 
 def test_a_stage_at_step_zero_holds_from_the_start():
-    weights, _, _ = run(env_with(weight=mdp.RewardWeightByStage(reward="position", stages={0: 0.0})), 1)
+    weights, _, _ = run(
+        env_with(weight=mdp.RewardWeightByStage(reward="position", stages={0: 0.0})), 1
+    )
     assert weights == [0.0]
 
 
 def test_weights_follow_the_level():
     level = mdp.LinearLevel(end_step=8)
-    env = env_with(level=level, weight=mdp.RewardWeightByLevel(reward="position", start=-1.0, end=1.0))
+    env = env_with(
+        level=level, weight=mdp.RewardWeightByLevel(reward="position", start=-1.0, end=1.0)
+    )
     assert run(env, 8)[0] == [-1, -0.5, -0.5, 0, 0, 0.5, 0.5, 1]
 
 
@@ -65,7 +69,9 @@ def test_the_reward_is_paid_at_the_weight_of_its_step():
 
 
 def test_ranges_follow_their_stages_and_fields_that_a_stage_leaves_out_stay():
-    env = env_with(ranges=mdp.CommandRangesByStage(command="height", stages={4: {"height": (0.5, 0.6)}}))
+    env = env_with(
+        ranges=mdp.CommandRangesByStage(command="height", stages={4: {"height": (0.5, 0.6)}})
+    )
     _, lows, highs = run(env, 8)
     assert min(lows[:3]) >= 0.2 and max(highs[:3]) <= 0.4
     assert min(lows[3:]) >= 0.5 and max(highs[3:]) <= 0.6
@@ -82,7 +88,9 @@ def test_ranges_follow_the_level():
     for step, share in enumerate((0, 0.25, 0.25, 0.5, 0.5, 0.75, 0.75, 1)):
         assert 0.3 - 0.1 * share - 1e-6 <= lows[step] <= 0.3 - 0.08 * share + 1e-6
         assert 0.3 + 0.08 * share - 1e-6 <= highs[step] <= 0.3 + 0.1 * share + 1e-6
-    torch.testing.assert_close(env.view.command_ranges["height"]["height"], torch.tensor([0.2, 0.4]))
+    torch.testing.assert_close(
+        env.view.command_ranges["height"]["height"], torch.tensor([0.2, 0.4])
+    )
 
 
 def test_a_velocity_commands_yaw_range_bounds_its_heading_control_too():
@@ -102,7 +110,9 @@ def test_a_velocity_commands_yaw_range_bounds_its_heading_control_too():
         curriculum={"ranges": mdp.CommandRangesByStage(command="twist", stages=stages)},
     )
     root_E = env.reset()
-    assert (root_E["command", "twist"][:, 2] == 0.5).all() and (root_E["command", "twist"][:, 0] >= 1.0).all()
+    assert (root_E["command", "twist"][:, 2] == 0.5).all() and (
+        root_E["command", "twist"][:, 0] >= 1.0
+    ).all()
     for _ in range(2):
         _, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(3, 1)))
     torch.testing.assert_close(root_E["command", "twist"][:, 2], torch.full((3,), 0.1))
@@ -115,7 +125,9 @@ def test_they_never_make_the_host_wait_and_are_part_of_the_state():
         return env_with(
             level=mdp.LinearLevel(end_step=20),
             length=mdp.RewardWeightByLevel(reward="position", start=0.0, end=2.0),
-            ranges=mdp.CommandRangesByLevel(command="height", start=ranges, end={"height": (0.1, 0.5)}),
+            ranges=mdp.CommandRangesByLevel(
+                command="height", start=ranges, end={"height": (0.1, 0.5)}
+            ),
         )
 
     first, second = env(), env()
@@ -129,7 +141,9 @@ def test_they_never_make_the_host_wait_and_are_part_of_the_state():
     for _ in range(5):
         state_E, next_root_E = first.step_and_maybe_reset(root_E.clone().set("action", action))
         twin_E, _ = second.step_and_maybe_reset(root_E.clone().set("action", action))
-        assert torch.equal(state_E["next", "command", "height"], twin_E["next", "command", "height"])
+        assert torch.equal(
+            state_E["next", "command", "height"], twin_E["next", "command", "height"]
+        )
         assert torch.equal(state_E["next", "reward"], twin_E["next", "reward"])
         root_E = next_root_E
 
@@ -139,9 +153,14 @@ def test_they_never_make_the_host_wait_and_are_part_of_the_state():
     [
         (lambda: mdp.RewardWeightByStage(reward="position", stages={}), r"stages=\{\}"),
         (lambda: mdp.RewardWeightByStage(reward="position", stages={-1: 1.0}), "stages key -1"),
-        (lambda: mdp.CommandRangesByStage(command="h", stages={1: {"x": (1.0, 0.0)}}), r"stages\.1\.x"),
         (
-            lambda: mdp.CommandRangesByLevel(command="h", start={"x": (0.0, 1.0)}, end={"y": (0.0, 1.0)}),
+            lambda: mdp.CommandRangesByStage(command="h", stages={1: {"x": (1.0, 0.0)}}),
+            r"stages\.1\.x",
+        ),
+        (
+            lambda: mdp.CommandRangesByLevel(
+                command="h", start={"x": (0.0, 1.0)}, end={"y": (0.0, 1.0)}
+            ),
             "start has the fields",
         ),
         (
@@ -150,7 +169,9 @@ def test_they_never_make_the_host_wait_and_are_part_of_the_state():
         ),
         (
             lambda: env_with(
-                ranges=mdp.CommandRangesByStage(command="heigth", stages={1: {"height": (0.0, 1.0)}})
+                ranges=mdp.CommandRangesByStage(
+                    command="heigth", stages={1: {"height": (0.0, 1.0)}}
+                )
             ),
             "unknown command with ranges 'heigth': did you mean 'height'",
         ),
@@ -206,7 +227,9 @@ def test_fields_of_a_termination_follow_their_stages():
     env = puck_env(
         limit=None,
         terminations={"beyond": Beyond(limit=0.05)},
-        curriculum={"limit": mdp.TerminationFieldsByStage(termination="beyond", stages={4: {"limit": 0.09}})},
+        curriculum={
+            "limit": mdp.TerminationFieldsByStage(termination="beyond", stages={4: {"limit": 0.09}})
+        },
     )
     root_E, lengths = env.reset(), [[], [], []]
     for _ in range(12):
@@ -221,7 +244,10 @@ def test_fields_of_a_termination_follow_their_stages():
 @pytest.mark.parametrize(
     ("term", "message"),
     [
-        (mdp.RewardFieldsByStage(reward="wai", stages={1: {"factor": 2.0}}), "unknown reward.*'wai'.*'way'"),
+        (
+            mdp.RewardFieldsByStage(reward="wai", stages={1: {"factor": 2.0}}),
+            "unknown reward.*'wai'.*'way'",
+        ),
         (mdp.RewardFieldsByStage(reward="way", stages={1: {"facto": 2.0}}), "'facto'.*'factor'"),
         (mdp.RewardFieldsByStage(reward="way", stages={1: {"weight": 2.0}}), "'weight'"),
         (mdp.RewardFieldsByStage(reward="way", stages={1: {"factor": "much"}}), "factor='much'"),

@@ -35,7 +35,12 @@ def test_joints_are_scaled_about_zero_within_the_soft_limits(crowd):
     crowd.fire(mdp.ResetJointsByScale(position_scale=(0.0, 3.0), velocity_range=(-1.0, 2.0)))
     left_E, right_E = crowd.world.qpos_EL[:, 7], crowd.world.qpos_EL[:, 8]
     # Defaults 0.25 and 0.5, soft limits (-0.5, 0.5) and (0.5, 1.5).
-    assert left_E.min() >= 0.0 and left_E.max() == 0.5 and right_E.min() == 0.5 and right_E.max() <= 1.5
+    assert (
+        left_E.min() >= 0.0
+        and left_E.max() == 0.5
+        and right_E.min() == 0.5
+        and right_E.max() <= 1.5
+    )
     assert float((left_E == 0.5).float().mean()) == pytest.approx(1 / 3, abs=0.1)
     velocity = crowd.world.qvel_EL[:, 6:]
     assert velocity.min() >= -1.0 and velocity.max() <= 2.0 and velocity.std() > 0.7

@@ -19,7 +19,9 @@ def clip(tmp_path):
 
 
 def motion_env(clip, num_envs=64, **fields):
-    return puck_env(num_envs=num_envs, limit=None, events={"motion": mdp.ResetToMotion(file=clip, **fields)})
+    return puck_env(
+        num_envs=num_envs, limit=None, events={"motion": mdp.ResetToMotion(file=clip, **fields)}
+    )
 
 
 def test_episodes_begin_in_states_of_the_motion(clip):

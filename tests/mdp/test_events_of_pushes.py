@@ -87,7 +87,9 @@ def test_the_wrench_is_at_the_centre_of_mass_in_the_world_frame_as_in_the_c_engi
     wrench = (1.0, -2.0, 3.0, 0.1, 0.2, -0.3)
     axes = ("x", "y", "z", "roll", "pitch", "yaw")
     ranges = {axis: (value, value) for axis, value in zip(axes, wrench, strict=True)}
-    push = mdp.PushByForce(body="brick", wrench_range=ranges, duration_s=(DT, DT), interval_range_s=(DT, DT))
+    push = mdp.PushByForce(
+        body="brick", wrench_range=ranges, duration_s=(DT, DT), interval_range_s=(DT, DT)
+    )
     env = brick_env(LOPSIDED, push=push)
     root_E = env.reset()
     start = torch.tensor([0, 0, 1, math.cos(0.4), 0, math.sin(0.4), 0, 0.3])
@@ -127,7 +129,9 @@ def test_a_reset_ends_the_push_of_its_rows_only():
 
 
 def test_a_pattern_of_several_bodies_is_refused():
-    push = mdp.PushByForce(body="b.*|knob", wrench_range={}, duration_s=(1, 1), interval_range_s=(1, 1))
+    push = mdp.PushByForce(
+        body="b.*|knob", wrench_range={}, duration_s=(1, 1), interval_range_s=(1, 1)
+    )
     with pytest.raises(ValueError, match=r"matches \['brick', 'knob'\]: name one of them"):
         brick_env(push=push)
 
@@ -148,7 +152,8 @@ def test_a_jump_adds_to_the_velocity_of_its_rows(free_body):
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0), qvel=velocity)
     free_body.world.gravity_EL.copy_(torch.tensor([0.0, 0.0, -5.0]))
     free_body.fire(
-        mdp.Jump(height_range=(0.4, 0.4), interval_range_s=(1.0, 1.0)), torch.tensor([True, False, False])
+        mdp.Jump(height_range=(0.4, 0.4), interval_range_s=(1.0, 1.0)),
+        torch.tensor([True, False, False]),
     )
     assert torch.equal(free_body.world.qvel_EL[1:], velocity.expand(2, 8))
     expected = velocity + torch.tensor([0, 0, math.sqrt(2 * 5.0 * 0.4), 0, 0, 0, 0, 0])
@@ -166,7 +171,10 @@ def test_a_jump_adds_to_the_velocity_of_its_rows(free_body):
             lambda: mdp.PushByForce(body="b", wrench_range={}, duration_s=(1.0, 1.0), mode="reset"),
             "mode='reset': expected 'interval'",
         ),
-        (lambda: mdp.Jump(height_range=(-0.1, 0.2), interval_range_s=(1.0, 1.0)), r"height_range\[0\]=-0.1"),
+        (
+            lambda: mdp.Jump(height_range=(-0.1, 0.2), interval_range_s=(1.0, 1.0)),
+            r"height_range\[0\]=-0.1",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(make, message):
@@ -176,7 +184,9 @@ def test_what_does_not_fit_is_refused(make, message):
 
 def test_an_unknown_body_is_refused_with_the_near_names(make_bench):
     bench = make_bench(FREE_BODY, 2)
-    push = mdp.PushByForce(body="trunc", wrench_range={}, duration_s=(1.0, 1.0), interval_range_s=(1.0, 1.0))
+    push = mdp.PushByForce(
+        body="trunc", wrench_range={}, duration_s=(1.0, 1.0), interval_range_s=(1.0, 1.0)
+    )
     with pytest.raises(ValueError, match="no body matches 'trunc': did you mean 'trunk'"):
         bench.fire(push)
 
@@ -184,7 +194,8 @@ def test_an_unknown_body_is_refused_with_the_near_names(make_bench):
 def test_push_adds_to_the_velocity_in_the_world_frame(crowd):
     half = math.pi / 4
     crowd.place(
-        qpos=(0, 0, 1, math.cos(half), 0, 0, math.sin(half), 0, 0), qvel=(0.5, 0, 0, 0.25, 0, 0, 7, 8)
+        qpos=(0, 0, 1, math.cos(half), 0, 0, math.sin(half), 0, 0),
+        qvel=(0.5, 0, 0, 0.25, 0, 0, 7, 8),
     )
     before = crowd.world.qvel_EL.clone()
     mask = torch.arange(500) % 2 == 1

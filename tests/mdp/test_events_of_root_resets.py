@@ -6,7 +6,13 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from ksim_rl.envs import ManagerBasedRlEnv, MjcfRobot, ObservationGroupCfg, ObservationTermCfg, SceneCfg
+from ksim_rl.envs import (
+    ManagerBasedRlEnv,
+    MjcfRobot,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    SceneCfg,
+)
 from ksim_rl.scene.quaternion import yaw
 from ksim_rl.scene.state.ground import Ground
 from tests.envs.probe_env import puck_cfg
@@ -34,7 +40,9 @@ def trunk_axes(crowd):
 
 
 def test_root_starts_around_its_default_pose(crowd):
-    event = mdp.ResetRootUniform(pose_range={"x": (-0.5, 0.5), "z": (0.01, 0.05), "yaw": (-3.0, 3.0)})
+    event = mdp.ResetRootUniform(
+        pose_range={"x": (-0.5, 0.5), "z": (0.01, 0.05), "yaw": (-3.0, 3.0)}
+    )
     crowd.fire(event)
     offset = crowd.world.qpos_EL[:, :3] - torch.tensor([1.0, 2.0, 3.0])
     assert offset[:, 0].min() < -0.45 and offset[:, 0].max() > 0.45
@@ -49,7 +57,8 @@ def test_root_starts_around_its_default_pose(crowd):
 def test_reset_velocity_is_in_the_world_frame(crowd):
     # Turned by 90 degrees of yaw, a spin about world x is one about minus y of the body.
     event = mdp.ResetRootUniform(
-        pose_range={"yaw": (math.pi / 2, math.pi / 2)}, velocity_range={"y": (1.0, 1.0), "roll": (2.0, 2.0)}
+        pose_range={"yaw": (math.pi / 2, math.pi / 2)},
+        velocity_range={"y": (1.0, 1.0), "roll": (2.0, 2.0)},
     )
     crowd.fire(event)
     expected = torch.tensor([0.0, 1.0, 0.0, 0.0, -2.0, 0.0]).expand(E, 6)
@@ -59,7 +68,9 @@ def test_reset_velocity_is_in_the_world_frame(crowd):
 def test_reset_leaves_other_rows_bit_identical(crowd):
     before_qpos, before_qvel = crowd.world.qpos_EL.clone(), crowd.world.qvel_EL.clone()
     mask = odd_rows()
-    crowd.fire(mdp.ResetRootUniform(pose_range={"x": (1.0, 2.0)}, velocity_range={"x": (1.0, 2.0)}), mask)
+    crowd.fire(
+        mdp.ResetRootUniform(pose_range={"x": (1.0, 2.0)}, velocity_range={"x": (1.0, 2.0)}), mask
+    )
     crowd.fire(mdp.ResetJoints(velocity_range=(1.0, 2.0)), mask)
     assert torch.equal(crowd.world.qpos_EL[~mask], before_qpos[~mask])
     assert torch.equal(crowd.world.qvel_EL[~mask], before_qvel[~mask])
@@ -87,7 +98,9 @@ def test_on_a_terrain_the_default_pose_stands_at_the_envs_origin(crowd):
 
     crowd.driver.ground = Hill(E, crowd.view.device)
     crowd.fire(mdp.ResetRootUniform(pose_range={"z": (0.1, 0.1)}))
-    torch.testing.assert_close(crowd.world.qpos_EL[:, :3], torch.tensor([6.0, -1.0, 3.6]).expand(E, 3))
+    torch.testing.assert_close(
+        crowd.world.qpos_EL[:, :3], torch.tensor([6.0, -1.0, 3.6]).expand(E, 3)
+    )
 
 
 def test_the_heading_is_the_drawn_one_and_the_tilt_stays(crowd):
@@ -121,9 +134,13 @@ def test_they_may_follow_one_another_in_one_reset(crowd):
     with crowd.driver.scope("events/height"):
         mdp.ResetHeight(height_range=(2.0, 2.0))(crowd.view, crowd.everybody_E)
     crowd.fire(mdp.ResetHeading(heading_range=(1.0, 1.0)))
-    torch.testing.assert_close(crowd.world.qpos_EL[:, :3], torch.tensor([1.0, 2.0, 2.0]).expand(E, 3))
+    torch.testing.assert_close(
+        crowd.world.qpos_EL[:, :3], torch.tensor([1.0, 2.0, 2.0]).expand(E, 3)
+    )
     torch.testing.assert_close(crowd.view.heading_E, torch.ones(E))
-    torch.testing.assert_close(crowd.view.projected_gravity_EL[:, 2], torch.full((E,), -math.cos(0.3)))
+    torch.testing.assert_close(
+        crowd.view.projected_gravity_EL[:, 2], torch.full((E,), -math.cos(0.3))
+    )
 
 
 @pytest.mark.parametrize(
@@ -145,7 +162,10 @@ def moving_env(share, **events):
         "w": ObservationTermCfg(term=mdp.RootAngVel()),
     }
     command = mdp.UniformVelocityCommand(
-        lin_vel_x=(0.5, 1.0), lin_vel_y=(-0.5, 0.5), ang_vel_z=(-1.0, 1.0), resampling_time_range_s=None
+        lin_vel_x=(0.5, 1.0),
+        lin_vel_y=(-0.5, 0.5),
+        ang_vel_z=(-1.0, 1.0),
+        resampling_time_range_s=None,
     )
     return ManagerBasedRlEnv(
         puck_cfg(

@@ -72,7 +72,9 @@ def test_rewards_are_finite_and_each_has_an_effect(env):
         root_E = env.maybe_reset(step_E["next"].exclude("reward"))
     assert torch.isfinite(sums).all()
     silent = {
-        name for name, total in zip(env.reward_manager.names, sums.tolist(), strict=True) if total == 0.0
+        name
+        for name, total in zip(env.reward_manager.names, sums.tolist(), strict=True)
+        if total == 0.0
     }
     # The robot's limbs cannot touch each other, and its joints have no limits.
     assert silent <= {"SelfCollision", "JointPosLimits"}

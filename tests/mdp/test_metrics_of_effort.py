@@ -44,7 +44,9 @@ def test_cost_of_transport_is_energy_per_weight_and_way(cart):
         energy, way = energy + 1.0 * speed * 0.02, way + speed * 0.02
         value_E = cart.read(metric, "metrics/x")
         assert float(value_E[0]) == pytest.approx(energy / (5.0 * max(way, 0.1)), rel=1e-5)
-    assert way > 0.6 and float(value_E[0]) == pytest.approx(0.2, rel=1e-5), "1 N of force over 5 N of weight"
+    assert way > 0.6 and float(value_E[0]) == pytest.approx(0.2, rel=1e-5), (
+        "1 N of force over 5 N of weight"
+    )
 
 
 def test_standing_still_has_a_finite_cost_and_a_reset_starts_anew():
@@ -58,7 +60,9 @@ def test_standing_still_has_a_finite_cost_and_a_reset_starts_anew():
     root_E = env.reset()
     for _ in range(2):
         for _ in range(3):
-            env_state_E, root_E = env.step_and_maybe_reset(root_E.set("action", torch.full((3, 1), 1.0)))
+            env_state_E, root_E = env.step_and_maybe_reset(
+                root_E.set("action", torch.full((3, 1), 1.0))
+            )
         assert env_state_E["next", "done"].all()
     log = env.episode_log()
     # Speeds 0.04, 0.08, 0.12 m/s under 2 N: 0.48 W in sum, so 0.0096 J on 5 N over the least way of 0.1 m.

@@ -26,7 +26,9 @@ def test_slip_is_the_speed_of_the_feet_that_touch(boxes):
         qvel=(0.3, 0.4, 0, 0, 0, 0, 3.0, 0, 0, 0, 0, 0),
     )
     boxes.step(1)
-    torch.testing.assert_close(boxes.read(slip, "metrics/x"), torch.full((2,), 0.5), msg="b is in the air")
+    torch.testing.assert_close(
+        boxes.read(slip, "metrics/x"), torch.full((2,), 0.5), msg="b is in the air"
+    )
     boxes.place(qpos=(0, 0, 2.0, 1, 0, 0, 0, 1, 0, 2.0, 1, 0, 0, 0), qvel=1.0)
     boxes.step(10)
     assert boxes.read(slip, "metrics/x").tolist() == [0.0, 0.0]

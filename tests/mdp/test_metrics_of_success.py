@@ -15,7 +15,11 @@ def finished(env, steps):
 def racing(*terminations, **fields):
     """Pucks of 1, 2 and 3 m/s; the goal is 0.11 m away, and the episode ends after five steps."""
     return puck_env(
-        terminations={"goal": Beyond(limit=0.11), "time_out": mdp.TimeOut(), "far": Beyond(limit=0.15)},
+        terminations={
+            "goal": Beyond(limit=0.11),
+            "time_out": mdp.TimeOut(),
+            "far": Beyond(limit=0.15),
+        },
         episode_length_s=5 * DT,
         metrics={"success": mdp.Success(terminations=terminations)},
         **fields,
@@ -24,7 +28,12 @@ def racing(*terminations, **fields):
 
 def test_success_is_an_end_by_the_named_terminations_and_by_no_other():
     # In five steps: 0 ends once by time at 0.10 m; 1 at 0.12 m in step 3; 2 at 0.12 m in steps 2 and 4.
-    for names, successes in ((("goal",), 3), (("time_out",), 1), (("goal", "time_out"), 4), (("far",), 0)):
+    for names, successes in (
+        (("goal",), 3),
+        (("time_out",), 1),
+        (("goal", "time_out"), 4),
+        (("far",), 0),
+    ):
         log = finished(racing(*names), 5)
         assert log["episodes"] == 4 and log["metric/success"] == successes, names
 

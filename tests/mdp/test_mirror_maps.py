@@ -86,7 +86,9 @@ def test_terms_without_a_known_image_are_refused_until_one_is_given(env):
         def __call__(self, view):
             return view.root_pos_EL
 
-    with pytest.raises(ValueError, match="the mirror image of Wind is not known.*term_mirror.register"):
+    with pytest.raises(
+        ValueError, match="the mirror image of Wind is not known.*term_mirror.register"
+    ):
         term_mirror(Wind(), innermost(env))
     term_mirror.register(Wind, lambda term, env: POLAR)
     assert term_mirror(Wind(), innermost(env)) is POLAR

@@ -28,7 +28,9 @@ def test_each_row_is_the_motion_one_env_step_later(env):
     names = [model.joint(i).name for i in range(model.njnt)]
     shown = [i for i, name in enumerate(names) if name == "root_z" or not name.startswith("root")]
     torso = model.body("torso").id
-    for row, qpos, qvel in zip(seen_FL.double().numpy(), motion["qpos"], motion["qvel"], strict=True):
+    for row, qpos, qvel in zip(
+        seen_FL.double().numpy(), motion["qpos"], motion["qvel"], strict=True
+    ):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         gravity = data.xmat[torso].reshape(3, 3).T @ [0.0, 0.0, -1.0]
@@ -39,7 +41,9 @@ def test_each_row_is_the_motion_one_env_step_later(env):
 
 def test_the_env_stays_as_it_was(env):
     env.reset()
-    before = {name: torch.as_tensor(value).clone() for name, value in env.base_env.state_dict().items()}
+    before = {
+        name: torch.as_tensor(value).clone() for name, value in env.base_env.state_dict().items()
+    }
     observe_motion(env, group="style", file="walker_walk")
     after = env.base_env.state_dict()
     assert all(torch.equal(value, torch.as_tensor(after[name])) for name, value in before.items())

@@ -55,13 +55,21 @@ def test_in_the_motion_every_reward_is_one(bench):
 def test_kernels_of_known_errors(bench):
     at(bench, 0.5, 1.0, 1.5, 2.0, moved=0.3)
     offset = read(bench, mdp.MotionBodyOffset(file=CLIP, bodies="torso"))
-    torch.testing.assert_close(offset, torch.tensor([[-0.3, 0.0, 0.0]]).expand(E, 3), atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(
+        offset, torch.tensor([[-0.3, 0.0, 0.0]]).expand(E, 3), atol=1e-4, rtol=0.0
+    )
     torso = mdp.TrackMotionBodyPos(file=CLIP, std=0.6, bodies="torso")
-    torch.testing.assert_close(bench.reward(torso), torch.full((E,), math.exp(-0.25)), atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(
+        bench.reward(torso), torch.full((E,), math.exp(-0.25)), atol=1e-4, rtol=0.0
+    )
     feet = mdp.TrackMotionBodyPos(file=CLIP, std=0.6, bodies=".*_foot")
-    torch.testing.assert_close(bench.reward(feet), torch.full((E,), math.exp(-0.5)), atol=2e-3, rtol=0.0)
+    torch.testing.assert_close(
+        bench.reward(feet), torch.full((E,), math.exp(-0.5)), atol=2e-3, rtol=0.0
+    )
     root_x = mdp.TrackMotionJointPos(file=CLIP, std=0.3, joints="root_x")
-    torch.testing.assert_close(bench.reward(root_x), torch.full((E,), math.exp(-1.0)), atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(
+        bench.reward(root_x), torch.full((E,), math.exp(-1.0)), atol=1e-4, rtol=0.0
+    )
 
     at(bench, 0.5, 1.0, 1.5, 2.0)
     bench.world.qpos_EL[:, 2] += 0.2
@@ -69,9 +77,13 @@ def test_kernels_of_known_errors(bench):
     bench.world.refresh()
     bench.driver.refreshed()
     turned = mdp.TrackMotionBodyQuat(file=CLIP, std=0.2, bodies="torso")
-    torch.testing.assert_close(bench.reward(turned), torch.full((E,), math.exp(-1.0)), atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(
+        bench.reward(turned), torch.full((E,), math.exp(-1.0)), atol=1e-4, rtol=0.0
+    )
     fast = mdp.TrackMotionJointVel(file=CLIP, std=0.5)
-    torch.testing.assert_close(bench.reward(fast), torch.full((E,), math.exp(-1.0)), atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(
+        bench.reward(fast), torch.full((E,), math.exp(-1.0)), atol=1e-4, rtol=0.0
+    )
 
 
 def test_poses_of_bodies_on_a_frame_are_the_engines(bench):
@@ -79,20 +91,28 @@ def test_poses_of_bodies_on_a_frame_are_the_engines(bench):
     data = mujoco.MjData(bench.model)
     with np.load(motion_path(CLIP)) as archive:
         qpos_FL, fps = archive["qpos"], float(archive["fps"])
-    pos_EN3, quat_EN4 = bench.view.motion(CLIP).sample_bodies(torch.tensor(frames) / fps, slice(1, 5))
+    pos_EN3, quat_EN4 = bench.view.motion(CLIP).sample_bodies(
+        torch.tensor(frames) / fps, slice(1, 5)
+    )
     for row, frame in enumerate(frames):
         data.qpos[:] = qpos_FL[frame]
         mujoco.mj_forward(bench.model, data)
         np.testing.assert_allclose(pos_EN3[row], data.xpos[1:5], atol=1e-5)
-        np.testing.assert_allclose(np.abs((quat_EN4[row].numpy() * data.xquat[1:5]).sum(-1)), 1.0, atol=1e-5)
+        np.testing.assert_allclose(
+            np.abs((quat_EN4[row].numpy() * data.xquat[1:5]).sum(-1)), 1.0, atol=1e-5
+        )
 
 
 def test_what_the_policy_sees(bench):
     at(bench, 0.0, 0.25, 1.0, 2.5)
     phase = read(bench, mdp.MotionPhase(file=CLIP, cycle_s=1.0))
-    torch.testing.assert_close(phase, torch.tensor([[0.0, 1], [1, 0], [0, 1], [0, -1]]), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(
+        phase, torch.tensor([[0.0, 1], [1, 0], [0, 1], [0, -1]]), atol=1e-5, rtol=0.0
+    )
     whole = read(bench, mdp.MotionPhase(file=CLIP))
-    torch.testing.assert_close(whole[2], torch.tensor([math.sin(math.pi / 4), math.cos(math.pi / 4)]))
+    torch.testing.assert_close(
+        whole[2], torch.tensor([math.sin(math.pi / 4), math.cos(math.pi / 4)])
+    )
     joints = read(bench, mdp.MotionJoints(file=CLIP, joints=LEGS))
     legs = bench.view.joints(LEGS)
     own = torch.cat((legs.pos_EL, legs.vel_EL), dim=-1)

@@ -66,7 +66,9 @@ def test_an_acceleration_adds_up_twice_within_the_greatest_velocity(arms):
 
 
 def test_a_target_approaches_a_position_within_the_greatest_acceleration(arms):
-    term = mdp.BoundedAccelerationAction(joints=JOINTS, use_default_offset=False, max_acceleration=50.0)
+    term = mdp.BoundedAccelerationAction(
+        joints=JOINTS, use_default_offset=False, max_acceleration=50.0
+    )
     seen = steps(arms, term, [[1.0, 0.21]] * 3)
     # 50 rad/s^2 are 1 rad/s more in each step; 0.01 rad in 0.02 s need only 0.5 rad/s, and as much to stop.
     same(seen, [[0.1 + 1 * DT, 0.21], [0.1 + 3 * DT, 0.21], [0.1 + 6 * DT, 0.21]])
@@ -78,7 +80,9 @@ def test_a_target_approaches_a_position_within_the_greatest_acceleration(arms):
     )
 
 
-LIMITED = ARMS.replace('<joint name="shoulder"', '<joint name="shoulder" limited="true" range="-1 0.15"')
+LIMITED = ARMS.replace(
+    '<joint name="shoulder"', '<joint name="shoulder" limited="true" range="-1 0.15"'
+)
 
 
 def test_a_target_stops_at_the_soft_limit_and_comes_back_at_once():
@@ -87,7 +91,9 @@ def test_a_target_stops_at_the_soft_limit_and_comes_back_at_once():
     term = mdp.IntegratedAccelerationAction(joints=JOINTS)
     seen = steps(bench, term, [[100.0, 0.0], [100.0, 0.0], [-100.0, 0.0]])[:, 0, 0]
     # 2 rad/s, then 4 rad/s into the limit, where it stands; -2 rad/s from there.
-    torch.testing.assert_close(seen, torch.tensor([0.1 + 2 * DT, 0.15, 0.15 - 2 * DT]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        seen, torch.tensor([0.1 + 2 * DT, 0.15, 0.15 - 2 * DT]), atol=1e-6, rtol=0
+    )
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,11 @@ def test_root_height_counts_from_the_ground_below(free_body):
 
 def test_far_is_horizontal_and_from_where_the_env_starts(free_body):
     free_body.place(
-        qpos=[(3, 4, 0, 1, 0, 0, 0, 0, 0), (0, 4.9, 9, 1, 0, 0, 0, 0, 0), (-5.1, 0, 0, 1, 0, 0, 0, 0, 0)]
+        qpos=[
+            (3, 4, 0, 1, 0, 0, 0, 0, 0),
+            (0, 4.9, 9, 1, 0, 0, 0, 0, 0),
+            (-5.1, 0, 0, 1, 0, 0, 0, 0, 0),
+        ]
     )
     term = mdp.FarFromOrigin(distance=4.99)
     assert free_body.read(term, "terminations/x").tolist() == [True, False, True]
@@ -78,7 +82,8 @@ def test_velocities_above_a_limit(free_body):
     half = math.pi / 4
     pose = (0, 0, 1, math.cos(half), 0, 0, math.sin(half), 0, 0)
     free_body.place(
-        qpos=pose, qvel=[(3, 0, 4, 0, 0, 0, 0, 0), (0, 0, 0, 5, 12, 0, 0, 0), (0, 0, 0, 0, 0, 0, -9, 2)]
+        qpos=pose,
+        qvel=[(3, 0, 4, 0, 0, 0, 0, 0), (0, 0, 0, 5, 12, 0, 0, 0), (0, 0, 0, 0, 0, 0, -9, 2)],
     )
 
     def ends(term):
@@ -96,7 +101,11 @@ def test_joint_limits_are_the_soft_ones_with_a_margin(free_body):
     # Soft limits are (-0.5, 0.5) and (0.5, 1.5).
     joints = ((0.55, 1.0), (0.0, 0.35), (0.5, 1.5))
     free_body.place(qpos=[(0, 0, 1, 1, 0, 0, 0, *pair) for pair in joints])
-    for margin, expected in ((0.0, [True, True, False]), (0.1, [False, True, False]), (0.2, [False] * 3)):
+    for margin, expected in (
+        (0.0, [True, True, False]),
+        (0.1, [False, True, False]),
+        (0.2, [False] * 3),
+    ):
         value = free_body.read(mdp.JointLimitViolated(margin=margin), "terminations/x")
         assert value.tolist() == expected
     left = mdp.JointLimitViolated(joints="left_hip")
@@ -107,7 +116,9 @@ def test_a_contact_is_illegal_above_its_force(boxes):
     boxes.place(qpos=(0, 0, 0.1, 1, 0, 0, 0, 1, 0, 5.0, 1, 0, 0, 0), qvel=0.0)
     boxes.step(100)  # box a rests with its weight of 30 N
     for threshold, ends in ((0.0, True), (29.0, True), (31.0, False)):
-        value = boxes.read(mdp.IllegalContact(sensor="touch", threshold=threshold), "terminations/x")
+        value = boxes.read(
+            mdp.IllegalContact(sensor="touch", threshold=threshold), "terminations/x"
+        )
         assert value.tolist() == [ends] * 2
     boxes.place(qpos=(0, 0, 5.0, 1, 0, 0, 0, 1, 0, 5.0, 1, 0, 0, 0), qvel=0.0)
     boxes.step(5)

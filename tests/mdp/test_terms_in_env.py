@@ -34,12 +34,19 @@ def test_steps_and_resets_never_make_the_host_wait_and_stay_finite(clip):
     with count_syncs() as syncs:
         states, _ = run(env, root_E, 30)
     assert syncs.total == 0, syncs.report()
-    assert all(torch.isfinite(leaf).all() for state_E in states for leaf in state_E.values(True, True))
+    assert all(
+        torch.isfinite(leaf).all() for state_E in states for leaf in state_E.values(True, True)
+    )
     log = env.episode_log()
-    assert log["episodes"] >= NUM_ENVS and log["termination/non_finite"] == log["termination/broken"] == 0
+    assert (
+        log["episodes"] >= NUM_ENVS
+        and log["termination/non_finite"] == log["termination/broken"] == 0
+    )
     levels = {**env.curriculum_levels(), **env.command_levels()}
     assert 0.0 < levels["level"] <= 1.0 and levels["weight"] == levels["heights"] == levels["level"]
-    assert levels["stage"] == 2.0 and levels["ranges"] == 1.0 and levels["twist/lin_vel_x_high"] == 2.0
+    assert (
+        levels["stage"] == 2.0 and levels["ranges"] == 1.0 and levels["twist/lin_vel_x_high"] == 2.0
+    )
 
 
 def test_stock_resets_give_the_same_rollout(clip):

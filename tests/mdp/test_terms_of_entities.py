@@ -40,7 +40,9 @@ def states(bench):
     "event",
     [
         mdp.ResetRootUniform(pose_range={"x": (1.0, 2.0)}, entity="two"),
-        mdp.PushByVelocity(velocity_range={"x": (1.0, 2.0)}, entity="two", interval_range_s=(1.0, 1.0)),
+        mdp.PushByVelocity(
+            velocity_range={"x": (1.0, 2.0)}, entity="two", interval_range_s=(1.0, 1.0)
+        ),
         mdp.Jump(height_range=(1.0, 2.0), entity="two", interval_range_s=(1.0, 1.0)),
         mdp.ResetHeading(heading_range=(-1.0, 1.0), entity="two"),
         mdp.ResetHeight(height_range=(1.0, 2.0), entity="two"),

@@ -48,7 +48,9 @@ def walked(bench, distances, *, levels, steps=100, speed=0.2):
     everybody_E = torch.ones(5, dtype=torch.bool)
     bench.ground.set_levels(everybody_E, torch.tensor(levels))
     bench.view.episode_step_E.copy_(torch.as_tensor(steps).expand(5))
-    bench.driver.readings.commands["twist"] = torch.tensor([[0.6 * speed, 0.8 * speed, 0.5]]).expand(5, 3)
+    bench.driver.readings.commands["twist"] = torch.tensor(
+        [[0.6 * speed, 0.8 * speed, 0.5]]
+    ).expand(5, 3)
     angle_E = torch.arange(5.0)
     distance_E = torch.tensor(distances)
     stand(bench, torch.stack((distance_E * angle_E.cos(), distance_E * angle_E.sin()), dim=-1))
@@ -91,7 +93,11 @@ def test_a_master_of_the_last_level_goes_on_at_a_random_one(five):
         adapt(five, torch.ones(5, dtype=torch.bool), count)
         seen += five.ground.levels_E.tolist()
     # 200 uniform draws: each of three levels within five standard deviations of a third.
-    assert all(abs(seen.count(level) - 200 / 3) < 34 for level in range(3)) and set(seen) == {0, 1, 2}
+    assert all(abs(seen.count(level) - 200 / 3) < 34 for level in range(3)) and set(seen) == {
+        0,
+        1,
+        2,
+    }
 
 
 # -- the edge ----------------------------------------------------------------------------------------------------
@@ -125,7 +131,9 @@ def test_a_scan_reads_the_ground_where_rays_of_the_c_engine_hit_it(bench):
     ]
     for row in range(NUM_ENVS):
         root = float(bench.ground.origins_E3[row, 2]) + 0.5
-        expected = torch.tensor(root - ground_heights(bench.mj_model(row), points) - 0.25).clamp(-0.5, 0.5)
+        expected = torch.tensor(root - ground_heights(bench.mj_model(row), points) - 0.25).clamp(
+            -0.5, 0.5
+        )
         assert torch.allclose(scan[row].double(), expected, atol=2e-4), GRID.columns[row // 3]
     assert float(scan[:3].std()) == pytest.approx(0.0, abs=1e-6) and float(scan[3:].std()) > 0.01
 

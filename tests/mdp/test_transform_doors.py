@@ -35,7 +35,10 @@ CUTOFF_HZ = 3.0
     [
         ({"clip": (-0.25, 0.5)}, lambda dt: ActionClip(clip=(-0.25, 0.5))),
         ({"scale": 0.3, "offset": 0.1}, lambda dt: ActionScale(scale=0.3, offset=0.1)),
-        ({"cutoff_hz": CUTOFF_HZ}, lambda dt: ActionLowPass(alpha=smoothing(CUTOFF_HZ, dt), initial=0.0)),
+        (
+            {"cutoff_hz": CUTOFF_HZ},
+            lambda dt: ActionLowPass(alpha=smoothing(CUTOFF_HZ, dt), initial=0.0),
+        ),
     ],
     ids=["clip", "scale", "low pass"],
 )
@@ -43,7 +46,9 @@ def test_an_action_is_shaped_alike(make_bench, option, transform):
     bench = make_bench(TWO_WHEELS, 3)
     term = mdp.JointEffortAction(**option)
     size = term.size(bench.view)
-    env = MaskedTransformedEnv(CounterEnv((9, 9, 9), action_size=size), [transform(bench.view.step_dt)])
+    env = MaskedTransformedEnv(
+        CounterEnv((9, 9, 9), action_size=size), [transform(bench.view.step_dt)]
+    )
     env.reset()
     for step in range(4):
         action_EK = torch.randn(3, size, generator=torch.Generator().manual_seed(step))
@@ -71,7 +76,9 @@ def test_time_left_successes_and_lengths_are_counted_alike():
         "ever": mdp.Success(terminations=("time_out",), reduce="max"),
         "length": Ones(),
     }
-    puck = puck_env(limit=0.11, episode_length_s=5 * DT, observations={"actor": left}, metrics=metrics)
+    puck = puck_env(
+        limit=0.11, episode_length_s=5 * DT, observations={"actor": left}, metrics=metrics
+    )
     trackers = [
         EpisodeTracker(),
         SuccessTracker("truncated", reduce="last"),
@@ -85,7 +92,9 @@ def test_time_left_successes_and_lengths_are_counted_alike():
         assert torch.equal(root_E["remaining_time"] / 5, root_E["share_left"])
         data_E, root_E = env.step_and_maybe_reset(root_E.set("action", torch.zeros(3, 1)))
         next_E = data_E["next"]
-        ended.append(next_E.select("episode_success", "episode_ever", "episode_length")[next_E["done"][:, 0]])
+        ended.append(
+            next_E.select("episode_success", "episode_ever", "episode_length")[next_E["done"][:, 0]]
+        )
     episodes, log = torch.cat(ended), puck.episode_log()
     assert log["episodes"] == len(episodes) > 3
     assert log["metric/success"] == episodes["episode_success"].sum() > 0

@@ -24,13 +24,18 @@ from ksim_rl.testing import count_syncs
 
 LOW, HIGH = torch.tensor([-2.0, 1.0]), torch.tensor([1.0, 3.0])
 BOX = Bounded(low=LOW.expand(4, 2), high=HIGH.expand(4, 2), shape=(4, 2))
-MIXED = Composite(action=Composite(arm=BOX, grip=Categorical(3, shape=(4,)), shape=(4,)), shape=(4,))
+MIXED = Composite(
+    action=Composite(arm=BOX, grip=Categorical(3, shape=(4,)), shape=(4,)), shape=(4,)
+)
 SPECS = {
     "gaussian": ("gaussian", Unbounded((4, 2))),
     "tanh_gaussian": ("tanh_gaussian", BOX),
     "truncated_gaussian": ("truncated_gaussian", BOX),
     "index": ("categorical", Categorical(3, shape=(4,))),
-    "column of indices": ("categorical", Composite(action=Categorical(3, shape=(4, 1)), shape=(4,))),
+    "column of indices": (
+        "categorical",
+        Composite(action=Categorical(3, shape=(4, 1)), shape=(4,)),
+    ),
     "one_hot": ("categorical", OneHot(3, shape=(4, 3))),
     "several indices": ("categorical", MultiCategorical([3, 2], shape=(4, 2))),
     "several one_hot": ("categorical", MultiOneHot([3, 2], shape=(4, 5))),
@@ -42,7 +47,9 @@ SPECS = {
 def _actor(name, **options):
     distribution, spec = SPECS[name]
     return make_actor(
-        ActorCfg(hidden_dims=(16,), distribution=distribution, **options), obs_dim=5, action_spec=spec
+        ActorCfg(hidden_dims=(16,), distribution=distribution, **options),
+        obs_dim=5,
+        action_spec=spec,
     )
 
 
@@ -73,7 +80,9 @@ def test_actions_are_of_the_spec_and_scored_by_the_distribution(name):
 
 
 @pytest.mark.parametrize("name", ["tanh_gaussian", "truncated_gaussian"])
-@pytest.mark.parametrize("options", [{}, {"state_dependent_std": True}, {"std_type": "log"}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"state_dependent_std": True}, {"std_type": "log"}], ids=str
+)
 def test_bounded_policies_start_at_the_center_with_init_std_of_half_the_range(name, options):
     torch.manual_seed(0)
     actor = _actor(name, init_std=0.1, **options)
@@ -90,7 +99,9 @@ def test_a_bound_of_our_own_where_the_spec_has_none():
     actions = make_actor(cfg, obs_dim=5, action_dim=2)(_data())["action"]
     assert actions.abs().max() <= 0.5
     bounded = make_actor(cfg, obs_dim=5, action_spec=BOX)
-    assert torch.equal(bounded.module[0].module.head.high, HIGH), "the bounds of the spec come first"
+    assert torch.equal(bounded.module[0].module.head.high, HIGH), (
+        "the bounds of the spec come first"
+    )
 
 
 @pytest.mark.parametrize("name", ["tanh_gaussian", "truncated_gaussian", "mixed"])
@@ -137,7 +148,11 @@ def test_compiles_without_a_break(name):
     ("distribution", "spec", "message"),
     [
         ("categorical", BOX, "'categorical' does not go with the action 'action', Bounded"),
-        ("gaussian", SPECS["index"][1], "'gaussian', but the action 'action' is discrete: use 'categorical'"),
+        (
+            "gaussian",
+            SPECS["index"][1],
+            "'gaussian', but the action 'action' is discrete: use 'categorical'",
+        ),
         (
             "tanh_gaussian",
             Unbounded((4, 2)),
@@ -146,7 +161,11 @@ def test_compiles_without_a_break(name):
         ("truncated_gaussian", Bounded(-1.0, torch.inf, (4, 2)), "has no finite ones"),
         ("categorical", MIXED, r"\('action', 'arm'\), BoundedContinuous of float32"),
         ("gaussian", Bounded(0, 5, (4, 2), dtype=torch.int64), "BoundedDiscrete of int64"),
-        ("gaussian", Composite(action=Unbounded((4, 2, 3)), shape=(4,)), r"shape \(2, 3\): expected one dim"),
+        (
+            "gaussian",
+            Composite(action=Unbounded((4, 2, 3)), shape=(4,)),
+            r"shape \(2, 3\): expected one dim",
+        ),
     ],
 )
 def test_a_distribution_that_does_not_go_with_the_spec_is_refused(distribution, spec, message):

@@ -34,7 +34,9 @@ def test_writes_what_torchrl_losses_read(cfg, shape):
 
 @pytest.mark.parametrize("cfg", CFGS)
 def test_observations_of_another_size_are_refused(cfg):
-    with pytest.raises(ValueError, match="built for obs_dim=7, and reads observations of 5 numbers"):
+    with pytest.raises(
+        ValueError, match="built for obs_dim=7, and reads observations of 5 numbers"
+    ):
         make_actor(cfg, obs_dim=7, action_dim=2)(_data(4))
 
 

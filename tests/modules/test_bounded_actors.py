@@ -62,7 +62,9 @@ def test_exploration_is_uniform_first_and_then_has_the_noise_of_each_env():
         obs_dim=4,
         action_spec=Bounded(LOW, HIGH, (2,)),
     )
-    policy = ExploringPolicy(actor, low_L=LOW, high_L=HIGH, num_envs=6, noise_min=0.05, noise_max=0.3)
+    policy = ExploringPolicy(
+        actor, low_L=LOW, high_L=HIGH, num_envs=6, noise_min=0.05, noise_max=0.3
+    )
     obs = torch.randn(6, 4)
 
     def actions():
@@ -75,7 +77,14 @@ def test_exploration_is_uniform_first_and_then_has_the_noise_of_each_env():
     torch.testing.assert_close(spread, policy.noise_scale_E1.expand(6, 2), rtol=0.08, atol=0.0)
     before = policy.noise_scale_E1.clone()
     policy.end_episodes_(torch.tensor([True, False, False, True, False, False]))
-    assert (policy.noise_scale_E1 != before)[:, 0].tolist() == [True, False, False, True, False, False]
+    assert (policy.noise_scale_E1 != before)[:, 0].tolist() == [
+        True,
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
 
 
 @pytest.mark.parametrize("kind", [DeterministicActorCfg, SquashedActorCfg])

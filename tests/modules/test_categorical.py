@@ -25,7 +25,9 @@ def test_one_choice_equals_torch():
     torch.testing.assert_close(ours.log_prob(value), reference.log_prob(value))
     torch.testing.assert_close(ours.entropy(), reference.entropy())
     torch.testing.assert_close(ours.probs, reference.probs)
-    assert torch.equal(ours.mode, reference.mode) and torch.equal(ours.deterministic_sample, ours.mode)
+    assert torch.equal(ours.mode, reference.mode) and torch.equal(
+        ours.deterministic_sample, ours.mode
+    )
     assert ours.batch_shape == reference.batch_shape and ours.event_shape == reference.event_shape
 
 
@@ -51,7 +53,9 @@ def test_several_choices_are_independent_ones(one_hot):
     )
     assert spec.is_in(sample)
     index = (
-        torch.stack([part.long().argmax(-1) for part in sample.split(SIZES, -1)], -1) if one_hot else sample
+        torch.stack([part.long().argmax(-1) for part in sample.split(SIZES, -1)], -1)
+        if one_hot
+        else sample
     )
     expected = sum(reference.log_prob(index[:, k]) for k, reference in enumerate(references))
     torch.testing.assert_close(ours.log_prob(sample), expected)
@@ -70,7 +74,10 @@ def test_gradients_are_those_of_finite_differences():
     logits = torch.randn(4, sum(SIZES), dtype=torch.float64, requires_grad=True)
     value = Categorical(logits, SIZES).sample()
     assert torch.autograd.gradcheck(
-        lambda logits: (Categorical(logits, SIZES).log_prob(value), Categorical(logits, SIZES).entropy()),
+        lambda logits: (
+            Categorical(logits, SIZES).log_prob(value),
+            Categorical(logits, SIZES).entropy(),
+        ),
         logits,
     )
 

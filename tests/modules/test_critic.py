@@ -10,7 +10,9 @@ from ksim_rl.testing import count_syncs
 @pytest.mark.parametrize("obs_normalization", [True, False])
 @pytest.mark.parametrize("shape", [(4,), (4, 3)])
 def test_writes_state_value(shape, obs_normalization):
-    critic = make_critic(CriticCfg(hidden_dims=(16, 8), obs_normalization=obs_normalization), obs_dim=5)
+    critic = make_critic(
+        CriticCfg(hidden_dims=(16, 8), obs_normalization=obs_normalization), obs_dim=5
+    )
     assert isinstance(critic, ValueOperator)
     data = TensorDict({"critic": torch.randn(*shape, 5)}, shape)
     with count_syncs() as syncs:

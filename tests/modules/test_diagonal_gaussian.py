@@ -30,7 +30,9 @@ def test_gradients_equal_those_of_independent_normal():
     scale = (torch.rand(5, 3) + 0.1).requires_grad_()
     gradients = []
     for dist in (DiagonalGaussian(loc, scale), Independent(Normal(loc, scale), 1)):
-        gradients.append(torch.autograd.grad((dist.log_prob(value) + dist.entropy()).sum(), (loc, scale)))
+        gradients.append(
+            torch.autograd.grad((dist.log_prob(value) + dist.entropy()).sum(), (loc, scale))
+        )
     for ours, reference in zip(*gradients, strict=True):
         torch.testing.assert_close(ours, reference)
 

@@ -15,9 +15,13 @@ def test_a_discriminator_normalizes_both_states_alike_and_learns_without_host_sy
     net.normalizer.update(states_NL)
     transition_N2L = torch.stack((states_NL, states_NL.flip(0)), 1)
     mean, var = states_NL.mean(0), states_NL.var(0, correction=0)
-    by_hand = torch.cat([(part - mean) / (var + 1e-4).sqrt() for part in transition_N2L.unbind(1)], -1)
+    by_hand = torch.cat(
+        [(part - mean) / (var + 1e-4).sqrt() for part in transition_N2L.unbind(1)], -1
+    )
     torch.testing.assert_close(net.normalized(transition_N2L), by_hand, atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(net(transition_N2L), net.layers(by_hand).squeeze(-1), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(
+        net(transition_N2L), net.layers(by_hand).squeeze(-1), atol=1e-4, rtol=1e-4
+    )
     with count_syncs() as syncs:
         normalized = net.normalized(transition_N2L)
         loss, _ = discriminator_loss(net.judge, normalized, -normalized, gradient_penalty=10.0)

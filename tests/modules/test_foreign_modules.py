@@ -58,7 +58,9 @@ def ppo_update(actor, critic, **data):
 
 
 def value():
-    return ValueOperator(nn.Sequential(nn.Linear(1, 16), nn.ELU(), nn.Linear(16, 1)), in_keys=["critic"])
+    return ValueOperator(
+        nn.Sequential(nn.Linear(1, 16), nn.ELU(), nn.Linear(16, 1)), in_keys=["critic"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -124,9 +126,15 @@ def test_plain_layers_learn_off_policy():
     update = OffPolicyUpdate(
         cfg,
         loss=TD3Loss(actor, critic, low_L=low, high_L=high, gamma=0.0),
-        behavior=ExploringPolicy(actor, low_L=low, high_L=high, num_envs=16, noise_min=0.05, noise_max=0.3),
+        behavior=ExploringPolicy(
+            actor, low_L=low, high_L=high, num_envs=16, noise_min=0.05, noise_max=0.3
+        ),
         data=ReplayCfg(
-            num_env_states_per_minibatch=128, num_minibatches=8, num_steps=4, capacity=200, learning_starts=8
+            num_env_states_per_minibatch=128,
+            num_minibatches=8,
+            num_steps=4,
+            capacity=200,
+            learning_starts=8,
         ),
         num_envs=16,
     )

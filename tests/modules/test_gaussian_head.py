@@ -13,7 +13,9 @@ def _head(**kwargs):
 @pytest.mark.parametrize("state_dependent_std", [False, True])
 @pytest.mark.parametrize("std_type", ["scalar", "log"])
 def test_starts_at_init_std_in_every_state(std_type, state_dependent_std):
-    loc, scale = _head(std_type=std_type, state_dependent_std=state_dependent_std)(torch.randn(5, 2, 6))
+    loc, scale = _head(std_type=std_type, state_dependent_std=state_dependent_std)(
+        torch.randn(5, 2, 6)
+    )
     assert loc.shape == scale.shape == (5, 2, 3)
     torch.testing.assert_close(scale, torch.full((5, 2, 3), 0.7))
 

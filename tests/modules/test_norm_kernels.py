@@ -10,7 +10,9 @@ from torch.nn import functional
 from ksim_rl.modules.mlp import Layers, mlp
 
 pytest.importorskip("triton", reason="Triton is not installed")
-pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="tests/gpu runs the kernels themselves")
+pytestmark = pytest.mark.skipif(
+    torch.cuda.is_available(), reason="tests/gpu runs the kernels themselves"
+)
 # By the numbers of the kernels.
 ACTIVATIONS = (lambda value: value, functional.relu, functional.silu)
 
@@ -43,7 +45,9 @@ def test_values_and_gradients_are_those_of_torch(shape, activation):
     d_out = torch.randn(shape)
 
     def expected(features, bias, gain, offset):
-        return ACTIVATIONS[activation](functional.layer_norm(features + bias, (width,)) * gain + offset)
+        return ACTIVATIONS[activation](
+            functional.layer_norm(features + bias, (width,)) * gain + offset
+        )
 
     def ours(*inputs):
         return Normalized.apply(*inputs, activation)
@@ -104,7 +108,9 @@ def test_networks_that_read_the_same_give_what_they_give_for_copies(learns, monk
     module, cast = sys.modules[Layers.__module__], []
     padded = vars(module)["_padded"]
     monkeypatch.setattr(module, "rounds", lambda features: True)
-    monkeypatch.setattr(module, "_padded", lambda own, *given: cast.append(own) or padded(own, *given))
+    monkeypatch.setattr(
+        module, "_padded", lambda own, *given: cast.append(own) or padded(own, *given)
+    )
 
     def run(features):
         out = layers(features).float().square().sum()

@@ -57,7 +57,12 @@ def test_a_config_names_it_and_its_fields(my_nets):
     assert (type(cfg.modules.actor).__name__, cfg.modules.actor.depth) == ("ResidualActorCfg", 3)
     actor, _ = build_networks(cfg, envs.make("cartpole_balance", num_envs=2))
     layers = residual(actor)
-    assert [type(layer).__name__ for layer in layers] == ["Linear", "Residual", "Residual", "Residual"]
+    assert [type(layer).__name__ for layer in layers] == [
+        "Linear",
+        "Residual",
+        "Residual",
+        "Residual",
+    ]
     assert actor[0].module.head.loc.in_features == 32
 
 
@@ -106,7 +111,11 @@ def cfg_that_builds(kind, make):
         (ActorCfg, lambda i, o: nn.Linear(i + 1, 8), r"cannot map observations \[2, 3\]"),
         (ActorCfg, lambda i, o: nn.GRU(i, 8), "gives a tuple, and no tensor"),
         (ActorCfg, lambda i, o: torch.tanh, "expected a torch.nn.Module"),
-        (ActorCfg, lambda i, o: nn.Flatten(0), r"maps \[2, 3\] to \[6\]: expected \[2, number of features\]"),
+        (
+            ActorCfg,
+            lambda i, o: nn.Flatten(0),
+            r"maps \[2, 3\] to \[6\]: expected \[2, number of features\]",
+        ),
         (CriticCfg, lambda i, o: nn.Linear(i, 2), r"maps \[2, 3\] to \[2, 2\]: expected \[2, 1\]"),
     ],
 )
@@ -118,13 +127,17 @@ def test_layers_that_do_not_fit_are_refused(kind, make, message):
 
 
 def test_statistics_of_batches_begin_untouched():
-    actor = make_actor(cfg_that_builds(ActorCfg, lambda i, o: nn.BatchNorm1d(i)), obs_dim=3, action_dim=2)
+    actor = make_actor(
+        cfg_that_builds(ActorCfg, lambda i, o: nn.BatchNorm1d(i)), obs_dim=3, action_dim=2
+    )
     norm = actor[0].module.trunk
     assert norm.training and int(norm.num_batches_tracked) == 0
 
 
 def test_critics_and_off_policy_networks_are_built_too():
-    critic = make_critic(cfg_that_builds(CriticCfg, lambda i, o: nn.Linear(i, o, bias=False)), obs_dim=3)
+    critic = make_critic(
+        cfg_that_builds(CriticCfg, lambda i, o: nn.Linear(i, o, bias=False)), obs_dim=3
+    )
     obs_BL = torch.randn(4, 3)
     torch.testing.assert_close(critic.module(obs_BL), obs_BL @ critic.module.layers.weight.T)
     cfg = cfg_that_builds(QNetworkCfg, nn.Linear)
@@ -146,8 +159,14 @@ def test_critics_and_off_policy_networks_are_built_too():
             "+modules.actor._target_=my_nets.residual.Residual",
             "Residual is a class, and no dataclass: name the data",
         ),
-        ("+modules.actor._target_=my_nets.residual.ResidualActor", "did you mean 'ResidualActorCfg'"),
-        ("+modules.critic._target_=my_nets.residual.ResidualActorCfg", "expected a kind of CriticCfg"),
+        (
+            "+modules.actor._target_=my_nets.residual.ResidualActor",
+            "did you mean 'ResidualActorCfg'",
+        ),
+        (
+            "+modules.critic._target_=my_nets.residual.ResidualActorCfg",
+            "expected a kind of CriticCfg",
+        ),
     ],
 )
 def test_wrong_names_get_the_right_hint(my_nets, override, message):

@@ -45,20 +45,30 @@ def test_networks_start_different_orthogonal_and_with_zero_biases():
         torch.testing.assert_close(weight @ weight.T, 2.0 * torch.eye(6))
 
 
-@pytest.mark.parametrize(("num_atoms", "key"), [(1, "state_action_value"), (7, "state_action_logits")])
+@pytest.mark.parametrize(
+    ("num_atoms", "key"), [(1, "state_action_value"), (7, "state_action_logits")]
+)
 @pytest.mark.parametrize("batch", [[4], [2, 3]])
 def test_shapes_and_keys(num_atoms, key, batch):
     cfg = QNetworkCfg(hidden_dims=(8,), num_networks=3, num_atoms=num_atoms, v_min=-1.0, v_max=2.0)
     network = make_q_network(cfg, obs_dim=5, action_dim=2)
-    td = network(TensorDict({"critic": torch.randn(*batch, 5), "action": torch.randn(*batch, 2)}, batch))
+    td = network(
+        TensorDict({"critic": torch.randn(*batch, 5), "action": torch.randn(*batch, 2)}, batch)
+    )
     assert td[key].shape == torch.Size([*batch, 3] + ([7] if num_atoms > 1 else []))
     support = network.module.support
-    assert support is None if num_atoms == 1 else support.tolist() == [-1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0]
+    assert (
+        support is None
+        if num_atoms == 1
+        else support.tolist() == [-1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0]
+    )
     one = network.module(td["critic"].reshape(-1, 5)[:1], td["action"].reshape(-1, 2)[:1])
     torch.testing.assert_close(td[key].flatten(0, len(batch) - 1)[0], one[0])
 
 
-@pytest.mark.parametrize("field", [{"num_networks": 0}, {"num_atoms": 0}, {"v_min": 5.0, "v_max": 5.0}])
+@pytest.mark.parametrize(
+    "field", [{"num_networks": 0}, {"num_atoms": 0}, {"v_min": 5.0, "v_max": 5.0}]
+)
 def test_what_it_refuses(field):
     with pytest.raises(ValueError, match=next(iter(field))):
         QNetworkCfg(**field)

@@ -45,7 +45,8 @@ def pair(kind, num_layers):
     obs_TB = torch.randn(T, B, OBS, dtype=torch.float64, requires_grad=True)
     num_parts = 2 if kind == "lstm" else 1
     state_BN = tuple(
-        torch.randn(B, num_layers, H, dtype=torch.float64, requires_grad=True) for _ in range(num_parts)
+        torch.randn(B, num_layers, H, dtype=torch.float64, requires_grad=True)
+        for _ in range(num_parts)
     )
     return ours, theirs, obs_TB, state_BN
 
@@ -60,7 +61,9 @@ def run_truth(theirs, obs_TB, state_BN):
 
 def gradients(features_TB, last, leaves):
     """Return the gradients of a loss that sees each feature, and the last state, differently."""
-    weight = torch.linspace(-1.0, 2.0, features_TB.numel(), dtype=torch.float64).view_as(features_TB)
+    weight = torch.linspace(-1.0, 2.0, features_TB.numel(), dtype=torch.float64).view_as(
+        features_TB
+    )
     loss = (features_TB * weight).sum() + sum((part.sin() * weight[0, 0, 0]).sum() for part in last)
     return torch.autograd.grad(loss, leaves)
 
@@ -123,11 +126,15 @@ def test_gradients_are_those_of_finite_differences(kind):
     torch.manual_seed(1)
     gates = {"lstm": 4, "gru": 3}[kind]
     shapes = [(3, 2, gates * 2), (gates * 2, 2), (2, 2), (2, 2)]
-    gates_TB, weight, *state = (torch.randn(s, dtype=torch.float64, requires_grad=True) for s in shapes)
+    gates_TB, weight, *state = (
+        torch.randn(s, dtype=torch.float64, requires_grad=True) for s in shapes
+    )
     reset_TB1 = torch.tensor([[False, False], [True, False], [False, False]])[..., None]
     bias = torch.randn(gates * 2, dtype=torch.float64, requires_grad=True)
     if kind == "lstm":
-        assert torch.autograd.gradcheck(lambda *x: LSTM.apply(*x, reset_TB1), (gates_TB, weight, *state))
+        assert torch.autograd.gradcheck(
+            lambda *x: LSTM.apply(*x, reset_TB1), (gates_TB, weight, *state)
+        )
     else:
         assert torch.autograd.gradcheck(
             lambda *x: GRU.apply(*x, reset_TB1), (gates_TB, weight, bias, state[0])
@@ -176,10 +183,15 @@ def policy(kind="lstm", *, in_keys=("drawn", "row")):
     """Return a policy of both observations, and its recurrent. Each episode draws another observation."""
     torch.manual_seed(0)
     recurrent = RecurrentModule(
-        RecurrentCfg(kind=kind, hidden_dim=H, num_layers=2), obs_dim=2, in_keys=in_keys, name="actor"
+        RecurrentCfg(kind=kind, hidden_dim=H, num_layers=2),
+        obs_dim=2,
+        in_keys=in_keys,
+        name="actor",
     )
     head = TensorDictModule(
-        nn.Sequential(nn.Linear(H, 2), nn.Tanh()), in_keys=[recurrent.feature_key], out_keys=["action"]
+        nn.Sequential(nn.Linear(H, 2), nn.Tanh()),
+        in_keys=[recurrent.feature_key],
+        out_keys=["action"],
     )
     return behind(recurrent, head), recurrent
 
@@ -218,9 +230,13 @@ def test_a_rollout_equals_that_of_torchrls_module_in_torchrls_env(kind):
     expected_ET = rolled_out(stock_env, stock_actor)
     for env_class in (MaskedTransformedEnv, TransformedEnv):
         rollout_ET = rolled_out(primed(env_class(TwoObservations()), recurrent), actor)
-        torch.testing.assert_close(rollout_ET["action"], expected_ET["action"], atol=1e-6, rtol=1e-6)
+        torch.testing.assert_close(
+            rollout_ET["action"], expected_ET["action"], atol=1e-6, rtol=1e-6
+        )
         for key, stock_key in zip(recurrent.state_keys, states, strict=True):
-            torch.testing.assert_close(rollout_ET[key], expected_ET[stock_key], atol=1e-6, rtol=1e-6)
+            torch.testing.assert_close(
+                rollout_ET[key], expected_ET[stock_key], atol=1e-6, rtol=1e-6
+            )
             torch.testing.assert_close(
                 rollout_ET[("next", *key)], expected_ET["next", stock_key], atol=1e-6, rtol=1e-6
             )
@@ -262,7 +278,9 @@ def test_state_begins_at_zero_and_never_leaks_over_a_reset(kind):
         root_E.set(key, torch.full_like(root_E[key], 9.0))
     root_E["is_init"].zero_()
     with torch.no_grad():
-        other_ET = other.rollout(12, actor, break_when_any_done=False, auto_reset=False, tensordict=root_E)
+        other_ET = other.rollout(
+            12, actor, break_when_any_done=False, auto_reset=False, tensordict=root_E
+        )
     for row, length in enumerate([3, 5, 4]):
         assert not torch.equal(other_ET["action"][row, :length], rollout_ET["action"][row, :length])
         assert torch.equal(other_ET["action"][row, length:], rollout_ET["action"][row, length:])
@@ -339,7 +357,9 @@ def test_values_out_of_range_are_refused(field):
 def test_actor_and_critic_have_recurrent_layers_of_their_own_which_normalize():
     cfg = RecurrentCfg(hidden_dim=H)
     actor = make_recurrent_actor(cfg, ActorCfg(hidden_dims=(8,)), obs_dim=3, action_dim=2)
-    critic = make_recurrent_critic(cfg, CriticCfg(in_keys=("critic", "actor"), hidden_dims=(8,)), obs_dim=5)
+    critic = make_recurrent_critic(
+        cfg, CriticCfg(in_keys=("critic", "actor"), hidden_dims=(8,)), obs_dim=5
+    )
     (of_actor,), (of_critic,) = recurrent_modules(actor), recurrent_modules(critic)
     assert not set(of_actor.state_keys) & set(of_critic.state_keys)
     td = TensorDict({"actor": torch.randn(7, 3) + 4.0, "critic": torch.randn(7, 2)}, batch_size=[7])

@@ -33,10 +33,14 @@ def _grid(low=-1.0, high=1.0, count=400_001):
     return 0.5 * (edges[1:] + edges[:-1]), edges.diff()
 
 
-@pytest.mark.parametrize("bounds", [(-1.0, 1.0), (LOW.double(), HIGH.double())], ids=["numbers", "tensors"])
+@pytest.mark.parametrize(
+    "bounds", [(-1.0, 1.0), (LOW.double(), HIGH.double())], ids=["numbers", "tensors"]
+)
 def test_equals_torch_and_torchrl(bounds):
     low, high = bounds
-    loc, scale = (parameter.requires_grad_() for parameter in _parameters(6, 4, dtype=torch.float64))
+    loc, scale = (
+        parameter.requires_grad_() for parameter in _parameters(6, 4, dtype=torch.float64)
+    )
     ours = TanhGaussian(loc, scale, low, high)
     torchrls = TanhNormal(loc, scale, low=low, high=high)
     squash = [TanhTransform(), AffineTransform((low + high) / 2, (high - low) / 2)]
@@ -45,7 +49,9 @@ def test_equals_torch_and_torchrl(bounds):
     value = low + (high - low) * torch.linspace(1e-4, 1.0 - 1e-4, 72).double().reshape(6, 4, 3)
     gradients = torch.autograd.grad(ours.log_prob(value).sum(), (loc, scale), retain_graph=True)
     for stock in (torchrls, torchs):
-        torch.testing.assert_close(ours.log_prob(value), stock.log_prob(value), rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(
+            ours.log_prob(value), stock.log_prob(value), rtol=1e-9, atol=1e-9
+        )
         expected = torch.autograd.grad(stock.log_prob(value).sum(), (loc, scale), retain_graph=True)
         torch.testing.assert_close(gradients, expected, rtol=1e-9, atol=1e-9)
         assert ours.batch_shape == stock.batch_shape and ours.event_shape == stock.event_shape
@@ -111,10 +117,15 @@ def test_both_ways_to_score_a_sample_agree():
 
 
 def test_rounded_parameters_leave_actions_near_a_bound_where_they_are():
-    loc, scale = torch.tensor([[4.0, -3.5, 0.0]]), torch.tensor([[0.5, 0.5, 1.0]])  # bfloat16 has them all
+    loc, scale = (
+        torch.tensor([[4.0, -3.5, 0.0]]),
+        torch.tensor([[0.5, 0.5, 1.0]]),
+    )  # bfloat16 has them all
     value = torch.tanh(torch.tensor([[4.25, -3.75, 0.5]]))
     rounded = TanhGaussian(loc.bfloat16(), scale.bfloat16()).log_prob(value)
-    torch.testing.assert_close(rounded, TanhGaussian(loc, scale).log_prob(value), rtol=1e-2, atol=1e-2)
+    torch.testing.assert_close(
+        rounded, TanhGaussian(loc, scale).log_prob(value), rtol=1e-2, atol=1e-2
+    )
 
 
 def test_gradients_are_those_of_finite_differences():
@@ -176,11 +187,15 @@ def test_compiled_densities_are_summed_by_a_product_and_equal_with_their_gradien
         kept.extend(str(node.target) for node in graph.graph.nodes)
         return make_boxed_func(graph.forward)
 
-    compiled = torch.compile(work, backend=aot_autograd(fw_compiler=note), fullgraph=True, dynamic=False)
+    compiled = torch.compile(
+        work, backend=aot_autograd(fw_compiler=note), fullgraph=True, dynamic=False
+    )
     results = []
     for draw in (compiled, work):
         torch.manual_seed(0)
         out = draw(loc, raw)
-        results.append([*out, *torch.autograd.grad(out[0].sum() + out[1].square().sum(), [loc, raw])])
+        results.append(
+            [*out, *torch.autograd.grad(out[0].sum() + out[1].square().sum(), [loc, raw])]
+        )
     torch.testing.assert_close(*results)
     assert "aten.mm.default" in kept and not any("aten.sum" in name for name in kept)

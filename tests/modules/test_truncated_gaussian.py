@@ -11,7 +11,16 @@ from ksim_rl.testing import count_syncs
 
 LOW, HIGH = torch.tensor([-2.0, 0.5, -1.0]), torch.tensor([1.0, 0.7, 1.0])
 # (loc, scale) on [-1, 1]: inside, on a bound, wide, narrow, and further out than Phi can tell from 0 or 1.
-CASES = [(0.2, 0.5), (1.0, 0.3), (0.0, 50.0), (0.9, 1e-3), (3.0, 0.2), (-9.0, 0.2), (20.0, 0.5), (-41.0, 1.0)]
+CASES = [
+    (0.2, 0.5),
+    (1.0, 0.3),
+    (0.0, 50.0),
+    (0.9, 1e-3),
+    (3.0, 0.2),
+    (-9.0, 0.2),
+    (20.0, 0.5),
+    (-41.0, 1.0),
+]
 
 
 def _parameters(*shape, dtype=torch.float32):
@@ -26,7 +35,9 @@ def _grid():
     """Return points of [-1, 1], dense where a density of `CASES` can peak, and the weight of each."""
     tails = torch.logspace(-12, 0, 40_000, dtype=torch.float64)
     inner = torch.linspace(0.88, 0.92, 40_000, dtype=torch.float64)
-    edges = torch.cat([-1.0 + tails, 1.0 - tails, inner, torch.tensor([-1.0, 1.0]).double()]).unique()
+    edges = torch.cat(
+        [-1.0 + tails, 1.0 - tails, inner, torch.tensor([-1.0, 1.0]).double()]
+    ).unique()
     return 0.5 * (edges[1:] + edges[:-1]), edges.diff()
 
 
@@ -91,7 +102,9 @@ def test_samples_have_the_moments_and_lie_inside(loc, scale, dtype):
     error = (samples.mean() - exact.mean).abs() / (exact.variance / count).sqrt()
     assert error.item() < 4.0
     # Of a distribution near a uniform or exponential one the variance's own error is below 3 variances / sqrt(count).
-    assert samples.var().item() == pytest.approx(exact.variance.item(), rel=4.0 * 3.0 / math.sqrt(count))
+    assert samples.var().item() == pytest.approx(
+        exact.variance.item(), rel=4.0 * 3.0 / math.sqrt(count)
+    )
 
 
 def test_without_near_bounds_it_is_the_gaussian():
@@ -136,7 +149,11 @@ def test_gradients_are_those_of_finite_differences():
 def test_gradients_are_finite_in_the_tails(loc, scale):
     parameters = torch.tensor([loc], requires_grad=True), torch.tensor([scale], requires_grad=True)
     dist = TruncatedGaussian(*parameters)
-    total = dist.rsample((1000,)).sum() + dist.log_prob(dist.sample((1000,))).sum() + dist.entropy().sum()
+    total = (
+        dist.rsample((1000,)).sum()
+        + dist.log_prob(dist.sample((1000,))).sum()
+        + dist.entropy().sum()
+    )
     assert all(gradient.isfinite().all() for gradient in torch.autograd.grad(total, parameters))
 
 

@@ -67,7 +67,8 @@ def test_the_module_of_tensordict_still_imports_pandas(pandas_asked_for):
 def test_a_module_of_tensors_writes_what_that_of_tensordict_writes():
     keys = {"in_keys": ["actor"], "out_keys": ["low", ("nested", "high")]}
     ours, theirs = (
-        kind(lambda x: (x - 1.0, x + 1.0), **keys) for kind in (upstream.TensorModule, TensorDictModule)
+        kind(lambda x: (x - 1.0, x + 1.0), **keys)
+        for kind in (upstream.TensorModule, TensorDictModule)
     )
     td = observed()
     assert (ours(td.clone()) == theirs(td.clone())).all()

@@ -30,9 +30,13 @@ def test_rule(kl, lr, expected):
 
 def test_factor_and_bounds_are_options():
     rate = torch.tensor(1.0)
-    adapt_learning_rate_(rate, torch.tensor(9.0), desired_kl=1.0, factor=4.0, lr_min=0.3, lr_max=2.0)
+    adapt_learning_rate_(
+        rate, torch.tensor(9.0), desired_kl=1.0, factor=4.0, lr_min=0.3, lr_max=2.0
+    )
     assert rate.item() == pytest.approx(0.3)
-    adapt_learning_rate_(rate, torch.tensor(0.1), desired_kl=1.0, factor=9.0, lr_min=0.3, lr_max=2.0)
+    adapt_learning_rate_(
+        rate, torch.tensor(0.1), desired_kl=1.0, factor=9.0, lr_min=0.3, lr_max=2.0
+    )
     assert rate.item() == pytest.approx(2.0)
 
 

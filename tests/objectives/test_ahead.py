@@ -23,7 +23,9 @@ class Kernel:
 
     def warmup(self, *, grid, x, num_warps):
         mode = triton.runtime._async_compile.active_mode.get()
-        mode.submit(id(self), self.compiled, lambda kernel: self.events.append(("compiled", grid, x)))
+        mode.submit(
+            id(self), self.compiled, lambda kernel: self.events.append(("compiled", grid, x))
+        )
 
     def compiled(self):
         if self.fails:

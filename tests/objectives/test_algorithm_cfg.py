@@ -63,5 +63,7 @@ def test_a_fixed_learning_rate_has_no_bounds():
 
 def test_vtrace_has_no_targets_of_another_lambda():
     assert PPOCfg(value_lmbda=1.0).value_lmbda == 1.0
-    with pytest.raises(ValueError, match=r"value_lmbda=1\.0 with advantage='vtrace'.*use advantage='gae'"):
+    with pytest.raises(
+        ValueError, match=r"value_lmbda=1\.0 with advantage='vtrace'.*use advantage='gae'"
+    ):
         PPOCfg(value_lmbda=1.0, advantage="vtrace")

@@ -19,7 +19,12 @@ OPTIONS = [
     {"clip_value": True},
     {"clip_value": 0.1, "loss_critic_type": "l2"},
     {"clip_value": 0.1, "loss_critic_type": "smooth_l1", "clip_epsilon": (0.1, 0.3)},
-    {"normalize_advantage": True, "entropy_coeff": 0.05, "critic_coeff": 0.7, "loss_critic_type": "l1"},
+    {
+        "normalize_advantage": True,
+        "entropy_coeff": 0.05,
+        "critic_coeff": 0.7,
+        "loss_critic_type": "l1",
+    },
     {"entropy_bonus": False, "critic_coeff": 0.0},
     {"reduction": "sum", "clip_value": 0.3},
     {"reduction": "none", "clip_value": 0.3},
@@ -77,7 +82,11 @@ def _compare(ours, stock, data):
 def test_losses_and_gradients_equal_stock_torchrl(options):
     actor, critic = networks()
     data = minibatch(actor, critic)
-    _compare(ClipPPOLoss(actor, critic, **options), objectives.ClipPPOLoss(actor, critic, **options), data)
+    _compare(
+        ClipPPOLoss(actor, critic, **options),
+        objectives.ClipPPOLoss(actor, critic, **options),
+        data,
+    )
 
 
 def test_equals_stock_where_the_value_estimator_makes_the_advantage():
@@ -119,7 +128,9 @@ def test_equals_stock_for_a_composite_policy():
         TensorDictModule(_TwiceTheOutputs(net), in_keys=["actor"], out_keys=keys),
         in_keys=["params"],
         distribution_class=CompositeDistribution,
-        distribution_kwargs={"distribution_map": dict.fromkeys(("arm", "leg"), torch.distributions.Normal)},
+        distribution_kwargs={
+            "distribution_map": dict.fromkeys(("arm", "leg"), torch.distributions.Normal)
+        },
         return_log_prob=True,
         default_interaction_type="random",
     )
@@ -130,8 +141,14 @@ def test_equals_stock_for_a_composite_policy():
 def test_clipped_value_loss_is_that_of_rsl_rl():
     actor, critic = networks()
     data = minibatch(actor, critic)
-    loss = ClipPPOLoss(actor, critic, clip_value=0.2, critic_coeff=1.5, loss_critic_type="l2")(data.clone())
-    value, old, target = critic(data.clone())["state_value"], data["state_value"], data["value_target"]
+    loss = ClipPPOLoss(actor, critic, clip_value=0.2, critic_coeff=1.5, loss_critic_type="l2")(
+        data.clone()
+    )
+    value, old, target = (
+        critic(data.clone())["state_value"],
+        data["state_value"],
+        data["value_target"],
+    )
     clipped = old + (value - old).clamp(-0.2, 0.2)
     expected = 1.5 * torch.maximum((value - target).square(), (clipped - target).square()).mean()
     torch.testing.assert_close(loss["loss_critic"], expected)
@@ -180,14 +197,27 @@ def test_a_removed_row_contributes_to_no_gradient(cls, normalize_advantage):
     dataset = DatasetBuffer(DatasetCfg(num_env_states_per_minibatch=12, num_minibatches=1))
     dataset.extend(dirty)
     without = data[[row for row in range(12) if row not in (3, 7)]]
-    loss = cls(actor, critic, clip_value=0.2, loss_critic_type="l2", normalize_advantage=normalize_advantage)
+    loss = cls(
+        actor,
+        critic,
+        clip_value=0.2,
+        loss_critic_type="l2",
+        normalize_advantage=normalize_advantage,
+    )
     parameters = list(loss.parameters())
     outs = [loss(dataset.sample()), loss(without)]
     gradients = [torch.autograd.grad(_total(out), parameters) for out in outs]
     for one, other in zip(*gradients, strict=True):
         torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
     if cls is ClipPPOLoss:
-        for name in ("loss_objective", "loss_critic", "kl", "kl_approx", "clip_fraction", "entropy"):
+        for name in (
+            "loss_objective",
+            "loss_critic",
+            "kl",
+            "kl_approx",
+            "clip_fraction",
+            "entropy",
+        ):
             torch.testing.assert_close(outs[0][name], outs[1][name], atol=1e-6, rtol=1e-5)
 
 
@@ -215,7 +245,11 @@ def _masked_minibatch(actor, critic):
     "options",
     [
         {"clip_value": 0.2, "loss_critic_type": "l2"},
-        {"normalize_advantage": True, "log_ratio_statistics": False, "log_explained_variance": False},
+        {
+            "normalize_advantage": True,
+            "log_ratio_statistics": False,
+            "log_explained_variance": False,
+        },
     ],
     ids=["clip_value", "normalize"],
 )
@@ -233,7 +267,9 @@ def test_no_host_sync(options, functional):
 def test_compiles_without_a_break(functional):
     actor, critic = networks()
     data = _masked_minibatch(actor, critic)
-    loss = ClipPPOLoss(actor, critic, functional=functional, clip_value=0.2, normalize_advantage=True)
+    loss = ClipPPOLoss(
+        actor, critic, functional=functional, clip_value=0.2, normalize_advantage=True
+    )
     expected = loss(data.clone())
     _total(expected).backward()
     gradients = [parameter.grad.clone() for parameter in loss.parameters()]
@@ -281,7 +317,14 @@ def test_any_tensordict_modules_with_the_right_keys_work():
     )
     critic = ValueOperator(nn.Linear(3, 1), in_keys=["pixels"])
     loss = ClipPPOLoss(actor, critic)
-    assert set(loss.dataset_keys) >= {"pixels", "action", "loc", "scale", "advantage", "value_target"}
+    assert set(loss.dataset_keys) >= {
+        "pixels",
+        "action",
+        "loc",
+        "scale",
+        "advantage",
+        "value_target",
+    }
 
 
 @pytest.mark.parametrize(

@@ -11,16 +11,27 @@ L = 3
 
 def test_of_a_linear_discriminator_loss_and_gradient_have_a_closed_form():
     torch.manual_seed(0)
-    reference, policy = torch.randn(40, L, dtype=torch.float64), torch.randn(25, L, dtype=torch.float64)
+    reference, policy = (
+        torch.randn(40, L, dtype=torch.float64),
+        torch.randn(25, L, dtype=torch.float64),
+    )
     weight = torch.randn(L, dtype=torch.float64, requires_grad=True)
     bias = torch.randn((), dtype=torch.float64, requires_grad=True)
-    loss, logged = discriminator_loss(lambda x: x @ weight + bias, reference, policy, gradient_penalty=7.0)
+    loss, logged = discriminator_loss(
+        lambda x: x @ weight + bias, reference, policy, gradient_penalty=7.0
+    )
     loss.backward()
     with torch.no_grad():
         d_reference, d_policy = reference @ weight + bias, policy @ weight + bias
         penalty = weight.square().sum()
-        expected = (d_reference - 1).square().mean() + (d_policy + 1).square().mean() + 3.5 * penalty
-        slope = 2 * ((d_reference - 1) @ reference) / 40 + 2 * ((d_policy + 1) @ policy) / 25 + 7.0 * weight
+        expected = (
+            (d_reference - 1).square().mean() + (d_policy + 1).square().mean() + 3.5 * penalty
+        )
+        slope = (
+            2 * ((d_reference - 1) @ reference) / 40
+            + 2 * ((d_policy + 1) @ policy) / 25
+            + 7.0 * weight
+        )
     torch.testing.assert_close(loss.detach(), expected)
     torch.testing.assert_close(weight.grad, slope)
     torch.testing.assert_close(bias.grad, 2 * (d_reference - 1).mean() + 2 * (d_policy + 1).mean())
@@ -47,7 +58,9 @@ def test_the_penalty_of_a_network_equals_the_written_out_slope_at_each_transitio
         slow = slow + ((out.weight[0] @ unit + out.bias[0] - 1) ** 2 + 5.0 * slope @ slope) / 12
     for row in policy:
         slow = (
-            slow + (out.weight[0] @ torch.tanh(hidden.weight @ row + hidden.bias) + out.bias[0] + 1) ** 2 / 12
+            slow
+            + (out.weight[0] @ torch.tanh(hidden.weight @ row + hidden.bias) + out.bias[0] + 1) ** 2
+            / 12
         )
     torch.testing.assert_close(loss, slow)
     for one, other in zip(gradients, torch.autograd.grad(slow, parameters), strict=True):
@@ -62,13 +75,16 @@ def test_masked_pairs_do_not_count():
     loss, logged = discriminator_loss(
         lambda x: x @ weight, reference, policy, gradient_penalty=1.0, mask_B=mask
     )
-    kept, _ = discriminator_loss(lambda x: x @ weight, reference[:5], policy[:5], gradient_penalty=1.0)
+    kept, _ = discriminator_loss(
+        lambda x: x @ weight, reference[:5], policy[:5], gradient_penalty=1.0
+    )
     torch.testing.assert_close(loss, kept)
     assert logged["policy_score"].isfinite()
 
 
 @pytest.mark.parametrize(
-    ("score", "reward"), [(1.0, 1.0), (-1.0, 0.0), (3.0, 0.0), (0.0, 0.75), (-5.0, 0.0), (2.0, 0.75)]
+    ("score", "reward"),
+    [(1.0, 1.0), (-1.0, 0.0), (3.0, 0.0), (0.0, 0.75), (-5.0, 0.0), (2.0, 0.75)],
 )
 def test_the_style_reward_is_one_for_motions_and_zero_for_the_policy(score, reward):
     assert style_reward(torch.tensor(score)).item() == pytest.approx(reward)

@@ -33,7 +33,9 @@ def networks(distribution="gaussian", **options):
 
 
 def rollout(actor, shape=(4, 6)):
-    data = TensorDict({"actor": torch.randn(*shape, 3), "privileged": torch.randn(*shape, 5)}, shape)
+    data = TensorDict(
+        {"actor": torch.randn(*shape, 3), "privileged": torch.randn(*shape, 5)}, shape
+    )
     with torch.no_grad():
         return actor(data)
 
@@ -148,7 +150,9 @@ def test_a_teacher_without_a_distribution_has_no_divergence():
     loss = DistillationLoss(actor, teacher, loss="mse")
     assert loss(loss.label(rollout(actor)).reshape(-1))["loss_distillation"] > 0.0
     other = make_actor(
-        ActorCfg(in_keys=("privileged",), hidden_dims=(), distribution="tanh_gaussian", action_bound=1.0),
+        ActorCfg(
+            in_keys=("privileged",), hidden_dims=(), distribution="tanh_gaussian", action_bound=1.0
+        ),
         obs_dim=5,
         action_dim=A,
     )

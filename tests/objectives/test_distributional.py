@@ -21,7 +21,9 @@ def _slow(probs, reward, discount):
     out = torch.zeros_like(probs)
     for row in range(probs.shape[0]):
         for atom in range(count):
-            value = min(max(reward[row].item() + discount[row].item() * SUPPORT[atom].item(), low), high)
+            value = min(
+                max(reward[row].item() + discount[row].item() * SUPPORT[atom].item(), low), high
+            )
             position = (value - low) / spacing
             below, above = math.floor(position), math.ceil(position)
             mass = probs[row, atom].item()
@@ -79,14 +81,20 @@ def test_one_kernel_compares_as_the_paper_does(kernel, networks, scale, reductio
     logits, following, reward, discount = _problem(networks, scale)
     losses, means = kernel(logits, SUPPORT, following, reward, discount, reduction == "min")
     probs = following.softmax(-1)
-    targets = torch.stack([_slow(probs[:, which], reward, discount) for which in range(networks)], 1)
+    targets = torch.stack(
+        [_slow(probs[:, which], reward, discount) for which in range(networks)], 1
+    )
     if reduction == "min":
-        targets = targets[torch.arange(25), (targets @ SUPPORT).argmin(-1)][:, None].expand_as(targets)
+        targets = targets[torch.arange(25), (targets @ SUPPORT).argmin(-1)][:, None].expand_as(
+            targets
+        )
     expected = -(targets * logits.log_softmax(-1)).sum(-1)
     torch.testing.assert_close(losses, expected, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(means, logits.softmax(-1) @ SUPPORT, rtol=1e-4, atol=1e-5)
     weights = torch.randn(25, networks)
-    (found,), (true,) = (torch.autograd.grad((own * weights).sum(), logits) for own in (losses, expected))
+    (found,), (true,) = (
+        torch.autograd.grad((own * weights).sum(), logits) for own in (losses, expected)
+    )
     torch.testing.assert_close(found, true, rtol=1e-4, atol=1e-5)
     plain = compare(logits, SUPPORT, following, reward, discount, reduction)
     torch.testing.assert_close([losses, means], list(plain), rtol=1e-4, atol=1e-5)
@@ -105,7 +113,8 @@ def test_one_kernel_takes_means_and_logits_of_half_precision(kernel):
             expected = mean_returns(exact, SUPPORT)
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
         (own,), (true,) = (
-            torch.autograd.grad(to.square().sum(), of) for to, of in ((found, logits), (expected, exact))
+            torch.autograd.grad(to.square().sum(), of)
+            for to, of in ((found, logits), (expected, exact))
         )
         assert own.dtype == torch.bfloat16
         # Cut off by the interpreter, where CUDA rounds, and then rounded.
@@ -128,7 +137,10 @@ def test_means_survive_the_projection_where_nothing_is_cut_off():
     reward, discount = torch.rand(50, 1), torch.full((50, 1), 0.3)
     projected = project_distribution(probs, reward, discount, SUPPORT)
     torch.testing.assert_close(
-        mean_of(projected, SUPPORT), reward[:, 0] + 0.3 * mean_of(probs, SUPPORT), rtol=1e-4, atol=1e-5
+        mean_of(projected, SUPPORT),
+        reward[:, 0] + 0.3 * mean_of(probs, SUPPORT),
+        rtol=1e-4,
+        atol=1e-5,
     )
 
 
@@ -161,15 +173,20 @@ def test_distributional_td3_loss_is_its_definition(value_reduction):
     out = loss(data)
     with torch.no_grad():
         next_action = deterministic(data["next"].copy())["loc"].tanh()
-        next_probs = loss.target_critic_network.module(data["next", "critic"], next_action).softmax(-1)
+        next_probs = loss.target_critic_network.module(data["next", "critic"], next_action).softmax(
+            -1
+        )
         discount = 0.9 ** data["steps_to_next_obs"] * ~data["next", "terminated"]
-        targets = [_slow(next_probs[:, which], data["next", "reward"], discount) for which in range(2)]
+        targets = [
+            _slow(next_probs[:, which], data["next", "reward"], discount) for which in range(2)
+        ]
         if value_reduction == "min":
             first = (targets[0] @ SUPPORT < targets[1] @ SUPPORT)[:, None]
             targets = [torch.where(first, *targets)] * 2
         logits = critic.module(data["critic"], data["action"])
         expected = sum(
-            torch.nn.functional.cross_entropy(logits[:, which], targets[which]) for which in range(2)
+            torch.nn.functional.cross_entropy(logits[:, which], targets[which])
+            for which in range(2)
         )
         torch.testing.assert_close(out["loss_qvalue"], expected, rtol=1e-4, atol=1e-5)
         own_action = deterministic(data.copy())["loc"].tanh()

@@ -37,7 +37,9 @@ def test_it_is_the_adamw_of_torch(max_grad_norm):
         _descend(twin, reference, seed=step)
         expected = nn.utils.clip_grad_norm_(twin.parameters(), max_grad_norm or float("inf"))
         reference.step()
-        torch._foreach_lerp_(list(slow.parameters()), [own.detach() for own in twin.parameters()], cfg.tau)
+        torch._foreach_lerp_(
+            list(slow.parameters()), [own.detach() for own in twin.parameters()], cfg.tau
+        )
         torch.testing.assert_close(norm, expected)
         assert not skipped
     for ours, theirs in ((network, twin), (target, slow)):
@@ -56,7 +58,9 @@ def test_a_step_that_is_not_finite_changes_only_the_target():
     aside = [own.clone() for own in target.parameters()]
     norm, skipped = flat.step(_descend(network, flat, seed=1, bad=True))
     assert norm.isnan() and skipped == 1.0
-    torch.testing.assert_close((network.state_dict(), optimizer_state(flat)), kept, rtol=0.0, atol=0.0)
+    torch.testing.assert_close(
+        (network.state_dict(), optimizer_state(flat)), kept, rtol=0.0, atol=0.0
+    )
     for old, new, own in zip(aside, target.parameters(), network.parameters(), strict=True):
         torch.testing.assert_close(new, old.lerp(own, CFG.tau))
 
@@ -72,7 +76,9 @@ def test_a_loaded_state_continues():
     load_optimizer_state(other, optimizer_state(flat), what="optimizer")
     for made, optimizer in ((network, flat), (twin, other)):
         optimizer.step(_descend(made, optimizer, seed=9))
-    assert all(torch.equal(a, b) for a, b in zip(network.parameters(), twin.parameters(), strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(network.parameters(), twin.parameters(), strict=True)
+    )
 
 
 def test_a_state_of_torchs_own_adamw_continues():
@@ -83,7 +89,9 @@ def test_a_state_of_torchs_own_adamw_continues():
     for step in range(3):
         _descend(network, reference, seed=step)
         reference.step()
-    flat = FlatAdamW(dataclasses.replace(CFG, max_grad_norm=None), twin.parameters(), learning_rate=0.5)
+    flat = FlatAdamW(
+        dataclasses.replace(CFG, max_grad_norm=None), twin.parameters(), learning_rate=0.5
+    )
     twin.load_state_dict(network.state_dict())
     load_optimizer_state(flat, optimizer_state(reference), what="optimizer")
     _descend(network, reference, seed=3)

@@ -14,7 +14,9 @@ OUT_KEYS = ("advantage", "value_target", "state_value", ("next", "state_value"))
 
 
 def _stock(critic, data, **options):
-    gae = value.GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic, vectorized=False, time_dim=1, **options)
+    gae = value.GAE(
+        gamma=GAMMA, lmbda=LMBDA, value_network=critic, vectorized=False, time_dim=1, **options
+    )
     with torch.no_grad():
         return gae(data.clone())
 
@@ -32,7 +34,9 @@ def test_value_targets_of_another_lambda_are_those_of_an_estimator_with_it(kind)
 
 
 def test_monte_carlo_targets_are_the_discounted_rewards_up_to_the_end():
-    data = _known([1.0, 2.0, 3.0, 4.0], values=[9.0] * 4, next_values=[9.0, 9.0, 9.0, 5.0], terminated=[1])
+    data = _known(
+        [1.0, 2.0, 3.0, 4.0], values=[9.0] * 4, next_values=[9.0, 9.0, 9.0, 5.0], terminated=[1]
+    )
     out = GAE(gamma=0.5, lmbda=0.3, value_lmbda=1.0, critic=_critic())(data)
     # The rollout's end is no episode's: there the value 5 stands for what follows.
     expected = [1.0 + 0.5 * 2.0, 2.0, 3.0 + 0.5 * (4.0 + 0.5 * 5.0), 4.0 + 0.5 * 5.0]
@@ -69,7 +73,9 @@ def test_memory_layout_names_and_time_dim_do_not_matter():
         out = gae(layout, time_dim=time_dim)
         for key in OUT_KEYS:
             leaf = out[key].transpose(0, 1) if time_dim == 0 else out[key]
-            torch.testing.assert_close(leaf, expected[key], msg=lambda text, name=name: f"{name}: {text}")
+            torch.testing.assert_close(
+                leaf, expected[key], msg=lambda text, name=name: f"{name}: {text}"
+            )
 
 
 def test_without_a_critic_values_come_from_the_data():
@@ -90,7 +96,9 @@ class _ValueIs(torch.nn.Module):
 
 def _known(rewards, values, next_values, *, terminated=(), truncated=()):
     length = len(rewards)
-    flags = {name: torch.zeros(1, length, 1, dtype=torch.bool) for name in ("terminated", "truncated")}
+    flags = {
+        name: torch.zeros(1, length, 1, dtype=torch.bool) for name in ("terminated", "truncated")
+    }
     for step in terminated:
         flags["terminated"][0, step] = True
     for step in truncated:
@@ -98,7 +106,9 @@ def _known(rewards, values, next_values, *, terminated=(), truncated=()):
     column = lambda numbers: torch.tensor(numbers, dtype=torch.float32).view(1, length, 1)  # noqa: E731
     following = {"obs": column(next_values), "reward": column(rewards)}
     following |= flags | {"done": flags["terminated"] | flags["truncated"]}
-    return TensorDict({"obs": column(values), "next": TensorDict(following, [1, length])}, [1, length])
+    return TensorDict(
+        {"obs": column(values), "next": TensorDict(following, [1, length])}, [1, length]
+    )
 
 
 def _critic():
@@ -122,7 +132,9 @@ def test_truncation_bootstraps_from_the_true_terminal_observation_and_terminatio
         )
         returns = [1.0 + 0.5 * (1.0 + 0.5 * bootstrap), 1.0 + 0.5 * bootstrap, 1.0 + 0.5 * 3.0]
         torch.testing.assert_close(out["value_target"].flatten(), torch.tensor(returns))
-        torch.testing.assert_close(out["advantage"].flatten(), torch.tensor(returns) - torch.tensor(values))
+        torch.testing.assert_close(
+            out["advantage"].flatten(), torch.tensor(returns) - torch.tensor(values)
+        )
 
 
 def test_a_step_that_is_both_terminated_and_truncated_counts_as_terminated():
@@ -134,7 +146,9 @@ def test_a_step_that_is_both_terminated_and_truncated_counts_as_terminated():
 
 def test_lambda_zero_is_the_one_step_error_and_one_the_return():
     rewards, values, next_values = [1.0, 2.0, 3.0], [0.5, 0.25, 0.125], [0.25, 0.125, 4.0]
-    one_step = [r + GAMMA * v_next - v for r, v, v_next in zip(rewards, values, next_values, strict=True)]
+    one_step = [
+        r + GAMMA * v_next - v for r, v, v_next in zip(rewards, values, next_values, strict=True)
+    ]
     out = GAE(gamma=GAMMA, lmbda=0.0, critic=_critic())(_known(rewards, values, next_values))
     torch.testing.assert_close(out["advantage"].flatten(), torch.tensor(one_step))
     out = GAE(gamma=GAMMA, lmbda=1.0, critic=_critic())(_known(rewards, values, next_values))
@@ -155,7 +169,9 @@ def test_a_reward_that_is_not_finite_marks_its_step_only():
     torch.testing.assert_close(out["advantage"][1, 3:], expected["advantage"][1, 3:])
     torch.testing.assert_close(out["advantage"][[0, 2, 3]], expected["advantage"][[0, 2, 3]])
     values = expected["state_value"]
-    delta = clean["next", "reward"][1, 1] + GAMMA * expected["next", "state_value"][1, 1] - values[1, 1]
+    delta = (
+        clean["next", "reward"][1, 1] + GAMMA * expected["next", "state_value"][1, 1] - values[1, 1]
+    )
     torch.testing.assert_close(out["advantage"][1, 1], delta)
 
 
@@ -254,9 +270,9 @@ def test_the_estimator_of_torchrls_tutorial_is_made_as_it_stands():
     actor, critic = networks()
     data = rollout(actor, num_envs=16, length=12, end_probability=0.15)
     expected = _stock(critic, data, average_gae=True)
-    out = GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic, average_gae=True, device=torch.device("cpu"))(
-        data
-    )
+    out = GAE(
+        gamma=GAMMA, lmbda=LMBDA, value_network=critic, average_gae=True, device=torch.device("cpu")
+    )(data)
     torch.testing.assert_close(out["advantage"], expected["advantage"], atol=1e-6, rtol=1e-6)
 
 
@@ -307,10 +323,19 @@ def test_values_that_are_there_are_kept_if_asked():
 )
 def test_options_that_ask_for_something_else_are_refused_by_name(kind, option):
     ((name, given),) = option.items()
-    with pytest.raises(ValueError, match=f"{kind.__name__}: {name}={given!r} is not taken: .*; leave it out"):
+    with pytest.raises(
+        ValueError, match=f"{kind.__name__}: {name}={given!r} is not taken: .*; leave it out"
+    ):
         kind(gamma=GAMMA, lmbda=LMBDA, **option)
 
 
 def test_options_that_ask_for_nothing_else_are_taken():
-    GAE(gamma=GAMMA, lmbda=LMBDA, shifted=False, differentiable=False, vectorized=False, skip_existing=False)
+    GAE(
+        gamma=GAMMA,
+        lmbda=LMBDA,
+        shifted=False,
+        differentiable=False,
+        vectorized=False,
+        skip_existing=False,
+    )
     TDLambda(gamma=GAMMA, lmbda=LMBDA, vectorized=None, deactivate_vmap=True, value_chunk_dim=0)

@@ -11,7 +11,9 @@ from ksim_rl.objectives.policy_kl import gaussian_parameters
 def test_equals_torchs_closed_form():
     loc_old, loc = torch.randn(2, 6, 4, 3)
     scale_old, scale = torch.rand(2, 6, 4, 3) + 0.05
-    expected = torch_kl(Independent(Normal(loc_old, scale_old), 1), Independent(Normal(loc, scale), 1))
+    expected = torch_kl(
+        Independent(Normal(loc_old, scale_old), 1), Independent(Normal(loc, scale), 1)
+    )
     torch.testing.assert_close(kl_divergence(loc_old, scale_old, loc, scale), expected)
 
 
@@ -27,7 +29,9 @@ def test_equals_the_mean_log_ratio_of_samples():
     old, new = Independent(Normal(loc_old, scale_old), 1), Independent(Normal(loc, scale), 1)
     samples = old.sample((200_000,))
     estimate = (old.log_prob(samples) - new.log_prob(samples)).mean()
-    assert kl_divergence(loc_old, scale_old, loc, scale).item() == pytest.approx(estimate.item(), rel=0.03)
+    assert kl_divergence(loc_old, scale_old, loc, scale).item() == pytest.approx(
+        estimate.item(), rel=0.03
+    )
 
 
 def test_parameters_are_found_beneath_wrappers_and_nowhere_else():

@@ -27,14 +27,20 @@ INHERITED: dict[type, dict[str, tuple[str, str]]] = {
             "self advantage tensordict update_norm",
             "the options of normalization",
         ),
-        "_standardize_advantage": ("self advantage tensordict", "overridden: masked rows have no part in it"),
+        "_standardize_advantage": (
+            "self advantage tensordict",
+            "overridden: masked rows have no part in it",
+        ),
         "_critic_loss_inputs": (
             "self target_return state_value old_state_value",
             "overridden: sequences [B, T]",
         ),
         "_get_entropy": ("self dist adv_shape", "overridden: the stock one asks the host"),
         "_weighted_loss_entropy": ("self entropy", "the entropy coefficients of several actions"),
-        "_reduce_loss": ("self loss tensordict mask reduction weights", "reductions other than the mean"),
+        "_reduce_loss": (
+            "self loss tensordict mask reduction weights",
+            "reductions other than the mean",
+        ),
         "_clear_weakrefs": ("self tds", "frees functional parameters as the stock forward does"),
     },
 }
@@ -50,10 +56,16 @@ def test_inherited_methods_take_the_same_arguments(kind, name):
     arguments, _ = INHERITED[kind][name]
     method = getattr(kind, name, None)
     assert method is not None, f"{kind.__name__}.{name} is gone"
-    assert " ".join(inspect.signature(method).parameters) == arguments, f"{kind.__name__}.{name} changed"
+    assert " ".join(inspect.signature(method).parameters) == arguments, (
+        f"{kind.__name__}.{name} changed"
+    )
 
 
 def test_properties_and_list_kernels_are_there():
-    gone = [name for name in READ if not isinstance(getattr(objectives.ClipPPOLoss, name, None), property)]
+    gone = [
+        name
+        for name in READ
+        if not isinstance(getattr(objectives.ClipPPOLoss, name, None), property)
+    ]
     gone += [name for name in FOREACH if not hasattr(torch, name)]
     assert not gone

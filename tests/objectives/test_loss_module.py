@@ -45,7 +45,13 @@ def test_keys_have_their_defaults_can_be_set_and_unknown_ones_are_refused():
 def test_keys_reach_the_value_estimator(kind):
     actor, critic = networks()
     loss = ClipPPOLoss(actor, critic)
-    new = {"advantage": "gain", "value_target": "goal", "reward": "pay", "done": "over", "terminated": "dead"}
+    new = {
+        "advantage": "gain",
+        "value_target": "goal",
+        "reward": "pay",
+        "done": "over",
+        "terminated": "dead",
+    }
     if kind in (GAE, TDLambda):
         kind = kind(gamma=0.9, lmbda=0.9, critic=critic)
     elif kind is VTrace:
@@ -84,7 +90,9 @@ def test_all_keys_of_the_data_may_have_other_names():
     other.set_keys(**renamed)
     moved = data.clone()
     moved.rename_key_("action", "act").rename_key_("action_log_prob", "log_p")
-    moved["next"].rename_key_("reward", "pay").rename_key_("done", "over").rename_key_("terminated", "dead")
+    moved["next"].rename_key_("reward", "pay").rename_key_("done", "over").rename_key_(
+        "terminated", "dead"
+    )
     for name in LOSSES:
         torch.testing.assert_close(other(moved.clone())[name], expected[name])
 
@@ -114,7 +122,10 @@ def test_resetting_parameters_changes_them_all():
     actor, critic = networks(obs_normalization=False)
     loss = ClipPPOLoss(actor, critic)
     linear = [
-        p for m in (*actor.modules(), *critic.modules()) if isinstance(m, nn.Linear) for p in m.parameters()
+        p
+        for m in (*actor.modules(), *critic.modules())
+        if isinstance(m, nn.Linear)
+        for p in m.parameters()
     ]
     with torch.no_grad():
         for parameter in linear:
@@ -131,7 +142,9 @@ def test_a_state_dict_restores_the_loss(functional):
     loss = ClipPPOLoss(actor, critic, functional=functional, clip_epsilon=0.3)
     other_actor, other_critic = networks()
     other = ClipPPOLoss(other_actor, other_critic, functional=functional)
-    assert not torch.allclose(loss(data.clone())["loss_objective"], other(data.clone())["loss_objective"])
+    assert not torch.allclose(
+        loss(data.clone())["loss_objective"], other(data.clone())["loss_objective"]
+    )
     other.load_state_dict(loss.state_dict())
     for name in LOSSES:
         torch.testing.assert_close(other(data.clone())[name], loss(data.clone())[name])
@@ -152,9 +165,13 @@ def test_moves_to_another_dtype_with_all_its_buffers():
 
 
 def _shared_networks():
-    trunk = TensorDictModule(nn.Sequential(nn.Linear(ACTOR_DIM, 8), nn.Tanh()), ["actor"], ["hidden"])
+    trunk = TensorDictModule(
+        nn.Sequential(nn.Linear(ACTOR_DIM, 8), nn.Tanh()), ["actor"], ["hidden"]
+    )
     head = TensorDictModule(
-        nn.Sequential(nn.Linear(8, 2 * ACTION_DIM), NormalParamExtractor()), ["hidden"], ["loc", "scale"]
+        nn.Sequential(nn.Linear(8, 2 * ACTION_DIM), NormalParamExtractor()),
+        ["hidden"],
+        ["loc", "scale"],
     )
     actor = ProbabilisticActor(
         TensorDictSequential(trunk, head),
@@ -171,11 +188,17 @@ def _shared_networks():
 
 @pytest.mark.parametrize("separate_losses", [True, False])
 @pytest.mark.parametrize("functional", [True, False])
-def test_a_shared_trunk_is_trained_by_the_critic_unless_losses_are_separate(separate_losses, functional):
+def test_a_shared_trunk_is_trained_by_the_critic_unless_losses_are_separate(
+    separate_losses, functional
+):
     trunk, actor, _, head = _shared_networks()
     data = rollout(actor, num_envs=16, length=1).reshape(-1)
     data["advantage"], data["value_target"] = torch.randn(16, 1), torch.randn(16, 1)
-    options = {"separate_losses": separate_losses, "functional": functional, "loss_critic_type": "l2"}
+    options = {
+        "separate_losses": separate_losses,
+        "functional": functional,
+        "loss_critic_type": "l2",
+    }
     trained = []
     for loss in both(actor, head, **options):
         # The critic reads the trunk's output, which the actor writes.
@@ -285,7 +308,9 @@ def test_rows_that_are_left_out_may_be_anything():
         loss.zero_grad()
         out = loss(batch)
         sum(out[name] for name in LOSSES).backward()
-        gradients.append([out[name] for name in LOSSES] + [parameter.grad for parameter in loss.parameters()])
+        gradients.append(
+            [out[name] for name in LOSSES] + [parameter.grad for parameter in loss.parameters()]
+        )
     torch.testing.assert_close(gradients[1], gradients[0])
 
 

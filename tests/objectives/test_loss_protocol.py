@@ -50,7 +50,9 @@ def off_policy(kind, *, atoms=1, layer_norm=False, seed=0):
         actor = make_squashed_actor(SquashedActorCfg(**plain), obs_dim=OBS, action_spec=spec)
     else:
         options |= {"low_L": torch.full((ACTION,), -1.0), "high_L": torch.ones(ACTION)}
-        actor = make_deterministic_actor(DeterministicActorCfg(**plain), obs_dim=OBS, action_spec=spec)
+        actor = make_deterministic_actor(
+            DeterministicActorCfg(**plain), obs_dim=OBS, action_spec=spec
+        )
     return kind(actor, critic, **options)
 
 
@@ -79,7 +81,9 @@ def evaluated(loss, data):
 
 def test_no_loss_is_left_out():
     public = {value for value in vars(objectives).values() if isinstance(value, type)}
-    losses = {cls for cls in public if issubclass(cls, LossModule)} - {OffPolicyLoss}  # the base of two
+    losses = {cls for cls in public if issubclass(cls, LossModule)} - {
+        OffPolicyLoss
+    }  # the base of two
     assert losses == {type(make()) for make in LOSSES.values()} | {ClipPPOLoss}
 
 
@@ -101,7 +105,10 @@ def test_keys_have_their_defaults_can_be_set_and_unknown_ones_are_refused(make):
 @each_loss
 def test_all_keys_of_the_data_may_have_other_names_nested_ones_too(make):
     loss, data = make(), minibatch()
-    data["priority_weight"], data["steps_to_next_obs"] = torch.rand(BATCH, 1), torch.randint(1, 4, (BATCH, 1))
+    data["priority_weight"], data["steps_to_next_obs"] = (
+        torch.rand(BATCH, 1),
+        torch.randint(1, 4, (BATCH, 1)),
+    )
     expected = evaluated(loss, data)
     other = make()
     other.set_keys(**{name: ("agent", key) for name, key in KEYS.items() if name != "action"})
@@ -131,14 +138,21 @@ def test_resetting_parameters_changes_them_all(make):
     before = {name: parameter.clone() for name, parameter in learned.items()}
     loss.reset_parameters_recursive()
     assert all((before[name] != parameter).any() for name, parameter in learned.items())
-    assert all(parameter.isfinite().all() and parameter.abs().max() < 100.0 for parameter in learned.values())
+    assert all(
+        parameter.isfinite().all() and parameter.abs().max() < 100.0
+        for parameter in learned.values()
+    )
 
 
 @each_loss
 def test_each_loss_trains_its_own_network_and_all_of_it(make):
     loss = make()
     out = evaluated(loss, minibatch())
-    trained = {"loss_qvalue": "critic_network", "loss_actor": "actor_network", "loss_alpha": "log_alpha"}
+    trained = {
+        "loss_qvalue": "critic_network",
+        "loss_actor": "actor_network",
+        "loss_alpha": "log_alpha",
+    }
     seen = set()
     for name in [key for key in out.keys() if key.startswith("loss_")]:
         loss.zero_grad()
@@ -179,7 +193,9 @@ def test_a_state_dict_restores_the_loss_targets_included(make):
         for parameter in loss.target_critic_network.parameters():
             parameter.add_(0.1)
     expected = evaluated(loss, data.clone())
-    assert not torch.allclose(evaluated(other, data.clone())["loss_qvalue"], expected["loss_qvalue"])
+    assert not torch.allclose(
+        evaluated(other, data.clone())["loss_qvalue"], expected["loss_qvalue"]
+    )
     other.load_state_dict(loss.state_dict())
     for name, value in evaluated(other, data.clone()).items():
         torch.testing.assert_close(value, expected[name])
@@ -232,7 +248,9 @@ def test_a_minibatch_in_which_no_row_counts_has_losses_and_gradients_of_zero(mak
         assert out[name] == 0.0
         out[name].backward(retain_graph=True)
     networks_of = (loss.actor_network, loss.critic_network)
-    assert all(parameter.grad.abs().max() == 0.0 for net in networks_of for parameter in net.parameters())
+    assert all(
+        parameter.grad.abs().max() == 0.0 for net in networks_of for parameter in net.parameters()
+    )
 
 
 @each_loss
@@ -254,7 +272,8 @@ def test_rows_that_are_left_out_may_be_anything(make, filler):
         out = evaluated(loss, batch)
         sum(out[name] for name in out.keys() if name.startswith("loss_")).backward()
         found.append(
-            [out[name] for name in out.keys()] + [p.grad for p in loss.parameters() if p.requires_grad]
+            [out[name] for name in out.keys()]
+            + [p.grad for p in loss.parameters() if p.requires_grad]
         )
     torch.testing.assert_close(found[1], found[0])
 
@@ -265,7 +284,11 @@ def test_moves_to_another_dtype(make):
     expected = evaluated(loss, data.clone())["loss_qvalue"]
     data = data.apply(lambda leaf: leaf if leaf.dtype == torch.bool else leaf.double())
     out = loss.double()(data)
-    assert out["loss_qvalue"].dtype == torch.float64 and out["loss_qvalue"].isfinite() and expected.isfinite()
+    assert (
+        out["loss_qvalue"].dtype == torch.float64
+        and out["loss_qvalue"].isfinite()
+        and expected.isfinite()
+    )
 
 
 @pytest.mark.parametrize("kind", ["kl", "mse"])
@@ -294,5 +317,7 @@ def test_distillation_trains_the_student_alone_leaves_the_data_and_ignores_explo
     out = loss(data)
     out["loss_distillation"].backward()
     assert out["loss_distillation"] == out["kl"] == 0.0
-    assert all(parameter.grad.abs().max() == 0.0 for parameter in student[0].module.trunk.parameters())
+    assert all(
+        parameter.grad.abs().max() == 0.0 for parameter in student[0].module.trunk.parameters()
+    )
     assert not any(isinstance(module, nn.Dropout) for module in loss.modules())

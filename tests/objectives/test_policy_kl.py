@@ -19,7 +19,9 @@ SPECS = {
     "tanh_gaussian": BOX,
     "truncated_gaussian": BOX,
     "categorical": Categorical(3, shape=(1,)),
-    "mixed": Composite(action=Composite(arm=BOX, grip=Categorical(3, shape=(1,)), shape=(1,)), shape=(1,)),
+    "mixed": Composite(
+        action=Composite(arm=BOX, grip=Categorical(3, shape=(1,)), shape=(1,)), shape=(1,)
+    ),
 }
 
 
@@ -61,7 +63,9 @@ def test_the_losses_kl_is_the_mean_log_ratio_of_samples(name):
     with torch.no_grad():
         for _ in range(40):
             sample = old.sample()
-            drawn = sample if isinstance(sample, TensorDict) else TensorDict({"action": sample}, [512])
+            drawn = (
+                sample if isinstance(sample, TensorDict) else TensorDict({"action": sample}, [512])
+            )
             ratios.append(_log_prob(old, drawn) - _log_prob(new, drawn))
     ratios = torch.cat(ratios)
     assert abs(ratios.mean().item() - kl) < 4.0 * ratios.std().item() / ratios.numel() ** 0.5
@@ -80,11 +84,14 @@ def test_losses_equal_stock_torchrl(name, functional):
 
 
 @pytest.mark.parametrize(
-    "name", [name if name == "mixed" else pytest.param(name, marks=pytest.mark.full) for name in SPECS]
+    "name",
+    [name if name == "mixed" else pytest.param(name, marks=pytest.mark.full) for name in SPECS],
 )
 def test_no_host_sync_and_compiles_without_a_break(name):
     actor, critic, data, _ = _problem(name, size=16)
-    loss = ClipPPOLoss(actor, critic, functional=False, log_ratio_statistics=False, loss_critic_type="l2")
+    loss = ClipPPOLoss(
+        actor, critic, functional=False, log_ratio_statistics=False, loss_critic_type="l2"
+    )
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(data.clone())
     with count_syncs() as syncs:
         eager = loss(data.clone())
@@ -109,13 +116,17 @@ def test_what_an_actor_reads_and_writes():
         in_keys={"loc": "mean", "scale": "spread"},
         distribution_class=TanhNormal,
     )
-    assert observation_keys(foreign) == ["pixels"] and set(distribution_keys(foreign)) == {"mean", "spread"}
+    assert observation_keys(foreign) == ["pixels"] and set(distribution_keys(foreign)) == {
+        "mean",
+        "spread",
+    }
 
 
 def test_foreign_distributions_are_measured_exactly_or_not_at_all():
     loc, scale = torch.randn(6, 3), torch.rand(6, 3) + 0.1
     gaussians = [
-        distributions.Independent(distributions.Normal(loc + shift, scale), 1) for shift in (0.0, 0.1)
+        distributions.Independent(distributions.Normal(loc + shift, scale), 1)
+        for shift in (0.0, 0.1)
     ]
     expected = distributions.kl_divergence(*gaussians)
     torch.testing.assert_close(policy_kl(*gaussians), expected)

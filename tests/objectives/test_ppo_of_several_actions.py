@@ -22,7 +22,10 @@ def _heads():
     parts = []
     for name, width in (("one", 2), ("two", 3)):
         net = nn.Sequential(nn.Linear(4, 2 * width), NormalParamExtractor())
-        keys = {"in_keys": ["obs"], "out_keys": [("params", name, "loc"), ("params", name, "scale")]}
+        keys = {
+            "in_keys": ["obs"],
+            "out_keys": [("params", name, "loc"), ("params", name, "scale")],
+        }
         parts.append(TensorDictModule(net, **keys))
 
     def independent(loc, scale):
@@ -82,9 +85,17 @@ def test_an_advantage_counts_for_each_part_of_an_action():
 
     logits = torch.randn(6, 3, 4)
     action = torch.randint(4, (6, 3))
-    log_prob = torch.distributions.Categorical(logits=logits).log_prob(action) + 0.3 * torch.randn(6, 3)
+    log_prob = torch.distributions.Categorical(logits=logits).log_prob(action) + 0.3 * torch.randn(
+        6, 3
+    )
     data = TensorDict(
-        {"logits": logits, "action": action, "sample_log_prob": log_prob, "advantage": torch.randn(6, 1)}, [6]
+        {
+            "logits": logits,
+            "action": action,
+            "sample_log_prob": log_prob,
+            "advantage": torch.randn(6, 1),
+        },
+        [6],
     )
     data.update({"obs": torch.randn(6, 4), "value_target": torch.randn(6, 1)})
     critic = TensorDictModule(nn.Linear(4, 1), ["obs"], ["state_value"])
@@ -103,7 +114,9 @@ def test_an_advantage_counts_for_each_part_of_an_action():
 def test_a_critic_may_give_several_values():
     actor, _, data = _heads()
     critic = TensorDictModule(
-        lambda obs: (obs[..., :1], obs[..., 1:2]), ["obs"], [("state_value", "a"), ("state_value", "b")]
+        lambda obs: (obs[..., :1], obs[..., 1:2]),
+        ["obs"],
+        [("state_value", "a"), ("state_value", "b")],
     )
     targets = TensorDict({"a": torch.randn(6, 1), "b": torch.randn(6, 1)}, [6])
     data.set("value_target", targets)

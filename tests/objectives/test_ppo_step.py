@@ -82,8 +82,18 @@ def test_metrics_are_detached_scalars_with_the_documented_names():
     cfg = PPOCfg()
     actor, critic, loss, optimizer = _parts(cfg)
     metrics = ppo_step(loss, optimizer, minibatch(actor, critic), cfg=cfg, guard=StepGuard())
-    named = {"loss", "loss_objective", "loss_critic", "loss_entropy", "entropy", "kl", "clip_fraction"}
-    assert named | {"grad_norm", "learning_rate", "skipped", "value_clip_fraction"} <= metrics.keys()
+    named = {
+        "loss",
+        "loss_objective",
+        "loss_critic",
+        "loss_entropy",
+        "entropy",
+        "kl",
+        "clip_fraction",
+    }
+    assert (
+        named | {"grad_norm", "learning_rate", "skipped", "value_clip_fraction"} <= metrics.keys()
+    )
     for value in metrics.values():
         assert value.shape == ()
         assert not value.requires_grad
@@ -120,7 +130,9 @@ def test_a_step_that_is_not_finite_is_skipped_and_counted():
     good = minibatch(actor, critic)
     ppo_step(loss, optimizer, good.clone(), cfg=cfg, guard=guard)
     rate = optimizer.param_groups[0]["lr"].item()
-    before = [parameter.detach().clone() for parameter in (*actor.parameters(), *critic.parameters())]
+    before = [
+        parameter.detach().clone() for parameter in (*actor.parameters(), *critic.parameters())
+    ]
     bad = good.clone()
     bad["value_target"][3] = float("nan")
     bad["loc"][3] = float("nan")
@@ -140,7 +152,9 @@ def test_shared_parameters_are_optimized_once():
     actor, critic, loss, _ = _parts(cfg)
     optimizer = make_optimizer(cfg, actor, critic, actor, loss)
     parameters = optimizer.param_groups[0]["params"]
-    assert len(parameters) == len(set(parameters)) == len({*actor.parameters(), *critic.parameters()})
+    assert (
+        len(parameters) == len(set(parameters)) == len({*actor.parameters(), *critic.parameters()})
+    )
 
 
 def test_a_learning_rate_that_is_given_anew_stays():
@@ -225,8 +239,12 @@ def test_learns_an_action_that_depends_on_the_state():
     first = collect()["next", "reward"].mean()
     for _ in range(30):
         _update(cfg, parts, dataset, collect(), guard)
-    probe = TensorDict({"actor": torch.tensor([[-1.0], [1.0]]), "critic": torch.tensor([[-1.0], [1.0]])}, [2])
-    torch.testing.assert_close(actor(probe)["loc"].flatten(), torch.tensor([-0.7, 0.7]), atol=0.15, rtol=0.0)
+    probe = TensorDict(
+        {"actor": torch.tensor([[-1.0], [1.0]]), "critic": torch.tensor([[-1.0], [1.0]])}, [2]
+    )
+    torch.testing.assert_close(
+        actor(probe)["loc"].flatten(), torch.tensor([-0.7, 0.7]), atol=0.15, rtol=0.0
+    )
     last = collect()["next", "reward"].mean()
     assert last > 0.2 * first
     assert critic(probe)["state_value"].mean().item() == pytest.approx(last.item(), abs=0.1)

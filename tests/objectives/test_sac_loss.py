@@ -20,7 +20,14 @@ from ksim_rl.testing import count_syncs
 
 BATCH, OBS, ACTION = 64, 5, 3
 # What CUDA adds up by atomics, in the order in which threads come, and sums of floats whose blocks do.
-UNORDERED = ("scatter_add", "scatter_reduce", "index_add", "index_put", "embedding_dense_backward", "cumsum")
+UNORDERED = (
+    "scatter_add",
+    "scatter_reduce",
+    "index_add",
+    "index_put",
+    "embedding_dense_backward",
+    "cumsum",
+)
 
 
 class _OneOfN(nn.Module):
@@ -44,7 +51,9 @@ class _OneOfN(nn.Module):
 def networks(num_atoms=1, low=-1.0, **fields):
     torch.manual_seed(0)
     actor = make_squashed_actor(
-        SquashedActorCfg(hidden_dims=(16,), obs_normalization=False, output_gain=1.0, action_bound=-low),
+        SquashedActorCfg(
+            hidden_dims=(16,), obs_normalization=False, output_gain=1.0, action_bound=-low
+        ),
         obs_dim=OBS,
         action_spec=Unbounded((ACTION,)),
     )
@@ -81,7 +90,9 @@ def for_torchrl(critic):
     """Return the networks of an ensemble, one by one."""
     return [
         TensorDictModule(
-            _OneOfN(critic.module, which), in_keys=["critic", "action"], out_keys=["state_action_value"]
+            _OneOfN(critic.module, which),
+            in_keys=["critic", "action"],
+            out_keys=["state_action_value"],
         )
         for which in range(critic.module.cfg.num_networks)
     ]
@@ -101,11 +112,15 @@ def assert_gradients_are_alike(critic, stock):
     linear = [layer for layer in critic.module.layers if hasattr(layer, "weight")]
     for number, layer in enumerate(linear):
         weight = stock.qvalue_network_params.get(("module", "layers", str(2 * number), "weight"))
-        torch.testing.assert_close(layer.weight.grad, weight.grad.transpose(1, 2), rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(
+            layer.weight.grad, weight.grad.transpose(1, 2), rtol=1e-5, atol=1e-6
+        )
 
 
 def _both(actor, critic, *, gamma=0.95, alpha=0.3, fixed=False, low=-1.0):
-    ours = SACLoss(actor, critic, gamma=gamma, alpha_init=alpha, target_entropy=-2.5, learn_alpha=not fixed)
+    ours = SACLoss(
+        actor, critic, gamma=gamma, alpha_init=alpha, target_entropy=-2.5, learn_alpha=not fixed
+    )
     plain = for_torchrl(critic)
     stock = objectives.SACLoss(
         actor_network=actor,
@@ -136,13 +151,17 @@ def test_losses_and_gradients_are_those_of_torchrl(low, num_networks, extra, fix
         inputs = data.clone()
         out = loss(inputs)
         actor.zero_grad()
-        total = sum(value for name, value in out.items() if name.startswith("loss_") and value.requires_grad)
+        total = sum(
+            value for name, value in out.items() if name.startswith("loss_") and value.requires_grad
+        )
         total.backward()
         results.append(out.select("loss_actor", "loss_qvalue", "loss_alpha", "alpha"))
         results[-1]["priority"] = inputs["td_error"]
         gradients.append([parameter.grad.clone() for parameter in actor.parameters()])
     for name in results[0].keys():
-        torch.testing.assert_close(results[0][name], results[1][name], rtol=1e-5, atol=1e-6, msg=name)
+        torch.testing.assert_close(
+            results[0][name], results[1][name], rtol=1e-5, atol=1e-6, msg=name
+        )
     for one, other in zip(*gradients, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
     assert_gradients_are_alike(critic, stock)

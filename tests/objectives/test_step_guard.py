@@ -56,7 +56,10 @@ def test_fused_adam_skips_the_step_and_continues_as_if_it_had_not_been(capturabl
         for bad in steps:
             for parameter in layer.parameters():
                 parameter.grad = torch.ones_like(parameter) * (float("nan") if bad else 0.3)
-            optimizer.grad_scale, optimizer.found_inf = None, clip_and_guard(layer.parameters(), 1.0)[1]
+            optimizer.grad_scale, optimizer.found_inf = (
+                None,
+                clip_and_guard(layer.parameters(), 1.0)[1],
+            )
             optimizer.step()
         return layer, optimizer
 

@@ -9,7 +9,13 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from ksim_rl.data import DatasetCfg
 from ksim_rl.modules import ActorCfg, CriticCfg, DiagonalGaussian, make_actor, make_critic
-from ksim_rl.objectives import ClipPPOLoss, PPOCfg, SymmetricAugmentation, make_symmetric, mirror_loss
+from ksim_rl.objectives import (
+    ClipPPOLoss,
+    PPOCfg,
+    SymmetricAugmentation,
+    make_symmetric,
+    mirror_loss,
+)
 from ksim_rl.testing import count_syncs
 from ksim_rl.trainers import PPOUpdate
 from ksim_rl.transforms import MirrorMap
@@ -31,7 +37,10 @@ def _affine_actor(weight, bias, scale=1.0):
     class Affine(nn.Module):
         def __init__(self):
             super().__init__()
-            self.weight, self.bias = nn.Parameter(torch.tensor(weight)), nn.Parameter(torch.tensor(bias))
+            self.weight, self.bias = (
+                nn.Parameter(torch.tensor(weight)),
+                nn.Parameter(torch.tensor(bias)),
+            )
 
         def forward(self, obs):
             loc = self.weight * obs + self.bias
@@ -73,7 +82,9 @@ def test_masked_env_states_take_no_part_in_the_mirror_loss():
     states_B["collector", "mask"] = torch.tensor([[True], [True], [False]])
     # pi(-x) + pi(x) = 2 x^2.
     expected = (2.0**2 + 8.0**2) / 2
-    assert mirror_loss(actor, states_B, SymmetricAugmentation(FLIP)).item() == pytest.approx(expected)
+    assert mirror_loss(actor, states_B, SymmetricAugmentation(FLIP)).item() == pytest.approx(
+        expected
+    )
     states_B["collector", "mask"].fill_(False)
     assert mirror_loss(actor, states_B, SymmetricAugmentation(FLIP)).item() == 0.0
 
@@ -123,7 +134,9 @@ class _Invariant(nn.Module):
 def _symmetric_networks():
     actor, critic = networks(obs_normalization=False)
     symmetric = ProbabilisticActor(
-        TensorDictModule(_Equivariant(actor.module[0].module), in_keys=["actor"], out_keys=["loc", "scale"]),
+        TensorDictModule(
+            _Equivariant(actor.module[0].module), in_keys=["actor"], out_keys=["loc", "scale"]
+        ),
         in_keys=["loc", "scale"],
         distribution_class=DiagonalGaussian,
         return_log_prob=True,
@@ -145,7 +158,14 @@ def test_for_symmetric_networks_images_change_no_loss_and_no_gradient():
         total = out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]
         results.append((out, torch.autograd.grad(total, list(loss.parameters()))))
     for out, gradients in results[1:]:
-        for key in ("loss_objective", "loss_critic", "loss_entropy", "kl", "clip_fraction", "kl_approx"):
+        for key in (
+            "loss_objective",
+            "loss_critic",
+            "loss_entropy",
+            "kl",
+            "clip_fraction",
+            "kl_approx",
+        ):
             torch.testing.assert_close(out[key], results[0][0][key], atol=1e-6, rtol=1e-5)
         for one, other in zip(gradients, results[0][1], strict=True):
             torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
@@ -238,7 +258,12 @@ def test_every_second_transition_is_reflected_with_what_follows_it():
         return {"actor": torch.randn(6, 5), "critic": torch.randn(6, 7)}
 
     before_B = TensorDict(
-        {**observed(), "action": torch.randn(6, 2), "next": {**observed(), "reward": torch.randn(6, 1)}}, [6]
+        {
+            **observed(),
+            "action": torch.randn(6, 2),
+            "next": {**observed(), "reward": torch.randn(6, 1)},
+        },
+        [6],
     )
     after_B = before_B.clone()
     mirror.reflect_every_second_(after_B)

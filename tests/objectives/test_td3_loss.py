@@ -54,7 +54,9 @@ def test_losses_and_gradients_are_those_of_torchrl(num_networks, extra):
         results.append(out.select("loss_qvalue", *(["loss_actor"] if num_networks == 1 else [])))
         gradients.append([parameter.grad.clone() for parameter in actor.parameters()])
     for name in results[0].keys():
-        torch.testing.assert_close(results[0][name], results[1][name], rtol=1e-5, atol=1e-6, msg=name)
+        torch.testing.assert_close(
+            results[0][name], results[1][name], rtol=1e-5, atol=1e-6, msg=name
+        )
     if num_networks == 1:
         torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-5, atol=1e-6)
     else:
@@ -64,7 +66,9 @@ def test_losses_and_gradients_are_those_of_torchrl(num_networks, extra):
 def test_bounds_and_atoms_move_with_the_networks():
     actor, critic = networks()
     bound = torch.ones(ACTION)
-    loss = TD3Loss(actor, critic, low_L=-bound, high_L=bound, support_A=torch.linspace(-1.0, 1.0, 5))
+    loss = TD3Loss(
+        actor, critic, low_L=-bound, high_L=bound, support_A=torch.linspace(-1.0, 1.0, 5)
+    )
     state = loss.state_dict()
     moved = loss.to("meta")
     for own in (moved.low_L, moved.high_L, moved.support_A):

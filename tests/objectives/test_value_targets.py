@@ -43,7 +43,11 @@ def _ratio(actor, data):
 
 def _columns(out):
     """Return the float64 numbers of one env, step by step."""
-    names = {"value": "state_value", "next_value": ("next", "state_value"), "reward": ("next", "reward")}
+    names = {
+        "value": "state_value",
+        "next_value": ("next", "state_value"),
+        "reward": ("next", "reward"),
+    }
     names |= {"done": ("next", "done"), "terminated": ("next", "terminated")}
     return {name: out[key].double().squeeze(-1) for name, key in names.items()}
 
@@ -76,7 +80,9 @@ def _vtrace(out, ratio, *, lmbda=1.0, rho_thresh=1.0, c_thresh=1.0):
         for s in range(length):
             total, weight = float(c["value"][env, s]), 1.0
             for t in range(s, length):
-                error = bootstrapped(env, t, float(c["next_value"][env, t])) - float(c["value"][env, t])
+                error = bootstrapped(env, t, float(c["next_value"][env, t])) - float(
+                    c["value"][env, t]
+                )
                 total += weight * min(rho_thresh, float(ratio[env, t])) * error
                 weight *= GAMMA * lmbda * min(c_thresh, float(ratio[env, t]))
                 if c["done"][env, t]:
@@ -102,7 +108,9 @@ def test_lambda_returns_equal_stock_torchrl_and_a_float64_recursion(end_probabil
         for key in ("advantage", "value_target", "state_value", ("next", "state_value")):
             torch.testing.assert_close(out[key], expected[key], atol=2e-6, rtol=1e-6)
     returns = _lambda_returns(out, LMBDA)
-    torch.testing.assert_close(out["value_target"].squeeze(-1).double(), returns, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(
+        out["value_target"].squeeze(-1).double(), returns, atol=1e-6, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("thresholds", [{}, {"rho_thresh": 2.0, "c_thresh": 1.3}])
@@ -136,8 +144,12 @@ def test_vtrace_weights_longer_returns_by_lambda():
     actor, critic, data = _parts()
     out = VTrace(gamma=GAMMA, actor=actor, critic=critic, lmbda=0.6)(data)
     expected = _vtrace(out, _ratio(actor, data), lmbda=0.6)
-    torch.testing.assert_close(out["advantage"].squeeze(-1).double(), expected[0], atol=2e-6, rtol=2e-6)
-    torch.testing.assert_close(out["value_target"].squeeze(-1).double(), expected[1], atol=2e-6, rtol=2e-6)
+    torch.testing.assert_close(
+        out["advantage"].squeeze(-1).double(), expected[0], atol=2e-6, rtol=2e-6
+    )
+    torch.testing.assert_close(
+        out["value_target"].squeeze(-1).double(), expected[1], atol=2e-6, rtol=2e-6
+    )
 
 
 def _continuous(data):
@@ -259,7 +271,8 @@ def test_serves_losses_as_value_estimator(kind):
     loss = ClipPPOLoss(actor, critic)
     loss.make_value_estimator(_make(kind, actor, critic))
     torch.testing.assert_close(
-        loss(data.clone())["loss_critic"], loss(_make(kind, actor, critic)(data.clone()))["loss_critic"]
+        loss(data.clone())["loss_critic"],
+        loss(_make(kind, actor, critic)(data.clone()))["loss_critic"],
     )
 
 
@@ -280,7 +293,9 @@ def test_a_ratio_beyond_the_threshold_stops_at_it():
     r = out["next", "reward"].flatten()
     errors = r + GAMMA * v_next - v
     assert math.e > 2.0
-    torch.testing.assert_close(out["value_target"].flatten()[0], v[0] + 2.0 * (errors[0] + GAMMA * errors[1]))
+    torch.testing.assert_close(
+        out["value_target"].flatten()[0], v[0] + 2.0 * (errors[0] + GAMMA * errors[1])
+    )
     torch.testing.assert_close(out["value_target"].flatten()[1], v[1] + 2.0 * errors[1])
 
 

@@ -34,7 +34,9 @@ def started(
     world = World(mj_model, num_envs=2, sim=sim, per_world_fields=tuple(fields))
     in_c = copy.copy(world.mj_model)
     for name, value in fields.items():
-        world.field(name)[1] = torch.as_tensor(value, dtype=torch.float32).reshape(world.field(name)[1].shape)
+        world.field(name)[1] = torch.as_tensor(value, dtype=torch.float32).reshape(
+            world.field(name)[1].shape
+        )
         getattr(in_c, name)[:] = value
     if fields:
         world.set_const(tuple(fields))
@@ -61,7 +63,9 @@ def check(
         np.testing.assert_allclose(found, expected, atol=tolerance * scale, err_msg=name)
 
 
-def check_sensors(world: World, mj_data: mujoco.MjData, *, of_forces: bool, tolerance: float = 3e-4) -> None:
+def check_sensors(
+    world: World, mj_data: mujoco.MjData, *, of_forces: bool, tolerance: float = 3e-4
+) -> None:
     """Compare the sensors that forces decide, or the others, of the second world with C's."""
     mj_model = world.mj_model
     for sensor in range(mj_model.nsensor):

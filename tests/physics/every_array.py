@@ -53,8 +53,12 @@ HONOURED = {
         "oct_coeff oct_depth "
     ),
     "tests/physics/test_asleep.py::test_trees_fall_asleep_as_in_c": ("tree_sleep_policy "),
-    "tests/physics/test_sensor_mending.py::test_what_is_in_a_site_with_a_mesh_is_refused": ("site_dataid "),
-    "tests/physics/test_height_fields.py": ("hfield_adr hfield_data hfield_ncol hfield_nrow hfield_size "),
+    "tests/physics/test_sensor_mending.py::test_what_is_in_a_site_with_a_mesh_is_refused": (
+        "site_dataid "
+    ),
+    "tests/physics/test_height_fields.py": (
+        "hfield_adr hfield_data hfield_ncol hfield_nrow hfield_size "
+    ),
 }
 # What is refused by name, by the kind that REFUSED of test_every_option.py shows.
 REFUSED = {

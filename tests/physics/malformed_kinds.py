@@ -143,7 +143,10 @@ def _generated() -> Iterator[tuple[str, str]]:
     for attribute in NOT_NEGATIVE:
         yield f"{attribute} is negative", _with(attribute, "-1")
     for tag in ("worldbody", "body", "geom", "joint", "actuator", "sensor", "asset", "tendon"):
-        yield f"{tag} is not closed", FULL.replace(f"</{tag}>", "", 1).replace(f"<{tag} ", f"<{tag}> <", 1)
+        yield (
+            f"{tag} is not closed",
+            FULL.replace(f"</{tag}>", "", 1).replace(f"<{tag} ", f"<{tag}> <", 1),
+        )
 
 
 def _enormous() -> Iterator[tuple[str, str]]:
@@ -151,7 +154,10 @@ def _enormous() -> Iterator[tuple[str, str]]:
     yield "time step of a second", _with("timestep", "1")
     yield "time step of nothing", _with("timestep", "0")
     for count in (100_000, 50_000_000):
-        yield f"{count} replicas", world(f'<replicate count="{count}" offset="1 0 0">{bare}</replicate>')
+        yield (
+            f"{count} replicas",
+            world(f'<replicate count="{count}" offset="1 0 0">{bare}</replicate>'),
+        )
     yield (
         "replicas of replicas",
         world(f'<replicate count="10000"><replicate count="10000">{bare}</replicate></replicate>'),
@@ -170,7 +176,10 @@ def _enormous() -> Iterator[tuple[str, str]]:
     yield "replicas of nothing", world('<replicate count="50000000"><site/></replicate>')
     yield "many geoms", world(bare * 20_000)
     yield "deep bodies", world("<body>" * 20_000 + bare + "</body>" * 20_000)
-    yield "deep defaults", f"<mujoco><default>{'<default>' * 9000}{'</default>' * 9000}</default></mujoco>"
+    yield (
+        "deep defaults",
+        f"<mujoco><default>{'<default>' * 9000}{'</default>' * 9000}</default></mujoco>",
+    )
     yield (
         "a soft grid",
         world('<flexcomp name="f" type="grid" count="2000 2000 2000" spacing="1 1 1" dim="3"/>'),
@@ -186,7 +195,9 @@ def _enormous() -> Iterator[tuple[str, str]]:
     for kind in ("2d", "cube", "skybox"):
         yield (
             f"texture {kind}",
-            _asset(f'<texture name="a" type="{kind}" builtin="flat" width="100000" height="600000"/>'),
+            _asset(
+                f'<texture name="a" type="{kind}" builtin="flat" width="100000" height="600000"/>'
+            ),
         )
     for size in ("nuserdata", "nkey", "nuser_body", "nuser_geom", "nuser_sensor", "njmax"):
         yield f"size {size}", world(bare, f'<size {size}="2000000000"/>')
@@ -229,9 +240,14 @@ def _files() -> Iterator[tuple[str, Writes]]:
     yield "stl of 4e9 faces", _with_file("m.stl", binary_stl, mesh("m.stl"))
     yield (
         "stl of nan",
-        _with_file("m.stl", b" " * 80 + struct.pack("<I12fH", 1, *[float("nan")] * 12, 0), mesh("m.stl")),
+        _with_file(
+            "m.stl", b" " * 80 + struct.pack("<I12fH", 1, *[float("nan")] * 12, 0), mesh("m.stl")
+        ),
     )
-    yield "obj of unknown points", _with_file("m.obj", b"v 0 0 0\nf 1 2 3\nf 9 8 7\n", mesh("m.obj"))
+    yield (
+        "obj of unknown points",
+        _with_file("m.obj", b"v 0 0 0\nf 1 2 3\nf 9 8 7\n", mesh("m.obj")),
+    )
     yield (
         "msh of 2e9 points",
         _with_file("m.msh", struct.pack("<4i", 2**31 - 1, 0, 0, 2**31 - 1), mesh("m.msh")),
@@ -297,7 +313,9 @@ def _special_files(mesh: Callable[[str], str]) -> Iterator[tuple[str, Writes]]:
 
 def kinds() -> dict[str, Writes]:
     """Return what writes each kind, by name: those of `malformed_models`, and the generated ones."""
-    texts = {name: xml for name, (xml, _) in MALFORMED.items()} | dict(_generated()) | dict(_enormous())
+    texts = (
+        {name: xml for name, (xml, _) in MALFORMED.items()} | dict(_generated()) | dict(_enormous())
+    )
     return {name: (lambda folder, xml=xml: xml) for name, xml in texts.items()} | dict(_files())
 
 
@@ -352,13 +370,20 @@ def _load_and_say(load: Callable[[Path], object], path: Path, pipe: int) -> None
     os._exit(0)
 
 
-def figures(names: Iterable[str] | None = None, *, load: Callable[[Path], object] = load_model) -> dict:
+def figures(
+    names: Iterable[str] | None = None, *, load: Callable[[Path], object] = load_model
+) -> dict:
     """Return how many kinds there are, how many crashed, hung or were accepted, and which."""
     chosen = kinds() if names is None else {name: kinds()[name] for name in names}
     found = {name: load_apart(write, load=load) for name, write in chosen.items()}
-    bad = {name: f"{verdict}: {text}" for name, (verdict, text) in found.items() if verdict != "refused"}
+    bad = {
+        name: f"{verdict}: {text}"
+        for name, (verdict, text) in found.items()
+        if verdict != "refused"
+    }
     counts = {
-        verdict: sum(v == verdict for v, _ in found.values()) for verdict in ("crash", "hang", "accepted")
+        verdict: sum(v == verdict for v, _ in found.values())
+        for verdict in ("crash", "hang", "accepted")
     }
     return {
         "kinds": len(found),

@@ -4,7 +4,9 @@ GEOM = '<geom name="ball" type="sphere" size="0.1"/>'
 
 
 def world(inside: str, rest: str = "") -> str:
-    return f'<mujoco model="broken">\n  <worldbody>\n    {inside}\n  </worldbody>\n  {rest}\n</mujoco>'
+    return (
+        f'<mujoco model="broken">\n  <worldbody>\n    {inside}\n  </worldbody>\n  {rest}\n</mujoco>'
+    )
 
 
 def body(inside: str, rest: str = "", attributes: str = "") -> str:
@@ -30,14 +32,26 @@ MALFORMED: dict[str, tuple[str, tuple[str, ...]]] = {
         world('<geom name="ball" type="sphere" radius="0.1"/>'),
         ("radius", "geom", "line 3"),
     ),
-    "unknown geom type": (world('<geom name="ball" type="spher" size="1"/>'), ("spher", "geom", "line 3")),
-    "unknown joint type": (body(f'<joint name="hinge" type="hing"/>{GEOM}'), ("hing", "joint", "line 4")),
-    "unknown integrator": ('<mujoco>\n  <option integrator="rk5"/>\n</mujoco>', ("rk5", "option", "line 2")),
+    "unknown geom type": (
+        world('<geom name="ball" type="spher" size="1"/>'),
+        ("spher", "geom", "line 3"),
+    ),
+    "unknown joint type": (
+        body(f'<joint name="hinge" type="hing"/>{GEOM}'),
+        ("hing", "joint", "line 4"),
+    ),
+    "unknown integrator": (
+        '<mujoco>\n  <option integrator="rk5"/>\n</mujoco>',
+        ("rk5", "option", "line 2"),
+    ),
     "unknown flag": (
         '<mujoco>\n  <option><flag contacts="disable"/></option>\n</mujoco>',
         ("contacts", "flag"),
     ),
-    "unknown sensor": (body(JOINTED, '<sensor><jointposition joint="hinge"/></sensor>'), ("jointposition",)),
+    "unknown sensor": (
+        body(JOINTED, '<sensor><jointposition joint="hinge"/></sensor>'),
+        ("jointposition",),
+    ),
     "repeated default class": (
         '<mujoco><default><default class="a"/><default class="a"/></default></mujoco>',
         ("a", "default"),
@@ -51,7 +65,10 @@ MALFORMED: dict[str, tuple[str, tuple[str, ...]]] = {
     "zero quaternion": (body(GEOM, attributes='quat="0 0 0 0"'), ("quaternion", "body", "line 3")),
     "two orientations": (body(GEOM, attributes='quat="1 0 0 0" euler="0 0 0"'), ("body", "line 3")),
     "zero size": (world('<geom name="ball" type="sphere" size="0"/>'), ("size", "ball", "line 3")),
-    "negative size": (world('<geom name="ball" type="sphere" size="-1"/>'), ("size", "ball", "line 3")),
+    "negative size": (
+        world('<geom name="ball" type="sphere" size="-1"/>'),
+        ("size", "ball", "line 3"),
+    ),
     "no size": (world('<geom name="ball" type="box"/>'), ("size", "ball", "line 3")),
     "zero axis": (body(f'<joint name="hinge" axis="0 0 0"/>{GEOM}'), ("axis", "hinge", "line 4")),
     "range upside down": (
@@ -69,10 +86,19 @@ MALFORMED: dict[str, tuple[str, tuple[str, ...]]] = {
         '<mujoco>\n  <option timestep="nan"/>\n</mujoco>',
         ("option.timestep", "nan", "<option>"),
     ),
-    "gravity nan": ('<mujoco>\n  <option gravity="0 0 nan"/>\n</mujoco>', ("option.gravity", "nan")),
+    "gravity nan": (
+        '<mujoco>\n  <option gravity="0 0 nan"/>\n</mujoco>',
+        ("option.gravity", "nan"),
+    ),
     "mass nan": (body('<joint name="hinge"/><geom size="0.1" mass="nan"/>'), ("nan", "line 4")),
-    "position nan": (body(f"<freejoint/>{GEOM}", attributes='pos="0 nan 0"'), ("body_pos", "nan", "link")),
-    "friction nan": (world('<geom name="ball" size="1" friction="nan 0 0"/>'), ("geom_friction", "ball")),
+    "position nan": (
+        body(f"<freejoint/>{GEOM}", attributes='pos="0 nan 0"'),
+        ("body_pos", "nan", "link"),
+    ),
+    "friction nan": (
+        world('<geom name="ball" size="1" friction="nan 0 0"/>'),
+        ("geom_friction", "ball"),
+    ),
     "damping nan": (body(f'<joint name="hinge" damping="nan"/>{GEOM}'), ("dof_damping", "hinge")),
     "gain nan": (
         body(JOINTED, '<actuator><general name="push" joint="hinge" gainprm="nan"/></actuator>'),
@@ -130,7 +156,10 @@ MALFORMED: dict[str, tuple[str, tuple[str, ...]]] = {
     "two free joints": (body(f'<freejoint name="a"/><freejoint name="b"/>{GEOM}'), ("link",)),
     "free joint with another": (body(f'<freejoint name="a"/><joint name="b"/>{GEOM}'), ("link",)),
     "joint in the world": (world('<joint name="hinge"/>'), ("joint", "line 3")),
-    "plane that moves": (body('<joint name="hinge"/><geom name="floor" type="plane" size="1 1 1"/>'), ()),
+    "plane that moves": (
+        body('<joint name="hinge"/><geom name="floor" type="plane" size="1 1 1"/>'),
+        (),
+    ),
     "empty tendon": (world("", '<tendon><spatial name="rope"/></tendon>'), ("rope",)),
     "weld of two bodies on one": (
         body(JOINTED, '<equality><weld name="glue" body1="link" body2="link"/></equality>'),

@@ -93,7 +93,9 @@ def sensed_box(reduction: str) -> mujoco.MjModel:
 @functools.cache
 def felt_crowd() -> mujoco.MjModel:
     """Return a body whose skin feels 55 balls at once, where MuJoCo Warp's tactile sensor keeps 50."""
-    balls = "".join(f'<geom type="sphere" size="0.05" pos="{0.001 * index} 0 0.95"/>' for index in range(55))
+    balls = "".join(
+        f'<geom type="sphere" size="0.05" pos="{0.001 * index} 0 0.95"/>' for index in range(55)
+    )
     return load_model(
         f"""<mujoco>
           <asset><mesh name="skin" builtin="sphere" params="0" scale="0.1 0.1 0.1"/></asset>

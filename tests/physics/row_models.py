@@ -72,7 +72,9 @@ def touching(
 ) -> World:
     """Return worlds in other states each, of which the last one hangs in the air, with what precedes the rows."""
     sim = SimCfg(njmax=njmax, nconmax=nconmax, one_kernel_dynamics=True)
-    world = World(mj_model(cone), num_envs=num_envs, sim=sim, device=device, per_world_fields=PER_WORLD)
+    world = World(
+        mj_model(cone), num_envs=num_envs, sim=sim, device=device, per_world_fields=PER_WORLD
+    )
     generator = torch.Generator().manual_seed(0)
     world.qpos_EL[:, 2] -= 0.02
     for row, scale in ((world.qpos_EL, 0.03), (world.qpos_EL[:, 7:], 0.3), (world.qvel_EL, 0.5)):
@@ -99,7 +101,10 @@ def in_c(world: World, cone: str, row: int) -> tuple[mujoco.MjModel, mujoco.MjDa
             world.field(name)[row].cpu().numpy().reshape(getattr(compiled, name).shape)
         )
     mj_data = mujoco.MjData(compiled)
-    mj_data.qpos[:], mj_data.qvel[:] = world.qpos_EL[row].cpu().numpy(), world.qvel_EL[row].cpu().numpy()
+    mj_data.qpos[:], mj_data.qvel[:] = (
+        world.qpos_EL[row].cpu().numpy(),
+        world.qvel_EL[row].cpu().numpy(),
+    )
     mujoco.mj_forward(compiled, mj_data)
     return compiled, mj_data
 

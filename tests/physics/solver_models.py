@@ -40,7 +40,11 @@ class Synthetic:
         if self.balls:
             bodies = "".join(self._ball(index) for index in range(self.balls))
         tendon = '<fixed name="rope" limited="true" range="-0.1 0.1" frictionloss="0.02"><joint joint="b0_0" coef="1"/>'
-        tendon = f"<tendon>{tendon}<joint joint='b0_1' coef='-1'/></fixed></tendon>" if self.tendon else ""
+        tendon = (
+            f"<tendon>{tendon}<joint joint='b0_1' coef='-1'/></fixed></tendon>"
+            if self.tendon
+            else ""
+        )
         tie = f"<equality>{_TIES[self.tie]}</equality>" if self.tie else ""
         return f"""
         <mujoco>
@@ -84,7 +88,9 @@ SYNTHETIC = (
     Synthetic(condim=3, cone="elliptic", tie="weld"),
     Synthetic(condim=6, tie="weld", ratio=1000.0),
     Synthetic(condim=3, tendon=True),
-    Synthetic(condim=4, cone="elliptic", tendon=True, tie="joint", frictionloss=0.05, impratio=100.0),
+    Synthetic(
+        condim=4, cone="elliptic", tendon=True, tie="joint", frictionloss=0.05, impratio=100.0
+    ),
     Synthetic(condim=3, balls=4, links=10),
     Synthetic(condim=3, cone="elliptic", balls=4, links=10, impratio=10.0),
     Synthetic(condim=6, cone="elliptic", balls=5, links=5, frictionloss=0.01, impratio=100.0),
@@ -131,7 +137,9 @@ def check_cost(mj_model: mujoco.MjModel, num_envs: int, device: str = "cpu") -> 
             d.efc.force.zero_()
             solve()
             qacc = d.qacc.numpy().astype(float)
-            found.append(np.array([problem.cost(each) for problem, each in zip(todo, qacc, strict=True)]))
+            found.append(
+                np.array([problem.cost(each) for problem, each in zip(todo, qacc, strict=True)])
+            )
     theirs, ours = found
     # float32 has no solution for some worlds of the steepest ratios of masses in MuJoCo Warp's solver; ours has one.
     assert np.isfinite(ours).all(), f"worlds {np.flatnonzero(~np.isfinite(ours))}"

@@ -68,11 +68,15 @@ class Problem:
         cones = self.kinds == _KINDS.mjCNSTR_CONTACT_ELLIPTIC
         linear = rubs & (np.abs(residual) * D >= self.bounds)
         quadratic = (
-            (self.kinds == _KINDS.mjCNSTR_EQUALITY) | (rubs & ~linear) | (~rubs & ~cones & (residual < 0.0))
+            (self.kinds == _KINDS.mjCNSTR_EQUALITY)
+            | (rubs & ~linear)
+            | (~rubs & ~cones & (residual < 0.0))
         )
         at_bound = self.bounds * (np.abs(residual) - 0.5 * self.bounds / D)
         cost = np.where(quadratic, 0.5 * D * residual**2, np.where(linear, at_bound, 0.0))
-        slope = np.where(quadratic, D * residual, np.where(linear, self.bounds * np.sign(residual), 0.0))
+        slope = np.where(
+            quadratic, D * residual, np.where(linear, self.bounds * np.sign(residual), 0.0)
+        )
         return cost, slope, np.where(quadratic, D, 0.0)
 
     def _of_cone(
@@ -90,7 +94,11 @@ class Problem:
         of_gap, bend = np.concatenate([[1.0], -mu * along]), np.diag(zeros)
         bend[1:, 1:] = -mu * (np.eye(len(along)) - np.outer(along, along)) / tangent
         hessian = Dm * (np.outer(of_gap, of_gap) + gap * bend)
-        return float(0.5 * Dm * gap**2), friction * Dm * gap * of_gap, np.outer(friction, friction) * hessian
+        return (
+            float(0.5 * Dm * gap**2),
+            friction * Dm * gap * of_gap,
+            np.outer(friction, friction) * hessian,
+        )
 
 
 def problems(world: World) -> list[Problem]:
@@ -98,7 +106,9 @@ def problems(world: World) -> list[Problem]:
     m, d = world.warp_model, world.warp_data_E
     names = "type id D aref frictionloss J_rownnz J_rowadr"
     read = {name: getattr(d.efc, name).numpy() for name in names.split()}
-    columns, values = (array.numpy().reshape(world.num_envs, -1) for array in (d.efc.J_colind, d.efc.J))
+    columns, values = (
+        array.numpy().reshape(world.num_envs, -1) for array in (d.efc.J_colind, d.efc.J)
+    )
     frictions = d.contact.friction.numpy().astype(float)
     to_root = float(m.opt.impratio_invsqrt.numpy()[0])
     smooth, entries = d.qfrc_smooth.numpy().astype(float), d.M.numpy()
@@ -109,7 +119,9 @@ def problems(world: World) -> list[Problem]:
         mass[rows, dofs] = mass[dofs, rows] = entries[env].ravel()[: len(rows)]
         jacobian = np.zeros((count, m.nv))
         for row in range(count):
-            here = slice(read["J_rowadr"][env, row], read["J_rowadr"][env, row] + read["J_rownnz"][env, row])
+            here = slice(
+                read["J_rowadr"][env, row], read["J_rowadr"][env, row] + read["J_rownnz"][env, row]
+            )
             jacobian[row, columns[env, here]] = values[env, here]
         kinds, contacts = read["type"][env, :count], read["id"][env, :count]
         elliptic, cones = kinds == _KINDS.mjCNSTR_CONTACT_ELLIPTIC, []
@@ -117,7 +129,9 @@ def problems(world: World) -> list[Problem]:
             of_cone = np.flatnonzero(elliptic & (contacts == contact))
             mu = frictions[contact, 0] * to_root
             cones.append((of_cone, np.array([mu, *frictions[contact, : len(of_cone) - 1]])))
-        D, aref, bounds = (read[name][env, :count].astype(float) for name in ("D", "aref", "frictionloss"))
+        D, aref, bounds = (
+            read[name][env, :count].astype(float) for name in ("D", "aref", "frictionloss")
+        )
         found.append(
             Problem(
                 mass=mass,

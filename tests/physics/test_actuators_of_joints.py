@@ -26,10 +26,14 @@ CONSTANTS = ("dof_invweight0", "body_invweight0", "actuator_acc0")
 @pytest.mark.parametrize("has_tendon", (False, True), ids=("joints", "and a tendon"))
 @pytest.mark.parametrize("integrator", ("Euler", "implicitfast"))
 @pytest.mark.parametrize("kernels", ("ours", "theirs"))
-def test_each_world_has_what_its_actuators_add(kernels: str, integrator: str, has_tendon: bool) -> None:
+def test_each_world_has_what_its_actuators_add(
+    kernels: str, integrator: str, has_tendon: bool
+) -> None:
     tendon = TENDON if has_tendon else ""
     more = '<motor tendon="t" gear="2"/>' if has_tendon else ""
-    mj_model = mujoco.MjModel.from_xml_string(CHAIN.format(integrator=integrator, tendon=tendon, more=more))
+    mj_model = mujoco.MjModel.from_xml_string(
+        CHAIN.format(integrator=integrator, tendon=tendon, more=more)
+    )
     numbers = np.arange(1.0, mj_model.nu + 1.0)
     fields = {"actuator_armature": 0.02 * numbers, "actuator_damping": 0.05 * numbers}
     world, mj_data, in_c = started(mj_model, KERNELS[kernels], fields=fields)
@@ -39,13 +43,17 @@ def test_each_world_has_what_its_actuators_add(kernels: str, integrator: str, ha
     check(world, mj_data)
     for name in CONSTANTS:
         found = world.field(name)[1].numpy()
-        np.testing.assert_allclose(found, getattr(in_c, name).reshape(found.shape), rtol=1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            found, getattr(in_c, name).reshape(found.shape), rtol=1e-4, err_msg=name
+        )
 
 
 def test_the_other_world_adds_nothing() -> None:
     mj_model = mujoco.MjModel.from_xml_string(CHAIN.format(integrator="Euler", tendon="", more=""))
     world, mj_data, _ = started(
-        mj_model, KERNELS["ours"], fields={"actuator_damping": np.ones(3), "actuator_armature": np.ones(3)}
+        mj_model,
+        KERNELS["ours"],
+        fields={"actuator_damping": np.ones(3), "actuator_armature": np.ones(3)},
     )
     plain = mujoco.MjData(mj_model)
     plain.qpos[:], plain.qvel[:], plain.ctrl[:] = mj_data.qpos, mj_data.qvel, mj_data.ctrl

@@ -57,7 +57,9 @@ FLAT = """
 def test_upper_corners_of_boxes_do_not_stick(integrator: str, kernels: str) -> None:
     names = ("qpos", "qvel", "qacc", "qfrc_passive", "actuator_velocity")
     for adhesion in (0.0, 1.0):
-        xml = FLAT.format(adhesion=adhesion).replace("<option", f'<option integrator="{integrator}"')
+        xml = FLAT.format(adhesion=adhesion).replace(
+            "<option", f'<option integrator="{integrator}"'
+        )
         step_and_check(xml, KERNELS[kernels], names=names, **CALM)
 
 
@@ -98,7 +100,9 @@ def test_an_actuator_does_not_adhere_by_a_pair_of_one_rigid_body(other: str, ker
 
 @pytest.mark.parametrize("more", ("", '<body mocap="true"/>'), ids=("own reset", "their reset"))
 def test_a_reset_of_one_world_leaves_the_adhesion_of_another(more: str) -> None:
-    world, mj_data, in_c = started(STUCK.format(integrator="Euler", more=more), KERNELS["ours"], **CALM)
+    world, mj_data, in_c = started(
+        STUCK.format(integrator="Euler", more=more), KERNELS["ours"], **CALM
+    )
     world.step(1)
     mujoco.mj_step(in_c, mj_data)
     world.reset(torch.tensor([True, False]))

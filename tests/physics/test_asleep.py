@@ -100,6 +100,8 @@ def test_nothing_sleeps_without_islands(kernels: str):
   </worldbody>
 </mujoco>
 """
-    step_and_check(xml, KERNELS[kernels], substeps=12, names=("qpos", "qvel", "qacc", "qfrc_constraint"))
+    step_and_check(
+        xml, KERNELS[kernels], substeps=12, names=("qpos", "qvel", "qacc", "qfrc_constraint")
+    )
     world = World(mujoco.MjModel.from_xml_string(xml), num_envs=1, sim=KERNELS["ours"])
     assert isinstance(world, WarpWorld) and world.has_one_kernel_solver

@@ -64,7 +64,9 @@ def spider(ground: str) -> mujoco.MjModel:
             )
             part = part.add_body(pos=pos, quat=quat)
             name = f"joint_{leg}_{segment}"
-            part.add_joint(name=name, axis=axis, limited=1, range=[-0.6, 0.6], damping=0.2, armature=0.01)
+            part.add_joint(
+                name=name, axis=axis, limited=1, range=[-0.6, 0.6], damping=0.2, armature=0.01
+            )
             rod = mujoco.mjtGeom.mjGEOM_CAPSULE
             part.add_geom(type=rod, fromto=[0.0, 0.0, 0.0, 0.15, 0.0, 0.0], size=[0.02, 0.0, 0.0])
             actuator = spec.add_actuator(target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -163,13 +165,17 @@ def test_the_settings_win_over_the_probe():
 )
 def test_more_than_warp_can_count_is_refused_by_name(field, number, most):
     capacity.check_countable(**{"njmax": 1, "nconmax": 1, field: most}, num_envs=4)
-    with pytest.raises(ValueError, match=f"sim.{field}={number}: expected at most {most} for num_envs=4"):
+    with pytest.raises(
+        ValueError, match=f"sim.{field}={number}: expected at most {most} for num_envs=4"
+    ):
         capacity.check_countable(**{"njmax": 1, "nconmax": 1, field: number}, num_envs=4)
 
 
 def test_a_world_of_more_contacts_than_warp_can_count_is_refused():
     sim = SimCfg(njmax=1, nconmax=10**9, engine="warp")
-    with pytest.raises(ValueError, match=r"sim.nconmax=1000000000: expected at most \d+ for num_envs=4"):
+    with pytest.raises(
+        ValueError, match=r"sim.nconmax=1000000000: expected at most \d+ for num_envs=4"
+    ):
         World(cartpole(), num_envs=4, device="cpu", sim=sim)
 
 

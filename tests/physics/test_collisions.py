@@ -72,7 +72,9 @@ def found(world: World) -> dict[tuple[int, int, int], torch.Tensor]:
     where = torch.cat(
         [wp.to_torch(d.contact.worldid)[:number, None], wp.to_torch(d.contact.geom)[:number]], 1
     )
-    what = torch.cat([wp.to_torch(d.contact.dist)[:number, None], wp.to_torch(d.contact.pos)[:number]], 1)
+    what = torch.cat(
+        [wp.to_torch(d.contact.dist)[:number, None], wp.to_torch(d.contact.pos)[:number]], 1
+    )
     contacts: dict[tuple[int, int, int], torch.Tensor] = {}
     for key in {tuple(row) for row in where.tolist()}:
         of_pair = what[(where == torch.tensor(key, device=where.device)).all(1)]
@@ -144,7 +146,9 @@ FIELDS = [
 
 def known(device: str = "cpu", num_envs: int = 200) -> World:
     """Worlds in which things of known types lie in each other, in some level or with capsules side by side."""
-    world = World(load_model(KNOWN), num_envs=num_envs, sim=SimCfg(njmax=400, nconmax=60), device=device)
+    world = World(
+        load_model(KNOWN), num_envs=num_envs, sim=SimCfg(njmax=400, nconmax=60), device=device
+    )
     generator = torch.Generator().manual_seed(0)
     qpos_EL = torch.randn(world.qpos_EL.shape, generator=generator).unflatten(1, (-1, 7))
     qpos_EL[..., :3] = torch.rand(qpos_EL[..., :3].shape, generator=generator) * 0.6 - 0.1
@@ -171,7 +175,9 @@ def check_against_c(device: str = "cpu", **kwargs: int) -> None:
         d.nacon.zero_()
         collisions(m, d, lists, **kwargs)()
     number, room = int(d.nacon.numpy()[0]), lists.found.numpy()
-    contact = SimpleNamespace(**{name: getattr(d.contact, name).numpy()[:number] for name in FIELDS})
+    contact = SimpleNamespace(
+        **{name: getattr(d.contact, name).numpy()[:number] for name in FIELDS}
+    )
     mj_data, met = mujoco.MjData(world.mj_model), set()
     for row, qpos in enumerate(world.qpos_EL.double().cpu().numpy()):
         mj_data.qpos[:] = qpos
@@ -182,9 +188,12 @@ def check_against_c(device: str = "cpu", **kwargs: int) -> None:
         own, theirs = contacts_of(contact, listed), contacts_of(mj_data.contact, slice(None))
         assert own.shape == theirs.shape, row
         np.testing.assert_allclose(own, theirs, atol=1e-4, err_msg=str(row))
-        met |= {tuple(kinds) for kinds in world.mj_model.geom_type[theirs[:, -2:].astype(int)].tolist()}
+        met |= {
+            tuple(kinds) for kinds in world.mj_model.geom_type[theirs[:, -2:].astype(int)].tolist()
+        }
     kind = {
-        name.removeprefix("mjGEOM_").lower(): int(kind) for name, kind in mujoco.mjtGeom.__members__.items()
+        name.removeprefix("mjGEOM_").lower(): int(kind)
+        for name, kind in mujoco.mjtGeom.__members__.items()
     }
     assert met == {(kind[a], kind[b]) for a, others in MOST_CONTACTS.items() for b in others}
 
@@ -207,8 +216,14 @@ def test_more_contacts_than_there_is_room_for_are_counted():
 
 def test_pairs_of_other_types_are_left_to_mujoco_warp():
     left = str(pairs_left(pile().warp_model))
-    assert left.startswith("box and box, ") and left.endswith("meet, whose contacts they alone find")
-    assert "ellipsoid and box" in left and "sphere and box" not in left and "capsule and box" not in left
+    assert left.startswith("box and box, ") and left.endswith(
+        "meet, whose contacts they alone find"
+    )
+    assert (
+        "ellipsoid and box" in left
+        and "sphere and box" not in left
+        and "capsule and box" not in left
+    )
 
 
 def test_a_model_outside_of_it_keeps_mujoco_warps():

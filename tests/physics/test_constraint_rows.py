@@ -27,7 +27,9 @@ def world_of(cone: str) -> World:
 
 def launch(world: World, **changes) -> ContactLists:
     """Make the rows of a world, with other options, in arrays that hold rubbish."""
-    m = dataclasses.replace(world.warp_model, opt=dataclasses.replace(world.warp_model.opt, **changes))
+    m = dataclasses.replace(
+        world.warp_model, opt=dataclasses.replace(world.warp_model.opt, **changes)
+    )
     for name in (*COLUMNS, "J", "J_colind", "J_rowadr", "J_rownnz", "id"):
         getattr(world.warp_data_E.efc, name).fill_(77)
     contact = world.warp_data_E.contact
@@ -76,14 +78,18 @@ def test_rows_are_those_of_the_c_engine_in_its_order(cone: str):
             mj_data.efc_pos - mj_data.efc_margin,
         )
         for name in ("type", "frictionloss"):
-            np.testing.assert_allclose(found[name], getattr(mj_data, f"efc_{name}"), atol=1e-7, err_msg=name)
+            np.testing.assert_allclose(
+                found[name], getattr(mj_data, f"efc_{name}"), atol=1e-7, err_msg=name
+            )
         for name, atol in (("J", 1e-6), ("pos", 2e-6), ("vel", 1e-5)):
             theirs = getattr(mj_data, f"efc_{name}").reshape(found[name].shape)
             np.testing.assert_allclose(found[name], theirs, atol=atol, err_msg=name)
         for name in ("D", "aref"):
             theirs = getattr(mj_data, f"efc_{name}")
             np.testing.assert_allclose(found[name], theirs, rtol=1e-3, atol=0.02, err_msg=name)
-        place = np.flatnonzero(found["type"] < int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
+        place = np.flatnonzero(
+            found["type"] < int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+        )
         np.testing.assert_array_equal(found["id"][place], mj_data.efc_id[place])
         ids = lists.ids.numpy()[row][: lists.count.numpy()[row]]
         np.testing.assert_array_equal(found["id"][place.size :], ids[mj_data.efc_id[place.size :]])
@@ -119,7 +125,8 @@ def test_rows_are_those_of_mujoco_warp(cone: str):
     theirs_addresses = world.warp_data_E.contact.efc_address.numpy().copy()
     count = int(world.warp_data_E.nacon.numpy()[0])
     np.testing.assert_array_equal(
-        addresses[:count] == -1, np.where(theirs_addresses[:count] == 77, -1, theirs_addresses[:count]) == -1
+        addresses[:count] == -1,
+        np.where(theirs_addresses[:count] == 77, -1, theirs_addresses[:count]) == -1,
     )
     for row in range(NUM_ENVS):
         theirs = made(world, row)
@@ -166,7 +173,9 @@ def test_what_is_switched_off_has_no_rows():
     with wp.ScopedDevice("cpu"):
         opt = dataclasses.replace(world.warp_model.opt, disableflags=int(flags.REFSAFE))
         mjw.make_constraint(dataclasses.replace(world.warp_model, opt=opt), world.warp_data_E)
-    np.testing.assert_allclose(np.sort(stiff), np.sort(made(world, 0)["aref"]), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        np.sort(stiff), np.sort(made(world, 0)["aref"]), rtol=1e-5, atol=1e-5
+    )
 
 
 def test_rows_beyond_njmax_are_counted_and_not_written():
@@ -178,11 +187,14 @@ def test_rows_beyond_njmax_are_counted_and_not_written():
     roomy = world_of("elliptic")
     launch(roomy)
     assert (
-        world.warp_data_E.contact.efc_address.numpy()[: int(world.warp_data_E.nacon.numpy()[0])] < 20
+        world.warp_data_E.contact.efc_address.numpy()[: int(world.warp_data_E.nacon.numpy()[0])]
+        < 20
     ).all()
     for row in range(NUM_ENVS):
         for name in (*COLUMNS, "J"):
-            np.testing.assert_array_equal(kept[row][name], made(roomy, row)[name][:20], err_msg=name)
+            np.testing.assert_array_equal(
+                kept[row][name], made(roomy, row)[name][:20], err_msg=name
+            )
     # More contacts than rows: the pool says how many there are, and the report how many rows they take at most.
     d = world.warp_data_E
     with wp.ScopedDevice("cpu"):
@@ -237,9 +249,7 @@ def test_steps_reach_what_mujoco_warps_rows_reach():
 
 
 def test_why_a_model_is_out_of_its_range_is_told():
-    xml = (
-        """<mujoco><worldbody>{}<body name="a"><freejoint/><geom size="0.1"/></body></worldbody>{}</mujoco>"""
-    )
+    xml = """<mujoco><worldbody>{}<body name="a"><freejoint/><geom size="0.1"/></body></worldbody>{}</mujoco>"""
     tie = '<equality><connect body1="a" anchor="0 0 0"/></equality>'
     for text, word in ((xml.format("", tie), "tie bodies"), (xml.format("", ""), None)):
         model = mujoco.MjModel.from_xml_string(text)

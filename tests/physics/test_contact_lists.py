@@ -28,7 +28,9 @@ def test_contacts_are_those_of_the_c_engine_in_its_order(world: World):
     for row in range(NUM_ENVS):
         mj_data = in_c(world, "elliptic", row)[1]
         np.testing.assert_array_equal(contact.geom.numpy()[found[row]], mj_data.contact.geom)
-        np.testing.assert_allclose(contact.dist.numpy()[found[row]], mj_data.contact.dist, atol=2e-5)
+        np.testing.assert_allclose(
+            contact.dist.numpy()[found[row]], mj_data.contact.dist, atol=2e-5
+        )
         assert (contact.worldid.numpy()[found[row]] == row).all()
 
 

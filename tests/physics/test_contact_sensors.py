@@ -18,7 +18,12 @@ from tests.physics import row_models
 OBJECT = mujoco.mjtObj
 ELEMENTS = ((OBJECT.mjOBJ_GEOM, "box"), (OBJECT.mjOBJ_GEOM, "floor"), (OBJECT.mjOBJ_BODY, "hand"))
 TREES = ((OBJECT.mjOBJ_XBODY, "trunk"), (OBJECT.mjOBJ_XBODY, "arm"))
-OTHERS = (None, (OBJECT.mjOBJ_GEOM, "floor"), (OBJECT.mjOBJ_BODY, "world"), (OBJECT.mjOBJ_XBODY, "trunk"))
+OTHERS = (
+    None,
+    (OBJECT.mjOBJ_GEOM, "floor"),
+    (OBJECT.mjOBJ_BODY, "world"),
+    (OBJECT.mjOBJ_XBODY, "trunk"),
+)
 # What only MJCF of users has.
 FOREIGN = (
     (NET[0], 1, 1),
@@ -33,7 +38,9 @@ def model(cone: str, foreign: tuple[tuple[int, ...], ...] = FOREIGN) -> mujoco.M
     spec = mujoco.MjSpec.from_string(row_models.XML)
     spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}")
     prepare_spec(spec, ())
-    for own, other, layout in itertools.product((*ELEMENTS, *TREES), OTHERS, (NET, STRONGEST, *foreign)):
+    for own, other, layout in itertools.product(
+        (*ELEMENTS, *TREES), OTHERS, (NET, STRONGEST, *foreign)
+    ):
         sensor = spec.add_sensor(
             type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=own[0], objname=own[1], intprm=[*layout]
         )
@@ -76,7 +83,10 @@ def columns(mj_model: mujoco.MjModel, *, ours: bool) -> np.ndarray:
 
 
 def test_substeps_of_which_nothing_else_is_read_write_no_poses():
-    seen: dict[Literal["contacts", "every"], list[tuple[torch.Tensor, ...]]] = {"contacts": [], "every": []}
+    seen: dict[Literal["contacts", "every"], list[tuple[torch.Tensor, ...]]] = {
+        "contacts": [],
+        "every": [],
+    }
     sim = SimCfg(njmax=120, nconmax=40, one_kernel_dynamics=True)
     for which, moments in seen.items():
         world = World(model("pyramidal", ()), num_envs=ENVS, sim=sim)
@@ -84,7 +94,9 @@ def test_substeps_of_which_nothing_else_is_read_write_no_poses():
         world.last_substep("xmat").fill_(7.0)
 
         def note(world: World = world, moments: list[tuple[torch.Tensor, ...]] = moments) -> None:
-            moments.append(tuple(world.last_substep(name).clone() for name in ("xmat", "qpos", "sensordata")))
+            moments.append(
+                tuple(world.last_substep(name).clone() for name in ("xmat", "qpos", "sensordata"))
+            )
 
         world.step(3, after=[note], sensors=which)
     own = columns(world.mj_model, ours=True)
@@ -92,7 +104,9 @@ def test_substeps_of_which_nothing_else_is_read_write_no_poses():
         assert torch.equal(contacts[1], every[1])
         assert torch.equal(contacts[2][:, own], every[2][:, own]) and contacts[2][:, own].any()
     unwritten = [bool((moment[0] == 7.0).all()) for moment in seen["contacts"]]
-    assert unwritten == [True, True, False] and torch.equal(seen["contacts"][2][0], seen["every"][2][0])
+    assert unwritten == [True, True, False] and torch.equal(
+        seen["contacts"][2][0], seen["every"][2][0]
+    )
 
 
 @pytest.fixture(scope="module", params=["pyramidal", "elliptic"])
@@ -135,7 +149,8 @@ def test_values_are_those_of_mujoco_warp(world: World):
     scale = np.maximum(1.0, np.abs(expected[:, theirs]).max())
     assert (np.abs(read[:, theirs] - expected[:, theirs]) < 1e-5 * scale).mean() > 0.95
     shares = [
-        share_that_agrees(world.mj_model, *pair, tolerance=2e-6) for pair in zip(read, expected, strict=True)
+        share_that_agrees(world.mj_model, *pair, tolerance=2e-6)
+        for pair in zip(read, expected, strict=True)
     ]
     assert np.mean(shares) > 0.95, shares
 
@@ -181,10 +196,15 @@ def test_of_equally_strong_contacts_the_first_in_the_order_of_the_c_engine_count
     )
     for layout in (NET, STRONGEST):
         spec.add_sensor(
-            type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=OBJECT.mjOBJ_GEOM, objname="ball", intprm=[*layout]
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=OBJECT.mjOBJ_GEOM,
+            objname="ball",
+            intprm=[*layout],
         )
     prepare_spec(spec, ())
-    world = World(spec.compile(), num_envs=2, sim=SimCfg(njmax=20, nconmax=8, one_kernel_dynamics=True))
+    world = World(
+        spec.compile(), num_envs=2, sim=SimCfg(njmax=20, nconmax=8, one_kernel_dynamics=True)
+    )
     mj_data = mujoco.MjData(world.mj_model)
     mujoco.mj_forward(world.mj_model, mj_data)
     world.step()
@@ -203,7 +223,8 @@ def test_forces_on_bodies_are_those_of_mujoco_warp(world: World):
         for name, launch in (("ours", contacts.rne_postconstraint), ("theirs", theirs_of(world))):
             launch(world.warp_model)
             found[name] = {
-                part: world.last_substep(part).numpy().copy() for part in ("cfrc_ext", "cfrc_int", "cacc")
+                part: world.last_substep(part).numpy().copy()
+                for part in ("cfrc_ext", "cfrc_int", "cacc")
             }
     for part, expected in found["theirs"].items():
         scale = max(1.0, np.abs(expected).max())
@@ -231,7 +252,9 @@ def test_accelerometers_are_those_of_mujoco_warp_which_computes_forces_of_bodies
     prepare_spec(spec, ())
     model, found = spec.compile(), []
     for theirs in (False, True):
-        world = World(model, num_envs=ENVS, sim=SimCfg(njmax=120, nconmax=40, one_kernel_dynamics=True))
+        world = World(
+            model, num_envs=ENVS, sim=SimCfg(njmax=120, nconmax=40, one_kernel_dynamics=True)
+        )
         place(world)
         world.qvel_EL.mul_(4.0)
         models, all_of_them = world._substeps._models, world.warp_model.sensor_acc_adr

@@ -97,7 +97,10 @@ def test_an_upright_rod_has_the_frame_of_the_c_engine(one_kernel: bool):
     world.step()
     expected = mj_data.contact.frame[(np.array(mj_data.contact.geom) == [3, 2]).all(-1)]
     count = int(world.last_substep("nacon").item())
-    geoms, frames = world.last_substep("contact.geom")[:count], world.last_substep("contact.frame")[:count]
+    geoms, frames = (
+        world.last_substep("contact.geom")[:count],
+        world.last_substep("contact.frame")[:count],
+    )
     found = frames[(geoms == torch.tensor([3, 2])).all(-1)].reshape(-1, 9).double()
     torch.testing.assert_close(found, torch.from_numpy(expected))
     assert len(expected) == 1
@@ -219,19 +222,23 @@ PAIRS = """
 @pytest.mark.parametrize("one_kernel", [True, False])
 def test_all_pairs_make_contacts_and_rows_where_joints_can_heed_them(one_kernel: bool):
     mj_model = load_model(PAIRS)
-    world = World(mj_model, num_envs=2, sim=SimCfg(njmax=80, nconmax=60, one_kernel_dynamics=one_kernel))
+    world = World(
+        mj_model, num_envs=2, sim=SimCfg(njmax=80, nconmax=60, one_kernel_dynamics=one_kernel)
+    )
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
     assert [each.dim for each in mj_data.contact if set(each.geom) == {0, 3}] == [1, 4, 3]
     world.step()
     contact, count = world.warp_data_E.contact, int(world.warp_data_E.nacon.numpy()[0])
     owner, geom, dim, dist, rows = (
-        getattr(contact, name).numpy()[:count] for name in ("worldid", "geom", "dim", "dist", "efc_address")
+        getattr(contact, name).numpy()[:count]
+        for name in ("worldid", "geom", "dim", "dist", "efc_address")
     )
     for row in range(2):
         mine = np.flatnonzero((owner == row) & (contact.type.numpy()[:count] != 0))
         found = sorted(
-            (*geom[i].tolist(), int(dim[i]), round(float(dist[i]), 4), rows[i, 0] >= 0) for i in mine
+            (*geom[i].tolist(), int(dim[i]), round(float(dist[i]), 4), rows[i, 0] >= 0)
+            for i in mine
         )
         expected = [
             (*each.geom.tolist(), each.dim, round(each.dist, 4), each.efc_address >= 0)
@@ -248,8 +255,12 @@ def test_all_pairs_make_contacts_and_rows_where_joints_can_heed_them(one_kernel:
                 for each in mj_data.contact
                 if each.efc_address >= 0
             ]
-        np.testing.assert_allclose(world.last_substep("qacc")[row], mj_data.qacc, rtol=1e-3, atol=1e-3)
-        np.testing.assert_allclose(world.sensordata_EL[row], mj_data.sensordata, rtol=1e-3, atol=1e-2)
+        np.testing.assert_allclose(
+            world.last_substep("qacc")[row], mj_data.qacc, rtol=1e-3, atol=1e-3
+        )
+        np.testing.assert_allclose(
+            world.sensordata_EL[row], mj_data.sensordata, rtol=1e-3, atol=1e-2
+        )
 
 
 BEAM = (

@@ -26,14 +26,18 @@ ARM = """
   <sensor><actuatorfrc actuator="0"/></sensor>
 </mujoco>
 """.replace('<motor joint="a"', '<motor name="0" joint="a"')
-WITHOUT_TENDON = ARM.replace('<tendon><fixed name="rope"><joint joint="a" coef="1"/></fixed></tendon>', "")
+WITHOUT_TENDON = ARM.replace(
+    '<tendon><fixed name="rope"><joint joint="a" coef="1"/></fixed></tendon>', ""
+)
 MORE = '<muscle joint="a" group="1" lengthrange="0 1"/><motor tendon="rope" group="3"/>'
 INTEGRATORS = ("Euler", "implicitfast", "implicit", "RK4")
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("kernels", KERNELS)
-def test_disabled_actuators_make_no_force_and_keep_their_activations(kernels: str, integrator: str) -> None:
+def test_disabled_actuators_make_no_force_and_keep_their_activations(
+    kernels: str, integrator: str
+) -> None:
     step_and_check(WITHOUT_TENDON.format(integrator=integrator, more=""), KERNELS[kernels])
 
 
@@ -43,7 +47,9 @@ def test_disabled_muscles_and_motors_of_tendons_are_off_too(integrator: str) -> 
 
 
 def test_an_enabled_group_still_drives() -> None:
-    enabled = WITHOUT_TENDON.format(integrator="Euler", more="").replace('actuatorgroupdisable="1 3"', "")
+    enabled = WITHOUT_TENDON.format(integrator="Euler", more="").replace(
+        'actuatorgroupdisable="1 3"', ""
+    )
     world, _, _ = started(enabled, KERNELS["ours"])
     world.step(1)
     assert (world.actuator_force_EL[1] != 0.0).all()
@@ -59,5 +65,7 @@ def test_groups_without_a_bit_are_never_disabled() -> None:
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_without_actuation_activations_keep_still_even_out_of_their_range(integrator: str) -> None:
     flag = '<option><flag actuation="disable"/></option>'
-    xml = WITHOUT_TENDON.format(integrator=integrator, more="").replace("<worldbody>", flag + "<worldbody>")
+    xml = WITHOUT_TENDON.format(integrator=integrator, more="").replace(
+        "<worldbody>", flag + "<worldbody>"
+    )
     step_and_check(xml.replace('actrange="-1 1"', 'actrange="-1 -0.9"'), KERNELS["our solver"])

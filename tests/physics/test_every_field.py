@@ -10,11 +10,20 @@ import torch
 from ksim_rl.physics import SimCfg, World
 from ksim_rl.physics.fields import ALL, const_groups, derived_fields, write_fields
 from ksim_rl.physics.upstream import per_world_fields
-from tests.physics.field_models import FIELDS, MODELS, OF_OTHER_TESTS, OF_PICTURES, changed, compiled
+from tests.physics.field_models import (
+    FIELDS,
+    MODELS,
+    OF_OTHER_TESTS,
+    OF_PICTURES,
+    changed,
+    compiled,
+)
 
 STEPS = 4
 # Of the state reached, and of the last substep.
-_POSES = "qpos qvel act xpos xquat xipos geom_xpos geom_xmat site_xpos site_xmat subtree_com sensordata"
+_POSES = (
+    "qpos qvel act xpos xquat xipos geom_xpos geom_xmat site_xpos site_xmat subtree_com sensordata"
+)
 _SEEN = "cam_xpos cam_xmat light_xpos light_xdir"
 _FORCES = "qacc actuator_force qfrc_passive qfrc_actuator qfrc_constraint"
 REACHED, FORCES = f"{_POSES} {_SEEN}".split(), _FORCES.split()
@@ -98,7 +107,11 @@ def differences(world: World, row: int, expected: dict[str, np.ndarray]) -> list
 @pytest.mark.parametrize(
     ("model", "sim"),
     [
-        *((model, sim) for model in ("plain", "fluid", "viscous", "sticky") for sim in (OURS, THEIRS)),
+        *(
+            (model, sim)
+            for model in ("plain", "fluid", "viscous", "sticky")
+            for sim in (OURS, THEIRS)
+        ),
         ("rich", THEIRS),
         ("rich", NO_KERNEL),
     ],
@@ -112,7 +125,9 @@ def test_each_field_has_its_effect(model: str, sim: SimCfg):
         mj_model = compiled(model)
         write_fields(mj_model, {name: world.field(name)[row].numpy()})
         expected = in_c(mj_model, state)
-        effect = max(np.abs(values - plain[key]).max(initial=0.0) for key, values in expected.items())
+        effect = max(
+            np.abs(values - plain[key]).max(initial=0.0) for key, values in expected.items()
+        )
         if effect < 1e-4:
             faults.append(f"{name} has no effect in C, so that it says nothing")
         faults += [f"{name}: {what}" for what in differences(world, row, expected)]
@@ -164,7 +179,8 @@ def numbers(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
     return {
         name: np.array(value, dtype=float)
         for name, value in values.items()
-        if isinstance(value, (int, float)) or (isinstance(value, np.ndarray) and value.dtype.kind in "bif")
+        if isinstance(value, (int, float))
+        or (isinstance(value, np.ndarray) and value.dtype.kind in "bif")
     }
 
 
@@ -213,9 +229,15 @@ def test_fields_without_effect_are_refused():
         "sensor_delay",
         "sensor_interval",
     ):
-        with pytest.raises(ValueError, match=f"per_world_fields has '{name}', but no .* in the model"):
+        with pytest.raises(
+            ValueError, match=f"per_world_fields has '{name}', but no .* in the model"
+        ):
             World(compiled("plain"), num_envs=2, per_world_fields=(name,))
     with pytest.raises(ValueError, match="'geom_size', but geom 'hull' moves the fluid around it"):
         World(compiled("fluid"), num_envs=2, per_world_fields=("geom_size",))
     with pytest.raises(ValueError, match="'jnt_axis', but body 'puck' is compiled as simple"):
-        World(mujoco.MjModel.from_xml_string(MODELS["plain"]), num_envs=2, per_world_fields=("jnt_axis",))
+        World(
+            mujoco.MjModel.from_xml_string(MODELS["plain"]),
+            num_envs=2,
+            per_world_fields=("jnt_axis",),
+        )

@@ -96,7 +96,12 @@ def test_every_array_of_a_model_is_listed_once():
     mj_model = mujoco.MjModel.from_xml_string("<mujoco/>")
     arrays = [name for name in dir(mj_model) if not name.startswith("_")]
     arrays = [name for name in arrays if isinstance(getattr(mj_model, name), np.ndarray)]
-    lists = (every_array.HONOURED, every_array.REFUSED, every_array.WITHOUT_MEANING, every_array.NOT_COMPARED)
+    lists = (
+        every_array.HONOURED,
+        every_array.REFUSED,
+        every_array.WITHOUT_MEANING,
+        every_array.NOT_COMPARED,
+    )
     listed = [word for blocks in lists for word in words(blocks)]
     assert Counter(listed) == Counter(arrays)
 
@@ -127,7 +132,9 @@ def test_what_shows_it_is_there():
 
 
 def test_what_is_refused_has_a_model():
-    refused = {f"{enum} {value}" for enum, block in every_enum.REFUSED.items() for value in block.split()}
+    refused = {
+        f"{enum} {value}" for enum, block in every_enum.REFUSED.items() for value in block.split()
+    }
     assert refused == {*MODELS, *OF_NO_XML}
 
 
@@ -146,7 +153,9 @@ def test_plugins_are_refused_by_name(what: str):
 
 
 def test_flags_are_named_also_where_there_are_several():
-    xml = model(option='<option><flag override="enable" speculative="enable" midphase="disable"/></option>')
+    xml = model(
+        option='<option><flag override="enable" speculative="enable" midphase="disable"/></option>'
+    )
     with pytest.raises(
         ValueError, match="mjDSBL_MIDPHASE, mjENBL_OVERRIDE, mjENBL_SPECULATIVE are unsupported"
     ):

@@ -108,7 +108,9 @@ def test_changed_fields_change_the_motion_as_in_the_c_engine():
 
 def test_set_const_leaves_the_state_alone():
     world = standing_quadrupeds(per_world_fields=("body_mass", "geom_friction"))
-    before = {name: world.view(name).clone() for name in ("qpos", "qvel", "sensordata", "xpos", "ctrl")}
+    before = {
+        name: world.view(name).clone() for name in ("qpos", "qvel", "sensordata", "xpos", "ctrl")
+    }
     world.set_const(("body_mass", "geom_friction"))
     for name, tensor in before.items():
         assert torch.equal(world.view(name), tensor), name
@@ -130,7 +132,9 @@ def test_unknown_and_shared_fields_are_named():
     with pytest.raises(ValueError, match="expected a sequence of names"):
         World(cartpole(), num_envs=2, per_world_fields="body_mass")
     world = World(cartpole(), num_envs=2)
-    with pytest.raises(ValueError, match="'body_mass' is shared by all worlds: add it to per_world_fields"):
+    with pytest.raises(
+        ValueError, match="'body_mass' is shared by all worlds: add it to per_world_fields"
+    ):
         world.field("body_mass")
 
 
@@ -176,7 +180,9 @@ def test_constants_of_masked_rows_are_those_of_the_c_engine_and_others_stay(fiel
             np.testing.assert_allclose(
                 actual.numpy().reshape(wanted.shape), wanted, rtol=2e-5, atol=1e-5, err_msg=name
             )
-    assert not torch.allclose(world.field("dof_invweight0")[0], before["dof_invweight0"][0], rtol=0.01)
+    assert not torch.allclose(
+        world.field("dof_invweight0")[0], before["dof_invweight0"][0], rtol=0.01
+    )
 
 
 def test_masked_constants_equal_those_of_all_rows():
@@ -210,7 +216,8 @@ def test_balls_elsewhere_need_bodies_that_are_not_compiled_as_simple():
         '<body pos="1 0 0"><joint/><geom size=".1"/></body></worldbody></mujoco>'
     )
     with pytest.raises(
-        ValueError, match="'jnt_pos', but body 'ball' is compiled as simple, turning about its centre"
+        ValueError,
+        match="'jnt_pos', but body 'ball' is compiled as simple, turning about its centre",
     ):
         World(load_model(source.format("")), num_envs=2, per_world_fields=("jnt_pos",))
     World(load_model(source.format(' simple="false"')), num_envs=2, per_world_fields=("jnt_pos",))
@@ -281,7 +288,11 @@ def test_bodies_that_only_slide_or_only_turn_weigh_as_in_the_c_engine(tendon, ma
         expected = with_constants(world.mj_model, row, world, fields)
         weights = expected.body_invweight0
         for name in ("cart", "lift", "bolted", "puck"):
-            assert weights[world.mj_model.body(name).id, 0] > 0.0 == weights[world.mj_model.body(name).id, 1]
+            assert (
+                weights[world.mj_model.body(name).id, 0]
+                > 0.0
+                == weights[world.mj_model.body(name).id, 1]
+            )
         wheel = world.mj_model.body("wheel").id
         assert not weights[wheel, 0]
         # Without any weight, contacts with what is fixed would exert rounding errors.

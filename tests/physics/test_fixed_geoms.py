@@ -37,7 +37,9 @@ def tables(one_kernel: bool, fields: tuple[str, ...] = MOVING) -> World:
 def in_c(world: World, row: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The C engine's model with the fields of one world, and its data at rest."""
     changed = copy.copy(world.mj_model)
-    write_fields(changed, {name: field[row].numpy() for name, field in world.per_world_fields().items()})
+    write_fields(
+        changed, {name: field[row].numpy() for name, field in world.per_world_fields().items()}
+    )
     mj_data = mujoco.MjData(changed)
     mujoco.mj_setConst(changed, mj_data)
     mujoco.mj_resetData(changed, mj_data)

@@ -38,10 +38,14 @@ def model(heights: np.ndarray, *, top=TOP, pairs=()) -> mujoco.MjModel:
     shape = {"name": "ground", "contype": 2, "conaffinity": 1, "friction": [0.9, 0.02, 0.001]}
     rows, columns = heights.shape
     size = [SIDE, SIDE, top, 0.5]
-    spec.add_hfield(name="field", size=size, nrow=rows, ncol=columns, userdata=heights.ravel().tolist())
+    spec.add_hfield(
+        name="field", size=size, nrow=rows, ncol=columns, userdata=heights.ravel().tolist()
+    )
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field", **shape)
     for geom in pairs:
-        spec.add_pair(geomname1="ground", geomname2=geom, friction=[0.3, 0.3, 0.1, 0.1, 0.1], condim=4)
+        spec.add_pair(
+            geomname1="ground", geomname2=geom, friction=[0.3, 0.3, 0.1, 0.1, 0.1], condim=4
+        )
     return load_model(spec)
 
 
@@ -65,7 +69,9 @@ def poses(seed=0) -> torch.Tensor:
     return torch.tensor(pose.reshape(NUM_ENVS, 28), dtype=torch.float32)
 
 
-def lowered(mj_model: mujoco.MjModel, pose_EL: torch.Tensor, body: str, depth: float) -> torch.Tensor:
+def lowered(
+    mj_model: mujoco.MjModel, pose_EL: torch.Tensor, body: str, depth: float
+) -> torch.Tensor:
     """Lower one body in each row until it is `depth` (m) below the height at which the C engine sees it touch."""
     mj_data, number = mujoco.MjData(mj_model), BODIES.index(body)
     column, geom = 7 * number + 2, mj_model.geom(body).id
@@ -79,7 +85,9 @@ def lowered(mj_model: mujoco.MjModel, pose_EL: torch.Tensor, body: str, depth: f
             mujoco.mj_kinematics(mj_model, mj_data)
             mujoco.mj_comPos(mj_model, mj_data)
             mujoco.mj_collision(mj_model, mj_data)
-            low, high = (middle, high) if any(geom in c.geom for c in mj_data.contact) else (low, middle)
+            low, high = (
+                (middle, high) if any(geom in c.geom for c in mj_data.contact) else (low, middle)
+            )
         row[column] = low - depth
     return lowered_EL
 
@@ -89,7 +97,9 @@ class Contacts:
 
     def __init__(self, mj_model: mujoco.MjModel, pose_EL: torch.Tensor, device="cpu") -> None:
         self.mj_model = mj_model
-        self.world = World(mj_model, num_envs=len(pose_EL), device=device, sim=SimCfg(njmax=120, nconmax=40))
+        self.world = World(
+            mj_model, num_envs=len(pose_EL), device=device, sim=SimCfg(njmax=120, nconmax=40)
+        )
         self.find(pose_EL)
 
     def find(self, pose_EL: torch.Tensor) -> None:
@@ -126,7 +136,9 @@ class Contacts:
         return {name: values[chosen] for name, values in fields.items()}
 
 
-def of_the_c_engine(mj_model: mujoco.MjModel, pose_L: torch.Tensor, geom: str) -> list[mujoco.MjContact]:
+def of_the_c_engine(
+    mj_model: mujoco.MjModel, pose_L: torch.Tensor, geom: str
+) -> list[mujoco.MjContact]:
     """Return the contacts of a geom in the C engine, deepest first."""
     mj_data = mujoco.MjData(mj_model)
     mj_data.qpos[:] = pose_L.numpy()
@@ -175,7 +187,9 @@ def check_contacts(ours: Contacts, pose_EL: torch.Tensor, body: str) -> None:
         used: set[int] = set()
         for each in theirs:
             # Where edges or faces are parallel, any place of theirs is as close.
-            away = np.linalg.norm(mine["pos"] - each.pos, axis=1) + 10.0 * np.abs(mine["dist"] - each.dist)
+            away = np.linalg.norm(mine["pos"] - each.pos, axis=1) + 10.0 * np.abs(
+                mine["dist"] - each.dist
+            )
             away[list(used)] = np.inf
             nearest = int(away.argmin())
             used.add(nearest)
@@ -215,7 +229,9 @@ def test_a_box_that_lies_flat_has_a_contact_for_each_prism_below_it():
 def test_more_contacts_than_a_pair_may_have_are_left_out_as_in_the_c_engine_and_told():
     spec = mujoco.MjSpec()
     heights = np.random.default_rng(0).uniform(size=(24, 24))
-    spec.add_hfield(name="field", size=[1, 1, 0.2, 0.5], nrow=24, ncol=24, userdata=heights.ravel().tolist())
+    spec.add_hfield(
+        name="field", size=[1, 1, 0.2, 0.5], nrow=24, ncol=24, userdata=heights.ravel().tolist()
+    )
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field")
     body = spec.worldbody.add_body(pos=[0, 0, 0.4])
     body.add_freejoint()
@@ -237,7 +253,9 @@ def test_a_pair_of_the_model_keeps_its_own_parameters():
     ours = Contacts(mj_model, pose_EL)
     for row in range(4):
         mine, theirs = ours.of(row, "rod"), of_the_c_engine(mj_model, pose_EL[row], "rod")[0]
-        assert mine["dim"][0] == theirs.dim == 4 and np.allclose(mine["friction"][0], theirs.friction)
+        assert mine["dim"][0] == theirs.dim == 4 and np.allclose(
+            mine["friction"][0], theirs.friction
+        )
 
 
 OTHER_SHAPES = {

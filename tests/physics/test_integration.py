@@ -12,7 +12,14 @@ import warp as wp
 from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.physics.smooth import stages
 from tests.physics.test_nan_guard import HEAVY, SLEDS
-from tests.physics.test_smooth import NUM_ENVS, PER_WORLD, draw_parameters, mixed, moved, with_parameters_of
+from tests.physics.test_smooth import (
+    NUM_ENVS,
+    PER_WORLD,
+    draw_parameters,
+    mixed,
+    moved,
+    with_parameters_of,
+)
 
 STATE = ("qpos", "qvel", "act", "time")
 WRITTEN = (*STATE, "qacc_warmstart")
@@ -63,7 +70,9 @@ def values(world: World, names: tuple[str, ...]) -> dict[str, torch.Tensor]:
     return {name: world.last_substep(name).clone() for name in names}
 
 
-def check_step(world: World, before: dict[str, torch.Tensor], mj_model: mujoco.MjModel, row: int) -> None:
+def check_step(
+    world: World, before: dict[str, torch.Tensor], mj_model: mujoco.MjModel, row: int
+) -> None:
     mj_data = mujoco.MjData(mj_model)
     for name, rows in before.items():
         setattr(mj_data, name, rows[row].numpy())

@@ -27,9 +27,7 @@ DISABLED = (
     'actuation="disable" damper="disable"',
     'actuation="disable" spring="disable" damper="disable"',
 )
-HINGE = (
-    '<body><joint name="h" axis="0 1 0" damping="0.1"/><geom size="0.05" pos="0 0 -0.3" mass="0.5"/></body>'
-)
+HINGE = '<body><joint name="h" axis="0 1 0" damping="0.1"/><geom size="0.05" pos="0 0 -0.3" mass="0.5"/></body>'
 SLOWED = '<general joint="h" gaintype="affine" gainprm="1 0 -3" ctrllimited="true" ctrlrange="-0.05 0.05"/>'
 
 # Inertia matrices of such bodies are diagonal, and what acts on them couples their degrees of freedom.
@@ -85,7 +83,9 @@ def test_a_gain_that_depends_on_velocity_has_its_control_within_its_range(integr
 def test_such_a_gain_beside_a_motor_of_several_controls_is_refused() -> None:
     motor = '<dcmotor joint="h" motorconst="0.1" resistance="1" input="pos vel"/>'
     xml = WITH_ACTUATORS.format(integrator="implicitfast", actuators=motor + SLOWED)
-    with pytest.raises(ValueError, match="DC motor has several controls.*choose integrator='euler'"):
+    with pytest.raises(
+        ValueError, match="DC motor has several controls.*choose integrator='euler'"
+    ):
         started(xml, KERNELS["our solver"])
     step_and_check(xml.replace("implicitfast", "Euler"), KERNELS["our solver"])
 
@@ -142,16 +142,28 @@ READ_BY_STAGES = {
 
 @pytest.mark.parametrize("kernels", ("our solver", "theirs"))
 @pytest.mark.parametrize(
-    "flag", ("", '<flag sleep="enable"/>', '<flag sleep="enable" spring="disable" damper="disable"/>')
+    "flag",
+    ("", '<flag sleep="enable"/>', '<flag sleep="enable" spring="disable" damper="disable"/>'),
 )
 @pytest.mark.parametrize("actuator", READ_BY_STAGES)
-def test_runge_kutta_leaves_the_readings_of_its_last_stage(actuator: str, flag: str, kernels: str) -> None:
+def test_runge_kutta_leaves_the_readings_of_its_last_stage(
+    actuator: str, flag: str, kernels: str
+) -> None:
     xml = WRAPPED.format(flag=flag, actuator=READ_BY_STAGES[actuator])
-    names = ("qpos", "qvel", "actuator_length", "actuator_velocity", "actuator_force", "qfrc_passive")
+    names = (
+        "qpos",
+        "qvel",
+        "actuator_length",
+        "actuator_velocity",
+        "actuator_force",
+        "qfrc_passive",
+    )
     step_and_check(xml, KERNELS[kernels], names=names, substeps=2, speed=8.0)
 
 
-@pytest.mark.parametrize("flag", ("", '<flag spring="disable" damper="disable" actuation="disable"/>'))
+@pytest.mark.parametrize(
+    "flag", ("", '<flag spring="disable" damper="disable" actuation="disable"/>')
+)
 def test_time_passes_as_ever_where_sensors_are_delayed(flag: str) -> None:
     xml = (
         f'<mujoco><option timestep="0.01" integrator="RK4">{flag}</option><worldbody>{HINGE}</worldbody>'
@@ -160,7 +172,9 @@ def test_time_passes_as_ever_where_sensors_are_delayed(flag: str) -> None:
     step_and_check(xml, KERNELS["ours"], names=("time", "qpos", "qvel"), refreshes=False)
 
 
-@pytest.mark.parametrize("actuators", (SLOWED, SLOWED.replace("<general", '<general forcerange="1 2"')))
+@pytest.mark.parametrize(
+    "actuators", (SLOWED, SLOWED.replace("<general", '<general forcerange="1 2"'))
+)
 def test_runge_kutta_leaves_out_what_is_disabled(actuators: str) -> None:
     flag = '<flag spring="disable" damper="disable" actuation="disable"/>'
     xml = WITH_ACTUATORS.format(integrator="RK4", actuators=actuators)
@@ -175,7 +189,9 @@ def test_controls_are_delayed_by_the_time_of_each_stage(integrator: str) -> None
         f'<mujoco><option timestep="0.004" integrator="{integrator}"/><worldbody>{HINGE}</worldbody><actuator>'
         '<position joint="h" kp="5" kv="0.2" delay="0.008" nsample="4"/></actuator></mujoco>'
     )
-    step_and_check(xml, KERNELS["ours"], substeps=6, names=("qpos", "qvel", "qacc", "actuator_force"))
+    step_and_check(
+        xml, KERNELS["ours"], substeps=6, names=("qpos", "qvel", "qacc", "actuator_force")
+    )
 
 
 def test_ellipsoids_in_a_fluid_are_refused_with_the_integrator_that_has_them_wrong() -> None:
@@ -183,7 +199,9 @@ def test_ellipsoids_in_a_fluid_are_refused_with_the_integrator_that_has_them_wro
     lone = f'<body pos="1 0 0"><freejoint/>{geom}</body>'
     jointed = f'<body name="fin"><joint axis="0 1 0"/>{geom}</body>'
     xml = '<mujoco><option density="1000" viscosity="0.1" integrator="{}"/><worldbody>{}</worldbody></mujoco>'
-    with pytest.raises(ValueError, match="fluidshape='ellipsoid'.*choose integrator='implicitfast'"):
+    with pytest.raises(
+        ValueError, match="fluidshape='ellipsoid'.*choose integrator='implicitfast'"
+    ):
         started(xml.format("implicit", jointed), KERNELS["ours"])
     step_and_check(xml.format("implicit", lone), KERNELS["ours"])
     step_and_check(xml.format("implicitfast", jointed), KERNELS["ours"])
@@ -192,7 +210,13 @@ def test_ellipsoids_in_a_fluid_are_refused_with_the_integrator_that_has_them_wro
 def test_motors_with_activations_are_refused_with_runge_kutta() -> None:
     motor = '<dcmotor joint="h" motorconst="0.1" resistance="1"{}/>'
     with_current = motor.format(' inductance="0.1"')
-    with pytest.raises(ValueError, match="DC motor with activations.*choose integrator='implicitfast'"):
+    with pytest.raises(
+        ValueError, match="DC motor with activations.*choose integrator='implicitfast'"
+    ):
         started(WITH_ACTUATORS.format(integrator="RK4", actuators=with_current), KERNELS["ours"])
-    step_and_check(WITH_ACTUATORS.format(integrator="RK4", actuators=motor.format("")), KERNELS["ours"])
-    step_and_check(WITH_ACTUATORS.format(integrator="implicitfast", actuators=with_current), KERNELS["ours"])
+    step_and_check(
+        WITH_ACTUATORS.format(integrator="RK4", actuators=motor.format("")), KERNELS["ours"]
+    )
+    step_and_check(
+        WITH_ACTUATORS.format(integrator="implicitfast", actuators=with_current), KERNELS["ours"]
+    )

@@ -38,7 +38,9 @@ TENDON = """
   <fixed name="rope" range="-0.05 0.05" limited="true" margin="0.02" damping="0.1">
     <joint joint="hinge" coef="1"/><joint joint="slide" coef="2"/></fixed>
 </tendon>"""
-OF_TENDON = '<tendonlimitpos tendon="rope"/><tendonlimitvel tendon="rope"/><tendonlimitfrc tendon="rope"/>'
+OF_TENDON = (
+    '<tendonlimitpos tendon="rope"/><tendonlimitvel tendon="rope"/><tendonlimitfrc tendon="rope"/>'
+)
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
@@ -53,7 +55,9 @@ def test_a_tendon_is_not_taken_for_the_joint_of_its_number(kernels: str) -> None
 
 @pytest.mark.parametrize("flags", ('limit="disable"', 'constraint="disable"', 'sensor="disable"'))
 def test_without_limits_or_sensors_they_read_zero(flags: str) -> None:
-    step_and_check(LIMITED.format(flags=flags, tendon=TENDON, sensors=OF_TENDON), KERNELS["our solver"])
+    step_and_check(
+        LIMITED.format(flags=flags, tendon=TENDON, sensors=OF_TENDON), KERNELS["our solver"]
+    )
 
 
 def test_a_refresh_reads_the_pose_that_was_written() -> None:

@@ -66,8 +66,16 @@ def test_files_that_are_none(tmp_path: Path):
     for name, content, words in (
         ("empty.xml", b"", "is empty"),
         ("binary.xml", b"\xff\xfe<mujoco/>", "is not utf-16 text"),
-        ("latin.xml", "<!-- b\xe4r --><mujoco/>".encode("latin-1"), "is not UTF-8 text: byte 6; save it as"),
-        ("klingon.xml", b'<?xml version="1.0" encoding="klingon"?><mujoco/>', "'klingon' is not known"),
+        (
+            "latin.xml",
+            "<!-- b\xe4r --><mujoco/>".encode("latin-1"),
+            "is not UTF-8 text: byte 6; save it as",
+        ),
+        (
+            "klingon.xml",
+            b'<?xml version="1.0" encoding="klingon"?><mujoco/>',
+            "'klingon' is not known",
+        ),
         ("model.mjb", b"\x00\x01", "ends in .xml"),
     ):
         (tmp_path / name).write_bytes(content)
@@ -78,9 +86,13 @@ def test_files_that_are_none(tmp_path: Path):
 
 
 def test_a_fault_in_an_included_file_names_both(tmp_path: Path):
-    (tmp_path / "leg.xml").write_text('<mujocoinclude>\n  <geom name="g" type="spher"/>\n</mujocoinclude>')
+    (tmp_path / "leg.xml").write_text(
+        '<mujocoinclude>\n  <geom name="g" type="spher"/>\n</mujocoinclude>'
+    )
     main = tmp_path / "robot.xml"
-    main.write_text('<mujoco>\n  <worldbody>\n    <include file="leg.xml"/>\n  </worldbody>\n</mujoco>')
+    main.write_text(
+        '<mujoco>\n  <worldbody>\n    <include file="leg.xml"/>\n  </worldbody>\n</mujoco>'
+    )
     with pytest.raises(ValueError, match=r"robot\.xml: .*'spher'"):
         load_model(main)
 
@@ -183,7 +195,9 @@ ONE_BODY = """
         ("", '<tendon tendon1="still"/>', "an equality holds it"),
     ],
 )
-def test_constraints_of_tendons_that_no_joint_moves_are_refused(still: str, equality: str, words: str):
+def test_constraints_of_tendons_that_no_joint_moves_are_refused(
+    still: str, equality: str, words: str
+):
     """Of a tendon on one rigid body C finds accelerations by chance, and worlds had some of 1e16."""
     with pytest.raises(ValueError, match=f"tendon 'still' lies on one rigid body, but {words}"):
         load_model(ONE_BODY.format(still=still, equality=equality))

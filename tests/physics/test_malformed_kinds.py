@@ -31,7 +31,9 @@ def test_the_count_tells_crashes_and_what_is_accepted(monkeypatch):
     def load_as_mujoco_does(path):
         return mujoco.MjModel.from_xml_path(str(path))
 
-    found = malformed_kinds.figures(["attached in itself", "time step of a second"], load=load_as_mujoco_does)
+    found = malformed_kinds.figures(
+        ["attached in itself", "time step of a second"], load=load_as_mujoco_does
+    )
     assert (found["crashes"], found["accepted"]) == (1, 1)
 
 

@@ -9,7 +9,9 @@ import pytest
 from ksim_rl.physics import load_model, load_spec
 from ksim_rl.physics.model_files.source import SUFFIXES
 
-NAMED = '<mujoco><worldbody><body name="bär"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>'
+NAMED = (
+    '<mujoco><worldbody><body name="bär"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>'
+)
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 INERTIA = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
 URDF = f"""<?xml version="1.0"?>
@@ -31,7 +33,9 @@ def test_every_suffix_that_is_listed_loads(tmp_path: Path, suffix: str):
     assert load_model(path).body(1).name == "bär"
 
 
-@pytest.mark.parametrize("name", ["ä ö.xml", "robot (1).xml", "a=b,c.xml", "v1.2.final.xml", "[x]{y}.mjcf"])
+@pytest.mark.parametrize(
+    "name", ["ä ö.xml", "robot (1).xml", "a=b,c.xml", "v1.2.final.xml", "[x]{y}.mjcf"]
+)
 def test_every_name_of_a_file_loads(tmp_path: Path, name: str):
     folder = tmp_path / name.replace(".xml", "")
     folder.mkdir()
@@ -62,7 +66,9 @@ def test_included_files_have_their_own_encodings(tmp_path: Path, monkeypatch):
     (tmp_path / "parts" / "body.xml").write_bytes(inner.encode("utf-16"))
     (tmp_path / "m.obj").write_text(TETRAHEDRON)
     body = '<worldbody><include file="parts/body.xml"/></worldbody>'
-    (tmp_path / "main.mjcf").write_text(f'<mujoco><asset><mesh file="m.obj"/></asset>{body}</mujoco>')
+    (tmp_path / "main.mjcf").write_text(
+        f'<mujoco><asset><mesh file="m.obj"/></asset>{body}</mujoco>'
+    )
     monkeypatch.chdir(tmp_path)
     for source in ("main.mjcf", tmp_path / "main.mjcf"):
         assert load_model(source).body(1).name == "bär"
@@ -104,7 +110,12 @@ def urdf_in_a_package(tmp_path: Path, mesh: str) -> Path:
 def test_meshes_of_a_urdf_file_are_found_and_its_links_stay(tmp_path: Path, mesh: str, monkeypatch):
     monkeypatch.chdir(tmp_path)
     mj_model = load_model(urdf_in_a_package(tmp_path, mesh).relative_to(tmp_path))
-    assert [mj_model.body(i).name for i in range(mj_model.nbody)] == ["world", "base", "arm", "head"]
+    assert [mj_model.body(i).name for i in range(mj_model.nbody)] == [
+        "world",
+        "base",
+        "arm",
+        "head",
+    ]
     assert mj_model.nmesh == 1
     np.testing.assert_allclose(mj_model.body_mass, [0.0, 2.0, 1.0, 1.0])
 

@@ -33,7 +33,9 @@ def test_no_file_is_written_into_the_working_directory_and_a_kind_is_shown_once(
     stands.mkdir()
     (stands / "MUJOCO_LOG.TXT").symlink_to(outside)
     command = [sys.executable, "-P", "-c", EXPLODES]
-    ended = subprocess.run(command, cwd=stands, timeout=60, check=True, capture_output=True, text=True)
+    ended = subprocess.run(
+        command, cwd=stands, timeout=60, check=True, capture_output=True, text=True
+    )
     assert not outside.exists()
     assert ended.stderr.count("warning: MuJoCo: Nan, Inf or huge value in QACC at DOF 0.") == 1
 

@@ -38,7 +38,10 @@ LIGHT, HEAVY = 1, 0
 def sleds(tmp_path, *, num_envs=3, guarded=True, max_files=4, **kwargs) -> World:
     guard = NanGuardCfg(folder=str(tmp_path / "failures"), history=HISTORY, max_files=max_files)
     return World(
-        load_model(SLEDS), num_envs=num_envs, sim=SimCfg(nan_guard=guard if guarded else None), **kwargs
+        load_model(SLEDS),
+        num_envs=num_envs,
+        sim=SimCfg(nan_guard=guard if guarded else None),
+        **kwargs,
     )
 
 
@@ -55,7 +58,9 @@ def test_a_failed_world_is_saved_with_the_states_that_led_there(tmp_path):
     world = sleds(tmp_path)
     push(world, row=1, light=0.0, steps=2)
     assert world.nan_report().ok
-    push(world, row=1, light=1e9)  # geared to 1e34 N, on a microgram: no float32 holds the acceleration
+    push(
+        world, row=1, light=1e9
+    )  # geared to 1e34 N, on a microgram: no float32 holds the acceleration
     report = world.nan_report()
     assert report.worlds == (1,) and len(report.files) == 1 and not report.ok
     assert (
@@ -68,7 +73,9 @@ def test_a_failed_world_is_saved_with_the_states_that_led_there(tmp_path):
     assert failure.world == 1 and failure.substep == 2 * SUBSTEPS + 1
     times = np.arange(failure.substep - HISTORY, failure.substep) * 0.01
     np.testing.assert_allclose(failure.states["time"][:, 0], times, atol=1e-6)
-    np.testing.assert_allclose(failure.states["qvel"][:, HEAVY], times / 2, atol=1e-6)  # 1 N on 2 kg
+    np.testing.assert_allclose(
+        failure.states["qvel"][:, HEAVY], times / 2, atol=1e-6
+    )  # 1 N on 2 kg
     assert failure.states["ctrl"][-1].tolist() == [1.0, np.float32(1e9)]
     assert failure.states["ctrl"][-2].tolist() == [1.0, 0.0]
     assert not np.isfinite(failure.reached["qvel"][LIGHT])
@@ -84,17 +91,24 @@ def test_the_replay_names_the_step_and_the_dof(tmp_path, capsys):
     found = replay.replay(failure)
     assert replay.dof_name(failure.mj_model, found.first) == "light"
     assert not found.was_broken_before and found.breaks_on_c
-    assert found.substeps[-1].warnings == ("bad qacc",) and all(not s.warnings for s in found.substeps[:-1])
+    assert found.substeps[-1].warnings == ("bad qacc",) and all(
+        not s.warnings for s in found.substeps[:-1]
+    )
     acceleration, dof = found.substeps[-1].acceleration
     assert acceleration == pytest.approx(1e40, rel=1e-5) and dof == LIGHT
-    assert all(substep.deviation < 1e-6 for substep in found.substeps[:-1]), "C and Warp agree until then"
+    assert all(substep.deviation < 1e-6 for substep in found.substeps[:-1]), (
+        "C and Warp agree until then"
+    )
     speed = 0.5 * found.substeps[-2].time  # of 2 kg under 1 N
     assert found.substeps[-2].energy == pytest.approx(0.5 * 2.0 * speed**2, rel=1e-4)
 
     assert replay.main([str(path)]) == 0
     said = capsys.readouterr().out
     assert "world 2: its last 5 of 9 substeps" in said and "bad qacc" in said
-    assert "First: light. Not finite after substep 0 on Warp: " in said and "The C engine breaks" in said
+    assert (
+        "First: light. Not finite after substep 0 on Warp: " in said
+        and "The C engine breaks" in said
+    )
 
 
 def test_a_control_beyond_all_bounds_is_named(tmp_path):
@@ -190,7 +204,9 @@ def test_a_folder_that_cannot_be_written_does_not_end_the_run(tmp_path):
     push(world, row=1, light=1e9)
     (tmp_path / "failures").rmdir()
     report = world.nan_report()
-    assert report.worlds == (1,) and report.files == () and "could not be saved" in report.messages[0]
+    assert (
+        report.worlds == (1,) and report.files == () and "could not be saved" in report.messages[0]
+    )
 
 
 @pytest.mark.parametrize("content", [b"", b"not a tensor file", b"\x10\0\0\0\0\0\0\0{}"])
@@ -211,7 +227,10 @@ def failure_file(tmp_path_factory):
 WRONG = {
     "a world below zero": ("world=-1", lambda failure: {"world": -1}),
     "a counter that is none": ("substep=True", lambda failure: {"substep": True}),
-    "more substeps than there were": ("1 substeps are kept of 0|substep=0", lambda failure: {"substep": 0}),
+    "more substeps than there were": (
+        "1 substeps are kept of 0|substep=0",
+        lambda failure: {"substep": 0},
+    ),
     "no substeps": (
         "0 substeps are kept",
         lambda failure: {"states": {name: rows[:0] for name, rows in failure.states.items()}},
@@ -222,18 +241,28 @@ WRONG = {
     ),
     "states of other lengths": (
         "state/ctrl",
-        lambda failure: {"states": {**failure.states, "ctrl": np.repeat(failure.states["ctrl"], 2, axis=0)}},
+        lambda failure: {
+            "states": {**failure.states, "ctrl": np.repeat(failure.states["ctrl"], 2, axis=0)}
+        },
     ),
     "another dtype": (
         "state/ctrl is float64",
-        lambda failure: {"states": {**failure.states, "ctrl": failure.states["ctrl"].astype(np.float64)}},
+        lambda failure: {
+            "states": {**failure.states, "ctrl": failure.states["ctrl"].astype(np.float64)}
+        },
     ),
     "a state that no substep has": (
         "expected .*it has .*state/odd",
         lambda failure: {"states": {**failure.states, "odd": failure.states["time"]}},
     ),
-    "no end": ("expected .*reached/qvel", lambda failure: {"reached": {"qpos": failure.reached["qpos"]}}),
-    "no positions": ("'qpos' is missing", lambda failure: {"states": {"time": failure.states["time"]}}),
+    "no end": (
+        "expected .*reached/qvel",
+        lambda failure: {"reached": {"qpos": failure.reached["qpos"]}},
+    ),
+    "no positions": (
+        "'qpos' is missing",
+        lambda failure: {"states": {"time": failure.states["time"]}},
+    ),
     "a field that no world has": (
         "field/nq, float32",
         lambda failure: {"fields": {"nq": np.zeros(1, np.float32)}},
@@ -250,7 +279,9 @@ def test_values_that_no_failure_has_are_refused_by_name(failure_file, tmp_path, 
     message, change = WRONG[wrong]
     failure = nan_file.read(failure_file)
     nan_file.write(tmp_path / "file", dataclasses.replace(failure, **change(failure)))
-    with pytest.raises(ValueError, match=f"file: {message}" if message[0].isalpha() else message) as refused:
+    with pytest.raises(
+        ValueError, match=f"file: {message}" if message[0].isalpha() else message
+    ) as refused:
         nan_file.read(tmp_path / "file")
     assert "\n" not in str(refused.value)
 
@@ -291,5 +322,7 @@ def test_the_models_own_file_is_not_pickle(tmp_path):
     (path,) = world.nan_report().files
     data = path.read_bytes()
     header = int.from_bytes(data[:8], "little")
-    assert data[8 : 8 + header].strip().startswith(b"{"), "safetensors: a JSON header, then plain numbers"
+    assert data[8 : 8 + header].strip().startswith(b"{"), (
+        "safetensors: a JSON header, then plain numbers"
+    )
     assert isinstance(nan_file.read(path).mj_model, mujoco.MjModel)

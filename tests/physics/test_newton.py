@@ -46,7 +46,9 @@ def test_accelerations_and_forces_are_those_of_the_c_engine(cone):
         scale = 1.0 + np.abs(mj_data.qfrc_constraint).max()
         np.testing.assert_allclose(forces / scale, mj_data.qfrc_constraint / scale, atol=2e-4)
     kinds = mujoco.mjtConstraint
-    contact = kinds.mjCNSTR_CONTACT_ELLIPTIC if cone == "elliptic" else kinds.mjCNSTR_CONTACT_PYRAMIDAL
+    contact = (
+        kinds.mjCNSTR_CONTACT_ELLIPTIC if cone == "elliptic" else kinds.mjCNSTR_CONTACT_PYRAMIDAL
+    )
     expected = (
         kinds.mjCNSTR_EQUALITY,
         kinds.mjCNSTR_FRICTION_DOF,
@@ -79,7 +81,12 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
         # Its line searches are shorter, so that it is elsewhere halfway; a world may have arrived all the same.
         assert not (ours["overflow"] & ~theirs["overflow"]).any() and ours["overflow"].any()
         start, there, here = (
-            np.array([problem.cost(each) for problem, each in zip(todo, qacc.double().numpy(), strict=True)])
+            np.array(
+                [
+                    problem.cost(each)
+                    for problem, each in zip(todo, qacc.double().numpy(), strict=True)
+                ]
+            )
             for qacc in (torch.zeros_like(ours["qacc"]), theirs["qacc"], ours["qacc"])
         )
         # Of what MuJoCo Warp has saved by then, 0.5 % was the most that ours had not.
@@ -87,7 +94,9 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
         return
     for name in ("qacc", "qfrc_constraint", "efc.Ma"):
         scale = 1.0 + theirs[name].abs().amax(-1, keepdim=True)
-        torch.testing.assert_close(ours[name] / scale, theirs[name] / scale, atol=2e-4, rtol=0, msg=name)
+        torch.testing.assert_close(
+            ours[name] / scale, theirs[name] / scale, atol=2e-4, rtol=0, msg=name
+        )
     for row, count in enumerate(world.last_substep("nefc").tolist()):
         assert torch.equal(ours["efc.state"][row, :count], theirs["efc.state"][row, :count])
 
@@ -142,9 +151,16 @@ SHANK = """
 @pytest.mark.parametrize("spacing", [0.15, 0.03])
 def test_limbs_with_and_without_contacts_between_them_move_as_in_the_c_engine(cone, spacing):
     condim = 6 if cone == "elliptic" else 3
-    shanks = (SHANK.format(condim=condim), SHANK.format(condim=condim), "", SHANK.format(condim=condim))
+    shanks = (
+        SHANK.format(condim=condim),
+        SHANK.format(condim=condim),
+        "",
+        SHANK.format(condim=condim),
+    )
     places = [(x, y) for x in (-spacing, spacing) for y in (-0.15, 0.15)]
-    legs = "".join(LEG.format(x=x, y=y, shank=shank) for (x, y), shank in zip(places, shanks, strict=True))
+    legs = "".join(
+        LEG.format(x=x, y=y, shank=shank) for (x, y), shank in zip(places, shanks, strict=True)
+    )
     model = load_model(LIMBS.format(cone=cone, condim=condim, legs=legs))
     limbs = limbs_of(model.dof_parentid.tolist())
     assert len(limbs.trunk) == 6 and [len(chain) for chain in limbs.chains] == [2, 3, 3, 3, 6]
@@ -164,17 +180,24 @@ def test_limbs_with_and_without_contacts_between_them_move_as_in_the_c_engine(co
             mujoco.mj_forward(model, mj_data)
             assert mj_data.nefc == world.last_substep("nefc")[row] > 0
             touched += [0 not in model.geom_bodyid[pair] for pair in mj_data.contact.geom]
-            for name, ours in (("qacc", world.qacc_EL), ("qfrc_constraint", world.view("qfrc_constraint"))):
+            for name, ours in (
+                ("qacc", world.qacc_EL),
+                ("qfrc_constraint", world.view("qfrc_constraint")),
+            ):
                 theirs = getattr(mj_data, name)
                 scale = 1.0 + np.abs(theirs).max()
-                np.testing.assert_allclose(ours[row] / scale, theirs / scale, atol=3e-4, err_msg=name)
+                np.testing.assert_allclose(
+                    ours[row] / scale, theirs / scale, atol=3e-4, err_msg=name
+                )
     # Only limbs that are close together touch each other, and fill the Hessian.
     assert any(touched) == (spacing < 0.1)
 
 
 @pytest.mark.parametrize("num_worlds", [4096, 32768])
 @pytest.mark.parametrize("floats", [300, 1760, 2400, 3000, 4400, 4576, 5536, 12_000])
-def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memory_lets(floats, num_worlds):
+def test_registers_are_bounded_so_that_as_many_worlds_run_at_once_as_shared_memory_lets(
+    floats, num_worlds
+):
     by_memory = (228 * 1024) // (4 * floats + 1024)
     registers = newton.most_registers(floats, num_worlds)
     if registers is None:
@@ -253,7 +276,9 @@ def test_a_step_calls_the_control_callback_as_mujoco_warp_does():
         world.warp_model.callback.control = lambda m, d: d.ctrl.fill_(2.0)
         world.step(1)
         reached.append(world.qvel_EL.item())
-    assert reached[0] == pytest.approx(2.0 * model.opt.timestep) and reached[0] == pytest.approx(reached[1])
+    assert reached[0] == pytest.approx(2.0 * model.opt.timestep) and reached[0] == pytest.approx(
+        reached[1]
+    )
 
 
 @pytest.mark.parametrize("with_rows", [False, True])
@@ -313,7 +338,9 @@ def test_a_cone_that_njmax_cuts_off_pushes_nothing_as_with_mujoco_warp(condim, n
             world.last_substep("efc.force").zero_()
             world.last_substep("efc.state").zero_()
             (solve or newton.solver(world.warp_model, world.warp_data_E))()
-            found.append([world.last_substep(name)[0].clone() for name in ("qacc", "efc.force", "efc.state")])
+            found.append(
+                [world.last_substep(name)[0].clone() for name in ("qacc", "efc.force", "efc.state")]
+            )
     theirs, ours = found
     assert ours[0][8] == pytest.approx(-9.81)
     for mine, expected in zip(ours, theirs, strict=True):

@@ -32,7 +32,10 @@ def test_a_debug_build_finds_no_broken_invariant(cone):
 WRONG_LINES = {
     "ROWS_ARE_WHOLE": ("efc_D[row] = row_of(problem.efc_D)", "efc_D[row] = -row_of(problem.efc_D)"),
     "CONES_ARE_WHOLE": ("friction[0] * impratio", "-friction[0] * impratio"),
-    "FORCES_ARE_ADMISSIBLE": ("push = -efc_D[row] * residual[row]", "push = efc_D[row] * residual[row]"),
+    "FORCES_ARE_ADMISSIBLE": (
+        "push = -efc_D[row] * residual[row]",
+        "push = efc_D[row] * residual[row]",
+    ),
     "HESSIAN_IS_POSITIVE": ("hessian[block][dof] = mass[", "hessian[block][dof] = -mass["),
     "SEARCH_DESCENDS": ("search[block] *= -inverse_pivot", "search[block] *= inverse_pivot"),
     "COST_FALLS": ("step = Step {alpha, -point", "step = Step {alpha, point"),
@@ -42,7 +45,9 @@ WRONG_LINES = {
 @pytest.mark.parametrize(
     "invariant",
     [
-        name if name in ("ROWS_ARE_WHOLE", "COST_FALLS") else pytest.param(name, marks=pytest.mark.full)
+        name
+        if name in ("ROWS_ARE_WHOLE", "COST_FALLS")
+        else pytest.param(name, marks=pytest.mark.full)
         for name in WRONG_LINES
     ],
 )

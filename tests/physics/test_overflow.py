@@ -10,7 +10,14 @@ from ksim_rl.physics import OverflowReport, SimCfg, World, load_model
 from ksim_rl.physics.overflow import METRIC_BITS
 from ksim_rl.physics.warp_world import WarpWorld
 from tests.physics.models import quadruped, standing_quadrupeds
-from tests.physics.overflowing_models import SCENES, bullet, can_on_fine_field, felt_crowd, pile, sensed_box
+from tests.physics.overflowing_models import (
+    SCENES,
+    bullet,
+    can_on_fine_field,
+    felt_crowd,
+    pile,
+    sensed_box,
+)
 
 
 def fallen(sim: SimCfg) -> World:
@@ -76,7 +83,9 @@ def test_too_few_contacts_names_the_need():
     assert not report.ok
     needed = -(-report.ncon // 4)
     assert needed > 1
-    assert any(f"set sim.nconmax >= {needed} (now 1 per world" in message for message in report.messages)
+    assert any(
+        f"set sim.nconmax >= {needed} (now 1 per world" in message for message in report.messages
+    )
     roomy = fallen(SimCfg(njmax=80, nconmax=needed))
     roomy.step(1)
     assert roomy.overflow_report().ok
@@ -123,7 +132,9 @@ def piled(
     return reports[-1]
 
 
-def check_overflows(scene: Sequence[Any], *, ours: bool, device: str = "cpu", num_envs: int = 3) -> None:
+def check_overflows(
+    scene: Sequence[Any], *, ours: bool, device: str = "cpu", num_envs: int = 3
+) -> None:
     """Make the room of a scene too small in every way, and look that each is told, and no other."""
     mj_model = pile(*scene)
     # On a GPU the threads of MuJoCo Warp's rows race for the Jacobian, and those that lose count no rows.
@@ -184,7 +195,9 @@ def test_more_geoms_than_a_tactile_sensor_keeps_are_told(ours):
     assert "tactile" in report.messages[0]
 
 
-@pytest.mark.parametrize("bit", [bit for bit in mjw.OverflowType if bit and bit & (bit - 1) == 0], ids=str)
+@pytest.mark.parametrize(
+    "bit", [bit for bit in mjw.OverflowType if bit and bit & (bit - 1) == 0], ids=str
+)
 @pytest.mark.parametrize("sim", [{"one_kernel_dynamics": True}, {}, {"one_kernel_solver": False}])
 def test_each_bit_of_a_substep_is_told_even_if_the_world_resets_after_it(sim, bit):
     world = World(quadruped(), num_envs=4, sim=SimCfg(njmax=80, nconmax=40, **sim))

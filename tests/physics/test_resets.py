@@ -50,7 +50,9 @@ def check(make: Callable[..., World], device: str) -> None:
     for name, array in arrays[0].items():
         found, expected = wp.to_torch(array), wp.to_torch(arrays[1][name])
         if name in views.ACCELERATION_STAGE:
-            assert not found[mask_E].any() and torch.equal(found[~mask_E], before[name][~mask_E]), name
+            assert not found[mask_E].any() and torch.equal(found[~mask_E], before[name][~mask_E]), (
+                name
+            )
         else:
             assert torch.equal(found, expected), name
     qpos0_L = torch.from_numpy(world.mj_model.qpos0).float().to(device)

@@ -31,7 +31,10 @@ TENDON = """
 </fixed></tendon>
 """
 SENSORS = '<sensor><jointlimitpos joint="swing"/><jointlimitvel joint="rail"/><jointlimitfrc joint="swing"/></sensor>'
-OURS, THEIRS = SimCfg(one_kernel_dynamics=True, njmax=40), SimCfg(one_kernel_dynamics=False, njmax=40)
+OURS, THEIRS = (
+    SimCfg(one_kernel_dynamics=True, njmax=40),
+    SimCfg(one_kernel_dynamics=False, njmax=40),
+)
 DENSE = SimCfg(one_kernel_solver=False, njmax=40)
 
 
@@ -46,7 +49,9 @@ def compare(world: World, mj_model: mujoco.MjModel, row: int) -> None:
     found = world.last_substep("efc.D")[row, : mj_data.nefc].sort().values
     np.testing.assert_allclose(found, np.sort(mj_data.efc_D), rtol=1e-4)
     np.testing.assert_allclose(world.qvel_EL[row], mj_data.qvel, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(world.view("sensordata")[row], mj_data.sensordata, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        world.view("sensordata")[row], mj_data.sensordata, rtol=1e-3, atol=1e-3
+    )
 
 
 def thrown(
@@ -77,7 +82,10 @@ def test_both_limits_hold(sim, jacobian, more):
 def test_ranges_of_a_world_may_be_narrower_than_those_of_the_model(sim, num_envs):
     wide = XML.replace("-.02 .03", "-1 1").replace("-.05 .1", "-1 1")
     world = World(
-        load_model(wide.format(more="")), num_envs=num_envs, sim=sim, per_world_fields=("jnt_range",)
+        load_model(wide.format(more="")),
+        num_envs=num_envs,
+        sim=sim,
+        per_world_fields=("jnt_range",),
     )
     world.field("jnt_range")[-1, :2] = torch.tensor([[-0.02, 0.03], [-0.05, 0.1]])
     narrow = load_model(XML.format(more=""))

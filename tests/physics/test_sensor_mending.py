@@ -38,7 +38,12 @@ THINGS = """
 """
 EVERYTHING, NO_VELOCITIES = 0b111111111, 0b001111111
 OBJECT = mujoco.mjtObj
-OWN = [(OBJECT.mjOBJ_GEOM, "box"), (OBJECT.mjOBJ_XBODY, "trunk"), (OBJECT.mjOBJ_BODY, "world"), None]
+OWN = [
+    (OBJECT.mjOBJ_GEOM, "box"),
+    (OBJECT.mjOBJ_XBODY, "trunk"),
+    (OBJECT.mjOBJ_BODY, "world"),
+    None,
+]
 OWN += [(OBJECT.mjOBJ_SITE, name) for name in ("all", "corner", "edge", "half", "disk")]
 OTHER = [None, (OBJECT.mjOBJ_GEOM, "floor")]
 REDUCTIONS = {"none": 0, "mindist": 1, "maxforce": 2, "netforce": 3}
@@ -53,7 +58,9 @@ def model(cone: str) -> mujoco.MjModel:
         slots = 3
         if reduction == REDUCTIONS["netforce"]:
             slots, fields = 1, fields & NO_VELOCITIES
-        sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=[fields, reduction, slots])
+        sensor = spec.add_sensor(
+            type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=[fields, reduction, slots]
+        )
         if own is not None:
             sensor.objtype, sensor.objname = own
         if other is not None:
@@ -65,7 +72,9 @@ def model(cone: str) -> mujoco.MjModel:
 @pytest.mark.parametrize("one_kernel", [True, False])
 def test_all_sensors_of_contacts_read_what_they_read_in_c(cone: str, one_kernel: bool):
     mj_model = model(cone)
-    sim = SimCfg(njmax=120, nconmax=20, one_kernel_dynamics=one_kernel, iterations=100, ls_iterations=50)
+    sim = SimCfg(
+        njmax=120, nconmax=20, one_kernel_dynamics=one_kernel, iterations=100, ls_iterations=50
+    )
     world = World(mj_model, num_envs=2, sim=sim)
     rng = np.random.default_rng(0)
     qvel_EL = 0.3 * rng.standard_normal(world.qvel_EL.shape)
@@ -78,13 +87,19 @@ def test_all_sensors_of_contacts_read_what_they_read_in_c(cone: str, one_kernel:
     expected = np.empty(0)
     for row in range(2):
         mj_data = mujoco.MjData(mj_model)
-        mj_data.qpos[:], mj_data.qvel[:] = qpos_EL[row].astype(np.float32), qvel_EL[row].astype(np.float32)
+        mj_data.qpos[:], mj_data.qvel[:] = (
+            qpos_EL[row].astype(np.float32),
+            qvel_EL[row].astype(np.float32),
+        )
         mujoco.mj_forward(mj_model, mj_data)
         assert mj_data.ncon > 5
         read, expected = world.sensordata_EL[row].numpy(), mj_data.sensordata
         scale = np.maximum(1.0, np.abs(expected))
         for sensor in range(mj_model.nsensor):
-            at = slice(mj_model.sensor_adr[sensor], mj_model.sensor_adr[sensor] + mj_model.sensor_dim[sensor])
+            at = slice(
+                mj_model.sensor_adr[sensor],
+                mj_model.sensor_adr[sensor] + mj_model.sensor_dim[sensor],
+            )
             setting = mj_model.sensor_intprm[sensor]
             # Forces are those of two solvers.
             tolerance = 1e-5 if setting[0] == FOUND_AND_DISTANCE else 2e-2
@@ -96,8 +111,14 @@ def test_all_sensors_of_contacts_read_what_they_read_in_c(cone: str, one_kernel:
 @pytest.mark.parametrize(
     ("sensor", "message"),
     [
-        ('<contact name="s" geom1="ball" data="found" nsample="2"/>', "'s' reads the first contacts"),
-        ('<touch name="s" site="all" cutoff="1" nsample="2" interp="linear"/>', "'s' has a cutoff of 1"),
+        (
+            '<contact name="s" geom1="ball" data="found" nsample="2"/>',
+            "'s' reads the first contacts",
+        ),
+        (
+            '<touch name="s" site="all" cutoff="1" nsample="2" interp="linear"/>',
+            "'s' has a cutoff of 1",
+        ),
     ],
 )
 def test_delays_that_mujoco_warp_has_before_our_reading_are_refused(sensor: str, message: str):
@@ -132,6 +153,8 @@ def test_what_is_in_a_site_with_a_mesh_is_refused(sensor: str):
 
 
 def test_frames_of_a_site_with_a_mesh_are_read():
-    world = World(load_model(MESH_SITES.format('<framepos objtype="site" objname="t"/>')), num_envs=1)
+    world = World(
+        load_model(MESH_SITES.format('<framepos objtype="site" objname="t"/>')), num_envs=1
+    )
     world.refresh()
     torch.testing.assert_close(world.sensordata_EL[0], torch.tensor([0.0, 0.0, 0.009]))

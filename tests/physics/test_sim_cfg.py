@@ -9,9 +9,9 @@ from tests.physics.models import cartpole
 
 def test_only_given_settings_are_applied():
     mj_model = copy.copy(cartpole())
-    SimCfg(timestep=0.004, integrator="implicitfast", solver="cg", impratio=10.0, iterations=7).apply_to(
-        mj_model
-    )
+    SimCfg(
+        timestep=0.004, integrator="implicitfast", solver="cg", impratio=10.0, iterations=7
+    ).apply_to(mj_model)
     assert mj_model.opt.timestep == 0.004
     assert mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert mj_model.opt.solver == mujoco.mjtSolver.mjSOL_CG

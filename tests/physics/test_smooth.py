@@ -80,7 +80,18 @@ PER_WORLD = (
     *("actuator_gainprm", "site_pos", "geom_pos"),
 )
 WRITTEN = (
-    *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "site_xpos", "site_xmat", "subtree_com"),
+    *(
+        "xpos",
+        "xquat",
+        "xmat",
+        "xipos",
+        "ximat",
+        "xanchor",
+        "xaxis",
+        "site_xpos",
+        "site_xmat",
+        "subtree_com",
+    ),
     *(
         "cdof",
         "cinert",
@@ -93,7 +104,14 @@ WRITTEN = (
         "qfrc_passive",
         "qfrc_gravcomp",
     ),
-    *("actuator_length", "actuator_velocity", "act_dot", "actuator_force", "qfrc_actuator", "qfrc_smooth"),
+    *(
+        "actuator_length",
+        "actuator_velocity",
+        "act_dot",
+        "actuator_force",
+        "qfrc_actuator",
+        "qfrc_smooth",
+    ),
 )
 GEOMS = ("geom_xpos", "geom_xmat")
 
@@ -124,7 +142,16 @@ def launch(world: World) -> None:
 
 def in_c(world: World, mj_model: mujoco.MjModel, row: int) -> mujoco.MjData:
     mj_data = mujoco.MjData(mj_model)
-    for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat"):
+    for name in (
+        "qpos",
+        "qvel",
+        "act",
+        "ctrl",
+        "qfrc_applied",
+        "xfrc_applied",
+        "mocap_pos",
+        "mocap_quat",
+    ):
         getattr(mj_data, name)[:] = world.view(name)[row].numpy()
     mujoco.mj_forward(mj_model, mj_data)
     return mj_data
@@ -199,7 +226,9 @@ def test_refresh_leaves_what_belongs_to_the_last_substep():
     expected = in_c(world, mixed(), 1)
     for name in ("xpos", "geom_xmat", "subtree_com", "cdof", "cvel", "cdof_dot"):
         theirs = np.asarray(getattr(expected, name)).ravel()
-        np.testing.assert_allclose(world.view(name)[1].numpy().ravel(), theirs, atol=3e-5, err_msg=name)
+        np.testing.assert_allclose(
+            world.view(name)[1].numpy().ravel(), theirs, atol=3e-5, err_msg=name
+        )
 
 
 def test_refresh_sums_the_momenta_of_subtrees_if_they_are_read():
@@ -272,7 +301,10 @@ OUT_OF_RANGE = {
     "affine": f"<worldbody>{BODY}</worldbody><actuator><muscle joint='a' lengthrange='0 1'/></actuator>",
     "hinge or slide": "<worldbody><body><joint type='ball' name='a'/><geom size='0.1'/></body></worldbody>"
     "<actuator><motor joint='a'/></actuator>",
-    "shared memory": "<worldbody>" + BODY + "<body><geom size='0.1'/></body>" * 700 + "</worldbody>",
+    "shared memory": "<worldbody>"
+    + BODY
+    + "<body><geom size='0.1'/></body>" * 700
+    + "</worldbody>",
 }
 
 
@@ -298,7 +330,9 @@ def test_few_or_large_worlds_have_more_lanes_each(num_bodies, worlds, expected):
     with wp.ScopedDevice("cpu"):
         sizes = stages._sizes(mjw.put_model(quadruped()))
     sizes |= {"num_bodies": num_bodies, "poses": 10 * num_bodies, "num_entries": 16 * num_bodies}
-    assert [stages._block(parts, sizes, worlds) for parts in (stages.SMOOTH, stages.INTEGRATION)] == expected
+    assert [
+        stages._block(parts, sizes, worlds) for parts in (stages.SMOOTH, stages.INTEGRATION)
+    ] == expected
 
 
 def test_settings_that_leave_it_out_are_told():
@@ -307,6 +341,10 @@ def test_settings_that_leave_it_out_are_told():
     unavailable = stages.one_kernel_dynamics_unavailable
     sim = SimCfg(one_kernel_dynamics=True)
     assert unavailable(warp_model, sim, solver_unavailable=None) is None
-    assert "not solved by one kernel" in str(unavailable(warp_model, sim, solver_unavailable="a reason"))
+    assert "not solved by one kernel" in str(
+        unavailable(warp_model, sim, solver_unavailable="a reason")
+    )
     off = dataclasses.replace(sim, one_kernel_dynamics=False)
-    assert "one_kernel_dynamics is False" in str(unavailable(warp_model, off, solver_unavailable=None))
+    assert "one_kernel_dynamics is False" in str(
+        unavailable(warp_model, off, solver_unavailable=None)
+    )

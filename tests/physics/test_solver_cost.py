@@ -16,7 +16,8 @@ ROBOTS = ("unitree_go1", "unitree_g1", "unitree_go2", "booster_t1", "unitree_a1"
 
 
 @pytest.mark.parametrize(
-    "index", [i if i in SHORT else pytest.param(i, marks=pytest.mark.full) for i in range(len(SYNTHETIC))]
+    "index",
+    [i if i in SHORT else pytest.param(i, marks=pytest.mark.full) for i in range(len(SYNTHETIC))],
 )
 def test_the_cost_on_synthetic_models(index):
     check_cost(load_model(SYNTHETIC[index].xml()), num_envs=64)
@@ -27,7 +28,9 @@ def test_the_cost_on_a_robot():
 
 
 @pytest.mark.full
-@pytest.mark.skipif("MENAGERIE_ROOT" not in os.environ, reason="MENAGERIE_ROOT names no folder of robots")
+@pytest.mark.skipif(
+    "MENAGERIE_ROOT" not in os.environ, reason="MENAGERIE_ROOT names no folder of robots"
+)
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_cost_on_menagerie_robots(robot):
     check_cost(load_model(robot), num_envs=16)
@@ -53,12 +56,17 @@ def test_a_solver_that_stops_early_fails(index, monkeypatch):
 def test_the_models_cover_what_a_solver_meets():
     assert {model.condim for model in SYNTHETIC} == {1, 3, 4, 6}
     assert {model.cone for model in SYNTHETIC} == {"pyramidal", "elliptic"}
-    assert {min(model.impratio for model in SYNTHETIC), max(model.impratio for model in SYNTHETIC)} == {
+    assert {
+        min(model.impratio for model in SYNTHETIC),
+        max(model.impratio for model in SYNTHETIC),
+    } == {
         1,
         100,
     }
     assert {0.001, 1000} <= {model.ratio for model in SYNTHETIC}
     assert {"joint", "connect", "weld"} <= {model.tie for model in SYNTHETIC}
-    assert any(model.tendon for model in SYNTHETIC) and any(model.ball_joints for model in SYNTHETIC)
+    assert any(model.tendon for model in SYNTHETIC) and any(
+        model.ball_joints for model in SYNTHETIC
+    )
     sizes = {load_model(SYNTHETIC[index].xml()).nv for index in (0, 17)}
     assert sizes == {1, 64} and len(SYNTHETIC) == 20

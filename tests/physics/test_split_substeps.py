@@ -112,7 +112,9 @@ def test_forces_of_bodies_survive_a_refresh_that_computes_bias_forces(sim: str) 
     for name in names:
         expected = getattr(mj_data, name)
         scale = np.abs(expected).max()
-        np.testing.assert_allclose(world.view(name)[0].numpy(), expected, atol=1e-3 * scale, err_msg=name)
+        np.testing.assert_allclose(
+            world.view(name)[0].numpy(), expected, atol=1e-3 * scale, err_msg=name
+        )
 
 
 def test_a_model_without_degrees_of_freedom_steps() -> None:

@@ -6,7 +6,17 @@ from tests.physics.models import cartpole, quadruped, standing_quadrupeds
 
 
 def observable(world: World) -> dict[str, torch.Tensor]:
-    names = ("qpos", "qvel", "qacc", "sensordata", "actuator_force", "xpos", "cvel", "site_xpos", "time")
+    names = (
+        "qpos",
+        "qvel",
+        "qacc",
+        "sensordata",
+        "actuator_force",
+        "xpos",
+        "cvel",
+        "site_xpos",
+        "time",
+    )
     return {name: world.view(name).clone() for name in names}
 
 
@@ -21,7 +31,9 @@ def test_a_restored_world_continues_bit_for_bit():
     straight.refresh()
     saved = {name: tensor.clone() for name, tensor in straight.state_dict().items()}
 
-    fresh = World(quadruped(), num_envs=4, sim=SimCfg(njmax=80, nconmax=40), per_world_fields=("body_mass",))
+    fresh = World(
+        quadruped(), num_envs=4, sim=SimCfg(njmax=80, nconmax=40), per_world_fields=("body_mass",)
+    )
     fresh.load_state_dict(saved)
     for name, tensor in observable(straight).items():
         assert torch.equal(observable(fresh)[name], tensor), f"{name} right after loading"

@@ -17,7 +17,9 @@ def test_hooks_that_do_nothing_change_nothing():
     called = []
     for _ in range(2):
         plain.step(4)
-        hooked.step(4, before=[lambda: called.append("before")], after=[lambda: called.append("after")])
+        hooked.step(
+            4, before=[lambda: called.append("before")], after=[lambda: called.append("after")]
+        )
     assert called == ["before", "after"] * 8
     for name in STATE:
         assert torch.equal(plain.view(name), hooked.view(name)), name
@@ -49,7 +51,11 @@ def test_each_substep_takes_the_controls_that_the_hook_before_it_wrote():
         times = []
         hooked.step(
             4,
-            before=[lambda controls=controls: hooked.ctrl_EL.copy_(next(controls).expand_as(hooked.ctrl_EL))],
+            before=[
+                lambda controls=controls: hooked.ctrl_EL.copy_(
+                    next(controls).expand_as(hooked.ctrl_EL)
+                )
+            ],
             after=[lambda times=times: times.append(hooked.time_E.clone())],
         )
         for ctrl_L in ramp_KL:
@@ -79,7 +85,9 @@ def test_sensors_are_read_on_every_substep_only_if_asked():
     for which in ("last", "every"):
         seen = readings[which] = []
         world.step(
-            3, after=[lambda seen=seen: seen.append(world.sensordata_EL[:, columns].clone())], sensors=which
+            3,
+            after=[lambda seen=seen: seen.append(world.sensordata_EL[:, columns].clone())],
+            sensors=which,
         )
     assert torch.equal(readings["last"][0], readings["last"][1])
     assert not torch.equal(readings["last"][1], readings["last"][2])
@@ -100,7 +108,9 @@ def test_of_contacts_alone_are_those_that_all_on_every_substep_have(ours):
     for own, true in zip(readings["contacts"], readings["every"], strict=True):
         assert torch.equal(own[:, touches], true[:, touches]) and own[:, touches].any()
     assert not readings["contacts"][1][:, accelerates].any()
-    assert torch.equal(readings["contacts"][2][:, accelerates], readings["every"][2][:, accelerates])
+    assert torch.equal(
+        readings["contacts"][2][:, accelerates], readings["every"][2][:, accelerates]
+    )
 
 
 def test_every_without_hooks_reaches_the_same_state():

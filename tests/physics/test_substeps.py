@@ -70,7 +70,10 @@ def test_refreshed_sensors_are_those_of_the_c_engine():
         for name in REFRESHED:
             columns = sensor(world, name)
             np.testing.assert_allclose(
-                world.sensordata_EL[row, columns], expected.sensordata[columns], atol=1e-5, err_msg=name
+                world.sensordata_EL[row, columns],
+                expected.sensordata[columns],
+                atol=1e-5,
+                err_msg=name,
             )
 
 
@@ -150,7 +153,9 @@ CONNECT, WELD = 'connect body1="one" body2="two" anchor="0.5 0 0"', 'weld body1=
 )
 def test_ties_of_fast_bodies_follow_the_c_engine(tie, one_kernel_solver):
     mj_model = load_model(SPINNING_TIES.format(tie=tie))
-    world = World(mj_model, num_envs=1, sim=SimCfg(one_kernel_solver=one_kernel_solver, tolerance=1e-8))
+    world = World(
+        mj_model, num_envs=1, sim=SimCfg(one_kernel_solver=one_kernel_solver, tolerance=1e-8)
+    )
     mj_data = mujoco.MjData(mj_model)
     qvel = np.array([8.0, 0.0, 0.0, -4.0, 0.0, 8.0, 1.0])
     mj_data.qvel[:] = qvel

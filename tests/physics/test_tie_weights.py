@@ -71,7 +71,8 @@ def test_tied_bodies_without_joints_weigh_as_in_the_c_engine(ties, sim):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"integrator": "rk4"}, {"integrator": "discrete"}, {"solver": "cg", "iterations": 200}]
+    "changes",
+    [{"integrator": "rk4"}, {"integrator": "discrete"}, {"solver": "cg", "iterations": 200}],
 )
 @pytest.mark.parametrize(
     "flag",

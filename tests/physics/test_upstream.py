@@ -84,7 +84,10 @@ def test_functions_take_the_same_arguments(name: str, arguments: str) -> None:
             mjw.Model,
             "nxn_geom_pair nxn_geom_pair_filtered nxn_pairid nxn_pairid_filtered geom_pair_type_count",
         ),
-        (mjw.Model, "callback flg_surfacevel M_hinit_i M_colind nsensorcollision nsensortaxel nrangefinder"),
+        (
+            mjw.Model,
+            "callback flg_surfacevel M_hinit_i M_colind nsensorcollision nsensortaxel nrangefinder",
+        ),
         (
             mjw.Model,
             "sensor_pos_adr sensor_vel_adr sensor_limitpos_adr sensor_limitvel_adr sensor_contact_pos_adr "
@@ -101,7 +104,10 @@ def test_functions_take_the_same_arguments(name: str, arguments: str) -> None:
             mjw.Data,
             "naconmax njmax nacon ncollision nefc ne nf overflow solver_niter moment_rownnz moment_rowadr",
         ),
-        (mjw.RenderContext, "hfield_bvh_id hfield_bounds_size hfield_registry rgb_data depth_data seg_data"),
+        (
+            mjw.RenderContext,
+            "hfield_bvh_id hfield_bounds_size hfield_registry rgb_data depth_data seg_data",
+        ),
     ],
 )
 def test_fields_have_the_same_names(owner: type, names: str) -> None:
@@ -111,12 +117,14 @@ def test_fields_have_the_same_names(owner: type, names: str) -> None:
 
 def test_a_model_says_which_of_its_fields_may_differ_between_worlds(warp_model: mjw.Model) -> None:
     names = upstream.per_world_fields()
-    assert {"body_mass", "geom_dataid", "dof_armature"} <= set(names) and "geom_type" not in names, (
-        "the annotations of mujoco_warp.Model changed"
-    )
+    assert {"body_mass", "geom_dataid", "dof_armature"} <= set(
+        names
+    ) and "geom_type" not in names, "the annotations of mujoco_warp.Model changed"
     with wp.ScopedDevice("cpu"):
         mjw.put_model(mujoco.MjModel.from_xml_string(MODEL), batch_sizes=dict.fromkeys(names, 2))
-    assert getattr(warp_model.opt.gravity, "_is_batched", False), "MuJoCo Warp marks batched arrays otherwise"
+    assert getattr(warp_model.opt.gravity, "_is_batched", False), (
+        "MuJoCo Warp marks batched arrays otherwise"
+    )
 
 
 def test_the_flag_that_lets_boxes_collide_as_in_c_does_nothing_else() -> None:
@@ -132,7 +140,9 @@ def test_the_flag_that_lets_boxes_collide_as_in_c_does_nothing_else() -> None:
 def test_pairs_are_numbered_as_before(warp_model: mjw.Model) -> None:
     pairs, pair_ids = upstream.geom_pairs(warp_model)
     assert pairs.tolist() == [[0, 1], [0, 2], [1, 2]], "Model.nxn_geom_pair is ordered otherwise"
-    assert pair_ids.tolist() == [[-1, -1], [-1, -1], [-2, -1]], "the ids of Model.nxn_pairid changed"
+    assert pair_ids.tolist() == [[-1, -1], [-1, -1], [-2, -1]], (
+        "the ids of Model.nxn_pairid changed"
+    )
     kept = warp_model.geom_pair_type_count
     upstream.drop_contacts(warp_model, pairs[:, 1] == -1)
     assert warp_model.geom_pair_type_count == kept, "Model.geom_pair_type_count counts otherwise"
@@ -181,7 +191,9 @@ def test_versions_are_bounded_above(package: str) -> None:
         rf'^  "{package}>=[\d.]+,<([\d.]+)",', (ROOT / "pyproject.toml").read_text(), re.MULTILINE
     )
     present = tuple(int(part) for part in metadata.version(package).split("+")[0].split(".")[:2])
-    assert present < tuple(int(part) for part in found.split(".")), f"{package} {present} is beyond {found}"
+    assert present < tuple(int(part) for part in found.split(".")), (
+        f"{package} {present} is beyond {found}"
+    )
 
 
 @pytest.mark.parametrize("integrator", ["euler", "implicit", "implicitfast", "discrete"])

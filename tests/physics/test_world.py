@@ -8,7 +8,14 @@ import torch
 import warp as wp
 
 from ksim_rl.physics import SimCfg, World, load_model, views
-from tests.physics.models import NUM_ENVS, cartpole, forwarded, quadruped, sensor, standing_quadrupeds
+from tests.physics.models import (
+    NUM_ENVS,
+    cartpole,
+    forwarded,
+    quadruped,
+    sensor,
+    standing_quadrupeds,
+)
 
 ACCELERATION_SENSORS = ("acceleration", "knee_force", "touch", "front_left_contact")
 OTHER_SENSORS = ("gyro", "velocity", "up", "momentum", "knee_pos", "servo_pos", "servo_vel")
@@ -40,7 +47,10 @@ def test_refresh_makes_positions_and_velocities_those_of_the_present_state():
         for name in OTHER_SENSORS:
             columns = sensor(world, name)
             np.testing.assert_allclose(
-                world.sensordata_EL[row, columns], expected.sensordata[columns], atol=2e-5, err_msg=name
+                world.sensordata_EL[row, columns],
+                expected.sensordata[columns],
+                atol=2e-5,
+                err_msg=name,
             )
         np.testing.assert_allclose(world.xpos_EL[row], expected.xpos, atol=1e-6)
         np.testing.assert_allclose(world.cvel_EL[row], expected.cvel, atol=1e-5)
@@ -87,7 +97,9 @@ def test_reset_touches_only_the_masked_rows_even_row_zero():
         assert world.view(name)[mask_E].abs().max() == 0, name
     # The pose after a refresh is that of qpos0: the torso stands upright.
     up = sensor(world, "up")
-    torch.testing.assert_close(world.sensordata_EL[mask_E][:, up], torch.tensor([[0.0, 0.0, 1.0]] * 2))
+    torch.testing.assert_close(
+        world.sensordata_EL[mask_E][:, up], torch.tensor([[0.0, 0.0, 1.0]] * 2)
+    )
 
 
 def test_rows_that_did_not_reset_go_on_as_if_nothing_happened():
@@ -181,7 +193,9 @@ def test_two_threads_may_step_two_worlds():
 
 def test_the_model_of_the_caller_is_not_changed():
     before = quadruped().opt.timestep
-    world = World(quadruped(), num_envs=1, sim=SimCfg(timestep=0.002, cone="elliptic", njmax=80, nconmax=40))
+    world = World(
+        quadruped(), num_envs=1, sim=SimCfg(timestep=0.002, cone="elliptic", njmax=80, nconmax=40)
+    )
     assert world.timestep == 0.002
     assert quadruped().opt.timestep == before
     world.step(5)

@@ -9,9 +9,13 @@ import torch
 import torch.multiprocessing as mp
 
 
-def _run_one(rank: int, size: int, folder: str, function: Callable[..., Any], arguments: tuple) -> None:
+def _run_one(
+    rank: int, size: int, folder: str, function: Callable[..., Any], arguments: tuple
+) -> None:
     torch.set_num_threads(1)
-    torch.distributed.init_process_group("gloo", f"file://{folder}/store", rank=rank, world_size=size)
+    torch.distributed.init_process_group(
+        "gloo", f"file://{folder}/store", rank=rank, world_size=size
+    )
     torch.save(function(*arguments), f"{folder}/{rank}.pt")
     torch.distributed.destroy_process_group()
 
@@ -32,5 +36,7 @@ def as_ranks_compute(dtype: torch.dtype = torch.float32) -> Iterator[None]:
 def results(function: Callable[..., Any], *arguments: Any, size: int, folder: Path) -> list[Any]:
     """Call `function` on each of `size` ranks, and return what it returned there."""
     folder.mkdir(exist_ok=True)
-    mp.start_processes(_run_one, (size, str(folder), function, arguments), nprocs=size, start_method="fork")
+    mp.start_processes(
+        _run_one, (size, str(folder), function, arguments), nprocs=size, start_method="fork"
+    )
     return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(size)]

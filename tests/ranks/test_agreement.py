@@ -71,8 +71,12 @@ def largest_difference(learnt, parts):
         if own or not expected.numel():
             continue
         shared = expected.shape == parts[0][key].shape
-        found = [part[key] for part in parts] if shared else [torch.cat([part[key] for part in parts])]
-        worst = max([worst, *((one.double() - expected.double()).abs().max().item() for one in found)])
+        found = (
+            [part[key] for part in parts] if shared else [torch.cat([part[key] for part in parts])]
+        )
+        worst = max(
+            [worst, *((one.double() - expected.double()).abs().max().item() for one in found)]
+        )
     return worst
 
 

@@ -10,7 +10,9 @@ from tests.ranks.gloo import results
 
 pytestmark = [
     pytest.mark.full,
-    pytest.mark.skipif(torch.cuda.is_available(), reason="without CUDA the interpreter runs the kernels"),
+    pytest.mark.skipif(
+        torch.cuda.is_available(), reason="without CUDA the interpreter runs the kernels"
+    ),
 ]
 
 

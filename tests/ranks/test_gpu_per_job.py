@@ -45,6 +45,8 @@ def test_each_job_at_a_time_has_a_gpu_and_more_jobs_share_them_equally(tmp_path)
 
 
 @pytest.mark.usefixtures("gpus")
-@pytest.mark.parametrize(("device", "mode"), [("cuda:1", "MULTIRUN"), ("cpu", "MULTIRUN"), ("auto", "RUN")])
+@pytest.mark.parametrize(
+    ("device", "mode"), [("cuda:1", "MULTIRUN"), ("cpu", "MULTIRUN"), ("auto", "RUN")]
+)
 def test_other_jobs_see_all(device, mode, tmp_path):
     assert of_processes(1, tmp_path, device, mode) == ["4,6"]

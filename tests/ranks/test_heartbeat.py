@@ -51,7 +51,9 @@ def test_a_rank_that_is_silent_ends_the_others(ended, monkeypatch, capsys):
     monkeypatch.setattr(heartbeat, "SILENT_S", 0.1)
     with heartbeat.Heartbeat(Values({key("beat"): "7|in iteration 3|0.5"})):
         assert ended.wait(20)
-    assert "rank 1 is silent since 0 s (in iteration 3): killed, or stopped" in capsys.readouterr().err
+    assert (
+        "rank 1 is silent since 0 s (in iteration 3): killed, or stopped" in capsys.readouterr().err
+    )
     assert heartbeat.took[1] == 0.5
 
 

@@ -36,7 +36,9 @@ def compared(name, size, folder, *, dtype=torch.float32):
         parts = results(learnt, name, 16, 1, iterations, size=size, folder=folder)
     if name == "amp":
         count = "/discriminator/normalizer.count"
-        assert sum(part[count] for part in parts) == whole[count], "each counts its share of the motions"
+        assert sum(part[count] for part in parts) == whole[count], (
+            "each counts its share of the motions"
+        )
     return len(whole), largest_difference(whole, parts)
 
 
@@ -65,5 +67,7 @@ def test_amp_agrees_in_float64_where_env_states_are_left_out(size, tmp_path, mon
 
 
 def test_shards_of_another_size_are_refused():
-    with pytest.raises(ValueError, match="shards=2: use a divisor of num_envs=32 and of minibatches of 33"):
+    with pytest.raises(
+        ValueError, match="shards=2: use a divisor of num_envs=32 and of minibatches of 33"
+    ):
         make_amp(num_envs=32, shards=2, cfg={"num_transitions_per_step": 33})

@@ -8,7 +8,8 @@ from ksim_rl.ranks.running_moments import RunningMoments, publish
 
 def test_merged_batches_equal_two_passes():
     batches = [
-        torch.randn(n, 2) * torch.tensor([1e-3, 30.0]) + torch.tensor([1e3, -1.0]) for n in (1, 7, 500)
+        torch.randn(n, 2) * torch.tensor([1e-3, 30.0]) + torch.tensor([1e3, -1.0])
+        for n in (1, 7, 500)
     ]
     moments, seen = RunningMoments(2), torch.cat(batches).double()
     for batch in batches:
@@ -34,7 +35,9 @@ def test_counted_rows_show_once_they_are_published():
 
 @pytest.mark.parametrize("num_rows", [1, 17, 9000])
 def test_rows_in_many_parts_equal_two_passes(num_rows):
-    rows = torch.randn(num_rows, 3) * torch.tensor([1.0, 1e-2, 1e3]) + torch.tensor([0.0, 1e4, -1e3])
+    rows = torch.randn(num_rows, 3) * torch.tensor([1.0, 1e-2, 1e3]) + torch.tensor(
+        [0.0, 1e4, -1e3]
+    )
     rows[num_rows // 2, 1] = torch.nan
     valid = torch.rand(num_rows) < 0.8
     moments = RunningMoments(3)
@@ -45,4 +48,6 @@ def test_rows_in_many_parts_equal_two_passes(num_rows):
     mean = seen.mean(0) if len(seen) else torch.zeros(3)
     torch.testing.assert_close(moments.exact_mean, mean, rtol=1e-12, atol=1e-12, check_dtype=False)
     squares = 2 * (seen - mean).square().sum(0)
-    torch.testing.assert_close(moments.exact_sum_of_squares, squares, rtol=1e-10, atol=0, check_dtype=False)
+    torch.testing.assert_close(
+        moments.exact_sum_of_squares, squares, rtol=1e-10, atol=0, check_dtype=False
+    )

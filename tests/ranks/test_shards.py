@@ -45,7 +45,10 @@ def test_two_ranks_go_on_bit_for_bit(name, tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    ["fast_td3", *(pytest.param(name, marks=pytest.mark.full) for name in ("ppo", "sac", "fast_sac", "amp"))],
+    [
+        "fast_td3",
+        *(pytest.param(name, marks=pytest.mark.full) for name in ("ppo", "sac", "fast_sac", "amp")),
+    ],
 )
 def test_one_to_two_to_one_is_the_run_without_a_break(name, tmp_path, monkeypatch):
     monkeypatch.setattr("tests.shapes.Shaped.fail", lambda *_: None)
@@ -69,7 +72,9 @@ STYLE = ["task=walker_amp", "objective=amp", "objective.num_transitions_per_step
 
 def on_these_ranks(overrides, ranks_before):
     cfg = conf.compose([*SMALL, "num_envs=4", "data.num_env_states_per_minibatch=24", *overrides])
-    return run_commands._on_these_ranks(cfg, SimpleNamespace(state={"ranks": {"size": ranks_before}}))
+    return run_commands._on_these_ranks(
+        cfg, SimpleNamespace(state={"ranks": {"size": ranks_before}})
+    )
 
 
 def shared_out(overrides):
@@ -100,7 +105,9 @@ def test_sizes_are_shared_out(overrides, style, tmp_path):
 def test_sizes_that_cannot_be_shared_out_are_refused(overrides, monkeypatch):
     monkeypatch.setattr("ksim_rl.ranks.shards.size", lambda: 2)
     monkeypatch.setattr(ranks, "size", lambda: 2)
-    with pytest.raises(ValueError, match="num_.*=[57] on each of 3 ranks .* by 2: resume the run on 3"):
+    with pytest.raises(
+        ValueError, match="num_.*=[57] on each of 3 ranks .* by 2: resume the run on 3"
+    ):
         on_these_ranks(overrides, 3)
 
 
@@ -127,7 +134,9 @@ def test_checkpoints_are_gathered_and_dealt_out(tmp_path):
     assert found["/update/non_finite_env_states"] == 7
     # Four values of mean 1 and five of mean 2.
     assert found["/env/moments.0.count"] == 9
-    torch.testing.assert_close(found["/env/moments.0.exact_mean"], torch.tensor([14.0 / 9.0]).double())
+    torch.testing.assert_close(
+        found["/env/moments.0.exact_mean"], torch.tensor([14.0 / 9.0]).double()
+    )
     expected = torch.tensor([4.0 + 20.0 / 9.0]).double()
     torch.testing.assert_close(found["/env/moments.0.exact_sum_of_squares"], expected)
     with pytest.raises(ValueError, match="as many envs as before"):

@@ -20,7 +20,12 @@ from tests.ranks.test_agreement import SMALL
 def test_a_process_alone_joins_nobody(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     with ranks.joined("train"):
-        assert (ranks.rank(), ranks.size(), ranks.first_row(8), ranks.device("cuda")) == (0, 1, 0, "cuda")
+        assert (ranks.rank(), ranks.size(), ranks.first_row(8), ranks.device("cuda")) == (
+            0,
+            1,
+            0,
+            "cuda",
+        )
     assert ranks.by_first(lambda: "here") == "here"
 
 
@@ -29,7 +34,11 @@ def test_a_process_alone_joins_nobody(monkeypatch):
     [
         ("eval", {}, "eval is for one process"),
         ("train", {}, "RANK is not: start the ranks by torchrun"),
-        ("train", {"RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "localhost"}, "MASTER_PORT is not"),
+        (
+            "train",
+            {"RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "localhost"},
+            "MASTER_PORT is not",
+        ),
     ],
 )
 def test_what_torchrun_did_not_start_is_refused(command, variables, message, monkeypatch):
@@ -43,7 +52,13 @@ def test_what_torchrun_did_not_start_is_refused(command, variables, message, mon
 
 def launch(monkeypatch, **variables):
     """Set what a launcher sets for rank 0 of 2, or other values."""
-    own = {"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "2", "MASTER_ADDR": "localhost", "MASTER_PORT": "1"}
+    own = {
+        "RANK": "0",
+        "LOCAL_RANK": "0",
+        "WORLD_SIZE": "2",
+        "MASTER_ADDR": "localhost",
+        "MASTER_PORT": "1",
+    }
     for name, value in {**own, **variables}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("TORCHELASTIC_USE_AGENT_STORE", raising=False)
@@ -56,7 +71,9 @@ def test_a_port_in_use_is_said_where_rank_0_serves_the_store(monkeypatch):
         port = other.getsockname()[1]
         launch(monkeypatch, MASTER_PORT=str(port))
         with (
-            pytest.raises(ValueError, match=f"MASTER_PORT={port} is in use on localhost: choose another one"),
+            pytest.raises(
+                ValueError, match=f"MASTER_PORT={port} is in use on localhost: choose another one"
+            ),
             ranks.joined("train"),
         ):
             pass
@@ -87,8 +104,13 @@ def sharing(*uuids):
 
 def test_two_ranks_on_one_gpu_are_refused_on_both(tmp_path):
     texts = results(sharing, "GPU-a", "GPU-a", size=2, folder=tmp_path / "one")
-    assert all(text.startswith("ranks 0 and 1 share one GPU (") and "GPU-a" in text for text in texts)
-    assert results(sharing, "GPU-a", "GPU-b", size=2, folder=tmp_path / "two") == ["nothing", "nothing"]
+    assert all(
+        text.startswith("ranks 0 and 1 share one GPU (") and "GPU-a" in text for text in texts
+    )
+    assert results(sharing, "GPU-a", "GPU-b", size=2, folder=tmp_path / "two") == [
+        "nothing",
+        "nothing",
+    ]
 
 
 def test_what_dead_processes_left_in_the_store_is_no_answer():
@@ -139,7 +161,11 @@ def everything():
         build(conf.compose(SMALL))
     except ValueError as error:
         refused = str(error)
-    others = [{"seed": 2, "task": {"dt": 0.01}}, {"seed": 1, "task": {}}, {"seed": 1, "task": {"dt": 0.01}}]
+    others = [
+        {"seed": 2, "task": {"dt": 0.01}},
+        {"seed": 1, "task": {}},
+        {"seed": 1, "task": {"dt": 0.01}},
+    ]
     return (
         [said(values) for values in others],
         one_error(),
@@ -150,7 +176,9 @@ def everything():
 
 def test_ranks_with_other_configs_are_refused_on_all_of_them(tmp_path):
     for texts, error, first, refused in results(everything, size=2, folder=tmp_path):
-        assert texts[0].startswith("rank 1 has another config: seed is 2 there and 1 on rank 0; start")
+        assert texts[0].startswith(
+            "rank 1 has another config: seed is 2 there and 1 on rank 0; start"
+        )
         assert "task.dt is nothing there and 0.01 on rank 0" in texts[1]
         assert texts[2] == "nothing"
         assert "/nowhere/at/all" in error, "what rank 0 cannot write fails on all"

@@ -60,7 +60,15 @@ def test_rank_0_writes_one_run_which_goes_on_in_one_process(tmp_path):
     text = finished(torchrun("resume", str(run), "--num-iterations=3", folder=tmp_path))
     assert "iteration 3/3: env states 768" in text
     alone = subprocess.run(
-        [sys.executable, "-m", "ksim_rl.cli.main", "resume", str(run), "--num-iterations=4", "--device=cpu"],
+        [
+            sys.executable,
+            "-m",
+            "ksim_rl.cli.main",
+            "resume",
+            str(run),
+            "--num-iterations=4",
+            "--device=cpu",
+        ],
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -85,7 +93,9 @@ def kill_rank_1(process, at):
     while not lines or at not in lines[-1]:
         lines.append(process.stdout.readline())
         assert lines[-1], "".join(lines)
-    ranks = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True)
+    ranks = subprocess.run(
+        ["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True
+    )
     os.kill(int(ranks.stdout.split()[1]), signal.SIGKILL)
     return "".join(lines)
 

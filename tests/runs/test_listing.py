@@ -9,11 +9,20 @@ from ksim_rl.runs import listing, record
 from ksim_rl.runs.csv_table import CsvTable
 
 
-def make_run(folder, *, task="cartpole_balance", status="done", returns=(1.0, 2.0), seed=1, evaluation=None):
+def make_run(
+    folder, *, task="cartpole_balance", status="done", returns=(1.0, 2.0), seed=1, evaluation=None
+):
     """Write what a run leaves."""
     folder.mkdir(parents=True)
-    (folder / "config.yaml").write_text(f"num_envs: 4\nseed: {seed}\ntask_name: {task}\ntask: {{}}\n")
-    session = {"began": f"2030-01-0{seed} 00:00:00", "command": "ksim-rl train", "status": status, "why": "w"}
+    (folder / "config.yaml").write_text(
+        f"num_envs: 4\nseed: {seed}\ntask_name: {task}\ntask: {{}}\n"
+    )
+    session = {
+        "began": f"2030-01-0{seed} 00:00:00",
+        "command": "ksim-rl train",
+        "status": status,
+        "why": "w",
+    }
     (folder / record.RECORD).write_text(json.dumps({"sessions": [session]}))
     table = CsvTable(folder / "metrics.csv")
     for step, value in enumerate(returns, 1):
@@ -27,7 +36,11 @@ def make_run(folder, *, task="cartpole_balance", status="done", returns=(1.0, 2.
 def test_a_run_in_figures(tmp_path):
     run = make_run(tmp_path / "a", evaluation=7.5)
     found = listing.summarize(run)
-    assert (found.task, found.status, found.began) == ("cartpole_balance", "done", "2030-01-01 00:00:00")
+    assert (found.task, found.status, found.began) == (
+        "cartpole_balance",
+        "done",
+        "2030-01-01 00:00:00",
+    )
     assert (found.iteration, found.env_states, found.seconds) == (2, 128, 20.0)
     assert (found.evaluation, found.episodes, found.speed) == (7.5, 2.0, 150.0)
     cells = listing.line(found, name="a")
@@ -67,7 +80,8 @@ def test_what_cannot_be_read_is_said_and_hides_no_other_run(tmp_path):
     os.mkfifo(run / "metrics.csv")
     found = listing.summarize(run)
     assert (
-        "metrics.csv: cannot be read: it is no regular file" in found.why and found.task == "cartpole_balance"
+        "metrics.csv: cannot be read: it is no regular file" in found.why
+        and found.task == "cartpole_balance"
     )
 
 

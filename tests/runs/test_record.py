@@ -48,12 +48,17 @@ def run(tmp_path):
 
 
 def test_a_run_that_ends_says_how_and_what_it_was_made_of(run, notes):
-    with record.recorded(run, command=["ksim-rl", "train", "num_envs=4"], note=notes.append) as ended:
+    with record.recorded(
+        run, command=["ksim-rl", "train", "num_envs=4"], note=notes.append
+    ) as ended:
         (during,) = record.read(run)
         ended("done", "solved")
     (session,) = record.read(run)
     assert (during.status, session.status, session.why) == ("running", "done", "solved")
-    assert session.command == "ksim-rl train num_envs=4" and session.ended >= session.began == during.began
+    assert (
+        session.command == "ksim-rl train num_envs=4"
+        and session.ended >= session.began == during.began
+    )
     assert session.versions["python"] == sys.version.split()[0] and "mujoco" in session.versions
     assert int(session.hardware["cores"]) > 0
     assert record.status(run) == ("done", "solved") and notes == []
@@ -63,7 +68,10 @@ def test_a_resumed_run_has_an_entry_for_each_session(run, notes):
     for why in ("SIGINT", "all"):
         with record.recorded(run, note=notes.append) as ended:
             ended("interrupted" if why == "SIGINT" else "done", why)
-    assert [(s.status, s.why) for s in record.read(run)] == [("interrupted", "SIGINT"), ("done", "all")]
+    assert [(s.status, s.why) for s in record.read(run)] == [
+        ("interrupted", "SIGINT"),
+        ("done", "all"),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +85,9 @@ def test_what_ends_a_run_is_kept(run, notes, error, status):
 
 def test_a_killed_run_has_failed_and_a_living_one_runs(run, notes):
     process = hold(run)
-    text = json.dumps({"sessions": [{"began": "2030-01-01 00:00:00", "command": "x", "status": "running"}]})
+    text = json.dumps(
+        {"sessions": [{"began": "2030-01-01 00:00:00", "command": "x", "status": "running"}]}
+    )
     (run / record.RECORD).write_text(text)
     assert record.status(run)[0] == "running"
     process.kill()
@@ -100,7 +110,9 @@ def test_commit_and_changes_of_a_plug_in_are_kept(run, package, notes):
     assert "-MASS = 1.0\n+MASS = 2.0\n" in (run / "some_robots.2.diff").read_text()
 
 
-def test_a_repository_that_only_lies_around_is_not_asked(run, tmp_path, package, monkeypatch, notes):
+def test_a_repository_that_only_lies_around_is_not_asked(
+    run, tmp_path, package, monkeypatch, notes
+):
     """Where somebody's folder is the working directory, its settings would have git run programs."""
     mark = tmp_path / "executed"
     around = tmp_path / "around"
@@ -160,6 +172,9 @@ def test_links_and_pipes_of_a_stranger_are_not_followed(run, tmp_path, notes):
     (run / record.RECORD).symlink_to(outside)
     (run / f"{WRITING}{record.RECORD}").symlink_to(outside)
     assert record.status(run)[0] == "unknown"
-    with pytest.raises(ValueError, match=r"run\.json: a link"), record.recorded(run, note=notes.append):
+    with (
+        pytest.raises(ValueError, match=r"run\.json: a link"),
+        record.recorded(run, note=notes.append),
+    ):
         pass
     assert outside.read_text() == "mine"

@@ -31,7 +31,9 @@ def hold(folder):
         "    print('held', flush=True)",
         "    time.sleep(60)",
     )
-    process = subprocess.Popen([sys.executable, "-c", "\n".join(lines)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", "\n".join(lines)], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None and process.stdout.readline() == "held\n"
     return process
 
@@ -46,7 +48,9 @@ def held(tmp_path):
 
 def test_the_lock_is_there_while_it_is_held_and_gone_afterwards(tmp_path, notes):
     with locked(tmp_path, note=notes.append):
-        assert is_locked(tmp_path) and json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
+        assert (
+            is_locked(tmp_path) and json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
+        )
     assert not is_locked(tmp_path) and list(tmp_path.iterdir()) == [] and notes == []
 
 
@@ -62,7 +66,10 @@ def test_a_second_process_is_refused_in_one_line_with_pid_host_and_time(tmp_path
     with pytest.raises(ValueError) as raised, locked(tmp_path, note=notes.append):
         pytest.fail("both write")
     text = str(raised.value)
-    assert f"process {held.pid} on {os.uname().nodename!r}, begun {known['since']!r}, writes this run" in text
+    assert (
+        f"process {held.pid} on {os.uname().nodename!r}, begun {known['since']!r}, writes this run"
+        in text
+    )
     assert "\n" not in text and str(tmp_path) in text
     assert is_locked(tmp_path), "the refused one leaves the lock alone"
 
@@ -91,7 +98,9 @@ def saved(run, note):
     from ksim_rl.trainers import Checkpoint
 
     newest = run / "checkpoint" / "00000001"
-    return Checkpoint(path=newest, iteration=1, config=conf.compose(["num_envs=64"]).to_tree(), state={})
+    return Checkpoint(
+        path=newest, iteration=1, config=conf.compose(["num_envs=64"]).to_tree(), state={}
+    )
 
 
 def test_a_folder_that_was_not_named_is_one_beside(tmp_path, held):
@@ -107,7 +116,11 @@ def test_the_lock_of_a_process_that_was_killed_is_taken_over_and_said(tmp_path, 
     assert (tmp_path / LOCK).exists() and not is_locked(tmp_path)
     with locked(tmp_path, note=notes.append):
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
-    assert len(notes) == 1 and f"left by process {held.pid} on" in notes[0] and "takes it over" in notes[0]
+    assert (
+        len(notes) == 1
+        and f"left by process {held.pid} on" in notes[0]
+        and "takes it over" in notes[0]
+    )
 
 
 @pytest.mark.parametrize("text", ["x" * 5000, '{"pid": "\\u001b[2J"}', "[1]", '{"pid": 1}'])
@@ -118,7 +131,9 @@ def test_a_lock_with_anything_in_it_is_taken_over(tmp_path, notes, text):
     assert len(notes) == 1 and "left by another process" in notes[0]
 
 
-def test_it_is_not_taken_by_a_process_that_waited_for_a_file_that_is_gone(tmp_path, notes, monkeypatch):
+def test_it_is_not_taken_by_a_process_that_waited_for_a_file_that_is_gone(
+    tmp_path, notes, monkeypatch
+):
     opened, flock = [], fcntl.flock
 
     def removed_meanwhile(file, how):
@@ -164,7 +179,9 @@ def test_what_leads_elsewhere_is_no_lock(tmp_path, notes, kind):
     else:
         (run / LOCK).hardlink_to(precious)
     assert not is_locked(run)
-    refused = pytest.raises(ValueError, match=r"run/\.lock: .*only files of this folder alone are written")
+    refused = pytest.raises(
+        ValueError, match=r"run/\.lock: .*only files of this folder alone are written"
+    )
     with refused, locked(run, note=notes.append):
         pass
     assert precious.read_text() == "precious"

@@ -22,7 +22,9 @@ def test_a_buffer_belongs_to_the_calling_term():
         second = view.buffer("peak", 3, dtype=torch.int64)
     with driver.scope("rewards/a"):
         assert view.buffer("peak", 2) is first
-        with pytest.raises(ValueError, match=r"'rewards/a\.peak' is torch.float32 \(2,\), asked for"):
+        with pytest.raises(
+            ValueError, match=r"'rewards/a\.peak' is torch.float32 \(2,\), asked for"
+        ):
             view.buffer("peak", 3)
     assert first.shape == (E, 2) and second.dtype == torch.int64
 
@@ -83,7 +85,9 @@ def test_draws_advance_with_the_step_or_with_the_given_counter():
     view.reset_count_E[3] += 1
     reset_after = drawn(driver, "events/a", view.reset_count_E)[0]
     changed = (reset_after != reset_before).any(-1)
-    assert changed.tolist() == [row == 3 for row in range(E)], "one row's reset changes its own numbers only"
+    assert changed.tolist() == [row == 3 for row in range(E)], (
+        "one row's reset changes its own numbers only"
+    )
 
 
 def test_a_row_draws_the_same_numbers_among_few_and_many():

@@ -50,7 +50,9 @@ def make(
     scene = scene or SceneCfg(robots={"arm": MjcfRobot(source=ARM.format(keys=keys))}, num_envs=3)
     blank = {"observations": {}, "rewards": {}, "terminations": {}, "actions": {}}
     sim = SimCfg(engine=engine, timestep=0.002)
-    return ManagerBasedRlEnv(ManagerBasedRlEnvCfg(decimation=1, scene=scene, sim=sim, **{**blank, **fields}))
+    return ManagerBasedRlEnv(
+        ManagerBasedRlEnvCfg(decimation=1, scene=scene, sim=sim, **{**blank, **fields})
+    )
 
 
 def state_of(env: ManagerBasedRlEnv, row: int) -> dict[str, np.ndarray]:
@@ -129,7 +131,10 @@ def test_without_a_keyframe_servos_hold_the_models_own_pose():
 
 @pytest.mark.parametrize("keys", [FULL, SILENT])
 def test_activations_follow_a_pose_that_was_drawn(keys):
-    env = make(keys, events={"joints": ResetJoints(joints=("shoulder", "elbow"), position_range=(-0.5, 0.5))})
+    env = make(
+        keys,
+        events={"joints": ResetJoints(joints=("shoulder", "elbow"), position_range=(-0.5, 0.5))},
+    )
     env.reset()
     drawn_EK = env.view.joints(("shoulder", "elbow")).pos_EL
     assert drawn_EK.std() > 0.05
@@ -141,7 +146,9 @@ def test_activations_follow_a_pose_that_was_drawn(keys):
 def test_activations_stay_in_their_range():
     text = ARM.format(keys=SILENT).replace('actrange="-3 3"', 'actrange="-0.5 0.5"')
     scene = SceneCfg(robots={"arm": MjcfRobot(source=text)}, num_envs=3)
-    env = make(scene=scene, events={"joints": ResetJoints(joints="elbow", position_range=(-0.4, -0.3))})
+    env = make(
+        scene=scene, events={"joints": ResetJoints(joints="elbow", position_range=(-0.4, -0.3))}
+    )
     env.reset()
     np.testing.assert_allclose(env.world.act_EL[:, 1].numpy(), [-0.5] * 3)
 
@@ -149,8 +156,12 @@ def test_activations_stay_in_their_range():
 def test_entities_that_no_event_moves_start_at_the_keyframe():
     env = make(events={"joints": ResetJoints(joints="shoulder")})
     env.reset()
-    np.testing.assert_allclose(env.world.qpos_EL[0, 4:].numpy(), [0.1, 0.2, 0.3, 1, 0, 0, 0], rtol=1e-6)
-    np.testing.assert_allclose(env.world.qvel_EL[0, 4:].numpy(), [1, 2, 3, 0.1, 0.2, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(
+        env.world.qpos_EL[0, 4:].numpy(), [0.1, 0.2, 0.3, 1, 0, 0, 0], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        env.world.qvel_EL[0, 4:].numpy(), [1, 2, 3, 0.1, 0.2, 0.3], rtol=1e-6
+    )
 
 
 def test_a_joined_scene_restores_the_keyframe_of_each_part():

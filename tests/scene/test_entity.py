@@ -22,7 +22,12 @@ CUBE = """
 </mujoco>
 """
 QUARTER_TURN = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
-ROOTS = {"left": "left/trunk", "right": "right/trunk", "turret": "turret/turret", "cube": "cube/box"}
+ROOTS = {
+    "left": "left/trunk",
+    "right": "right/trunk",
+    "turret": "turret/turret",
+    "cube": "cube/box",
+}
 SCENE = SceneCfg(
     robots={
         "left": MjcfRobot(source=FREE_BODY),
@@ -44,7 +49,9 @@ def scene():
         *(int(a) + 3 for a in model.jnt_qposadr[model.jnt_type == 0]),
         *model.jnt_qposadr[model.jnt_type == 1],
     ):
-        qpos[:, start : start + 4] /= np.linalg.norm(qpos[:, start : start + 4], axis=1, keepdims=True)
+        qpos[:, start : start + 4] /= np.linalg.norm(
+            qpos[:, start : start + 4], axis=1, keepdims=True
+        )
     world.qpos_EL.copy_(torch.tensor(qpos))
     world.qvel_EL.copy_(torch.tensor(rng.normal(0.0, 1.5, (E, model.nv))))
     world.refresh()
@@ -65,7 +72,9 @@ def test_root_pose_and_velocity_of_each_entity(scene, name):
     close(entity.root_quat_EL * same_sign, engine(scene, lambda m, d: d.xquat[body]))
     down = engine(scene, lambda m, d: d.xmat[body].reshape(3, 3).T @ [0.0, 0.0, -1.0])
     close(entity.projected_gravity_EL, down)
-    close(entity.heading_E, engine(scene, lambda m, d: math.atan2(d.xmat[body][3], d.xmat[body][0])))
+    close(
+        entity.heading_E, engine(scene, lambda m, d: math.atan2(d.xmat[body][3], d.xmat[body][0]))
+    )
     for part, in_world, in_body in (
         ("linear", entity.root_lin_vel_w_EL, entity.root_lin_vel_b_EL),
         ("angular", entity.root_ang_vel_w_EL, entity.root_ang_vel_b_EL),
@@ -73,7 +82,9 @@ def test_root_pose_and_velocity_of_each_entity(scene, name):
         close(in_world, engine(scene, lambda m, d, part=part: velocity(m, d, [body], part=part)[0]))
         rotated = engine(
             scene,
-            lambda m, d, part=part: d.xmat[body].reshape(3, 3).T @ velocity(m, d, [body], part=part)[0],
+            lambda m, d, part=part: (
+                d.xmat[body].reshape(3, 3).T @ velocity(m, d, [body], part=part)[0]
+            ),
         )
         close(in_body, rotated)
 
@@ -95,7 +106,9 @@ def test_the_views_root_is_the_first_robots(scene):
 def test_joints_of_an_entity_are_its_columns_of_the_views(scene):
     view = scene.view
     names = view.joints().names
-    assert [name for name in names if name.startswith("right/")] == list(view.entity("right").joints.names)
+    assert [name for name in names if name.startswith("right/")] == list(
+        view.entity("right").joints.names
+    )
     for name, own in (
         ("left", ["left/left_hip", "left/right_hip"]),
         ("turret", ["turret/pan", "turret/reach"]),
@@ -125,7 +138,10 @@ def test_writes_change_one_entity_in_the_masked_rows(scene):
     lin, ang = torch.randn(E, 3), torch.randn(E, 3)
     cube.write_root_pose(mask_E, pos, quat)
     cube.write_root_velocity(mask_E, lin, ang)
-    for after, before, own in ((world.qpos_EL, qpos, cube.root_qpos), (world.qvel_EL, qvel, cube.root_qvel)):
+    for after, before, own in (
+        (world.qpos_EL, qpos, cube.root_qpos),
+        (world.qvel_EL, qvel, cube.root_qvel),
+    ):
         unchanged = torch.ones_like(after, dtype=torch.bool)
         unchanged[mask_E, own] = False
         assert torch.equal(after[unchanged], before[unchanged])
@@ -134,7 +150,9 @@ def test_writes_change_one_entity_in_the_masked_rows(scene):
     body = cube.root.id
     close(engine(scene, lambda m, d: d.xpos[body])[mask_E], pos[mask_E])
     close(engine(scene, lambda m, d: velocity(m, d, [body], part="linear")[0])[mask_E], lin[mask_E])
-    close(engine(scene, lambda m, d: velocity(m, d, [body], part="angular")[0])[mask_E], ang[mask_E])
+    close(
+        engine(scene, lambda m, d: velocity(m, d, [body], part="angular")[0])[mask_E], ang[mask_E]
+    )
     close(cube.root_ang_vel_w_EL[mask_E], ang[mask_E])
 
 
@@ -142,7 +160,8 @@ def test_a_fixed_root_is_not_written(scene):
     everybody_E = torch.ones(E, dtype=torch.bool)
     pos, quat = torch.zeros(E, 3), torch.zeros(E, 4)
     with pytest.raises(
-        ValueError, match="write_root_pose of 'turret': its root body 'turret/turret' has no free joint"
+        ValueError,
+        match="write_root_pose of 'turret': its root body 'turret/turret' has no free joint",
     ):
         scene.view.entity("turret").write_root_pose(everybody_E, pos, quat)
     with pytest.raises(ValueError, match="write_root_velocity of 'turret'"):

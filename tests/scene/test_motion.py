@@ -47,9 +47,9 @@ def test_between_frames_positions_are_linear_and_turns_take_the_shorter_way(mode
     qpos[1, 3:7] *= -1.0  # the same orientation
     motion = load_motion(saved(tmp_path, qpos=qpos), model, CPU)
     qpos_EL, qvel_EL = motion.sample(torch.tensor([0.05, 0.15]))
-    assert qpos_EL[:, 0].tolist() == pytest.approx([0.5, 1.5]) and qpos_EL[:, 7].tolist() == pytest.approx(
-        [0.05, 0.15]
-    )
+    assert qpos_EL[:, 0].tolist() == pytest.approx([0.5, 1.5]) and qpos_EL[
+        :, 7
+    ].tolist() == pytest.approx([0.05, 0.15])
     assert qvel_EL[:, 0].tolist() == pytest.approx([15.0, 30.0])
     for row, angle in zip(qpos_EL, (np.pi / 4, 3 * np.pi / 4), strict=True):
         expected = np.zeros(4)
@@ -58,7 +58,9 @@ def test_between_frames_positions_are_linear_and_turns_take_the_shorter_way(mode
 
 
 def test_joint_names_that_are_the_models_are_accepted(model, tmp_path):
-    load_motion(saved(tmp_path, joint_names=np.array(["root", "left_hip", "right_hip"])), model, CPU)
+    load_motion(
+        saved(tmp_path, joint_names=np.array(["root", "left_hip", "right_hip"])), model, CPU
+    )
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,12 @@ def test_size_mass_and_friction():
         [1.2 / 12 * (0.2**2 + 0.3**2), 1.2 / 12 * (0.1**2 + 0.3**2), 1.2 / 12 * (0.1**2 + 0.2**2)]
     )
     assert sorted(body.inertia.tolist()) == pytest.approx(moments)
-    assert geom.friction.tolist() == [0.4, 0.01, 0.002] and geom.rgba.tolist() == [1.0, 0.0, 0.0, 0.5]
+    assert geom.friction.tolist() == [0.4, 0.01, 0.002] and geom.rgba.tolist() == [
+        1.0,
+        0.0,
+        0.0,
+        0.5,
+    ]
     assert (model.nq, model.nv) == (7, 6)
 
 

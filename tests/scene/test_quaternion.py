@@ -22,7 +22,9 @@ def test_multiply_is_mju_mulquat(pairs):
     expected = np.zeros((50, 4))
     for i in range(50):
         mujoco.mju_mulQuat(expected[i], a[i], b[i])
-    torch.testing.assert_close(quaternion.multiply(torch.tensor(a), torch.tensor(b)), torch.tensor(expected))
+    torch.testing.assert_close(
+        quaternion.multiply(torch.tensor(a), torch.tensor(b)), torch.tensor(expected)
+    )
 
 
 def test_rotate_is_mju_rotvecquat_and_its_inverse_undoes_it(pairs):
@@ -51,7 +53,9 @@ def test_yaw_is_the_heading_of_the_x_axis(pairs):
     x_axis = quaternion.rotate(
         torch.tensor(q), torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(50, 3)
     )
-    torch.testing.assert_close(quaternion.yaw(torch.tensor(q)), torch.atan2(x_axis[:, 1], x_axis[:, 0]))
+    torch.testing.assert_close(
+        quaternion.yaw(torch.tensor(q)), torch.atan2(x_axis[:, 1], x_axis[:, 0])
+    )
 
 
 def test_wrap_to_pi():

@@ -64,7 +64,9 @@ def lit(picture):
 
 def blobs(mask):
     """Count the runs of columns and of rows in which something is drawn."""
-    return tuple(int((np.diff(mask.any(axis).astype(int), prepend=0) == 1).sum()) for axis in (0, 1))
+    return tuple(
+        int((np.diff(mask.any(axis).astype(int), prepend=0) == 1).sum()) for axis in (0, 1)
+    )
 
 
 def test_a_picture_shows_the_puck_in_its_middle(gl):
@@ -101,7 +103,10 @@ def test_the_camera_follows_its_body(gl):
 
 def test_its_shadow_follows_too(gl):
     aside = dataclasses.replace(TOP, body="puck", elevation=-30.0, distance=2.0)
-    robots, placements = {"puck": MjcfRobot(source=PUCK_XML)}, {"puck": Placement(pos=(0.0, 0.0, 0.5))}
+    robots, placements = (
+        {"puck": MjcfRobot(source=PUCK_XML)},
+        {"puck": Placement(pos=(0.0, 0.0, 0.5))},
+    )
     scene = SceneCfg(robots=robots, placements=placements, terrain=PlaneTerrain(), num_envs=3)
     env = filmed(aside, scene=scene)
 
@@ -161,7 +166,9 @@ def test_each_env_of_the_picture_is_drawn_with_its_marks(gl):
     env = ManagerBasedRlEnv(cfg, render_mode="rgb_array")
     place(env, *[0.0] * 4)
     picture = env.render().astype(int)
-    assert blobs(picture[..., 1] > picture[..., [0, 2]].max(-1) + 60) == (2, 2), "a green ball over each puck"
+    assert blobs(picture[..., 1] > picture[..., [0, 2]].max(-1) + 60) == (2, 2), (
+        "a green ball over each puck"
+    )
     assert blobs(picture[..., 0] > picture[..., 1:].max(-1) + 60) == (2, 2), "a red one beside it"
     env.close()
 
@@ -232,7 +239,9 @@ def test_an_unknown_body_is_refused_before_the_first_picture():
 
 
 def test_an_env_that_does_not_exist_cannot_be_drawn():
-    with pytest.raises(ValueError, match=r"viewer\.env_index=3: expected less than scene\.num_envs=3"):
+    with pytest.raises(
+        ValueError, match=r"viewer\.env_index=3: expected less than scene\.num_envs=3"
+    ):
         puck_cfg(num_envs=3, viewer=ViewerCfg(env_index=3))
 
 
@@ -296,7 +305,11 @@ def drawing_cfg(**fields) -> ManagerBasedRlEnvCfg:
             "target": DrawnTarget(resampling_time_range_s=(DT, DT)),
             "other": Target(resampling_time_range_s=(DT, DT)),
         },
-        rewards={"position": DrawnPosition(), "unused": DrawnPosition(weight=0.0), "plain": Position()},
+        rewards={
+            "position": DrawnPosition(),
+            "unused": DrawnPosition(weight=0.0),
+            "plain": Position(),
+        },
         **fields,
     )
     unit = ImuSensor(body="puck")

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from ksim_rl.envs import ContactSensor, ManagerBasedRlEnv, MjcfRobot, Placement, PlaneTerrain, SceneCfg
+from ksim_rl.envs import (
+    ContactSensor,
+    ManagerBasedRlEnv,
+    MjcfRobot,
+    Placement,
+    PlaneTerrain,
+    SceneCfg,
+)
 from ksim_rl.mdp import JointEffortAction
 from ksim_rl.scene.scene import Robot, build_spec
 from tests.envs.probe_env import PUCK_XML, SUBSTEP_S, puck_cfg, push
@@ -49,7 +56,9 @@ def scene(**fields) -> mujoco.MjModel:
 
 
 def names(model, kind):
-    count = {"body": model.nbody, "joint": model.njnt, "geom": model.ngeom, "actuator": model.nu}[kind]
+    count = {"body": model.nbody, "joint": model.njnt, "geom": model.ngeom, "actuator": model.nu}[
+        kind
+    ]
     return [getattr(model, kind)(i).name for i in range(count)]
 
 
@@ -103,9 +112,13 @@ def test_entities_have_names_of_their_own():
     puck = MjcfRobot(source=PUCK_XML)
     with pytest.raises(ValueError, match="objects: 'puck' is the name of a robot"):
         SceneCfg(robots={"puck": puck}, objects={"puck": puck})
-    with pytest.raises(ValueError, match="placements: no robot or object 'pick': did you mean 'puck'"):
+    with pytest.raises(
+        ValueError, match="placements: no robot or object 'pick': did you mean 'puck'"
+    ):
         SceneCfg(robots={"puck": puck}, placements={"pick": Placement()})
-    with pytest.raises(ValueError, match=r"quat=\(1\.0, 1\.0, 0\.0, 0\.0\): expected a unit quaternion"):
+    with pytest.raises(
+        ValueError, match=r"quat=\(1\.0, 1\.0, 0\.0, 0\.0\): expected a unit quaternion"
+    ):
         Placement(quat=(1.0, 1.0, 0.0, 0.0))
 
 
@@ -129,7 +142,9 @@ def test_two_pucks_are_driven_apart():
     )
     env = ManagerBasedRlEnv(cfg)
     next_E = push(env, env.reset(), force=2.0)["next"]
-    torch.testing.assert_close(next_E["obs", "velocity"], torch.tensor([[0.0, 2.0 * env.step_dt]] * 2))
+    torch.testing.assert_close(
+        next_E["obs", "velocity"], torch.tensor([[0.0, 2.0 * env.step_dt]] * 2)
+    )
 
 
 def test_the_plane_is_a_body_of_its_own_with_its_friction():
@@ -144,7 +159,8 @@ def test_the_plane_is_a_body_of_its_own_with_its_friction():
 
 def test_the_plane_collides_whatever_the_robots_default_class_says():
     ghostly = PUCK_XML.replace(
-        "<worldbody>", '<default><geom contype="0" conaffinity="0" condim="6"/></default><worldbody>'
+        "<worldbody>",
+        '<default><geom contype="0" conaffinity="0" condim="6"/></default><worldbody>',
     )
     geom = scene(robots={"puck": MjcfRobot(source=ghostly)}, terrain=PlaneTerrain()).geom("terrain")
     assert (geom.contype, geom.conaffinity, geom.condim) == (1, 1, 3)
@@ -161,7 +177,8 @@ def test_sensors_of_several_robots_use_the_prefixed_names():
     model = scene(robots=robots, terrain=terrain, sensors=sensors)
     assert [model.sensor(i).name for i in range(model.nsensor)] == ["touch_b/puck"]
     with pytest.raises(
-        ValueError, match=r"scene\.sensors\.touch: no geom matches 'puck': did you mean 'b/puck' or 'a/puck'"
+        ValueError,
+        match=r"scene\.sensors\.touch: no geom matches 'puck': did you mean 'b/puck' or 'a/puck'",
     ):
         scene(robots=robots, terrain=terrain, sensors={"touch": ContactSensor(geoms=("puck",))})
 
@@ -221,7 +238,12 @@ PENDULUM = """
 
 @pytest.mark.parametrize(
     "settings",
-    ['settotalmass="7"', 'boundmass="90"', 'boundinertia="3"', 'settotalmass="7" inertiafromgeom="true"'],
+    [
+        'settotalmass="7"',
+        'boundmass="90"',
+        'boundinertia="3"',
+        'settotalmass="7" inertiafromgeom="true"',
+    ],
 )
 def test_a_part_weighs_beside_others_what_it_weighs_alone(settings):
     text = PENDULUM.format(settings=settings)

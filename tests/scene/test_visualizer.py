@@ -97,7 +97,9 @@ def test_what_does_not_fit_is_refused_not_dropped(recwarn):
 
 
 def test_moving_geoms_are_added_without_the_fixed_ones():
-    ground = PUCK_XML.replace("<worldbody>", '<worldbody><geom name="ground" type="plane" size="1 1 1"/>')
+    ground = PUCK_XML.replace(
+        "<worldbody>", '<worldbody><geom name="ground" type="plane" size="1 1 1"/>'
+    )
     model = mujoco.MjModel.from_xml_string(ground)
     scene, data = mujoco.MjvScene(model, maxgeom=20), mujoco.MjData(model)
     mujoco.mj_forward(model, data)

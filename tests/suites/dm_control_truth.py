@@ -59,7 +59,9 @@ def _moment(env, time_step) -> Moment:
         ctrl=physics.data.ctrl.copy(),
         sensordata=physics.data.sensordata.copy(),
         target=_target(physics),
-        observations={name: np.atleast_1d(value).copy() for name, value in time_step.observation.items()},
+        observations={
+            name: np.atleast_1d(value).copy() for name, value in time_step.observation.items()
+        },
         reward=time_step.reward,
     )
 

@@ -10,7 +10,9 @@ from tests.suites.dm_control_truth import load, moments
 
 # Models that compile fast, one of them built in Python; the others in full runs.
 QUICK = ("cartpole_balance", "pendulum_swingup", "swimmer_swimmer6")
-TASKS = [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in SUITE_TASKS]
+TASKS = [
+    name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in SUITE_TASKS
+]
 COUNT = 8
 
 
@@ -25,14 +27,20 @@ def injected(env, states):
     world = inner.world
 
     def tensor(name):
-        return torch.tensor(np.stack([getattr(state, name) for state in states]), dtype=torch.float32)
+        return torch.tensor(
+            np.stack([getattr(state, name) for state in states]), dtype=torch.float32
+        )
 
     world.qpos_EL.copy_(tensor("qpos"))
     world.qvel_EL.copy_(tensor("qvel"))
     world.ctrl_EL.copy_(tensor("ctrl"))
     world.refresh()
     # Touch sensors belong to the last substep of dm_control's step, which is not in the state.
-    touch = [i for i in range(world.mj_model.nsensor) if world.mj_model.sensor(i).name.startswith("touch")]
+    touch = [
+        i
+        for i in range(world.mj_model.nsensor)
+        if world.mj_model.sensor(i).name.startswith("touch")
+    ]
     for sensor in touch:
         address = world.mj_model.sensor_adr[sensor]
         world.sensordata_EL[:, address] = tensor("sensordata")[:, address]
@@ -64,7 +72,9 @@ def has_the_model_and_time_steps_of(env, theirs):
         "qpos0",
         "actuator_gear",
     ):
-        np.testing.assert_allclose(getattr(ours, field), getattr(model, field), atol=1e-9, err_msg=field)
+        np.testing.assert_allclose(
+            getattr(ours, field), getattr(model, field), atol=1e-9, err_msg=field
+        )
     assert ours.opt.timestep == model.opt.timestep and ours.opt.integrator == model.opt.integrator
     assert ours.opt.disableflags == model.opt.disableflags
     assert env.base_env.step_dt == pytest.approx(theirs.control_timestep())
@@ -76,7 +86,9 @@ def observes_and_rewards_as(env, states):
     env.reset()
     observations, reward_E = injected(env, states)
     ours_EL = torch.cat(list(observations.values()), dim=-1).double().numpy()
-    theirs_EL = np.stack([np.concatenate([v.ravel() for v in s.observations.values()]) for s in states])
+    theirs_EL = np.stack(
+        [np.concatenate([v.ravel() for v in s.observations.values()]) for s in states]
+    )
     assert ours_EL.shape == theirs_EL.shape
     error_EL = np.abs(ours_EL - theirs_EL) / (1.0 + np.abs(theirs_EL))
     assert error_EL.max() < 1e-5, list(observations)

@@ -43,7 +43,8 @@ def test_nothing_touches_in_a_bank_where_contacts_are_refused(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["ball_in_cup_catch", "finger_spin", pytest.param("humanoid_stand", marks=pytest.mark.full)]
+    "name",
+    ["ball_in_cup_catch", "finger_spin", pytest.param("humanoid_stand", marks=pytest.mark.full)],
 )
 def test_a_bank_has_the_spread_of_dm_controls_own_starts(name):
     mj_model, bank_NL = bank_of(name)
@@ -67,7 +68,9 @@ def test_a_bank_of_cheetahs_has_settled_as_c_settles_them():
     data.qpos[:] = drawn_NL[17, : mj_model.nq]
     mujoco.mj_step(mj_model, data, nstep=200)
     np.testing.assert_allclose(bank_NL[17], np.concatenate((data.qpos, data.qvel)), atol=1e-9)
-    assert (np.abs(bank_NL[:, mj_model.nq :]).mean() < 0.1) and (drawn_NL[:, mj_model.nq :] == 0.0).all()
+    assert (np.abs(bank_NL[:, mj_model.nq :]).mean() < 0.1) and (
+        drawn_NL[:, mj_model.nq :] == 0.0
+    ).all()
 
 
 def test_a_small_bank_is_refused():

@@ -51,7 +51,9 @@ STRANGE = {
     "task_by_another_spelling": lambda place: table(place, "+task=reacher"),
     "several_values": lambda place: table(place, "trainer.log_interval=1,2"),
     "plug_in": lambda place: table(place, "+plugins=[antigravity]"),
-    "class_of_a_stranger": lambda place: table(place, "+task.rewards.x={_target_: antigravity.fly}"),
+    "class_of_a_stranger": lambda place: table(
+        place, "+task.rewards.x={_target_: antigravity.fly}"
+    ),
     "override_that_does_not_parse": lambda place: table(place, "a={"),
 }
 
@@ -67,7 +69,17 @@ def tried(name, place: Path):
     path.write_text(yaml.safe_dump(STRANGE[name](place)))
     before = {found for found in place.rglob("*") if found != work}
     said = io.StringIO()
-    words = ["reproduce", str(path), "--smoke", "--device", "cpu", "--output", "tables", "--runs", "runs"]
+    words = [
+        "reproduce",
+        str(path),
+        "--smoke",
+        "--device",
+        "cpu",
+        "--output",
+        "tables",
+        "--runs",
+        "runs",
+    ]
     code = 0
     with (
         mock.patch.dict(os.environ, {"KSIM_RL_SECRET": SECRET}),

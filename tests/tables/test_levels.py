@@ -73,7 +73,9 @@ def test_beside_a_return_each_seed_should_end_with_its_levels():
 
 
 def test_returns_are_compared_with_what_one_of_the_others_reports():
-    results = [{"evaluation": {"return_mean": value}, "falls": 1.0} for value in (400.0, 500.0, 601.0)]
+    results = [
+        {"evaluation": {"return_mean": value}, "falls": 1.0} for value in (400.0, 500.0, 601.0)
+    ]
     assert value_of(RETURN, results) == pytest.approx(500.333, abs=1e-3)
     assert is_reached(RETURN, results) is True
     assert is_reached(RETURN, results[:1]) is False

@@ -87,7 +87,14 @@ def reproduce(monkeypatch, tmp_path):
         started.clear()
         reproduce.most_at_once = 0
         failing["job"] = fail
-        arguments = [str(path), "--output", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"), *words]
+        arguments = [
+            str(path),
+            "--output",
+            str(tmp_path / "out"),
+            "--runs",
+            str(tmp_path / "runs"),
+            *words,
+        ]
         with pytest.raises(SystemExit) as ended:
             main(["reproduce", *arguments])
         written = tmp_path / "out" / "poles.json"
@@ -172,7 +179,9 @@ def test_a_job_that_another_process_took_first_is_no_failure(reproduce, monkeypa
 
     monkeypatch.setattr(runner.run_lock, "is_locked", is_locked)
     code, started, _ = reproduce("--rows", "ppo/Balance", "--seeds", "1", fail=("ppo/Balance", 1))
-    assert started == [("ppo/Balance", 1)] * 2 and code == 1  # it fails again, and nobody else does it
+    assert (
+        started == [("ppo/Balance", 1)] * 2 and code == 1
+    )  # it fails again, and nobody else does it
 
 
 def test_a_job_belongs_to_who_has_its_log_until_that_process_ends(reproduce, tmp_path):
@@ -180,7 +189,8 @@ def test_a_job_belongs_to_who_has_its_log_until_that_process_ends(reproduce, tmp
     job = ("ppo/Balance", 1)
     path = str(reproduce.folder.parent / "poles.yaml")
     first, second = (
-        runner.Runs(load(path), tmp_path / "new", tmp_path / "new_runs", smoke=False) for _ in range(2)
+        runner.Runs(load(path), tmp_path / "new", tmp_path / "new_runs", smoke=False)
+        for _ in range(2)
     )
     taken, log = first._next([job], set(), print)
     assert taken == job
@@ -195,7 +205,9 @@ def test_a_job_belongs_to_who_has_its_log_until_that_process_ends(reproduce, tmp
 def test_what_another_process_has_done_meanwhile_is_kept(reproduce, tmp_path, capsys):
     reproduce("--rows", "ppo/Balance", "--seeds", "1")
     path = str(reproduce.folder.parent / "poles.yaml")
-    runs = runner.Runs(load(path), reproduce.folder / "poles", tmp_path / "runs" / "poles", smoke=False)
+    runs = runner.Runs(
+        load(path), reproduce.folder / "poles", tmp_path / "runs" / "poles", smoke=False
+    )
     assert runs._next([("ppo/Balance", 1)], set(), print) is None
     assert "ppo/Balance, seed 1: done by another process" in capsys.readouterr().out
 
@@ -218,7 +230,8 @@ def test_runs_share_a_gpu_where_no_row_measures_seconds(reproduce, monkeypatch):
     with pytest.raises(ValueError, match="--per-gpu=0"):
         reproduce_command.reproduce([str(reproduce.folder.parent / "poles.yaml"), "--per-gpu", "0"])
     timed = TABLE.replace(
-        "Other: {task: reacher}", "Other: {task: reacher, measure: seconds, levels: {episode/return: 5}}"
+        "Other: {task: reacher}",
+        "Other: {task: reacher, measure: seconds, levels: {episode/return: 5}}",
     )
     (reproduce.folder.parent / "poles.yaml").write_text(timed)
     with pytest.raises(ValueError, match="ppo/Other measures seconds"):
@@ -234,9 +247,14 @@ def test_a_row_whose_levels_no_seed_reaches_is_in_the_table(reproduce):
 
 
 def test_what_training_ended_with_stands_beside_the_return_for_the_worst_seed(reproduce):
-    text = TABLE.replace("Other: {task: reacher}", "Other: {task: reacher, levels: {episode/length: 2}}")
+    text = TABLE.replace(
+        "Other: {task: reacher}", "Other: {task: reacher, levels: {episode/length: 2}}"
+    )
     assert reproduce("--rows", "ppo/Other", text=text)[0] == 1
-    assert "| 8 ± 1, length 1.50 | 2 | 1.0 M | 5 + 1 | no |" in (reproduce.folder / "poles.md").read_text()
+    assert (
+        "| 8 ± 1, length 1.50 | 2 | 1.0 M | 5 + 1 | no |"
+        in (reproduce.folder / "poles.md").read_text()
+    )
     assert reproduce("--rows", "ppo/Other", text=text.replace("length: 2", "length: 1"))[0] == 0
 
 
@@ -301,14 +319,18 @@ class Steps(MetricTerm):
         return view.episode_step_E.to(torch.float32)
 
 
-def test_means_are_of_the_end_of_training_and_of_the_episodes_of_the_evaluation(monkeypatch, tmp_path):
+def test_means_are_of_the_end_of_training_and_of_the_episodes_of_the_evaluation(
+    monkeypatch, tmp_path
+):
     def with_steps(row, seed, **options):
         cfg = run_cfg(row, seed, **options)
         return replace(cfg, task=replace(cfg.task, metrics={"steps": Steps()}))
 
     monkeypatch.setattr(measuring, "run_cfg", with_steps)
     path = tmp_path / "one.yaml"
-    path.write_text(TABLE.replace("Swingup: {", "Swingup: {levels: {rollout/reward: 0, episode/none: 0}, "))
+    path.write_text(
+        TABLE.replace("Swingup: {", "Swingup: {levels: {rollout/reward: 0, episode/none: 0}, ")
+    )
     row = load(str(path)).rows["ppo/Swingup"]
     found = measure(row, 1, tmp_path / "run", device="cpu", smoke=True)
     logged = [point["rollout/reward"] for point in found["curve"]]
@@ -329,7 +351,9 @@ def test_a_row_may_name_the_task_of_a_plug_in(monkeypatch, tmp_path):
     monkeypatch.setenv("KSIM_RL_PLUGINS", "poles_of_mine")
     # What is named here ends with the test: other tests ask for all tasks.
     monkeypatch.setattr(plugins, "_named", [])
-    monkeypatch.setattr(measuring, "measure", lambda row, *_, **__: {"task": run_cfg(row, 1).task_name})
+    monkeypatch.setattr(
+        measuring, "measure", lambda row, *_, **__: {"task": run_cfg(row, 1).task_name}
+    )
     result = tmp_path / "out" / "seed_1.json"
     measuring.main(str(tmp_path / "mine.yaml"), "ppo/Other", "1", str(result), str(tmp_path), "cpu")
     assert json.loads(result.read_text()) == {"task": "balance_of_mine"}
@@ -349,7 +373,16 @@ def test_a_row_may_name_the_task_of_a_plug_in(monkeypatch, tmp_path):
 def test_the_shipped_tables_run_for_two_iterations(table, rows, tmp_path, capsys):
     words = [table, "--rows", rows, "--seeds", "1", "--smoke", "--device", "cpu"]
     with pytest.raises(SystemExit) as ended:
-        main(["reproduce", *words, "--output", str(tmp_path / "out"), "--runs", str(tmp_path / "runs")])
+        main(
+            [
+                "reproduce",
+                *words,
+                "--output",
+                str(tmp_path / "out"),
+                "--runs",
+                str(tmp_path / "runs"),
+            ]
+        )
     said = capsys.readouterr().out
     if "menagerie model" in said or "ksim_rl[playground]" in said:
         pytest.skip(said)

@@ -35,7 +35,12 @@ def written(tmp_path, text=OWN):
 def test_rows_inherit_the_fields_of_their_group(tmp_path):
     table = load(written(tmp_path))
     balance, swingup = table.rows["ppo/Balance"], table.rows["ppo/Swingup"]
-    assert (table.name, balance.seeds, balance.env_states, balance.goal) == ("ours", (1, 2), 1e6, 900.0)
+    assert (table.name, balance.seeds, balance.env_states, balance.goal) == (
+        "ours",
+        (1, 2),
+        1e6,
+        900.0,
+    )
     assert (swingup.env_states, swingup.goal) == (2e6, None)
     assert table.groups() == {"ppo": ["ppo/Balance", "ppo/Swingup"]}
 
@@ -94,7 +99,10 @@ def test_the_other_algorithm_stays_within_its_env_states():
         "manipulation:leap_cube_reorient",
         *(f"tracking:{clip}" for clip in ("walk", "squat", "turn", "kick")),
         *(f"tasks:{row}" for row in load("tasks").rows),
-        *(pytest.param(f"dm_control:{row}", marks=pytest.mark.full) for row in load("dm_control").rows),
+        *(
+            pytest.param(f"dm_control:{row}", marks=pytest.mark.full)
+            for row in load("dm_control").rows
+        ),
     ],
 )
 def test_a_row_composes_with_one_evaluation_at_its_end_and_at_most_its_env_states(name):
@@ -110,7 +118,9 @@ def test_a_row_composes_with_one_evaluation_at_its_end_and_at_most_its_env_state
 def test_the_tables_have_every_task_and_that_of_tasks_asks_of_each_what_the_task_does():
     rows = load("tasks").rows
     elsewhere = {
-        row.task for name in ("velocity", "humanoids", "tracking") for row in load(name).rows.values()
+        row.task
+        for name in ("velocity", "humanoids", "tracking")
+        for row in load(name).rows.values()
     }
     own = [name for name in envs.names() if not envs.task(name).suite]
     assert sorted([*(row.task for row in rows.values()), *elsewhere]) == own
@@ -119,7 +129,8 @@ def test_the_tables_have_every_task_and_that_of_tasks_asks_of_each_what_the_task
         assert name.rpartition("/")[2] == row.task and row.goal == task.solved_at
         if name.startswith("control/"):
             assert (
-                run_cfg(row, 1).trainer.num_iterations == compose([f"task={row.task}"]).trainer.num_iterations
+                run_cfg(row, 1).trainer.num_iterations
+                == compose([f"task={row.task}"]).trainer.num_iterations
             )
 
 

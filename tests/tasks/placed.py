@@ -19,7 +19,9 @@ class Placed:
         self.env.reset()
 
     def set(
-        self, qpos: Mapping[str, float | list[float]], qvel: Mapping[str, float | list[float]] | None = None
+        self,
+        qpos: Mapping[str, float | list[float]],
+        qvel: Mapping[str, float | list[float]] | None = None,
     ) -> None:
         """Start from the default pose at rest, and set some joints by name, one value or one per env."""
         self.world.qpos_EL.copy_(self.view.default_qpos_L.expand_as(self.world.qpos_EL))

@@ -19,7 +19,9 @@ def test_its_config_survives_yaml(name):
 # With those that tests/integration/test_stock_torchrl.py checks, one of each kind of robot, ground and suite. The
 # others, which compile kernels of their own, run in full tests.
 QUICK = ("cartpole_swingup", "dm_control_cartpole_balance", "humanoid_get_up")
-NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in envs.names()]
+NAMES = [
+    name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in envs.names()
+]
 
 
 def test_the_quick_ones_are_tasks():

@@ -20,9 +20,9 @@ def hold(bench, **targets):
     """Let the servos hold the default pose, but for some joints, for half a second."""
     bench.world.ctrl_EL.copy_(bench.view.default_joint_pos_EL)
     for name, value in targets.items():
-        bench.world.ctrl_EL[:, bench.view.resolver.index("actuator", f"arm/{name}")] = torch.tensor(value)[
-            :, None
-        ]
+        bench.world.ctrl_EL[:, bench.view.resolver.index("actuator", f"arm/{name}")] = torch.tensor(
+            value
+        )[:, None]
     bench.world.step(100)
     bench.world.refresh()
     bench.driver.refreshed()
@@ -36,7 +36,9 @@ def test_the_arm_carries_its_weight_and_points_down(bench):
         bench.view.entity("arm").joints.pos_EL, bench.view.default_joint_pos_EL, atol=1e-3, rtol=0.0
     )
     wrist = bench.view.bodies("arm/hand").pos_EN3[:, 0]
-    assert (wrist[:, 2] - tip[:, 2] > 0.99 * 0.142).all(), "the pusher hangs from the wrist, 0.142 m long"
+    assert (wrist[:, 2] - tip[:, 2] > 0.99 * 0.142).all(), (
+        "the pusher hangs from the wrist, 0.142 m long"
+    )
 
 
 def test_the_cube_rests_on_the_table_until_it_is_pushed(bench):
@@ -44,7 +46,9 @@ def test_the_cube_rests_on_the_table_until_it_is_pushed(bench):
     bench.set({})
     hold(bench)
     pos = cube.root_pos_EL.clone()
-    torch.testing.assert_close(pos, torch.tensor([[0.35, 0.0, 0.03]]).expand(E, 3), atol=2e-3, rtol=0.0)
+    torch.testing.assert_close(
+        pos, torch.tensor([[0.35, 0.0, 0.03]]).expand(E, 3), atol=2e-3, rtol=0.0
+    )
     # The pusher beside the cube, low; then each env turns the arm another way: toward it, not at all, away.
     low = {"arm/yaw": 0.4, "arm/shoulder": 0.8, "arm/elbow": 1.55, "arm/wrist": 0.75}
     bench.set(low)
@@ -65,7 +69,9 @@ def test_terms_name_their_entity(bench):
         mdp.TrackPosition(command="target", body="cube/box", std=0.1)
     ).tolist() == pytest.approx([math.exp(-1.0)] * E, abs=1e-4)
     offset = bench.reward(mdp.OffsetToCommand(command="target", body="cube/box"))
-    torch.testing.assert_close(offset, torch.tensor([[0.0, 0.1, 0.0]]).expand(E, 3), atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(
+        offset, torch.tensor([[0.0, 0.1, 0.0]]).expand(E, 3), atol=1e-6, rtol=0.0
+    )
     tip = view.sites("arm/tip").pos_EN3[:, 0]
     to_cube = bench.reward(mdp.OffsetToBody(site="arm/tip", body="cube/box"))
     torch.testing.assert_close(to_cube, torch.tensor([[0.35, 0.0, 0.03]]) - tip)
@@ -83,7 +89,11 @@ def test_a_partial_reset_moves_the_cubes_of_its_rows_only(bench):
         bench.view.entity("cube").root_pos_EL[1], qpos[1, bench.view.entity("cube").root_qpos][:3]
     )
     for row in world.qpos_EL[:, bench.view.entity("cube").root_qpos]:
-        assert 0.28 <= row[0] <= 0.40 and abs(row[1]) <= 0.12 and row[2] == pytest.approx(0.03, abs=1e-6)
+        assert (
+            0.28 <= row[0] <= 0.40
+            and abs(row[1]) <= 0.12
+            and row[2] == pytest.approx(0.03, abs=1e-6)
+        )
 
 
 def test_one_of_body_and_site_is_named():

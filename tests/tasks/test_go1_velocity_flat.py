@@ -27,9 +27,9 @@ def test_model_has_the_physics_of_the_task(figures):
     assert model.opt.timestep == figures["physics"]["timestep"]
     assert model.opt.impratio == figures["physics"]["impratio"]
     resolver = NameResolver(model, torch.device("cpu"))
-    assert [resolver.names("joint")[i] for i in resolver.ids("joint", ROBOT.joint_names)] == figures[
-        "joint_names"
-    ]
+    assert [
+        resolver.names("joint")[i] for i in resolver.ids("joint", ROBOT.joint_names)
+    ] == figures["joint_names"]
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,10 @@ def test_group_sizes_and_a_short_rollout(env, figures):
         assert env.observation_spec[group].shape == (4, size)
     assert env.action_spec.shape == (4, len(figures["joint_names"]))
     rollout = env.rollout(6, break_when_any_done=False)
-    assert torch.isfinite(rollout["next", "critic"]).all() and torch.isfinite(rollout["next", "reward"]).all()
+    assert (
+        torch.isfinite(rollout["next", "critic"]).all()
+        and torch.isfinite(rollout["next", "reward"]).all()
+    )
     critic, bias = (
         rollout["obs", "joint_pos"],
         rollout["obs", "joint_pos_biased"] - rollout["obs", "joint_pos"],

@@ -16,7 +16,9 @@ def close(actual, expected):
 
 def test_pendulum():
     bench = Placed("pendulum_swingup", 5)
-    bench.set({"hinge": [0.0, 0.1, math.pi, math.pi / 2, 0.0]}, {"hinge": [0.0, 0.0, 0.0, 0.0, 5.0]})
+    bench.set(
+        {"hinge": [0.0, 0.1, math.pi, math.pi / 2, 0.0]}, {"hinge": [0.0, 0.0, 0.0, 0.0, 5.0]}
+    )
     rated = bench.reward(control_suite.PendulumReward())
     # Level with the axle the cosine is 0, about half-way from hanging to 8 degrees from upright.
     # At 5 rad/s "slow" is 0.1.
@@ -34,7 +36,9 @@ def test_reacher():
     bench = Placed("reacher", 3)
     # Straight along x, the finger is 0.25 m from the hub; targets on it, at its margin, and beyond the tolerated 15 mm.
     bench.set({"shoulder": 0.0, "wrist": 0.0})
-    bench.driver.readings.commands["target"] = torch.tensor([[0.25, 0.0], [0.25, 0.115], [0.25, 0.0149]])
+    bench.driver.readings.commands["target"] = torch.tensor(
+        [[0.25, 0.0], [0.25, 0.115], [0.25, 0.0149]]
+    )
     close(bench.reward(control_suite.ReacherReward()), [1.0, 0.1, 1.0])
 
 
@@ -102,4 +106,6 @@ def test_they_stand_on_the_ground_at_the_start(name):
     bench.driver.refreshed()
     after = bench.view.joints("root_z").pos_EL
     assert lowest > -0.001
-    assert (before - after).abs().max() < 0.06, "they neither fall through the ground nor are thrown up"
+    assert (before - after).abs().max() < 0.06, (
+        "they neither fall through the ground nor are thrown up"
+    )

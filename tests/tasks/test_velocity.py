@@ -38,7 +38,9 @@ def env(request):
 def test_zero_action_stands_for_two_seconds(env):
     base = env.base_env
     (robot,) = base.cfg.scene.robots.values()
-    seconds = 0.7 if robot.name == "g1" else 2.0  # whose reference gains are too soft to stand on for longer
+    seconds = (
+        0.7 if robot.name == "g1" else 2.0
+    )  # whose reference gains are too soft to stand on for longer
     td = env.reset()
     zero = torch.zeros(env.action_spec.shape)
     for _ in range(round(seconds / base.step_dt)):
@@ -95,7 +97,9 @@ def test_get_up_starts_anywhere_and_rewards_standing(fallen):
         stands_E = base.cfg.metrics["stands"](view)
     assert (standing_E >= 0).all() and (standing_E <= 1).all()
     assert (standing_E[~tall_E] < 0.6).all()
-    assert not stands_E[~tall_E & (height_E < 0.6 * base.cfg.rewards["height"].standing_height)].any()
+    assert not stands_E[
+        ~tall_E & (height_E < 0.6 * base.cfg.rewards["height"].standing_height)
+    ].any()
 
 
 def test_get_up_rates_the_stance_highest(fallen):
@@ -122,9 +126,15 @@ def test_get_up_rates_the_stance_highest(fallen):
             if name in ("upright", "height", "standing")
         }
         stands_E = base.cfg.metrics["stands"](view)
-    torch.testing.assert_close(reward["upright"][:3], torch.tensor([1.0, 0.5, 0.0]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        reward["upright"][:3], torch.tensor([1.0, 0.5, 0.0]), atol=1e-5, rtol=0
+    )
     torch.testing.assert_close(reward["height"][:2], torch.tensor([1.0, 0.4]), atol=0.03, rtol=0)
-    assert reward["standing"][0] > 0.99 and reward["standing"][1] < 0.1 and reward["standing"][2] == 0.0
+    assert (
+        reward["standing"][0] > 0.99
+        and reward["standing"][1] < 0.1
+        and reward["standing"][2] == 0.0
+    )
     assert reward["standing"][3] < 0.2  # it shakes
     assert stands_E[:4].tolist() == [1.0, 0.0, 0.0, 1.0]
 
@@ -143,9 +153,16 @@ def test_actions_of_the_delayed_quadruped_arrive_up_to_two_steps_late():
 
 def test_feet_of_several_geoms_are_refused_before_anything_is_built():
     robot = Humanoid()
-    parts = {"sim": velocity.sim(), "viewer": ViewerCfg(), "rewards": {}, "events": {}, "observations": {}}
+    parts = {
+        "sim": velocity.sim(),
+        "viewer": ViewerCfg(),
+        "rewards": {},
+        "events": {},
+        "observations": {},
+    }
     with pytest.raises(
-        ValueError, match=r"feet: 4 geom elements .* for 2 foot_sites: .*ContactSensor\(bodies=...\)"
+        ValueError,
+        match=r"feet: 4 geom elements .* for 2 foot_sites: .*ContactSensor\(bodies=...\)",
     ):
         velocity.velocity_cfg(robot, feet=ContactSensor(geoms=robot.foot_geoms), **parts)
     for feet in (ContactSensor(bodies=robot.foot_bodies), ContactSensor(geoms=(".*_foot_inner",))):
@@ -175,9 +192,7 @@ def test_commands_become_faster_by_stages():
 @pytest.mark.full
 def test_a_humanoid_that_gets_up_is_not_thrown_about_by_its_first_policy():
     """Its joints move at up to 24 rad/s in 99 % of what they do; with an output gain of 1 that were 72."""
-    words = (
-        "device=cpu logger=none num_envs=128 data.num_env_states_per_minibatch=768 trainer.eval_episodes=0"
-    )
+    words = "device=cpu logger=none num_envs=128 data.num_env_states_per_minibatch=768 trainer.eval_episodes=0"
     trainer = build(conf.compose(["task=humanoid_get_up", *words.split()]))
     joints = trainer.collector.env.action_spec.shape[-1]
     rollout_ET: Any = trainer.collector.collect()

@@ -161,9 +161,17 @@ def test_actions_follow_the_joint_names(ref):
 
 def test_command_is_that_of_the_page(ref):
     command = ref.cfg.commands["twist"]
-    assert (command.lin_vel_x, command.lin_vel_y, command.ang_vel_z) == ((-1, 1), (-1, 1), (-0.5, 0.5))
+    assert (command.lin_vel_x, command.lin_vel_y, command.ang_vel_z) == (
+        (-1, 1),
+        (-1, 1),
+        (-0.5, 0.5),
+    )
     assert command.resampling_time_range_s == (3, 8)
-    assert (command.rel_standing_envs, command.rel_heading_envs, command.rel_forward_envs) == (0.1, 0.3, 0.2)
+    assert (command.rel_standing_envs, command.rel_heading_envs, command.rel_forward_envs) == (
+        0.1,
+        0.3,
+        0.2,
+    )
     assert (command.heading_stiffness, command.forward_min_speed) == (0.5, 0.3)
     assert ref.cfg.episode_length_s == 20.0
     assert not ref.cfg.is_finite_horizon and ref.cfg.scale_rewards_by_dt

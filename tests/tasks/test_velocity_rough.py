@@ -14,8 +14,18 @@ POINTS = 17 * 11
 @pytest.mark.parametrize("robot", ["go1", "g1"])
 def test_it_is_the_flat_task_but_for_the_ground(robot):
     flat, rough = (envs.task(f"{robot}_velocity_{ground}").cfg() for ground in ("flat", "rough"))
-    assert isinstance(flat.scene.terrain, PlaneTerrain) and isinstance(rough.scene.terrain, TerrainGrid)
-    for field in ("actions", "commands", "rewards", "events", "metrics", "decimation", "episode_length_s"):
+    assert isinstance(flat.scene.terrain, PlaneTerrain) and isinstance(
+        rough.scene.terrain, TerrainGrid
+    )
+    for field in (
+        "actions",
+        "commands",
+        "rewards",
+        "events",
+        "metrics",
+        "decimation",
+        "episode_length_s",
+    ):
         assert getattr(rough, field) == getattr(flat, field), field
     assert rough.scene.robots == flat.scene.robots and rough.scene.sensors == flat.scene.sensors
     for name, group in flat.observations.items():

@@ -79,7 +79,9 @@ class ObservesTheNextEpisode(Masked):
         fresh = self._observe()
         for key in ("count", "episode", "drawn"):
             stepped[key] = torch.where(ended_E1, fresh[key], stepped[key])
-        stepped["obs", "vector"] = torch.where(ended_E1, fresh["obs"]["vector"], stepped["obs", "vector"])
+        stepped["obs", "vector"] = torch.where(
+            ended_E1, fresh["obs"]["vector"], stepped["obs", "vector"]
+        )
         return stepped
 
     def _reset(self, tensordict=None, **kwargs):
@@ -157,7 +159,9 @@ class Counting(RewardTerm):
 
 def test_python_that_changes_is_named_where_steps_are_recorded():
     env = puck_env(rewards={"counting": Counting()})
-    with pytest.raises(AssertionError, match=r"\[python\] rewards\.counting: Counting\.calls\[\d+\]"):
+    with pytest.raises(
+        AssertionError, match=r"\[python\] rewards\.counting: Counting\.calls\[\d+\]"
+    ):
         check_env(env, skip=[name for name in CHECKS if name != "python"])
 
 

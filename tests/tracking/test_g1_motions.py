@@ -50,7 +50,9 @@ def each_frame(motion):
 def test_it_lasts_and_is_quick(motion):
     assert motion.fps == FPS
     assert motion.time_F[-1] >= 8.0
-    assert np.percentile(np.abs(motion.qvel_FM[:, 6:]), 95.0) > 2.0, "rad/s, of all joints in all frames"
+    assert np.percentile(np.abs(motion.qvel_FM[:, 6:]), 95.0) > 2.0, (
+        "rad/s, of all joints in all frames"
+    )
 
 
 def test_velocities_are_those_of_its_positions(motion):
@@ -103,13 +105,16 @@ def test_pressure_stays_under_the_soles_that_stand(motion):
         heading = start[3] + share * (end[3] - start[3])
         away_2 = zmp_2 - start[:2] - share * line_2
         ahead, aside = (
-            np.array(((np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading)))) @ away_2
+            np.array(((np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading))))
+            @ away_2
         )
         assert abs(ahead) < SOLE[0] and abs(aside) < SOLE[1], (frame, ahead, aside)
 
 
 def test_its_motors_can_do_it(motion):
-    asked = demand(motion.model, motion.qpos_FL, FPS, feet=FIGURE.feet, planted_FN=motion.planted_FN)
+    asked = demand(
+        motion.model, motion.qpos_FL, FPS, feet=FIGURE.feet, planted_FN=motion.planted_FN
+    )
     joints = motion.model.actuator_trnid[:, 0]
     torque_FM = np.abs(asked.torque_FM[:, motion.model.jnt_dofadr[joints] - 6])
     assert (torque_FM / motion.model.actuator_forcerange[:, 1]).max() < 0.6

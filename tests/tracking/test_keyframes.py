@@ -24,7 +24,12 @@ def steps():
         feet=((0.0, 0.1, 0.0), (0.0, -0.1, 0.0)),
         moves=(
             FootMove(
-                foot=0, begin_s=0.6, end_s=1.0, to=(0.3, 0.1, 0.5), lift=((0.2, 0.08),), pitch=((0.1, 0.4),)
+                foot=0,
+                begin_s=0.6,
+                end_s=1.0,
+                to=(0.3, 0.1, 0.5),
+                lift=((0.2, 0.08),),
+                pitch=((0.1, 0.4),),
             ),
             FootMove(foot=1, begin_s=1.1, end_s=1.5, to=(0.3, -0.1, 0.5), lift=((0.2, 0.08),)),
         ),

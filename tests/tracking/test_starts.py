@@ -43,14 +43,18 @@ def test_errors_of_the_start_keep_their_ranges():
             and 0.8 * high < away_E3[:, axis].max() <= high + 1e-5
         )
     kick_E3 = view.root_lin_vel_w_EL - qvel_EL[:, :3]
-    assert (kick_E3.abs().amax(0) <= torch.tensor((0.5, 0.5, 0.2)) + 1e-4).all() and kick_E3.abs().max() > 0.4
+    assert (
+        kick_E3.abs().amax(0) <= torch.tensor((0.5, 0.5, 0.2)) + 1e-4
+    ).all() and kick_E3.abs().max() > 0.4
     turn, world = np.empty(4), np.empty(3)
     for row in range(20):
         mujoco.mju_negQuat(turn, qpos_EL[row, 3:7].double().numpy())
         mujoco.mju_mulQuat(turn, view.root_quat_EL[row].double().numpy(), turn.copy())
         # Turned in the world by roll, pitch and yaw of at most 0.1, 0.1 and 0.2 rad.
         assert 2.0 * np.arccos(min(1.0, abs(turn[0]))) < np.sqrt(0.1**2 + 0.1**2 + 0.2**2) + 1e-3
-        mujoco.mju_rotVecQuat(world, qvel_EL[row, 3:6].double().numpy(), qpos_EL[row, 3:7].double().numpy())
+        mujoco.mju_rotVecQuat(
+            world, qvel_EL[row, 3:6].double().numpy(), qpos_EL[row, 3:7].double().numpy()
+        )
         spin = view.root_ang_vel_w_EL[row].numpy() - world
         assert (np.abs(spin) < np.array((0.52, 0.52, 0.78)) + 1e-4).all()
     off_EL = (view.joint_pos_EL - qpos_EL[:, 7:]).abs()

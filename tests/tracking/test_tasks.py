@@ -47,4 +47,6 @@ def test_two_iterations_of_training(tmp_path):
     outcome = run(cfg, tmp_path / "run", progress=RunProgress(2))
     assert outcome.env_states == 2 * 32
     _, lines = read_table(tmp_path / "run" / "metrics.csv")
-    assert all(math.isfinite(float(line[name])) for line in lines for name in ("loss/policy", "loss/value"))
+    assert all(
+        math.isfinite(float(line[name])) for line in lines for name in ("loss/policy", "loss/value")
+    )

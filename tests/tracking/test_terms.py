@@ -155,7 +155,9 @@ def test_errors(bench, states):
     drift_E = read(bench, terms.BodyDrift(**OF_BODIES))
     for env, (own, wanted) in enumerate(states):
         pos_N3, _ = aligned(own, wanted)
-        assert error_E[env] == pytest.approx(np.linalg.norm(own.pos_N3 - pos_N3, axis=-1).mean(), abs=1e-5)
+        assert error_E[env] == pytest.approx(
+            np.linalg.norm(own.pos_N3 - pos_N3, axis=-1).mean(), abs=1e-5
+        )
         assert drift_E[env] == pytest.approx(
             np.linalg.norm(own.pos_N3 - wanted.pos_N3, axis=-1).mean(), abs=1e-5
         )

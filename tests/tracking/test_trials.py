@@ -36,14 +36,18 @@ def run_cfg(clip, **limits):
     cfg = conf.compose(["task=g1_track_walk", "device=cpu", "num_envs=4"])
     task = track_cfg(clip)
     terminations = {
-        name: dataclasses.replace(term, distance=limits["distance"]) if hasattr(term, "distance") else term
+        name: dataclasses.replace(term, distance=limits["distance"])
+        if hasattr(term, "distance")
+        else term
         for name, term in task.terminations.items()
     }
     return dataclasses.replace(cfg, task=dataclasses.replace(task, terminations=terminations))
 
 
 def still():
-    return TensorDictModule(lambda actor_EL: torch.zeros(*actor_EL.shape[:-1], 29), ["actor"], ["action"])
+    return TensorDictModule(
+        lambda actor_EL: torch.zeros(*actor_EL.shape[:-1], 29), ["actor"], ["action"]
+    )
 
 
 def test_all_succeed_whom_no_limit_ends(short_clip):
@@ -69,7 +73,10 @@ def test_the_command_says_how_many_succeed(short_clip, monkeypatch, capsys):
 
 
 def test_none_succeeds_where_the_limit_is_tight(short_clip):
-    assert run_trials(run_cfg(short_clip, distance=1e-4), still(), trials=6, note=pytest.fail).success == 0.0
+    assert (
+        run_trials(run_cfg(short_clip, distance=1e-4), still(), trials=6, note=pytest.fail).success
+        == 0.0
+    )
 
 
 def test_trials_begin_with_the_motion_and_are_not_pushed():
@@ -77,7 +84,9 @@ def test_trials_begin_with_the_motion_and_are_not_pushed():
     start = cfg.events["start"]
     assert isinstance(start, StartInMotion)
     assert (start.start_range, start.part_s, start.joint_range) == ((0.0, 0.0), None, 0.1)
-    assert "push_robot" not in cfg.events and {"foot_friction", "base_com", "default_pose"} <= set(cfg.events)
+    assert "push_robot" not in cfg.events and {"foot_friction", "base_com", "default_pose"} <= set(
+        cfg.events
+    )
     assert cfg.curriculum == {}
     assert "push_robot" in trial_cfg(track_cfg("g1_walk"), pushes=True).events
 
@@ -93,9 +102,12 @@ def test_the_tasks_have_the_limits_of_the_peer():
     assert (HEIGHT_LIMIT, UPRIGHT_LIMIT) == (0.25, 0.8)
     for task in TASKS:
         terminations = task.cfg().terminations
-        assert terminations["anchor_height"].distance == terminations["ends_height"].distance == 0.25
+        assert (
+            terminations["anchor_height"].distance == terminations["ends_height"].distance == 0.25
+        )
         assert terminations["anchor_upright"].limit == 0.8
         assert not any(
-            terminations[name].time_out for name in ("anchor_height", "anchor_upright", "ends_height")
+            terminations[name].time_out
+            for name in ("anchor_height", "anchor_upright", "ends_height")
         )
         assert terminations["finished"].time_out

@@ -9,7 +9,13 @@ from ksim_rl.cli import main
 from ksim_rl.trainers import checkpoint
 from tests.cli.payloads import SMALL
 
-WORDS = ("task=cartpole_balance", *SMALL, "trainer.num_iterations=1", "trainer.eval_episodes=0", "device=cpu")
+WORDS = (
+    "task=cartpole_balance",
+    *SMALL,
+    "trainer.num_iterations=1",
+    "trainer.eval_episodes=0",
+    "device=cpu",
+)
 
 
 def called(*words):

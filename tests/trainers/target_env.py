@@ -38,7 +38,8 @@ class TargetEnv(MaskedReset):
         self.target_E1 = torch.zeros(num_envs, 1)
         self.return_E = torch.zeros(num_envs)
         self.totals = {
-            name: torch.tensor(0.0) for name in ("episodes", "length_sum", "return_sum", "reward/hit")
+            name: torch.tensor(0.0)
+            for name in ("episodes", "length_sum", "return_sum", "reward/hit")
         }
         self.totals["termination/non_finite"] = torch.tensor(0.0)
         vector, flag = Unbounded((num_envs, 1)), Binary(1, (num_envs, 1), dtype=torch.bool)
@@ -51,7 +52,9 @@ class TargetEnv(MaskedReset):
         )
 
     def _observe(self, **flags):
-        keys = random.row_keys(self.seed_value, 1, self.episode_E * 100 + self.step_E, self.batch_size[0])
+        keys = random.row_keys(
+            self.seed_value, 1, self.episode_E * 100 + self.step_E, self.batch_size[0]
+        )
         self.target_E1 = random.uniform(keys, 1, -1.0, 1.0)
         clean = {"actor": self.target_E1, "critic": self.target_E1.clone()}
         return TensorDict({**clean, **flags}, batch_size=self.batch_size)
@@ -72,7 +75,9 @@ class TargetEnv(MaskedReset):
         self.totals["length_sum"] += (self.step_E * done_E).sum()
         self.totals["return_sum"] += (self.return_E * done_E).sum()
         self.totals["reward/hit"] += (self.return_E * done_E).sum()
-        return self._observe(reward=reward_E1, done=done_E1, terminated=terminated_E1, truncated=truncated_E1)
+        return self._observe(
+            reward=reward_E1, done=done_E1, terminated=terminated_E1, truncated=truncated_E1
+        )
 
     def _reset(self, tensordict=None, **_):
         mask_E = torch.ones(self.batch_size, dtype=torch.bool)
@@ -97,7 +102,9 @@ class TargetEnv(MaskedReset):
 
     def _kept(self):
         names = ("seed_value", "step_E", "episode_E", "return_E", "target_E1")
-        return {name: getattr(self, name) for name in names} | {f"log/{k}": v for k, v in self.totals.items()}
+        return {name: getattr(self, name) for name in names} | {
+            f"log/{k}": v for k, v in self.totals.items()
+        }
 
     def state_dict(self, *_, **__):
         return {name: value.clone() for name, value in self._kept().items()}
@@ -137,7 +144,10 @@ def make_trainer(
     torch.manual_seed(seed)
     env = make_env(seed=seed, noise=noise) if env is None else env
     actor = make_actor(
-        ActorCfg(hidden_dims=(16,), init_std=0.5), obs_dim=1, action_dim=1, action_spec=env.action_spec
+        ActorCfg(hidden_dims=(16,), init_std=0.5),
+        obs_dim=1,
+        action_dim=1,
+        action_spec=env.action_spec,
     )
     critic = make_critic(CriticCfg(hidden_dims=(16,)), obs_dim=1)
     data = DatasetCfg(num_env_states_per_minibatch=64, num_minibatches=4)
@@ -149,7 +159,9 @@ def make_trainer(
     fields = {"num_iterations": iterations, "eval_interval": 0, "checkpoint_interval": 0, **cfg}
     trainer = Trainer(
         TrainerCfg(**fields),
-        collector=RolloutCollector(env, actor, rollout_length=rollout_length, keys=update.rollout_keys),
+        collector=RolloutCollector(
+            env, actor, rollout_length=rollout_length, keys=update.rollout_keys
+        ),
         update=update,
         evaluator=Evaluator(evaluation_env, actor, max_steps=LENGTH, seed=7),
         solved_at=solved_at,

@@ -40,4 +40,8 @@ def test_evaluations_and_checkpoints_keep_the_engine_that_was_chosen_for_trainin
     compiled, notes = build(conf.compose(overrides)), Notes()
     assert part(compiled.collector.env, ManagerBasedRlEnv).world.engine == "warp"
     compiled.train(notes)
-    assert [note for note in notes.notes if note.startswith("collector.compile=true: MuJoCo Warp simulates")]
+    assert [
+        note
+        for note in notes.notes
+        if note.startswith("collector.compile=true: MuJoCo Warp simulates")
+    ]

@@ -57,8 +57,14 @@ def test_only_the_newest_stay_and_no_other_file_is_left(tmp_path):
 
 def test_the_newest_one_that_is_trusted_stays_as_well(tmp_path):
     for iteration, trusted in ((5, 5), (10, 5), (15, 12), (20, 12), (25, 12)):
-        checkpoint.save(tmp_path, STATE, iteration=iteration, config=CONFIG, keep=2, trusted=trusted)
-    assert [entry.name for entry in checkpoint.saved(tmp_path)] == ["00000010", "00000020", "00000025"]
+        checkpoint.save(
+            tmp_path, STATE, iteration=iteration, config=CONFIG, keep=2, trusted=trusted
+        )
+    assert [entry.name for entry in checkpoint.saved(tmp_path)] == [
+        "00000010",
+        "00000020",
+        "00000025",
+    ]
     checkpoint.save(tmp_path, STATE, iteration=30, config=CONFIG, keep=2, trusted=30)
     assert [entry.name for entry in checkpoint.saved(tmp_path)] == ["00000025", "00000030"]
     assert checkpoint.newest_until(tmp_path, 29) == tmp_path / "00000025"
@@ -75,7 +81,11 @@ def test_saving_the_same_iteration_again_keeps_both_until_one_is_old(tmp_path):
 @pytest.mark.parametrize("given", ["run folder", "checkpoint folder", "checkpoint"])
 def test_the_newest_is_found_from_each_level(tmp_path, saved, given):
     checkpoint.save(tmp_path / "checkpoint", STATE, iteration=3, config=CONFIG)
-    path = {"run folder": tmp_path, "checkpoint folder": tmp_path / "checkpoint", "checkpoint": saved}[given]
+    path = {
+        "run folder": tmp_path,
+        "checkpoint folder": tmp_path / "checkpoint",
+        "checkpoint": saved,
+    }[given]
     assert checkpoint.load_latest(path).path == saved
 
 
@@ -225,21 +235,37 @@ def test_the_config_keeps_its_order(tmp_path):
 
 def test_a_checkpoint_of_version_1_gets_back_the_order_of_its_observations(tmp_path):
     """Version 1 sorted the config by name; the columns say how the terms stood."""
-    columns = {"actor": {"actor_terms/velocity": [0, 3], "obs/angle": [5, 6], "obs/command": [3, 5]}}
+    columns = {
+        "actor": {"actor_terms/velocity": [0, 3], "obs/angle": [5, 6], "obs/command": [3, 5]}
+    }
     terms = {"angle": 2, "command": 3, "velocity": 1}
-    config = {"task": {"observations": {"actor": {"keep": True, "terms": terms}, "plain": {"terms": terms}}}}
-    saved = checkpoint.save(tmp_path, STATE | {"observation_columns": columns}, iteration=1, config=config)
+    config = {
+        "task": {
+            "observations": {"actor": {"keep": True, "terms": terms}, "plain": {"terms": terms}}
+        }
+    }
+    saved = checkpoint.save(
+        tmp_path, STATE | {"observation_columns": columns}, iteration=1, config=config
+    )
     observations = checkpoint.load(with_version(saved, 1)).config["task"]["observations"]
-    assert list(observations["actor"]["terms"].items()) == [("velocity", 1), ("command", 3), ("angle", 2)]
+    assert list(observations["actor"]["terms"].items()) == [
+        ("velocity", 1),
+        ("command", 3),
+        ("angle", 2),
+    ]
     assert observations["actor"]["keep"] is True
-    assert list(observations["plain"]["terms"]) == ["angle", "command", "velocity"], "nothing is known of it"
+    assert list(observations["plain"]["terms"]) == ["angle", "command", "velocity"], (
+        "nothing is known of it"
+    )
 
 
 def test_a_checkpoint_of_version_1_is_migrated(saved):
     """Version 1 is what ksim_rl wrote before hooks had a state."""
     loaded = checkpoint.load(with_version(saved, 1))
     assert loaded.state["hooks"] == loaded.state["update"]["recurrent_state"] == {}
-    assert torch.equal(loaded.state["update"]["actor"]["weight"], STATE["update"]["actor"]["weight"])
+    assert torch.equal(
+        loaded.state["update"]["actor"]["weight"], STATE["update"]["actor"]["weight"]
+    )
     assert loaded.state["sampler"] == STATE["sampler"]
 
 
@@ -266,7 +292,10 @@ def payloads(trace):
     yield "zip", archive.getvalue()
     yield "header", (2**62).to_bytes(8, "little") + b"{}"
     yield "nested", b"[" * 200_000
-    yield "target", json.dumps({"manifest": {"_target_": "os.system", "_args_": [f"touch {trace}"]}}).encode()
+    yield (
+        "target",
+        json.dumps({"manifest": {"_target_": "os.system", "_args_": [f"touch {trace}"]}}).encode(),
+    )
 
 
 @pytest.mark.parametrize("file", [MANIFEST, TENSORS])
@@ -350,9 +379,13 @@ def kill_while_saving(folder, times):
         for path in checkpoint.saved(folder):
             intact = checkpoint.load(path)
             assert intact.state["iteration"] == intact.iteration
-            assert torch.equal(intact.state["weight"], torch.full((20000,), float(intact.iteration)))
+            assert torch.equal(
+                intact.state["weight"], torch.full((20000,), float(intact.iteration))
+            )
     checkpoint.remove_leftovers(folder)
-    assert {entry.name for entry in folder.iterdir()} == {path.name for path in checkpoint.saved(folder)}
+    assert {entry.name for entry in folder.iterdir()} == {
+        path.name for path in checkpoint.saved(folder)
+    }
     assert len(checkpoint.saved(folder)) <= 3
 
 
@@ -391,10 +424,14 @@ def test_a_newest_checkpoint_of_an_unknown_format_is_not_passed_over(tmp_path):
         checkpoint.load_latest(tmp_path)
 
 
-@pytest.mark.parametrize("error", [KeyError("seed"), TypeError("no"), AttributeError("no"), IndexError("no")])
+@pytest.mark.parametrize(
+    "error", [KeyError("seed"), TypeError("no"), AttributeError("no"), IndexError("no")]
+)
 def test_a_state_of_another_kind_is_refused_with_its_checkpoint(tmp_path, error):
     with (
-        pytest.raises(checkpoint.CheckpointError, match=f"{tmp_path}: it holds another state .*{error}"),
+        pytest.raises(
+            checkpoint.CheckpointError, match=f"{tmp_path}: it holds another state .*{error}"
+        ),
         checkpoint.fitting(tmp_path),
     ):
         raise error

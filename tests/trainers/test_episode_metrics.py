@@ -62,7 +62,9 @@ def test_rewards_ends_and_the_levels_of_curricula_and_commands_reach_the_table(t
             "heights": mdp.CommandRangesByLevel(command="height", **ranges),
         },
     )
-    rollout_ET = env.rollout(4, lambda td: td.set("action", torch.zeros(3, 1)), break_when_any_done=False)
+    rollout_ET = env.rollout(
+        4, lambda td: td.set("action", torch.zeros(3, 1)), break_when_any_done=False
+    )
     env.reset()  # the level moves when envs reset
     sums = start_copy(read_episode_sums(env, rollout_ET), device=env.device).read()
     table = CsvTable(tmp_path / "metrics.csv")
@@ -74,7 +76,8 @@ def test_rewards_ends_and_the_levels_of_curricula_and_commands_reach_the_table(t
     assert float(row["reward/still"]) == pytest.approx(-0.5 * float(row["reward/position"])) != 0.0
     assert float(row["curriculum/level"]) == float(row["curriculum/heights"]) == 0.25
     assert (
-        float(row["command/height/height_low"]) == 0.375 and float(row["command/height/height_high"]) == 0.625
+        float(row["command/height/height_low"]) == 0.375
+        and float(row["command/height/height_high"]) == 0.625
     )
     assert env.episode_log()["episodes"] == 0.0, "and the sums start anew"
 

@@ -20,13 +20,19 @@ class ForeignEnv(EnvBase):
         one, flag = Unbounded((E, 1)), Binary(1, (E, 1), dtype=torch.bool)
         self.observation_spec = Composite(actor=one.clone(), critic=one.clone(), shape=[E])
         self.action_spec, self.reward_spec = one.clone(), one.clone()
-        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=[E])
+        self.full_done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=[E]
+        )
         self.step_E1 = torch.zeros(E, 1)
         self.target_E1 = torch.zeros(E, 1)
 
     def _shown(self, **more):
         done_E1 = self.step_E1 >= 8
-        flags = {"done": done_E1, "truncated": done_E1.clone(), "terminated": torch.zeros_like(done_E1)}
+        flags = {
+            "done": done_E1,
+            "truncated": done_E1.clone(),
+            "terminated": torch.zeros_like(done_E1),
+        }
         observed = {"actor": self.target_E1.clone(), "critic": self.target_E1.clone()}
         return TensorDict({**observed, **flags, **more}, batch_size=[E])
 

@@ -89,7 +89,9 @@ def test_a_model_that_is_as_it_was_is_used_where_it_lies(robot, run):
     assert with_kept_models(cfg, run, note=said.append) == cfg and said == []
 
 
-def test_in_another_folder_the_copy_stands_in_for_a_relative_path(robot, run, tmp_path, monkeypatch):
+def test_in_another_folder_the_copy_stands_in_for_a_relative_path(
+    robot, run, tmp_path, monkeypatch
+):
     cfg, said = kept(robot, run)
     monkeypatch.chdir(tmp_path)
     source = source_of(with_kept_models(cfg, run, note=said.append))
@@ -132,7 +134,9 @@ def test_another_model_that_is_asked_for_is_taken(robot, run, tmp_path):
     _, said = kept(robot, run)
     other = tmp_path / "other.xml"
     other.write_text(
-        ROBOT.replace('<include file="parts/asset.xml"/>', "").replace('type="mesh" mesh="cart"', 'size="1"')
+        ROBOT.replace('<include file="parts/asset.xml"/>', "").replace(
+            'type="mesh" mesh="cart"', 'size="1"'
+        )
     )
     cfg = cfg_of(other)
     assert with_kept_models(cfg, run, note=said.append) == cfg and said == []
@@ -157,7 +161,9 @@ def test_a_urdf_file_of_a_package_is_copied_with_what_it_finds_there(run, tmp_pa
     (package / "cart" / "meshes" / "cart.obj").write_text(TETRAHEDRON)
     mesh = '<geometry><mesh filename="package://robots/cart/meshes/cart.obj"/></geometry>'
     urdf = package / "cart" / "urdf" / "cart.urdf"
-    urdf.write_text(f'<robot name="cart"><link name="cart"><collision>{mesh}</collision></link></robot>')
+    urdf.write_text(
+        f'<robot name="cart"><link name="cart"><collision>{mesh}</collision></link></robot>'
+    )
     (tmp_path / "linked").symlink_to(tmp_path / "share")
     for source in (urdf, tmp_path / "linked" / "robots" / "cart" / "urdf" / "cart.urdf"):
         _, said = kept(source, run)
@@ -206,7 +212,9 @@ def test_a_strangers_record_is_refused_in_one_line(robot, run, text):
 def test_a_record_that_names_a_path_outside_is_refused(robot, run, tmp_path):
     cfg, _ = kept(robot, run)
     plain = json.loads((run / "models.json").read_text())
-    plain["robots/cart"]["copy"] = os.path.relpath(tmp_path / "home" / "robot" / "cart.xml", run / "models")
+    plain["robots/cart"]["copy"] = os.path.relpath(
+        tmp_path / "home" / "robot" / "cart.xml", run / "models"
+    )
     (run / "models.json").write_text(json.dumps(plain))
     robot.write_text(ROBOT + "\n")
     with pytest.raises(ValueError, match="lies outside of it"):

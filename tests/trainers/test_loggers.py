@@ -40,7 +40,9 @@ def test_a_torchrl_logger_works_as_it_is(tmp_path):
 @pytest.mark.parametrize(("name", "cfg"), [("wandb", WandbCfg()), ("mlflow", MLflowCfg())])
 def test_a_logger_without_its_package_says_how_to_install_it(monkeypatch, name, cfg):
     real = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda wanted: None if wanted == name else real(wanted))
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda wanted: None if wanted == name else real(wanted)
+    )
     check_installed(LoggerCfg())
     with pytest.raises(ValueError, match=rf"logger.{name}: .* pip install 'ksim_rl\[{name}\]'"):
         check_installed(LoggerCfg(**{name: cfg}))
@@ -63,7 +65,9 @@ def test_mlflow_has_figures_and_config_of_a_run_that_was_resumed(tmp_path, monke
 
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     folder = tmp_path / "2030-01-01"
-    log_two_sessions(LoggerCfg(csv=False, tensorboard=False, mlflow=MLflowCfg(experiment="probe")), folder)
+    log_two_sessions(
+        LoggerCfg(csv=False, tensorboard=False, mlflow=MLflowCfg(experiment="probe")), folder
+    )
     client = MlflowClient(f"sqlite:///{folder / 'mlflow' / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("probe")
     (found,) = client.search_runs([experiment.experiment_id])
@@ -105,7 +109,11 @@ def test_wandb_offline_has_figures_and_config_of_a_run_that_was_resumed(tmp_path
     records = list(wandb_records(folder))
     runs = [record.run for record in records if record.WhichOneof("record_type") == "run"]
     assert {run.run_id for run in runs} == {(folder / "wandb" / "run_id").read_text()}
-    assert runs[0].project == "probe" and runs[0].display_name == "2030-01-01" and "test" in runs[0].tags
+    assert (
+        runs[0].project == "probe"
+        and runs[0].display_name == "2030-01-01"
+        and "test" in runs[0].tags
+    )
     rows = [
         {item.key or "/".join(item.nested_key): item.value_json for item in record.history.item}
         for record in records
@@ -113,7 +121,9 @@ def test_wandb_offline_has_figures_and_config_of_a_run_that_was_resumed(tmp_path
     ]
     values = [(row["loss/step"], row["loss/policy"]) for row in rows if "loss/policy" in row]
     assert values == [("512", "0.25"), ("1024", "0.125"), ("1536", "0.5")]
-    assert [row["evaluation/return_mean"] for row in rows if "evaluation/return_mean" in row] == ["7"] * 2
+    assert [row["evaluation/return_mean"] for row in rows if "evaluation/return_mean" in row] == [
+        "7"
+    ] * 2
     configs = [record.run.config for record in records if record.WhichOneof("record_type") == "run"]
     configs += [record.config for record in records if record.WhichOneof("record_type") == "config"]
     updates = {update.key: update.value_json for config in configs for update in config.update}
@@ -125,5 +135,7 @@ def test_a_service_that_is_not_there_is_named_with_the_way_out(monkeypatch, tmp_
         raise Exception("no such host")
 
     monkeypatch.setattr(loggers, "open_wandb", refuse)
-    with pytest.raises(RuntimeError, match=r"logger\.wandb .*logger\.wandb\.offline=true.*no such host"):
+    with pytest.raises(
+        RuntimeError, match=r"logger\.wandb .*logger\.wandb\.offline=true.*no such host"
+    ):
         make_loggers(LoggerCfg(wandb=WandbCfg()), tmp_path)

@@ -9,8 +9,16 @@ CPU = torch.device("cpu")
 
 
 def test_values_keep_their_names_and_counts_stay_exact():
-    metrics = {"count": torch.tensor(2**40 + 1), "mean": torch.tensor(0.5), "flag": torch.tensor(True)}
-    assert start_copy(metrics, device=CPU).read() == {"count": 2.0**40 + 1, "mean": 0.5, "flag": 1.0}
+    metrics = {
+        "count": torch.tensor(2**40 + 1),
+        "mean": torch.tensor(0.5),
+        "flag": torch.tensor(True),
+    }
+    assert start_copy(metrics, device=CPU).read() == {
+        "count": 2.0**40 + 1,
+        "mean": 0.5,
+        "flag": 1.0,
+    }
 
 
 def test_no_metrics_are_no_metrics():

@@ -27,7 +27,8 @@ def test_a_run_of_c_gets_another_integrator_and_half_the_time_step(by_c):
     assert (judged.task.sim.integrator, judged.task.sim.timestep) == ("euler", 0.0025)
     assert judged.task.decimation == 2 * by_c.task.decimation
     assert (
-        "integrator euler instead of implicitfast, with a time step of 0.0025 s instead of 0.005 s" in words
+        "integrator euler instead of implicitfast, with a time step of 0.0025 s instead of 0.005 s"
+        in words
     )
 
 

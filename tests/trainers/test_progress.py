@@ -118,7 +118,9 @@ def test_a_pipe_is_never_silent_for_long(impatient):
         assert lines_within(progress, 2)[0] == "iteration 1/10: 0 s so far"
         with progress.busy("evaluating over 100 episodes"):
             before = len(progress.console.file.getvalue().splitlines())
-            assert lines_within(progress, before + 2)[-1] == "evaluating over 100 episodes: 0 s so far"
+            assert (
+                lines_within(progress, before + 2)[-1] == "evaluating over 100 episodes: 0 s so far"
+            )
         progress.update(3, METRICS, seconds_left=None)
         told = len(progress.console.file.getvalue().splitlines())
         assert lines_within(progress, told + 1)[-1] == "iteration 4/10: 0 s so far"

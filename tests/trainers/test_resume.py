@@ -38,7 +38,9 @@ def assert_same(one, other):
 def test_a_resumed_run_is_bit_identical(tmp_path):
     straight = trained(iterations=6)
     trained(tmp_path, iterations=3)
-    resumed = make_trainer(iterations=6, seed=123)  # another seed: all of it must come from the checkpoint
+    resumed = make_trainer(
+        iterations=6, seed=123
+    )  # another seed: all of it must come from the checkpoint
     resumed.load(tmp_path)
     assert resumed.iteration == 3
     resumed.train()
@@ -120,7 +122,9 @@ def test_a_checkpoint_of_version_1_resumes_bit_for_bit(tmp_path):
 def test_a_checkpoint_of_another_network_is_refused_with_both_shapes(tmp_path):
     make_trainer(tmp_path, iterations=1).train()
     saved = checkpoint.load_latest(tmp_path)
-    name = next(name for name, tensor in saved.state["update"]["actor"].items() if tensor.shape == (16, 1))
+    name = next(
+        name for name, tensor in saved.state["update"]["actor"].items() if tensor.shape == (16, 1)
+    )
     saved.state["update"]["actor"][name] = torch.zeros(32, 1)
     with pytest.raises(
         ValueError, match=r"actor: .* float32\[32, 1\] in the checkpoint and float32\[16, 1\]"
@@ -132,7 +136,9 @@ def test_a_checkpoint_of_other_observations_is_refused(tmp_path):
     make_trainer(tmp_path, iterations=1).train()
     saved = checkpoint.load_latest(tmp_path)
     saved.state["observation_columns"] = {"actor": {"obs/height": [0, 1]}}
-    with pytest.raises(ValueError, match="other observations: .*only the checkpoint has obs/height"):
+    with pytest.raises(
+        ValueError, match="other observations: .*only the checkpoint has obs/height"
+    ):
         make_trainer().load_state_dict(saved.state)
 
 
@@ -159,7 +165,9 @@ def test_what_an_env_refuses_of_a_checkpoint_is_said_with_the_way_out(tmp_path, 
         raise ValueError("state of an env: the checkpoint has no 'clock'")
 
     monkeypatch.setattr(trainer.collector.env, "load_state_dict", refuse)
-    with pytest.raises(ValueError, match="another env.* has no 'clock'. Its networks.*train checkpoint=RUN"):
+    with pytest.raises(
+        ValueError, match="another env.* has no 'clock'. Its networks.*train checkpoint=RUN"
+    ):
         trainer.load_state_dict(checkpoint.load_latest(tmp_path).state)
 
 
@@ -177,7 +185,9 @@ def test_a_resumed_run_in_real_physics_is_bit_identical(tmp_path):
     ]
 
     def run(iterations, *, seed=1, load=None, folder=None):
-        trainer = build(conf.compose([*overrides, f"seed={seed}", f"trainer.num_iterations={iterations}"]))
+        trainer = build(
+            conf.compose([*overrides, f"seed={seed}", f"trainer.num_iterations={iterations}"])
+        )
         trainer.folder = folder
         if load is not None:
             trainer.load(load)
@@ -187,5 +197,7 @@ def test_a_resumed_run_in_real_physics_is_bit_identical(tmp_path):
     straight = run(4)
     run(2, folder=tmp_path)
     columns = checkpoint.load_latest(tmp_path).state["observation_columns"]["actor"]
-    assert [start for start, _ in columns.values()][1:] == [stop for _, stop in columns.values()][:-1]
+    assert [start for start, _ in columns.values()][1:] == [stop for _, stop in columns.values()][
+        :-1
+    ]
     assert_same(straight, run(4, seed=5, load=tmp_path))

@@ -54,7 +54,11 @@ def test_a_run_names_its_engine_and_one_that_does_not_was_made_by_warp(cfg):
         ("modules.actor.hidden_dims", 64, "modules.actor.hidden_dims=64: expected a list of int"),
         ("trainer.stop_at", 3, "trainer.stop_at=3: expected a mapping from str to float or null"),
         ("task.scene.robots", 3, "task.scene.robots=3: expected a mapping from str to Robot"),
-        ("modules.actor.hidden_dims", [64, "x"], r"modules.actor.hidden_dims\[1\]='x': expected int"),
+        (
+            "modules.actor.hidden_dims",
+            [64, "x"],
+            r"modules.actor.hidden_dims\[1\]='x': expected int",
+        ),
         (
             "modules.actor.activatio",
             "elu",
@@ -80,7 +84,9 @@ def test_a_wrong_value_is_refused_by_its_path(cfg, path, value, message):
 
 
 def test_a_dataset_that_the_envs_cannot_share_is_refused_with_working_numbers(cfg):
-    with pytest.raises(ValueError, match=r"num_minibatches=4 = 256 .* num_envs=48.* num_envs=32 or 64"):
+    with pytest.raises(
+        ValueError, match=r"num_minibatches=4 = 256 .* num_envs=48.* num_envs=32 or 64"
+    ):
         dataclasses.replace(cfg, num_envs=48)
 
 

@@ -22,7 +22,9 @@ def test_a_run_ends_with_the_iterations_and_the_checkpoint_before_them(tmp_path,
     # What was compared with the env's own step, the last time after the second rollout.
     unchecked = property(lambda recording: max(0, trainer.iteration - 2))
     monkeypatch.setattr(Recording, "unchecked_rollouts", unchecked)
-    message = r"rewards\.x was frozen\. These are the iterations 3 to 5; \S+/00000002 is from before them"
+    message = (
+        r"rewards\.x was frozen\. These are the iterations 3 to 5; \S+/00000002 is from before them"
+    )
     with pytest.raises(FrozenPythonError, match=message):
         trainer.train()
     assert sorted(path.name for path in folder.iterdir()) == ["00000002", "00000005"]
@@ -30,8 +32,13 @@ def test_a_run_ends_with_the_iterations_and_the_checkpoint_before_them(tmp_path,
 
 def test_without_a_checkpoint_from_before_that_is_said(tmp_path):
     error = FrozenPythonError("x", rollouts=1)
-    assert "no checkpoint is from before" in str(with_iterations(error, iteration=1, folder=tmp_path))
-    assert str(with_iterations(error, iteration=1, folder=None)) == "x. These are the iterations 1 to 1"
+    assert "no checkpoint is from before" in str(
+        with_iterations(error, iteration=1, folder=tmp_path)
+    )
+    assert (
+        str(with_iterations(error, iteration=1, folder=None))
+        == "x. These are the iterations 1 to 1"
+    )
 
 
 def test_an_error_about_what_comes_next_is_as_it_was():

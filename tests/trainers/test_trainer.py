@@ -80,7 +80,11 @@ def test_the_final_policy_is_evaluated_once():
 
 def test_checkpoints_come_at_their_interval_and_at_the_end(tmp_path):
     make_trainer(tmp_path, iterations=5, checkpoint_interval=2, keep_checkpoints=5).train()
-    assert [path.name for path in checkpoint.saved(tmp_path)] == ["00000002", "00000004", "00000005"]
+    assert [path.name for path in checkpoint.saved(tmp_path)] == [
+        "00000002",
+        "00000004",
+        "00000005",
+    ]
 
 
 def test_a_full_disk_costs_a_checkpoint_but_not_the_run(tmp_path, monkeypatch):
@@ -99,19 +103,27 @@ def test_a_full_disk_costs_a_checkpoint_but_not_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", fsync)
     trainer.loggers, notes = [FullAfterTwo()], Notes()
     trainer.train(notes)
-    assert [path.name for path in checkpoint.saved(tmp_path)] == ["00000001", "00000002", "00000004"]
+    assert [path.name for path in checkpoint.saved(tmp_path)] == [
+        "00000001",
+        "00000002",
+        "00000004",
+    ]
     assert any("No space left on device" in note and "goes on" in note for note in notes.notes)
     assert not [entry for entry in tmp_path.iterdir() if entry.name.startswith(".")]
 
 
-def test_a_checkpoint_of_the_end_that_cannot_be_written_is_an_error_that_says_so(tmp_path, monkeypatch):
+def test_a_checkpoint_of_the_end_that_cannot_be_written_is_an_error_that_says_so(
+    tmp_path, monkeypatch
+):
     trainer = make_trainer(tmp_path, iterations=2, checkpoint_interval=1)
 
     def fsync(descriptor):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", fsync)
-    with pytest.raises(OSError, match="no checkpoint of the end, iteration 2: .*No space left on device"):
+    with pytest.raises(
+        OSError, match="no checkpoint of the end, iteration 2: .*No space left on device"
+    ):
         trainer.train(Notes())
 
 
@@ -186,7 +198,9 @@ def test_lost_contacts_are_said_once_and_stay_in_the_metrics():
     said = [note for note in notes.notes if "njmax" in note]
     assert len(said) == 1
     assert "needed 30" in said[0] and "4 worlds" in said[0]
-    assert [row["physics/nefc_share"] for row in logger.rows if "physics/nefc_share" in row] == [1.5] * 3
+    assert [row["physics/nefc_share"] for row in logger.rows if "physics/nefc_share" in row] == [
+        1.5
+    ] * 3
 
 
 def test_contacts_that_an_evaluation_lost_are_said():
@@ -303,7 +317,9 @@ def test_what_a_hook_changes_counts_in_the_next_iteration():
 
 def rows_without_times(trainer_rows):
     timed = ("seconds", "throughput/env_states_per_s", "warm_up_s")
-    return [{name: value for name, value in row.items() if name not in timed} for row in trainer_rows]
+    return [
+        {name: value for name, value in row.items() if name not in timed} for row in trainer_rows
+    ]
 
 
 def test_overlapping_iterations_log_the_same_rows():
@@ -318,10 +334,14 @@ def test_a_target_ends_the_run_one_iteration_later_where_iterations_overlap():
     trainer = make_trainer(iterations=20, stop_at={"iteration": 4, "episode/length": 8})
     outcome = trainer.train()
     assert (outcome.iteration, outcome.target_met) == (4, True)
-    assert make_trainer(iterations=20, stop_at={"iteration": 4}, overlap=True).train().iteration == 5
+    assert (
+        make_trainer(iterations=20, stop_at={"iteration": 4}, overlap=True).train().iteration == 5
+    )
     # An evaluation settles its iteration, so nothing is late then.
     assert (
-        make_trainer(iterations=20, stop_at={"iteration": 4}, overlap=True, eval_interval=4).train().iteration
+        make_trainer(iterations=20, stop_at={"iteration": 4}, overlap=True, eval_interval=4)
+        .train()
+        .iteration
         == 4
     )
 

@@ -69,7 +69,9 @@ def test_an_mp4_has_a_frame_per_step(tmp_path):
 )
 def test_so_many_pictures_are_drawn_as_asked_at_real_speed(tmp_path, step_dt, fps, drawn, shown):
     camera = Camera()
-    path = record(filmed(camera), still(), tmp_path / "video.mp4", steps=20, step_dt=step_dt, fps=fps)
+    path = record(
+        filmed(camera), still(), tmp_path / "video.mp4", steps=20, step_dt=step_dt, fps=fps
+    )
     assert camera.count == drawn
     told = imageio.get_reader(path).get_meta_data()
     assert told["fps"] == pytest.approx(shown, rel=1e-3)
@@ -96,7 +98,9 @@ def test_a_signal_that_comes_while_the_encoder_is_forked_is_not_lost(tmp_path, m
         frames = 0
 
         def append_data(self, frame):
-            with suppress(KeyboardInterrupt):  # Python drops what is raised in its hooks around a fork
+            with suppress(
+                KeyboardInterrupt
+            ):  # Python drops what is raised in its hooks around a fork
                 os.kill(os.getpid(), signal.SIGTERM)
             self.frames += 1
 

@@ -28,7 +28,9 @@ def test_the_weakest_condition_is_named_with_its_share():
     found = card(**worse)
     # Of return and upright episodes the lesser counts.
     assert found.share("friction 0.3") == pytest.approx(0.6)
-    assert found.weakest == "pushes of 0.8 m/s" and found.share(found.weakest) == pytest.approx(0.25)
+    assert found.weakest == "pushes of 0.8 m/s" and found.share(found.weakest) == pytest.approx(
+        0.25
+    )
     assert "weakest under 'pushes of 0.8 m/s', which leaves 0.25" in found.verdict()
     assert f"{len(NAMES) - 2} of {len(NAMES)} conditions" in found.verdict()
     assert card(**{"friction 0.3": judged(-5.0)}).share("friction 0.3") == 0.0

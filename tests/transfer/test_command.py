@@ -32,5 +32,8 @@ def test_a_card_is_written(tmp_path, monkeypatch, capsys):
     code, output = run(capsys, FOLDER / "cartpole", "--episodes", 2, "--output", tmp_path / "card")
     assert code in (0, 1) and "cannot apply: its ground is no plane" in output.out
     numbers = json.loads((tmp_path / "card" / "card.json").read_text())
-    assert set(numbers["judged"]) == {few[0].name, few[1].name} and numbers["task"] == "cartpole_swingup"
+    assert (
+        set(numbers["judged"]) == {few[0].name, few[1].name}
+        and numbers["task"] == "cartpole_swingup"
+    )
     assert (tmp_path / "card" / "card.md").exists() and (tmp_path / "card" / "card.png").exists()

@@ -27,7 +27,9 @@ def test_names_are_unique_and_the_first_is_what_was_trained(quadruped):
     assert CONDITIONS[0].change(quadruped) is quadruped
 
 
-@pytest.mark.parametrize("robot", [Quadruped(), Cartpole(), Cheetah()], ids=lambda robot: robot.name)
+@pytest.mark.parametrize(
+    "robot", [Quadruped(), Cartpole(), Cheetah()], ids=lambda robot: robot.name
+)
 def test_entries_of_a_model_give_its_efforts(robot):
     own, again = robot.spec().compile(), changed(robot, lambda entry: entry).spec().compile()
     rng = np.random.default_rng(0)
@@ -58,7 +60,9 @@ def test_actions_are_late_in_physics_steps(quadruped):
     late = BY_NAME["actions 20 ms late, with jitter"](quadruped).scene.robots["quadruped"].actuators
     assert len(late) == len(entries(Quadruped())) == 12
     # 15 to 25 ms in steps of 5 ms.
-    assert {(type(entry), entry.min_lag, entry.max_lag) for entry in late} == {(DelayedActuator, 3, 5)}
+    assert {(type(entry), entry.min_lag, entry.max_lag) for entry in late} == {
+        (DelayedActuator, 3, 5)
+    }
 
 
 def test_motors_are_of_another_kind_with_the_same_gains():

@@ -24,18 +24,25 @@ def test_as_trained_is_an_evaluation_on_the_c_engine(policy):
     found = judge(policy.cfg, policy.actor, CONDITIONS[0], episodes=4, seconds=1.0)
     sim = dataclasses.replace(policy.cfg.task.sim, engine="c", one_kernel_dynamics=None)
     task = dataclasses.replace(policy.cfg.task, sim=sim)
-    evaluator = build_evaluator(dataclasses.replace(policy.cfg, task=task), policy.actor, episodes=4)
+    evaluator = build_evaluator(
+        dataclasses.replace(policy.cfg, task=task), policy.actor, episodes=4
+    )
     # Of 20 ms each.
     evaluator.max_steps = 50
     assert found.return_mean == pytest.approx(evaluator().return_mean)
     assert 0.0 < found.effort <= 1.0 and found.speed > 0.5 and found.power > 1.0
-    assert found.impact > 0.0 and set(found.errors) == {"linear_velocity_error", "angular_velocity_error"}
+    assert found.impact > 0.0 and set(found.errors) == {
+        "linear_velocity_error",
+        "angular_velocity_error",
+    }
 
 
 @pytest.mark.full
 def test_limits_of_effort_reach_the_worlds(policy):
     strong = judge(policy.cfg, policy.actor, CONDITIONS[0], episodes=2, seconds=1.0)
-    weak = judge(policy.cfg, policy.actor, BY_NAME["a battery that is empty"], episodes=2, seconds=1.0)
+    weak = judge(
+        policy.cfg, policy.actor, BY_NAME["a battery that is empty"], episodes=2, seconds=1.0
+    )
     # Of the limit of the robot's files no more than what is left of it.
     assert weak.effort <= 0.7 + 1e-4 < strong.effort + 0.7
     assert weak.return_mean != strong.return_mean

@@ -47,7 +47,8 @@ def full_chain() -> list[Transform]:
         ObservationDelay([COUNT], delay=DelayCfg(max_lag=3, per_env=False, resample_every=3)),
         ObservationHistory([NOISY, DRAWN], length=3),
         ObservationGroups(
-            {"actor": [NOISY, COUNT, DRAWN], "critic": ["count", "episode"]}, drop=[NOISY, COUNT, DRAWN]
+            {"actor": [NOISY, COUNT, DRAWN], "critic": ["count", "episode"]},
+            drop=[NOISY, COUNT, DRAWN],
         ),
     ]
 
@@ -70,10 +71,16 @@ def seed_all(env: TransformedEnv, seed: int) -> None:
 def actions(num_steps: int, env: EnvBase) -> Tensor:
     """Return fixed actions [T, E, A]."""
     generator = torch.Generator().manual_seed(7)
-    return torch.rand((num_steps, *env.full_action_spec[env.action_key].shape), generator=generator) * 2 - 1
+    return (
+        torch.rand((num_steps, *env.full_action_spec[env.action_key].shape), generator=generator)
+        * 2
+        - 1
+    )
 
 
-def fixed_rollout(env: EnvBase, num_steps: int, root: TensorDictBase | None = None) -> TensorDictBase:
+def fixed_rollout(
+    env: EnvBase, num_steps: int, root: TensorDictBase | None = None
+) -> TensorDictBase:
     """Roll out with the fixed actions, from `root` or from a reset."""
     steps = iter(actions(num_steps, env))
     return env.rollout(
@@ -85,14 +92,20 @@ def fixed_rollout(env: EnvBase, num_steps: int, root: TensorDictBase | None = No
     )
 
 
-def assert_same(found: TensorDictBase, expected: TensorDictBase, rows: Sequence[int] | None = None) -> None:
+def assert_same(
+    found: TensorDictBase, expected: TensorDictBase, rows: Sequence[int] | None = None
+) -> None:
     """Check that two data agree bit for bit, in all rows or in some."""
     assert set(found.keys(True, True)) == set(expected.keys(True, True))
     for key, value in expected.items(True, True):
-        ours, theirs = (found[key], value) if rows is None else (found[key][list(rows)], value[list(rows)])
+        ours, theirs = (
+            (found[key], value) if rows is None else (found[key][list(rows)], value[list(rows)])
+        )
         assert torch.equal(ours, theirs), (key, ours, theirs)
 
 
 def copied(td: TensorDictBase) -> TensorDict:
     """Return the values as they are now."""
-    return TensorDict({key: value.clone() for key, value in td.items(True, True)}, batch_size=td.batch_size)
+    return TensorDict(
+        {key: value.clone() for key, value in td.items(True, True)}, batch_size=td.batch_size
+    )

@@ -44,7 +44,9 @@ class LeafEnv(EnvBase):
             observation: TensorSpec = Bounded(-1e4, 1e4, shape, dtype=dtype)
         else:
             observation = (
-                Binary(shape=shape, dtype=dtype) if dtype == torch.bool else Unbounded(shape, dtype=dtype)
+                Binary(shape=shape, dtype=dtype)
+                if dtype == torch.bool
+                else Unbounded(shape, dtype=dtype)
             )
         self.observation_spec = self._composite(self.key, observation)
         self.observation_spec["again"] = observation.clone()
@@ -86,11 +88,15 @@ class LeafEnv(EnvBase):
         self.received = tensordict.get(self.action_name).clone()
         expected = self.full_action_spec[self.action_name]
         if self.received.shape != expected.shape or self.received.dtype != expected.dtype:
-            raise RuntimeError(f"the action arrives as {self.received.dtype} {tuple(self.received.shape)}")
+            raise RuntimeError(
+                f"the action arrives as {self.received.dtype} {tuple(self.received.shape)}"
+            )
         ended = (self.count_E >= self.length_E).reshape(*self.batch_size, 1)
         td = self._observed().set("done", ended).set("terminated", ended.clone())
         width = len(self.batch_size) + len(self.inner)
-        reward = self.received.float().reshape(*self.received.shape[:width], -1).sum(-1, keepdim=True)
+        reward = (
+            self.received.float().reshape(*self.received.shape[:width], -1).sum(-1, keepdim=True)
+        )
         return self._put(td, self.reward_name, reward)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:

@@ -36,7 +36,9 @@ TURN = MirrorMap(source=(0,), signs=(-1.0,))
 
 # One per class, for any env with three observed numbers under a key and one action in [-2, 2].
 PORTABLE: dict[str, Callable[[NestedKey], Transform]] = {
-    "ObservationNoise": lambda key: ObservationNoise(key, noise=GaussianNoise(std=0.1, bias=UNIFORM)),
+    "ObservationNoise": lambda key: ObservationNoise(
+        key, noise=GaussianNoise(std=0.1, bias=UNIFORM)
+    ),
     "ObservationClip": lambda key: ObservationClip(key, clip=(-0.5, 0.5)),
     "ObservationScale": lambda key: ObservationScale(key, "scaled", scale=(1.0, 2.0, -3.0)),
     "ObservationDelay": lambda key: ObservationDelay(key, delay=DelayCfg(max_lag=3)),
@@ -59,5 +61,9 @@ PORTABLE: dict[str, Callable[[NestedKey], Transform]] = {
 def exported_transforms() -> set[str]:
     """Return the names of the transform classes that we export, without those that others are based on."""
     exported = [getattr(ours, name) for name in ours.__all__]
-    classes = {value for value in exported if isinstance(value, type) and issubclass(value, Transform)}
-    return {c.__name__ for c in classes if not any(issubclass(d, c) and d is not c for d in classes)}
+    classes = {
+        value for value in exported if isinstance(value, type) and issubclass(value, Transform)
+    }
+    return {
+        c.__name__ for c in classes if not any(issubclass(d, c) and d is not c for d in classes)
+    }

@@ -90,7 +90,11 @@ KINDS: dict[str, Callable[[LeafEnv], Transform]] = {
     "EpisodeTracker": lambda env: EpisodeTracker(env.reward_name),
     "SuccessTracker": lambda env: SuccessTracker(env.key, threshold=0.5),
     "Mirror": lambda env: Mirror(
-        env.key, None, env.action_name, maps={env.key: TURNED, env.action_name: SWAPPED}, probability=1.0
+        env.key,
+        None,
+        env.action_name,
+        maps={env.key: TURNED, env.action_name: SWAPPED},
+        probability=1.0,
     ),
 }
 
@@ -170,7 +174,9 @@ def reset_and_steps(kind: str, shape: str) -> None:
     for action in _steps(env, 9):
         count_E = torch.where(fresh, 0, inner.count_E)
         _check_seen(name, kind, env, root, count_E)
-        stepped, root = env.step_and_maybe_reset(root.clone().set(inner.action_name, action.clone()))
+        stepped, root = env.step_and_maybe_reset(
+            root.clone().set(inner.action_name, action.clone())
+        )
         assert torch.equal(stepped.get(inner.action_name), action)
         rows = fresh.reshape(*batch, *[1] * (action.ndim - len(batch)))
         expected = action
@@ -191,7 +197,9 @@ def reset_and_steps(kind: str, shape: str) -> None:
         _check_seen(name, kind, env, stepped["next"], reached_E)
         for key, spec in env.full_observation_spec.items(True, True):
             value = stepped["next"].get(key)
-            assert value.shape == spec.shape and value.dtype == spec.dtype and spec.is_in(value), key
+            assert value.shape == spec.shape and value.dtype == spec.dtype and spec.is_in(value), (
+                key
+            )
 
 
 def _check_seen(name: str, kind: str, env: TransformedEnv, td: TensorDict, count_E: Tensor) -> None:
@@ -216,7 +224,9 @@ def _check_seen(name: str, kind: str, env: TransformedEnv, td: TensorDict, count
     if name == "ObservationHistory":
         width = len(batch) + len(agents)
         frames = torch.stack([at(lag) for lag in (2, 1, 0)], width)
-        assert torch.equal(td.get(inner.key), frames if kind.endswith("stacked") else frames.flatten(width))
+        assert torch.equal(
+            td.get(inner.key), frames if kind.endswith("stacked") else frames.flatten(width)
+        )
     if name == "ObservationGroups":
         one = at(0).reshape(*batch, -1)
         assert torch.equal(td.get("actor"), torch.cat((one, one), -1))
@@ -276,7 +286,9 @@ def samples_in_a_compose(kind: str, shape: str) -> None:
 def samples_before_a_model(kind: str, shape: str) -> None:
     def run(transform: Transform, td: TensorDict) -> TensorDict:
         reads = transform.out_keys[0] if transform.out_keys else SHAPES[shape]().key
-        module = TensorDictModule(lambda x: x.float().reshape(8, -1).sum(-1), in_keys=[reads], out_keys=["y"])
+        module = TensorDictModule(
+            lambda x: x.float().reshape(8, -1).sum(-1), in_keys=[reads], out_keys=["y"]
+        )
         found = torch.nn.Sequential(transform, module)(td)
         assert found["y"].shape == (8,)
         return found
@@ -352,7 +364,8 @@ def main() -> None:
                     counts[check]["fails"] += 1
                     print(f"{check}, {kind}, {shape}: {type(error).__name__}: {str(error)[:200]}")
         print(
-            f"{check:32} " + ", ".join(f"{number} {word}" for word, number in sorted(counts[check].items()))
+            f"{check:32} "
+            + ", ".join(f"{number} {word}" for word, number in sorted(counts[check].items()))
         )
         sys.stdout.flush()
     total = sum(counts.values(), Counter())

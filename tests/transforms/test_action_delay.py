@@ -11,7 +11,9 @@ from tests.transforms.chains import actions, counter, fixed_rollout
 def test_the_env_receives_the_action_of_lag_steps_ago(lag):
     """The reward is the sum of the action that the env received."""
     lengths = (3, 5, 20)
-    env = counter(ActionDelay(delay=DelayCfg(min_lag=lag, max_lag=lag), initial=0.5), lengths=lengths)
+    env = counter(
+        ActionDelay(delay=DelayCfg(min_lag=lag, max_lag=lag), initial=0.5), lengths=lengths
+    )
     rollout_ET = fixed_rollout(env, 15)
     sent = actions(15, env).transpose(0, 1).sum(-1)
     assert torch.equal(rollout_ET["action"].sum(-1), sent)

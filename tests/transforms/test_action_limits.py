@@ -38,12 +38,16 @@ def test_scale_and_offset_per_element():
 
 
 def test_scale_from_the_bounds_equals_torchrls():
-    ours, theirs = (TransformedEnv(GymEnv("Pendulum-v1"), t) for t in (ActionScale(), ActionScaling()))
+    ours, theirs = (
+        TransformedEnv(GymEnv("Pendulum-v1"), t) for t in (ActionScale(), ActionScaling())
+    )
     assert ours.action_spec == theirs.action_spec
     for env in (ours, theirs):
         env.set_seed(0)
     rollouts = [fixed_rollout(env, 20) for env in (ours, theirs)]
-    torch.testing.assert_close(rollouts[0]["next", "observation"], rollouts[1]["next", "observation"])
+    torch.testing.assert_close(
+        rollouts[0]["next", "observation"], rollouts[1]["next", "observation"]
+    )
     torch.testing.assert_close(rollouts[0]["action"], rollouts[1]["action"])
     bare = GymEnv("Pendulum-v1")
     bare.set_seed(0)

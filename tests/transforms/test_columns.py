@@ -18,7 +18,9 @@ def test_what_was_split_is_joined_without_a_copy():
     parts = split(WHOLE, [torch.empty(4, 2), torch.empty(4, 3, 1), torch.empty(4)])
     assert [part.shape for part in parts] == [(4, 2), (4, 3, 1), (4,)]
     assert torch.equal(side_by_side(parts, 4), WHOLE)
-    assert shared([WHOLE[:, :2], WHOLE[:, 2:]]) and shared([WHOLE[:, :1], WHOLE[:, 1:5], WHOLE[:, 5:]])
+    assert shared([WHOLE[:, :2], WHOLE[:, 2:]]) and shared(
+        [WHOLE[:, :1], WHOLE[:, 1:5], WHOLE[:, 5:]]
+    )
 
 
 @pytest.mark.parametrize(

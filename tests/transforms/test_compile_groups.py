@@ -120,7 +120,9 @@ def test_delay_and_history_of_a_whole_group():
     by_hand = [
         ObservationDelay([("obs", "row")], [(a, "row")], delay=DelayCfg(min_lag=1, max_lag=1)),
         ObservationDelay(
-            [("obs", "count"), ("obs", "vector")], [(a, "count"), (a, "vector")], delay=DelayCfg(max_lag=3)
+            [("obs", "count"), ("obs", "vector")],
+            [(a, "count"), (a, "vector")],
+            delay=DelayCfg(max_lag=3),
         ),
         ObservationHistory([(a, "count"), (a, "row")], length=3, stride=2),
         ObservationGroups(
@@ -128,7 +130,10 @@ def test_delay_and_history_of_a_whole_group():
             drop=[(a, "count"), (a, "row"), (a, "vector")],
         ),
     ]
-    envs = [MaskedTransformedEnv(TermEnv(), chain) for chain in (compile_groups({"actor": group}), by_hand)]
+    envs = [
+        MaskedTransformedEnv(TermEnv(), chain)
+        for chain in (compile_groups({"actor": group}), by_hand)
+    ]
     for env in envs:
         env.set_seed(4)
     ours, theirs = (fixed_rollout(env, 15) for env in envs)
@@ -191,20 +196,26 @@ def test_kept_terms_are_what_the_vector_holds_and_others_are_gone():
 
 def test_terms_without_a_chain_go_straight_into_the_vector():
     plain = ObservationGroupCfg(terms={"count": term(), "row": term()})
-    assert [type(t) for t in compile_groups({"actor": plain, "critic": plain})] == [ObservationGroups]
+    assert [type(t) for t in compile_groups({"actor": plain, "critic": plain})] == [
+        ObservationGroups
+    ]
 
 
 def test_noise_of_one_group_leaves_the_other_clean():
     noisy = ObservationGroupCfg(terms={"count": term(noise=UniformNoise(low=1.0, high=2.0))})
     clean = ObservationGroupCfg(terms=noisy.terms, enable_noise=False)
-    root = MaskedTransformedEnv(TermEnv(), compile_groups({"actor": noisy, "critic": clean})).reset()
+    root = MaskedTransformedEnv(
+        TermEnv(), compile_groups({"actor": noisy, "critic": clean})
+    ).reset()
     assert bool((root["actor"] >= 1).all())
     assert torch.equal(root["critic"], root["obs", "count"])
 
 
 def test_two_noisy_groups_draw_apart():
     noisy = ObservationGroupCfg(terms={"count": term(noise=GaussianNoise(std=1.0))})
-    root = MaskedTransformedEnv(TermEnv(), compile_groups({"actor": noisy, "critic": noisy})).reset()
+    root = MaskedTransformedEnv(
+        TermEnv(), compile_groups({"actor": noisy, "critic": noisy})
+    ).reset()
     assert not (root["actor"] == root["critic"]).any()
 
 

@@ -31,7 +31,9 @@ def check_against_closed_form(delay, lengths, seed, steps=14):
     root = env.reset()
     lag = transform.lag_E.clone()
     for clock in range(1, steps + 1):
-        stepped, root = env.step_and_maybe_reset(root.set("action", torch.zeros(env.action_spec.shape)))
+        stepped, root = env.step_and_maybe_reset(
+            root.set("action", torch.zeros(env.action_spec.shape))
+        )
         count, done = stepped["next", "count"][:, 0].long(), stepped["next", "done"][:, 0]
         reached = stepped["next", "delayed"][:, 0].long()
         age = count - reached
@@ -81,7 +83,8 @@ def test_delayed_counts_in_closed_form_1000_cases(delay, lengths, seed):
 
 def test_a_fixed_lag_is_exact_over_resets():
     env = counter(
-        ObservationDelay("count", "delayed", delay=DelayCfg(min_lag=2, max_lag=2)), lengths=(3, 5, 1, 20)
+        ObservationDelay("count", "delayed", delay=DelayCfg(min_lag=2, max_lag=2)),
+        lengths=(3, 5, 1, 20),
     )
     rollout_ET = fixed_rollout(env, 18)
     for part in (rollout_ET, rollout_ET["next"]):
@@ -89,7 +92,9 @@ def test_a_fixed_lag_is_exact_over_resets():
 
 
 def test_lag_zero_changes_nothing():
-    rollout_ET = fixed_rollout(counter(ObservationDelay(VECTOR, "delayed", delay=DelayCfg(max_lag=0))), 9)
+    rollout_ET = fixed_rollout(
+        counter(ObservationDelay(VECTOR, "delayed", delay=DelayCfg(max_lag=0))), 9
+    )
     assert torch.equal(rollout_ET["delayed"], rollout_ET[VECTOR])
 
 
@@ -105,7 +110,9 @@ def lags(delay, num_envs=2000, steps=60, length=10):
 
 def assert_frequency(hits, probability):
     n = hits.numel()
-    assert abs(hits.float().mean() - probability) < 4 * math.sqrt(probability * (1 - probability) / n)
+    assert abs(hits.float().mean() - probability) < 4 * math.sqrt(
+        probability * (1 - probability) / n
+    )
 
 
 def test_lags_are_uniform_and_drawn_anew_at_each_reset():
@@ -117,7 +124,9 @@ def test_lags_are_uniform_and_drawn_anew_at_each_reset():
 
 
 def test_lags_of_a_reset_are_the_keyed_draws_of_the_rows_that_reset():
-    delay = ObservationDelay("count", "delayed", delay=DelayCfg(min_lag=2, max_lag=9), seed=11, stream="imu")
+    delay = ObservationDelay(
+        "count", "delayed", delay=DelayCfg(min_lag=2, max_lag=9), seed=11, stream="imu"
+    )
     env = counter(delay, lengths=(50,) * 5)
     env.reset()
     before = delay.lag_E.clone()
@@ -140,7 +149,9 @@ def test_hold_probability_is_the_share_of_draws_that_change_nothing():
 def test_a_shared_lag_is_one_number_that_single_resets_leave_alone():
     found = lags(DelayCfg(max_lag=30, per_env=False), num_envs=3, steps=30, length=1000)
     assert bool((found == found[0, 0]).all())
-    env = counter(ObservationDelay("count", delay=DelayCfg(max_lag=1000, per_env=False)), lengths=(100,) * 3)
+    env = counter(
+        ObservationDelay("count", delay=DelayCfg(max_lag=1000, per_env=False)), lengths=(100,) * 3
+    )
     env.reset()
     lag = env.transform[0].lag_E.clone()
     env.reset(env_ids=[1])

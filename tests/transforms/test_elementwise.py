@@ -19,7 +19,8 @@ def test_it_equals_torchrls_clip(clip):
 
 
 @pytest.mark.parametrize(
-    ("clip", "low", "high"), [((-1.0, 0.5), 0.0, 0.5), ((0.25, None), 0.25, 1.0), ((2.0, 3.0), 2.0, 2.0)]
+    ("clip", "low", "high"),
+    [((-1.0, 0.5), 0.0, 0.5), ((0.25, None), 0.25, 1.0), ((2.0, 3.0), 2.0, 2.0)],
 )
 def test_bounds_are_narrowed(clip, low, high):
     spec = counter(ObservationClip("drawn", clip=clip)).observation_spec["drawn"]
@@ -46,7 +47,9 @@ def test_it_equals_torchrls_norm_without_an_offset(scale):
     factor = torch.tensor(scale)
     env = counter(
         ObservationScale(VECTOR, "ours", scale=scale),
-        ObservationNorm(loc=torch.zeros_like(factor), scale=factor, in_keys=[VECTOR], out_keys=["theirs"]),
+        ObservationNorm(
+            loc=torch.zeros_like(factor), scale=factor, in_keys=[VECTOR], out_keys=["theirs"]
+        ),
     )
     rollout_ET = fixed_rollout(env, 8)
     assert torch.equal(rollout_ET["ours"], rollout_ET["theirs"])

@@ -50,7 +50,9 @@ def test_serial_env_inside_and_outside(kind):
 
 @every_kind
 def test_specs_made_before_or_after_the_first_reset(kind):
-    before, after = (TransformedEnv(CounterEnv((3, 5, 4)), Compose(KINDS[kind]())) for _ in range(2))
+    before, after = (
+        TransformedEnv(CounterEnv((3, 5, 4)), Compose(KINDS[kind]())) for _ in range(2)
+    )
     assert before.output_spec is not None and before.input_spec is not None
     before.set_seed(0), after.set_seed(0)
     assert_same(before.reset(), after.reset())
@@ -212,7 +214,8 @@ def test_parallel_env_inside_and_outside(name):
         mp_start_method="fork",
     )
     outside = TransformedEnv(
-        ParallelEnv(2, lambda: CounterEnv((), action_size=1), mp_start_method="fork"), PORTABLE[name](VECTOR)
+        ParallelEnv(2, lambda: CounterEnv((), action_size=1), mp_start_method="fork"),
+        PORTABLE[name](VECTOR),
     )
     for env in (inside, outside):
         try:

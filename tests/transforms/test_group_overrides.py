@@ -40,9 +40,13 @@ def actor():
 
 def test_overrides_become_configs(actor):
     group, first = actor
-    noise = GaussianNoise(std=0.5, walk_std=0.01, by_level=True, bias=UniformNoise(low=-1.0, high=1.0))
+    noise = GaussianNoise(
+        std=0.5, walk_std=0.01, by_level=True, bias=UniformNoise(low=-1.0, high=1.0)
+    )
     assert group.terms[first].noise == noise
-    assert group.terms[first].delay == DelayCfg(min_lag=1, max_lag=3, resample_every=10, hold_probability=0.5)
+    assert group.terms[first].delay == DelayCfg(
+        min_lag=1, max_lag=3, resample_every=10, hold_probability=0.5
+    )
     assert group.delay == DelayCfg(max_lag=2, by_level=True)
     assert group.history == HistoryCfg(length=5, stride=2)
 

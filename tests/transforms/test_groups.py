@@ -48,7 +48,10 @@ def test_dropped_terms_leave_data_and_specs():
 
 def test_bounds_are_concatenated():
     spec = counter(ObservationGroups({"actor": ["drawn", "count"]})).observation_spec["actor"]
-    assert spec.space.low[0].tolist() == [0.0, -torch.inf] and spec.space.high[0].tolist() == [1.0, torch.inf]
+    assert spec.space.low[0].tolist() == [0.0, -torch.inf] and spec.space.high[0].tolist() == [
+        1.0,
+        torch.inf,
+    ]
 
 
 def test_samples_are_concatenated_too():
@@ -57,7 +60,9 @@ def test_samples_are_concatenated_too():
 
 
 def test_bool_terms_become_numbers():
-    td = TensorDict({"a": torch.ones(4, 1), "touch": torch.ones(4, 2, dtype=torch.bool)}, batch_size=4)
+    td = TensorDict(
+        {"a": torch.ones(4, 1), "touch": torch.ones(4, 2, dtype=torch.bool)}, batch_size=4
+    )
     assert ObservationGroups({"g": ["a", "touch"]})(td)["g"].dtype == torch.float32
 
 

@@ -16,12 +16,16 @@ def test_frames_are_the_last_ones_oldest_first(length):
     for part in (rollout_ET, rollout_ET["next"]):
         for frame in range(length):
             age = length - 1 - frame
-            assert torch.equal(part["frames"][..., frame : frame + 1], (part["count"] - age).clamp(min=0))
+            assert torch.equal(
+                part["frames"][..., frame : frame + 1], (part["count"] - age).clamp(min=0)
+            )
 
 
 @pytest.mark.parametrize(("length", "stride"), [(3, 2), (2, 5), (4, 3), (1, 4)])
 def test_frames_are_a_stride_apart(length, stride):
-    env = counter(ObservationHistory("count", "frames", length=length, stride=stride), lengths=(3, 11, 1, 40))
+    env = counter(
+        ObservationHistory("count", "frames", length=length, stride=stride), lengths=(3, 11, 1, 40)
+    )
     rollout_ET = fixed_rollout(env, 30)
     ages = torch.tensor([(length - 1 - frame) * stride for frame in range(length)])
     for part in (rollout_ET, rollout_ET["next"]):
@@ -88,7 +92,9 @@ def test_it_equals_catframes():
 @pytest.mark.parametrize("flat", [True, False])
 def test_observations_of_one_dtype_share_a_ring(flat):
     """The frames of each are those that a transform of its own gives."""
-    together = ObservationHistory([VECTOR, "drawn", "count"], ["a", "b", "c"], length=4, stride=2, flat=flat)
+    together = ObservationHistory(
+        [VECTOR, "drawn", "count"], ["a", "b", "c"], length=4, stride=2, flat=flat
+    )
     alone = [
         ObservationHistory(key, f"{name}_alone", length=4, stride=2, flat=flat)
         for name, key in {"a": VECTOR, "b": "drawn", "c": "count"}.items()

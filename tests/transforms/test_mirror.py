@@ -44,7 +44,11 @@ def test_mirrored_joints_put_the_bodies_where_the_mirror_shows_them(robot):
     data, image = mujoco.MjData(model), mujoco.MjData(model)
     quat = generator.normal(size=4)
     data.qpos[:] = np.concatenate(
-        (generator.normal(size=3), quat / np.linalg.norm(quat), generator.uniform(-0.5, 0.5, model.nq - 7))
+        (
+            generator.normal(size=3),
+            quat / np.linalg.norm(quat),
+            generator.uniform(-0.5, 0.5, model.nq - 7),
+        )
     )
     data.qvel[:] = generator.normal(size=model.nv)
     qpos, qvel = torch.tensor(data.qpos), torch.tensor(data.qvel)
@@ -57,7 +61,11 @@ def test_mirrored_joints_put_the_bodies_where_the_mirror_shows_them(robot):
     places = mirror_by_name(names, POLAR)
     for quantity in ("xpos", "cvel"):
         seen, shown = getattr(data, quantity)[1:], getattr(image, quantity)[1:]
-        each = POLAR if quantity == "xpos" else MirrorMap(source=range(6), signs=AXIAL.signs + POLAR.signs)
+        each = (
+            POLAR
+            if quantity == "xpos"
+            else MirrorMap(source=range(6), signs=AXIAL.signs + POLAR.signs)
+        )
         places = mirror_by_name(names, each)
         expected = places(torch.tensor(seen.reshape(-1))).numpy().reshape(seen.shape)
         # The centers of mass, about which cvel is, are symmetric to some millimeters only.
@@ -190,7 +198,10 @@ def test_the_policy_gets_the_bounds_that_both_images_have():
         (lambda: MirrorMap(source=(0,), signs=(2.0,)), r"signs\[0\]"),
         (lambda: MirrorMap(source=(0, 1), signs=(1.0,)), "1 numbers for the 2"),
         (lambda: Mirror("x", maps={"x": POLAR}), "expected those of"),
-        (lambda: Mirror("x", in_keys_inv=[], maps={"x": POLAR}, probability=2.0), "probability=2.0"),
+        (
+            lambda: Mirror("x", in_keys_inv=[], maps={"x": POLAR}, probability=2.0),
+            "probability=2.0",
+        ),
         (lambda: mirrored(TensorDict(x=torch.zeros(2)), {"y": POLAR}), "y"),
     ],
 )

@@ -54,7 +54,9 @@ def test_reset_observations_are_noisy_too():
 
 
 def test_per_dim_parameters():
-    _, noise = added(GaussianNoise(std=(0.0, 1.0, 2.0), mean=(5.0, 0.0, -1.0)), lengths=(50,) * 1100)
+    _, noise = added(
+        GaussianNoise(std=(0.0, 1.0, 2.0), mean=(5.0, 0.0, -1.0)), lengths=(50,) * 1100
+    )
     assert bool((noise[..., 0] - 5.0).abs().max() < 1e-4)
     assert_moments(noise[..., 1], 0.0, 1.0)
     assert_moments(noise[..., 2], -1.0, 2.0)
@@ -75,7 +77,9 @@ def test_constant_and_multiplicative():
     env = counter(
         ObservationNoise("count", "plus", noise=ConstantNoise(value=2.0)),
         ObservationNoise("count", "times", noise=ConstantNoise(value=2.0, operation="multiply")),
-        ObservationNoise("row", "random", noise=UniformNoise(low=0.5, high=1.5, operation="multiply")),
+        ObservationNoise(
+            "row", "random", noise=UniformNoise(low=0.5, high=1.5, operation="multiply")
+        ),
     )
     rollout_ET = fixed_rollout(env, 10)
     count = rollout_ET["count"]
@@ -111,7 +115,11 @@ def test_bias_is_constant_in_an_episode_and_independent_across_episodes_and_envs
     assert bool((per_episode - per_episode[:, :, :1]).abs().max() < 1e-4)
     drawn = per_episode[:, :, 0]
     assert_moments(drawn, 0.0, 1 / math.sqrt(3))
-    for a, b in [(drawn[:-1], drawn[1:]), (drawn[:, :-1], drawn[:, 1:]), (drawn[..., :-1], drawn[..., 1:])]:
+    for a, b in [
+        (drawn[:-1], drawn[1:]),
+        (drawn[:, :-1], drawn[:, 1:]),
+        (drawn[..., :-1], drawn[..., 1:]),
+    ]:
         assert abs((a * b).mean()) < 4 / 3 / math.sqrt(a.numel())
     # The terminal observation still has the bias of the episode that ends there.
     reached = rollout_ET["next", "noisy"] - rollout_ET["next", VECTOR]
@@ -158,7 +166,9 @@ def test_lost_readings_are_the_last_ones_or_zero_and_are_lost_whole():
     probability = 0.3
     env = counter(
         ObservationNoise(VECTOR, "held", noise=ConstantNoise(value=1.0, dropout=probability)),
-        ObservationNoise(VECTOR, "zeroed", noise=ConstantNoise(value=1.0, dropout=probability, lost="zero")),
+        ObservationNoise(
+            VECTOR, "zeroed", noise=ConstantNoise(value=1.0, dropout=probability, lost="zero")
+        ),
         lengths=(20,) * 900,
     )
     rollout_ET = fixed_rollout(env, 120)
@@ -170,7 +180,9 @@ def test_lost_readings_are_the_last_ones_or_zero_and_are_lost_whole():
     )
     assert not bool(zeroed[is_reset].any()), "the reading of a reset always arrives"
     share = zeroed[~is_reset].float()
-    assert abs(share.mean() - probability) < 4 * math.sqrt(probability * (1 - probability) / share.numel())
+    assert abs(share.mean() - probability) < 4 * math.sqrt(
+        probability * (1 - probability) / share.numel()
+    )
     held = rollout_ET["held"]
     lost = (held != arrived).any(-1)
     assert not bool(lost[is_reset].any())
@@ -254,7 +266,8 @@ def test_evaluation_is_not_part_of_the_saved_state():
 def test_noise_is_drawn_afresh_when_it_is_switched_on_again():
     """Switching off does not shift the draws: evaluation in between changes no number."""
     on, switched = (
-        counter(ObservationNoise("count", "noisy", noise=UniformNoise(low=1.0, high=2.0))) for _ in "ab"
+        counter(ObservationNoise("count", "noisy", noise=UniformNoise(low=1.0, high=2.0)))
+        for _ in "ab"
     )
     on.set_seed(0), switched.set_seed(0)
     expected = fixed_rollout(on, 6)
@@ -332,8 +345,14 @@ def test_float64_stays_float64():
     ("build", "message"),
     [
         (lambda: ObservationNoise(["a", "b"], ["c"], noise=ConstantNoise(value=1.0)), "out_keys"),
-        (lambda: ObservationNoise(["a", "b"], ["c", "c"], noise=ConstantNoise(value=1.0)), "repeats"),
-        (lambda: ObservationNoise(["a", "b"], noise=[ConstantNoise(value=1.0)]), "1 entries for the 2"),
+        (
+            lambda: ObservationNoise(["a", "b"], ["c", "c"], noise=ConstantNoise(value=1.0)),
+            "repeats",
+        ),
+        (
+            lambda: ObservationNoise(["a", "b"], noise=[ConstantNoise(value=1.0)]),
+            "1 entries for the 2",
+        ),
         (lambda: ObservationNoise(["a"], noise={"b": ConstantNoise(value=1.0)}), "one per key"),
     ],
 )

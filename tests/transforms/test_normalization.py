@@ -22,7 +22,9 @@ def env_states(rollout_ET, key):
 @pytest.mark.parametrize("stock", [False, True])
 def test_each_env_state_counts_once_and_equals_two_passes(stock):
     env = counter(
-        ObservationNormalization([VECTOR, "drawn"], ["a", "b"], eps=1e-6), lengths=LENGTHS, stock=stock
+        ObservationNormalization([VECTOR, "drawn"], ["a", "b"], eps=1e-6),
+        lengths=LENGTHS,
+        stock=stock,
     )
     rollout_ET = fixed_rollout(env, 19)
     env.transform[0].enable_(False)
@@ -43,7 +45,9 @@ def test_what_a_step_returns_counts_already():
         so_far = seen[:, : step + 2].flatten(0, 1)
         std = (so_far.var(0, unbiased=False) + 1e-4).sqrt()
         expected = (seen[:, step + 1] - so_far.mean(0)) / std
-        torch.testing.assert_close(rollout_ET["next", "a"][:, step].double(), expected, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(
+            rollout_ET["next", "a"][:, step].double(), expected, rtol=1e-4, atol=1e-4
+        )
 
 
 def test_frozen_it_equals_torchrls_norm():

@@ -55,7 +55,9 @@ def test_trackers_agree_with_the_envs_own_log(env):
     assert syncs.total == 0, syncs.report()
     env.reset(seed=1)
     base.episode_log_reset_()
-    rollout_ET = env.rollout(25, lambda td: td.set("action", torch.zeros(4, 1)), break_when_any_done=False)
+    rollout_ET = env.rollout(
+        25, lambda td: td.set("action", torch.zeros(4, 1)), break_when_any_done=False
+    )
     next_ET, done = rollout_ET["next"], rollout_ET["next", "done"]
     log = base.episode_log()
     assert int(log["episodes"]) == int(done.sum()) > 4
@@ -65,6 +67,7 @@ def test_trackers_agree_with_the_envs_own_log(env):
     assert torch.equal(next_ET["scaled"], 2 * next_ET["reward"])
     # The clock runs out where the env's own one does.
     assert torch.equal(
-        next_ET["remaining_time"][next_ET["truncated"]], torch.zeros(int(next_ET["truncated"].sum()))
+        next_ET["remaining_time"][next_ET["truncated"]],
+        torch.zeros(int(next_ET["truncated"].sum())),
     )
     assert bool((next_ET["remaining_time"][next_ET["terminated"]] > 0).all())

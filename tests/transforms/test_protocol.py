@@ -7,7 +7,13 @@ import torch
 from torchrl.data import Binary, Composite
 from torchrl.envs import TransformedEnv
 
-from ksim_rl.transforms import ActionScale, EpisodeTracker, Mirror, ObservationScale, TimeAwareObservation
+from ksim_rl.transforms import (
+    ActionScale,
+    EpisodeTracker,
+    Mirror,
+    ObservationScale,
+    TimeAwareObservation,
+)
 from tests.transforms.leaf_env import LeafEnv
 from tests.transforms.portable import exported_transforms
 from tests.transforms.protocol import (
@@ -22,7 +28,13 @@ from tests.transforms.protocol import (
     transformed,
 )
 
-QUICK = ("specs_alone", "reset_and_steps", "samples_alone", "samples_from_a_buffer", "inverse_of_samples")
+QUICK = (
+    "specs_alone",
+    "reset_and_steps",
+    "samples_alone",
+    "samples_from_a_buffer",
+    "inverse_of_samples",
+)
 
 
 def shapes_of(check, *, short):
@@ -34,7 +46,9 @@ def shapes_of(check, *, short):
 def run(check, kind, shapes):
     counts = Counter(outcome(check, kind, shape) for shape in shapes)
     print(f"{check}, {kind}: {dict(counts)}")
-    assert counts["refused"] + counts["not asked"] == sum(is_refused(kind, shape) for shape in shapes)
+    assert counts["refused"] + counts["not asked"] == sum(
+        is_refused(kind, shape) for shape in shapes
+    )
     assert sum(counts.values()) == len(shapes)
 
 
@@ -81,7 +95,9 @@ def test_rows_are_no_columns(transform, message):
 
 
 def test_a_key_among_agents_needs_their_batch_size():
-    env = TransformedEnv(LeafEnv((3,), agents=True), TimeAwareObservation(("agents", "clock"), horizon=3))
+    env = TransformedEnv(
+        LeafEnv((3,), agents=True), TimeAwareObservation(("agents", "clock"), horizon=3)
+    )
     with pytest.raises(
         ValueError, match=r"\('agents', 'clock'\) lies in a TensorDict of batch size \(3, 2\)"
     ):
@@ -90,6 +106,10 @@ def test_a_key_among_agents_needs_their_batch_size():
 
 def test_rewards_that_are_flags_are_no_returns():
     env = LeafEnv((3,))
-    env.full_reward_spec = Composite(reward=Binary(1, shape=torch.Size([3, 1]), dtype=torch.bool), shape=[3])
-    with pytest.raises(ValueError, match="EpisodeTracker: 'reward' is torch.bool: expected numbers"):
+    env.full_reward_spec = Composite(
+        reward=Binary(1, shape=torch.Size([3, 1]), dtype=torch.bool), shape=[3]
+    )
+    with pytest.raises(
+        ValueError, match="EpisodeTracker: 'reward' is torch.bool: expected numbers"
+    ):
         TransformedEnv(env, EpisodeTracker()).output_spec  # noqa: B018

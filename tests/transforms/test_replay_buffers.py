@@ -51,7 +51,9 @@ def test_every_way_to_join_a_transform_gives_the_same(kind, name):
             stored = joined._storage.get(slice(None)).select("x", "action", "reward")
             assert_same(stored, samples())
             sampled = joined.sample()
-            found.append(sampled[sampled["index"].argsort()] if "index" in sampled.keys() else sampled)
+            found.append(
+                sampled[sampled["index"].argsort()] if "index" in sampled.keys() else sampled
+            )
         except RuntimeError as error:
             refusals.append(str(error))
     transform = PORTABLE[name]("x")
@@ -66,9 +68,9 @@ def test_every_way_to_join_a_transform_gives_the_same(kind, name):
         else:
             assert set(other.keys()) == set(found[0].keys())
             for key in found[0].keys():
-                assert torch.equal(*(td[key].flatten(1).sum(1).sort().values for td in (other, found[0]))), (
-                    key
-                )
+                assert torch.equal(
+                    *(td[key].flatten(1).sum(1).sort().values for td in (other, found[0]))
+                ), key
 
 
 @every_class
@@ -136,7 +138,9 @@ def test_samples_without_the_key_are_refused_in_a_sentence(name, how):
 @pytest.mark.parametrize("dtype", [torch.int64, torch.bool])
 def test_samples_of_other_dtypes_are_refused_in_a_sentence(name, dtype):
     batch = TensorDict({"x": torch.ones(8, 3, dtype=dtype)}, batch_size=8)
-    with pytest.raises(ValueError, match=f"{name}: 'x' is {dtype}: expected floating-point values$"):
+    with pytest.raises(
+        ValueError, match=f"{name}: 'x' is {dtype}: expected floating-point values$"
+    ):
         with_statistics(PORTABLE[name]("x"))(batch)
 
 
@@ -144,6 +148,7 @@ def test_statistics_that_are_not_there_are_asked_for():
     joined = buffer(ReplayBuffer, PORTABLE["ObservationNormalization"]("x"), "append")
     joined.extend(samples())
     with pytest.raises(
-        RuntimeError, match="^there are no statistics yet: an env, or `load_state_dict`, gives them$"
+        RuntimeError,
+        match="^there are no statistics yet: an env, or `load_state_dict`, gives them$",
     ):
         joined.sample()

@@ -25,7 +25,9 @@ def test_clip_equals_torchrls():
 
 
 def test_bounds_follow():
-    env = counter(RewardClip(clip=(-1.0, 0.5)), RewardScale(scale=-2.0, offset=1.0, first_scale=-4.0))
+    env = counter(
+        RewardClip(clip=(-1.0, 0.5)), RewardScale(scale=-2.0, offset=1.0, first_scale=-4.0)
+    )
     space = env.full_reward_spec["reward"].space
     assert (space.low.unique().tolist(), space.high.unique().tolist()) == ([-1.0], [5.0])
 

@@ -31,7 +31,9 @@ def test_it_scales_additive_and_multiplicative_noise(level):
             "count", "times", noise=ConstantNoise(value=3.0, operation="multiply", by_level=True)
         ),
         ObservationNoise("count", "always", noise=ConstantNoise(value=2.0)),
-        ObservationNoise("count", "rounded", noise=ConstantNoise(value=0.1, resolution=4.0, by_level=True)),
+        ObservationNoise(
+            "count", "rounded", noise=ConstantNoise(value=0.1, resolution=4.0, by_level=True)
+        ),
     ]
     env = counter(*transforms)
     follow_level(transforms, level)
@@ -106,7 +108,9 @@ def test_the_level_is_part_of_the_state_where_it_is_used():
 
 def test_noise_that_follows_full_level_equals_noise_that_follows_none():
     def run(**fields):
-        noise = GaussianNoise(std=0.3, bias=UniformNoise(low=0.5, high=1.5, operation="multiply"), **fields)
+        noise = GaussianNoise(
+            std=0.3, bias=UniformNoise(low=0.5, high=1.5, operation="multiply"), **fields
+        )
         env = counter(ObservationNoise([VECTOR, "row"], noise=noise))
         env.set_seed(3)
         return fixed_rollout(env, 10)

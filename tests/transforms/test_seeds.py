@@ -205,7 +205,9 @@ def test_an_env_goes_with_its_last_user():
 
 
 def test_a_mirror_draws_apart_too():
-    mirror = partial(Mirror, "count", maps={"count": MirrorMap(source=(0,), signs=(-1.0,))}, in_keys_inv=[])
+    mirror = partial(
+        Mirror, "count", maps={"count": MirrorMap(source=(0,), signs=(-1.0,))}, in_keys_inv=[]
+    )
     env = SerialEnv(2, lambda: TransformedEnv(CounterEnv((2,) * 64), mirror()))
     env.set_seed(0)
     env.reset()

@@ -27,7 +27,9 @@ def test_a_row_that_is_done_shows_its_whole_episode():
         ended = rollout_ET["next", "done"][row, :, 0].nonzero()[:, 0].tolist()
         for step in ended:
             reached = rollout_ET["next"][row, step]
-            expected = rollout_ET["next", "reward"][row, step + 1 - length : step + 1].double().sum()
+            expected = (
+                rollout_ET["next", "reward"][row, step + 1 - length : step + 1].double().sum()
+            )
             assert reached["episode_length"].item() == length
             assert reached["episode_return"].item() == pytest.approx(expected.item(), abs=1e-6)
 
@@ -41,7 +43,8 @@ def test_rewards_of_any_kind_equal_torchrls(dtype, size):
         def __init__(self):
             super().__init__(LENGTHS)
             self.full_reward_spec = Composite(
-                reward=Unbounded(torch.Size([len(LENGTHS), size]), dtype=dtype), shape=(len(LENGTHS),)
+                reward=Unbounded(torch.Size([len(LENGTHS), size]), dtype=dtype),
+                shape=(len(LENGTHS),),
             )
 
         def _step(self, tensordict):
@@ -78,9 +81,9 @@ def test_success(reduce, outcomes):
     assert not rollout_ET["episode_success"][:, 0].any()
     for row, outcome in enumerate(outcomes):
         ended = rollout_ET["next", "done"][row, :, 0]
-        assert rollout_ET["next", "episode_success"][row, ended].flatten().tolist() == [outcome] * int(
-            ended.sum()
-        )
+        assert rollout_ET["next", "episode_success"][row, ended].flatten().tolist() == [
+            outcome
+        ] * int(ended.sum())
 
 
 def test_success_by_a_done_flag():

@@ -78,7 +78,9 @@ def test_what_is_wrong_is_named_with_its_path(tree, message):
 
 def test_python_gives_data_too():
     with pytest.raises(ValueError, match="fn=<function.*expected data"):
-        TransformCfg(type("Own", (ActionDelay,), {"__init__": lambda self, fn: None}), fn=lambda x: x)
+        TransformCfg(
+            type("Own", (ActionDelay,), {"__init__": lambda self, fn: None}), fn=lambda x: x
+        )
     with pytest.raises(ValueError, match="expected a class of transforms"):
         TransformCfg(CFGS[0].build())  # pyright: ignore[reportArgumentType]
 

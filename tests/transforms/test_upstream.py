@@ -38,7 +38,9 @@ def test_gym_envs_tell_their_horizon():
 
 
 def test_a_stock_env_keeps_seeds_from_its_transforms():
-    moved = f"TorchRL {version('torchrl')}: TransformedEnv.set_seed is not what _SetSeed stands in for"
+    moved = (
+        f"TorchRL {version('torchrl')}: TransformedEnv.set_seed is not what _SetSeed stands in for"
+    )
     env = TransformedEnv(
         CounterEnv((3, 4)), ObservationNoise("count", noise=UniformNoise(low=-1.0, high=1.0))
     )
@@ -48,7 +50,9 @@ def test_a_stock_env_keeps_seeds_from_its_transforms():
 
 
 def told(results, worker_idx=None):
-    results.put((upstream.fresh_seed(), multiprocessing.current_process()._kwargs.get("worker_idx")))
+    results.put(
+        (upstream.fresh_seed(), multiprocessing.current_process()._kwargs.get("worker_idx"))
+    )
 
 
 def test_workers_know_their_number():

@@ -53,14 +53,18 @@ def test_orders_are_the_same(without_warp, n):
 
 def test_counters_that_would_be_misread_are_refused(without_warp):
     without_warp()
-    with pytest.raises(ValueError, match=r"expected torch.int64, and a counter of shape \(\) or \(4,\)"):
+    with pytest.raises(
+        ValueError, match=r"expected torch.int64, and a counter of shape \(\) or \(4,\)"
+    ):
         random.uniform(random.row_keys(SEED, STREAM, torch.zeros(3, dtype=torch.int64), 4), 2)
 
 
 def rolled_out(kind: str) -> dict[NestedKey, torch.Tensor]:
     env = masked(kind)
     steps = iter(actions(12, env))
-    rollout_ET = env.rollout(12, lambda td: td.set(env.action_key, next(steps)), break_when_any_done=False)
+    rollout_ET = env.rollout(
+        12, lambda td: td.set(env.action_key, next(steps)), break_when_any_done=False
+    )
     return dict(rollout_ET.items(True, True))
 
 

@@ -111,7 +111,9 @@ def figures(markups):
     text = "".join(page.text for page in pages)
     # In the title, as a reward, and in the error.
     unseen = [markup for markup in markups if text.count(shown(markup)) < 3]
-    in_markdown = [content for content in gui.markdown if any(markup in content for markup in markups)]
+    in_markdown = [
+        content for content in gui.markdown if any(markup in content for markup in markups)
+    ]
     return {
         "names": len(markups),
         "obeyed": len(strange) + len(handlers),

@@ -58,11 +58,23 @@ TO_VISER = {
     "type_that_is_no_text": {"type": ["GuiUpdateMessage"]},
     "tunnel": {"type": "ShareUrlRequest"},
     "script": {"type": "RunJavascriptMessage", "source": "window.ran=1"},
-    "upload": {"type": "FileTransferStartUpload", "source_component_uuid": "UUID", "transfer_uuid": "x"},
+    "upload": {
+        "type": "FileTransferStartUpload",
+        "source_component_uuid": "UUID",
+        "transfer_uuid": "x",
+    },
     "unknown_widget": {"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": 1.0}},
-    "icon": {"type": "GuiUpdateMessage", "uuid": "WIDGET", "updates": {"_icon_html": "<img src=x>"}},
+    "icon": {
+        "type": "GuiUpdateMessage",
+        "uuid": "WIDGET",
+        "updates": {"_icon_html": "<img src=x>"},
+    },
     "callbacks": {"type": "GuiUpdateMessage", "uuid": "UUID", "updates": {"update_cb": []}},
-    "two_values": {"type": "GuiUpdateMessage", "uuid": "UUID", "updates": {"value": 1.0, "removed": True}},
+    "two_values": {
+        "type": "GuiUpdateMessage",
+        "uuid": "UUID",
+        "updates": {"value": 1.0, "removed": True},
+    },
     "no_number": {"type": "GuiUpdateMessage", "uuid": "UUID", "updates": {"value": "fast"}},
     "nan": {"type": "GuiUpdateMessage", "uuid": "UUID", "updates": {"value": float("nan")}},
     "infinity": {"type": "GuiUpdateMessage", "uuid": "UUID", "updates": {"value": float("inf")}},
@@ -114,7 +126,10 @@ def answer(address, *, host, origin, path, websocket):
         lines.append(f"Origin: {fill(origin)}")
     if websocket:
         lines += ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
-        lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", f"Sec-WebSocket-Protocol: {version()}"]
+        lines += [
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
+            f"Sec-WebSocket-Protocol: {version()}",
+        ]
     with socket.create_connection((parts.hostname, parts.port), timeout=PATIENCE_S) as link:
         link.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
         return int(link.recv(64).split()[1])
@@ -143,7 +158,9 @@ def widgets(link):
     while not {"Push (m/s)", "Pause", "Push"} <= found.keys():
         raw = link.recv(timeout=PATIENCE_S)
         size = int.from_bytes(raw[8:16], "little")
-        window = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size]))
+        window = msgspec.msgpack.decode(
+            zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size])
+        )
         for message in window["messages"]:
             label = message.get("props", {}).get("label")
             if label is not None and "uuid" in message:
@@ -157,7 +174,8 @@ def filled(message, known):
         return message
     names = {"UUID": known["Push (m/s)"], "WIDGET": known["Pause"]}
     message = {
-        key: names.get(value, value) if isinstance(value, str) else value for key, value in message.items()
+        key: names.get(value, value) if isinstance(value, str) else value
+        for key, value in message.items()
     }
     return msgspec.msgpack.encode(message)
 
@@ -218,7 +236,11 @@ def pushes(viewer, session, values):
         )  # viser calls back for a page that has said where it looks from
         for value in values:
             wanted = len(taken) + 1
-            update = {"type": "GuiUpdateMessage", "uuid": known["Push (m/s)"], "updates": {"value": value}}
+            update = {
+                "type": "GuiUpdateMessage",
+                "uuid": known["Push (m/s)"],
+                "updates": {"value": value},
+            }
             click = {"type": "GuiUpdateMessage", "uuid": known["Push"], "updates": {"value": True}}
             link.send(msgspec.msgpack.encode(update))
             link.send(msgspec.msgpack.encode(click))

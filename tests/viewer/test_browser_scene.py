@@ -34,10 +34,16 @@ class Recorder:
         self.labels.append(label)
         return label
 
-    def add_batched_meshes_simple(self, name, vertices, faces, wxyzs, positions, *, batched_scales, **how):
+    def add_batched_meshes_simple(
+        self, name, vertices, faces, wxyzs, positions, *, batched_scales, **how
+    ):
         batch = type("Batch", (), {"remove": lambda self: None})()
         batch.vertices, batch.faces, batch.how = np.asarray(vertices), np.asarray(faces), how
-        batch.batched_wxyzs, batch.batched_positions, batch.batched_scales = wxyzs, positions, batched_scales
+        batch.batched_wxyzs, batch.batched_positions, batch.batched_scales = (
+            wxyzs,
+            positions,
+            batched_scales,
+        )
         batch.batched_colors = how["batched_colors"]
         self.meshes[name] = batch
         return batch
@@ -57,9 +63,9 @@ def _shown(batch):
 def _placed(batch, row):
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, np.asarray(batch.batched_wxyzs[row], dtype=np.float64))
-    return (batch.vertices * batch.batched_scales[row]) @ matrix.reshape(3, 3).T + batch.batched_positions[
-        row
-    ]
+    return (batch.vertices * batch.batched_scales[row]) @ matrix.reshape(
+        3, 3
+    ).T + batch.batched_positions[row]
 
 
 def shown(xml: str, *, change=lambda scene: None) -> Recorder:
@@ -67,7 +73,10 @@ def shown(xml: str, *, change=lambda scene: None) -> Recorder:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     scene = mujoco.MjvScene(model, 100)
-    everything, nothing = mujoco.mjtCatBit.mjCAT_ALL.value, (mujoco.MjvPerturb(), mujoco.MjvCamera())
+    everything, nothing = (
+        mujoco.mjtCatBit.mjCAT_ALL.value,
+        (mujoco.MjvPerturb(), mujoco.MjvCamera()),
+    )
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), *nothing, everything, scene)
     change(scene)
     recorder = Recorder()
@@ -87,7 +96,9 @@ def test_primitives_have_their_size_and_place():
         "<geom type='plane' size='0 0 1'/>"
         "</worldbody></mujoco>"
     )
-    bounds = {(tuple(c.min(0).round(2)), tuple(c.max(0).round(2))) for c in recorder.corners().values()}
+    bounds = {
+        (tuple(c.min(0).round(2)), tuple(c.max(0).round(2))) for c in recorder.corners().values()
+    }
     assert bounds == {
         ((0.9, 1.8, 2.7), (1.1, 2.2, 3.3)),
         ((-0.4, -0.1, 0.9), (0.4, 0.1, 1.1)),
@@ -106,7 +117,10 @@ def test_a_mesh_keeps_its_triangles():
     model = mujoco.MjModel.from_xml_string(xml)
     vertices, faces = mesh_of_model(model, 0)
     triangles = {tuple(sorted(map(tuple, vertices[face].round(4).tolist()))) for face in faces}
-    own = {tuple(sorted(map(tuple, model.mesh_vert[face].round(4).tolist()))) for face in model.mesh_face}
+    own = {
+        tuple(sorted(map(tuple, model.mesh_vert[face].round(4).tolist())))
+        for face in model.mesh_face
+    }
     assert triangles == own and len(triangles) == 4
     batches = shown(xml).meshes.values()  # two, as one of them is transparent
     assert sorted(batch.how["opacity"] or 1.0 for batch in batches) == [0.5, 1.0]
@@ -134,7 +148,8 @@ def test_a_height_field_has_its_heights():
         )  # which diagonal is split
     assert (
         np.cross(
-            vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+            vertices[faces[:, 1]] - vertices[faces[:, 0]],
+            vertices[faces[:, 2]] - vertices[faces[:, 0]],
         )[:, 2].min()
         > 0
     )
@@ -142,7 +157,9 @@ def test_a_height_field_has_its_heights():
 
 def _height(vertices, faces, x, y):
     for a, b, c in vertices[faces]:
-        weights = np.linalg.solve(np.stack([b[:2] - a[:2], c[:2] - a[:2]], axis=1), np.array([x, y]) - a[:2])
+        weights = np.linalg.solve(
+            np.stack([b[:2] - a[:2], c[:2] - a[:2]], axis=1), np.array([x, y]) - a[:2]
+        )
         if min(*weights, 1 - weights.sum()) >= -1e-9:
             return a[2] + weights @ np.array([b[2] - a[2], c[2] - a[2]])
     raise AssertionError("outside of the field")
@@ -165,7 +182,11 @@ def test_arrows_lines_and_labels_stand_where_they_are_drawn():
         :, 0
     ].max() == pytest.approx(1)
     assert (line[:, 1].min(), line[:, 1].max()) == pytest.approx((2, 3))
-    assert recorder.labels[0].text == "in the air" and recorder.labels[0].position.tolist() == [1, 2, 3]
+    assert recorder.labels[0].text == "in the air" and recorder.labels[0].position.tolist() == [
+        1,
+        2,
+        3,
+    ]
 
 
 def test_what_moves_is_sent_anew_and_what_is_gone_shrinks():
@@ -180,7 +201,11 @@ def test_what_moves_is_sent_anew_and_what_is_gone_shrinks():
     env.base_env.world.qpos_EL[0, 0] += 0.5
     scene.fill(0, drawn=(), contacts=False)
     browser.show(scene.mjv, center=scene.center(None))
-    moved = {name for name, batch in recorder.meshes.items() if batch.batched_positions is not before[name]}
+    moved = {
+        name
+        for name, batch in recorder.meshes.items()
+        if batch.batched_positions is not before[name]
+    }
     assert moved and moved < set(before) | moved
     scene.mjv.ngeom = 0
     browser.show(scene.mjv, center=np.zeros(3))

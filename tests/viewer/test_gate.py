@@ -36,7 +36,9 @@ def test_the_pages_of_the_printed_addresses_are(served):
     for address in (viewer.address, viewer.pad_address):
         for origin in (None, "http://HOST"):
             for websocket, status in ((False, 200), (True, 101)):
-                found = answer(address, host="HOST", origin=origin, path="/TOKEN", websocket=websocket)
+                found = answer(
+                    address, host="HOST", origin=origin, path="/TOKEN", websocket=websocket
+                )
                 assert found == status
 
 
@@ -71,7 +73,9 @@ def can_look(viewer):
 
 
 def test_a_server_that_would_stand_open_is_not_started(monkeypatch):
-    monkeypatch.setattr(guarded_server, "_gated", lambda gate: guarded_server.contextlib.nullcontext([]))
+    monkeypatch.setattr(
+        guarded_server, "_gated", lambda gate: guarded_server.contextlib.nullcontext([])
+    )
     with pytest.raises(RuntimeError, match="nothing would keep strangers out"):
         guarded_server.start(Gate("127.0.0.1"), host="127.0.0.1", port=18360, label="")
     assert websockets.asyncio.server.serve is guarded_server._serve

@@ -138,7 +138,9 @@ def test_plots_hold_the_present_values(served, page):
 
     until(drawn, "a chart of the reward terms")
     table = {name: pytest.approx(value, abs=1e-4) for name, value in now.items()}
-    until(lambda: table.items() <= page.execute_script(CELLS).items(), "a table of the reward terms")
+    until(
+        lambda: table.items() <= page.execute_script(CELLS).items(), "a table of the reward terms"
+    )
 
 
 def test_an_error_pauses_and_is_shown(served, page):
@@ -150,16 +152,22 @@ def test_an_error_pauses_and_is_shown(served, page):
 
     session.ask(lambda: setattr(session, "agent", broken))
     click(page, "Play")
-    until(lambda: "RuntimeError: the policy has no answer" in page.execute_script(TEXT), "the error")
+    until(
+        lambda: "RuntimeError: the policy has no answer" in page.execute_script(TEXT), "the error"
+    )
     assert not session.playing
     session.ask(lambda: setattr(session, "agent", working))
     step(page, session)
-    until(lambda: "the policy has no answer" not in page.execute_script(TEXT), "an end of the error")
+    until(
+        lambda: "the policy has no answer" not in page.execute_script(TEXT), "an end of the error"
+    )
 
 
 def test_noise_is_switched_off(served, page):
     _, session = served
-    box = until(lambda: page.execute_script(LABELLED, "noise", "input[type=checkbox]"), "a switch of noise")
+    box = until(
+        lambda: page.execute_script(LABELLED, "noise", "input[type=checkbox]"), "a switch of noise"
+    )
     assert any(group.enable_noise for group in session.ours.cfg.observations.values())
     page.execute_script("arguments[0].click()", box)
     until(lambda: session.built == 2, "another env")

@@ -54,7 +54,10 @@ def test_weights_are_given_between_iterations_while_somebody_watches(tmp_path):
             saved = torch.load(path, weights_only=True)
             own = trainer.update.actor.state_dict()
             seen.append(
-                (saved["iteration"], all(own[name].equal(held) for name, held in saved["actor"].items()))
+                (
+                    saved["iteration"],
+                    all(own[name].equal(held) for name, held in saved["actor"].items()),
+                )
             )
             assert saved["actor"].keys() == own.keys()
             path.unlink()

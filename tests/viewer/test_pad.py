@@ -20,7 +20,9 @@ def served():
     session.play = lambda playing: said.append(("play", playing))
     session.step_once = session.reset = lambda: said.append("other")
     session.push = lambda speed: said.append(("push", speed))
-    panel = SimpleNamespace(drive=lambda shares: said.append(shares), push_speed=SimpleNamespace(value=1.5))
+    panel = SimpleNamespace(
+        drive=lambda shares: said.append(shares), push_speed=SimpleNamespace(value=1.5)
+    )
     pad = Pad(panel, session, Gate("127.0.0.1"), host="127.0.0.1", port=18301, viewer_port=18300)
     yield pad, said
     pad.close()

@@ -20,8 +20,14 @@ from ksim_rl.viewer.session import showing_motion
         (["RUN", "--fps", "0"], "--fps=0.0: expected a finite number in (0.0, inf)"),
         (["RUN", "--seconds", "-1"], "--seconds=-1.0: expected a finite number in (0.0, inf)"),
         (["RUN", "--num-envs", "0"], "--num-envs=0: expected a whole number >= 1"),
-        (["RUN", "--motion", "walker_walk"], "--motion walker_walk: name a task with the motion's robot"),
-        (["task=walker_track", "--motion", "walker_walk", "--agent", "zero"], "nothing acts in a motion"),
+        (
+            ["RUN", "--motion", "walker_walk"],
+            "--motion walker_walk: name a task with the motion's robot",
+        ),
+        (
+            ["task=walker_track", "--motion", "walker_walk", "--agent", "zero"],
+            "nothing acts in a motion",
+        ),
         (["RUN", "--output", "clip.avi"], "ends in .mp4 or .gif"),
     ],
 )

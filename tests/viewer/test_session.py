@@ -75,7 +75,9 @@ def test_an_error_pauses_and_is_kept_until_it_plays_again(clock):
     clock[0] += 0.05
     assert session.advance()  # which a display has to show
     assert not session.playing
-    assert session.error == "ZeroDivisionError: the policy broke" and "def agent" not in session.error
+    assert (
+        session.error == "ZeroDivisionError: the policy broke" and "def agent" not in session.error
+    )
     assert "in agent" in session.trace
     session.agent = working
     session.ask(session.play)

@@ -21,7 +21,12 @@ def test_a_text_without_end_is_cut():
 
 def test_the_panel_and_the_plots_hold_no_markup_of_a_run():
     names = len(MARKUP)
-    assert figures(MARKUP.values()) == {"names": names, "obeyed": 0, "not_shown_as_text": 0, "in_markdown": 0}
+    assert figures(MARKUP.values()) == {
+        "names": names,
+        "obeyed": 0,
+        "not_shown_as_text": 0,
+        "in_markdown": 0,
+    }
 
 
 def test_a_real_browser_runs_nothing_of_a_run(tmp_path):
@@ -45,5 +50,8 @@ def test_a_real_browser_runs_nothing_of_a_run(tmp_path):
         session.ask(lambda: setattr(session, "agent", broken))
         click(page, "Step")
         until(lambda: "Paused by an error" in page.execute_script(TEXT), "the error")
-        assert page.execute_script("return document.querySelectorAll('img[src=x], iframe').length") == 0
+        assert (
+            page.execute_script("return document.querySelectorAll('img[src=x], iframe').length")
+            == 0
+        )
         assert page.execute_script("return window.ran === undefined")

@@ -99,13 +99,18 @@ def run(tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(FOLDER / "reacher" / "checkpoint", folder / "checkpoint")
     (folder / "config.yaml").write_text("task_name: reacher\n")
-    rows = [f"{8192 * i},{i},{'' if i % 2 else i / 3}," + ("795.5" if i == 60 else "") for i in range(1, 61)]
+    rows = [
+        f"{8192 * i},{i},{'' if i % 2 else i / 3}," + ("795.5" if i == 60 else "")
+        for i in range(1, 61)
+    ]
     (folder / "metrics.csv").write_text(
         "\n".join(["env_states,iteration,episode/return,evaluation/return_mean", *rows, ""])
     )
 
     def of(*codes):
-        sessions = [{"began": "today", "command": "train", "code": {"ksim_rl": code}} for code in codes]
+        sessions = [
+            {"began": "today", "command": "train", "code": {"ksim_rl": code}} for code in codes
+        ]
         (folder / "run.json").write_text(json.dumps({"sessions": sessions}))
         return folder
 
@@ -115,16 +120,30 @@ def run(tmp_path):
 @pytest.mark.parametrize(
     ("codes", "said"),
     [
-        ([{"commit": COMMIT, "changed": "ksim_rl.diff"}], f"made of {COMMIT} with changes: train in a clean"),
-        ([{"commit": COMMIT}, {"commit": COMMIT, "changed": "x"}], f"made of {COMMIT} and {COMMIT} with"),
-        ([{"commit": COMMIT}, {"commit": COMMIT[::-1]}], f"made of {COMMIT} and {COMMIT[::-1]}: train"),
-        ([{"commit": "HEAD"}], "made of HEAD: train in a clean clone of one commit, and add that run"),
+        (
+            [{"commit": COMMIT, "changed": "ksim_rl.diff"}],
+            f"made of {COMMIT} with changes: train in a clean",
+        ),
+        (
+            [{"commit": COMMIT}, {"commit": COMMIT, "changed": "x"}],
+            f"made of {COMMIT} and {COMMIT} with",
+        ),
+        (
+            [{"commit": COMMIT}, {"commit": COMMIT[::-1]}],
+            f"made of {COMMIT} and {COMMIT[::-1]}: train",
+        ),
+        (
+            [{"commit": "HEAD"}],
+            "made of HEAD: train in a clean clone of one commit, and add that run",
+        ),
         ([{}], "made of no commit: train in a clean clone"),
         ([], "made of no commit: train in a clean clone"),
     ],
     ids=["changed", "changed later", "two commits", "a name", "outside of git", "no record"],
 )
-def test_a_run_of_code_that_no_commit_has_is_refused_in_one_line(run, codes, said, tmp_path, capsys):
+def test_a_run_of_code_that_no_commit_has_is_refused_in_one_line(
+    run, codes, said, tmp_path, capsys
+):
     with pytest.raises(SystemExit) as ended:
         main(["zoo", "add", str(run(*codes)), "mine", "--folder", str(tmp_path / "zoo")])
     assert ended.value.code == 2
@@ -135,7 +154,9 @@ def test_a_run_of_code_that_no_commit_has_is_refused_in_one_line(run, codes, sai
 
 def test_an_entry_names_the_commit_of_its_run(run, tmp_path):
     pytest.importorskip("onnxruntime")
-    card = add(run({"commit": COMMIT}, {"commit": COMMIT}), "mine", folder=tmp_path / "zoo", episodes=2)
+    card = add(
+        run({"commit": COMMIT}, {"commit": COMMIT}), "mine", folder=tmp_path / "zoo", episodes=2
+    )
     assert card == read_card("mine", tmp_path / "zoo")
     assert (card.commit, card.task, card.seed) == (COMMIT, "reacher", 1)
     assert (card.env_states, card.return_mean) == (60 * 8192, 795.5)
@@ -182,7 +203,10 @@ class Artifact:
     @property
     def manifest(self):
         return types.SimpleNamespace(
-            entries={name: types.SimpleNamespace(size=len(content)) for name, content in self.files.items()}
+            entries={
+                name: types.SimpleNamespace(size=len(content))
+                for name, content in self.files.items()
+            }
         )
 
     def add_file(self, path, name):
@@ -210,7 +234,9 @@ class Stub(types.ModuleType):
         )
 
     def Api(self):
-        return types.SimpleNamespace(run=lambda _: types.SimpleNamespace(logged_artifacts=lambda: self.kept))
+        return types.SimpleNamespace(
+            run=lambda _: types.SimpleNamespace(logged_artifacts=lambda: self.kept)
+        )
 
 
 @pytest.fixture
@@ -251,7 +277,9 @@ def test_a_service_that_fails_costs_no_training(wandb, zoo, monkeypatch):
     assert len(said) == 1 and "nothing was sent to Weights & Biases" in said[0]
 
 
-@pytest.mark.parametrize("name", ["../../secret", "checkpoint/1/evil.py", "/etc/passwd", "config.yaml/../x"])
+@pytest.mark.parametrize(
+    "name", ["../../secret", "checkpoint/1/evil.py", "/etc/passwd", "config.yaml/../x"]
+)
 def test_an_artifact_with_other_files_is_refused(wandb, name, tmp_path):
     artifact = Artifact("run-x", wandb_runs.KIND)
     artifact.files[name] = b"x"

@@ -11,7 +11,12 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl import ranks
-from ksim_rl.algorithms.gradient_steps import RolloutUpdate, in_columns, load_optimizer_state, optimizer_state
+from ksim_rl.algorithms.gradient_steps import (
+    RolloutUpdate,
+    in_columns,
+    load_optimizer_state,
+    optimizer_state,
+)
 from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.algorithms.ppo.wiring import make_ppo_update
 from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
@@ -38,7 +43,9 @@ def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: State | None = None) -> 
     """Build PPO and the discriminator of a run, and observe its reference motions."""
     objective: Any = cfg.objective
     ppo = make_ppo_update(cfg, env)
-    motions = [observe_motion(env, group=objective.style_group, file=file) for file in objective.motions]
+    motions = [
+        observe_motion(env, group=objective.style_group, file=file) for file in objective.motions
+    ]
     # Successive frames of each motion are the transitions; none joins the end of one motion to another.
     transitions = []
     for seen_FL in motions:
@@ -96,7 +103,9 @@ class AMPUpdate(RolloutUpdate):
             shards=ppo.dataset.cfg.shards,
         )
         kept.rollout_length(num_envs)  # which refuses shards that are not equal
-        self.replay = ReplayRing(kept, num_envs=num_envs, observations=[cfg.style_group], device=self.device)
+        self.replay = ReplayRing(
+            kept, num_envs=num_envs, observations=[cfg.style_group], device=self.device
+        )
         self._style = torch.zeros((), device=self.device)
 
     @property
@@ -121,7 +130,9 @@ class AMPUpdate(RolloutUpdate):
             **self._means,
             "style/reward": self._style,
             "update/skipped_steps": metrics["update/skipped_steps"] + self.guard.skipped,
-            "update/skipped_in_a_row": torch.maximum(metrics["update/skipped_in_a_row"], self._longest_skip),
+            "update/skipped_in_a_row": torch.maximum(
+                metrics["update/skipped_in_a_row"], self._longest_skip
+            ),
         }
 
     def _update(self) -> None:
@@ -132,7 +143,9 @@ class AMPUpdate(RolloutUpdate):
     @torch.no_grad()
     def _rewarded(self, rollout_ET: TensorDictBase) -> TensorDictBase:
         """Return the rollout with the sum of both rewards, which leaves the env's own as it was."""
-        style_ET = style_reward(self.discriminator(_transitions(rollout_ET, *self._features))).unsqueeze(-1)
+        style_ET = style_reward(
+            self.discriminator(_transitions(rollout_ET, *self._features))
+        ).unsqueeze(-1)
         # Scores of env states that are not finite are NaN, and the dataset removes those rows.
         self._style.copy_(style_ET.nanmean())
         reward = self.signals.following[0]
@@ -147,7 +160,9 @@ class AMPUpdate(RolloutUpdate):
         shown = []
         for minibatch_B in self.replay.minibatches(self.cfg.num_discriminator_steps):
             # As many reference transitions as there are of the policy, drawn with replacement.
-            drawn_B = ranks.randint(len(self.reference_N2L), minibatch_B.batch_size, device=self.device)
+            drawn_B = ranks.randint(
+                len(self.reference_N2L), minibatch_B.batch_size, device=self.device
+            )
             reference_B2L = self.reference_N2L[drawn_B]
             policy_B2L = _transitions(minibatch_B, *self._features)
             mask_B = minibatch_B.get(MASK_KEY).squeeze(-1)
@@ -165,7 +180,8 @@ class AMPUpdate(RolloutUpdate):
             _, skipped = step(self.optimizer, loss, max_grad_norm=self.cfg.max_grad_norm)
             self.guard.count_(skipped)
             made.append(
-                logged | {"skipped": skipped, "skipped_in_a_row": self.guard.skipped_in_a_row.clone()}
+                logged
+                | {"skipped": skipped, "skipped_in_a_row": self.guard.skipped_in_a_row.clone()}
             )
             shown += [reference_B2L, policy_B2L]
         # Only now, so that all steps see the statistics that the rollout was scored with.
@@ -185,7 +201,9 @@ class AMPUpdate(RolloutUpdate):
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         self.ppo.load_state_dict(state)
         super().load_weights(state)
-        load_optimizer_state(self.optimizer, state["discriminator_optimizer"], what="discriminator's Adam")
+        load_optimizer_state(
+            self.optimizer, state["discriminator_optimizer"], what="discriminator's Adam"
+        )
         guard = state["discriminator_guard"]
         state_tree.copy_into(self.guard.state_dict(), guard, what="guard of the discriminator")
         self.replay.load_state_dict(state["replay"])

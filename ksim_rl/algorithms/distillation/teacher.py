@@ -55,7 +55,9 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
 def restored_teacher(state: State, env: EnvBase, *, cfg: RunCfg) -> Teacher:
     """Build the teacher of a `Teacher.state_dict`; see `load_teacher`."""
     # Built by the config of its own run, on the device of this one.
-    teacher_cfg = RunCfg.from_tree({**json.loads(state["config"]), "device": str(cfg.resolved_device())})
+    teacher_cfg = RunCfg.from_tree(
+        {**json.loads(state["config"]), "device": str(cfg.resolved_device())}
+    )
     read = teacher_cfg.modules.observation_keys("actor")
     theirs: Any = json.loads(state["columns"])
     ours: Any = observation_columns(env)
@@ -70,12 +72,17 @@ def restored_teacher(state: State, env: EnvBase, *, cfg: RunCfg) -> Teacher:
     # Only groups of the vector kind have columns; nested keys are single observations.
     groups = [key for key in read if isinstance(key, str)]
     checkpoint.check_columns(
-        *({group: columns[group] for group in groups if group in columns} for columns in (theirs, ours))
+        *(
+            {group: columns[group] for group in groups if group in columns}
+            for columns in (theirs, ours)
+        )
     )
     policy = make_policy(teacher_cfg, env)
     # Labels are made for single env states, from which no recurrent state can be known.
     if recurrent_modules(policy):
-        raise ValueError("the teacher is recurrent, and has to label single env states: take one without")
+        raise ValueError(
+            "the teacher is recurrent, and has to label single env states: take one without"
+        )
     state_tree.copy_into(policy.state_dict(), state["actor"], what="teacher")
     description = {name: state[name] for name in ("config", "columns")}
     return Teacher(policy=policy.requires_grad_(False).eval(), description=description)

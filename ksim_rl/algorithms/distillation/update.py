@@ -18,15 +18,26 @@ from ksim_rl.device import state_tree
 from ksim_rl.device.state_tree import State
 from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.modules import MixedPolicy, update_normalizers
-from ksim_rl.objectives import DistillationCfg, DistillationLoss, distribution_keys, observation_keys
+from ksim_rl.objectives import (
+    DistillationCfg,
+    DistillationLoss,
+    distribution_keys,
+    observation_keys,
+)
 from ksim_rl.trainers.algorithm import part_of
 from ksim_rl.trainers.run_cfg import RunCfg
 
 # Names of the logged means, by the names that `ppo_step` gives them.
-LOGGED = {"loss_distillation": "loss/distillation", "kl": "update/kl", "grad_norm": "update/grad_norm"}
+LOGGED = {
+    "loss_distillation": "loss/distillation",
+    "kl": "update/kl",
+    "grad_norm": "update/grad_norm",
+}
 
 
-def make_distillation_update(cfg: RunCfg, env: EnvBase, resumed: State | None = None) -> "DistillationUpdate":
+def make_distillation_update(
+    cfg: RunCfg, env: EnvBase, resumed: State | None = None
+) -> "DistillationUpdate":
     """Build the distillation of a run; the teacher is in `resumed`, or else the policy of `objective.teacher`."""
     objective: Any = cfg.objective
     data = part_of(cfg, "data", DatasetCfg)

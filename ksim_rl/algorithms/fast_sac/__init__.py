@@ -23,9 +23,16 @@ class FastSACCfg(SACCfg):
     weight_decay: float = 1e-3
 
 
-ACTOR = SquashedActorCfg(hidden_dims=(512, 256, 128), activation="silu", layer_norm=True, log_std_max=0.0)
+ACTOR = SquashedActorCfg(
+    hidden_dims=(512, 256, 128), activation="silu", layer_norm=True, log_std_max=0.0
+)
 CRITIC = QNetworkCfg(
-    hidden_dims=(768, 384, 192), activation="silu", layer_norm=True, num_atoms=101, v_min=-20.0, v_max=20.0
+    hidden_dims=(768, 384, 192),
+    activation="silu",
+    layer_norm=True,
+    num_atoms=101,
+    v_min=-20.0,
+    v_max=20.0,
 )
 MODULES = ModulesCfg(actor=ACTOR, critic=CRITIC)
 FAST_SAC = OFF_POLICY(name="fast_sac", cfg=FastSACCfg, data=MANY_ENVS, modules=MODULES)

@@ -13,7 +13,12 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
-from ksim_rl.algorithms.gradient_steps import RolloutUpdate, in_columns, load_optimizer_state, optimizer_state
+from ksim_rl.algorithms.gradient_steps import (
+    RolloutUpdate,
+    in_columns,
+    load_optimizer_state,
+    optimizer_state,
+)
 from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
@@ -88,13 +93,19 @@ class OffPolicyUpdate(RolloutUpdate):
         fast: Any = partial(compiled, device=self.device, wanted=cfg.compile)
         self._images = None
         if cfg.symmetry == "augment":
-            self._images = SymmetricAugmentation(mirror, read=self._observations, device=self.device)
+            self._images = SymmetricAugmentation(
+                mirror, read=self._observations, device=self.device
+            )
         self._read = fast(self._stored)
         self._count_ = fast(self._counted_)
         self._critic_loss = fast(loss.critic_loss)
         self._actor_losses = fast(loss.actor_losses)
         self.replay = ReplayRing(
-            data, num_envs=num_envs, observations=self._observations, gamma=cfg.gamma, device=self.device
+            data,
+            num_envs=num_envs,
+            observations=self._observations,
+            gamma=cfg.gamma,
+            device=self.device,
         )
         # The optimizer of the critics moves the targets in the same step.
         target = loss.target_critic_network.parameters()
@@ -202,7 +213,11 @@ class OffPolicyUpdate(RolloutUpdate):
         # A step counts as skipped if the temperature's was.
         if "alpha" in steps:
             skipped = torch.maximum(skipped, steps["alpha"][1])
-        return logged | {"loss_actor": losses["loss_actor"], "actor_grad_norm": norm, "skipped": skipped}
+        return logged | {
+            "loss_actor": losses["loss_actor"],
+            "actor_grad_norm": norm,
+            "skipped": skipped,
+        }
 
     def _descend(
         self, losses: dict[str, Tensor], minibatch_B: TensorDictBase
@@ -233,7 +248,9 @@ class OffPolicyUpdate(RolloutUpdate):
         super().load_state_dict(state)
         for name, optimizer in self.optimizers.items():
             load_optimizer_state(optimizer, state["optimizers"][name], what=f"{name} optimizer")
-        state_tree.copy_into(self.behavior.exploration_state(), state["exploration"], what="exploration")
+        state_tree.copy_into(
+            self.behavior.exploration_state(), state["exploration"], what="exploration"
+        )
         self.replay.load_state_dict(state["replay"])
         # Without a replay the run has to collect random actions first, as at its start.
         if state["replay"]:
@@ -255,7 +272,11 @@ class OffPolicyUpdate(RolloutUpdate):
         """Refuse an actor that was trained for other actions: its bounds are not weights, and come from the config."""
         for name, bound in self.actor.state_dict().items():
             own = bound.cpu()
-            if name.endswith((".low", ".high")) and name in saved and not torch.equal(saved[name].cpu(), own):
+            if (
+                name.endswith((".low", ".high"))
+                and name in saved
+                and not torch.equal(saved[name].cpu(), own)
+            ):
                 raise ValueError(
                     f"modules.actor.action_bound: {name!r} is {own.tolist()} in this run and {saved[name].tolist()} in "
                     "the checkpoint; take that of the checkpoint's run"

@@ -26,7 +26,9 @@ from ksim_rl.trainers.algorithm import Algorithm, part_of
 from ksim_rl.trainers.run_cfg import RunCfg
 
 
-def make_off_policy_update(cfg: RunCfg, env: EnvBase, resumed: State | None = None) -> OffPolicyUpdate:
+def make_off_policy_update(
+    cfg: RunCfg, env: EnvBase, resumed: State | None = None
+) -> OffPolicyUpdate:
     """Build the update of a run; one that is resumed is built like a new one."""
     objective: Any = cfg.objective
     actor: Any = make_off_policy_policy(cfg, env)
@@ -60,7 +62,10 @@ def make_off_policy_update(cfg: RunCfg, env: EnvBase, resumed: State | None = No
         target = {name: getattr(objective, name) for name in ("target_noise", "target_noise_clip")}
         loss = TD3Loss(actor, critic, **bounds, **target, **learned)
         # SAC explores by its own draws; TD3's policy is deterministic, and needs noise.
-        noise = {"noise_min": objective.exploration_noise_min, "noise_max": objective.exploration_noise_max}
+        noise = {
+            "noise_min": objective.exploration_noise_min,
+            "noise_max": objective.exploration_noise_max,
+        }
     return OffPolicyUpdate(
         objective,
         loss=loss,
@@ -90,5 +95,7 @@ def make_off_policy_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
     )
 
 
-OFF_POLICY = partial(Algorithm, update=make_off_policy_update, policy=make_off_policy_policy, on_ranks=True)
+OFF_POLICY = partial(
+    Algorithm, update=make_off_policy_update, policy=make_off_policy_policy, on_ranks=True
+)
 """Makes an algorithm of these from its name and settings, and the data and networks that suit it."""

@@ -46,7 +46,9 @@ def make_fused_ppo(
     actor, critic = [cast(Any, update.networks[name]) for name in ("actor", "critic")]
     networks = fused_networks(actor, critic)
     data = update.dataset.cfg
-    sizes: Any = {name: getattr(data, name) for name in ("num_env_states_per_minibatch", "num_minibatches")}
+    sizes: Any = {
+        name: getattr(data, name) for name in ("num_env_states_per_minibatch", "num_minibatches")
+    }
     if isinstance(networks, NotFused):
         return networks
     # The description of the networks is there: now config, sizes and precision.

@@ -72,9 +72,13 @@ class PPOUpdate(DatasetUpdate):
         self._carried = CarriedState(critic, acting=actor)
         # The kernels that make the gradient steps, or why torch makes them.
         self.fused = make_fused_ppo(self, mirror)
-        self._is_fused = torch.tensor(float(not isinstance(self.fused, NotFused)), device=self.device)
+        self._is_fused = torch.tensor(
+            float(not isinstance(self.fused, NotFused)), device=self.device
+        )
         self._std = torch.zeros((), device=self.device)
-        self._scale_keys = [key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"]
+        self._scale_keys = [
+            key for key in distribution_keys(actor) if key == "scale" or key[-1] == "scale"
+        ]
 
     @property
     def behavior(self) -> ProbabilisticTensorDictSequential:

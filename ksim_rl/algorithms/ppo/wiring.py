@@ -51,7 +51,9 @@ def make_ppo_policy(cfg: RunCfg, env: EnvBase) -> ProbabilisticTensorDictSequent
     return build_networks(cfg, env)[0]
 
 
-def build_networks(cfg: RunCfg, env: EnvBase) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
+def build_networks(
+    cfg: RunCfg, env: EnvBase
+) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
     """Build actor and critic for an env's observations and actions; a ValueError refuses an off-policy method's."""
     device = cfg.resolved_device()
     modules = cfg.modules

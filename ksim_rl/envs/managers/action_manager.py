@@ -47,7 +47,9 @@ class ActionManager:
             start = stop
         self.size = start
         # One unbounded column leaves the whole action spec unbounded.
-        given = [part_K2 for part_K2 in bounds if part_K2 is not None and torch.isfinite(part_K2).all()]
+        given = [
+            part_K2 for part_K2 in bounds if part_K2 is not None and torch.isfinite(part_K2).all()
+        ]
         if len(given) == len(terms) > 0:
             self.bounds_L2 = torch.cat(given)
         else:
@@ -71,7 +73,9 @@ class ActionManager:
         """Return an action without its gradient; a ValueError where it is missing, or has another shape or dtype."""
         expected = (self._view.num_envs, self.size)
         if action is None:
-            raise ValueError(f"the tensordict has no 'action': expected float32 of shape {expected}")
+            raise ValueError(
+                f"the tensordict has no 'action': expected float32 of shape {expected}"
+            )
         if tuple(action.shape) != expected or action.dtype != torch.float32:
             raise ValueError(
                 f"action has dtype {action.dtype} and shape {tuple(action.shape)}: expected torch.float32 and "

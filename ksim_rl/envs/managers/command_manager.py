@@ -43,9 +43,13 @@ class CommandManager:
                 if term.ranges:
                     # Columns beyond those of `ranges` are the term's own.
                     columns = term.shared_ranges(view).unbind(-1)
-                    driver.readings.command_ranges[name] = dict(zip(term.ranges, columns, strict=False))
+                    driver.readings.command_ranges[name] = dict(
+                        zip(term.ranges, columns, strict=False)
+                    )
             # The number of columns K is known from the first vector.
-            self.values[name] = view.buffers.get(f"commands/{name}.value_EK", value_EK.shape[1], owner=ENV)
+            self.values[name] = view.buffers.get(
+                f"commands/{name}.value_EK", value_EK.shape[1], owner=ENV
+            )
             driver.non_finite.watch("command", self.values[name], (name,), value_EK.shape[1:])
 
     def time_left(self, name: str) -> Float[Tensor, " E"]:
@@ -162,5 +166,7 @@ class CommandManager:
                 # Drawn for all rows and used in a few: sizes must not depend on data in a captured step.
                 drawn_E = self._view.uniform(1, *term.resampling_time_range_s)[:, 0]
             clock_E.copy_(torch.where(mask_E, drawn_E, clock_E))
-        with self._driver.scope(f"commands/{name}", counter, draws=moment, part=term, mask_E=mask_E):
+        with self._driver.scope(
+            f"commands/{name}", counter, draws=moment, part=term, mask_E=mask_E
+        ):
             term.resample(self._view, mask_E)

@@ -28,11 +28,15 @@ class EventManager:
             self._by_mode.setdefault(term.mode, []).append((f"events/{name}", term))
         # By mode the model fields that its events write, each once: derived constants follow from them.
         self._fields = {
-            mode: tuple(dict.fromkeys(field for _, term in parts for field in term.per_world_fields))
+            mode: tuple(
+                dict.fromkeys(field for _, term in parts for field in term.per_world_fields)
+            )
             for mode, parts in self._by_mode.items()
         }
         clocked = self._by_mode.get("interval", [])
-        self._clocks = {scope: view.buffers.get(f"{scope}.time_left_E", owner=ENV) for scope, _ in clocked}
+        self._clocks = {
+            scope: view.buffers.get(f"{scope}.time_left_E", owner=ENV) for scope, _ in clocked
+        }
         # Names that match nothing are errors now, and all buffers exist before the first step.
         # Events that may read commands wait for these: see `rehearse_starts`.
         self._rehearse(name for name, term in terms.items() if term.mode != "start")

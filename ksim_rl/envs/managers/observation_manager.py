@@ -23,7 +23,9 @@ class ObservationManager:
     def __init__(self, groups: Mapping[str, ObservationGroupCfg], driver: EnvDriver) -> None:
         self._driver = driver
         self._view = driver.view
-        self.terms = {name: cfg.term for group in groups.values() for name, cfg in group.terms.items()}
+        self.terms = {
+            name: cfg.term for group in groups.values() for name, cfg in group.terms.items()
+        }
         # The buffers that each term writes whenever it is read; most write none.
         self._kept: dict[str, dict[str, Kept]] = {}
         self._shapes: dict[str, torch.Size] = {}
@@ -31,7 +33,9 @@ class ObservationManager:
         readings = self.read()
         self.examples = {name: reading.to("meta") for name, reading in readings.items()}
 
-    def read(self, reset_E: Bool[Tensor, " E"] | None = None) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
+    def read(
+        self, reset_E: Bool[Tensor, " E"] | None = None
+    ) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
         """Return the readings of the current state by term, in memory that nobody else reads or writes.
 
         They are float32 [E, L], side by side in one tensor, and images [E, H, W] or [E, H, W, C]. Buffers of terms
@@ -79,7 +83,9 @@ class ObservationManager:
             with self._driver.scope(f"observations/{name}", part=self.terms[name]) as written:
                 reading = self.terms[name](self._view)
                 if not isinstance(reading, Tensor):
-                    raise ValueError(f"returns {type(reading).__name__}: expected a tensor, one row per env")
+                    raise ValueError(
+                        f"returns {type(reading).__name__}: expected a tensor, one row per env"
+                    )
             kept.update(written)
         # The cheap comparison first, as this runs for each term in each eager step.
         if self._shapes.get(name) != reading.shape:

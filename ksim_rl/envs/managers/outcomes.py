@@ -126,14 +126,22 @@ class RewardManager(_OutcomeManager):
                 f"a curriculum adapts the unknown reward {unknown[0]!r}: {near(unknown[0], terms)}"
             )
         # Left out here, so that a term of weight 0 costs nothing and may even be invalid.
-        computed = {name: term for name, term in terms.items() if term.weight != 0.0 or name in adapted}
+        computed = {
+            name: term for name, term in terms.items() if term.weight != 0.0 or name in adapted
+        }
         super().__init__(computed, driver, curriculum)
         self._scale = scale
         # One tensor, of whose elements curricula get windows below.
-        self.weights_R = torch.tensor([term.weight for term in computed.values()], device=driver.view.device)
-        self.episode_sums_ER = driver.view.buffers.get("rewards.episode_sums_ER", len(self.names), owner=ENV)
+        self.weights_R = torch.tensor(
+            [term.weight for term in computed.values()], device=driver.view.device
+        )
+        self.episode_sums_ER = driver.view.buffers.get(
+            "rewards.episode_sums_ER", len(self.names), owner=ENV
+        )
         driver.readings.reward_weights.update(zip(self.names, self.weights_R.unbind(), strict=True))
-        driver.readings.episode_rewards.update(zip(self.names, self.episode_sums_ER.unbind(-1), strict=True))
+        driver.readings.episode_rewards.update(
+            zip(self.names, self.episode_sums_ER.unbind(-1), strict=True)
+        )
         # Run once, so that wrong names and shapes are errors now.
         self.step(self._everybody_E())
 
@@ -174,7 +182,9 @@ class TerminationManager(_OutcomeManager):
         self.names = (*terms, "non_finite")
         self.flags_EK = torch.zeros(num_envs, len(self.names), dtype=torch.bool, device=device)
         driver.readings.terminations.update(zip(self.names, self.flags_EK.unbind(-1), strict=True))
-        self._time_out_K = torch.tensor([term.time_out for term in terms.values()] + [False], device=device)
+        self._time_out_K = torch.tensor(
+            [term.time_out for term in terms.values()] + [False], device=device
+        )
         self._failure_K = ~self._time_out_K
         self.step(self._everybody_E())
 
@@ -210,7 +220,9 @@ class MetricManager(_OutcomeManager):
         self._occurring = frozenset(reductions)
         # Masks of columns [M], made once: a step picks by `where`, without branches.
         self._is_mean_M, self._is_last_M, self._is_max_M = (
-            torch.tensor([given == kind for given in reductions], dtype=torch.bool, device=driver.view.device)
+            torch.tensor(
+                [given == kind for given in reductions], dtype=torch.bool, device=driver.view.device
+            )
             for kind in ("mean", "last", "max")
         )
         # Sums over the substeps of an env step, of the terms that are read there.
@@ -277,9 +289,13 @@ class CurriculumManager(_OutcomeManager):
 
     def __init__(self, terms: Mapping[str, CurriculumTerm], driver: EnvDriver) -> None:
         super().__init__(terms, driver)
-        drivers = {name: term.first_level for name, term in terms.items() if term.first_level is not None}
+        drivers = {
+            name: term.first_level for name, term in terms.items() if term.first_level is not None
+        }
         if len(drivers) > 1:
-            raise ValueError(f"curriculum: {' and '.join(drivers)} all drive the one level: keep one of them")
+            raise ValueError(
+                f"curriculum: {' and '.join(drivers)} all drive the one level: keep one of them"
+            )
         for level in drivers.values():
             driver.readings.level.fill_(level)
         self.levels_C = torch.zeros(len(self.names), device=driver.view.device)
@@ -337,7 +353,11 @@ class EpisodeLog:
         self._terminations = terminations
         self._metrics = metrics
         self._num_non_finite = driver.non_finite.num_terms
-        parts = {"reward": rewards.names, "termination": terminations.names, "metric": metrics.names}
+        parts = {
+            "reward": rewards.names,
+            "termination": terminations.names,
+            "metric": metrics.names,
+        }
         of_terms = [f"{kind}/{name}" for kind, names in parts.items() for name in names]
         self.names = ("episodes", "length_sum", "return_sum", *of_terms)
         self.totals_N = torch.zeros(len(self.names), device=view.device)

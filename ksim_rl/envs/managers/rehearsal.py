@@ -15,7 +15,11 @@ class Rehearsed(Protocol):
 
 
 def rehearse(
-    driver: EnvDriver, *, laws: JointDrives, writing: Sequence[Rehearsed], reading: Sequence[Rehearsed]
+    driver: EnvDriver,
+    *,
+    laws: JointDrives,
+    writing: Sequence[Rehearsed],
+    reading: Sequence[Rehearsed],
 ) -> None:
     """Run all terms, and put back all changes; a ValueError names a term that wrote memory of others.
 

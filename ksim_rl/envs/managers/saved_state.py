@@ -31,7 +31,8 @@ def buffers_to_save(
 
 
 def joined(
-    of_env: Mapping[str, Shaped[Tensor, "*?shape"]], of_world: Mapping[str, Shaped[Tensor, "*?shape"]]
+    of_env: Mapping[str, Shaped[Tensor, "*?shape"]],
+    of_world: Mapping[str, Shaped[Tensor, "*?shape"]],
 ) -> State:
     """Return the state dict of an env and its worlds; the env's tensors are copied."""
     state: State = {f"{WORLD}{name}": value for name, value in of_world.items()}

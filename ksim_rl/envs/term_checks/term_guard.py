@@ -30,7 +30,11 @@ class _Writes(TorchDispatchMode):
         self._look = look
 
     def __torch_dispatch__(
-        self, func: OpOverload, types: Sequence[type], args: OpArgs = (), kwargs: OpKwargs | None = None
+        self,
+        func: OpOverload,
+        types: Sequence[type],
+        args: OpArgs = (),
+        kwargs: OpKwargs | None = None,
     ) -> PyTree:
         kwargs = kwargs or {}
         for tensor in recording.written_by(func, args, kwargs):

@@ -35,7 +35,9 @@ QUANTITY = "quantity"
 """Tensors that nobody writes once they are made, and quantities that were computed once for all readers."""
 
 _KIND_OF_ARRAY = {"qpos": STATE, "qvel": STATE, "mocap_pos": MOCAP, "mocap_quat": MOCAP}
-_KIND_OF_ARRAY |= dict.fromkeys((*views.SUBSTEP_INPUTS, "eq_active", "userdata"), INPUT) | _KIND_OF_ARRAY
+_KIND_OF_ARRAY |= (
+    dict.fromkeys((*views.SUBSTEP_INPUTS, "eq_active", "userdata"), INPUT) | _KIND_OF_ARRAY
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +71,9 @@ def bits_of(tensor: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
     return tensor.view(whole_number[tensor.element_size()])
 
 
-def _piece(name: str, owner: str, tensor: Shaped[Tensor, "*shape"], *, has_rows: bool = False) -> Piece:
+def _piece(
+    name: str, owner: str, tensor: Shaped[Tensor, "*shape"], *, has_rows: bool = False
+) -> Piece:
     start, end = extent(tensor)
     return Piece(name=name, owner=owner, start=start, end=end, tensor=tensor, has_rows=has_rows)
 
@@ -238,12 +242,16 @@ class TermMemory:
         for tensor in constants():
             if tensor.numel():
                 start, end = extent(tensor)
-                yield Piece(name="a constant that all terms share", owner=TABLE, start=start, end=end)
+                yield Piece(
+                    name="a constant that all terms share", owner=TABLE, start=start, end=end
+                )
 
     def _named_quantities(self) -> Iterator[Piece]:
         """List all quantities, windows too, as terms call them."""
         # The part of the view whose cache has the quantity, as in `view.robot.`.
-        owners = {id(vars(part).get("cache")): spelled for spelled, part in self._view.parts().items()}
+        owners = {
+            id(vars(part).get("cache")): spelled for spelled, part in self._view.parts().items()
+        }
         for cache in self._simulation.caches():
             for key, value in cache.items():
                 # Of elements that a robot reads for itself, as of its root body, no term knows how to spell them.

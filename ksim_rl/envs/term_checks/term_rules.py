@@ -2,7 +2,15 @@
 
 from dataclasses import dataclass
 
-from ksim_rl.envs.term_checks.term_memory import DIFFICULTY, FIELD, INPUT, MOCAP, PARAMETER, STATE, Piece
+from ksim_rl.envs.term_checks.term_memory import (
+    DIFFICULTY,
+    FIELD,
+    INPUT,
+    MOCAP,
+    PARAMETER,
+    STATE,
+    Piece,
+)
 
 _READS = "only reads what the view gives it, and keeps what it must in `view.buffer`"
 # Positions and velocities only by `view.write_qpos` and its like, which know the rows and what becomes stale.
@@ -38,7 +46,9 @@ RULES = {
         writes=frozenset((PARAMETER,)),
     ),
     "actions": Rule(
-        noun="an action", does="writes targets, controls and other inputs of the worlds", writes=_DRIVES
+        noun="an action",
+        does="writes targets, controls and other inputs of the worlds",
+        writes=_DRIVES,
     ),
     "events": Rule(
         noun="an event",
@@ -79,12 +89,8 @@ def refusal(scope: str, part: object, how: str, name: str, piece: Piece) -> str:
     # The advice repeats the term's own expression where it has one.
     # Only names that begin with "view." are valid code in a term.
     read = name if name.startswith("view.") else "x"
-    fix = (
-        f"Write `error = {read} - 0.5` instead of `error = {read}; error -= 0.5`, or change `{read}.clone()`"
-    )
+    fix = f"Write `error = {read} - 0.5` instead of `error = {read}; error -= 0.5`, or change `{read}.clone()`"
     # It may write this, but not in place: the view's methods keep caches and rows right.
     if may_write(scope, piece):
-        fix = (
-            "Write positions and velocities by `view.write_qpos`, `view.joints(...).write_pos` and their like"
-        )
+        fix = "Write positions and velocities by `view.write_qpos`, `view.joints(...).write_pos` and their like"
     return f"{type(part).__name__} {how}{effect}: {rule.noun} {rule.does}. {fix}"

@@ -68,10 +68,14 @@ def main() -> None:
     parser.add_argument("folder", nargs="?", default=str(Path(__file__).parent))
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0, help="of noise and lags")
-    parser.add_argument("--integrator", choices=INTEGRATORS, default="", help="default: the model's own")
+    parser.add_argument(
+        "--integrator", choices=INTEGRATORS, default="", help="default: the model's own"
+    )
     parser.add_argument("--refine", type=int, default=1, help="so many substeps in place of one")
     parser.add_argument("--output", help="a JSON file; without it the means are printed")
-    parser.add_argument("--replay", help="an .npz file for what each recorded step of trace.npz gives here")
+    parser.add_argument(
+        "--replay", help="an .npz file for what each recorded step of trace.npz gives here"
+    )
     options = parser.parse_args()
     try:
         found = _run_all(options)
@@ -95,7 +99,9 @@ def _run_all(options: argparse.Namespace) -> list[dict[str, float]]:
         _replay(runner, Path(options.replay))
     cores = min(len(os.sched_getaffinity(0)), options.episodes)
     arguments = (options.folder, options.seed, options.integrator, options.refine)
-    with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn"), _begin, arguments) as pool:
+    with ProcessPoolExecutor(
+        cores, multiprocessing.get_context("spawn"), _begin, arguments
+    ) as pool:
         return list(pool.map(_run, range(options.episodes)))
 
 

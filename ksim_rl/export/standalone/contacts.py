@@ -53,12 +53,17 @@ class Contacts:
         # The time up to and including this update, so that a landing reports the whole flight.
         flight, stance = kept["air_time"] + dt, kept["contact_time"] + dt
         # Elements that stood from the start have flown for no time: that is no flight.
-        kept["last_air_time"] = np.where(lands & (kept["air_time"] > 0), flight, kept["last_air_time"])
+        kept["last_air_time"] = np.where(
+            lands & (kept["air_time"] > 0), flight, kept["last_air_time"]
+        )
         kept["last_contact_time"] = np.where(leaves, stance, kept["last_contact_time"])
         kept["air_time"] = np.where(touches, 0.0, flight)
         kept["contact_time"] = np.where(touches, stance, 0.0)
         kept["found"] = touches * 1.0
         # An event of any substep counts for the whole env step, as long as what it began lasts.
-        for name, event, lasts in (("first_contact", lands, touches), ("first_air", leaves, ~touches)):
+        for name, event, lasts in (
+            ("first_contact", lands, touches),
+            ("first_air", leaves, ~touches),
+        ):
             held = 0.0 if starts else kept[name]
             kept[name] = np.maximum(held, event) * lasts

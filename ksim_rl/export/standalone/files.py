@@ -43,7 +43,9 @@ _FIELDS = {
     "actuator": "cranklength dynprm gainprm biasprm actrange damping dampingpoly armature forcerange ctrlrange gear "
     "acc0 lengthrange",
 }
-FIELDS = frozenset(f"{kind}_{name}" for kind, names in _FIELDS.items() for name in names.split()) | {"qpos0"}
+FIELDS = frozenset(
+    f"{kind}_{name}" for kind, names in _FIELDS.items() for name in names.split()
+) | {"qpos0"}
 # Which mesh or height field a geom has; each that the model has may stand in the place of another of its kind.
 CHOICE = "geom_dataid"
 
@@ -94,7 +96,8 @@ def read_arrays(path: Path) -> dict[str, Array]:
             if sum(entry.file_size for entry in archive.infolist()) > MOST_BYTES:
                 raise ValueError(f"{path}: unpacked larger than {MOST_BYTES} bytes")
             return {
-                entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in archive.infolist()
+                entry.filename.removesuffix(".npy"): _array(archive, entry)
+                for entry in archive.infolist()
             }
     except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for a damaged file
         raise ValueError(f"{path}: not arrays of numbers: {error}") from None
@@ -105,7 +108,10 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
     # Header first: numpy allocates the whole shape before it reads.
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
-        headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        headers = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }
         if version not in headers:
             raise ValueError(f"{entry.filename}: version {version} of the format")
         shape, _, dtype = headers[version](file)
@@ -151,22 +157,39 @@ def check_count(what: str, value: float) -> int:
     """Return a whole number of 0 to a million, or refuse it."""
     # bool is a subclass of int in Python.
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MOST:
-        raise ValueError(f"export.json: {what} is {str(value)[:40]}: expected a whole number of 0 to {MOST}")
+        raise ValueError(
+            f"export.json: {what} is {str(value)[:40]}: expected a whole number of 0 to {MOST}"
+        )
     return value
 
 
-def check_record(path: Path, record: Mapping[str, Array], meta: Json, mj_model: mujoco.MjModel) -> int:
+def check_record(
+    path: Path, record: Mapping[str, Array], meta: Json, mj_model: mujoco.MjModel
+) -> int:
     """Return how many episodes a record has, or refuse it: everything that it writes into the model has to fit.
 
     A model's field is one of `FIELDS`, of finite numbers and the model's own shape.
     """
     # All shapes follow from the model and the metadata, which were checked before.
     joints = len(meta["joints"]["names"])
-    shapes = {"qpos": (mj_model.nq,), "qvel": (mj_model.nv,), "ctrl": (mj_model.nu,), "act": (mj_model.na,)}
-    shapes |= {"mocap_pos": (mj_model.nmocap, 3), "mocap_quat": (mj_model.nmocap, 4), "gravity": (3,)}
+    shapes = {
+        "qpos": (mj_model.nq,),
+        "qvel": (mj_model.nv,),
+        "ctrl": (mj_model.nu,),
+        "act": (mj_model.na,),
+    }
+    shapes |= {
+        "mocap_pos": (mj_model.nmocap, 3),
+        "mocap_quat": (mj_model.nmocap, 4),
+        "gravity": (3,),
+    }
     shapes |= {"encoder_bias": (joints,), "default_pos": (joints,)}
     # Its first axis is the number of episodes, which all others must have.
-    if "start/qpos" not in record or record["start/qpos"].ndim != 2 or not len(record["start/qpos"]):
+    if (
+        "start/qpos" not in record
+        or record["start/qpos"].ndim != 2
+        or not len(record["start/qpos"])
+    ):
         raise ValueError(f"{path}: no 'start/qpos' of [episodes, {mj_model.nq}] numbers")
     episodes = len(record["start/qpos"])
     for name, value in record.items():
@@ -186,7 +209,9 @@ def check_record(path: Path, record: Mapping[str, Array], meta: Json, mj_model: 
     for name, command in meta["commands"].items():
         values = record.get(f"command/{name}", np.zeros(0))
         if values.ndim != 3 or values.shape[0] != episodes or values.shape[1] < 1:
-            raise ValueError(f"{path}: no 'command/{name}' of [{episodes}, steps, {command['size']}] numbers")
+            raise ValueError(
+                f"{path}: no 'command/{name}' of [{episodes}, steps, {command['size']}] numbers"
+            )
         _check_shape(path, f"command/{name}", values, (*values.shape[:2], command["size"]))
     # Rows of episode, step, change of qvel [nv].
     pushes = record.get("pushes", np.zeros(0))
@@ -216,7 +241,10 @@ def _check_field(path: Path, field: str, value: Array, mj_model: mujoco.MjModel)
 
 def _check_choice(path: Path, value: Array, mj_model: mujoco.MjModel) -> None:
     # How many assets there are of each kind that geom_dataid can point at; other geoms have -1.
-    counts = {mujoco.mjtGeom.mjGEOM_HFIELD: mj_model.nhfield, mujoco.mjtGeom.mjGEOM_MESH: mj_model.nmesh}
+    counts = {
+        mujoco.mjtGeom.mjGEOM_HFIELD: mj_model.nhfield,
+        mujoco.mjtGeom.mjGEOM_MESH: mj_model.nmesh,
+    }
     for geom, kind in enumerate(mj_model.geom_type.tolist()):
         chosen = value[..., geom]
         own = mj_model.geom_dataid[geom]
@@ -224,7 +252,9 @@ def _check_choice(path: Path, value: Array, mj_model: mujoco.MjModel) -> None:
         # Either unchanged, or an asset of the same kind that exists. C does not check the index.
         fits = (chosen == own) | ((chosen >= 0) & (chosen < count) & (own >= 0))
         if value.dtype.kind != "i" or not bool(np.all(fits)):
-            raise ValueError(f"{path}: 'start/model/{CHOICE}' names what geom {geom} of the model cannot be")
+            raise ValueError(
+                f"{path}: 'start/model/{CHOICE}' names what geom {geom} of the model cannot be"
+            )
 
 
 def _check_shape(path: Path, name: str, value: Array, shape: tuple[int, ...]) -> None:

@@ -27,7 +27,9 @@ class Network:
         # Episodes run in parallel processes; a small network gains nothing from threads.
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        self.session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        self.session = onnxruntime.InferenceSession(
+            data, options, providers=["CPUExecutionProvider"]
+        )
         self.path, self.specs = path, states
         self.outputs = [output, *(spec["output"] for spec in states)]
         self.inputs = {value.name: self._example(value) for value in self.session.get_inputs()}
@@ -50,7 +52,9 @@ class Network:
     def begin(self, frame: Array) -> list[Array]:
         """Return the states of a new episode: zeros, or columns of its first frame in all places."""
         return [
-            np.repeat(frame[:, None, slice(*spec["columns"])], self.inputs[spec["input"]].shape[1], 1)
+            np.repeat(
+                frame[:, None, slice(*spec["columns"])], self.inputs[spec["input"]].shape[1], 1
+            )
             if spec.get("starts_with") == "frame"
             else self.inputs[spec["input"]]
             for spec in self.specs
@@ -66,7 +70,9 @@ class Network:
             self.states = self.begin(feed.get("obs", np.zeros((1, 0))))
         # `states`, `specs` and the outputs after the first have the same order.
         feed |= {spec["input"]: state for spec, state in zip(self.specs, self.states, strict=True)}
-        first, *self.next_states = (np.asarray(value) for value in self.session.run(self.outputs, feed))
+        first, *self.next_states = (
+            np.asarray(value) for value in self.session.run(self.outputs, feed)
+        )
         return first[0].astype(np.float64)
 
     def advance(self) -> None:

@@ -189,7 +189,9 @@ class Runner(Signals):
         self.steps, self.terminated = 0, False
         self.action = self.last_action = np.zeros_like(self.action)
         for kind in KINDS:
-            self.targets[kind] = dict(self.default) if kind == "pos" else dict.fromkeys(self.joints, 0.0)
+            self.targets[kind] = (
+                dict(self.default) if kind == "pos" else dict.fromkeys(self.joints, 0.0)
+            )
         self.drawn.clear()
         networks = (self.policy, self.readings, self.scores)
         for part in (*networks, *self.lags, *self.noises, *self.contacts.values()):
@@ -227,7 +229,9 @@ class Runner(Signals):
         """Return the policy's action for the newest frame."""
         return self.policy(self.frame)
 
-    def step(self, action: Array, command: dict[str, Array] | None = None, *, observes: bool = True) -> Json:
+    def step(
+        self, action: Array, command: dict[str, Array] | None = None, *, observes: bool = True
+    ) -> Json:
         """Run one env step; return rewards by term, metrics and the ending. `command` holds from the next frame on."""
         # Stages of the chain hold memory: run each of them once per env step.
         for stage in self.chain:
@@ -279,7 +283,9 @@ class Runner(Signals):
 
     def _begin(self, record: dict[str, Array], number: int) -> None:
         self.command |= self._commands(record, number, 0)
-        self.reset({name[6:]: value[number] for name, value in record.items() if name.startswith("start/")})
+        self.reset(
+            {name[6:]: value[number] for name, value in record.items() if name.startswith("start/")}
+        )
 
     def _commands(self, record: dict[str, Array], number: int, step: int) -> dict[str, Array]:
         # The last command holds where an episode lasts longer than all recorded ones.
@@ -305,10 +311,13 @@ class Runner(Signals):
             now |= {f"metric/{name}": value for name, value in result["metrics"].items()}
             for name, tracker in self.contacts.items():
                 now |= {
-                    f"contact/{name}/{k}": touch for k, touch in enumerate(tracker.fields["found"].tolist())
+                    f"contact/{name}/{k}": touch
+                    for k, touch in enumerate(tracker.fields["found"].tolist())
                 }
             efforts = np.abs(self.data.qfrc_actuator[joints]).tolist()
-            now |= {f"torque/{name}": effort for name, effort in zip(self.joints, efforts, strict=True)}
+            now |= {
+                f"torque/{name}": effort for name, effort in zip(self.joints, efforts, strict=True)
+            }
             for name, value in now.items():
                 sums[name] = sums.get(name, 0.0) + value
         earned = {name: value for name, value in sums.items() if name.startswith("reward/")}
@@ -321,7 +330,11 @@ class Runner(Signals):
 
         Every step starts at the recorded state, with the recorded frame and action; lags are `lag` as far as they may.
         """
-        trace = {name[6:]: v[number] for name, v in record.items() if name.startswith("trace/") and v.ndim}
+        trace = {
+            name[6:]: v[number]
+            for name, v in record.items()
+            if name.startswith("trace/") and v.ndim
+        }
         joints, found, self.noisy = [at for _, at in self.joints.values()], {}, False
         self._begin(record, number)
         for delay in self.lags:
@@ -343,7 +356,9 @@ class Runner(Signals):
                 "effort": self.data.qfrc_actuator[joints],
             }
             now |= {"next_qpos": self.data.qpos, "next_qvel": self.data.qvel}
-            now |= {f"found_{name}": tracker.fields["found"] for name, tracker in self.contacts.items()}
+            now |= {
+                f"found_{name}": tracker.fields["found"] for name, tracker in self.contacts.items()
+            }
             for name, value in now.items():
                 found.setdefault(name, []).append(np.array(value))
             if trace["done"][t]:

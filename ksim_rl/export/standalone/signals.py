@@ -16,7 +16,8 @@ Value = Callable[[], Array]
 # In this order targets lie side by side in a trace: rad (m for slides), rad/s, N m.
 KINDS = ("pos", "vel", "effort")
 INTEGRATORS = {
-    name.removeprefix("mjINT_").lower(): kind for name, kind in mujoco.mjtIntegrator.__members__.items()
+    name.removeprefix("mjINT_").lower(): kind
+    for name, kind in mujoco.mjtIntegrator.__members__.items()
 }
 # Arrays of MuJoCo's data that an exported model has in the env's layout, and the only ones that an export may name.
 ARRAYS = (
@@ -74,9 +75,9 @@ class Noise:
     def _sample(self, spec: Json, size: int) -> Array:
         # Uniform draws lie in [0, 1), gaussian ones have std 1; offset and spread map them to the range.
         draws = self.signals.draws
-        unit = {"uniform": draws.random, "gaussian": draws.standard_normal, "none": np.zeros}[spec["draw"]](
-            size
-        )
+        unit = {"uniform": draws.random, "gaussian": draws.standard_normal, "none": np.zeros}[
+            spec["draw"]
+        ](size)
         return np.asarray(spec["offset"]) + np.asarray(spec["spread"]) * unit
 
     def reset(self) -> None:
@@ -97,14 +98,16 @@ class Noise:
                 value = value + self.bias
         # A random walk: it begins at 0 and grows by one draw per reading.
         if not first:
-            self.walk = self.walk + np.asarray(spec["walk_std"]) * self.signals.draws.standard_normal(
-                len(value)
-            )
+            self.walk = self.walk + np.asarray(
+                spec["walk_std"]
+            ) * self.signals.draws.standard_normal(len(value))
         value, sample = value + self.walk, self._sample(spec, len(value))
         value = value * sample if spec["operation"] == "multiply" else value + sample
         # Round to the steps of the converter; where the resolution is 0 the value passes unchanged.
         grain = np.broadcast_to(spec["resolution"], value.shape)
-        value = np.where(grain > 0, np.round(value / np.where(grain > 0, grain, 1.0)) * grain, value)
+        value = np.where(
+            grain > 0, np.round(value / np.where(grain > 0, grain, 1.0)) * grain, value
+        )
         # A lost reading repeats the last one or reads 0; the first has nothing to repeat.
         if not first and spec["dropout"] and self.signals.draws.random() < spec["dropout"]:
             if spec["lost"] == "last":
@@ -169,14 +172,18 @@ class Signals:
         self.targets = {kind: dict.fromkeys(meta["joints"]["names"], 0.0) for kind in KINDS}
         # Addresses differ from joint numbers as soon as there is a free or ball joint.
         names = meta["joints"]["names"]
-        self.joints = {n: (int(model.joint(n).qposadr[0]), int(model.joint(n).dofadr[0])) for n in names}
+        self.joints = {
+            n: (int(model.joint(n).qposadr[0]), int(model.joint(n).dofadr[0])) for n in names
+        }
         # The model's own pose, and this episode's, which a recorded start may have drawn around it.
         self.own_default = dict(zip(names, meta["joints"]["default_pos"], strict=True))
         self.default = dict(self.own_default)
         # Errors of joint encoders, rad, which a recorded start may set.
         self.bias = dict.fromkeys(names, 0.0)
         # Commands are zero until the caller gives one.
-        sizes = {n: check_count(f"commands.{n}.size", c["size"]) for n, c in meta["commands"].items()}
+        sizes = {
+            n: check_count(f"commands.{n}.size", c["size"]) for n, c in meta["commands"].items()
+        }
         self.command: dict[str, Array] = {name: np.zeros(size) for name, size in sizes.items()}
         self.contacts = {
             name: Contacts(spec, model, self.decimation) for name, spec in meta["contacts"].items()
@@ -186,7 +193,9 @@ class Signals:
         )
         self.steps, self.terminated = 0, False
         # Height fields are the terrain; where there is none, the ground is the plane z = 0.
-        self.ground = [g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_HFIELD]
+        self.ground = [
+            g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_HFIELD
+        ]
 
     @property
     def step_dt(self) -> float:
@@ -386,9 +395,13 @@ class Signals:
         for geom in self.ground:
             size = self.model.hfield_size[self.model.geom_dataid[geom]]
             # Just inside of the field: a ray on its edge misses it.
-            near = np.clip(point[:2] - self.data.geom_xpos[geom][:2], -size[:2] + 1e-6, size[:2] - 1e-6)
+            near = np.clip(
+                point[:2] - self.data.geom_xpos[geom][:2], -size[:2] + 1e-6, size[:2] - 1e-6
+            )
             above = np.append(near + self.data.geom_xpos[geom][:2], 1e3)
             # Down from 1 km above all terrain; a miss returns a negative distance.
-            distance = mujoco.mj_rayHfield(self.model, self.data, geom, above, np.array([0.0, 0.0, -1.0]))
+            distance = mujoco.mj_rayHfield(
+                self.model, self.data, geom, above, np.array([0.0, 0.0, -1.0])
+            )
             heights += [1e3 - distance] * (distance >= 0)
         return max(heights, default=0.0)

@@ -43,7 +43,9 @@ class JoystickCommand(CommandTerm):
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw nothing: the values that were set stay."""
 
-    def set(self, view: EnvView, value_EK: Float[Tensor, "*rows K"], mask_E: Bool[Tensor, " E"]) -> None:
+    def set(
+        self, view: EnvView, value_EK: Float[Tensor, "*rows K"], mask_E: Bool[Tensor, " E"]
+    ) -> None:
         """Take finite values [E, K], or [K] for all alike, for the rows of `mask_E`; they are checked on the host."""
         held_EK = self._held(view)
         if tuple(value_EK.shape) not in (held_EK.shape[1:], held_EK.shape):

@@ -39,7 +39,9 @@ class OfTarget(InFrame):
 
     def offset(self, view: EnvView) -> Float[Tensor, "E 3"]:
         """Return the commanded position minus where the body or site is, world frame, m; position stage."""
-        target_E3, _ = target_pose_w(view, view.command(self.command), frame=self.frame, entity=self.entity)
+        target_E3, _ = target_pose_w(
+            view, view.command(self.command), frame=self.frame, entity=self.entity
+        )
         if self.body is not None:
             point = view.body(self.body)
         else:
@@ -52,7 +54,11 @@ class OfTarget(InFrame):
 
 
 def target_pose_w(
-    view: EnvView, target_EK: Float[Tensor, "E K"], *, frame: Literal["root", "world"], entity: str = ""
+    view: EnvView,
+    target_EK: Float[Tensor, "E K"],
+    *,
+    frame: Literal["root", "world"],
+    entity: str = "",
 ) -> tuple[Float[Tensor, "E 3"], Float[Tensor, "E 4"] | None]:
     """Return a target's position in the world frame, m, and its quaternion there if the target has one.
 

@@ -15,7 +15,14 @@ from ksim_rl.checked import NonNegative
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands.pose import OfTarget
-from ksim_rl.mdp.fields import FramedObservation, OfContacts, OfSensor, OfSites, SiteAndBody, contact_force
+from ksim_rl.mdp.fields import (
+    FramedObservation,
+    OfContacts,
+    OfSensor,
+    OfSites,
+    SiteAndBody,
+    contact_force,
+)
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 

@@ -12,7 +12,13 @@ from torch import Tensor
 
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant, index_constant
-from ksim_rl.mdp.randomization.randomize import Operation, Pair, Randomize, RandomizeModelField, write_entries
+from ksim_rl.mdp.randomization.randomize import (
+    Operation,
+    Pair,
+    Randomize,
+    RandomizeModelField,
+    write_entries,
+)
 from ksim_rl.physics.constants.principal_axes import principal_axes
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
@@ -75,7 +81,9 @@ class RandomizeBodyInertia(RandomizeBodyField):
         # Factors of 1 stand in for the model's own moments, since the draws are factors themselves.
         self._check_reach(view, np.ones((len(ids), 3)), pairs)
         # Columns without a range keep the factor 1.
-        factor_EN3 = torch.ones(view.num_envs, 1 if self.shared else len(ids), 3, device=view.device)
+        factor_EN3 = torch.ones(
+            view.num_envs, 1 if self.shared else len(ids), 3, device=view.device
+        )
         drawn_ENC = self.draw(view, len(ids), list(pairs.values()))
         factor_EN3[..., index_constant(tuple(pairs), view.device)] = drawn_ENC
         # From the model's own values, not the present ones: draws must not pile up over resets.
@@ -123,13 +131,20 @@ class RandomizePseudoInertia(Randomize):
 
     bodies: Patterns
     alpha: Pair = _NOTHING  # half the logarithm of the mass's factor
-    stretch: Pair = _NOTHING  # d1, d2, d3: logarithms of the mass's stretch along each principal axis
+    stretch: Pair = (
+        _NOTHING  # d1, d2, d3: logarithms of the mass's stretch along each principal axis
+    )
     shear: Pair = _NOTHING  # s12, s13, s23
     shift: Pair = _NOTHING  # t1, t2, t3: m that the centre of mass moves along each principal axis
     operation: Literal["add"] = "add"
     distribution: Literal["uniform", "gaussian"] = "uniform"
 
-    per_world_fields: ClassVar[tuple[str, ...]] = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+    per_world_fields: ClassVar[tuple[str, ...]] = (
+        "body_mass",
+        "body_ipos",
+        "body_inertia",
+        "body_iquat",
+    )
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         # Per-body constants of the model: mass [N, 1], centre of mass [N, 3], principal axes [N, 4] and
@@ -154,9 +169,13 @@ class RandomizePseudoInertia(Randomize):
         map_EN33[..., 1, 2] = drawn[..., 6]
 
         # Second moments about the moved centre of mass; the inertia is trace * 1 minus these.
-        spread_EN33 = density_EN1[..., None] * product(map_EN33 * spread_N3[:, None, :], map_EN33.mT)
+        spread_EN33 = density_EN1[..., None] * product(
+            map_EN33 * spread_N3[:, None, :], map_EN33.mT
+        )
         trace_EN = spread_EN33.diagonal(dim1=-2, dim2=-1).sum(-1)
-        inertia_EN33 = torch.diag_embed(trace_EN[..., None].expand(*trace_EN.shape, 3)) - spread_EN33
+        inertia_EN33 = (
+            torch.diag_embed(trace_EN[..., None].expand(*trace_EN.shape, 3)) - spread_EN33
+        )
         moments_EN3, turn_EN4 = principal_axes(inertia_EN33)
         # From the principal axes of the model's own body back into the body's frame.
         values = {

@@ -74,7 +74,11 @@ def _launch(
     # 0).
     where = lanes, *field_ENC.stride()[:2], followers, counter.ndim, first_row, stream
     tensors = seed, counter.contiguous(), mask_E, table_L, field_ENC, follower_ENF
-    _quick(field_ENC.device, (field_ENC.shape[0], lanes), *numbers, cut, *where, *map(address, tensors))
+    _quick(
+        field_ENC.device, (field_ENC.shape[0], lanes), *numbers, cut, *where, *map(address, tensors)
+    )
 
 
-draw_entries = as_operator("draw_entries", _launch, lambda *_: None, mutates=("field_ENC", "follower_ENF"))
+draw_entries = as_operator(
+    "draw_entries", _launch, lambda *_: None, mutates=("field_ENC", "follower_ENF")
+)

@@ -213,7 +213,9 @@ class RandomizeActuator(OfJoints, Randomize):
             held_EL[:, columns] = torch.where(mask_E[:, None], value_EN, held_EL[:, columns])
         return drawn_EN, [i for i, joint in enumerate(joints) if joint not in owners]
 
-    def _check_not_negative(self, field: str, names: Sequence[str], own: np.ndarray, pair: Pair) -> None:
+    def _check_not_negative(
+        self, field: str, names: Sequence[str], own: np.ndarray, pair: Pair
+    ) -> None:
         low, _ = self.reach(own, pair)
         if np.any(low < 0.0):
             # The worst joint is named; `own` may have a low and a high end per joint.
@@ -264,7 +266,9 @@ class RandomizeActuatorGains(RandomizeActuator):
         value_EN = self.combine(array_constant(own, view.device), drawn_EN)
         # Back to before the gear.
         value_EN = _times(value_EN, 1.0 / (gear * gear))
-        write_entries(view.field("actuator_biasprm"), servos, (column,), mask_E, -value_EN[..., None])
+        write_entries(
+            view.field("actuator_biasprm"), servos, (column,), mask_E, -value_EN[..., None]
+        )
         # The gain and the constant of a position servo, or of a velocity servo, are in proportion to it.
         leads = [i for i, servo in enumerate(servos) if _leading_column(model, servo) == column]
         if not leads:
@@ -276,7 +280,9 @@ class RandomizeActuatorGains(RandomizeActuator):
         constants = model.actuator_biasprm[rows, 0]
         if constants.any():
             constant_EN = _times(lead_EN, constants / before_gear[leads])
-            write_entries(view.field("actuator_biasprm"), rows, (0,), mask_E, constant_EN[..., None])
+            write_entries(
+                view.field("actuator_biasprm"), rows, (0,), mask_E, constant_EN[..., None]
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,7 +304,9 @@ class RandomizeEffortLimit(RandomizeActuator, RandomizeNumber):
         ranges: dict[str, dict[int, int]] = {"actuator_forcerange": {}, "jnt_actfrcrange": {}}
         for i in builtin:
             joint = model.joint(names[i]).id
-            limited = [a for a in actuators_of_joint(model, joint) if model.actuator_forcelimited[a]]
+            limited = [
+                a for a in actuators_of_joint(model, joint) if model.actuator_forcelimited[a]
+            ]
             # An effort limit may be kept in several places; all of them get the same draw.
             ranges["actuator_forcerange"] |= dict.fromkeys(limited, i)
             # A joint's own limit acts on the sum of its actuators.

@@ -82,11 +82,23 @@ class Randomize(EventTerm):
         low, high = zip(*pairs.values(), strict=True)
         table_L = constant((*low, *high, *pairs, *ids, *own_NC.flat, *follower[1]), view.device)
         # The kernel knows kinds and operations by their places in the literals.
-        kinds = get_args(Distribution).index(self.distribution), get_args(Operation).index(operation)
+        kinds = (
+            get_args(Distribution).index(self.distribution),
+            get_args(Operation).index(operation),
+        )
         numbers = [*own_NC.shape, int(self.shared), *kinds]
         # Keys of seed, stream and counter make draws the same whichever rows reset together.
         keys = view.next_keys()
-        given = keys.seed, keys.counter, table_L, follower[0], numbers, CUT, keys.stream, keys.first_row
+        given = (
+            keys.seed,
+            keys.counter,
+            table_L,
+            follower[0],
+            numbers,
+            CUT,
+            keys.stream,
+            keys.first_row,
+        )
         draw_entries(field_ENC, mask_E, *given)
 
     def combine(
@@ -111,7 +123,9 @@ class Randomize(EventTerm):
             return nominal + low, nominal + high
         # A negative own value swaps the ends.
         if self.operation == "scale":
-            return np.minimum(nominal * low, nominal * high), np.maximum(nominal * low, nominal * high)
+            return np.minimum(nominal * low, nominal * high), np.maximum(
+                nominal * low, nominal * high
+            )
         return np.full_like(nominal, low), np.full_like(nominal, high)
 
 
@@ -203,10 +217,16 @@ class RandomizeModelField(RandomizeField):
         names = view.resolver.names(self.kind)
         chosen = [names[i] for i in view.resolver.ids(self.kind, self.elements)]
         # Which pattern each element matches: exactly one.
-        number_of = values_by_name("ranges", {pattern: n for n, pattern in enumerate(pairs)}, chosen)
+        number_of = values_by_name(
+            "ranges", {pattern: n for n, pattern in enumerate(pairs)}, chosen
+        )
         events = []
         for number, pair in enumerate(pairs.values()):
-            own = [re.escape(name) for name, found in zip(chosen, number_of, strict=True) if found == number]
+            own = [
+                re.escape(name)
+                for name, found in zip(chosen, number_of, strict=True)
+                if found == number
+            ]
             events.append(replace(self, **{self.elements_field: tuple(own), "ranges": pair}))
         return events
 

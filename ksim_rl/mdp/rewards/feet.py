@@ -15,7 +15,14 @@ from ksim_rl.checks import check_in_range
 from ksim_rl.envs.term import RewardTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import index_constant
-from ksim_rl.mdp.fields import OfContacts, OfFeet, OfSensor, OfSites, RewardWhileCommanded, contact_force
+from ksim_rl.mdp.fields import (
+    OfContacts,
+    OfFeet,
+    OfSensor,
+    OfSites,
+    RewardWhileCommanded,
+    contact_force,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +109,9 @@ class FootSwingPeak(OfSwing):
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
         earned_EF = self.peak(view).clamp(max=self.target_height)
-        return self.while_commanded(view, (earned_EF * self.contact(view).first_contact_EN).amax(-1))
+        return self.while_commanded(
+            view, (earned_EF * self.contact(view).first_contact_EN).amax(-1)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +127,8 @@ class FeetTooClose(OfSites, RewardTerm):
             raise ValueError(f"sites={self.sites!r} match one site: give at least two")
         first, second = zip(*pairs, strict=True)
         gap_EP3 = (
-            pos_EF3[:, index_constant(first, view.device)] - pos_EF3[:, index_constant(second, view.device)]
+            pos_EF3[:, index_constant(first, view.device)]
+            - pos_EF3[:, index_constant(second, view.device)]
         )
         near_EP = torch.linalg.vector_norm(gap_EP3, dim=-1) < self.min_distance
         return near_EP.any(-1).to(torch.float32)

@@ -115,7 +115,8 @@ class UnreachableTargetL2(OfJoints, RewardTerm):
         step = view.step_dt
         pairs = zip(speed_L, acceleration_L, strict=True)
         reach_L = constant(
-            [speed * step + acceleration * step**2 / 2 for speed, acceleration in pairs], view.device
+            [speed * step + acceleration * step**2 / 2 for speed, acceleration in pairs],
+            view.device,
         )
         # Where the step began: the positions that this term saw last.
         last_EL = view.buffer("last_pos_EL", len(joints))

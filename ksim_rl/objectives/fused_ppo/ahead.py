@@ -19,7 +19,9 @@ class Ahead(triton.AsyncCompileMode):
         context.run(self.__enter__)  # whose exit waits
         context.run(work)
 
-    def submit(self, key: str, compile_fn: Callable[[], Any], finalize_fn: Callable[[Any], None]) -> Any:
+    def submit(
+        self, key: str, compile_fn: Callable[[], Any], finalize_fn: Callable[[Any], None]
+    ) -> Any:
         """Compile a kernel and its launcher, for which some versions of Triton start gcc."""
         driver: Any = triton.runtime.driver.active
 

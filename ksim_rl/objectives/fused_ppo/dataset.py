@@ -58,7 +58,9 @@ class FusedDataset:
         self._signals = torch.zeros(4, size, device=device)
         # The arguments of kernels, by the names of their parameters.
         self._arguments: dict[str, Argument] = {
-            **dict(zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)),
+            **dict(
+                zip(("values", "next_values", "advantages", "targets"), self._signals, strict=True)
+            ),
             **{name.upper(): getattr(layout, name) for name in ("actions", "out", "stored")},
             "obs": self.obs,
             "records": self.records,
@@ -77,10 +79,14 @@ class FusedDataset:
             "TF32": tf32,
             "STANDARDIZED": cfg.normalize_advantage == "dataset",
         }
-        self.listed = {name: self._arguments[name] for name in ("places", "count") if layout.chained}
+        self.listed = {
+            name: self._arguments[name] for name in ("places", "count") if layout.chained
+        }
 
     @torch.no_grad()
-    def read(self, rollout_ET: TensorDictBase, *, evaluate: Callable[..., None]) -> Int32[Tensor, ""]:
+    def read(
+        self, rollout_ET: TensorDictBase, *, evaluate: Callable[..., None]
+    ) -> Int32[Tensor, ""]:
         """Take over a rollout `["E","T"]`, whose advantages are estimated here with the values that `evaluate` writes.
 
         An env state with an element that is not finite takes no part, as in `DatasetStorage`; returned is how many.
@@ -88,7 +94,9 @@ class FusedDataset:
         # First the observations, which are normalized by the statistics that the rollout was collected with.
         for part_ET, first in self._parts(rollout_ET):
             for network, faults_D in enumerate(self._arguments["faults"]):
-                self._take_observations(network, part_ET, self.obs[network, first:], faults=faults_D[first:])
+                self._take_observations(
+                    network, part_ET, self.obs[network, first:], faults=faults_D[first:]
+                )
         following = rollout_ET.get("next")
         num_envs, length = rollout_ET.batch_size
         # Values of all env states, and of the next observations that differ from the following step's.
@@ -106,7 +114,10 @@ class FusedDataset:
         launch(estimate_advantages, (programs,), given, num_warps=1, moments=moments)
         moments = torch.cat(ranks.gather(moments))
         # Last the records: standardized advantages need the moments of all parts.
-        left_out = [self._take_records(part_ET, first, moments) for part_ET, first in self._parts(rollout_ET)]
+        left_out = [
+            self._take_records(part_ET, first, moments)
+            for part_ET, first in self._parts(rollout_ET)
+        ]
         return reduce(add, (own.sum(dtype=torch.int32) for own in left_out))
 
     def _parts(self, rollout_ET: TensorDictBase) -> Iterator[tuple[TensorDictBase, int]]:
@@ -123,8 +134,18 @@ class FusedDataset:
         rows = part_ET.numel()
         block = _block(self._arguments["RECORD_LANES"])
         left_out = torch.empty(parts(rows, block), dtype=torch.int32, device=self.records.device)
-        own = {"obs": self.obs[0, first:], "records": self.records[first:], "first": first, "num_rows": rows}
-        own |= {"moments": moments, "num_moments": len(moments), "left_out": left_out, "BLOCK": block}
+        own = {
+            "obs": self.obs[0, first:],
+            "records": self.records[first:],
+            "first": first,
+            "num_rows": rows,
+        }
+        own |= {
+            "moments": moments,
+            "num_moments": len(moments),
+            "left_out": left_out,
+            "BLOCK": block,
+        }
         keys = ("action", "loc", "scale", "action_log_prob")
         acted = {key: _time_major(part_ET.get(key)) for key in keys}
         # Kernels know the gaussian before the tanh only, so that stored actions are taken back through it.
@@ -143,8 +164,20 @@ class FusedDataset:
         # Inputs of the network side by side, in the order of the rows of `obs`.
         source = _time_major(observer.read(part_ET))
         block = _block(self._arguments["LANES"])
-        own = {"source": source, "obs": obs, "num_rows": len(source), "WIDTH": source.shape[1], "num_envs": 0}
-        given = self._arguments | observer.moments_given | own | {"LISTED": False, "faults": None} | changes
+        own = {
+            "source": source,
+            "obs": obs,
+            "num_rows": len(source),
+            "WIDTH": source.shape[1],
+            "num_envs": 0,
+        }
+        given = (
+            self._arguments
+            | observer.moments_given
+            | own
+            | {"LISTED": False, "faults": None}
+            | changes
+        )
         launch(read_observations, (parts(len(source), block),), given, BLOCK=block)
 
 

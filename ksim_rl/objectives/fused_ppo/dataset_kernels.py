@@ -77,7 +77,9 @@ def write_records(
         count = tl.sum(counts)
         mean = tl.sum(counts * means) / tl.maximum(count, 1.0)
         gap = means - mean
-        squares = tl.sum(tl.load(moments + 3 * part + 2, mask=known, other=0.0) + counts * gap * gap)
+        squares = tl.sum(
+            tl.load(moments + 3 * part + 2, mask=known, other=0.0) + counts * gap * gap
+        )
         std = tl.sqrt(squares / tl.maximum(count - 1.0, 1.0))
         advantage = (advantage - mean) / tl.maximum(std, min_advantage_std)
     row = rows[:, None]
@@ -118,4 +120,7 @@ def write_records(
     if tl.sum(odd) > 0:
         tl.store(of_actor, 0.0, mask=inside & is_odd)
         tl.store(of_critic, 0.0, mask=inside & is_odd)
-    tl.store(left_out + tl.program_id(0), tl.sum(tl.where(valid & (odd > 0) & (first + rows < size), 1, 0)))
+    tl.store(
+        left_out + tl.program_id(0),
+        tl.sum(tl.where(valid & (odd > 0) & (first + rows < size), 1, 0)),
+    )

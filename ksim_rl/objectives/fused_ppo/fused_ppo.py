@@ -68,7 +68,9 @@ def _squashing(networks: FusedNetworks, zeros_A: Tensor) -> dict[str, Any]:
         return {"nodes": None, "log_range": 0.0, "NODES": 0}
     policy = networks.squashed(zeros_A, zeros_A + 1.0)
     points, weights = hermegauss(NODES)
-    nodes = torch.tensor(np.stack((points, weights / math.sqrt(2.0 * math.pi)), 1), dtype=torch.float32)
+    nodes = torch.tensor(
+        np.stack((points, weights / math.sqrt(2.0 * math.pi)), 1), dtype=torch.float32
+    )
     # At the median only the range sets both densities apart.
     log_range = policy.base.log_prob(zeros_A) - policy.log_prob(policy.median)
     return {"nodes": nodes.to(zeros_A.device), "log_range": log_range.item(), "NODES": NODES}
@@ -94,16 +96,22 @@ class FusedPPO:
         tuning: Tuning | None = None,
     ) -> None:
         if (mirror is None) != (cfg.symmetry == "none"):
-            raise ValueError(f"mirror={mirror}: symmetry={cfg.symmetry!r} needs one, and 'none' has none")
+            raise ValueError(
+                f"mirror={mirror}: symmetry={cfg.symmetry!r} needs one, and 'none' has none"
+            )
         self.cfg = cfg
         self.networks = networks
         self.optimizer = optimizer
         self.guard = guard
         self._mirrored = cfg.symmetry == "loss"
-        self.layout = layout = FusedLayout(networks, chained=networks.chained and not self._mirrored)
+        self.layout = layout = FusedLayout(
+            networks, chained=networks.chained and not self._mirrored
+        )
         device = networks.parameters[0].device
         dtype = getattr(torch, cfg.precision)
-        tf32 = self._tf32 = dtype is torch.float32 and torch.get_float32_matmul_precision() != "highest"
+        tf32 = self._tf32 = (
+            dtype is torch.float32 and torch.get_float32_matmul_precision() != "highest"
+        )
         self.tuning = tuning = tuning or Tuning.of(layout, dtype)
         self.batch = num_env_states_per_minibatch
         # With the mirror images behind.
@@ -111,7 +119,13 @@ class FusedPPO:
         steps = cfg.num_epochs * num_minibatches
         self._side = warp_stream(torch.cuda.Stream(device)) if device.type == "cuda" else None
         self.parameters = FusedParameters(
-            networks, layout, optimizer=optimizer, dtype=dtype, tf32=tf32, num_steps=steps, size=tuning.size
+            networks,
+            layout,
+            optimizer=optimizer,
+            dtype=dtype,
+            tf32=tf32,
+            num_steps=steps,
+            size=tuning.size,
         )
         self.dataset = FusedDataset(
             cfg,
@@ -129,7 +143,9 @@ class FusedPPO:
         self._rows: Tensor | None = None
         # Splits whose layer inputs and gradients exist at a time. The loss of a mirror image reads the whole minibatch;
         # chained kernels leave out half of its columns.
-        self._splits = tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
+        self._splits = (
+            tuning.splits if self._mirrored or layout.chained else parts(tuning.splits, 2)
+        )
         self._arguments = self._all_arguments(rows, mirror)
 
         def launch_all() -> None:
@@ -137,11 +153,15 @@ class FusedPPO:
             self._improve(0)
             launch(mean_steps, (1,), self._arguments, summary=self._summary)
             for listed in ({}, self.dataset.listed):
-                self._evaluate(self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed)
+                self._evaluate(
+                    self.dataset.obs[1], self.dataset.records[:, 0].contiguous(), **listed
+                )
             self.means(torch.zeros(rows, layout.obs_dims[0], device=device))
 
         # Until the first update. One after another, kernels took ten of a cold start's seconds.
-        self._ahead = Ahead(ThreadPoolExecutor()) if device.type == "cuda" and layout.chained else None
+        self._ahead = (
+            Ahead(ThreadPoolExecutor()) if device.type == "cuda" and layout.chained else None
+        )
         if self._ahead is not None:
             self._ahead.add(launch_all)
 
@@ -223,7 +243,10 @@ class FusedPPO:
         }
 
     def __call__(
-        self, rollout_ET: TensorDictBase, orders_KD: Int64[Tensor, "K D"], *aside: Callable[[], None]
+        self,
+        rollout_ET: TensorDictBase,
+        orders_KD: Int64[Tensor, "K D"],
+        *aside: Callable[[], None],
     ) -> tuple[dict[str, Float[Tensor, ""]], Int64[Tensor, ""], Int32[Tensor, ""]]:
         """Make all gradient steps of an update.
 
@@ -256,21 +279,35 @@ class FusedPPO:
             self.parameters.store()
             launch(mean_steps, (1,), self._arguments, summary=self._summary)
         names = SUMMARY if self._mirrored else SUMMARY[:-1]
-        return dict(zip(names, self._step_means.unbind(), strict=False)), self._longest_skip, left_out
+        return (
+            dict(zip(names, self._step_means.unbind(), strict=False)),
+            self._longest_skip,
+            left_out,
+        )
 
     @torch.no_grad()
     def means(self, obs_EL: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch A"]:
         """Return mean actions for raw observations, as chained kernels have them, with the weights loaded last."""
         means_EA = obs_EL.new_empty(*obs_EL.shape[:-1], self.layout.actions)
         rows_EL = obs_EL.flatten(0, -2).contiguous()
-        self._answer(0, rows_EL, means_EA.flatten(0, -2), **self.networks.observers[0].moments_given)
+        self._answer(
+            0, rows_EL, means_EA.flatten(0, -2), **self.networks.observers[0].moments_given
+        )
         return means_EA
 
     def _answer(self, network: int, obs: Tensor, outputs: Tensor, **given: Any) -> None:
         """Write the outputs of a network of chained kernels for `obs` [D, L], as many columns as `outputs` has."""
         own = {"obs": obs, "outputs": outputs, "num_rows": len(obs), "LISTED": "count" in given}
-        own |= {"WIDTH": obs.shape[1], "COLUMNS": outputs.stride(0), "NORMALIZED": False, "eps": 0.0}
-        own |= {"weights": self.parameters.weights[network], "biases": self.parameters.biases_2N[network]}
+        own |= {
+            "WIDTH": obs.shape[1],
+            "COLUMNS": outputs.stride(0),
+            "NORMALIZED": False,
+            "eps": 0.0,
+        }
+        own |= {
+            "weights": self.parameters.weights[network],
+            "biases": self.parameters.biases_2N[network],
+        }
         own |= {"mean": None, "var": None, "count": None, **given}
         grid = (parts(len(obs), self.tuning.block),)
         launch(network_outputs, grid, self._arguments, num_warps=self.tuning.warps, **own)
@@ -365,7 +402,9 @@ class FusedPPO:
         *layers, last = self.networks.critic
         activation = self.networks.activation()
         # The hidden layers of some env states at a time: they take several times the memory of these.
-        for obs_BL, values_B in zip(obs_DL.chunk(ROLLOUT_PARTS), values_D.chunk(ROLLOUT_PARTS), strict=True):
+        for obs_BL, values_B in zip(
+            obs_DL.chunk(ROLLOUT_PARTS), values_D.chunk(ROLLOUT_PARTS), strict=True
+        ):
             hidden_BL = obs_BL[:, : self.layout.obs_dims[1]]
             for below in layers:
                 weight = below.weight.to(obs_DL.dtype)

@@ -14,13 +14,17 @@ from ksim_rl.objectives.fused_ppo.mlp_kernels import activate, operand, slope_of
 
 
 @triton.jit
-def _product(left, right, keep, inside, length, step, acc, DEPTH: tl.constexpr, STAGES: tl.constexpr):
+def _product(
+    left, right, keep, inside, length, step, acc, DEPTH: tl.constexpr, STAGES: tl.constexpr
+):
     # Rows of `left` are contiguous; elements of a column of `right` are `step` apart.
     place = tl.arange(0, DEPTH)
     for first in tl.range(0, length, DEPTH, num_stages=STAGES):  # pyright: ignore[reportGeneralTypeIssues]
         at = first + place
         row = tl.load(left + at[None, :], mask=keep & (at < length)[None, :], other=0.0)
-        column = tl.load(right + at[:, None] * step, mask=inside & (at < length)[:, None], other=0.0)
+        column = tl.load(
+            right + at[:, None] * step, mask=inside & (at < length)[:, None], other=0.0
+        )
         acc = tl.dot(row, column, acc)
     return acc
 
@@ -66,8 +70,15 @@ def layer(
     if FORWARD:
         # Weights are [outputs, inputs]: forward, a column of the product is a row of them.
         right = weights + column[None, :] * length
-        acc = _product(input_rows + read_at, right, keep, inside, length, 1, acc, DEPTH, TILE_STAGES)
-        value = acc + tl.load(biases + network * NUM_PADDED + column, mask=column < width, other=0.0)[None, :]
+        acc = _product(
+            input_rows + read_at, right, keep, inside, length, 1, acc, DEPTH, TILE_STAGES
+        )
+        value = (
+            acc
+            + tl.load(biases + network * NUM_PADDED + column, mask=column < width, other=0.0)[
+                None, :
+            ]
+        )
         hidden = activate(value, ACTIVATION)
         # The slope of SiLU needs its input, which is gone once the output is stored.
         if ACTIVATION == 3:
@@ -75,12 +86,18 @@ def layer(
             slope = gate + hidden * (1.0 - gate)
         else:
             slope = slope_of(hidden, ACTIVATION)
-        tl.store(input_rows + (output_at + column[None, :]), operand(hidden, dtype, TF32), mask=keep & inside)
+        tl.store(
+            input_rows + (output_at + column[None, :]),
+            operand(hidden, dtype, TF32),
+            mask=keep & inside,
+        )
         tl.store(slope_to, slope.to(dtype), mask=keep & inside)
     else:
         # Back, the same weights are read across: elements of a column are a row apart.
         right = weights + column[None, :]
-        acc = _product(slope_rows + read_at, right, keep, inside, length, width, acc, DEPTH, TILE_STAGES)
+        acc = _product(
+            slope_rows + read_at, right, keep, inside, length, width, acc, DEPTH, TILE_STAGES
+        )
         gradient = acc * tl.load(slope_to, mask=keep & inside, other=0.0).to(tl.float32)
         tl.store(slope_to, operand(gradient, dtype, TF32), mask=keep & inside)
 
@@ -130,9 +147,9 @@ def output_gradients(
                 left, weights, biases, OUT + output, keep, fan_in, BLOCK, OUT, DEPTH, TILE_STAGES
             )
         else:
-            raw_std = tl.load(biases + OUT + output, mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0)[
-                None, :
-            ]
+            raw_std = tl.load(
+                biases + OUT + output, mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
+            )[None, :]
         d_out, d_std = policy_gradient(
             out, raw_std, record, judged, d_std_at, statistics, log_ratio_low, log_ratio_high, entropy_coeff,
             nodes, log_range, ACTIONS, OUT, LOG_STD, MIN_STD, STATE_STD, NODES
@@ -145,12 +162,16 @@ def output_gradients(
             other = inputs + ((rows + num_rows // 2) % num_rows)[:, None] * INPUTS
             signed = tl.load(image_of + output)
             source = tl.abs(signed) - 1
-            image = _linear(other, weights, biases, source, keep, fan_in, BLOCK, OUT, DEPTH, TILE_STAGES)
+            image = _linear(
+                other, weights, biases, source, keep, fan_in, BLOCK, OUT, DEPTH, TILE_STAGES
+            )
             image = tl.where(signed > 0, image, -image)
             counts = tl.load(record + (3 * OUT + MASK), mask=valid, other=0.0)[:, None] > 0.0
             gap = tl.where(counts & (output < ACTIONS)[None, :], out - image, 0.0)
             d_out += (2.0 * symmetry_coeff / ACTIONS) * gap
             tl.store(statistics + 5, 0.5 * symmetry_coeff / ACTIONS * tl.sum(gap * gap))
     else:
-        d_out = value_gradient(out, record, judged, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
+        d_out = value_gradient(
+            out, record, judged, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE
+        )
     tl.store(slope_rows + output[None, :], operand(d_out, dtype, TF32), mask=keep)

@@ -135,7 +135,8 @@ class FusedLayout:
         pairs = zip(networks.actor[:-1], networks.critic[:-1], strict=True)
         # Layers of actor and critic that lie side by side take the room of the wider one.
         self.hidden = tuple(
-            _multiple(max(of_actor.out_features, of_critic.out_features)) for of_actor, of_critic in pairs
+            _multiple(max(of_actor.out_features, of_critic.out_features))
+            for of_actor, of_critic in pairs
         )
         self.actions = networks.actor[-1].out_features
         self.obs_dims = networks.actor[0].in_features, networks.critic[0].in_features
@@ -226,7 +227,9 @@ class FusedLayout:
                             bias = -1
                         else:
                             bias = self.num_weights + at.bias + row
-                        tiles.append([*first, at.weight + row * at.fan_in + column, at.fan_in, *used, bias])
+                        tiles.append(
+                            [*first, at.weight + row * at.fan_in + column, at.fan_in, *used, bias]
+                        )
         return torch.tensor(tiles, dtype=torch.int32)
 
 
@@ -243,7 +246,9 @@ def power_of_two(number: int) -> int:
 class Tuning:
     """How work is cut. `of` gives the fastest sizes on an H200 for layers of 512, 256 and 128, but for `lower`."""
 
-    block: int = 64  # rows of a minibatch that one program takes through a network, or through one layer
+    block: int = (
+        64  # rows of a minibatch that one program takes through a network, or through one layer
+    )
     chunk: int = 32  # columns of the widest layer that exist at a time
     stages: int = 3  # how far loads of weights run ahead
     warps: int = 4
@@ -280,7 +285,9 @@ class Tuning:
             wide |= {"block": 32, "lower_depth": 16}
         else:
             wide |= {"depth": 32, "tile_stages": 6}
-        return cls(chunk=chunk, lower=lower, lower_stages=stages, lower_warps=warps, splits=16, **wide)
+        return cls(
+            chunk=chunk, lower=lower, lower_stages=stages, lower_warps=warps, splits=16, **wide
+        )
 
 
 def why_not_fused(
@@ -304,9 +311,7 @@ def why_not_fused(
     of_actor = [layer.out_features for layer in networks.actor[:-1]]
     of_critic = [layer.out_features for layer in networks.critic[:-1]]
     if len(of_actor) != len(of_critic) or not of_actor:
-        return (
-            f"actor and critic have hidden layers of {of_actor} and {of_critic}, not one or more, and as many"
-        )
+        return f"actor and critic have hidden layers of {of_actor} and {of_critic}, not one or more, and as many"
     widest = max(*of_actor, *of_critic)
     if widest > MAX_WIDTH or networks.actor[-1].out_features > MAX_ACTIONS:
         return f"a hidden layer is wider than {MAX_WIDTH}, or there are more than {MAX_ACTIONS} actions"

@@ -55,7 +55,9 @@ def policy_gradient(
     log_scale = tl.log(bounded)
     # The log-probability of the stored action, summed over the dims that exist.
     error = (action - loc) * inverse
-    log_prob = tl.sum(tl.where(action_dims, -0.5 * error * error - log_scale - HALF_LOG_2_PI, 0.0), 1)
+    log_prob = tl.sum(
+        tl.where(action_dims, -0.5 * error * error - log_scale - HALF_LOG_2_PI, 0.0), 1
+    )
     # Padding and rows that take no part may be anything, and zero times infinity is NaN.
     counts = mask > 0.0
     log_ratio = tl.where(counts, log_prob - log_prob_old, 0.0)

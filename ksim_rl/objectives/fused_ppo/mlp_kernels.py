@@ -85,12 +85,16 @@ def _outputs(
     output = tl.arange(0, OUT)
     at = rows[:, None]
     # Observations are read as one or two powers of two of columns: a single one would be mostly padding.
-    observed = read_rows(seen, at, head_column, keep, mean, var, eps, weights, WIDTH, NORMALIZED, TF32)
+    observed = read_rows(
+        seen, at, head_column, keep, mean, var, eps, weights, WIDTH, NORMALIZED, TF32
+    )
     if STORE:
         tl.store(inputs + (input_rows + head_column), observed, mask=keep)
     if REST:
         rest_column = HEAD + tl.arange(0, REST)
-        rest = read_rows(seen, at, rest_column, keep, mean, var, eps, weights, WIDTH, NORMALIZED, TF32)
+        rest = read_rows(
+            seen, at, rest_column, keep, mean, var, eps, weights, WIDTH, NORMALIZED, TF32
+        )
         if STORE:
             tl.store(inputs + (input_rows + rest_column), rest, mask=keep)
     acc = tl.zeros((BLOCK, H2), dtype=tl.float32)
@@ -122,7 +126,9 @@ def _outputs(
         bias = tl.load(biases + H1 + H2 + (first + CHUNK) % H3 + column)
         hidden = operand(activate(hidden, ACTIVATION), dtype, TF32)
         if STORE:
-            tl.store(inputs + (input_rows + (OBS + H2 + first + column[None, :])), hidden, mask=keep)
+            tl.store(
+                inputs + (input_rows + (OBS + H2 + first + column[None, :])), hidden, mask=keep
+            )
         out = tl.dot(hidden, weight4, out)
     return out + tl.load(biases + H1 + H2 + H3 + output)[None, :]
 
@@ -151,7 +157,9 @@ def network_outputs(
         # Row i of the list is of the env state at `places[i]`.
         rows = tl.load(places + rows, mask=valid, other=0)
     column = tl.arange(0, OUT)[None, :]
-    tl.store(outputs + (rows[:, None] * COLUMNS + column), out, mask=valid[:, None] & (column < COLUMNS))
+    tl.store(
+        outputs + (rows[:, None] * COLUMNS + column), out, mask=valid[:, None] & (column < COLUMNS)
+    )
 
 
 @triton.jit
@@ -207,14 +215,18 @@ def minibatch_gradients(
     if network == 0:
         # The std follows the biases; padding has the neutral value 1, or 0 as a logarithm.
         raw_std = tl.load(
-            biases + H1 + H2 + H3 + OUT + output, mask=output < ACTIONS, other=0.0 if LOG_STD else 1.0
+            biases + H1 + H2 + H3 + OUT + output,
+            mask=output < ACTIONS,
+            other=0.0 if LOG_STD else 1.0,
         )[None, :]
         d_out, _ = policy_gradient(
             out, raw_std, record, valid, d_std_at, statistics, log_ratio_low, log_ratio_high, entropy_coeff,
             None, 0.0, ACTIONS, OUT, LOG_STD, MIN_STD, False, 0
         )  # fmt: skip
     else:
-        d_out = value_gradient(out, record, valid, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE)
+        d_out = value_gradient(
+            out, record, valid, statistics, clip_value, critic_coeff, OUT, CLIP_VALUE
+        )
     # Gradients of the outputs, from here on the first factor of the products back.
     d_out = operand(d_out, dtype, TF32)
     tl.store(slopes + (gradient_rows + (H2 + H3 + output[None, :])), d_out, mask=keep)
@@ -225,7 +237,9 @@ def minibatch_gradients(
         # Back through the third layer chunk by chunk; `acc` collects the gradient of the second.
         weight4 = tl.load(weights + (OUT_AT + output[:, None] * H3 + (first + column)[None, :]))
         weight3 = tl.load(weights + (THIRD_AT + (first + column)[:, None] * H2 + column2[None, :]))
-        hidden = tl.load(inputs + (input_rows + (OBS + H2 + first + column[None, :])), mask=keep, other=0.0)
+        hidden = tl.load(
+            inputs + (input_rows + (OBS + H2 + first + column[None, :])), mask=keep, other=0.0
+        )
         slope = tl.dot(d_out, weight4) * slope_of(hidden.to(tl.float32), ACTIVATION)
         slope = operand(slope, dtype, TF32)
         tl.store(slopes + (gradient_rows + (H2 + first + column[None, :])), slope, mask=keep)
@@ -336,8 +350,12 @@ def weight_gradients(
     for first in tl.range(0, ROWS, DEPTH, num_stages=TILE_STAGES):
         rows = (split * ROWS + first + row)[:, None]
         valid = rows < num_rows
-        layer_input = tl.load(inputs + (rows * INPUTS + column), mask=valid & reads[None, :], other=0.0)
-        gradient = tl.load(slopes + (rows * GRADIENTS + column), mask=valid & inside[None, :], other=0.0)
+        layer_input = tl.load(
+            inputs + (rows * INPUTS + column), mask=valid & reads[None, :], other=0.0
+        )
+        gradient = tl.load(
+            slopes + (rows * GRADIENTS + column), mask=valid & inside[None, :], other=0.0
+        )
         acc = tl.dot(tl.trans(gradient), layer_input, acc)
         sums = tl.dot(tl.trans(gradient), one, sums)
     weight_partials += (split * 2 + network).to(tl.int64) * NUM_PADDED

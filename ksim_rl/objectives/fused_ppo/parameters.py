@@ -58,9 +58,12 @@ class FusedParameters:
             state = self._optimizer.state[parameter]
             held = [parameter, *(state[name] for name in MOMENTS)]
             # Elsewhere at first, and where torch has loaded the optimizer's state.
-            if any(own.data_ptr() != view.data_ptr() for own, view in zip(held, views, strict=True)):
+            if any(
+                own.data_ptr() != view.data_ptr() for own, view in zip(held, views, strict=True)
+            ):
                 views = [
-                    view.copy_(own.flatten()).view_as(own) for own, view in zip(held, views, strict=True)
+                    view.copy_(own.flatten()).view_as(own)
+                    for own, view in zip(held, views, strict=True)
                 ]
                 parameter.data, *moments = views
                 state.update(zip(MOMENTS, moments, strict=True))

@@ -121,10 +121,14 @@ def sum_gradients(
     elif program == 2 * PROGRAMS:
         output = tl.arange(0, OUT)
         column = tl.arange(0, NUM_STATISTICS)
-        sums = _block_sums(block_partials, OUT + column, column < 6, WIDTH, BLOCKS, ROWS, NUM_STATISTICS)
+        sums = _block_sums(
+            block_partials, OUT + column, column < 6, WIDTH, BLOCKS, ROWS, NUM_STATISTICS
+        )
         if not STATE_STD:
             # The std is shared by all rows: its gradient is a sum over all blocks.
-            d_std = _block_sums(block_partials, output, output >= 0, WIDTH, BLOCKS, ROWS, OUT) / divisor
+            d_std = (
+                _block_sums(block_partials, output, output >= 0, WIDTH, BLOCKS, ROWS, OUT) / divisor
+            )
             tl.store(gradients + STD_AT + output, d_std)
             tl.store(squares + program, tl.sum(d_std * d_std))
         # How many env states take part. It may be none.
@@ -137,9 +141,13 @@ def sum_gradients(
         else:
             acts = output < ACTIONS
             # The entropy of a shared std is the same in each row, and computed once from the parameter.
-            raw = tl.load(biases + (NUM_BIASES - OUT + output), mask=acts, other=0.0 if LOG_STD else 1.0)
+            raw = tl.load(
+                biases + (NUM_BIASES - OUT + output), mask=acts, other=0.0 if LOG_STD else 1.0
+            )
             std = tl.maximum(tl.exp(raw) if LOG_STD else raw, MIN_STD)
-            entropy = tl.sum(tl.where(acts, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0)) * (counted / number)
+            entropy = tl.sum(tl.where(acts, tl.log(std) + (0.5 + HALF_LOG_2_PI), 0.0)) * (
+                counted / number
+            )
         tl.store(summary + SHARE, counted / divisor)
         tl.store(summary, _column(policy, 1, NUM_STATISTICS))
         tl.store(summary + 2, entropy)
@@ -176,7 +184,9 @@ def sum_gradients(
         # With more ranks the division by the rows that took part waits until sums of all ranks are there.
         number = tl.maximum(counted, 1.0) if RANKS == 1 else divisor
         # The share of the targets' variance that the critic leaves unexplained.
-        left = _variance(count, error, error_squares) / (_variance(count, target, target_squares) + EPS)
+        left = _variance(count, error, error_squares) / (
+            _variance(count, target, target_squares) + EPS
+        )
         tl.store(summary + 1, critic_coeff * tl.sum(loss) / number)
         tl.store(summary + 5, (1.0 - left) * (counted / number))
 
@@ -198,7 +208,9 @@ def take_means(
         rate = _adapt(learning_rate, tl.load(sums + 3) * scale, desired_kl, rate_bounds, ADAPTIVE)
         column = tl.arange(0, SIZE)
         means = tl.load(sums + column, mask=column < SHARE) * scale
-        tl.store(summary + column, tl.where(column == LEARNING_RATE, rate, means), mask=column < SHARE)
+        tl.store(
+            summary + column, tl.where(column == LEARNING_RATE, rate, means), mask=column < SHARE
+        )
         tl.store(summary + SHARE, share)
 
 
@@ -229,7 +241,10 @@ def adam_step(
     gradient = tl.load(gradients + place, mask=inside, other=0.0)
     square_at = tl.arange(0, SQUARES)
     share = tl.maximum(tl.load(summary + SHARE), 1e-30)  # all is zero where no env state takes part
-    norm = tl.sqrt(tl.sum(tl.load(squares + square_at, mask=square_at < NUM_SQUARES, other=0.0))) / share
+    norm = (
+        tl.sqrt(tl.sum(tl.load(squares + square_at, mask=square_at < NUM_SQUARES, other=0.0)))
+        / share
+    )
     loss = tl.load(summary) + tl.load(summary + 1) + tl.load(summary + LOSS_MIRROR)
     loss -= entropy_coeff * tl.load(summary + 2)
     rate = tl.load(summary + LEARNING_RATE)
@@ -246,7 +261,9 @@ def adam_step(
     gradient += weight_decay * parameter
     new_mean = mean + (gradient - mean) * (1.0 - beta1)
     new_variance = beta2 * variance + (1.0 - beta2) * gradient * gradient
-    change = (rate / correction1) * new_mean / (tl.sqrt(new_variance) / tl.sqrt(correction2) + adam_eps)
+    change = (
+        (rate / correction1) * new_mean / (tl.sqrt(new_variance) / tl.sqrt(correction2) + adam_eps)
+    )
     # A step that is not finite writes back the old values.
     parameter = tl.where(made, parameter - change, parameter)
     tl.store(parameters + at, parameter)

@@ -70,7 +70,10 @@ def transmissions_of_refresh(warp_model: mjw.Model, warp_data_E: mjw.Data) -> Ca
 
 @wp.kernel(enable_backward=False)
 def _gather_moments(
-    actuators: wp.array[int], rowadr: wp.array2d[int], moment: wp.array2d[float], kept: wp.array3d[float]
+    actuators: wp.array[int],
+    rowadr: wp.array2d[int],
+    moment: wp.array2d[float],
+    kept: wp.array3d[float],
 ):
     """Copy the moments of some actuators, each of which has all degrees of freedom in its row."""
     world, place, dof = wp.tid()
@@ -79,7 +82,10 @@ def _gather_moments(
 
 @wp.kernel(enable_backward=False)
 def _scatter_moments(
-    actuators: wp.array[int], rowadr: wp.array2d[int], kept: wp.array3d[float], moment: wp.array2d[float]
+    actuators: wp.array[int],
+    rowadr: wp.array2d[int],
+    kept: wp.array3d[float],
+    moment: wp.array2d[float],
 ):
     """Put back the moments that `_gather_moments` has copied."""
     world, place, dof = wp.tid()

@@ -19,7 +19,10 @@ _FOR_SENSORS = {
     ),
     SUBTREE_VELOCITIES: (_SENSORS.mjSENS_SUBTREELINVEL, _SENSORS.mjSENS_SUBTREEANGMOM),
 }
-_FUNCTIONS = {FORCES_OF_BODIES: mujoco.mj_rnePostConstraint, SUBTREE_VELOCITIES: mujoco.mj_subtreeVel}
+_FUNCTIONS = {
+    FORCES_OF_BODIES: mujoco.mj_rnePostConstraint,
+    SUBTREE_VELOCITIES: mujoco.mj_subtreeVel,
+}
 
 
 def left_out(mj_model: mujoco.MjModel) -> frozenset[str]:

@@ -84,7 +84,12 @@ class CWorld(World):
         if self.sim.nan_guard is not None:
             tensors = {name: mirror.tensor for name, mirror in self._of_state.items()}
             self._nan_guard = NanGuard(
-                self.sim.nan_guard, self.mj_model, tensors, self._fields, num_envs=num_envs, by_warp=False
+                self.sim.nan_guard,
+                self.mj_model,
+                tensors,
+                self._fields,
+                num_envs=num_envs,
+                by_warp=False,
             )
         # Views exist before the first refresh, which fills them.
         self.show_views()
@@ -117,7 +122,11 @@ class CWorld(World):
             self._nan_guard.keep_fields()
 
     def _step_between(
-        self, before: Sequence[Callable[[], None]], after: Sequence[Callable[[], None]], *, is_read: bool
+        self,
+        before: Sequence[Callable[[], None]],
+        after: Sequence[Callable[[], None]],
+        *,
+        is_read: bool,
     ) -> None:
         """Advance by one substep between hooks, whose changes alone are float32."""
         # Hooks may write ctrl or applied forces.
@@ -216,7 +225,9 @@ class CWorld(World):
         half_EN3, has_size = geom_bounds.half_sizes(self.mj_model, size_EN3)
         # Geoms whose bounds do not follow from their size (meshes, say) keep the compiled ones.
         chosen = np.ix_(rows.numpy(), has_size)
-        self._batch.expand("geom_rbound")[chosen] = geom_bounds.radii(self.mj_model, size_EN3)[:, has_size]
+        self._batch.expand("geom_rbound")[chosen] = geom_bounds.radii(self.mj_model, size_EN3)[
+            :, has_size
+        ]
         boxes = self._batch.expand("geom_aabb")
         # The second half of a box is its half sizes; the first, its centre, does not depend on the size.
         boxes[rows.numpy()[:, None], np.flatnonzero(has_size), 3:] = half_EN3[:, has_size]
@@ -244,7 +255,9 @@ class CWorld(World):
 
     def launch(self, key: Hashable, launches: Callable[[], None]) -> None:
         """Refuse Warp launches: there are no Warp arrays here."""
-        raise ValueError("sim.engine='c' has no Warp arrays to launch kernels on: choose sim.engine='warp'")
+        raise ValueError(
+            "sim.engine='c' has no Warp arrays to launch kernels on: choose sim.engine='warp'"
+        )
 
     def record_overflow(self) -> None:
         """Do nothing: a step whose memory is full raises."""
@@ -257,7 +270,9 @@ class CWorld(World):
     def explain_overflow(self, numbers: Sequence[int]) -> OverflowReport:
         """Return a report without losses."""
         worlds = dict.fromkeys(BIT_NAMES, 0)
-        return OverflowReport(worlds=worlds, nefc=0, njmax=0, ncon=0, naconmax=0, num_envs=self.num_envs)
+        return OverflowReport(
+            worlds=worlds, nefc=0, njmax=0, ncon=0, naconmax=0, num_envs=self.num_envs
+        )
 
     @property
     def room_is_certain(self) -> bool:
@@ -411,7 +426,9 @@ def _told() -> Iterator[None]:
         yield
     for text in caught:
         if "memory" in text or "arena" in text or "full" in text:
-            raise RuntimeError(f"{text.splitlines()[0]} (MuJoCo's C engine; in XML: <size memory='...'/>)")
+            raise RuntimeError(
+                f"{text.splitlines()[0]} (MuJoCo's C engine; in XML: <size memory='...'/>)"
+            )
 
 
 ENGINES["c"] = CWorld

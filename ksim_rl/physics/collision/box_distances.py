@@ -27,7 +27,9 @@ FAR = wp.constant(1.0e10)
 TOUCHING = wp.constant(1.0e-5)
 # The sine below which two edges are parallel, and have no common normal.
 PARALLEL = wp.constant(1.0e-6)
-AXES = wp.constant(15)  # the normals of three faces of each box, and what is normal to an edge of each
+AXES = wp.constant(
+    15
+)  # the normals of three faces of each box, and what is normal to an edge of each
 EDGE_PAIRS = wp.constant(144)
 
 
@@ -121,7 +123,9 @@ def overlap_of(half: wp.vec3, other_half: wp.vec3, turn: wp.mat33, place: wp.vec
         if length > PARALLEL:
             normal = normal / length
             # Half the extents of both boxes along the axis, then the distance between their centres.
-            reach = wp.dot(wp.abs(normal), half) + wp.dot(wp.abs(wp.transpose(turn) @ normal), other_half)
+            reach = wp.dot(wp.abs(normal), half) + wp.dot(
+                wp.abs(wp.transpose(turn) @ normal), other_half
+            )
             offset = wp.dot(normal, place)
             distance = wp.abs(offset) - reach
             if distance > best.distance:

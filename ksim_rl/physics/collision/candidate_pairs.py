@@ -36,12 +36,16 @@ class CandidatePairs:
         # Explicit <pair>s come on top, whatever the filters say.
         self.first = np.concatenate([first[keep], mj_model.pair_geom1])
         self.second = np.concatenate([second[keep], mj_model.pair_geom2])
-        self.margin = np.maximum(mj_model.geom_margin[self.first], mj_model.geom_margin[self.second])
+        self.margin = np.maximum(
+            mj_model.geom_margin[self.first], mj_model.geom_margin[self.second]
+        )
         is_plane = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self.plane_1 = is_plane[self.first]
         self.plane_2 = is_plane[self.second]
         # A plane has a radius of 0; its distance is measured along the normal below.
-        self.reach = mj_model.geom_rbound[self.first] + mj_model.geom_rbound[self.second] + self.margin
+        self.reach = (
+            mj_model.geom_rbound[self.first] + mj_model.geom_rbound[self.second] + self.margin
+        )
 
     def count(self, mj_data: mujoco.MjData) -> int:
         """Return the number of pairs that may touch in the present pose."""

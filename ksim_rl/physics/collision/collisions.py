@@ -60,7 +60,9 @@ def _pairs(warp_model: mjw.Model) -> Iterator[tuple[int, int, list[str], int]]:
     """Yield each pair, the geom of the lower type first, its types, and how many contacts the kernel finds at most."""
     pairs = warp_model.nxn_geom_pair_filtered.numpy()
     types = warp_model.geom_type.numpy()
-    for pair, (_, sensor) in zip(pairs.tolist(), warp_model.nxn_pairid_filtered.numpy(), strict=True):
+    for pair, (_, sensor) in zip(
+        pairs.tolist(), warp_model.nxn_pairid_filtered.numpy(), strict=True
+    ):
         # The lower type first, as in the keys of MOST_CONTACTS.
         a, b = sorted(pair, key=types.__getitem__)
         kinds = [mjw.GeomType(types[geom]).name.lower() for geom in (a, b)]
@@ -118,7 +120,9 @@ def collisions(
         "others": others.size > 0,
         "has_rows": HAS_ROWS,
     }
-    collide = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, build=build)
+    collide = native.launcher(
+        source, constants, own, m, d, lanes=lanes, threads=threads, build=build
+    )
     # MuJoCo Warp's narrow phase launches kernels by these counts: only of the pairs that are left.
     theirs = dataclasses.replace(m, geom_pair_type_count=upstream.pair_type_counts(m, others))
     their_ids = wp.array(m.nxn_pairid_filtered.numpy()[are_theirs], dtype=wp.vec2i, device=device)

@@ -74,7 +74,9 @@ def frames(c: Constants):
         parent = c.body_parentid[body]
         turn = c.xquat[world, parent]
         # Fields have one row that all worlds share, or one for each world: hence the modulo.
-        pos = c.xpos[world, parent] + rot_vec_quat(c.body_pos[world % c.body_pos.shape[0], body], turn)
+        pos = c.xpos[world, parent] + rot_vec_quat(
+            c.body_pos[world % c.body_pos.shape[0], body], turn
+        )
         quat = mul_quat(turn, c.body_quat[world % c.body_quat.shape[0], body])
         for joint in range(c.body_jntadr[body], c.body_jntadr[body] + c.body_jntnum[body]):
             kind = c.jnt_type[joint]
@@ -87,7 +89,10 @@ def frames(c: Constants):
                 pos = wp.vec3(c.qpos0[row, q], c.qpos0[row, q + 1], c.qpos0[row, q + 2])
                 quat = wp.normalize(
                     wp.quat(
-                        c.qpos0[row, q + 3], c.qpos0[row, q + 4], c.qpos0[row, q + 5], c.qpos0[row, q + 6]
+                        c.qpos0[row, q + 3],
+                        c.qpos0[row, q + 4],
+                        c.qpos0[row, q + 5],
+                        c.qpos0[row, q + 6],
                     )
                 )
                 # Its translations are along the world's axes, its rotations about the body's.
@@ -116,7 +121,9 @@ def frames(c: Constants):
             # A hinge or slide at qpos0 does not move the body, whatever number qpos0 is.
             else:
                 c.anchor[world, dof] = pos + rot_vec_quat(pivot, quat)
-                c.axis[world, dof] = rot_vec_quat(c.jnt_axis[world % c.jnt_axis.shape[0], joint], quat)
+                c.axis[world, dof] = rot_vec_quat(
+                    c.jnt_axis[world % c.jnt_axis.shape[0], joint], quat
+                )
         c.xpos[world, body] = pos
         c.xquat[world, body] = wp.normalize(quat)
 
@@ -262,7 +269,12 @@ def constants_kernel(nv: int, nbody: int, lanes: int, on_chip: bool) -> wp.Kerne
     @wp.func_native(f"constexpr int {sizes};\n{_SOURCE}")
     def constants_of_inertia(world: int, lane: int, c: Constants) -> None: ...
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": lanes})
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        module_options={"block_dim": lanes},
+    )
     def constants_at_qpos0(c: Constants, groups: int):
         world, lane = wp.tid()
         if not c.mask[world]:

@@ -23,7 +23,9 @@ _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPA
 # What `body_simple` says of a body that has slides only, along axes of the world, and carries no other.
 SLIDES_ALONE = 2
 LANES = 128  # threads that share the work of one world on a GPU: a block
-_MOST_FLOATS_ON_CHIP = 40 * 1024 // 4  # of the 48 KiB of shared memory that any block has, some is Warp's
+_MOST_FLOATS_ON_CHIP = (
+    40 * 1024 // 4
+)  # of the 48 KiB of shared memory that any block has, some is Warp's
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -35,15 +37,23 @@ class MaskedConstants:
     """
 
     def __init__(
-        self, mj_model: mujoco.MjModel, warp_model: mjw.Model, mask: wp.array, expanded: Iterable[str]
+        self,
+        mj_model: mujoco.MjModel,
+        warp_model: mjw.Model,
+        mask: wp.array,
+        expanded: Iterable[str],
     ) -> None:
         self._mj_model = mj_model
         self._warp_model = warp_model
         self._moves = KINEMATIC & set(expanded)
         self._resizes = "geom_size" in expanded
         # Weights of tendons, flexes and other transmissions are not computed by the kernel.
-        self._inert = not mj_model.ntendon and not mj_model.nflex and _drives_scalar_joints(mj_model)
-        self._ties_bodies = bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any()) or mj_model.ntendon > 0
+        self._inert = (
+            not mj_model.ntendon and not mj_model.nflex and _drives_scalar_joints(mj_model)
+        )
+        self._ties_bodies = (
+            bool(np.isin(mj_model.eq_type, BODY_EQUALITIES).any()) or mj_model.ntendon > 0
+        )
         has_armature = "actuator_armature" in expanded or np.any(mj_model.actuator_armature)
         self._num_envs = num_envs = mask.shape[0]
         nbody = mj_model.nbody
@@ -120,7 +130,10 @@ class MaskedConstants:
 
 def _drives_scalar_joints(mj_model: mujoco.MjModel) -> bool:
     on_joints = np.isin(mj_model.actuator_trntype, _JOINT_TRANSMISSIONS).all()
-    return bool(on_joints and np.isin(mj_model.jnt_type[mj_model.actuator_trnid[:, 0]], _SCALAR_JOINTS).all())
+    return bool(
+        on_joints
+        and np.isin(mj_model.jnt_type[mj_model.actuator_trnid[:, 0]], _SCALAR_JOINTS).all()
+    )
 
 
 def _driven_dofs(mj_model: mujoco.MjModel) -> np.ndarray:
@@ -149,7 +162,9 @@ def _joint_groups(mj_model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     triple = np.isin(kind, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL))
     # The rotations of a free joint, whose translations are averaged apart from them.
     second = _free_offset(mj_model) // 3 == 1
-    start = np.where(triple, mj_model.jnt_dofadr[mj_model.dof_jntid] + 3 * second, np.arange(mj_model.nv))
+    start = np.where(
+        triple, mj_model.jnt_dofadr[mj_model.dof_jntid] + 3 * second, np.arange(mj_model.nv)
+    )
     return start, np.where(triple, 3, 1)
 
 

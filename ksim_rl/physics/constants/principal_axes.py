@@ -8,7 +8,9 @@ from ksim_rl.device.streams import warp_scope
 
 
 @wp.kernel(enable_backward=False)
-def _diagonalize(matrices: wp.array[wp.mat33d], moments: wp.array[wp.vec3d], quats: wp.array[wp.vec4d]):
+def _diagonalize(
+    matrices: wp.array[wp.mat33d], moments: wp.array[wp.vec3d], quats: wp.array[wp.vec4d]
+):
     i = wp.tid()
     axes, diagonal = wp.eig3(matrices[i])
     moments[i] = diagonal

@@ -37,7 +37,9 @@ TOO_MANY = wp.constant(int(mjw.OverflowType.HFIELD))
 
 
 @struct_with(
-    ("", mjw.Model, MODEL_FIELDS), ("", mjw.Data, DATA_FIELDS), ("contact_", mjw.Contact, CONTACT_FIELDS)
+    ("", mjw.Model, MODEL_FIELDS),
+    ("", mjw.Data, DATA_FIELDS),
+    ("contact_", mjw.Contact, CONTACT_FIELDS),
 )
 class Collisions:
     """The arrays of a model and its worlds that the kernel reads, and the contacts that it appends to."""
@@ -131,8 +133,12 @@ def height_field_contacts(c: Collisions):
     # The cells of the lattice below the geom's box.
     low_column = wp.max(int(wp.floor((center[0] - span[0] + field.half_x) / field.dx)), 0)
     low_row = wp.max(int(wp.floor((center[1] - span[1] + field.half_y) / field.dy)), 0)
-    high_column = wp.min(int(wp.floor((center[0] + span[0] + field.half_x) / field.dx)), field.columns - 2)
-    high_row = wp.min(int(wp.floor((center[1] + span[1] + field.half_y) / field.dy)), field.rows - 2)
+    high_column = wp.min(
+        int(wp.floor((center[0] + span[0] + field.half_x) / field.dx)), field.columns - 2
+    )
+    high_row = wp.min(
+        int(wp.floor((center[1] + span[1] + field.half_y) / field.dy)), field.rows - 2
+    )
     found = int(0)
     for row in range(low_row, high_row + 1):
         for column in range(low_column, high_column + 1):
@@ -220,12 +226,16 @@ def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.D
         if is_exact.any():
             collisions = filled(Collisions, lists[0], warp_model, warp_data_E)
             wp.launch(
-                height_field_contacts, dim=(warp_data_E.nworld, int(is_exact.sum())), inputs=[collisions]
+                height_field_contacts,
+                dim=(warp_data_E.nworld, int(is_exact.sum())),
+                inputs=[collisions],
             )
         if is_convex.any():
             if not memory:
                 memory.update(
-                    convex_contacts.memory_for(warp_model, warp_data_E, num_pairs=int(is_convex.sum()))
+                    convex_contacts.memory_for(
+                        warp_model, warp_data_E, num_pairs=int(is_convex.sum())
+                    )
                 )
             convex_contacts.append({**lists[1], **memory}, warp_model, warp_data_E)
         # Our kernels write no velocity of a surface.

@@ -272,7 +272,9 @@ def append(own: Mapping[str, wp.array], warp_model: mjw.Model, warp_data_E: mjw.
     wp.launch(convex_height_field_contacts, dim=slots, inputs=[filled(Searches, *owners)])
 
 
-def memory_for(warp_model: mjw.Model, warp_data_E: mjw.Data, *, num_pairs: int) -> dict[str, wp.array]:
+def memory_for(
+    warp_model: mjw.Model, warp_data_E: mjw.Data, *, num_pairs: int
+) -> dict[str, wp.array]:
     """Return the memory of searches: vertices, faces and edges of their polytopes. On a CPU there is one at a time."""
     # Memory for each pair at the same time would be too much on a GPU.
     if warp_data_E.qpos.device.is_cuda:

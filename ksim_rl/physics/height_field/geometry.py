@@ -150,7 +150,9 @@ def start_and_end(prism: Prism, edge: int):
     # Edges 0 to 2 are at the top, 3 to 5 at the base.
     if edge < 6:
         level = 3 * (edge // 3)
-        return corner_of_prism(prism, level + edge % 3), corner_of_prism(prism, level + (edge + 1) % 3)
+        return corner_of_prism(prism, level + edge % 3), corner_of_prism(
+            prism, level + (edge + 1) % 3
+        )
     # Edges 6 to 8 are vertical, from the base up.
     return corner_of_prism(prism, edge - 3), corner_of_prism(prism, edge - 6)
 
@@ -169,7 +171,9 @@ def normal_of_face(prism: Prism, face: int) -> wp.vec3:
     along = corner_of_prism(prism, (face + 1) % 3) - start
     normal = wp.normalize(wp.vec3(along[1], -along[0], 0.0))
     # The third corner is inside, so that an outward normal points away from it.
-    return wp.where(wp.dot(normal, corner_of_prism(prism, (face + 2) % 3) - start) > 0.0, -normal, normal)
+    return wp.where(
+        wp.dot(normal, corner_of_prism(prism, (face + 2) % 3) - start) > 0.0, -normal, normal
+    )
 
 
 @wp.func
@@ -299,7 +303,9 @@ def widest_axis(prism: Prism, core: Core) -> Touch:
             # Cross products of each edge of the prism with each axis of the core.
             edge = (axis - FACE_AXES) // 3
             start, end = start_and_end(prism, edge)
-            normal = wp.cross(wp.normalize(end - start), column_of(core.turn, (axis - FACE_AXES) % 3))
+            normal = wp.cross(
+                wp.normalize(end - start), column_of(core.turn, (axis - FACE_AXES) % 3)
+            )
         length = wp.length(normal)
         # Parallel edges have no common normal, and the faces' normals cover them.
         if length > PARALLEL:

@@ -161,7 +161,9 @@ def _with_rows(mj_model: mujoco.MjModel, warp_model: mjw.Model, rows: Rows) -> m
     )
 
 
-def _entries_of_lone_bodies(warp_model: mjw.Model, start: np.ndarray, count: np.ndarray) -> np.ndarray:
+def _entries_of_lone_bodies(
+    warp_model: mjw.Model, start: np.ndarray, count: np.ndarray
+) -> np.ndarray:
     """Return the entries of single bodies in rows that start at `start` and have `count` entries, int [N]."""
     found = [np.zeros(0, dtype=np.int32)]
     for body in warp_model.body_freeadr.numpy():

@@ -176,9 +176,9 @@ def _inputs_of_gains(
     # In range and one for each actuator, the controls are right as they are.
     if not np.any(ranges) and _has_own_controls(mj_model):
         return None
-    if np.any(mj_model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR) and not _has_own_controls(
-        mj_model
-    ):
+    if np.any(
+        mj_model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR
+    ) and not _has_own_controls(mj_model):
         raise ValueError(
             "a gain depends on velocity, and a DC motor has several controls or none: MuJoCo Warp's implicit "
             "integrators mix their controls up; choose integrator='euler', or drop one of the two actuators"

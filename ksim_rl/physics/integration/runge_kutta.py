@@ -159,7 +159,9 @@ class _StageClock:
         fraction = STAGE_TIMES[self._stage]
         self._stage += 1
         inputs = [self._before_E, self._timestep, fraction]
-        wp.launch(kernels.shifted_time, dim=self._time_E.shape, inputs=inputs, outputs=[self._time_E])
+        wp.launch(
+            kernels.shifted_time, dim=self._time_E.shape, inputs=inputs, outputs=[self._time_E]
+        )
 
     def put_back(self) -> None:
         """Launch the time of the first stage again, from which the step goes on."""
@@ -172,7 +174,9 @@ class _ExactFilters:
     def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
         is_exact = warp_model.actuator_dyntype.numpy() == int(mjw.DynType.FILTEREXACT)
         self.exist = bool(is_exact.any())
-        self._actuators = wp.array(np.flatnonzero(is_exact), dtype=int, device=warp_data_E.act.device)
+        self._actuators = wp.array(
+            np.flatnonzero(is_exact), dtype=int, device=warp_data_E.act.device
+        )
         self._warp_model = warp_model
         self._warp_data_E = warp_data_E
         self._stage = 0
@@ -187,7 +191,14 @@ class _ExactFilters:
         d = self._warp_data_E
         fraction = STAGE_TIMES[self._stage]
         self._stage += 1
-        inputs = [self._actuators, m.actuator_actadr, m.actuator_dynprm, m.opt.timestep, d.act_dot, fraction]
+        inputs = [
+            self._actuators,
+            m.actuator_actadr,
+            m.actuator_dynprm,
+            m.opt.timestep,
+            d.act_dot,
+            fraction,
+        ]
         dim = (d.nworld, self._actuators.size)
         wp.launch(kernels.rate_exact_filters, dim=dim, inputs=inputs, outputs=[d.act])
 
@@ -201,7 +212,9 @@ def _with_hooks(callback: mjw.Callback, hooks: dict[str, list[Callable[[], None]
     return dataclasses.replace(callback, **hooked)
 
 
-def _in_turn(launches: list[Callable[[], None]], own: Callable[..., None] | None) -> Callable[..., None]:
+def _in_turn(
+    launches: list[Callable[[], None]], own: Callable[..., None] | None
+) -> Callable[..., None]:
     def all_of_them(*model_and_data: mjw.Model | mjw.Data) -> None:
         for launch in launches:
             launch()

@@ -33,7 +33,9 @@ def _in_folder(root: Path, robot: str, entry: str) -> Path:
     path = root / robot / f"{stem}.xml"
     if not path.is_file():
         found = [path.stem for path in (root / robot).glob("*.xml")]
-        raise ValueError(f"menagerie model {robot!r} has no entry point {stem!r}: {near(stem, found)}")
+        raise ValueError(
+            f"menagerie model {robot!r} has no entry point {stem!r}: {near(stem, found)}"
+        )
     return path
 
 

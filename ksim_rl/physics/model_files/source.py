@@ -55,9 +55,13 @@ def model_file(source: str | Path) -> Path | None:
     except RuntimeError as error:  # a user who is not known
         raise ValueError(f"model file {str(path)!r}: {error}") from None
     if path.is_dir() or not path.exists():
-        raise ValueError(f"model file {str(path)!r}: {'is a folder' if path.is_dir() else 'no such file'}")
+        raise ValueError(
+            f"model file {str(path)!r}: {'is a folder' if path.is_dir() else 'no such file'}"
+        )
     if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"model file {str(path)!r}: expected a name that ends in {', '.join(SUFFIXES)}")
+        raise ValueError(
+            f"model file {str(path)!r}: expected a name that ends in {', '.join(SUFFIXES)}"
+        )
     return path
 
 

@@ -46,8 +46,14 @@ class Failure:
 def write(path: Path, failure: Failure) -> None:
     """Write a failure: safetensors, of which nothing is ever executed, completely or not at all."""
     tensors = {_MODEL: model_bytes(failure.mj_model)}
-    for prefix, arrays in ((_STATE, failure.states), (_REACHED, failure.reached), (_FIELD, failure.fields)):
-        tensors |= {f"{prefix}{name}": np.ascontiguousarray(array) for name, array in arrays.items()}
+    for prefix, arrays in (
+        (_STATE, failure.states),
+        (_REACHED, failure.reached),
+        (_FIELD, failure.fields),
+    ):
+        tensors |= {
+            f"{prefix}{name}": np.ascontiguousarray(array) for name, array in arrays.items()
+        }
     # Counters and versions travel as JSON in the header of the file.
     about = {"format": FORMAT, "mujoco": mujoco.__version__}
     about |= {"world": failure.world, "substep": failure.substep, "sha256": _sha256(tensors)}
@@ -81,13 +87,21 @@ def read(path: Path) -> Failure:
         raise ValueError(f"{path}: damaged: its numbers are not those that were written")
     # The binary format of models differs from version to version.
     if about.get("mujoco") != mujoco.__version__:
-        raise ValueError(f"{path}: written with MuJoCo {about.get('mujoco')}; this is {mujoco.__version__}")
+        raise ValueError(
+            f"{path}: written with MuJoCo {about.get('mujoco')}; this is {mujoco.__version__}"
+        )
 
     def under(prefix: str) -> dict[str, np.ndarray]:
-        return {name.removeprefix(prefix): own for name, own in tensors.items() if name.startswith(prefix)}
+        return {
+            name.removeprefix(prefix): own
+            for name, own in tensors.items()
+            if name.startswith(prefix)
+        }
 
     try:
-        mj_model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": tensors[_MODEL].tobytes()})
+        mj_model = mujoco.MjModel.from_binary_path(
+            "model.mjb", {"model.mjb": tensors[_MODEL].tobytes()}
+        )
         failure = Failure(
             mj_model=mj_model,
             world=about["world"],
@@ -131,12 +145,16 @@ def _check(failure: Failure) -> None:
         raise ValueError(f"expected {', '.join(expected)}; it has {', '.join(found)}")
     for name, array in found.items():
         if array.shape != expected[name] or array.dtype != np.float32:
-            raise ValueError(f"{name} is {array.dtype} {array.shape}: expected float32 {expected[name]}")
+            raise ValueError(
+                f"{name} is {array.dtype} {array.shape}: expected float32 {expected[name]}"
+            )
     if not 1 <= kept <= failure.substep:
         raise ValueError(f"{kept} substeps are kept of {failure.substep}")
     for name, array in failure.fields.items():
         if name not in (*per_world_fields(), GRAVITY) or array.dtype not in (np.float32, np.int32):
-            raise ValueError(f"{_FIELD}{name}, {array.dtype}: no model field that may differ between worlds")
+            raise ValueError(
+                f"{_FIELD}{name}, {array.dtype}: no model field that may differ between worlds"
+            )
         own = getattr(failure.mj_model, name, None)
         if own is not None and own.size != array.size:
             raise ValueError(f"{_FIELD}{name} has {array.size} numbers: its model has {own.size}")

@@ -58,7 +58,9 @@ class NanReport:
 
 
 @wp.kernel(enable_backward=False)
-def keep_rows(rows: wp.array2d[float], failed: wp.array[int], count: wp.array[int], ring: wp.array3d[float]):
+def keep_rows(
+    rows: wp.array2d[float], failed: wp.array[int], count: wp.array[int], ring: wp.array3d[float]
+):
     """Write each world's row into the next place of its ring, unless the world has failed."""
     world, i = wp.tid()
     # A failed world's ring stands still, so that its last substeps stay readable.
@@ -118,7 +120,9 @@ class NanGuard:
         self._names = [name for name in SUBSTEP_INPUTS if name in state and state[name].numel()]
         self._rows = [_as_rows(state[name], num_envs) for name in self._names]
         self._reached_from = {name: _as_rows(state[name], num_envs) for name in ("qpos", "qvel")}
-        self._rings = [wp.zeros((num_envs, cfg.history, rows.shape[1]), dtype=float) for rows in self._rows]
+        self._rings = [
+            wp.zeros((num_envs, cfg.history, rows.shape[1]), dtype=float) for rows in self._rows
+        ]
         self._failed = wp.zeros(num_envs, dtype=int)
         self._count = wp.zeros(num_envs, dtype=int)
         self._reached = {name: wp.zeros_like(rows) for name, rows in self._reached_from.items()}
@@ -134,7 +138,9 @@ class NanGuard:
             self._keep_rows()
             return
         for rows, ring in zip(self._rows, self._rings, strict=True):
-            wp.launch(keep_rows, dim=rows.shape, inputs=[rows, self._failed, self._count], outputs=[ring])
+            wp.launch(
+                keep_rows, dim=rows.shape, inputs=[rows, self._failed, self._count], outputs=[ring]
+            )
 
     def after_substep(self) -> None:
         """Launch the search for worlds that failed in this substep."""
@@ -144,7 +150,12 @@ class NanGuard:
         wp.launch(
             mark_failed,
             dim=self._failed.shape,
-            inputs=[self._reached_from["qpos"], self._reached_from["qvel"], self._failed, self._count],
+            inputs=[
+                self._reached_from["qpos"],
+                self._reached_from["qvel"],
+                self._failed,
+                self._count,
+            ],
             outputs=[self._reached["qpos"], self._reached["qvel"]],
         )
 
@@ -199,7 +210,9 @@ class NanGuard:
                 )
         # A full disk must not end the run: the failure is still named.
         except OSError as error:
-            messages.append(f"world {worlds[len(files)]} became non-finite, and could not be saved: {error}")
+            messages.append(
+                f"world {worlds[len(files)]} became non-finite, and could not be saved: {error}"
+            )
         self._failed_E.zero_()
         # Their rings start again from the first place.
         self._count_E[list(worlds)] = 0
@@ -224,8 +237,13 @@ class NanGuard:
                 name: wp.to_torch(ring)[world].cpu().numpy()[places]
                 for name, ring in zip(self._names, self._rings, strict=True)
             },
-            reached={name: wp.to_torch(array)[world].cpu().numpy() for name, array in self._reached.items()},
-            fields={name: np.asarray(kept[world].cpu()) for name, kept in self._kept_fields.items()},
+            reached={
+                name: wp.to_torch(array)[world].cpu().numpy()
+                for name, array in self._reached.items()
+            },
+            fields={
+                name: np.asarray(kept[world].cpu()) for name, kept in self._kept_fields.items()
+            },
         )
         path = self._folder / f"nan-{os.getpid()}-{self._written:03d}-world{world}.safetensors"
         self._failures.write(path, failure)
@@ -240,7 +258,9 @@ def _failures(cfg: NanGuardCfg) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name != "safetensors":
             raise
-        raise ValueError(f"nan_guard={cfg}: its files need the package safetensors; install it") from error
+        raise ValueError(
+            f"nan_guard={cfg}: its files need the package safetensors; install it"
+        ) from error
     return failures
 
 

@@ -84,7 +84,9 @@ def replay(failure: Failure) -> Replay:
     reached_qvel = [*failure.states["qvel"][1:], failure.reached["qvel"]]
     # Overflows in numpy and warnings of MuJoCo are the subject here, not faults.
     with np.errstate(all="ignore"), caught_warnings():
-        substeps = tuple(_substep(data, failure, k, reached) for k, reached in enumerate(reached_qvel))
+        substeps = tuple(
+            _substep(data, failure, k, reached) for k, reached in enumerate(reached_qvel)
+        )
     before = _broken_dofs(mj_model, failure.states["qpos"][-1], failure.states["qvel"][-1])
     after = _broken_dofs(mj_model, failure.reached["qpos"], failure.reached["qvel"])
     finite = np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()
@@ -104,7 +106,10 @@ def dof_name(mj_model: mujoco.MjModel, dof: int) -> str:
     joint = int(mj_model.dof_jntid[dof])
     name = mj_model.joint(joint).name or f"joint {joint}"
     # A free joint has six dofs and a ball three: their place is shown.
-    several = mj_model.jnt_type[joint] in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
+    several = mj_model.jnt_type[joint] in (
+        int(mujoco.mjtJoint.mjJNT_FREE),
+        int(mujoco.mjtJoint.mjJNT_BALL),
+    )
     if several:
         return f"{name}[{dof - int(mj_model.jnt_dofadr[joint])}]"
     return name
@@ -113,19 +118,24 @@ def dof_name(mj_model: mujoco.MjModel, dof: int) -> str:
 def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
     """Return the replay as a table, with the verdict below it."""
     mj_model = failure.mj_model
-    heads = (
-        "substep,time s,energy J,max |qvel|,of dof,max |qacc|,of dof,max |ctrl|,contacts,off Warp,C engine"
-    )
+    heads = "substep,time s,energy J,max |qvel|,of dof,max |qacc|,of dof,max |ctrl|,contacts,off Warp,C engine"
     # The head is a row as well, so that columns are as wide as both.
     rows: list[tuple[str, ...]] = [tuple(heads.split(","))]
     last = len(result.substeps) - 1
     for k, substep in enumerate(result.substeps):
         (speed, fast) = substep.speed
         (acceleration, pushed) = substep.acceleration
-        numbers = (f"{substep.time:.4f}", _short(substep.energy), _short(speed), dof_name(mj_model, fast))
+        numbers = (
+            f"{substep.time:.4f}",
+            _short(substep.energy),
+            _short(speed),
+            dof_name(mj_model, fast),
+        )
         numbers += (_short(acceleration), dof_name(mj_model, pushed), _short(substep.control[0]))
         said = ", ".join(substep.warnings) or "ok"
-        rows.append((str(k - last), *numbers, str(substep.contacts), _short(substep.deviation), said))
+        rows.append(
+            (str(k - last), *numbers, str(substep.contacts), _short(substep.deviation), said)
+        )
     widths = []
     for column in zip(*rows, strict=True):
         widths.append(max(len(cell) for cell in column))
@@ -134,7 +144,9 @@ def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
         cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
         lines.append("  ".join(cells))
     names = [dof_name(mj_model, dof) for dof in result.dofs]
-    shown = ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
+    shown = ", ".join(names[:limit]) + (
+        f" and {len(names) - limit} more" if len(names) > limit else ""
+    )
     kept = len(result.substeps)
     title = f"world {failure.world}: its last {kept} of {failure.substep} substeps; 0 is the one that broke"
     first = dof_name(mj_model, result.first)
@@ -142,19 +154,26 @@ def describe(failure: Failure, result: Replay, *, limit: int = 10) -> str:
     if result.was_broken_before:
         verdict = f"First: {first}, before substep 0 already. An event, a command or a reset wrote it there."
     else:
-        verdict = f"First: {first}. Not finite after substep 0 on Warp: {shown or 'the sum of all'}."
+        verdict = (
+            f"First: {first}. Not finite after substep 0 on Warp: {shown or 'the sum of all'}."
+        )
     lines = [title, *lines, verdict]
     size, actuator = result.substeps[-1].control
     if size > MOST_CONTROL:
-        lines.append(f"The control of actuator {mj_model.actuator(actuator).name!r} is {_short(size)}.")
-    lines.append(f"The C engine {'breaks in the same' if result.breaks_on_c else 'takes the'} substep.")
+        lines.append(
+            f"The control of actuator {mj_model.actuator(actuator).name!r} is {_short(size)}."
+        )
+    lines.append(
+        f"The C engine {'breaks in the same' if result.breaks_on_c else 'takes the'} substep."
+    )
     return "\n".join(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table of a file."""
     parser = argparse.ArgumentParser(
-        prog="python -m ksim_rl.physics.nan_guard.replay", description="Show the step that became non-finite."
+        prog="python -m ksim_rl.physics.nan_guard.replay",
+        description="Show the step that became non-finite.",
     )
     parser.add_argument("file", type=Path, help="a file that the NaN guard wrote (sim.nan_guard)")
     path = parser.parse_args(arguments).file

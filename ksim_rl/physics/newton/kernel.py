@@ -63,7 +63,9 @@ def layout(
     # A column of a whole block has the entries of the block twice; one more is the gradient's.
     column = padded(nv + 1 + (CUDA_LANES if nv >= CUDA_LANES else 0))
     # Part 4 of the C++ has blocks and arms of limbs, then the trunk; part 6 has two columns, or in the end two rows.
-    of_limbs = chains * (limb + arms) * padded(limb) + max(padded(arms * (arms + 1) // 2), 2 * narrow)
+    of_limbs = chains * (limb + arms) * padded(limb) + max(
+        padded(arms * (arms + 1) // 2), 2 * narrow
+    )
     workspace = max(2 * column, 2 * stride, of_limbs)
     spread = trunk + chains * padded(limb)
     # So many lanes sum the tile of a limb: a power of two. A lane has three rows of it in its registers.
@@ -77,9 +79,19 @@ def layout(
         tile = lanes
     else:
         tile = 0
-    bounds = rows if elliptic else padded(min(nv + ntendon, njmax))  # of cones, or else of dry friction
+    bounds = (
+        rows if elliptic else padded(min(nv + ntendon, njmax))
+    )  # of cones, or else of dry friction
     # The inertia matrix and one vector, rows of the Jacobian, workspace, a vector by limbs, bounds, numbers per row.
-    floats = (nv + 1) * stride + rows_on_chip * narrow + workspace + spread + bounds + 4 * rows + rows // 2
+    floats = (
+        (nv + 1) * stride
+        + rows_on_chip * narrow
+        + workspace
+        + spread
+        + bounds
+        + 4 * rows
+        + rows // 2
+    )
     return {
         "NV": nv,
         "NJ": njmax,
@@ -171,7 +183,10 @@ def sort_by_counting(order: wp.array[int], iterations: wp.array[int], rows: wp.a
 
 
 @wp.kernel(
-    module="unique", enable_backward=False, grid_stride=False, module_options={"block_dim": SORTING_THREADS}
+    module="unique",
+    enable_backward=False,
+    grid_stride=False,
+    module_options={"block_dim": SORTING_THREADS},
 )
 def sort_worlds(order: wp.array[int], iterations: wp.array[int], rows: wp.array[int]):
     """Write the order of the worlds, by one block."""

@@ -22,7 +22,9 @@ class Limbs:
         trunk = self.trunk if self.chains else range(nv)
         where = {dof: (-1, place) for place, dof in enumerate(trunk)}
         for limb, chain in enumerate(self.chains):
-            where |= {dof: (limb, padded(len(self.trunk)) + place) for place, dof in enumerate(chain)}
+            where |= {
+                dof: (limb, padded(len(self.trunk)) + place) for place, dof in enumerate(chain)
+            }
         dofs = list(where)
         (limbs, places) = zip(*(where[dof] for dof in range(nv)), strict=True)
         slots = sorted(range(nv), key=dofs.__getitem__)

@@ -44,10 +44,13 @@ def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
     nv = mj_model.nv
     elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
     limbs = limbs_of(mj_model.dof_parentid.tolist())
-    floats = layout(nv, njmax, limbs, ntendon=mj_model.ntendon, elliptic=elliptic, rows_on_chip=0)["FLOATS"]
+    floats = layout(nv, njmax, limbs, ntendon=mj_model.ntendon, elliptic=elliptic, rows_on_chip=0)[
+        "FLOATS"
+    ]
     reasons = {
         "the solver is not Newton's": opt.solver != mujoco.mjtSolver.mjSOL_NEWTON,
-        f"the integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator not in INTEGRATORS,
+        f"the integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator
+        not in INTEGRATORS,
         "the Jacobian is dense": opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE,
         "no iterations are allowed": opt.iterations < 1,
         "there are noslip iterations": opt.noslip_iterations > 0,
@@ -115,7 +118,9 @@ def solver(
     narrow = sizes["NARROW"]
     if rows_on_chip is None:
         # Of many worlds, eleven run at the same time if an eighth of the rows finds room; see FLOATS_OF_MANY.
-        is_tight = d.nworld > FEW_WORLDS and sizes["FLOATS"] + d.njmax // 8 * narrow <= FLOATS_OF_MANY
+        is_tight = (
+            d.nworld > FEW_WORLDS and sizes["FLOATS"] + d.njmax // 8 * narrow <= FLOATS_OF_MANY
+        )
         room = (FLOATS_OF_MANY if is_tight else FLOATS_PER_WORLD) - sizes["FLOATS"]
         if on_cuda:
             # Half of the rows suffice: few worlds have more.
@@ -129,7 +134,10 @@ def solver(
         "efc_J_colind": efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": efc.J.reshape((d.nworld, -1)),
         "scratch": wp.empty((d.nworld, far_floats), dtype=float, device=device),
-        **{name: wp.array(table, dtype=int, device=device) for name, table in limbs.tables(m.nv).items()},
+        **{
+            name: wp.array(table, dtype=int, device=device)
+            for name, table in limbs.tables(m.nv).items()
+        },
         # The worlds are in the order of their numbers until the first sort.
         "order": wp.array(list(range(d.nworld)), dtype=int, device=device),
         "broken": wp.empty(0, dtype=int, device=device) if broken is None else broken,
@@ -140,7 +148,9 @@ def solver(
     else:
         lanes = 1
         registers = None
-    solve = launcher(m, d, own, sizes, lanes=lanes, max_registers=registers, checked=broken is not None)
+    solve = launcher(
+        m, d, own, sizes, lanes=lanes, max_registers=registers, checked=broken is not None
+    )
 
     def launch(*, orders: bool = True, solves: bool = True) -> None:
         # The CPU takes the worlds one after the other, so that an order gains nothing.

@@ -32,7 +32,9 @@ _ENUMS = {
 }
 
 
-def one_kernel_rows_unavailable(warp_model: mjw.Model, *, dynamics_unavailable: str | None) -> str | None:
+def one_kernel_rows_unavailable(
+    warp_model: mjw.Model, *, dynamics_unavailable: str | None
+) -> str | None:
     """Return why MuJoCo Warp's own kernels make a model's rows, or None where ours does, given earlier stages."""
     m = warp_model
     reasons = {
@@ -58,7 +60,9 @@ def constraint_rows(
     bits = mjw.DisableBit
     flags = int(warp_model.opt.disableflags)
     # Sorted below by number: MuJoCo Warp lists balls apart from hinges and slides.
-    limited = np.concatenate([m.jnt_limited_ball_adr.numpy(), m.jnt_limited_slide_hinge_adr.numpy()])
+    limited = np.concatenate(
+        [m.jnt_limited_ball_adr.numpy(), m.jnt_limited_slide_hinge_adr.numpy()]
+    )
     # For each geom, 64 bits say which degrees of freedom move it: a contact's row needs no search.
     bodies = m.body_weldid.numpy()[m.geom_bodyid.numpy()]
     moves = m.body_isdofancestor.numpy()[bodies, : m.nv] != 0
@@ -94,7 +98,9 @@ def constraint_rows(
     waits = device.is_cuda and d.nworld * lanes > THREADS_AT_ONCE * device.sm_count
     build = native.Build(max_registers=REGISTERS if waits else None)
     source = native.source_of("rows", PARTS)
-    launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, build=build)
+    launch = native.launcher(
+        source, constants, own, m, d, lanes=lanes, threads=threads, build=build
+    )
 
     def make_rows() -> None:
         # First, since rows of contacts follow the order of the lists.

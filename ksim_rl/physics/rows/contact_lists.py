@@ -26,7 +26,9 @@ class ContactLists:
         order: launches the second, where no kernel of constraint rows does so on its way.
     """
 
-    def __init__(self, warp_model: mjw.Model, warp_data_E: mjw.Data, *, room: int | None = None) -> None:
+    def __init__(
+        self, warp_model: mjw.Model, warp_data_E: mjw.Data, *, room: int | None = None
+    ) -> None:
         m = warp_model
         d = warp_data_E
         device = warp_data_E.qpos.device
@@ -34,7 +36,9 @@ class ContactLists:
         gaps = any(gap.numpy().any() for gap in (m.geom_gap, m.pair_gap))
         self.room = room or max(1, d.njmax + (d.naconmax // d.nworld if gaps else 0))
         self.count, self.appended = (wp.zeros(d.nworld, dtype=int, device=device) for _ in range(2))
-        self.ids, self.found = (wp.zeros((d.nworld, self.room), dtype=int, device=device) for _ in range(2))
+        self.ids, self.found = (
+            wp.zeros((d.nworld, self.room), dtype=int, device=device) for _ in range(2)
+        )
         # Contacts are sorted by these 64 bits, in C's order.
         self.keys = wp.empty((d.nworld, self.room), dtype=wp.uint64, device=device)
         # For the kernels that read them, too.
@@ -54,7 +58,9 @@ class ContactLists:
         # The first half appends, the second one sorts.
         sources = [native.source_of("rows", parts) for parts in (("append",), ("layout", "order"))]
         self._append, self.order = (
-            native.launcher(source, self.constants, vars(self), m, d, lanes=self.lanes, threads=self.threads)
+            native.launcher(
+                source, self.constants, vars(self), m, d, lanes=self.lanes, threads=self.threads
+            )
             for source in sources
         )
         self.are_appended = False

@@ -47,7 +47,9 @@ class Limits:
     is_discrete: bool
 
 
-def _narrow(limited: np.ndarray, ranges: np.ndarray, margins: np.ndarray, *, differs: bool) -> np.ndarray:
+def _narrow(
+    limited: np.ndarray, ranges: np.ndarray, margins: np.ndarray, *, differs: bool
+) -> np.ndarray:
     """Return which of those with limits may be within the margins of both, in the model or where its fields differ."""
     # Fields of each world may be drawn at any time: then the width of today proves nothing.
     differs = differs or len(ranges) > 1 or len(margins) > 1
@@ -73,14 +75,17 @@ def tendons_between_limits(warp_model: mjw.Model, expanded: Collection[str]) -> 
     return _narrow(limited, m.tendon_range.numpy(), m.tendon_margin.numpy(), differs=differs)
 
 
-def room_for_nonzeros(warp_model: mjw.Model, expanded: Collection[str], *, njmax: int) -> int | None:
+def room_for_nonzeros(
+    warp_model: mjw.Model, expanded: Collection[str], *, njmax: int
+) -> int | None:
     """Return how many entries of the Jacobian a world needs room for, or None where MuJoCo Warp's estimate will do.
 
     That has one row for each limit, and none for dry friction that the model itself does not have.
     """
     # Rows of the second limits, and of friction that a world draws, are unknown to MuJoCo Warp's estimate.
     between = (
-        joints_between_limits(warp_model, expanded).size + tendons_between_limits(warp_model, expanded).size
+        joints_between_limits(warp_model, expanded).size
+        + tendons_between_limits(warp_model, expanded).size
     )
     if between or {"dof_frictionloss", "tendon_frictionloss"}.intersection(expanded):
         # Every row may have all columns: an upper bound that needs no look at the tree.
@@ -164,7 +169,9 @@ def _appended(world: int, nonzeros: int, c: Limits) -> int:
 
 
 @wp.func
-def _write_limit(world: int, row: int, kind: int, owner: int, distance: float, sign: float, c: Limits):
+def _write_limit(
+    world: int, row: int, kind: int, owner: int, distance: float, sign: float, c: Limits
+):
     """Write a row of a limit: the Jacobian of its joint or tendon, times the sign of the side, and its law."""
     velocity = float(0.0)  # noqa: UP018
     # A dense row may hold leftovers of another step's row.
@@ -231,7 +238,14 @@ def _write_limit(world: int, row: int, kind: int, owner: int, distance: float, s
 
 @wp.func
 def _add_second(
-    world: int, kind: int, owner: int, value: float, bounds: wp.vec2, margin: float, nonzeros: int, c: Limits
+    world: int,
+    kind: int,
+    owner: int,
+    value: float,
+    bounds: wp.vec2,
+    margin: float,
+    nonzeros: int,
+    c: Limits,
 ):
     # Distances to both limits, rad or m; a row exists below the margin.
     lower = value - bounds[0]
@@ -257,10 +271,14 @@ def add_second_limits(c: Limits):
         joint = c.joints[i]
         bounds = c.jnt_range[world % c.jnt_range.shape[0], joint]
         margin = c.jnt_margin[world % c.jnt_margin.shape[0], joint]
-        _add_second(world, LIMIT_JOINT, joint, c.qpos[world, c.jnt_qposadr[joint]], bounds, margin, 1, c)
+        _add_second(
+            world, LIMIT_JOINT, joint, c.qpos[world, c.jnt_qposadr[joint]], bounds, margin, 1, c
+        )
     for i in range(c.tendons.shape[0]):
         tendon = c.tendons[i]
         bounds = c.tendon_range[world % c.tendon_range.shape[0], tendon]
         margin = c.tendon_margin[world % c.tendon_margin.shape[0], tendon]
         nonzeros = c.ten_J_rownnz[tendon]
-        _add_second(world, LIMIT_TENDON, tendon, c.ten_length[world, tendon], bounds, margin, nonzeros, c)
+        _add_second(
+            world, LIMIT_TENDON, tendon, c.ten_length[world, tendon], bounds, margin, nonzeros, c
+        )

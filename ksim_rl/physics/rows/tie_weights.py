@@ -80,7 +80,11 @@ def weigh_ties(
     # A weld has three rows of translation, which three of rotation follow.
     part = int(0)  # noqa: UP018 (Warp: a variable that changes)
     third_before = wp.max(row - 3, 0)
-    if row >= 3 and efc_type[world, third_before] == EQUALITY and efc_id[world, third_before] == equality:
+    if (
+        row >= 3
+        and efc_type[world, third_before] == EQUALITY
+        and efc_id[world, third_before] == equality
+    ):
         part = 1
     of_world = world % body_invweight0.shape[0]
     present = float(0.0)  # noqa: UP018

@@ -54,7 +54,11 @@ class ContactReadings:
     """
 
     def __init__(
-        self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists
+        self,
+        mj_model: mujoco.MjModel,
+        warp_model: mjw.Model,
+        warp_data_E: mjw.Data,
+        lists: ContactLists,
     ) -> None:
         m = warp_model
         d = warp_data_E
@@ -87,7 +91,9 @@ class ContactReadings:
         else:
             lanes = lists.lanes
         parts = ("matching", "sensors", "accelerometers"), ("bodies",)
-        sources = [native.source_of("rows", ("layout", "wrench", *own_parts)) for own_parts in parts]
+        sources = [
+            native.source_of("rows", ("layout", "wrench", *own_parts)) for own_parts in parts
+        ]
         self._read_sensors, self._sum_forces = (
             native.launcher(source, constants, own, m, d, lanes=lanes, threads=lists.threads)
             for source in sources

@@ -38,7 +38,9 @@ class LimitSensors:
         reads_tendons: whether one of them needs `ten_velocity`.
     """
 
-    def __init__(self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+    def __init__(
+        self, mj_model: mujoco.MjModel, warp_model: mjw.Model, warp_data_E: mjw.Data
+    ) -> None:
         self._warp_model = warp_model
         self._warp_data_E = warp_data_E
         # C reads zero under these flags; sensordata is zeroed before.
@@ -94,7 +96,12 @@ class LimitSensors:
             ),
             *(d.ne, d.nf, d.nl, d.njmax, d.efc.type, d.efc.id, d.efc.force),
         ]
-        wp.launch(_read_forces, dim=(d.nworld, self._of_forces.size), inputs=inputs, outputs=[d.sensordata])
+        wp.launch(
+            _read_forces,
+            dim=(d.nworld, self._of_forces.size),
+            inputs=inputs,
+            outputs=[d.sensordata],
+        )
 
 
 @wp.func
@@ -149,7 +156,9 @@ def _read_state(
         limits = tendon_range[world % tendon_range.shape[0], of]
         length = ten_length[world, of]
         margin = tendon_margin[world % tendon_margin.shape[0], of]
-        value = _nearest(length - limits[0], limits[1] - length, margin, ten_velocity[world, of], wants_speed)
+        value = _nearest(
+            length - limits[0], limits[1] - length, margin, ten_velocity[world, of], wants_speed
+        )
     else:
         limits = jnt_range[world % jnt_range.shape[0], of]
         margin = jnt_margin[world % jnt_margin.shape[0], of]
@@ -175,7 +184,9 @@ def _read_state(
         else:
             at = qpos[world, q]
             value = _nearest(at - limits[0], limits[1] - at, margin, qvel[world, v], wants_speed)
-    sensordata[world, sensor_adr[sensor]] = _cut(value, sensor_cutoff[sensor], sensor_datatype[sensor])
+    sensordata[world, sensor_adr[sensor]] = _cut(
+        value, sensor_cutoff[sensor], sensor_datatype[sensor]
+    )
 
 
 @wp.kernel(enable_backward=False)
@@ -205,7 +216,13 @@ def _read_forces(
     found = bool(False)  # noqa: UP018 (Warp: a variable that changes in a loop)
     for row in range(first, end):
         # Where both limits hold, the first row counts, which is the lower limit's.
-        if not found and efc_type[world, row] == kind and efc_id[world, row] == sensor_objid[sensor]:
+        if (
+            not found
+            and efc_type[world, row] == kind
+            and efc_id[world, row] == sensor_objid[sensor]
+        ):
             value = efc_force[world, row]
             found = True
-    sensordata[world, sensor_adr[sensor]] = _cut(value, sensor_cutoff[sensor], sensor_datatype[sensor])
+    sensordata[world, sensor_adr[sensor]] = _cut(
+        value, sensor_cutoff[sensor], sensor_datatype[sensor]
+    )

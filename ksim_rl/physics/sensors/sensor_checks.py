@@ -44,7 +44,9 @@ def check_delayed(mj_model: mujoco.MjModel) -> None:
         kind = mj_model.sensor_type[sensor]
         (samples, interpolation) = mj_model.sensor_history[sensor]
         # A `reduce` of 0 takes contacts as they come.
-        takes_first = kind == mujoco.mjtSensor.mjSENS_CONTACT and mj_model.sensor_intprm[sensor, 1] == 0
+        takes_first = (
+            kind == mujoco.mjtSensor.mjSENS_CONTACT and mj_model.sensor_intprm[sensor, 1] == 0
+        )
         if takes_first and (samples or mj_model.nflex):
             raise ValueError(
                 f"{_name(mj_model, sensor)} reads the first contacts, which have no order "
@@ -64,7 +66,9 @@ def check_sites_of_meshes(mj_model: mujoco.MjModel) -> None:
     """Refuse sensors of things inside a site with the shape of a mesh, of which MuJoCo Warp knows no inside."""
     kinds = mujoco.mjtSensor
     m = mj_model
-    for sensor in np.flatnonzero(np.isin(m.sensor_type, (kinds.mjSENS_CONTACT, kinds.mjSENS_INSIDESITE))):
+    for sensor in np.flatnonzero(
+        np.isin(m.sensor_type, (kinds.mjSENS_CONTACT, kinds.mjSENS_INSIDESITE))
+    ):
         # A sensor that tells whether an object is inside names the site second.
         is_second = m.sensor_type[sensor] == kinds.mjSENS_INSIDESITE
         if is_second:
@@ -108,8 +112,12 @@ def check_signed_distance_fields(mj_model: mujoco.MjModel) -> None:
         np.isin(mj_model.sensor_type, (*DISTANCES, mujoco.mjtSensor.mjSENS_CONTACT))
     ):
         of_contacts = mj_model.sensor_type[sensor] == mujoco.mjtSensor.mjSENS_CONTACT
-        own = geoms_of(mj_model, mj_model.sensor_objtype[sensor], int(mj_model.sensor_objid[sensor]))
-        others = geoms_of(mj_model, mj_model.sensor_reftype[sensor], int(mj_model.sensor_refid[sensor]))
+        own = geoms_of(
+            mj_model, mj_model.sensor_objtype[sensor], int(mj_model.sensor_objid[sensor])
+        )
+        others = geoms_of(
+            mj_model, mj_model.sensor_reftype[sensor], int(mj_model.sensor_refid[sensor])
+        )
         # A sensor that names one object reads its contacts with everything.
         found = fields[own[fields] | others[fields]]
         if of_contacts:
@@ -131,7 +139,9 @@ def geoms_of(mj_model: mujoco.MjModel, kind: int, element: int) -> np.ndarray:
     if kind == BODY:
         return mj_model.geom_bodyid == element
     if kind == TREE:
-        below = [body == element or _is_below(mj_model, body, element) for body in range(mj_model.nbody)]
+        below = [
+            body == element or _is_below(mj_model, body, element) for body in range(mj_model.nbody)
+        ]
         return np.array(below)[mj_model.geom_bodyid]
     return np.ones(mj_model.ngeom, dtype=bool)
 

@@ -23,7 +23,10 @@ _SITE_TYPES = ("SPHERE", "CAPSULE", "CYLINDER", "BOX")
 
 @wp.kernel(enable_backward=False)
 def bound_touch(
-    sensors: wp.array[int], sensor_adr: wp.array[int], cutoff: wp.array[float], sensordata: wp.array2d[float]
+    sensors: wp.array[int],
+    sensor_adr: wp.array[int],
+    cutoff: wp.array[float],
+    sensordata: wp.array2d[float],
 ):
     """Keep touch sensors within their cutoff."""
     world, place = wp.tid()
@@ -47,7 +50,9 @@ def contact_sensors_left(mj_model: mujoco.MjModel, read: list[int]) -> list[int]
 
 def bounded_touch_sensors(mj_model: mujoco.MjModel) -> list[int]:
     """Return the touch sensors with a cutoff."""
-    bounded = (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH) & (mj_model.sensor_cutoff > 0.0)
+    bounded = (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH) & (
+        mj_model.sensor_cutoff > 0.0
+    )
     return np.flatnonzero(bounded).tolist()
 
 
@@ -81,7 +86,9 @@ def mend_sensors(
     return contact_sensors
 
 
-def _bounding_of(sensors: list[int], warp_model: mjw.Model, warp_data_E: mjw.Data) -> Callable[[], None]:
+def _bounding_of(
+    sensors: list[int], warp_model: mjw.Model, warp_data_E: mjw.Data
+) -> Callable[[], None]:
     m = warp_model
     d = warp_data_E
     inputs = [wp.array(sensors, dtype=int), m.sensor_adr, m.sensor_cutoff]

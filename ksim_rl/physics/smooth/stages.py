@@ -106,7 +106,11 @@ def one_kernel_integration_unavailable(
 
 
 def smooth_dynamics(
-    warp_model: mjw.Model, warp_data_E: mjw.Data, *, lanes: int | None = None, mask: wp.array | None = None
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    *,
+    lanes: int | None = None,
+    mask: wp.array | None = None,
 ) -> Callable[..., None]:
     """Return a launcher of the smooth dynamics of a model that is not `unsuited`, with arrays in their final place.
 
@@ -175,7 +179,11 @@ def _launcher(
     own = {**WHOLE, **given, **arrays}
     constants = {**_ENUMS, **sizes, "floats": _floats(parts, sizes, lanes)}
     # The bound was measured to pay for dynamics in small blocks; see LANES.
-    is_small = parts == SMOOTH and threads == 64 and constants["floats"] * (64 // lanes) <= SMALL_BLOCK_FLOATS
+    is_small = (
+        parts == SMOOTH
+        and threads == 64
+        and constants["floats"] * (64 // lanes) <= SMALL_BLOCK_FLOATS
+    )
     parents = ", ".join(map(str, m.body_parentid.numpy()))
     # Without a record of overflow, its part is not compiled.
     parts += ("record",) if "sticky" in given else ()
@@ -257,7 +265,9 @@ def _elimination(warp_model: mjw.Model) -> dict[str, Sequence[int] | np.ndarray]
         *ancestors, _ = column[row == dof]
         # The outer product of a row updates the rows of its ancestors.
         for other, ancestor in enumerate(ancestors):
-            changes += [starts[ancestor] + place << 14 | place << 7 | other for place in range(other + 1)]
+            changes += [
+                starts[ancestor] + place << 14 | place << 7 | other for place in range(other + 1)
+            ]
             # Entries beyond the matrix belong to the right-hand side, which is eliminated with it.
             changes.append(column.size + ancestor << 14 | other << 7 | len(ancestors))
         first.append(len(changes))
@@ -271,7 +281,9 @@ def _has_affine_actuators(warp_model: mjw.Model) -> bool:
     m = warp_model
     for enum, names in AFFINE.items():
         known = [SWITCHED_OFF, *(native.names_of(enum)[name] for name in names)]
-        if not np.isin(getattr(m, f"actuator_{enum.__name__[3:].lower()}type").numpy(), known).all():
+        if not np.isin(
+            getattr(m, f"actuator_{enum.__name__[3:].lower()}type").numpy(), known
+        ).all():
             return False
     # Balls and free joints have transmissions of several columns.
     return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())

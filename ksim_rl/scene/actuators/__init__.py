@@ -12,4 +12,7 @@ from ksim_rl.scene.actuators.nets import LSTMActuator, MLPActuator
 from ksim_rl.scene.state.buffers import ActuatorParams
 from ksim_rl.scene.state.joint_targets import JointTargets
 
-__all__ = ["set_actuators", *sorted(name for name, value in vars().items() if isinstance(value, type))]  # pyright: ignore
+__all__ = [
+    "set_actuators",
+    *sorted(name for name, value in vars().items() if isinstance(value, type)),
+]  # pyright: ignore

@@ -24,7 +24,9 @@ Law = Callable[[JointState, JointTarget], Float[Tensor, "E N"]]
 class Drive:
     """The N joints of one law, in the model's order."""
 
-    def __init__(self, name: str, simulation: Simulation, view: WorldView, joint_ids: Sequence[int]) -> None:
+    def __init__(
+        self, name: str, simulation: Simulation, view: WorldView, joint_ids: Sequence[int]
+    ) -> None:
         self.num_envs = view.num_envs
         self.num_joints = len(joint_ids)
         self.device = view.device

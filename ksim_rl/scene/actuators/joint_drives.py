@@ -84,7 +84,11 @@ class JointDrives:
         names = view.joints().names
         for prefix, entries in actuators.items():
             # Entries name joints without the robot's prefix.
-            ids = {name.removeprefix(prefix): i for i, name in enumerate(names) if name.startswith(prefix)}
+            ids = {
+                name.removeprefix(prefix): i
+                for i, name in enumerate(names)
+                if name.startswith(prefix)
+            }
             for actuator, driven in driven_joints(entries, list(ids)):
                 if not actuator.is_explicit:
                     continue

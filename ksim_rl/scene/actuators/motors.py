@@ -49,7 +49,9 @@ class IdealPDActuator(ExplicitActuator):
 def pd_effort(drive: Drive, state: JointState, target: JointTarget) -> Float[Tensor, "E N"]:
     """Return the effort that a proportional-derivative controller asks for, without limits."""
     # Effort + kp * (position error) + kd * (velocity error), in two fused kernels.
-    asked_EN = torch.addcmul(target.effort_EN, drive.param("stiffness"), target.pos_EN - state.pos_EN)
+    asked_EN = torch.addcmul(
+        target.effort_EN, drive.param("stiffness"), target.pos_EN - state.pos_EN
+    )
     return torch.addcmul(asked_EN, drive.param("damping"), target.vel_EN - state.vel_EN)
 
 
@@ -96,7 +98,9 @@ class DelayedActuator(Actuator):
     before.
     """
 
-    is_explicit: ClassVar[bool] = True  # built-in actuators too get their control before each substep
+    is_explicit: ClassVar[bool] = (
+        True  # built-in actuators too get their control before each substep
+    )
     counts_substeps: ClassVar[bool] = True
 
     actuator: Actuator

@@ -26,7 +26,9 @@ ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "softsign": nn.Softsign, "tanh": 
 _SCALES = ("position_scale", "velocity_scale", "effort_scale")
 _LSTM_PARTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 
-Lags = Annotated[tuple[WholeNumber, ...], Filled("expected whole numbers of substeps of at least 0")]
+Lags = Annotated[
+    tuple[WholeNumber, ...], Filled("expected whole numbers of substeps of at least 0")
+]
 Predictor = Callable[[Float[Tensor, "E N"], Float[Tensor, "E N"]], Float[Tensor, "E N"]]
 """A network at work: efforts [E, N] from position errors [E, N] and velocities [E, N]."""
 
@@ -47,11 +49,15 @@ class NetFile:
         self.where = f"file={file!r} (SHA-256 {digest})"
         # Before the bytes are parsed: nothing of a wrong file is used.
         if sha256 is not None and digest != sha256.lower():
-            raise ValueError(f"{self.where}: expected sha256={sha256!r}: the file is damaged, or another one")
+            raise ValueError(
+                f"{self.where}: expected sha256={sha256!r}: the file is damaged, or another one"
+            )
         try:
             tensors = load(data)
         except SafetensorError as error:
-            raise ValueError(f"{self.where}: no safetensors file: {' '.join(str(error).split())}") from None
+            raise ValueError(
+                f"{self.where}: no safetensors file: {' '.join(str(error).split())}"
+            ) from None
         # The header: its length in 8 bytes, then JSON (https://github.com/huggingface/safetensors#format).
         header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
         self.tensors = {name: tensor.to(torch.float32) for name, tensor in tensors.items()}
@@ -68,7 +74,9 @@ class NetFile:
         )
         if not fits:
             wanted = ", ".join(str(size) for size in shape).replace("-1", "any")
-            raise ValueError(f"{self.where}: {name} has shape {tuple(tensor.shape)}: expected ({wanted})")
+            raise ValueError(
+                f"{self.where}: {name} has shape {tuple(tensor.shape)}: expected ({wanted})"
+            )
         # A NaN in a weight would become a NaN in the state.
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{self.where}: {name} holds numbers that are not finite")
@@ -137,13 +145,17 @@ class NetActuator(ExplicitActuator):
         text = net.metadata.get(name)
         if text is None:
             if default is None:
-                raise ValueError(f"{net.where}: no {name!r} in its metadata: give the field `{name}`")
+                raise ValueError(
+                    f"{net.where}: no {name!r} in its metadata: give the field `{name}`"
+                )
             return default
         if name in _SCALES:
             try:
                 number = float(text)
             except ValueError:
-                raise ValueError(f"{net.where}: {name}={text!r} in its metadata: expected a number") from None
+                raise ValueError(
+                    f"{net.where}: {name}={text!r} in its metadata: expected a number"
+                ) from None
             check_in_range(f"{net.where}: {name}", number)
             return number
         return text
@@ -171,7 +183,9 @@ class MLPActuator(NetActuator):
         # As long as the longest lag, and the present; both signals side by side, [E, 2 N].
         seen = SubstepRing(drive, "seen", max(lags) + 1, 2 * drive.num_joints)
 
-        def predict(error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]) -> Float[Tensor, "E N"]:
+        def predict(
+            error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]
+        ) -> Float[Tensor, "E N"]:
             seen.push(torch.cat((error_EN, vel_EN), dim=1))
             # Two lists of [E, N], one tensor per lag.
             errors = []
@@ -266,11 +280,16 @@ class LSTMActuator(NetActuator):
         num_rows = drive.num_envs * drive.num_joints
         # Zeroed at resets, which is the state that `nn.LSTM` starts from.
         buffers = [
-            tuple(drive.buffer(f"{kind}{layer}_ENH", drive.num_joints, size) for kind in ("hidden", "cell"))
+            tuple(
+                drive.buffer(f"{kind}{layer}_ENH", drive.num_joints, size)
+                for kind in ("hidden", "cell")
+            )
             for layer in range(num_layers)
         ]
 
-        def predict(error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]) -> Float[Tensor, "E N"]:
+        def predict(
+            error_EN: Float[Tensor, "E N"], vel_EN: Float[Tensor, "E N"]
+        ) -> Float[Tensor, "E N"]:
             # Position error, then velocity, as in training.
             value = torch.stack((error_EN, vel_EN), dim=-1).view(num_rows, 2)
             for (hidden_ENH, cell_ENH), layer in zip(buffers, layers, strict=True):

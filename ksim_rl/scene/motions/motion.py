@@ -50,7 +50,9 @@ class ReferenceMotion(NearNames):
         """Seconds from the first frame to the last."""
         return (self.qpos_FL.shape[0] - 1) / self.fps
 
-    def sample(self, time_E: Float[Tensor, " E"]) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E M"]]:
+    def sample(
+        self, time_E: Float[Tensor, " E"]
+    ) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E M"]]:
         """Return qpos and qvel at times, s; before the first and after the last frame those stay.
 
         Between frames both are interpolated linearly, quaternions along the shorter arc and normalized.
@@ -72,7 +74,9 @@ class ReferenceMotion(NearNames):
         """Return positions and velocities of hinges and slides at times, s."""
         low_E, share_E1 = self._between(time_E)
         pos_EL, vel_EL = (
-            torch.lerp(_entries(table_FL, low_E, joints), _entries(table_FL, low_E + 1, joints), share_E1)
+            torch.lerp(
+                _entries(table_FL, low_E, joints), _entries(table_FL, low_E + 1, joints), share_E1
+            )
             for table_FL in (self.joint_pos_FL, self.joint_vel_FL)
         )
         return pos_EL, vel_EL
@@ -88,7 +92,9 @@ class ReferenceMotion(NearNames):
         )
         # [E, 1, 1], to broadcast over bodies and numbers.
         share_E11 = share_E1[:, None]
-        return torch.lerp(pos_EN3, next_pos_EN3, share_E11), _blend(quat_EN4, next_quat_EN4, share_E11)
+        return torch.lerp(pos_EN3, next_pos_EN3, share_E11), _blend(
+            quat_EN4, next_quat_EN4, share_E11
+        )
 
     def _between(self, time_E: Float[Tensor, " E"]) -> tuple[Tensor, Tensor]:
         """Return the frame before each time, [E], and the part of the way to the next one, [E, 1]."""
@@ -108,7 +114,9 @@ def motion_path(file: str) -> Path:
     return Path(file)
 
 
-def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device) -> ReferenceMotion:
+def load_motion(
+    file: str | Path, mj_model: mujoco.MjModel, device: torch.device
+) -> ReferenceMotion:
     """Read an .npz file of the model: `fps`, `qpos` [F, nq], `qvel` [F, nv] and, if it has them, `joint_names`.
 
     The file may be the name of a motion that comes with the package (`ksim_rl.scene.motions`).
@@ -137,7 +145,9 @@ def load_motion(file: str | Path, mj_model: mujoco.MjModel, device: torch.device
     own = [mj_model.joint(i).name for i in range(mj_model.njnt)]
     for name in () if names is None else names:
         if name not in own:
-            raise ValueError(f"motion {file}: the model has no joint {str(name)!r}: {near(str(name), own)}")
+            raise ValueError(
+                f"motion {file}: the model has no joint {str(name)!r}: {near(str(name), own)}"
+            )
     if names is not None and [str(name) for name in names] != own:
         raise ValueError(
             f"motion {file}: joint_names={names.tolist()}: expected the model's joints in their order, {own}"
@@ -183,10 +193,14 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
         # Without pickles, since these run code when they are read.
         arrays = read_arrays(path, limit=MOST_DATA_BYTES)
     except ValueError as error:
-        raise ValueError(f"motion {path}: cannot be read as .npz without pickles: {error}") from None
+        raise ValueError(
+            f"motion {path}: cannot be read as .npz without pickles: {error}"
+        ) from None
     for key in KEYS:
         if key not in arrays:
-            raise ValueError(f"motion {path}: no array {key!r}: it has {', '.join(sorted(arrays)) or 'none'}")
+            raise ValueError(
+                f"motion {path}: no array {key!r}: it has {', '.join(sorted(arrays)) or 'none'}"
+            )
         if arrays[key].dtype.kind not in "fiu":
             raise ValueError(f"motion {path}: {key} is {arrays[key].dtype}: expected numbers")
     unknown = sorted(arrays.keys() - {*KEYS, *_OPTIONAL})

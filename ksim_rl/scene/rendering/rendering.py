@@ -128,16 +128,21 @@ class OffscreenRenderer:
                 # MuJoCo refuses pictures that are larger than its off-screen buffer.
                 vis.offwidth = max(vis.offwidth, cfg.width)
                 vis.offheight = max(vis.offheight, cfg.height)
-                self._renderer = mujoco.Renderer(self._mj_model, cfg.height, cfg.width, max_geom=20_000)
+                self._renderer = mujoco.Renderer(
+                    self._mj_model, cfg.height, cfg.width, max_geom=20_000
+                )
             except Exception as error:  # MuJoCo's platforms raise whatever their loader raises
-                raise RuntimeError(f"{_FIXES}. MUJOCO_GL is {platform!r}, and it said: {error}") from error
+                raise RuntimeError(
+                    f"{_FIXES}. MUJOCO_GL is {platform!r}, and it said: {error}"
+                ) from error
         return self._renderer
 
 
 def pose_env(mj_model: mujoco.MjModel, data: mujoco.MjData, world: World, env: int) -> None:
     """Take over the visible state of one env: its positions, and its own fields, which are written into `mj_model`."""
     write_fields(
-        mj_model, {name: field[env].cpu().numpy() for name, field in world.per_world_fields().items()}
+        mj_model,
+        {name: field[env].cpu().numpy() for name, field in world.per_world_fields().items()},
     )
     data.qpos[:] = world.qpos_EL[env].cpu()
     if mj_model.nmocap:

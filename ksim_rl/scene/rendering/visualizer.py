@@ -60,24 +60,34 @@ class DebugVisualizer:
 
     def text(self, position: Vector, content: str) -> None:
         """Write a label."""
-        geom = self._next(mujoco.mjtGeom.mjGEOM_LABEL, np.full(3, 0.1), position, (1.0, 1.0, 1.0, 1.0))
+        geom = self._next(
+            mujoco.mjtGeom.mjGEOM_LABEL, np.full(3, 0.1), position, (1.0, 1.0, 1.0, 1.0)
+        )
         geom.label = content
 
-    def _next(self, kind: mujoco.mjtGeom, size: np.ndarray, position: Vector, rgba: Rgba) -> mujoco.MjvGeom:
+    def _next(
+        self, kind: mujoco.mjtGeom, size: np.ndarray, position: Vector, rgba: Rgba
+    ) -> mujoco.MjvGeom:
         if self._scene.ngeom >= self._scene.maxgeom:
             raise RuntimeError(_full(self._scene))
         geom = self._scene.geoms[self._scene.ngeom]
         # In the picture's frame.
         center = np.asarray(position, dtype=np.float64) + self._offset
         # Unit orientation; connectors turn it afterwards.
-        mujoco.mjv_initGeom(geom, kind, size, center, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32))
+        mujoco.mjv_initGeom(
+            geom, kind, size, center, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32)
+        )
         self._scene.ngeom += 1
         return geom
 
-    def _connector(self, kind: mujoco.mjtGeom, width: float, start: Vector, end: Vector, rgba: Rgba) -> None:
+    def _connector(
+        self, kind: mujoco.mjtGeom, width: float, start: Vector, end: Vector, rgba: Rgba
+    ) -> None:
         geom = self._next(kind, np.zeros(3), start, rgba)
         # Both ends move with the env.
-        begin, finish = (np.asarray(point, dtype=np.float64) + self._offset for point in (start, end))
+        begin, finish = (
+            np.asarray(point, dtype=np.float64) + self._offset for point in (start, end)
+        )
         mujoco.mjv_connector(geom, kind, width, begin, finish)
 
 

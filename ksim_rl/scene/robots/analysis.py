@@ -106,7 +106,9 @@ class RobotAnalysis:
 
     def by_joint(self, pitch: float, legs: float, others: float) -> dict[str, float]:
         """Return a value by joint pattern: for the legs' joints that turn about y, their others, and all others."""
-        values = dict.fromkeys(self.robot.default_joint_pos, others) | dict.fromkeys(self.leg_joints, legs)
+        values = dict.fromkeys(self.robot.default_joint_pos, others) | dict.fromkeys(
+            self.leg_joints, legs
+        )
         by_pattern = {}
         for joint, value in values.items():
             if joint in self.pitch_joints:
@@ -135,7 +137,9 @@ class RobotAnalysis:
         table = Table(box=None, pad_edge=False, header_style="bold")
         heads = "joint|actuator|range|kp|kd|effort|armature|damping|friction|load|: stance|kp|kd|scale|sag"
         for head in heads.split("|"):
-            table.add_column(head, justify="left" if head in ("joint", "actuator") else "right", no_wrap=True)
+            table.add_column(
+                head, justify="left" if head in ("joint", "actuator") else "right", no_wrap=True
+            )
         for joint in self.joints:
             name, actuator, limits, gains, *numbers = dataclasses.astuple(joint)
             if limits is None:
@@ -171,7 +175,9 @@ TASK = velocity.VelocityTask.for_robot({name})
         camera.azimuth = 130.0
         camera.elevation = -15.0
         with mujoco.Renderer(mj_model, 480, 640) as renderer:
-            renderer.update_scene(posed(mj_model, mj_model.key_qpos[0]), camera, visible_groups(mj_model))
+            renderer.update_scene(
+                posed(mj_model, mj_model.key_qpos[0]), camera, visible_groups(mj_model)
+            )
             picture = Image.fromarray(renderer.render())
         with whole_file(file) as temporary:
             picture.save(temporary)
@@ -233,7 +239,9 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
     load = data.qfrc_bias.copy()
     jacobian = np.zeros((3, mj_model.nv))
     for leg in legs:
-        mujoco.mj_jac(mj_model, data, jacobian, None, leg.points(data).mean(0), data.body(leg.foot).id)
+        mujoco.mj_jac(
+            mj_model, data, jacobian, None, leg.points(data).mean(0), data.body(leg.foot).id
+        )
         load -= jacobian[2] * weight / len(legs)
     most = MOST_EFFORT * weight * com_height
     given_drives = {j: drive_of(mj_model, j, most=most) for j in names}
@@ -245,7 +253,8 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
         usual = three_digits(usual)
     efforts = {j: limit or usual for j, (_, _, limit) in given_drives.items()}
     inertias = {
-        j: three_digits(mj_model.dof_armature[dof[j]] or ARMATURE_PER_EFFORT * efforts[j]) for j in names
+        j: three_digits(mj_model.dof_armature[dof[j]] or ARMATURE_PER_EFFORT * efforts[j])
+        for j in names
     }
     # Stiffness by joint: the largest of three needs.
     gains = {}
@@ -260,7 +269,9 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
             over = 0
             share = 0.5 if biped else 0.0
         # Only height over a horizontal axis topples: m of lever per rad.
-        lever = np.hypot(*data.xaxis[j, :2]) * max(0.0, data.subtree_com[over, 2] - data.xanchor[j, 2])
+        lever = np.hypot(*data.xaxis[j, :2]) * max(
+            0.0, data.subtree_com[over, 2] - data.xanchor[j, 2]
+        )
         topples = share * mj_model.body_subtreemass[over] * GRAVITY * lever
         # First need: a natural frequency for the motor alone, but too soft to saturate below an error of `SOFTEST`.
         own = min(inertias[j] * (2.0 * math.pi * FREQUENCY) ** 2, efforts[j] / SOFTEST)
@@ -281,7 +292,12 @@ def _analyse_from(model: StrangersModel, start: StartingPose) -> RobotAnalysis:
         for j, kp in gains.items():
             kp = three_digits(kp * stiffer[j])
             kd = three_digits(2.0 * DAMPING_RATIO * math.sqrt(kp * inertias[j]))
-            servos[j] = {"stiffness": kp, "damping": kd, "effort_limit": efforts[j], "armature": inertias[j]}
+            servos[j] = {
+                "stiffness": kp,
+                "damping": kd,
+                "effort_limit": efforts[j],
+                "armature": inertias[j],
+            }
         robot = propose(model, data, anatomy, servos)
         mj_stand = on_plane(robot.spec())
         standing = stand(mj_stand, seconds=TRIAL_S)

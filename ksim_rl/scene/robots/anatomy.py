@@ -50,7 +50,9 @@ class Leg:
     def pitch_joints(self, data: mujoco.MjData) -> dict[int, float]:
         """Return the joints that turn about the y axis, from the hip down, with the sign of that turn."""
         # Joints within 45 degrees of y; the sign tells which way they turn.
-        return {j: float(np.sign(data.xaxis[j, 1])) for j in self.joints if abs(data.xaxis[j, 1]) > 0.7}
+        return {
+            j: float(np.sign(data.xaxis[j, 1])) for j in self.joints if abs(data.xaxis[j, 1]) > 0.7
+        }
 
     @property
     def geoms(self) -> list[CollisionGeom]:
@@ -86,7 +88,9 @@ def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
     root = _root_of(mj_model)
     # Bodies without joints are parts of the body that they are welded to.
     weld = mj_model.body_weldid
-    moving = [b for b in range(root, mj_model.nbody) if weld[b] == b and mj_model.body_rootid[b] == root]
+    moving = [
+        b for b in range(root, mj_model.nbody) if weld[b] == b and mj_model.body_rootid[b] == root
+    ]
     upright = posed(mj_model, qpos)
     # Points of collision geoms by moving body, world frame, in the given pose.
     parts = {b: list(_points(mj_model, upright, b).values()) for b in moving}
@@ -134,7 +138,9 @@ def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
     }
     return Anatomy(
         root=mj_model.body(root).name,
-        legs=tuple(_leg(mj_model, flat if len(feet) == 2 else upright, foot, root) for foot in feet),
+        legs=tuple(
+            _leg(mj_model, flat if len(feet) == 2 else upright, foot, root) for foot in feet
+        ),
         hulls=tuple(_hull(mj_model.body(b).name, of_body) for b, of_body in limbs.items()),
         height=height,
     )
@@ -385,7 +391,9 @@ def _hull(body: str, points_N3: np.ndarray) -> CollisionGeom:
     if edges[axis] / 2 < 1.2 * radius:
         return sphere(f"{body}_hull", body, radius, rounded(middle), **_HULL)
     reach = np.eye(3)[axis] * (edges[axis] / 2 - radius)
-    return capsule(f"{body}_hull", body, radius, rounded(np.stack((middle - reach, middle + reach))), **_HULL)
+    return capsule(
+        f"{body}_hull", body, radius, rounded(np.stack((middle - reach, middle + reach))), **_HULL
+    )
 
 
 def _points(mj_model: mujoco.MjModel, data: mujoco.MjData, body: int) -> dict[int, np.ndarray]:
@@ -394,17 +402,22 @@ def _points(mj_model: mujoco.MjModel, data: mujoco.MjData, body: int) -> dict[in
     # Geoms of explicit pairs collide whatever their bits are.
     paired = {*mj_model.pair_geom1.tolist(), *mj_model.pair_geom2.tolist()}
     collide = [
-        g for g in geoms if mj_model.geom_contype[g] or mj_model.geom_conaffinity[g] or int(g) in paired
+        g
+        for g in geoms
+        if mj_model.geom_contype[g] or mj_model.geom_conaffinity[g] or int(g) in paired
     ]
     found = {}
     for g in collide or geoms:
         # MuJoCo's boxes are centre and half edges in the geom's frame.
         centre, half = mj_model.geom_aabb[g].reshape(2, 3)
-        local = centre + half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        local = centre + half * np.array(
+            [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+        )
         # Vertices are tighter than a box, and tell a sole's shape.
         if mj_model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
             first, count = (
-                table[mj_model.geom_dataid[g]] for table in (mj_model.mesh_vertadr, mj_model.mesh_vertnum)
+                table[mj_model.geom_dataid[g]]
+                for table in (mj_model.mesh_vertadr, mj_model.mesh_vertnum)
             )
             local = mj_model.mesh_vert[first : first + count]
         found[int(g)] = data.geom_xpos[g] + local @ data.geom_xmat[g].reshape(3, 3).T

@@ -28,7 +28,9 @@ JOINTS = (
 
 # One armature for all motors, kg m^2.
 def _servo(joints: tuple[str, ...], limit: float, *, kp: float, kd: float) -> PositionActuator:
-    return PositionActuator(joints=joints, effort_limit=limit, armature=0.005, stiffness=kp, damping=kd)
+    return PositionActuator(
+        joints=joints, effort_limit=limit, armature=0.005, stiffness=kp, damping=kd
+    )
 
 
 SERVOS = (
@@ -75,11 +77,27 @@ def _side_geoms(side: str) -> tuple[CollisionGeom, ...]:
         for number, edge in ((1, -1.0), (2, 1.0))
     )
     return (
-        capsule(f"{low}_upper_arm_collision", upper_arm, 0.03, (0, -0.01 * y, 0, 0, 0.11 * y, 0), **_SMOOTH),
         capsule(
-            f"{low}_forearm_collision", f"{low}_hand_link", 0.03, (0, 0.05 * y, 0, 0, 0.2 * y, 0), **_SMOOTH
+            f"{low}_upper_arm_collision",
+            upper_arm,
+            0.03,
+            (0, -0.01 * y, 0, 0, 0.11 * y, 0),
+            **_SMOOTH,
         ),
-        capsule(f"{low}_thigh_collision", f"Hip_Yaw_{side}", 0.05, (0, 0, 0.04, -0.01, 0, -0.08), **_SMOOTH),
+        capsule(
+            f"{low}_forearm_collision",
+            f"{low}_hand_link",
+            0.03,
+            (0, 0.05 * y, 0, 0, 0.2 * y, 0),
+            **_SMOOTH,
+        ),
+        capsule(
+            f"{low}_thigh_collision",
+            f"Hip_Yaw_{side}",
+            0.05,
+            (0, 0, 0.04, -0.01, 0, -0.08),
+            **_SMOOTH,
+        ),
         capsule(f"{low}_shin_collision", shank, 0.045, (0, 0, -0.05, 0, 0, -0.2), **_SMOOTH),
         *soles,
     )
@@ -115,7 +133,9 @@ class BoosterT1(MenagerieRobot):
     sites: ClassVar[tuple[Site, ...]] = (
         Site(name="imu", body="Trunk"),
         *(
-            Site(name=f"{side.lower()}_foot", body=f"{side.lower()}_foot_link", pos=(0.01, 0, -0.03))
+            Site(
+                name=f"{side.lower()}_foot", body=f"{side.lower()}_foot_link", pos=(0.01, 0, -0.03)
+            )
             for side in SIDES
         ),
     )

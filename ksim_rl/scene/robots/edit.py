@@ -60,7 +60,9 @@ class CollisionGeom:
     def __rich_repr__(self) -> Iterator[tuple[str, Any, Any]]:
         """Yield name, value and default of each field, so that code shows what differs."""
         # Without `field.default` each geom would be printed in full.
-        yield from ((field.name, getattr(self, field.name), field.default) for field in fields(self))
+        yield from (
+            (field.name, getattr(self, field.name), field.default) for field in fields(self)
+        )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "type", int(self.type))  # so that it can stand in a config file
@@ -76,7 +78,9 @@ def capsule(
 ) -> CollisionGeom:
     """Return a capsule between two points; `attributes` are fields of `CollisionGeom`."""
     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-    return CollisionGeom(name=name, body=body, type=kind, size=(radius,), fromto=fromto, **attributes)
+    return CollisionGeom(
+        name=name, body=body, type=kind, size=(radius,), fromto=fromto, **attributes
+    )
 
 
 def sphere(
@@ -87,9 +91,13 @@ def sphere(
     return CollisionGeom(name=name, body=body, type=kind, size=(radius,), pos=pos, **attributes)
 
 
-def box(name: str, body: str, half_edges: Vector, **attributes: Unpack[GeomAttributes]) -> CollisionGeom:
+def box(
+    name: str, body: str, half_edges: Vector, **attributes: Unpack[GeomAttributes]
+) -> CollisionGeom:
     """Return a box about the body's origin; `attributes` are fields of `CollisionGeom`."""
-    return CollisionGeom(name=name, body=body, type=mujoco.mjtGeom.mjGEOM_BOX, size=half_edges, **attributes)
+    return CollisionGeom(
+        name=name, body=body, type=mujoco.mjtGeom.mjGEOM_BOX, size=half_edges, **attributes
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,7 +242,9 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
     drop_references(spec, mujoco.mjtObj.mjOBJ_GEOM, deleted - {""})
     # The world counts as seen: its colliding geoms are ground and props, which a scene has of its own.
     looks = {spec.worldbody.name}
-    looks |= {geom.parent.name for geom in spec.geoms if geom not in colliding and geom.group <= VISIBLE}
+    looks |= {
+        geom.parent.name for geom in spec.geoms if geom not in colliding and geom.group <= VISIBLE
+    }
     for geom in colliding:
         if geom.name in wrapped:
             geom.contype = geom.conaffinity = 0
@@ -247,7 +257,9 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
             spec.delete(geom)
     for geom in geoms:
         # Each attribute is written: the body's default class may hold others.
-        attributes = {name: value for name, value in vars(geom).items() if name not in ("body", "fromto")}
+        attributes = {
+            name: value for name, value in vars(geom).items() if name not in ("body", "fromto")
+        }
         # MuJoCo wants three sizes, whatever the kind.
         attributes["size"] = [*geom.size, 0.0, 0.0, 0.0][:3]
         # Without mass: the body's inertia is written down already.
@@ -259,7 +271,9 @@ def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom])
 def _wrapped_geoms(spec: mujoco.MjSpec) -> set[str]:
     """Return the names of geoms that tendons wrap around."""
     around = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
-    return {path.target.name for tendon in spec.tendons for path in tendon.path if path.type in around}
+    return {
+        path.target.name for tendon in spec.tendons for path in tendon.path if path.type in around
+    }
 
 
 def _keep_inertia(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody]) -> None:
@@ -296,7 +310,12 @@ def compiled_bodies(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def write_inertia(
-    body: mujoco.MjsBody, mj_model: mujoco.MjModel, number: int, *, ipos: np.ndarray, iquat: np.ndarray
+    body: mujoco.MjsBody,
+    mj_model: mujoco.MjModel,
+    number: int,
+    *,
+    ipos: np.ndarray,
+    iquat: np.ndarray,
 ) -> None:
     """Write down a body's mass and principal inertia, from body `number`; the axes lie at `ipos` (m), `iquat`."""
     body.explicitinertial = True
@@ -342,7 +361,12 @@ def exclude_contacts(spec: mujoco.MjSpec, pairs: Iterable[tuple[str, str]]) -> N
 
 
 def set_keyframe(
-    spec: mujoco.MjSpec, name: str, *, init_pos: Vector, init_quat: Vector, joint_pos: Mapping[str, float]
+    spec: mujoco.MjSpec,
+    name: str,
+    *,
+    init_pos: Vector,
+    init_quat: Vector,
+    joint_pos: Mapping[str, float],
 ) -> None:
     """Replace all keyframes by one: the root pose, `joint_pos`, and the controls of servos that hold those joints.
 

@@ -80,7 +80,11 @@ class MenagerieRobot(Checked):
         # Sites before the sensors that sit at them.
         edit.set_sites(spec, self.sites)
         edit.replace_sensors(spec, edit.root_sensors(imu=self.imu, root=self.root_body))
-        pose = {"init_pos": self.init_pos, "init_quat": self.init_quat, "joint_pos": self.default_joint_pos}
+        pose = {
+            "init_pos": self.init_pos,
+            "init_quat": self.init_quat,
+            "joint_pos": self.default_joint_pos,
+        }
         # The keyframe needs the final joints and actuators.
         edit.set_keyframe(spec, "init_state", **pose)
         edit.exclude_contacts(spec, self.overlaps)

@@ -24,7 +24,9 @@ class Quadruped(ShippedModel):
 
     name: ClassVar[str] = "quadruped"
 
-    action_scale: Mapping[str, float] = field(default_factory=lambda: {".*_roll": 0.2, ".*_(hip|knee)": 0.3})
+    action_scale: Mapping[str, float] = field(
+        default_factory=lambda: {".*_roll": 0.2, ".*_(hip|knee)": 0.3}
+    )
     soft_joint_pos_limit_factor: Share = 0.9
 
     root_body: ClassVar[str] = "trunk"

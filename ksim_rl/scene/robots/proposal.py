@@ -19,7 +19,10 @@ MOST_SCALE = 0.5
 
 
 def propose(
-    model: StrangersModel, data: mujoco.MjData, anatomy: Anatomy, servos: dict[int, dict[str, float]]
+    model: StrangersModel,
+    data: mujoco.MjData,
+    anatomy: Anatomy,
+    servos: dict[int, dict[str, float]],
 ) -> ModelRobot:
     """Return the robot in the pose of `data` with servos by joint; bodies whose hulls touch there may pass."""
     mj_model = data.model
@@ -28,7 +31,9 @@ def propose(
     # Adding 0 turns -0 into 0, for code that is read by people.
     w, x, y, z = (round(float(value), 6) + 0.0 for value in data.qpos[root_at + 3 : root_at + 7])
     positions = rounded(data.qpos[mj_model.jnt_qposadr[every_joint]])
-    stance = {mj_model.joint(j).name: position for j, position in zip(every_joint, positions, strict=True)}
+    stance = {
+        mj_model.joint(j).name: position for j, position in zip(every_joint, positions, strict=True)
+    }
     names = {j: mj_model.joint(j).name for j in servos}
     # Joints with equal servos share an entry.
     alike: dict[tuple[float, ...], list[int]] = {}
@@ -102,7 +107,9 @@ def drive_of(
             limits.append(gear * np.abs(mj_model.actuator_forcerange[a]).max())
         # A motor's control range limits its force where no force range does.
         elif mj_model.actuator_ctrllimited[a] and target == "effort":
-            control_limit = np.abs(mj_model.actuator_gainprm[a, 0] * mj_model.actuator_ctrlrange[a]).max()
+            control_limit = np.abs(
+                mj_model.actuator_gainprm[a, 0] * mj_model.actuator_ctrlrange[a]
+            ).max()
             limits.append(gear * control_limit)
     limits = [limit for limit in limits if 0.0 < limit < most]
     return kind, gains, three_digits(min(limits)) if limits else None

@@ -13,7 +13,9 @@ from ksim_rl.scene.names import SCALAR_JOINTS
 from ksim_rl.scene.robots.anatomy import Leg, posed
 from ksim_rl.scene.terrains import PlaneTerrain
 
-SIM = SimCfg(timestep=0.005, integrator="implicitfast", solver="newton", iterations=10, ls_iterations=20)
+SIM = SimCfg(
+    timestep=0.005, integrator="implicitfast", solver="newton", iterations=10, ls_iterations=20
+)
 """The physics of the velocity tasks."""
 OTHER_CONSTRAINTS = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -25,7 +27,11 @@ BEND = np.array([-0.4, 0.8, -0.4])
 
 
 def find_stance(
-    mj_model: mujoco.MjModel, legs: Sequence[Leg], qpos: np.ndarray, *, passive: Collection[int] = ()
+    mj_model: mujoco.MjModel,
+    legs: Sequence[Leg],
+    qpos: np.ndarray,
+    *,
+    passive: Collection[int] = (),
 ) -> np.ndarray:
     """Return the pose near `qpos` in which all soles are flat on z = 0 with the centre of mass above their middle.
 
@@ -42,9 +48,13 @@ def find_stance(
     # Each joint once: legs may share some.
     of_legs = dict.fromkeys(joint for leg in legs for joint in leg.joints)
     # Passive joints without a spring follow the loop that they close; springs keep their length.
-    rods = [joint for joint in passive if closed is not None and mj_model.jnt_stiffness[joint] == 0.0]
+    rods = [
+        joint for joint in passive if closed is not None and mj_model.jnt_stiffness[joint] == 0.0
+    ]
     joints = [
-        joint for joint in of_legs if joint not in passive and int(mj_model.jnt_type[joint]) in SCALAR_JOINTS
+        joint
+        for joint in of_legs
+        if joint not in passive and int(mj_model.jnt_type[joint]) in SCALAR_JOINTS
     ]
     joints += [joint for joint in rods if joint not in joints]
     # The unknowns: the root's height, then the joints.
@@ -159,6 +169,9 @@ def stand(mj_model: mujoco.MjModel, *, seconds: float = 5.0) -> Standing:
     driven = mj_model.actuator_trnid[:, 0]
     # Controls of position servos are target angles.
     off = data.ctrl - data.qpos[mj_model.jnt_qposadr[driven]]
-    sag = {mj_model.joint(joint).name: float(of_joint) for joint, of_joint in zip(driven, off, strict=True)}
+    sag = {
+        mj_model.joint(joint).name: float(of_joint)
+        for joint, of_joint in zip(driven, off, strict=True)
+    }
     drift = float(np.hypot(*(data.qpos[first : first + 2] - start[:2])))
     return Standing(round(float(min(data.time, seconds)), 2), sag, drift)

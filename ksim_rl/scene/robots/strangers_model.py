@@ -87,13 +87,21 @@ def read_model(source: Source, drop: Sequence[str] = ()) -> StrangersModel:
         notes.append(f"left out, with all that hangs on them: {', '.join(drop)}")
     # Only URDF cannot say that its base is free; a fixed MJCF model is meant to be.
     root = fixed_root(spec)
-    frees = root is not None and not isinstance(source, mujoco.MjSpec) and is_urdf(read_source(source).text)
+    frees = (
+        root is not None
+        and not isinstance(source, mujoco.MjSpec)
+        and is_urdf(read_source(source).text)
+    )
     if frees:
         assert root is not None
         free_root(spec, root)
         notes.append(f"the base {root} is freed: the URDF file fixes it to the world")
     # Velocity tasks drive joints only.
-    others = [actuator.name or "unnamed" for actuator in spec.actuators if actuator.trntype not in TO_JOINTS]
+    others = [
+        actuator.name or "unnamed"
+        for actuator in spec.actuators
+        if actuator.trntype not in TO_JOINTS
+    ]
     if others:
         notes.append(
             f"servos of joints take the place of actuators of tendons, sites and bodies: {', '.join(others)}"

@@ -10,13 +10,28 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from ksim_rl.scene.actuators import Actuator, PositionActuator
-from ksim_rl.scene.robots.edit import CollisionGeom, Site, capsule, reflected_inertia, sphere, spread
+from ksim_rl.scene.robots.edit import (
+    CollisionGeom,
+    Site,
+    capsule,
+    reflected_inertia,
+    sphere,
+    spread,
+)
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 
 # The model's order: legs, waist, arms, left before right.
 SIDES = ("left", "right")
 _LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
-_ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
+_ARM = (
+    "shoulder_pitch",
+    "shoulder_roll",
+    "shoulder_yaw",
+    "elbow",
+    "wrist_roll",
+    "wrist_pitch",
+    "wrist_yaw",
+)
 JOINTS = (
     *(f"{side}_{kind}_joint" for side in SIDES for kind in _LEG),
     *(f"waist_{axis}_joint" for axis in ("yaw", "roll", "pitch")),
@@ -152,12 +167,20 @@ class UnitreeG1(MenagerieRobot):
         for side in SIDES
         for site in (
             Site(name=f"{side}_foot", body=f"{side}_ankle_roll_link", pos=(0.04, 0.0, -0.037)),
-            Site(name=f"{side}_palm", body=f"{side}_wrist_yaw_link", pos=(0.08, 0.0, 0.0), radius=0.01),
+            Site(
+                name=f"{side}_palm",
+                body=f"{side}_wrist_yaw_link",
+                pos=(0.08, 0.0, 0.0),
+                radius=0.01,
+            ),
         )
     )
     # Neighbours that the capsules would let touch in every pose.
     overlaps: ClassVar[tuple[tuple[str, str], ...]] = tuple(
         pair
         for side in SIDES
-        for pair in (("pelvis", f"{side}_hip_roll_link"), (f"{side}_elbow_link", f"{side}_wrist_pitch_link"))
+        for pair in (
+            ("pelvis", f"{side}_hip_roll_link"),
+            (f"{side}_elbow_link", f"{side}_wrist_pitch_link"),
+        )
     )

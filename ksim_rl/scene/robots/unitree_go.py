@@ -12,12 +12,25 @@ from typing import ClassVar
 import mujoco
 
 from ksim_rl.scene.actuators import Actuator, IdealPDActuator, PositionActuator
-from ksim_rl.scene.robots.edit import CollisionGeom, GeomAttributes, Site, box, capsule, sphere, spread
+from ksim_rl.scene.robots.edit import (
+    CollisionGeom,
+    GeomAttributes,
+    Site,
+    box,
+    capsule,
+    sphere,
+    spread,
+)
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot
 
 LEGS = ("FR", "FL", "RR", "RL")
 JOINTS = tuple(f"{leg}_{kind}_joint" for leg in LEGS for kind in ("hip", "thigh", "calf"))
-STANCE = {"[FR]R_hip_joint": 0.1, "[FR]L_hip_joint": -0.1, ".*_thigh_joint": 0.9, ".*_calf_joint": -1.8}
+STANCE = {
+    "[FR]R_hip_joint": 0.1,
+    "[FR]L_hip_joint": -0.1,
+    ".*_thigh_joint": 0.9,
+    ".*_calf_joint": -1.8,
+}
 _LIGHT_JOINTS = (".*_hip_joint", ".*_thigh_joint")
 _CALF_JOINTS = (".*_calf_joint",)
 # Contacts with other parts of the robot are frictionless: fewer dimensions cost less. Go2's priority makes those with
@@ -44,7 +57,9 @@ ROTOR_INERTIA = 0.000111842
 # Gains follow from the motor's inertia and a chosen 10 Hz, as in BeyondMimic (Liao et al., 2025) and mjlab 1.6.0, whose
 # figures these are.
 GO1_SERVOS = (
-    PositionActuator.tuned(joints=_LIGHT_JOINTS, effort_limit=23.7, armature=ROTOR_INERTIA * 6.0**2),
+    PositionActuator.tuned(
+        joints=_LIGHT_JOINTS, effort_limit=23.7, armature=ROTOR_INERTIA * 6.0**2
+    ),
     PositionActuator.tuned(
         joints=_CALF_JOINTS, effort_limit=35.55, armature=ROTOR_INERTIA * (6.0 * 1.5) ** 2
     ),
@@ -68,7 +83,13 @@ def _go1_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
     calf = f"{leg}_calf"
     # The thigh bends backwards: three capsules follow its shape.
     return (
-        capsule(f"{leg}_hip_collision", f"{leg}_hip", 0.05, (0, 0.02 * y, 0, 0, 0.04 * y, 0), **_GO1_SMOOTH),
+        capsule(
+            f"{leg}_hip_collision",
+            f"{leg}_hip",
+            0.05,
+            (0, 0.02 * y, 0, 0, 0.04 * y, 0),
+            **_GO1_SMOOTH,
+        ),
         capsule(f"{thigh}_collision1", thigh, 0.015, (-0.02, 0, 0, -0.02, 0, -0.16), **_GO1_SMOOTH),
         capsule(f"{thigh}_collision2", thigh, 0.015, (0, 0, 0, -0.02, 0, -0.1), **_GO1_SMOOTH),
         capsule(f"{thigh}_collision3", thigh, 0.015, (-0.02, 0, -0.16, 0, 0, -0.2), **_GO1_SMOOTH),
@@ -87,7 +108,9 @@ class UnitreeGo1(UnitreeQuadruped):
     model: ClassVar[str] = "unitree_go1/go1"
 
     init_pos: tuple[float, float, float] = (0.0, 0.0, 0.278)
-    action_scale: Mapping[str, float] = field(default_factory=lambda: spread(GO1_ACTION_SCALE, JOINTS))
+    action_scale: Mapping[str, float] = field(
+        default_factory=lambda: spread(GO1_ACTION_SCALE, JOINTS)
+    )
     actuators: tuple[Actuator, ...] = GO1_SERVOS
 
     collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = (
@@ -95,7 +118,9 @@ class UnitreeGo1(UnitreeQuadruped):
         sphere("head_collision", "trunk", 0.06, (0.24, 0.0, 0.0), **_GO1_SMOOTH),
         *(geom for leg in LEGS for geom in _go1_leg_geoms(leg)),
     )
-    sites: ClassVar[tuple[Site, ...]] = (Site(name="imu", body="trunk", pos=(-0.01592, -0.06659, -0.00617)),)
+    sites: ClassVar[tuple[Site, ...]] = (
+        Site(name="imu", body="trunk", pos=(-0.01592, -0.06659, -0.00617)),
+    )
 
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh, editable model of the robot alone, whose free joint has a name."""
@@ -123,7 +148,13 @@ def _go2_leg_geoms(leg: str) -> tuple[CollisionGeom, ...]:
     thigh = f"{leg}_thigh"
     calf = f"{leg}_calf"
     return (
-        capsule(f"{leg}_hip_collision", f"{leg}_hip", 0.046, (0, 0.06 * y, 0, 0, 0.1 * y, 0), **_GO2_SMOOTH),
+        capsule(
+            f"{leg}_hip_collision",
+            f"{leg}_hip",
+            0.046,
+            (0, 0.06 * y, 0, 0, 0.1 * y, 0),
+            **_GO2_SMOOTH,
+        ),
         capsule(f"{thigh}_collision", thigh, 0.017, (0, 0, -0.01, 0, 0, -0.2), **_GO2_SMOOTH),
         capsule(f"{calf}_collision", calf, 0.012, (0.008, 0, -0.02, 0.02, 0, -0.17), **_GO2_SMOOTH),
         sphere(f"{leg}_foot_collision", calf, 0.022, _GO2_FOOT, **_GO2_TREAD),

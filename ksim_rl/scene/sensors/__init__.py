@@ -2,7 +2,11 @@
 
 from ksim_rl.scene.sensors.camera import CameraSensor, CameraTracker
 from ksim_rl.scene.sensors.contact import ContactSensor, ContactState, ContactTracker
-from ksim_rl.scene.sensors.contact_points import ContactPoints, ContactPointsState, ContactPointsTracker
+from ksim_rl.scene.sensors.contact_points import (
+    ContactPoints,
+    ContactPointsState,
+    ContactPointsTracker,
+)
 from ksim_rl.scene.sensors.imu import ImuSensor, ImuTracker
 from ksim_rl.scene.sensors.rays import (
     GridPattern,

@@ -52,7 +52,9 @@ class CameraSensor(Sensor):
         super()._check_fields()
         # A camera that draws nothing would fail where it is read.
         if not (self.rgb or self.depth or self.segmentation):
-            raise ValueError("rgb=False, depth=False, segmentation=False: draw at least one of them")
+            raise ValueError(
+                "rgb=False, depth=False, segmentation=False: draw at least one of them"
+            )
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return the pixels of all worlds."""
@@ -80,7 +82,16 @@ class CameraTracker(SensorTracker):
         self._sensor = sensor
         self._view = view
         # The sensor's fields by the renderer's names.
-        drawn = ("width", "height", "rgb", "depth", "segmentation", "geom_groups", "textures", "shadows")
+        drawn = (
+            "width",
+            "height",
+            "rgb",
+            "depth",
+            "segmentation",
+            "geom_groups",
+            "textures",
+            "shadows",
+        )
         settings = {field: getattr(sensor, field) for field in drawn}
         self._camera = BatchCamera(view.world, sensor.camera or name, Picture(**settings))
 
@@ -104,7 +115,9 @@ class CameraTracker(SensorTracker):
         camera = view.world.mj_model.camera(self._sensor.camera or self._name).id
         origin = view.world.view("cam_xpos")[env_index, camera].cpu().numpy()
         # MuJoCo's camera looks along -z: the third axis points back.
-        visualizer.frame(origin, view.world.view("cam_xmat")[env_index, camera].cpu().numpy().reshape(3, 3))
+        visualizer.frame(
+            origin, view.world.view("cam_xmat")[env_index, camera].cpu().numpy().reshape(3, 3)
+        )
 
     def _read(self, output: str) -> Tensor:
         cache = self._view.cache
@@ -112,7 +125,9 @@ class CameraTracker(SensorTracker):
         if key + output not in cache:
             # A picture that was not asked for is not drawn, and cannot be read.
             if not getattr(self._sensor, output):
-                raise ValueError(f"scene.sensors.{self._name}.{output}=False: set it to True to read it")
+                raise ValueError(
+                    f"scene.sensors.{self._name}.{output}=False: set it to True to read it"
+                )
             # Refuses to draw a state whose poses are stale.
             self._view.derived()
             self._camera.render()

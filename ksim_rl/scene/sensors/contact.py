@@ -142,7 +142,9 @@ class ContactSensor(ContactElements):
         # One per element: MuJoCo's sensor reports one element's contacts.
         for element in self.elements_of(spec, name):
             called = f"{name}_{element}"
-            self.add_contacts(spec, name, of=element, against=self.against, intprm=intprm, called=called)
+            self.add_contacts(
+                spec, name, of=element, against=self.against, intprm=intprm, called=called
+            )
 
     def track(self, name: str, view: WorldView) -> "ContactTracker":
         return ContactTracker(name, self, view)
@@ -196,13 +198,17 @@ class ContactTracker(SensorTracker):
         names = [f"{name}_{element}" for element in elements]
         # All numbers of all elements, in one index, so that one gather reads them.
         self._columns = columns_of(view, names)
-        self._clocks = {clock: view.buffers.get(f"{self._key}.{clock}", self._count) for clock in _CLOCKS}
+        self._clocks = {
+            clock: view.buffers.get(f"{self._key}.{clock}", self._count) for clock in _CLOCKS
+        }
         self._history_ESN3: Tensor | None = None
         self._substep = 0
         if sensor.every_substep:
             # Env steps are whole numbers of substeps; the quotient may be rounded.
             substeps = round(view.step_dt / view.physics_dt)
-            self._history_ESN3 = view.buffers.get(f"{self._key}.force_history", substeps, self._count, 3)
+            self._history_ESN3 = view.buffers.get(
+                f"{self._key}.force_history", substeps, self._count, 3
+            )
             self.every_substep = True
 
     def update(self) -> None:
@@ -222,7 +228,9 @@ class ContactTracker(SensorTracker):
             cache[self._key] = ContactState(
                 force_EN3=force_EN3,
                 position_EN3=readings[..., 4:7],
-                force_history_ESN3=force_EN3[:, None] if self._history_ESN3 is None else self._history_ESN3,
+                force_history_ESN3=force_EN3[:, None]
+                if self._history_ESN3 is None
+                else self._history_ESN3,
                 **{f"{clock}_EN": value_EN for clock, value_EN in self._clocks.items()},
             )
         return cache[self._key]
@@ -275,7 +283,9 @@ class ContactTracker(SensorTracker):
         self._keep_event(clock["first_contact"], lands, touches, starts=starts)
         self._keep_event(clock["first_air"], leaves, ~touches, starts=starts)
 
-    def _keep_event(self, event_EN: Tensor, happens: Tensor, lasts: Tensor, *, starts: bool) -> None:
+    def _keep_event(
+        self, event_EN: Tensor, happens: Tensor, lasts: Tensor, *, starts: bool
+    ) -> None:
         """Note what happens, in whichever substep of the env step, as long as the state that it began lasts."""
         # Events of the env step before are over.
         if not starts:
@@ -290,7 +300,9 @@ class ContactTracker(SensorTracker):
         if not self._strongest:
             return readings[..., 1:4]
         # The strongest contact's force is in the contact's frame.
-        return from_contact(readings[..., 1:4], normal=readings[..., 7:10], tangent=readings[..., 10:13])
+        return from_contact(
+            readings[..., 1:4], normal=readings[..., 7:10], tangent=readings[..., 10:13]
+        )
 
 
 def columns_of(view: WorldView, names: Sequence[str]) -> Index:

@@ -16,7 +16,15 @@ from ksim_rl.scene.sensors.contact import ELEMENT_TABLES, ContactElements, colum
 from ksim_rl.scene.sensors.sensor import SensorTracker
 from ksim_rl.scene.state.world_view import WorldView
 
-_WIDTHS = {"found": 1, "force": 3, "torque": 3, "distance": 1, "position": 3, "normal": 3, "tangent": 3}
+_WIDTHS = {
+    "found": 1,
+    "force": 3,
+    "torque": 3,
+    "distance": 1,
+    "position": 3,
+    "normal": 3,
+    "tangent": 3,
+}
 """All that MuJoCo's contact sensor gives, in the order of its bits and of its numbers."""
 _ALL = (1 << len(_WIDTHS)) - 1
 _ORDERS = {"deepest": 1, "strongest": 2}
@@ -139,10 +147,14 @@ class ContactPointsTracker(SensorTracker):
 
     def _parts(self) -> dict[str, Tensor]:
         """Return the readings by name, [E, N, width], with forces and torques in the world's axes."""
-        readings_ENL = self._view.world.sensordata_EL[:, self._columns].unflatten(1, (self._num_contacts, -1))
+        readings_ENL = self._view.world.sensordata_EL[:, self._columns].unflatten(
+            1, (self._num_contacts, -1)
+        )
         parts = dict(zip(_WIDTHS, readings_ENL.split(tuple(_WIDTHS.values()), dim=-1), strict=True))
         # MuJoCo counts all contacts of the pair in each slot that holds one.
         parts["found"] = (parts["found"] > 0).to(torch.float32)
         for part in ("force", "torque"):
-            parts[part] = from_contact(parts[part], normal=parts["normal"], tangent=parts["tangent"])
+            parts[part] = from_contact(
+                parts[part], normal=parts["normal"], tangent=parts["tangent"]
+            )
         return parts

@@ -72,7 +72,9 @@ class ImuTracker(SensorTracker):
         key = f"imu/{self._name}.projected_gravity"
         # Computed once per state, however many terms read it.
         if key not in cache:
-            cache[key] = quaternion.rotate_inverse(self.quat_EL, self._down.expand(self._view.num_envs, 3))
+            cache[key] = quaternion.rotate_inverse(
+                self.quat_EL, self._down.expand(self._view.num_envs, 3)
+            )
         return cache[key]
 
     def draw_debug(self, view: WorldView, visualizer: DebugVisualizer, env_index: int) -> None:
@@ -80,4 +82,6 @@ class ImuTracker(SensorTracker):
         site = view.world.mj_model.site(self._site).id
         # Pictures are drawn on the host.
         origin = view.world.site_xpos_EL[env_index, site].cpu().numpy()
-        visualizer.frame(origin, view.world.site_xmat_EL[env_index, site].cpu().numpy().reshape(3, 3))
+        visualizer.frame(
+            origin, view.world.site_xmat_EL[env_index, site].cpu().numpy().reshape(3, 3)
+        )

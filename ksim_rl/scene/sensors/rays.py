@@ -62,7 +62,10 @@ class GridPattern(RayPattern):
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return the distances that all rays measure."""
-        return {("size", "resolution"): num_envs * math.prod(edge / self.resolution for edge in self.size)}
+        return {
+            ("size", "resolution"): num_envs
+            * math.prod(edge / self.resolution for edge in self.size)
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +105,9 @@ class RingPattern(RayPattern):
     """
 
     num_rays: Count = 36
-    elevations: Annotated[tuple[Elevation, ...], Filled("give at least one ring, such as (0.0,)")] = (0.0,)
+    elevations: Annotated[
+        tuple[Elevation, ...], Filled("give at least one ring, such as (0.0,)")
+    ] = (0.0,)
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return the distances that all rays measure."""
@@ -210,7 +215,8 @@ class RayTracker(SensorTracker):
             self._sites = (int(model.site(sensor.mounting_site(name)).id),)
         # On the device once, since patterns do not change.
         start_N3, direction_N3 = (
-            torch.tensor(table, dtype=torch.float32, device=view.device) for table in sensor.pattern.rays()
+            torch.tensor(table, dtype=torch.float32, device=view.device)
+            for table in sensor.pattern.rays()
         )
         self._start_N3 = start_N3
         self._direction_N3 = direction_N3
@@ -219,7 +225,9 @@ class RayTracker(SensorTracker):
         for site in self._sites:
             own = int(model.site_bodyid[site]) if sensor.exclude_body else -1
             self._batches.append(
-                RayBatch(view.world, len(start_N3), geom_groups=sensor.geom_groups, exclude_body=own)
+                RayBatch(
+                    view.world, len(start_N3), geom_groups=sensor.geom_groups, exclude_body=own
+                )
             )
 
     @property
@@ -251,7 +259,10 @@ class RayTracker(SensorTracker):
 
     def _cast(self) -> RayState:
         """Cast the rays of all sites, one site after the other."""
-        parts = [self._cast_from(site, batch) for site, batch in zip(self._sites, self._batches, strict=True)]
+        parts = [
+            self._cast_from(site, batch)
+            for site, batch in zip(self._sites, self._batches, strict=True)
+        ]
         if len(parts) == 1:
             return parts[0]
         return RayState(*(torch.cat(leaves, dim=1) for leaves in zip(*parts, strict=True)))
@@ -287,7 +298,11 @@ class RayTracker(SensorTracker):
             sin_E1 = torch.sin(yaw_E1)
             # A turn about the world's z axis; z stays.
             x_N, y_N, z_N = vectors_N3.unbind(-1)
-            turned = (cos_E1 * x_N - sin_E1 * y_N, sin_E1 * x_N + cos_E1 * y_N, z_N.expand(len(cos_E1), -1))
+            turned = (
+                cos_E1 * x_N - sin_E1 * y_N,
+                sin_E1 * x_N + cos_E1 * y_N,
+                z_N.expand(len(cos_E1), -1),
+            )
             return torch.stack(turned, dim=-1)
         # Rows times the transpose: each vector turned by the matrix.
         return product(vectors_N3, matrix_E33.mT)

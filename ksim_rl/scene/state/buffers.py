@@ -26,7 +26,9 @@ class Kept(NamedTuple):
 
 
 @contextmanager
-def only_in_rows(mask_E: Bool[Tensor, " E"], kept: Sequence[Kept], *, is_step: bool) -> Iterator[None]:
+def only_in_rows(
+    mask_E: Bool[Tensor, " E"], kept: Sequence[Kept], *, is_step: bool
+) -> Iterator[None]:
     """Let the code inside change kept tensors in the rows of `mask_E` only.
 
     Tensors that all envs share change in steps only (`is_step`): a reset is no step of the envs that go on.
@@ -55,7 +57,10 @@ class Arena:
 
     def has_room(self, width: int, dtype: torch.dtype) -> bool:
         """Whether a buffer of this width and dtype fits."""
-        return dtype == self.values.dtype and self._used + self._num_envs * width <= self.values.numel()
+        return (
+            dtype == self.values.dtype
+            and self._used + self._num_envs * width <= self.values.numel()
+        )
 
     def take(self, shape: tuple[int, ...]) -> Shaped[Tensor, " E *shape"]:
         """Return a buffer [E, *shape], contiguous, that nobody else has."""
@@ -204,7 +209,9 @@ class SharedValues:
         tensor = self._tensors.get(name)
         if tensor is None:
             if self._frozen:
-                raise ValueError(f"shared value {name!r} is new after construction: ask for it on every path")
+                raise ValueError(
+                    f"shared value {name!r} is new after construction: ask for it on every path"
+                )
             # A tensor made in inference mode could not be written in place outside of it later.
             with torch.inference_mode(False):
                 tensor = torch.tensor(initial, dtype=torch.float32, device=self._device)
@@ -249,7 +256,9 @@ class ActuatorParams:
         """Give some joints a number; during construction only."""
         if name not in self._buffers:
             # Zero in the columns of joints without this number; these are never read.
-            nominal_L = self._nominal[name] = torch.zeros(len(self._joint_names), device=self._device)
+            nominal_L = self._nominal[name] = torch.zeros(
+                len(self._joint_names), device=self._device
+            )
             self._buffers[name] = self._all_buffers.get(
                 # Kept over resets: an event's draw at startup must survive them.
                 f"actuators.{name}_EL",
@@ -275,7 +284,9 @@ class ActuatorParams:
     def joints(self, name: str, *, finite: bool = False) -> frozenset[int]:
         """Return the joints that have this number; with `finite`, those whose number in the config is finite."""
         owners = self._owners.get(name, {})
-        return frozenset(joint for joint, value in owners.items() if not finite or math.isfinite(value))
+        return frozenset(
+            joint for joint, value in owners.items() if not finite or math.isfinite(value)
+        )
 
     def _check(self, name: str, joints: Collection[int]) -> None:
         check_known("parameter of explicit actuators", name, self._buffers)

@@ -23,7 +23,9 @@ class GroundScan(NearNames):
         cache: a dict of computed quantities; it is emptied whenever the state changes.
     """
 
-    def __init__(self, state: Simulation, entity: "Entity", points: Sequence[tuple[float, float]]) -> None:
+    def __init__(
+        self, state: Simulation, entity: "Entity", points: Sequence[tuple[float, float]]
+    ) -> None:
         self.points = tuple(points)
         self.cache = state.new_cache()
         self._state = state
@@ -80,7 +82,9 @@ class Entity(NearNames):
         # All bodies of these trees: parts of an attached model may have names without the prefix.
         bodies = [b for b in range(1, model.nbody) if model.body_rootid[b] in roots]
         if prefix and not bodies:
-            raise ValueError(f"scene: {name!r} has no body: give it one, or put its geoms into the terrain")
+            raise ValueError(
+                f"scene: {name!r} has no body: give it one, or put its geoms into the terrain"
+            )
         joints = [j for j in range(model.njnt) if model.body_rootid[model.jnt_bodyid[j]] in roots]
         # MuJoCo allows a free joint as a body's first and only joint.
         self.free_root = bool(joints) and model.jnt_type[joints[0]] == mujoco.mjtJoint.mjJNT_FREE
@@ -105,7 +109,9 @@ class Entity(NearNames):
             pose = default_qpos_L[self.root_qpos]
         self.default_root_pos_L, self.default_root_quat_L = pose.to(torch.float32).split((3, 4))
         self._down = torch.tensor([0.0, 0.0, -1.0], device=device)
-        self.joints = every_joint.some([i for i, j in enumerate(scalar_joint_ids(model)) if j in joints])
+        self.joints = every_joint.some(
+            [i for i, j in enumerate(scalar_joint_ids(model)) if j in joints]
+        )
 
     @quantity
     def root_pos_EL(self) -> Float[Tensor, "E 3"]:
@@ -126,7 +132,9 @@ class Entity(NearNames):
     def projected_gravity_EL(self) -> Float[Tensor, "E 3"]:
         """Gravity's direction (world -z), a unit vector, body frame; position stage."""
         # The world's -z axis, also where a world's gravity points elsewhere.
-        return quaternion.rotate_inverse(self.root_quat_EL, self._down.expand(self._state.world.num_envs, 3))
+        return quaternion.rotate_inverse(
+            self.root_quat_EL, self._down.expand(self._state.world.num_envs, 3)
+        )
 
     @quantity
     def heading_E(self) -> Float[Tensor, " E"]:
@@ -179,7 +187,10 @@ class Entity(NearNames):
         return list(self._scans.values())
 
     def write_root_pose(
-        self, mask_E: Bool[Tensor, " E"], pos_EL: Float[Tensor, "E 3"], quat_EL: Float[Tensor, "E 4"]
+        self,
+        mask_E: Bool[Tensor, " E"],
+        pos_EL: Float[Tensor, "E 3"],
+        quat_EL: Float[Tensor, "E 4"],
     ) -> None:
         """Set position (m) and orientation (w, x, y, z) of the free root body in the rows of `mask_E`."""
         self._require_free_root("write_root_pose")

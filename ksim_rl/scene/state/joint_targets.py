@@ -183,7 +183,9 @@ class JointTargets:
         if self._servo_ctrl is not None:
             ctrl_EL = self._world.ctrl_EL
             held_EL = self._servo_line.of(self.true_positions(self._servo_joints))
-            ctrl_EL[:, self._servo_ctrl] = torch.where(mask_E[:, None], held_EL, ctrl_EL[:, self._servo_ctrl])
+            ctrl_EL[:, self._servo_ctrl] = torch.where(
+                mask_E[:, None], held_EL, ctrl_EL[:, self._servo_ctrl]
+            )
 
     def limits(self, kind: TargetKind, patterns: Patterns) -> Float[Tensor, "K 2"] | None:
         """Return the limits that targets of joints are clamped to, (low, high); None if nothing limits them."""
@@ -306,7 +308,9 @@ class JointTargets:
             limits_K2 = torch.tensor([-torch.inf, torch.inf], device=device).repeat(len(joints), 1)
             for column, actuator in zip(columns, ctrl, strict=True):
                 if model.actuator_ctrllimited[actuator]:
-                    limits_K2[column] = torch.tensor(model.actuator_ctrlrange[actuator], device=device)
+                    limits_K2[column] = torch.tensor(
+                        model.actuator_ctrlrange[actuator], device=device
+                    )
         return _Route(
             joints=self._resolver.index("joint", patterns),
             ctrl=as_index(ctrl, device) if ctrl else None,

@@ -68,7 +68,9 @@ class Simulation:
         # The quantities that are kept from the moment of the contacts, and how each is read there.
         self._of_contacts: dict[str, tuple[Tensor, Callable[[], Tensor]]] = {}
         # The tree of each body; its centre of mass is the reference of `cvel`.
-        self._body_root = torch.tensor(world.mj_model.body_rootid, device=self.device, dtype=torch.int64)
+        self._body_root = torch.tensor(
+            world.mj_model.body_rootid, device=self.device, dtype=torch.int64
+        )
         self._counter = self.startup_counter
         self._scope = ""
         self._draw_scope = ""
@@ -133,7 +135,9 @@ class Simulation:
             self.is_writing = False
         self.changed()
 
-    def point_velocity(self, point_EN3: Float[Tensor, "E N 3"], body: Index) -> Float[Tensor, "E N 3"]:
+    def point_velocity(
+        self, point_EN3: Float[Tensor, "E N 3"], body: Index
+    ) -> Float[Tensor, "E N 3"]:
         """Return the velocities of points fixed to bodies, world frame, m/s."""
         return self._point_velocity(self.derived(), point_EN3, body)
 
@@ -203,9 +207,13 @@ class Simulation:
             raise ValueError(f"{name.replace('/', '.')}: {error}") from error
         except SystemExit as error:
             # It would end the run as one that has done its work.
-            raise RuntimeError(f"{name.replace('/', '.')}: it ends the program: {error!r}") from error
+            raise RuntimeError(
+                f"{name.replace('/', '.')}: it ends the program: {error!r}"
+            ) from error
         except Exception as error:
-            error.add_note(f"(in {name.replace('/', '.')})")  # of the same class, which others look for
+            error.add_note(
+                f"(in {name.replace('/', '.')})"
+            )  # of the same class, which others look for
             raise
         # Outside of a term nobody reads or owns buffers.
         finally:

@@ -104,9 +104,15 @@ class WorldView(NearNames):
 
         # The state that resets restore comes before the targets, which start from it.
         self.default_state = DefaultState(simulation)
-        self.default_qpos_L = torch.tensor(self.default_state.qpos_L, device=self.device, dtype=torch.float32)
-        self.default_qvel_L = torch.tensor(self.default_state.qvel_L, device=self.device, dtype=torch.float32)
-        default_joint_pos_L = self.default_qpos_L[as_index(model.jnt_qposadr[joints].tolist(), self.device)]
+        self.default_qpos_L = torch.tensor(
+            self.default_state.qpos_L, device=self.device, dtype=torch.float32
+        )
+        self.default_qvel_L = torch.tensor(
+            self.default_state.qvel_L, device=self.device, dtype=torch.float32
+        )
+        default_joint_pos_L = self.default_qpos_L[
+            as_index(model.jnt_qposadr[joints].tolist(), self.device)
+        ]
         # A buffer with a row per env: events may move the default pose, and resets keep it.
         self.default_joint_pos_EL = self.buffers.get(
             "default_joint_pos_EL", self.num_joints, keep=True, initial=default_joint_pos_L
@@ -124,14 +130,20 @@ class WorldView(NearNames):
         self.joint_pos_target_EL = self.targets.pos_EL
         self.joint_vel_target_EL = self.targets.vel_EL
         self.joint_effort_target_EL = self.targets.effort_EL
-        self.actuator_params = ActuatorParams(self.buffers, self.resolver.names("joint"), self.device)
+        self.actuator_params = ActuatorParams(
+            self.buffers, self.resolver.names("joint"), self.device
+        )
         ctrl_range = torch.tensor(model.actuator_ctrlrange, device=self.device, dtype=torch.float32)
         # Infinite where the model has no limit.
         self.ctrl_limits_L2 = self._limited(ctrl_range.view(-1, 2), model.actuator_ctrllimited)
         self.soft_joint_pos_limits_L2 = self._soft_limits(joints, soft_joint_pos_limit_factor)
         # One object for all joints; parts share its tables.
-        tables = JointTables(self.default_joint_pos_EL, self.soft_joint_pos_limits_L2, self.encoder_bias_EL)
-        self._every_joint = Joints(simulation, range(self.num_joints), self.resolver.names("joint"), tables)
+        tables = JointTables(
+            self.default_joint_pos_EL, self.soft_joint_pos_limits_L2, self.encoder_bias_EL
+        )
+        self._every_joint = Joints(
+            simulation, range(self.num_joints), self.resolver.names("joint"), tables
+        )
         self.entities = {
             name: Entity(
                 simulation,
@@ -284,7 +296,9 @@ class WorldView(NearNames):
         A value that an event writes holds from the next substep until it is written again: resets leave it alone.
         Built-in actuators have model fields instead (`actuators.builtin`).
         """
-        return self.actuator_params.get(name, () if joints is None else self.resolver.ids("joint", joints))
+        return self.actuator_params.get(
+            name, () if joints is None else self.resolver.ids("joint", joints)
+        )
 
     # -- what terms keep and draw --------------------------------------------------------------------------------
 
@@ -309,7 +323,10 @@ class WorldView(NearNames):
         return self._simulation.shared_values.get(full_name, initial, owner=owner)
 
     def uniform(
-        self, n: int, low: float | Float[Tensor, "*low"] = 0.0, high: float | Float[Tensor, "*high"] = 1.0
+        self,
+        n: int,
+        low: float | Float[Tensor, "*low"] = 0.0,
+        high: float | Float[Tensor, "*high"] = 1.0,
     ) -> Float[Tensor, "E L"]:
         """Draw float32 from [low, high); the numbers depend on seed, term, env and moment only."""
         return random.uniform(self.next_keys(), n, low, high)
@@ -366,14 +383,20 @@ class WorldView(NearNames):
     def _soft_limits(self, joints: list[int], factor: float) -> Tensor:
         """Shrink the joint ranges about their middles; unlimited joints get infinite limits. [L, 2]."""
         model = self.world.mj_model
-        limits = torch.tensor(model.jnt_range[joints], device=self.device, dtype=torch.float32).view(-1, 2)
+        limits = torch.tensor(
+            model.jnt_range[joints], device=self.device, dtype=torch.float32
+        ).view(-1, 2)
         # Shrunk about the middle, so that both ends give way alike.
         middle = limits.mean(-1)
         half = (limits[:, 1] - limits[:, 0]) / 2 * factor
-        return self._limited(torch.stack((middle - half, middle + half), dim=-1), model.jnt_limited[joints])
+        return self._limited(
+            torch.stack((middle - half, middle + half), dim=-1), model.jnt_limited[joints]
+        )
 
     def _limited(self, limits_L2: Float[Tensor, "L 2"], is_limited: np.ndarray) -> Tensor:
         """Make the limits of elements without any infinite, [L, 2]."""
         # [L, 1], to choose both ends together.
         mask_L1 = torch.tensor(is_limited, device=self.device, dtype=torch.bool).view(-1, 1)
-        return torch.where(mask_L1, limits_L2, torch.tensor([-torch.inf, torch.inf], device=self.device))
+        return torch.where(
+            mask_L1, limits_L2, torch.tensor([-torch.inf, torch.inf], device=self.device)
+        )

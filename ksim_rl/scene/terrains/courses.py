@@ -8,7 +8,15 @@ import numpy as np
 
 from ksim_rl.checked import Count, NonNegative, NonNegativeRange, Positive, Repeats, Share, Within
 from ksim_rl.checks import check_in_range
-from ksim_rl.scene.terrains.patch import TIE, Cell, EasyToHard, Lattice, Pieces, TerrainPatch, between
+from ksim_rl.scene.terrains.patch import (
+    TIE,
+    Cell,
+    EasyToHard,
+    Lattice,
+    Pieces,
+    TerrainPatch,
+    between,
+)
 
 
 def in_cells(length: float, lattice: Lattice, *, least: int) -> int:
@@ -43,7 +51,9 @@ class PerlinNoise(TerrainPatch):
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         noise_RC = np.zeros_like(lattice.x_RC)
         for octave in range(self.octaves):
-            noise_RC += self.persistence**octave * _gradient_noise(lattice, self.wave_length / 2**octave, rng)
+            noise_RC += self.persistence**octave * _gradient_noise(
+                lattice, self.wave_length / 2**octave, rng
+            )
         span = np.ptp(noise_RC)
         return between(self.height, difficulty) * (noise_RC - noise_RC.min()) / span
 
@@ -98,7 +108,9 @@ class RandomStairs(TerrainPatch):
 
     def heights(self, lattice: Lattice, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         num_steps = int((lattice.size - self.platform_width) / 2 / self.step_width)
-        risers = between(self.step_height, difficulty) * rng.uniform(self.least_share, 1.0, num_steps)
+        risers = between(self.step_height, difficulty) * rng.uniform(
+            self.least_share, 1.0, num_steps
+        )
         # Treads are as high as all risers below them together; the platform is the first.
         tread = np.concatenate(([0.0], np.cumsum(risers)))
         from_platform_RC = (lattice.ring_RC - self.platform_width / 2 - TIE) / self.step_width
@@ -162,9 +174,13 @@ class TiltedGrid(TerrainPatch):
         along_x, along_y = np.tan(rng.uniform(-tilt, tilt, (2, *shape)))
         # Distance of each lattice line from the middle of its square, m.
         cells = in_cells(self.square_width, lattice, least=2)
-        from_middle_C = (np.arange(lattice.num_cells + 1) % cells - (cells - 1) / 2) * lattice.spacing
+        from_middle_C = (
+            np.arange(lattice.num_cells + 1) % cells - (cells - 1) / 2
+        ) * lattice.spacing
         place = (square_C[:, None], square_C[None, :])
-        ground_RC = middle[place] + along_x[place] * from_middle_C + along_y[place] * from_middle_C[:, None]
+        ground_RC = (
+            middle[place] + along_x[place] * from_middle_C + along_y[place] * from_middle_C[:, None]
+        )
         ground_RC[lattice.ring_RC <= self.platform_width / 2 + TIE] = 0.0
         return ground_RC
 

@@ -110,7 +110,9 @@ class TerrainGrid(Terrain):
         """Return the highest point of the cells of a patch that `spawn_width` reaches into, m."""
         lattice = Lattice(self.size, self.size / (len(heights_RC) - 1))
         # One more point beyond the square: the ground is a triangle up to there.
-        return float(heights_RC[lattice.ring_RC < self.spawn_width / 2 + lattice.spacing - TIE].max())
+        return float(
+            heights_RC[lattice.ring_RC < self.spawn_width / 2 + lattice.spacing - TIE].max()
+        )
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add all patches as height fields, and the geom, with the steepest patch in place."""
@@ -188,9 +190,15 @@ class PatchedGround(Ground):
         }
         # The top of each number's own height field.
         tops = np.repeat(mj_model.hfield_size[:, 2], mj_model.hfield_nrow * mj_model.hfield_ncol)
-        self._heights = torch.tensor(mj_model.hfield_data * tops, dtype=torch.float32, device=device)
-        self._address_P = torch.tensor(mj_model.hfield_adr[patches], dtype=torch.int64, device=device)
-        self._columns_P = torch.tensor(mj_model.hfield_ncol[patches], dtype=torch.int64, device=device)
+        self._heights = torch.tensor(
+            mj_model.hfield_data * tops, dtype=torch.float32, device=device
+        )
+        self._address_P = torch.tensor(
+            mj_model.hfield_adr[patches], dtype=torch.int64, device=device
+        )
+        self._columns_P = torch.tensor(
+            mj_model.hfield_ncol[patches], dtype=torch.int64, device=device
+        )
         self._spawn_heights_P = torch.tensor(spawn_heights, dtype=torch.float32, device=device)
 
         # By an env's place among the envs of all ranks.
@@ -219,7 +227,9 @@ class PatchedGround(Ground):
         """Where each env starts: (0, 0) at the height of the highest point around, world frame, m."""
         height_E = self._spawn_heights_P[self.patches_E]
         # Patches lie about each world's own origin, so x and y are 0.
-        return torch.stack((torch.zeros_like(height_E), torch.zeros_like(height_E), height_E), dim=-1)
+        return torch.stack(
+            (torch.zeros_like(height_E), torch.zeros_like(height_E), height_E), dim=-1
+        )
 
     def heights(self, points_EN2: Float[Tensor, "E N 2"]) -> Float[Tensor, "E N"]:
         """Return the height of the ground at x, y, exact on its triangles; beyond the edge, of the nearest one."""
@@ -236,7 +246,9 @@ class PatchedGround(Ground):
         x_EN = within_EN2[..., 0]
         y_EN = within_EN2[..., 1]
         # Rows run along y, columns along x.
-        first_EN = self._address_P[patch_E][:, None] + corner_EN2[..., 1] * columns_E1 + corner_EN2[..., 0]
+        first_EN = (
+            self._address_P[patch_E][:, None] + corner_EN2[..., 1] * columns_E1 + corner_EN2[..., 0]
+        )
         # MuJoCo splits each cell along the diagonal from its first corner to the opposite one.
         second_EN = first_EN + torch.where(x_EN >= y_EN, 1, columns_E1)
         # Corners of the triangle: first, the one along the longer step, and the opposite one.
@@ -263,7 +275,9 @@ class PatchedGround(Ground):
                 for level in range(self.num_levels)
                 for column in range(self._num_columns)
             ]
-            self._even[key] = torch.tensor(np.stack(tables), dtype=torch.float32, device=self._heights.device)
+            self._even[key] = torch.tensor(
+                np.stack(tables), dtype=torch.float32, device=self._heights.device
+            )
         return self._even[key][self.patches_E]
 
     def _even_places(
@@ -287,7 +301,9 @@ class PatchedGround(Ground):
                 f"no square of {edge} m of level {level} of the ground {grid.columns[column]!r} is even within "
                 f"max_difference={max_difference}: ask for a smaller edge, or allow more"
             )
-        chosen = np.random.default_rng((grid.seed, level, column, count)).integers(0, len(row_N), count)
+        chosen = np.random.default_rng((grid.seed, level, column, count)).integers(
+            0, len(row_N), count
+        )
         row_N = row_N[chosen]
         column_N = column_N[chosen]
         # A window begins `reach` points before its middle.

@@ -7,7 +7,15 @@ import numpy as np
 
 from ksim_rl.checked import NonNegative, NonNegativeRange, Positive, Within
 from ksim_rl.checks import check_in_range
-from ksim_rl.scene.terrains.patch import TIE, Cell, EasyToHard, Lattice, Pieces, TerrainPatch, between
+from ksim_rl.scene.terrains.patch import (
+    TIE,
+    Cell,
+    EasyToHard,
+    Lattice,
+    Pieces,
+    TerrainPatch,
+    between,
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,11 +45,16 @@ def add_look(spec: mujoco.MjSpec, *, repeat: float) -> None:
     # Uniform: the pattern is measured in metres, not stretched over the geom.
     spec.add_material(name=MATERIAL, textures=textures, texuniform=True, texrepeat=[repeat, repeat])
     # A directional light shines alike on all of the ground.
-    spec.worldbody.add_light(pos=[0, 0, 4], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    spec.worldbody.add_light(
+        pos=[0, 0, 4], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    )
 
 
 def add_ground(
-    spec: mujoco.MjSpec, *, friction: Sequence[float], **shape: mujoco.mjtGeom | Sequence[float] | str
+    spec: mujoco.MjSpec,
+    *,
+    friction: Sequence[float],
+    **shape: mujoco.mjtGeom | Sequence[float] | str,
 ) -> None:
     """Add a terrain's body with its one geom; `shape` holds the geom's attributes of type and size."""
     spec.worldbody.add_body(name=BODY).add_geom(
@@ -92,4 +97,6 @@ class PlaneTerrain(Terrain):
     def add_to(self, spec: mujoco.MjSpec) -> None:
         add_look(spec, repeat=2)
         # Size 0 along x and y means without end; the third number is the spacing of the grid that is drawn.
-        add_ground(spec, friction=self.friction, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.01])
+        add_ground(
+            spec, friction=self.friction, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.01]
+        )

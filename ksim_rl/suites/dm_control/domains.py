@@ -63,7 +63,9 @@ DOMAINS: Mapping[str, Domain] = {
         decimation=1,
         observations={
             # By entry: both horizontals first, then both verticals, as dm_control has them.
-            "orientations": BodyAxes(bodies=("upper_arm", "lower_arm"), entries=("xz", "zz"), by_entry=True),
+            "orientations": BodyAxes(
+                bodies=("upper_arm", "lower_arm"), entries=("xz", "zz"), by_entry=True
+            ),
             "velocity": _VELOCITY,
         },
         events=_OWN_RANGES,
@@ -90,7 +92,9 @@ DOMAINS: Mapping[str, Domain] = {
             "velocity": _VELOCITY,
         },
         events={
-            "start": DrawStart(ranges={"slider": (-0.1, 0.1), "hinge_1": (-0.034, 0.034)}, velocity_std=0.01)
+            "start": DrawStart(
+                ranges={"slider": (-0.1, 0.1), "hinge_1": (-0.034, 0.034)}, velocity_std=0.01
+            )
         },
         viewer=_side_view(5.0, 1.0),
         playground={"sim": _iterations(1, 4, integrator="euler")},
@@ -103,7 +107,9 @@ DOMAINS: Mapping[str, Domain] = {
             "velocity": _VELOCITY,
         },
         # Of the joints without limits dm_control turns none here.
-        events={"start": StartFromBank(own_ranges=True, ranges={"rooty": (0.0, 0.0)}, settle_steps=200)},
+        events={
+            "start": StartFromBank(own_ranges=True, ranges={"rooty": (0.0, 0.0)}, settle_steps=200)
+        },
         viewer=_beside("torso", 4.0),
         playground={"sim": _iterations(4, 8)},
     ),
@@ -112,7 +118,9 @@ DOMAINS: Mapping[str, Domain] = {
         observations={
             "position": mdp.JointPos(joints=("proximal", "distal")),
             "tip": Offset(ends=("site:tip",), start="body:spinner", axes="xz"),
-            "velocity": Readings(sensors=("proximal_velocity", "distal_velocity", "hinge_velocity")),
+            "velocity": Readings(
+                sensors=("proximal_velocity", "distal_velocity", "hinge_velocity")
+            ),
             # Touch forces span orders of magnitude.
             "touch": Readings(sensors=("touchtop", "touchbottom"), log=True),
         },
@@ -132,7 +140,9 @@ DOMAINS: Mapping[str, Domain] = {
             "target": Offset(ends=("command:target",), start="geom:mouth", frame="geom:mouth"),
             "velocity": _VELOCITY,
         },
-        events={"start": DrawStart(ranges=dict.fromkeys(_FISH_JOINTS, (-0.2, 0.2)), root="uniform")},
+        events={
+            "start": DrawStart(ranges=dict.fromkeys(_FISH_JOINTS, (-0.2, 0.2)), root="uniform")
+        },
         viewer=_beside("torso", 1.2),
         playground={"decimation": 20, "sim": _iterations(2, 6, timestep=0.002)},
     ),
@@ -205,7 +215,9 @@ DOMAINS: Mapping[str, Domain] = {
         observations={
             "joints": mdp.JointPos(joints="joint_.*"),
             # In the head's frame, as seen from the swimmer.
-            "to_target": Offset(ends=("command:target",), start="geom:nose", frame="body:head", axes="xy"),
+            "to_target": Offset(
+                ends=("command:target",), start="geom:nose", frame="body:head", axes="xy"
+            ),
             "body_velocities": Readings(
                 sensors=(
                     "head_vel.xy",

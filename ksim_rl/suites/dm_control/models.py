@@ -86,7 +86,10 @@ def _add_links(spec: mujoco.MjSpec, count: int) -> None:
             ("gyro", mujoco.mjtSensor.mjSENS_GYRO),
         ):
             spec.add_sensor(
-                name=f"{name}_{index}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name
+                name=f"{name}_{index}",
+                type=kind,
+                objtype=mujoco.mjtObj.mjOBJ_SITE,
+                objname=site.name,
             )
 
 

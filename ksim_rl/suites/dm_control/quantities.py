@@ -78,7 +78,10 @@ class BodyAxes(ObservationTerm):
         # Row b of `axes_EN33` is the axis b of the body, whose components are along the world's axes.
         axes_EN33 = view.bodies(self.bodies).axes_EN33
         # Names are (component, axis), as in dm_control's matrices.
-        values = [axes_EN33[..., AXES.index(axis), AXES.index(component)] for component, axis in self.entries]
+        values = [
+            axes_EN33[..., AXES.index(axis), AXES.index(component)]
+            for component, axis in self.entries
+        ]
         return torch.stack(values, dim=1 if self.by_entry else -1).flatten(start_dim=1)
 
 

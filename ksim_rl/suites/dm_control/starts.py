@@ -46,7 +46,9 @@ class StartRule(EventTerm):
     ranges: Mapping[str, Range] = field(default_factory=dict)
     root: Literal["default", "uniform", "positive"] = "default"
 
-    def bounds(self, mj_model: mujoco.MjModel, default_L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def bounds(
+        self, mj_model: mujoco.MjModel, default_L: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest qpos, [nq] each, without the orientation of a free root."""
         # Equal bounds leave a number at the default pose.
         low_L = default_L.copy()
@@ -100,7 +102,9 @@ class DrawStart(StartRule):
         key = f"bounds of {self!r}"
         if key not in known:
             default_L = view.default_qpos_L.double().cpu().numpy()
-            known[key] = array_constant(np.stack(self.bounds(view.world.mj_model, default_L)), view.device)
+            known[key] = array_constant(
+                np.stack(self.bounds(view.world.mj_model, default_L)), view.device
+            )
         low_L, high_L = known[key].unbind(0)
         return low_L, high_L
 
@@ -126,7 +130,9 @@ class StartFromBank(StartRule):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         known = _BANKS.setdefault(view.world, {})
         if repr(self) not in known:
-            bank_NL = self._drawn_once(view.world.mj_model, view.default_qpos_L.double().cpu().numpy())
+            bank_NL = self._drawn_once(
+                view.world.mj_model, view.default_qpos_L.double().cpu().numpy()
+            )
             # Outside of inference mode: the tensor outlives the mode of the call that comes first.
             with torch.inference_mode(False):
                 known[repr(self)] = torch.tensor(bank_NL, dtype=torch.float32, device=view.device)
@@ -169,7 +175,9 @@ class StartFromBank(StartRule):
                 if data.ncon == 0:
                     break
             else:
-                raise ValueError(f"without_contacts=True: no start without contacts in {MOST_DRAWS} draws")
+                raise ValueError(
+                    f"without_contacts=True: no start without contacts in {MOST_DRAWS} draws"
+                )
             # Velocities stay 0.
             row_L[: mj_model.nq] = data.qpos
         if self.settle_steps:

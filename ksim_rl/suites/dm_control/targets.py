@@ -42,7 +42,9 @@ class BoxTarget(Target):
 
     def draw(self, view: EnvView) -> Float[Tensor, "E 3"]:
         # Uniform by volume.
-        point_E3 = view.uniform(3, constant(self.low, view.device), constant(self.high, view.device))
+        point_E3 = view.uniform(
+            3, constant(self.low, view.device), constant(self.high, view.device)
+        )
         # One draw less where no target is near.
         if not self.near_share:
             return point_E3

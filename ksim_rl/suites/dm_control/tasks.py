@@ -71,7 +71,12 @@ def _speed(low: float, *, margin: float, value_at_margin: float, floor: float = 
     # Along x, of the whole robot's centre of mass.
     speed = Readings(sensors=("torso_subtreelinvel.x",))
     return Factor(
-        of=speed, low=low, margin=margin, value_at_margin=value_at_margin, shape="linear", floor=floor
+        of=speed,
+        low=low,
+        margin=margin,
+        value_at_margin=value_at_margin,
+        shape="linear",
+        floor=floor,
     )
 
 
@@ -108,7 +113,9 @@ _CART = mdp.JointPos(joints="slider")
 _CARTPOLE = _reward(
     upright=_upright("pole_1"),
     small_control=_SMALL_CONTROL,
-    small_velocity=Factor(of=mdp.JointVel(joints="hinge_1"), low=0.0, high=0.0, margin=5.0, floor=0.5),
+    small_velocity=Factor(
+        of=mdp.JointVel(joints="hinge_1"), low=0.0, high=0.0, margin=5.0, floor=0.5
+    ),
     centered=Factor(of=_CART, low=0.0, high=0.0, margin=2.0, floor=0.5),
 )
 _CARTPOLE_SPARSE = _reward(
@@ -119,7 +126,10 @@ _CARTPOLE_SPARSE = _reward(
 # Position and velocity of each joint: normal with these means, std 0.01.
 _HANGING: Mapping[str, EventTerm] = {
     joint: mdp.ResetJoints(
-        joints=joint, position_range=(mean, 0.01), velocity_range=(0.0, 0.01), distribution="gaussian"
+        joints=joint,
+        position_range=(mean, 0.01),
+        velocity_range=(0.0, 0.01),
+        distribution="gaussian",
     )
     for joint, mean in (("slider", 0.0), ("hinge_1", math.pi))
 }
@@ -128,7 +138,9 @@ _HANGING: Mapping[str, EventTerm] = {
 def _turn(radius: float) -> SuiteTask:
     target = Offset(ends=("command:target",), start="body:spinner", axes="xz")
     # The radius is part of the distance, so that 0 is its surface.
-    distance = Distance(of=Offset(ends=("command:target",), start="site:tip", axes="xz"), radius=radius)
+    distance = Distance(
+        of=Offset(ends=("command:target",), start="site:tip", axes="xz"), radius=radius
+    )
     return SuiteTask(
         description=f"turn a free body to a target of {100 * radius:g} cm",
         rewards=_reward(inside=Factor(of=distance, high=0.0)),
@@ -157,7 +169,9 @@ _HUMANOID_STILL = Factor(of=_HUMANOID_VELOCITY, low=0.0, high=0.0, margin=2.0)
 def _humanoid_speed(low: float) -> Factor:
     speed = Distance(of=_HUMANOID_VELOCITY)
     # The floor keeps standing worth a sixth, for a robot that does not move yet.
-    return Factor(of=speed, low=low, margin=low, value_at_margin=0.0, shape="linear", floor=1.0 / 6.0)
+    return Factor(
+        of=speed, low=low, margin=low, value_at_margin=0.0, shape="linear", floor=1.0 / 6.0
+    )
 
 
 def _reach(radius: float) -> SuiteTask:
@@ -216,10 +230,13 @@ SUITE_TASKS: Mapping[str, SuiteTask] = {
     ),
     "cartpole_balance": SuiteTask(description="keep a pole upright on a cart", rewards=_CARTPOLE),
     "cartpole_balance_sparse": SuiteTask(
-        description="the same, with a reward near upright and the middle only", rewards=_CARTPOLE_SPARSE
+        description="the same, with a reward near upright and the middle only",
+        rewards=_CARTPOLE_SPARSE,
     ),
     "cartpole_swingup": SuiteTask(
-        description="swing a hanging pole up and keep it upright", rewards=_CARTPOLE, events=_HANGING
+        description="swing a hanging pole up and keep it upright",
+        rewards=_CARTPOLE,
+        events=_HANGING,
     ),
     "cartpole_swingup_sparse": SuiteTask(
         description="the same, with a reward near upright and the middle only",
@@ -242,7 +259,9 @@ SUITE_TASKS: Mapping[str, SuiteTask] = {
         description="a fish swims to a target",
         rewards={
             # Both radii.
-            "in_target": _product(7.0 / 8.0, near=Factor(of=_FISH_TO_TARGET, high=0.045, margin=0.09)),
+            "in_target": _product(
+                7.0 / 8.0, near=Factor(of=_FISH_TO_TARGET, high=0.045, margin=0.09)
+            ),
             "upright": _product(1.0 / 8.0, upright=_upright("torso")),
         },
         target=BoxTarget(low=(-0.4, -0.4, 0.1), high=(0.4, 0.4, 0.3), size=0.04),
@@ -275,21 +294,26 @@ SUITE_TASKS: Mapping[str, SuiteTask] = {
     "pendulum_swingup": SuiteTask(
         description="swing a pendulum up with little torque; a reward within 8 degrees of upright only",
         rewards=_reward(
-            upright=Factor(of=BodyAxes(bodies="pole", entries=("zz",)), low=math.cos(math.radians(8.0)))
+            upright=Factor(
+                of=BodyAxes(bodies="pole", entries=("zz",)), low=math.cos(math.radians(8.0))
+            )
         ),
         fast_sac_states=FAST_SAC_LONG,
     ),
     "point_mass_easy": SuiteTask(
         description="move a mass to the middle",
         rewards=_reward(
-            near=Factor(of=_POINT_MASS_TO_TARGET, high=0.015, margin=0.015), small_control=_SMALL_CONTROL
+            near=Factor(of=_POINT_MASS_TO_TARGET, high=0.015, margin=0.015),
+            small_control=_SMALL_CONTROL,
         ),
     ),
     "reacher_easy": _reach(0.05),
     "reacher_hard": _reach(0.015),
     "swimmer_swimmer6": SuiteTask(
         description="a chain of six links swims to a target",
-        rewards=_reward(near=Factor(of=_SWIMMER_TO_TARGET, high=0.1, margin=0.5, shape="long_tail")),
+        rewards=_reward(
+            near=Factor(of=_SWIMMER_TO_TARGET, high=0.1, margin=0.5, shape="long_tail")
+        ),
         # One of five targets is near.
         target=BoxTarget(
             low=(-2.0, -2.0, 0.05),

@@ -43,7 +43,9 @@ def ppo(*, gamma: float = 0.995, env_states: float = PPO_STATES) -> TrainingCfg:
             critic=CriticCfg(hidden_dims=(256, 256, 128)),
         ),
         trainer=TrainerCfg(
-            num_iterations=math.ceil(env_states / (8192 * 16)), eval_interval=50, stop_when_solved=False
+            num_iterations=math.ceil(env_states / (8192 * 16)),
+            eval_interval=50,
+            stop_when_solved=False,
         ),
     )
 
@@ -56,7 +58,11 @@ def fast_sac_training(*, env_states: float) -> TrainingCfg:
     """
     num_envs = 1024
     data = dataclasses.replace(
-        MANY_ENVS, num_env_states_per_minibatch=4096, num_minibatches=16, num_steps=4, save_replay=False
+        MANY_ENVS,
+        num_env_states_per_minibatch=4096,
+        num_minibatches=16,
+        num_steps=4,
+        save_replay=False,
     )
     return TrainingCfg(
         num_envs=num_envs,
@@ -65,7 +71,8 @@ def fast_sac_training(*, env_states: float) -> TrainingCfg:
         ),
         data=data,
         modules=ModulesCfg(
-            actor=fast_sac.ACTOR, critic=dataclasses.replace(fast_sac.CRITIC, v_min=-100.0, v_max=100.0)
+            actor=fast_sac.ACTOR,
+            critic=dataclasses.replace(fast_sac.CRITIC, v_min=-100.0, v_max=100.0),
         ),
         trainer=TrainerCfg(
             num_iterations=math.ceil(env_states / (num_envs * data.num_steps)),

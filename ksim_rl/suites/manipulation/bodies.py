@@ -69,7 +69,9 @@ class PlaceFreeBody(EventTerm):
         low, high = zip(*(self.offset.get(axis, (0.0, 0.0)) for axis in AXES), strict=True)
         default_7 = view.default_qpos_L[start : start + 7]
         # About its default place, in the world's axes.
-        pos_E3 = default_7[:3] + view.uniform(3, constant(low, view.device), constant(high, view.device))
+        pos_E3 = default_7[:3] + view.uniform(
+            3, constant(low, view.device), constant(high, view.device)
+        )
         quat_E4 = default_7[3:].expand(len(pos_E3), 4)
         if self.orientation == "uniform":
             # Independent normals favour no direction.

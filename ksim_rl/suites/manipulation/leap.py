@@ -24,7 +24,13 @@ from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.viewer_cfg import ViewerCfg
-from ksim_rl.suites.dm_control.quantities import Distance, Factor, Offset, Readings, ToleranceProduct
+from ksim_rl.suites.dm_control.quantities import (
+    Distance,
+    Factor,
+    Offset,
+    Readings,
+    ToleranceProduct,
+)
 from ksim_rl.suites.manipulation.bodies import AXES, LeavesBox, PlaceFreeBody, PlaygroundModel
 from ksim_rl.suites.manipulation.targets import JointTarget, MoveTargets, TargetsAtJoints
 from ksim_rl.transforms import GaussianNoise, UniformNoise
@@ -77,7 +83,9 @@ class GoalOrientation(CommandTerm):
         # No env step has passed when a row has just been reset, so that its goal stays where it was drawn.
         moves_E1 = (steps_E != view.episode_step_E)[:, None]
         # Against the goal from before this step, which the rewards have seen.
-        is_reached_E1 = (quaternion.angle_between(view.sensor(self.sensor), goal_E4) <= self.reached)[:, None]
+        is_reached_E1 = (
+            quaternion.angle_between(view.sensor(self.sensor), goal_E4) <= self.reached
+        )[:, None]
         next_E3 = torch.where(is_reached_E1, view.uniform(3, *self.turn), self.decay * turn_E3)
         turn_E3.copy_(torch.where(moves_E1, next_E3, turn_E3))
         # Half the angle of this step, since quaternions turn by halves.
@@ -114,7 +122,9 @@ class GoalAngle(OfGoal, ObservationTerm):
     """The angle between an object and its goal, rad in [0, pi], [E, 1]; position stage."""
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 1"]:
-        return quaternion.angle_between(view.sensor(self.sensor), view.command(self.command))[:, None]
+        return quaternion.angle_between(view.sensor(self.sensor), view.command(self.command))[
+            :, None
+        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,10 +198,15 @@ def leap_cube_reorient() -> ManagerBasedRlEnvCfg:
         scene=SceneCfg(robots={"leap": PlaygroundModel(scene="leap_cube")}, num_envs=8192),
         # Playground stops after 5 iterations of the solver and 8 of its line search, which leaves grasps half solved.
         sim=SimCfg(iterations=10, ls_iterations=20, ccd_iterations=10, njmax=160),
-        observations={"actor": ObservationGroupCfg(terms=actor), "critic": ObservationGroupCfg(terms=critic)},
+        observations={
+            "actor": ObservationGroupCfg(terms=actor),
+            "critic": ObservationGroupCfg(terms=critic),
+        },
         actions={"joints": MoveTargets(joints=HAND, scale=0.5)},
         events={
-            "hand": mdp.ResetJoints(joints=HAND, position_range=(0.0, 0.1), distribution="gaussian"),
+            "hand": mdp.ResetJoints(
+                joints=HAND, position_range=(0.0, 0.1), distribution="gaussian"
+            ),
             "targets": TargetsAtJoints(joints=HAND),
             "cube": PlaceFreeBody(
                 body=CUBE, offset=dict.fromkeys(AXES, (-0.01, 0.01)), orientation="uniform"

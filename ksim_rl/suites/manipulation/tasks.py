@@ -51,7 +51,9 @@ LEAP = Task(
         num_envs=16384,
         objective=_ppo(learning_rate=3e-4, desired_kl=0.016, entropy_coeff=0.002, precision="auto"),
         data=DatasetCfg(num_env_states_per_minibatch=65536, num_minibatches=4),
-        modules=ModulesCfg(actor=ActorCfg(init_std=0.5), critic=CriticCfg(in_keys=("actor", "critic"))),
+        modules=ModulesCfg(
+            actor=ActorCfg(init_std=0.5), critic=CriticCfg(in_keys=("actor", "critic"))
+        ),
         trainer=TrainerCfg(num_iterations=1831, eval_interval=100),
     ),
 )

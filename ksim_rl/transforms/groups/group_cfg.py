@@ -12,7 +12,12 @@ from torchrl.envs.transforms import RenameTransform, Transform
 
 from ksim_rl.checked import Checked, Filled
 from ksim_rl.transforms.delay import DelayCfg, ObservationDelay
-from ksim_rl.transforms.elementwise import ObservationClip, ObservationScale, check_clip, check_scale
+from ksim_rl.transforms.elementwise import (
+    ObservationClip,
+    ObservationScale,
+    check_clip,
+    check_scale,
+)
 from ksim_rl.transforms.groups.groups import ObservationGroups
 from ksim_rl.transforms.history import HistoryCfg, ObservationHistory
 from ksim_rl.transforms.noise.cfg import NoiseCfg, PerDim
@@ -105,7 +110,9 @@ class ObservationGroupCfg(Checked):
         return 1
 
 
-def _numbers_of_frames(history: int | HistoryCfg | None, num_envs: int) -> Mapping[tuple[str, ...], float]:
+def _numbers_of_frames(
+    history: int | HistoryCfg | None, num_envs: int
+) -> Mapping[tuple[str, ...], float]:
     # A config of its own tells for itself.
     if isinstance(history, int):
         return {("history",): num_envs * history}
@@ -189,11 +196,15 @@ def _completed(term: ObservationTermCfg, group: ObservationGroupCfg) -> Observat
         term,
         noise=term.noise if group.enable_noise else None,
         delay=term.delay or group.delay,
-        history=term.history if term.history is not None or frames is None or not frames.flat else frames,
+        history=term.history
+        if term.history is not None or frames is None or not frames.flat
+        else frames,
     )
 
 
-def _chain(group: str, cfg: ObservationGroupCfg, terms: Mapping[str, ObservationTermCfg]) -> list[Transform]:
+def _chain(
+    group: str, cfg: ObservationGroupCfg, terms: Mapping[str, ObservationTermCfg]
+) -> list[Transform]:
     """Return the transforms of the terms that need some; each term starts at its clean reading."""
     transforms: list[Transform] = []
     current: dict[str, NestedKey] = {name: ("obs", name) for name in terms}
@@ -207,10 +218,17 @@ def _chain(group: str, cfg: ObservationGroupCfg, terms: Mapping[str, Observation
     noisy = {name: term.noise for name, term in terms.items() if term.noise is not None}
     if noisy:
         transforms.append(ObservationNoise(*advance(list(noisy)), noise=list(noisy.values())))
-    makers: dict[str, tuple[Any, Any]] = {"clip": (ObservationClip, None), "scale": (ObservationScale, 1.0)}
+    makers: dict[str, tuple[Any, Any]] = {
+        "clip": (ObservationClip, None),
+        "scale": (ObservationScale, 1.0),
+    }
     for field, (make, neutral) in makers.items():
         # Terms with the same stage share one transform, which saves launches.
-        given = {name: value for name, term in terms.items() if (value := getattr(term, field)) != neutral}
+        given = {
+            name: value
+            for name, term in terms.items()
+            if (value := getattr(term, field)) != neutral
+        }
         if given:
             in_keys, out_keys = advance(list(given))
             by_key = dict(zip(in_keys, given.values(), strict=True))
@@ -228,7 +246,9 @@ def _chain(group: str, cfg: ObservationGroupCfg, terms: Mapping[str, Observation
     for name, term in terms.items():
         if (frames := history_cfg(term.history)) is not None:
             by_frames.setdefault(frames, []).append(name)
-    for frames, names in sorted(by_frames.items(), key=lambda item: (item[0].length, item[0].stride)):
+    for frames, names in sorted(
+        by_frames.items(), key=lambda item: (item[0].length, item[0].stride)
+    ):
         transforms.append(ObservationHistory(*advance(names), **vars(frames)))
     return transforms
 

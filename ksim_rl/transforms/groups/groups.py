@@ -13,7 +13,15 @@ from ksim_rl import checks
 from ksim_rl.transforms.checked_keys import CheckedKeys, as_keys
 from ksim_rl.transforms.columns import side_by_side
 from ksim_rl.transforms.row_transform import held_transforms
-from ksim_rl.transforms.specs import Device, bounded, bounds, drop_leaf, leaf_spec, set_leaf_spec, spell
+from ksim_rl.transforms.specs import (
+    Device,
+    bounded,
+    bounds,
+    drop_leaf,
+    leaf_spec,
+    set_leaf_spec,
+    spell,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +44,13 @@ class GroupSpec:
             i for i, key in enumerate(self.terms) if last_name(key) == term
         ]
         if not found:
-            raise checks.unknown_name(f"term of group {self.name!r}", str(term), map(last_name, self.terms))
+            raise checks.unknown_name(
+                f"term of group {self.name!r}", str(term), map(last_name, self.terms)
+            )
         if len(found) > 1:
-            raise ValueError(f"group {self.name!r} has {len(found)} terms named {term!r}: give the whole key")
+            raise ValueError(
+                f"group {self.name!r} has {len(found)} terms named {term!r}: give the whole key"
+            )
         # Columns of the terms before it.
         start = sum(self.sizes[: found[0]])
         return slice(start, start + self.sizes[found[0]])
@@ -67,7 +79,10 @@ class ObservationGroups(CheckedKeys):
     """
 
     def __init__(
-        self, groups: Mapping[NestedKey, Sequence[NestedKey]], *, drop: bool | Sequence[NestedKey] = False
+        self,
+        groups: Mapping[NestedKey, Sequence[NestedKey]],
+        *,
+        drop: bool | Sequence[NestedKey] = False,
     ) -> None:
         if not groups:
             raise ValueError("groups={}: expected at least one group")
@@ -101,7 +116,9 @@ class ObservationGroups(CheckedKeys):
         if group not in self.groups:
             raise checks.unknown_name("group", str(group), map(str, self.groups))
         if group not in self.group_specs:
-            raise RuntimeError("the columns are known once an env holds the transform and has made its specs")
+            raise RuntimeError(
+                "the columns are known once an env holds the transform and has made its specs"
+            )
         return self.group_specs[group].slice(term)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -127,7 +144,9 @@ class ObservationGroups(CheckedKeys):
             drop_leaf(observation_spec, key)
         return observation_spec
 
-    def _vector_spec(self, specs: list[TensorSpec], batch_size: torch.Size, device: Device) -> TensorSpec:
+    def _vector_spec(
+        self, specs: list[TensorSpec], batch_size: torch.Size, device: Device
+    ) -> TensorSpec:
         # The vector takes the dtype to which `torch.cat` promotes its terms.
         dtype = specs[0].dtype
         for spec in specs[1:]:
@@ -163,7 +182,9 @@ class ObservationGroups(CheckedKeys):
         self._check_samples(tensordict, is_floating=False)
         return self._call(tensordict)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         return self._call(tensordict_reset)
 
 

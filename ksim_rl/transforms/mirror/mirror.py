@@ -31,12 +31,18 @@ class MirrorMap:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source", tuple(self.source))
-        object.__setattr__(self, "signs", tuple(float(s) for s in self.signs) or (1.0,) * len(self.source))
+        object.__setattr__(
+            self, "signs", tuple(float(s) for s in self.signs) or (1.0,) * len(self.source)
+        )
         # A permutation: each column comes from exactly one other.
         if sorted(self.source) != list(range(len(self.source))):
-            raise ValueError(f"source={self.source}: expected each of 0 to {len(self.source) - 1} once")
+            raise ValueError(
+                f"source={self.source}: expected each of 0 to {len(self.source) - 1} once"
+            )
         if len(self.signs) != len(self.source):
-            raise ValueError(f"signs has {len(self.signs)} numbers for the {len(self.source)} of source")
+            raise ValueError(
+                f"signs has {len(self.signs)} numbers for the {len(self.source)} of source"
+            )
         for index, (source, sign) in enumerate(zip(self.source, self.signs, strict=True)):
             checks.check_choice(f"signs[{index}]", sign, (1.0, -1.0))
             # Twice in the mirror is the vector itself.
@@ -61,7 +67,9 @@ class MirrorMap:
 
 
 def image(
-    vector: Shaped[Tensor, "*batch L"], source_L: Int64[Tensor, " L"] | None, signs_L: Float32[Tensor, " L"]
+    vector: Shaped[Tensor, "*batch L"],
+    source_L: Int64[Tensor, " L"] | None,
+    signs_L: Float32[Tensor, " L"],
 ) -> Shaped[Tensor, "*batch L"]:
     """Return the mirror image of vectors [..., L]; a `source_L` of None leaves the columns in place."""
     if source_L is None:
@@ -136,7 +144,9 @@ class Mirror(KeyedTransform):
         keys = self.in_keys
         keys_inv = self.in_keys_inv
         if set(maps) != {*keys, *keys_inv}:
-            raise ValueError(f"maps has the keys {list(maps)}: expected those of {keys} and {keys_inv}")
+            raise ValueError(
+                f"maps has the keys {list(maps)}: expected those of {keys} and {keys_inv}"
+            )
         checks.check_in_range("probability", probability, low=0.0, high=1.0)
         self._register_rows("mirrored_E")
         self.maps = dict(maps)
@@ -182,7 +192,9 @@ class Mirror(KeyedTransform):
     def _image(self, key: NestedKey, ends: Bounds, batch_dims: int) -> Bounds:
         leaf = ends[0].shape[batch_dims:]
         if leaf[-1:] != (self.maps[key].size,):
-            raise ValueError(f"the map of {key!r} has {self.maps[key].size} columns for shape {tuple(leaf)}")
+            raise ValueError(
+                f"the map of {key!r} has {self.maps[key].size} columns for shape {tuple(leaf)}"
+            )
         images = [self.maps[key](end) for end in ends]
         # A sign of -1 turns low and high around.
         return torch.minimum(*images), torch.maximum(*images)
@@ -228,7 +240,9 @@ def mirrored(tensordict: TensorDictBase, maps: Mapping[NestedKey, MirrorMap]) ->
     for key, mirror in maps.items():
         path = path_of(key)
         # Observations after the step are mirrored like those before it.
-        places = [place for place in (path, ("next", *path)) if tensordict.get(place, None) is not None]
+        places = [
+            place for place in (path, ("next", *path)) if tensordict.get(place, None) is not None
+        ]
         if not places:
             raise KeyError(f"maps: the batch has no {key!r}")
         for place in places:

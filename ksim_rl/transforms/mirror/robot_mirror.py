@@ -33,7 +33,8 @@ def mirror_name(name: str, names: Sequence[str]) -> str:
     # Words that are no side stand for themselves; a side may have several counterparts.
     words = _WORDS.findall(name)
     images = [
-        "".join(image) for image in itertools.product(*[_counterparts(word) or [word] for word in words])
+        "".join(image)
+        for image in itertools.product(*[_counterparts(word) or [word] for word in words])
     ]
     if images == [name]:
         # AL1 and AR1 are arms, but an AR tag has no counterpart.
@@ -97,7 +98,9 @@ def mirror_joints(mj_model: "mujoco.MjModel", joints: Sequence[str] | None = Non
     mujoco.mj_kinematics(mj_model, data)
     hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
     scalar = (hinge, int(mujoco.mjtJoint.mjJNT_SLIDE))
-    valid = {mj_model.joint(i).name: i for i in range(mj_model.njnt) if mj_model.jnt_type[i] in scalar}
+    valid = {
+        mj_model.joint(i).name: i for i in range(mj_model.njnt) if mj_model.jnt_type[i] in scalar
+    }
     if joints is None:
         names = list(valid)
     else:
@@ -113,7 +116,9 @@ def mirror_joints(mj_model: "mujoco.MjModel", joints: Sequence[str] | None = Non
     return MirrorMap(source=tuple(source), signs=tuple(signs))
 
 
-def _sign(mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: int, *, hinge: int) -> float:
+def _sign(
+    mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: int, *, hinge: int
+) -> float:
     reflection = np.array([1.0, -1.0, 1.0])
     apart = np.abs(data.xanchor[joint] * reflection - data.xanchor[other]).max()
     # A rotation axis is a pseudovector: its mirror image turns the other way as well.
@@ -124,7 +129,9 @@ def _sign(mj_model: "mujoco.MjModel", data: "mujoco.MjData", joint: int, other: 
     agreement = float(handed * reflection * data.xaxis[joint] @ data.xaxis[other])
     # Anchors may differ by 2 percent of the robot's size, and axes by a thousandth.
     extent = max(float(mj_model.stat.extent), _TOLERANCE)
-    differs = mj_model.jnt_type[joint] != mj_model.jnt_type[other] or abs(abs(agreement) - 1) > _TOLERANCE
+    differs = (
+        mj_model.jnt_type[joint] != mj_model.jnt_type[other] or abs(abs(agreement) - 1) > _TOLERANCE
+    )
     if differs or apart > 0.02 * extent:
         raise ValueError(
             f"joints {mj_model.joint(joint).name!r} and {mj_model.joint(other).name!r} are no mirror images of each "

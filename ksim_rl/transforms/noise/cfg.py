@@ -65,7 +65,9 @@ class UniformNoise(NoiseCfg):
         low = _numbers(self.low)
         high = _numbers(self.high)
         if not low or not high or (len(low) != len(high) and 1 not in (len(low), len(high))):
-            raise ValueError(f"low has {len(low)} numbers and high has {len(high)}: give as many, or one")
+            raise ValueError(
+                f"low has {len(low)} numbers and high has {len(high)}: give as many, or one"
+            )
         # One number stands for all elements: the shorter list repeats.
         width = max(len(low), len(high))
         if any(low[i % len(low)] > high[i % len(high)] for i in range(width)):

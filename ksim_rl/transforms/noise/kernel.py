@@ -8,7 +8,14 @@ from torch import Tensor
 
 from ksim_rl import ranks
 from ksim_rl.device import draws_in_torch as draws
-from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator, source_of
+from ksim_rl.device.quick_launch import (
+    ADDRESS,
+    QuickLaunch,
+    address,
+    arguments_of,
+    as_operator,
+    source_of,
+)
 from ksim_rl.device.random import DRAWS
 
 GAUSSIAN, MULTIPLY, BIAS_GAUSSIAN, BIAS_MULTIPLY, BY_LEVEL, HOLD = (1 << bit for bit in range(6))
@@ -128,7 +135,9 @@ def _noise_in_torch(
         count = counter + 1
     else:
         count = counter.reshape(-1) + 1
-    keys = draws.keys_of(seed, stream, count, num_rows=num_rows, first_row=ranks.first_row(num_rows))
+    keys = draws.keys_of(
+        seed, stream, count, num_rows=num_rows, first_row=ranks.first_row(num_rows)
+    )
     # Batches of samples are counted by the caller, since one counter serves all rows.
     if moment != "forward":
         counter += begins_E.view_as(counter)
@@ -173,7 +182,9 @@ def _noise_in_torch(
     if features & HAS_DROPOUT and last_EL is not None:
         if moment != "reset":
             # One draw for all columns of an observation.
-            chance_EL = draws.unit(draws.bits_of(keys, (flags_L >> KEY_SHIFT).long() + DROPOUT_INDEX))
+            chance_EL = draws.unit(
+                draws.bits_of(keys, (flags_L >> KEY_SHIFT).long() + DROPOUT_INDEX)
+            )
             lost_EL = chance_EL < strength_L * table_PL[DROPOUT]
             held_EL = torch.where(flags_L & HOLD > 0, last_EL.view(num_rows, num_columns), 0.0)
             x_EL = torch.where(lost_EL, held_EL, x_EL)

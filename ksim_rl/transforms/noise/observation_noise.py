@@ -100,7 +100,9 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         if self._layout == (self.num_rows, shapes):
             return
         self._layout = (self.num_rows, shapes)
-        columns = NoiseColumns(self.noise, self.in_keys, [shape.numel() for shape in shapes], device)
+        columns = NoiseColumns(
+            self.noise, self.in_keys, [shape.numel() for shape in shapes], device
+        )
         self.noise_columns = columns
         shape = (self.num_rows, columns.size)
         if columns.has(HAS_BIAS):
@@ -113,7 +115,9 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
             if columns.has(feature):
                 self._size_buffer(name, torch.float32, (columns.size,))
 
-    def _rows_that_reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> Tensor:
+    def _rows_that_reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> Tensor:
         # The kernel counts the resets, and in `_step` the steps.
         return RowTransform._rows_that_reset(self, tensordict, tensordict_reset)
 
@@ -140,7 +144,9 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         # One observation needs no joining: the kernel takes it in its own shape.
         clean_EL = values[0]
         if len(values) > 1:
-            clean_EL = side_by_side(values, tensordict.numel() if moment == "forward" else self.num_rows)
+            clean_EL = side_by_side(
+                values, tensordict.numel() if moment == "forward" else self.num_rows
+            )
         # The kernel computes in float32; the results go back to the dtype of the leaf below.
         if clean_EL.dtype != torch.float32:
             clean_EL = clean_EL.float()
@@ -163,12 +169,15 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
 
 
 def _one_per_key(
-    noise: NoiseCfg | Sequence[NoiseCfg] | Mapping[NestedKey, NoiseCfg], in_keys: Sequence[NestedKey]
+    noise: NoiseCfg | Sequence[NoiseCfg] | Mapping[NestedKey, NoiseCfg],
+    in_keys: Sequence[NestedKey],
 ) -> list[NoiseCfg]:
     if isinstance(noise, NoiseCfg | Mapping):
         return one_per_key("noise", noise, in_keys)
     if len(noise) != len(in_keys):
-        raise ValueError(f"noise has {len(noise)} entries for the {len(in_keys)} of in_keys={list(in_keys)}")
+        raise ValueError(
+            f"noise has {len(noise)} entries for the {len(in_keys)} of in_keys={list(in_keys)}"
+        )
     return list(noise)
 
 
@@ -182,7 +191,11 @@ class NoiseColumns(nn.Module):
     flags_L: Tensor
 
     def __init__(
-        self, cfgs: Sequence[NoiseCfg], keys: Sequence[NestedKey], sizes: Sequence[int], device: Device
+        self,
+        cfgs: Sequence[NoiseCfg],
+        keys: Sequence[NestedKey],
+        sizes: Sequence[int],
+        device: Device,
     ) -> None:
         super().__init__()
         self.size = sum(sizes)
@@ -198,7 +211,9 @@ class NoiseColumns(nn.Module):
             start += size
         # A feature that no column has is skipped by the kernel for all of them.
         found = {
-            noise_kernel.HAS_GAUSSIAN: any(_is_gaussian(cfg) or _is_gaussian(cfg.bias) for cfg in cfgs),
+            noise_kernel.HAS_GAUSSIAN: any(
+                _is_gaussian(cfg) or _is_gaussian(cfg.bias) for cfg in cfgs
+            ),
             noise_kernel.HAS_BIAS: any(cfg.bias is not None for cfg in cfgs),
             noise_kernel.HAS_WALK: bool(table[noise_kernel.WALK_STD].any()),
             noise_kernel.HAS_RESOLUTION: bool(table[noise_kernel.RESOLUTION].any()),
@@ -220,7 +235,9 @@ def _parameters(cfg: NoiseCfg, key: NestedKey, size: int) -> list[list[float]]:
             bias = cfg.bias.affine(size)
         else:
             bias = ([0.0] * size, [0.0] * size)
-        walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
+        walk, grain = (
+            per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution")
+        )
         return [*cfg.affine(size), *bias, walk, grain, [cfg.dropout] * size]
 
 
@@ -241,17 +258,24 @@ def _is_gaussian(cfg: NoiseCfg | None) -> bool:
 
 
 def widen(
-    cfg: NoiseCfg, key: NestedKey, low: Float[Tensor, "*leaf"], high: Float[Tensor, "*leaf"], batch_dims: int
+    cfg: NoiseCfg,
+    key: NestedKey,
+    low: Float[Tensor, "*leaf"],
+    high: Float[Tensor, "*leaf"],
+    batch_dims: int,
 ) -> tuple[Float[Tensor, "*leaf"], Float[Tensor, "*leaf"]]:
     """Return the bounds of the noisy observation; they hold the clean one too, as noise can be off or weaker."""
     shape = low.shape[batch_dims:]
     rows = [
-        torch.tensor(row, device=low.device).reshape(shape) for row in _parameters(cfg, key, shape.numel())
+        torch.tensor(row, device=low.device).reshape(shape)
+        for row in _parameters(cfg, key, shape.numel())
     ]
     # The stages of the reading, in the order of the kernel, each by its extremes.
     ends = low, high
     if cfg.bias is not None:
-        ends = _noisy(cfg.bias, rows[noise_kernel.BIAS_OFFSET], rows[noise_kernel.BIAS_SPREAD], ends)
+        ends = _noisy(
+            cfg.bias, rows[noise_kernel.BIAS_OFFSET], rows[noise_kernel.BIAS_SPREAD], ends
+        )
     # A random walk has no bounds.
     drift = torch.where(rows[noise_kernel.WALK_STD] > 0, torch.inf, 0.0)
     ends = ends[0] - drift, ends[1] + drift

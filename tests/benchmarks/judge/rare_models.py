@@ -54,7 +54,9 @@ MODELS = {
     "distance fields": _model(
         '<body pos="0 0 .3"><freejoint/><geom type="sdf" mesh="stone"/></body>', asset=_STONE
     ),
-    "noslip": _model(_BOX, asset=_STONE, option='<option noslip_iterations="3" noslip_tolerance="1e-2"/>'),
+    "noslip": _model(
+        _BOX, asset=_STONE, option='<option noslip_iterations="3" noslip_tolerance="1e-2"/>'
+    ),
     "searches": _model(
         _BOX,
         asset=_STONE,

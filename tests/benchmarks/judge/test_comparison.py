@@ -43,7 +43,9 @@ def found_with(change: float, quantity: str) -> list[str]:
     return [finding.quantity for finding in found]
 
 
-@pytest.mark.parametrize(("quantity", "limit"), [("qpos", DIRECT), ("qvel", SOLVED), ("cacc", SOLVED)])
+@pytest.mark.parametrize(
+    ("quantity", "limit"), [("qpos", DIRECT), ("qvel", SOLVED), ("cacc", SOLVED)]
+)
 def test_what_is_beyond_the_limit_fails(quantity: str, limit: float):
     assert found_with(1.5 * limit, quantity) == [quantity]
     assert found_with(0.5 * limit, quantity) == []

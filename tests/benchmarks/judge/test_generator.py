@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from benchmarks.judge.draw import Draw
-from benchmarks.judge.generator import DEALT, FEATURES, FOREIGN, SHARE, compiled, dealt, generate, implied
+from benchmarks.judge.generator import (
+    DEALT,
+    FEATURES,
+    FOREIGN,
+    SHARE,
+    compiled,
+    dealt,
+    generate,
+    implied,
+)
 
 MODELS = 100
 
@@ -20,7 +29,9 @@ def test_the_same_seed_gives_the_same_models():
 
 
 def test_each_feature_is_in_enough_models():
-    counts = Counter(feature for number in range(MODELS) for feature in generate(0, number).features)
+    counts = Counter(
+        feature for number in range(MODELS) for feature in generate(0, number).features
+    )
     # Ten of 400 are asked for, and some of the models that have it are refused.
     assert min(counts[name] for name in FEATURES) >= SHARE * MODELS - 1
     assert set(counts) >= set(FEATURES)

@@ -19,13 +19,22 @@ XML = """
 
 
 def has_margin(xml: str, fields: tuple[str, ...]) -> bool:
-    return any(element.get("margin") for element in ET.fromstring(xml).iter("geom")) and "geom_gap" in fields
+    return (
+        any(element.get("margin") for element in ET.fromstring(xml).iter("geom"))
+        and "geom_gap" in fields
+    )
 
 
 def test_only_what_fails_is_left():
     xml, fields = shrunk(XML, ("geom_gap", "body_mass"), has_margin)
     root = ET.fromstring(xml)
-    assert [element.tag for element in root.iter()] == ["mujoco", "option", "worldbody", "body", "geom"]
+    assert [element.tag for element in root.iter()] == [
+        "mujoco",
+        "option",
+        "worldbody",
+        "body",
+        "geom",
+    ]
     assert [geom.attrib for geom in root.iter("geom")] == [{"name": "g", "margin": "0.1"}]
     assert fields == ("geom_gap",)
 

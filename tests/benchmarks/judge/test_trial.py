@@ -83,7 +83,9 @@ def test_contacts_that_may_differ_are_looked_for_in_each_substep():
     assert not touched_accepted(mj_model, state_of(mj_data), 3)
 
 
-def test_what_turns_about_its_centre_of_mass_has_a_weight_in_both_engines(monkeypatch: pytest.MonkeyPatch):
+def test_what_turns_about_its_centre_of_mass_has_a_weight_in_both_engines(
+    monkeypatch: pytest.MonkeyPatch,
+):
     assert judge(BALANCED, kernels="theirs").findings == ()
     monkeypatch.setattr(worlds, "least_weights", lambda mj_model: 0.0)
     assert judge(BALANCED, kernels="theirs").findings

@@ -25,13 +25,17 @@ def test_others_go_on():
 
 
 def test_no_task_begins_too_late():
-    assert list(in_processes(do, ["a"], jobs=1, most_seconds=8.0, until=time.monotonic() - 1.0)) == []
+    assert (
+        list(in_processes(do, ["a"], jobs=1, most_seconds=8.0, until=time.monotonic() - 1.0)) == []
+    )
 
 
 def test_a_process_that_is_spoilt_does_nothing_further():
     same = list(in_processes(do, ["which 1", "which 2"], jobs=1, most_seconds=60.0))
     assert same[0][1] == same[1][1]
-    others = list(in_processes(do, ["which 1", "which 2"], jobs=1, most_seconds=60.0, spoils=str.isdigit))
+    others = list(
+        in_processes(do, ["which 1", "which 2"], jobs=1, most_seconds=60.0, spoils=str.isdigit)
+    )
     assert others[0][1] != others[1][1]
 
 

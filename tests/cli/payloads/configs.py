@@ -102,7 +102,9 @@ def tag_of_an_object(place):
 @family(lambda monkeypatch: monkeypatch.setattr(plain_data, "check_events", lambda *_: None))
 def exploding_anchors(place):
     lines = ["checkpoint: &a0 [x, x, x, x, x, x, x, x, x, x]"]
-    lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]" for level in range(1, 4)]
+    lines += [
+        f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]" for level in range(1, 4)
+    ]
     command = place.write_config()
     (place.run / "config.yaml").write_text("\n".join(lines))
     return command
@@ -147,6 +149,9 @@ def viewer_that_listens_in_config(place):
 @family(without_the_check_of_places)
 def database_of_mlflow_in_a_manifest(place):
     place.write_checkpoint(
-        logger={**place.tree["logger"], "mlflow": {"tracking_uri": f"sqlite:///{place.outside}/written"}}
+        logger={
+            **place.tree["logger"],
+            "mlflow": {"tracking_uri": f"sqlite:///{place.outside}/written"},
+        }
     )
     return ["resume", str(place.run)]

@@ -41,7 +41,9 @@ def group_that_reads_the_environment(place):
 
 @family(without_the_check_of_groups)
 def group_that_reads_the_environment_by_a_reference(place):
-    return group(place, GROUP + "wandb: {entity: KSIM_RL_SECRET, name: '${oc.env:${logger.wandb.entity}}'}\n")
+    return group(
+        place, GROUP + "wandb: {entity: KSIM_RL_SECRET, name: '${oc.env:${logger.wandb.entity}}'}\n"
+    )
 
 
 def as_anybody_may(monkeypatch):
@@ -86,8 +88,13 @@ def group_of_a_folder_on_the_search_path(place):
 def folder_of_groups_that_shadows_ours(place):
     (place.run / "logger").mkdir()
     (place.run / "logger" / "quiet.yaml").write_text("csv: false\ntensorboard: false\n")
-    alone = {name: place.tree[name] for name in ("task_name", "num_envs", "seed", "device", "checkpoint")}
-    evil = {"hydra": {"callbacks": {"x": {"_target_": "sympy.sympify", "a": place.expression}}}, **alone}
+    alone = {
+        name: place.tree[name] for name in ("task_name", "num_envs", "seed", "device", "checkpoint")
+    }
+    evil = {
+        "hydra": {"callbacks": {"x": {"_target_": "sympy.sympify", "a": place.expression}}},
+        **alone,
+    }
     (place.run / "run.yaml").write_text("# @package _global_\n" + yaml.safe_dump(evil))
     return ["train", "--config-dir", str(place.run)]
 
@@ -95,6 +102,8 @@ def folder_of_groups_that_shadows_ours(place):
 @family(without_the_check_of_groups)
 def group_file_that_spells_hydra_with_escapes(place):
     (place.run / "logger").mkdir()
-    text = f'"h\\x79dra":\n  callbacks:\n    x: {{_target_: sympy.sympify, a: "{place.expression}"}}\n'
+    text = (
+        f'"h\\x79dra":\n  callbacks:\n    x: {{_target_: sympy.sympify, a: "{place.expression}"}}\n'
+    )
     (place.run / "logger" / "local.yaml").write_text("# @package _global_\n" + text)
     return ["train", "--config-dir", str(place.run)]

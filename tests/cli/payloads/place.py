@@ -45,7 +45,9 @@ class Place:
     def write_checkpoint(self, state: dict | None = None, **more) -> list[str]:
         """Write a checkpoint whose manifest has a config with `more` at its top; return the command that reads it."""
         config = {**copy.deepcopy(self.tree), **more}
-        checkpoint.save(self.run / "checkpoint", state or {"x": torch.zeros(1)}, iteration=1, config=config)
+        checkpoint.save(
+            self.run / "checkpoint", state or {"x": torch.zeros(1)}, iteration=1, config=config
+        )
         return ["eval", str(self.run)]
 
 

@@ -35,7 +35,10 @@ def step(env, action):
 
 
 def test_each_term_takes_its_columns_in_the_order_of_the_config():
-    right, left = JointEffortAction(joints="right/rail"), JointEffortAction(joints="left/rail", scale=2.0)
+    right, left = (
+        JointEffortAction(joints="right/rail"),
+        JointEffortAction(joints="left/rail", scale=2.0),
+    )
     env = pucks(right=right, idle=Idle(), left=left)
     assert env.action_spec.shape == (2, 5)
     step(env, [[1.0, 9.0, 9.0, 9.0, 2.0], [3.0, 9.0, 9.0, 9.0, 4.0]])
@@ -61,7 +64,10 @@ def test_a_row_with_a_non_finite_entry_repeats_its_last_action():
         action = torch.tensor([[1.0, bad], [1.0, 2.0]])
         next_E = env.step(root_E.set("action", action))["next"].clone()
         assert env.world.ctrl_EL.isfinite().all()
-        assert env.view.action_EL[0].tolist() == [0.5, 0.5] and env.view.action_EL[1].tolist() == [1.0, 2.0]
+        assert env.view.action_EL[0].tolist() == [0.5, 0.5] and env.view.action_EL[1].tolist() == [
+            1.0,
+            2.0,
+        ]
         assert next_E["terminated"][:, 0].tolist() == [True, False]
         env.reset(env_ids=[0])
         root_E = env.step(next_E.set("action", torch.full((2, 2), 0.5)))["next"].clone()

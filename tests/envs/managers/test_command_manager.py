@@ -50,7 +50,9 @@ def targets(env, steps):
 def test_a_command_of_n_steps_lasts_n_steps(steps):
     seen = targets(commanded(steps * DT), 2 * steps + 1)
     changed = (seen[1:] != seen[:-1]).all(-1)
-    assert changed.nonzero().flatten().tolist() == [n for n in range(2 * steps + 1) if (n + 1) % steps == 0]
+    assert changed.nonzero().flatten().tolist() == [
+        n for n in range(2 * steps + 1) if (n + 1) % steps == 0
+    ]
 
 
 def test_each_env_has_a_clock_of_its_own():
@@ -100,7 +102,9 @@ def test_an_observation_of_the_command_is_the_commands_copy():
 
 
 def test_a_command_is_a_vector_per_env():
-    with pytest.raises(ValueError, match=r"command term 'flat' returns shape \(3,\): expected \[3, K\]"):
+    with pytest.raises(
+        ValueError, match=r"command term 'flat' returns shape \(3,\): expected \[3, K\]"
+    ):
         puck_env(commands={"flat": Flat(resampling_time_range_s=(1.0, 1.0))})
 
 

@@ -59,9 +59,19 @@ def rollout(env, steps):
 
 def test_a_weight_changes_from_the_step_after_the_reset():
     env = ramp_env()
-    weights = [0.0, 0.0, 3.0, 3.0, 6.0, 6.0, 9.0]  # three envs begin another episode every two steps
+    weights = [
+        0.0,
+        0.0,
+        3.0,
+        3.0,
+        6.0,
+        6.0,
+        9.0,
+    ]  # three envs begin another episode every two steps
     speed_E = torch.tensor([1.0, 2.0, 3.0])
-    expected = torch.stack([weight * speed_E * DT * (1 + k % 2) * DT for k, weight in enumerate(weights)])
+    expected = torch.stack(
+        [weight * speed_E * DT * (1 + k % 2) * DT for k, weight in enumerate(weights)]
+    )
     torch.testing.assert_close(rollout(env, 7), expected)
     assert env.curriculum_levels()["ramp"] == 9.0
 
@@ -105,5 +115,7 @@ def test_an_adapted_reward_must_exist():
 
 
 def test_a_level_is_one_for_all_envs():
-    with pytest.raises(ValueError, match=r"curriculum term 'rows' returns shape \(3,\): expected \(\)"):
+    with pytest.raises(
+        ValueError, match=r"curriculum term 'rows' returns shape \(3,\): expected \(\)"
+    ):
         puck_env(curriculum={"rows": PerEnv()})

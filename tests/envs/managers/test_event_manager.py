@@ -92,7 +92,9 @@ def test_intervals_are_drawn_per_env_and_start_anew_with_the_episode():
     assert len(kicks_E.unique()) > 1
     root_E = env.reset(env_ids=[0])
     root_E = push(env, root_E)["next"]
-    assert root_E["obs", "velocity"][0].eq(0.0).all(), "the clock of a row that resets is at least two steps"
+    assert root_E["obs", "velocity"][0].eq(0.0).all(), (
+        "the clock of a row that resets is at least two steps"
+    )
 
 
 def test_a_startup_event_fires_once_per_seed_and_for_all_rows():
@@ -134,8 +136,14 @@ def test_an_event_that_reads_what_it_has_made_stale_is_refused_at_construction()
     [
         ({"mode": "intervall"}, "mode='intervall': did you mean 'interval'"),
         ({"mode": "interval"}, "interval_range_s=None with mode='interval'"),
-        ({"mode": "reset", "interval_range_s": (1.0, 2.0)}, "interval_range_s=.* with mode='reset'"),
-        ({"mode": "interval", "interval_range_s": (2.0, 1.0)}, "interval_range_s=.*low exceeds high"),
+        (
+            {"mode": "reset", "interval_range_s": (1.0, 2.0)},
+            "interval_range_s=.* with mode='reset'",
+        ),
+        (
+            {"mode": "interval", "interval_range_s": (2.0, 1.0)},
+            "interval_range_s=.*low exceeds high",
+        ),
     ],
 )
 def test_modes_and_intervals_go_together(fields, message):

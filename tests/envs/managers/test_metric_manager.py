@@ -38,7 +38,9 @@ def finished(env, steps):
     return env.episode_log()
 
 
-@pytest.mark.parametrize(("reduce", "value"), [("mean", -2.5), ("last", -3.0), ("max", -1.0), ("sum", -10.0)])
+@pytest.mark.parametrize(
+    ("reduce", "value"), [("mean", -2.5), ("last", -3.0), ("max", -1.0), ("sum", -10.0)]
+)
 def test_each_reduction_over_whole_episodes(reduce, value):
     env = puck_env(limit=None, episode_length_s=4 * DT, metrics={"wave": Wave(reduce=reduce)})
     log = finished(
@@ -78,7 +80,9 @@ def test_a_failed_world_adds_nothing():
     env.world.qvel_EL.fill_(torch.inf)
     env.step_and_maybe_reset(root_E.set("action", torch.zeros(1, 1)))
     log = env.episode_log()
-    assert log["termination/non_finite"] == 1 and log["metric/speed"] == 2.0 and log["length_sum"] == 3
+    assert (
+        log["termination/non_finite"] == 1 and log["metric/speed"] == 2.0 and log["length_sum"] == 3
+    )
 
 
 def test_the_log_sums_over_rows_that_end_together_and_apart():
@@ -129,7 +133,9 @@ def test_a_metric_of_substeps_is_their_mean():
     # Env e is at 0.005 (e + 1) k m after k substeps; the second step has the substeps 5 to 8.
     factor = 0.005**2 * (1 + 4 + 9)
     torch.testing.assert_close(log["metric/step"], torch.tensor(factor * 8**2))
-    torch.testing.assert_close(log["metric/substep"], torch.tensor(factor * (25 + 36 + 49 + 64) / 4))
+    torch.testing.assert_close(
+        log["metric/substep"], torch.tensor(factor * (25 + 36 + 49 + 64) / 4)
+    )
     torch.testing.assert_close(log["metric/peak"], log["metric/substep"])
     # And so again in the next episode.
     env.episode_log_reset_()

@@ -51,7 +51,11 @@ def test_terms_of_one_kind_are_joined_by_or_and_counted_apart():
     env = ending(Returns(flags=FAILED), Returns(flags=LATE))
     assert flags_of(env)[0] == (True, True, True, False)
     log = env.episode_log()
-    assert (log["termination/term_0"], log["termination/term_1"], log["termination/non_finite"]) == (2, 2, 0)
+    assert (
+        log["termination/term_0"],
+        log["termination/term_1"],
+        log["termination/non_finite"],
+    ) == (2, 2, 0)
     assert log["episodes"] == 3, "a row that ends for two reasons is one episode"
 
 
@@ -68,8 +72,14 @@ def test_without_terms_only_failed_physics_ends_an_episode():
 @pytest.mark.parametrize(
     ("term", "message"),
     [
-        (Returns(flags=(1.0, 0.0, 0.0, 0.0), dtype=torch.float32), r"returns torch\.float32 \(4,\)"),
-        (Returns(flags=((True,),) * 4), r"returns torch\.bool \(4, 1\): expected torch\.bool \(4,\)"),
+        (
+            Returns(flags=(1.0, 0.0, 0.0, 0.0), dtype=torch.float32),
+            r"returns torch\.float32 \(4,\)",
+        ),
+        (
+            Returns(flags=((True,),) * 4),
+            r"returns torch\.bool \(4, 1\): expected torch\.bool \(4,\)",
+        ),
         (Returns(flags=(True,)), r"returns torch\.bool \(1,\)"),
     ],
 )
@@ -80,5 +90,7 @@ def test_flags_of_a_wrong_shape_or_dtype_are_refused_at_construction(term, messa
 
 def test_a_time_out_needs_an_episode_length():
     terms = {"late": Returns(flags=LATE, time_out=True)}
-    with pytest.raises(ValueError, match=r"episode_length_s=0\.0 with the time-out termination 'late'"):
+    with pytest.raises(
+        ValueError, match=r"episode_length_s=0\.0 with the time-out termination 'late'"
+    ):
         puck_cfg(terminations=terms, episode_length_s=0.0)

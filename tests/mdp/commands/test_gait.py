@@ -28,7 +28,9 @@ def turned(cycles):
 
 def gait_env(**fields):
     return puck_env(
-        limit=None, commands={"gait": mdp.SinusoidalGaitCommand(offsets=TROT, **fields)}, episode_length_s=4.0
+        limit=None,
+        commands={"gait": mdp.SinusoidalGaitCommand(offsets=TROT, **fields)},
+        episode_length_s=4.0,
     )
 
 
@@ -42,7 +44,9 @@ def test_each_env_has_a_pace_of_its_own_for_the_episode():
     cycles = phases(gait_env(frequency=(1.0, 3.0)), 20)
     pace_E = turned(cycles[1:, :, 0] - cycles[:-1, :, 0]) / DT
     torch.testing.assert_close(pace_E, pace_E[:1].expand(20, 3), atol=1e-3, rtol=0)
-    assert len(pace_E[0].unique()) == 3 and pace_E.min() >= 1.0 - 1e-3 and pace_E.max() <= 3.0 + 1e-3
+    assert (
+        len(pace_E[0].unique()) == 3 and pace_E.min() >= 1.0 - 1e-3 and pace_E.max() <= 3.0 + 1e-3
+    )
 
 
 def test_a_new_pace_makes_no_jump():

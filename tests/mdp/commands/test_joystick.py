@@ -88,7 +88,10 @@ def test_envs_that_do_not_exist_are_refused(env):
     [
         ({"axes": {}}, r"axes=\{\}"),
         ({"axes": {"vx": (1.0, -1.0)}}, r"axes\.vx"),
-        ({"axes": AXES, "resampling_time_range_s": (1.0, 2.0)}, "resampling_time_range_s=.*never drawn"),
+        (
+            {"axes": AXES, "resampling_time_range_s": (1.0, 2.0)},
+            "resampling_time_range_s=.*never drawn",
+        ),
     ],
 )
 def test_what_makes_no_stick_is_refused(fields, message):

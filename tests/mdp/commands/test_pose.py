@@ -37,12 +37,16 @@ def drawn(bench, term, scope="commands/x", env_index=1):
 def is_even(value_E, low, high):
     assert low <= value_E.min() and value_E.max() <= high
     # The mean of n uniform draws has the standard error (high - low) / sqrt(12 n).
-    assert abs(float(value_E.mean()) - (low + high) / 2) < 4.0 * (high - low) / math.sqrt(12 * len(value_E))
+    assert abs(float(value_E.mean()) - (low + high) / 2) < 4.0 * (high - low) / math.sqrt(
+        12 * len(value_E)
+    )
 
 
 def test_heights_fill_their_range(crowd):
     value_E1 = draw(
-        crowd, mdp.BaseHeightCommand(resampling_time_range_s=SOMETIMES, height=(0.2, 0.4)), scope="c/h"
+        crowd,
+        mdp.BaseHeightCommand(resampling_time_range_s=SOMETIMES, height=(0.2, 0.4)),
+        scope="c/h",
     )
     assert value_E1.shape == (E, 1)
     is_even(value_E1[:, 0], 0.2, 0.4)
@@ -62,7 +66,9 @@ def test_joint_targets_are_offsets_from_the_default_within_the_soft_limits(crowd
 def test_a_cartesian_target_stays_in_the_frame_that_it_was_drawn_in(crowd):
     position = {"x": (0.5, 0.5), "z": (-1.0, 1.0)}
     for frame in ("root", "world"):
-        term = mdp.CartesianCommand(resampling_time_range_s=SOMETIMES, position=position, frame=frame)
+        term = mdp.CartesianCommand(
+            resampling_time_range_s=SOMETIMES, position=position, frame=frame
+        )
         crowd.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0))
         before_E3 = draw(crowd, term, scope=f"c/{frame}").clone()
         assert (before_E3[:, 0] == 0.5).all() and (before_E3[:, 1] == 0.0).all()
@@ -84,7 +90,8 @@ def test_a_cartesian_orientation_is_that_of_mujocos_euler_angles(free_body):
         resampling_time_range_s=SOMETIMES,
         position={"x": (0.3, 0.3)},
         orientation={
-            axis: (angle, angle) for axis, angle in zip(("roll", "pitch", "yaw"), angles, strict=True)
+            axis: (angle, angle)
+            for axis, angle in zip(("roll", "pitch", "yaw"), angles, strict=True)
         },
     )
     target_E7 = draw(free_body, term)
@@ -129,9 +136,13 @@ def test_the_start_pose_stays_when_the_robot_moves(free_body):
     "term",
     [
         mdp.BaseHeightCommand(resampling_time_range_s=SOMETIMES, height=(0.2, 0.4)),
-        mdp.JointPositionCommand(resampling_time_range_s=SOMETIMES, joints=".*", offset=(-0.1, 0.1)),
+        mdp.JointPositionCommand(
+            resampling_time_range_s=SOMETIMES, joints=".*", offset=(-0.1, 0.1)
+        ),
         mdp.CartesianCommand(
-            resampling_time_range_s=SOMETIMES, position={"x": (0.0, 1.0)}, orientation={"yaw": (0.0, 1.0)}
+            resampling_time_range_s=SOMETIMES,
+            position={"x": (0.0, 1.0)},
+            orientation={"yaw": (0.0, 1.0)},
         ),
     ],
     ids=lambda term: type(term).__name__,
@@ -181,7 +192,10 @@ def test_each_draws_what_it_asks_for(free_body):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: mdp.BaseHeightCommand(resampling_time_range_s=SOMETIMES, height=(0.4, 0.2)), "height"),
+        (
+            lambda: mdp.BaseHeightCommand(resampling_time_range_s=SOMETIMES, height=(0.4, 0.2)),
+            "height",
+        ),
         (
             lambda: mdp.CartesianCommand(resampling_time_range_s=None, position={"yaw": (0, 1)}),
             "position key 'yaw'.*x, y, z",

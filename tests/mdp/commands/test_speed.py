@@ -29,7 +29,10 @@ class SpeedSeen(ObservationTerm):
 
     def __call__(self, view: EnvView) -> Tensor:
         speed_E, is_fast_E = commanded_speed(view, "twist"), is_commanded(view, "twist", 7.5)
-        assert commanded_speed(view, "twist") is speed_E and is_commanded(view, "twist", 7.5) is is_fast_E
+        assert (
+            commanded_speed(view, "twist") is speed_E
+            and is_commanded(view, "twist", 7.5) is is_fast_E
+        )
         return torch.stack((speed_E, is_fast_E), dim=-1)
 
 
@@ -55,5 +58,7 @@ def test_rewards_see_the_old_command_and_observations_the_new_one():
     for speed in (6.0, 7.0, 8.0):
         step_E = push(env, root_E)
         assert step_E["next", "reward"].tolist() == [[speed]] * 3
-        assert step_E["next", "obs", "speed"].tolist() == [[speed + 1.0, float(speed + 1.0 > 7.5)]] * 3
+        assert (
+            step_E["next", "obs", "speed"].tolist() == [[speed + 1.0, float(speed + 1.0 > 7.5)]] * 3
+        )
         root_E = step_E["next"].exclude("reward")

@@ -69,7 +69,9 @@ def test_heading_control_turns_the_short_way_within_the_yaw_range(crowd):
     headed(crowd, -3.0)  # the error is 6 rad, or 6 - 2 pi = -0.283 the other way
     with crowd.driver.scope("commands/heading"):
         value = term(crowd.view)
-    torch.testing.assert_close(value[:, 2], torch.full((E,), 0.5 * (6.0 - 2 * math.pi)), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        value[:, 2], torch.full((E,), 0.5 * (6.0 - 2 * math.pi)), atol=1e-4, rtol=0
+    )
     headed(crowd, 0.0)
     with crowd.driver.scope("commands/heading"):
         assert (term(crowd.view)[:, 2] == 0.5).all()
@@ -112,7 +114,9 @@ def test_debug_drawing_shows_command_and_velocity(free_body):
             self.arrows.append([float(x) for x in end - start])
 
     half = math.pi / 4
-    free_body.place(qpos=(0, 0, 1, math.cos(half), 0, 0, math.sin(half), 0, 0), qvel=(1, 0, 0, 0, 0, 0, 0, 0))
+    free_body.place(
+        qpos=(0, 0, 1, math.cos(half), 0, 0, math.sin(half), 0, 0), qvel=(1, 0, 0, 0, 0, 0, 0, 0)
+    )
     term, recorder = command(lin_vel_x=(1.0, 1.0), lin_vel_y=(0.0, 0.0)), Recorder()
     draw(free_body, term)
     with free_body.driver.scope("commands/twist"):

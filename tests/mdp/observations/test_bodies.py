@@ -27,7 +27,8 @@ def rotation(d):
 def test_positions(chain):
     bench, names, ids = chain
     close(
-        bench.read(mdp.BodyPos(bodies=names, frame="world")), engine(bench, lambda m, d: d.xpos[ids].ravel())
+        bench.read(mdp.BodyPos(bodies=names, frame="world")),
+        engine(bench, lambda m, d: d.xpos[ids].ravel()),
     )
     expected = engine(bench, lambda m, d: ((d.xpos[ids] - d.xpos[1]) @ rotation(d).T).ravel())
     close(bench.read(mdp.BodyPos(bodies=names)), expected)
@@ -43,7 +44,9 @@ def test_orientations(chain):
         return d.xmat[ids].reshape(-1, 3, 3)
 
     for frame, matrices in (("root", relative), ("world", in_world)):
-        six = engine(bench, lambda m, d, matrices=matrices: matrices(m, d)[:, :, :2].swapaxes(1, 2).ravel())
+        six = engine(
+            bench, lambda m, d, matrices=matrices: matrices(m, d)[:, :, :2].swapaxes(1, 2).ravel()
+        )
         close(bench.read(mdp.BodyRotation6d(bodies=names, frame=frame)), six)
         quat = bench.read(mdp.BodyQuat(bodies=names, frame=frame)).view(E, 2, 4)
         rows = []
@@ -66,17 +69,22 @@ def test_orientations_of_sites(chain):
 
     world = bench.read(mdp.SiteRotation6d(sites=names, frame="world"))
     close(world, engine(bench, lambda m, d: six(d, np.eye(3))))
-    close(bench.read(mdp.SiteRotation6d(sites=names)), engine(bench, lambda m, d: six(d, rotation(d))))
+    close(
+        bench.read(mdp.SiteRotation6d(sites=names)), engine(bench, lambda m, d: six(d, rotation(d)))
+    )
 
 
 def test_inertias(chain):
     bench, names, ids = chain
     close(
-        bench.read(mdp.CenterOfMassInertia(bodies=names)), engine(bench, lambda m, d: d.cinert[ids].ravel())
+        bench.read(mdp.CenterOfMassInertia(bodies=names)),
+        engine(bench, lambda m, d: d.cinert[ids].ravel()),
     )
 
 
-@pytest.mark.parametrize(("term", "part"), [(mdp.BodyLinVel, "linear"), (mdp.BodyAngVel, "angular")])
+@pytest.mark.parametrize(
+    ("term", "part"), [(mdp.BodyLinVel, "linear"), (mdp.BodyAngVel, "angular")]
+)
 def test_velocities(chain, term, part):
     bench, names, ids = chain
     close(
@@ -99,9 +107,16 @@ def test_centres_of_mass(chain):
         return d.subtree_linvel[ids]
 
     world = {"bodies": bodies, "frame": "world"}
-    close(bench.read(mdp.CenterOfMassPos(**world)), engine(bench, lambda m, d: d.subtree_com[ids].ravel()))
-    close(bench.read(mdp.CenterOfMassVel(**world)), engine(bench, lambda m, d: speeds(m, d).ravel()))
-    expected = engine(bench, lambda m, d: ((d.subtree_com[ids] - d.xpos[1]) @ rotation(d).T).ravel())
+    close(
+        bench.read(mdp.CenterOfMassPos(**world)),
+        engine(bench, lambda m, d: d.subtree_com[ids].ravel()),
+    )
+    close(
+        bench.read(mdp.CenterOfMassVel(**world)), engine(bench, lambda m, d: speeds(m, d).ravel())
+    )
+    expected = engine(
+        bench, lambda m, d: ((d.subtree_com[ids] - d.xpos[1]) @ rotation(d).T).ravel()
+    )
     close(bench.read(mdp.CenterOfMassPos(bodies=bodies)), expected)
     expected = engine(bench, lambda m, d: (speeds(m, d) @ rotation(d).T).ravel())
     close(bench.read(mdp.CenterOfMassVel(bodies=bodies)), expected)

@@ -68,7 +68,9 @@ def test_contact_terms_of_resting_and_lifted_boxes(boxes):
 
 
 def test_contact_forces_keep_their_sign(make_bench):
-    bench = make_bench(BLOCK_UNDER_CEILING, 1, {"touch": ContactSensor(geoms=("a",), against="ceiling")})
+    bench = make_bench(
+        BLOCK_UNDER_CEILING, 1, {"touch": ContactSensor(geoms=("a",), against="ceiling")}
+    )
     for _ in range(20):
         bench.step()
     force = bench.read(mdp.FootContactForces(sensor="touch"))

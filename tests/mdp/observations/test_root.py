@@ -46,7 +46,9 @@ def test_root_pose(free_body):
 
 def test_root_terms_read_the_entity_that_is_named(make_bench):
     bench = make_bench(ROBOT_AND_CUBE, 1, entities=("robot", "cube"))
-    bench.place(qpos=(0, 0, 1, 1, 0, 0, 0, 2, 0, 1, *YAW_90), qvel=(1, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0, 4))
+    bench.place(
+        qpos=(0, 0, 1, 1, 0, 0, 0, 2, 0, 1, *YAW_90), qvel=(1, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0, 4)
+    )
     close(bench.read(mdp.RootPos(entity="cube")), [2.0, 0.0, 1.0])
     close(bench.read(mdp.RootQuat(entity="cube")), YAW_90)
     close(bench.read(mdp.RootRotation6d(entity="cube")), [0.0, 1.0, 0.0, -1.0, 0.0, 0.0])

@@ -67,7 +67,9 @@ RICH = (
         <light name="torch" pos="0.1 0.1 0" dir="1 0 -0.5" diffuse="0.5 0.5 0.5"/>
         <geom name="belly" type="box" material="paint\"""",
     )
-    .replace('<body name="tail" pos="-0.25 0 0">', '<body name="tail" pos="-0.25 0 0" euler="0.1 0 0.2">')
+    .replace(
+        '<body name="tail" pos="-0.25 0 0">', '<body name="tail" pos="-0.25 0 0" euler="0.1 0 0.2">'
+    )
     .replace(
         "<actuator>",
         """<contact><pair name="sole" geom1="floor" geom2="right_foot" condim="6" friction="0.5 0.5 0.01 0.001 0.001"/>
@@ -111,7 +113,10 @@ class Runners:
     """Worlds of RUNNER or RICH whose fields an event may change; `restart` gives them back the model's own."""
 
     def __init__(self, num_envs: int, device: str = "cpu", *, rich: bool = False) -> None:
-        spec, fields = mujoco.MjSpec.from_string(RICH if rich else RUNNER), RICH_FIELDS if rich else FIELDS
+        spec, fields = (
+            mujoco.MjSpec.from_string(RICH if rich else RUNNER),
+            RICH_FIELDS if rich else FIELDS,
+        )
         prepare_spec(spec, fields)
         self.world = World(
             load_model(spec),
@@ -127,11 +132,15 @@ class Runners:
 
     def restart(self) -> None:
         self.world.load_state_dict(self.own)
-        self.view.default_joint_pos_EL.copy_(torch.tensor((0.1, -0.1, 0.05)).expand(self.world.num_envs, 3))
+        self.view.default_joint_pos_EL.copy_(
+            torch.tensor((0.1, -0.1, 0.05)).expand(self.world.num_envs, 3)
+        )
         for counter in (self.view.seed, self.view.step_count, self.view.reset_count_E):
             counter.zero_()
 
-    def fire(self, event: EventTerm, mask_E: torch.Tensor | None = None, scope: str = "events/x") -> None:
+    def fire(
+        self, event: EventTerm, mask_E: torch.Tensor | None = None, scope: str = "events/x"
+    ) -> None:
         """Run an event for some rows (all by default), and recompute what follows from it, as the env does."""
         mask_E = self.everybody_E if mask_E is None else mask_E
         with self.driver.scope(scope, self.view.reset_count_E):
@@ -143,7 +152,9 @@ class Runners:
         self.world.qpos_EL.copy_(torch.tensor(START_QPOS).expand_as(self.world.qpos_EL))
         self.world.qpos_EL[:, 3:7] /= self.world.qpos_EL[:, 3:7].norm(dim=-1, keepdim=True)
         self.world.qvel_EL.copy_(torch.tensor(START_QVEL).expand_as(self.world.qvel_EL))
-        self.world.ctrl_EL.copy_(torch.tensor(CTRL[-self.world.mj_model.nu :]).expand_as(self.world.ctrl_EL))
+        self.world.ctrl_EL.copy_(
+            torch.tensor(CTRL[-self.world.mj_model.nu :]).expand_as(self.world.ctrl_EL)
+        )
 
     def run(self, substeps: int) -> np.ndarray:
         """Start all worlds alike and return where they end, qpos and qvel, [E, nq + nv]."""

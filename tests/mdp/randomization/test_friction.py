@@ -117,7 +117,9 @@ def test_one_pair_of_numbers_is_for_columns_that_mean_the_same(event, count):
 
 @pytest.mark.parametrize("column", range(5))
 def test_a_build_warns_of_columns_of_pairs_that_no_contact_of_the_c_engine_feels(column):
-    pair = '<contact><pair name="p" geom1="box" geom2="floor" condim="{condim}"/></contact></mujoco>'
+    pair = (
+        '<contact><pair name="p" geom1="box" geom2="floor" condim="{condim}"/></contact></mujoco>'
+    )
     for condim in (3, 4, 6):
         text = BOX.format(**PLAIN).replace("</mujoco>", pair.format(condim=condim))
         _, said = build(text, mdp.RandomizePairFriction(pairs="p", ranges={column: (0.4, 0.5)}))

@@ -86,7 +86,9 @@ def test_ranges_by_name_survive_a_config_and_are_checked():
 
 
 def test_log_uniform_spreads_evenly_over_decades(crowd):
-    event = mdp.RandomizeGeomFriction(geoms="a", ranges={1: (1e-4, 1e-2)}, distribution="log_uniform")
+    event = mdp.RandomizeGeomFriction(
+        geoms="a", ranges={1: (1e-4, 1e-2)}, distribution="log_uniform"
+    )
     crowd.fire(event)
     exponent = torch.log10(crowd.view.field("geom_friction")[:, 1, 1])
     assert exponent.min() >= -4.0 - 1e-5 and exponent.max() <= -2.0 + 1e-5
@@ -124,7 +126,9 @@ def test_friction_stops_a_sliding_box_after_its_braking_distance(make_bench):
     for _ in range(30):
         bench.step()
     # v^2 / (2 mu g) with v = 1 m/s and g = 10 m/s^2
-    torch.testing.assert_close(bench.world.qpos_EL[:, 0], torch.tensor([0.125, 0.0625]), atol=0.01, rtol=0)
+    torch.testing.assert_close(
+        bench.world.qpos_EL[:, 0], torch.tensor([0.125, 0.0625]), atol=0.01, rtol=0
+    )
 
 
 def test_encoder_bias_is_drawn_per_joint_and_world(make_bench):
@@ -133,8 +137,14 @@ def test_encoder_bias_is_drawn_per_joint_and_world(make_bench):
     bias = bench.view.encoder_bias_EL
     assert -0.015 <= bias.min() < -0.0148 and 0.0148 < bias.max() <= 0.015
     assert (bias[:, 0] != bias[:, 1]).float().mean() > 0.99
-    bench.fire(mdp.RandomizeEncoderBias(ranges=(1.0, 1.0), joints="right_hip"), torch.arange(E) < 10)
-    assert (bias[:10, 1] == 1.0).all() and bias[10:].abs().max() <= 0.015 and bias[:, 0].abs().max() <= 0.015
+    bench.fire(
+        mdp.RandomizeEncoderBias(ranges=(1.0, 1.0), joints="right_hip"), torch.arange(E) < 10
+    )
+    assert (
+        (bias[:10, 1] == 1.0).all()
+        and bias[10:].abs().max() <= 0.015
+        and bias[:, 0].abs().max() <= 0.015
+    )
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +159,9 @@ def moments(values: torch.Tensor) -> tuple[float, float]:
 
 def test_gaussian_draws_have_the_mean_and_the_deviation(herd):
     herd.restart()
-    herd.fire(mdp.RandomizeJointDamping(joints=".*_hip", ranges=(1.0, 0.2), distribution="gaussian"))
+    herd.fire(
+        mdp.RandomizeJointDamping(joints=".*_hip", ranges=(1.0, 0.2), distribution="gaussian")
+    )
     damping = herd.view.field("dof_damping")[:, 6:8]
     mean, deviation = moments(damping)
     assert abs(mean - 1.0) < 4.0 * 0.2 / math.sqrt(2 * E)
@@ -170,7 +182,9 @@ def test_draws_of_elements_and_columns_are_independent(herd):
 def test_shared_draws_are_one_per_world_in_each_kind_of_term(herd):
     herd.restart()
     herd.fire(mdp.RandomizeBodyMass(bodies=".*_leg", ranges=(0.5, 2.0), shared=True))
-    herd.fire(mdp.RandomizeActuatorGains(joints=("tail", "left_hip"), damping=(0.5, 2.0), shared=True))
+    herd.fire(
+        mdp.RandomizeActuatorGains(joints=("tail", "left_hip"), damping=(0.5, 2.0), shared=True)
+    )
     model = herd.world.mj_model
     legs = [model.body("left_leg").id, model.body("right_leg").id]
     factor = herd.view.field("body_mass")[:, legs] / torch.tensor(model.body_mass[legs])
@@ -186,7 +200,9 @@ def test_masses_keep_the_shape_of_their_body(herd):
     herd.fire(mdp.RandomizeBodyMass(bodies="trunk", ranges=(1.0, 6.0), operation="abs"))
     mass, inertia = herd.view.field("body_mass")[:, 1], herd.view.field("body_inertia")[:, 1]
     assert mass.min() >= 1.0 and mass.max() <= 6.0
-    torch.testing.assert_close(inertia / mass[:, None], torch.tensor([[0.02, 0.03, 0.04]]).expand(E, 3) / 3.0)
+    torch.testing.assert_close(
+        inertia / mass[:, None], torch.tensor([[0.02, 0.03, 0.04]]).expand(E, 3) / 3.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -194,7 +210,11 @@ def test_masses_keep_the_shape_of_their_body(herd):
     [
         mdp.RandomizeBodyInertia(bodies=".*", ranges=(0.05, 20.0), distribution="log_uniform"),
         mdp.RandomizePseudoInertia(
-            bodies=".*", alpha=(-1.0, 1.0), stretch=(-1.0, 1.0), shear=(-1.0, 1.0), shift=(-0.2, 0.2)
+            bodies=".*",
+            alpha=(-1.0, 1.0),
+            stretch=(-1.0, 1.0),
+            shear=(-1.0, 1.0),
+            shift=(-0.2, 0.2),
         ),
     ],
     ids=("inertia", "pseudo_inertia"),
@@ -224,7 +244,12 @@ def test_pseudo_inertia_is_the_deformed_one(herd):
     for row in range(0, E, 100):
         a, d1, d2, d3, s12, s23_13, s23, t1, t2, t3 = parameters[row]
         u = np.exp(a) * np.array(
-            [[np.exp(d1), s12, s23_13, t1], [0, np.exp(d2), s23, t2], [0, 0, np.exp(d3), t3], [0, 0, 0, 1]]
+            [
+                [np.exp(d1), s12, s23_13, t1],
+                [0, np.exp(d2), s23, t2],
+                [0, 0, np.exp(d3), t3],
+                [0, 0, 0, 1],
+            ]
         )
         # The deformation acts in the principal frame, which here differs from the body's by a shift only.
         shift = np.eye(4)
@@ -241,7 +266,9 @@ def pseudo_inertia(model: mujoco.MjModel, herd: Runners | None, row: int = 0) ->
     if herd is None:
         mass, com, moments, quat = (np.array(getattr(model, field)[1]) for field in fields)
     else:
-        mass, com, moments, quat = (herd.view.field(field)[row, 1].double().numpy() for field in fields)
+        mass, com, moments, quat = (
+            herd.view.field(field)[row, 1].double().numpy() for field in fields
+        )
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, quat)
     inertia = axes.reshape(3, 3) @ np.diag(moments) @ axes.reshape(3, 3).T
@@ -254,7 +281,9 @@ def pseudo_inertia(model: mujoco.MjModel, herd: Runners | None, row: int = 0) ->
 
 def test_default_joint_pos_moves_what_joint_positions_are_relative_to(herd):
     herd.restart()
-    herd.fire(mdp.RandomizeDefaultJointPos(joints=".*_hip", ranges=(-0.1, 0.1)), torch.arange(E) >= 10)
+    herd.fire(
+        mdp.RandomizeDefaultJointPos(joints=".*_hip", ranges=(-0.1, 0.1)), torch.arange(E) >= 10
+    )
     herd.world.qpos_EL[:, 7:] = torch.tensor((0.1, -0.1, 0.05))
     herd.driver.refreshed()
     offset = herd.view.joint_pos_rel_EL
@@ -357,7 +386,9 @@ class Kernels(TorchDispatchMode):
     "event",
     [
         mdp.RandomizeBodyMass(bodies=("trunk", ".*_leg", "tail"), ranges=(0.8, 1.2)),
-        mdp.RandomizeBodyCom(bodies=("trunk", ".*_leg", "tail"), ranges=(-0.1, 0.1), operation="add"),
+        mdp.RandomizeBodyCom(
+            bodies=("trunk", ".*_leg", "tail"), ranges=(-0.1, 0.1), operation="add"
+        ),
     ],
 )
 def test_draws_of_all_bodies_take_one_kernel(herd, event, monkeypatch):

@@ -50,7 +50,11 @@ def runner_env(
 def fields(env: ManagerBasedRlEnv) -> dict[str, torch.Tensor]:
     """Copies of all fields and constants that differ between worlds."""
     state = env.world.state_dict()
-    return {name.removeprefix("field/"): value for name, value in state.items() if name.startswith("field/")}
+    return {
+        name.removeprefix("field/"): value
+        for name, value in state.items()
+        if name.startswith("field/")
+    }
 
 
 def assert_constants_follow(env: ManagerBasedRlEnv) -> None:
@@ -71,7 +75,9 @@ def env():
     return runner_env(
         {
             "com": mdp.RandomizeBodyCom(bodies="trunk", ranges=(-0.05, 0.05), operation="add"),
-            "mass": mdp.RandomizeBodyMass(bodies=("trunk", ".*_leg"), ranges=(0.5, 2.0), mode="reset"),
+            "mass": mdp.RandomizeBodyMass(
+                bodies=("trunk", ".*_leg"), ranges=(0.5, 2.0), mode="reset"
+            ),
             "armature": mdp.RandomizeJointArmature(
                 ranges=(0.01, 0.1), mode="interval", interval_range_s=(0.008, 0.008)
             ),
@@ -149,18 +155,23 @@ def test_explicit_actuators_take_gains_and_limits_of_their_world():
     )
     root = env.reset()
     env.step(root.set("action", torch.ones(E, 1)))
-    stiffness, limit = (env.view.actuator_param(name)[:, 0] for name in ("stiffness", "effort_limit"))
+    stiffness, limit = (
+        env.view.actuator_param(name)[:, 0] for name in ("stiffness", "effort_limit")
+    )
     assert stiffness.std() > 1.0 and limit.std() > 0.3
     assert (stiffness >= 4.0).all() and (stiffness <= 40.0).all() and (limit <= 4.0).all()
     # The hip starts at its default pose, and the action asks for half a radian more.
     asked = torch.minimum(0.5 * stiffness, limit)
     actuator = env.world.mj_model.actuator("left_hip").id
-    torch.testing.assert_close(env.world.actuator_force_EL[:, actuator], asked, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        env.world.actuator_force_EL[:, actuator], asked, rtol=1e-5, atol=1e-5
+    )
 
 
 def test_a_factor_on_the_limit_of_an_unlimited_motor_is_refused():
     servo = IdealPDActuator(joints="left_hip", stiffness=20.0, damping=0.0)
     with pytest.raises(ValueError, match="nothing limits the effort on joint 'left_hip'"):
         runner_env(
-            {"limit": mdp.RandomizeEffortLimit(joints="left_hip", ranges=(0.1, 1.0))}, actuators=(servo,)
+            {"limit": mdp.RandomizeEffortLimit(joints="left_hip", ranges=(0.1, 1.0))},
+            actuators=(servo,),
         )

@@ -16,12 +16,18 @@ SUBSTEPS = 60
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
 
 EVENTS = {
-    "friction": mdp.RandomizeGeomFriction(geoms=".*_foot", ranges={0: (0.3, 1.5), 1: (0.005, 0.05)}),
+    "friction": mdp.RandomizeGeomFriction(
+        geoms=".*_foot", ranges={0: (0.3, 1.5), 1: (0.005, 0.05)}
+    ),
     "size": mdp.RandomizeGeomSize(geoms=".*_foot", ranges={0: (1.1, 1.4)}, operation="scale"),
     "geom_pos": mdp.RandomizeGeomPos(geoms=".*_foot", ranges=(-0.03, 0.03)),
-    "geom_quat": mdp.RandomizeGeomQuat(geoms="right_foot", ranges={"pitch": (0.4, 0.8), "roll": (-0.2, 0.2)}),
+    "geom_quat": mdp.RandomizeGeomQuat(
+        geoms="right_foot", ranges={"pitch": (0.4, 0.8), "roll": (-0.2, 0.2)}
+    ),
     "mass": mdp.RandomizeBodyMass(bodies=("trunk", "left_leg"), ranges=(0.7, 1.5)),
-    "inertia": mdp.RandomizeBodyInertia(bodies="trunk", ranges=(0.3, 3.0), distribution="log_uniform"),
+    "inertia": mdp.RandomizeBodyInertia(
+        bodies="trunk", ranges=(0.3, 3.0), distribution="log_uniform"
+    ),
     "com": mdp.RandomizeBodyCom(bodies="trunk", ranges=(-0.05, 0.05), operation="add"),
     "pseudo_inertia": mdp.RandomizePseudoInertia(
         bodies=("trunk", "left_leg"),
@@ -57,18 +63,30 @@ RICH_EVENTS = {
 # What is seen, and moves nothing.
 SEEN_EVENTS = {
     "camera_pos": mdp.RandomizeCameraPos(cameras=".*", ranges=(-0.1, 0.1)),
-    "camera_quat": mdp.RandomizeCameraQuat(cameras="eye", ranges={"roll": (-0.2, 0.2), "yaw": (0.1, 0.3)}),
-    "field_of_view": mdp.RandomizeCameraFieldOfView(cameras="eye", ranges=(0.8, 1.2), operation="scale"),
-    "intrinsic": mdp.RandomizeCameraIntrinsic(cameras="lens", ranges={0: (0.9, 1.1), 1: (0.9, 1.1)}),
+    "camera_quat": mdp.RandomizeCameraQuat(
+        cameras="eye", ranges={"roll": (-0.2, 0.2), "yaw": (0.1, 0.3)}
+    ),
+    "field_of_view": mdp.RandomizeCameraFieldOfView(
+        cameras="eye", ranges=(0.8, 1.2), operation="scale"
+    ),
+    "intrinsic": mdp.RandomizeCameraIntrinsic(
+        cameras="lens", ranges={0: (0.9, 1.1), 1: (0.9, 1.1)}
+    ),
     "light_pos": mdp.RandomizeLightPos(lights=("lamp", "torch"), ranges=(-0.1, 0.1)),
-    "light_dir": mdp.RandomizeLightDir(lights=".*", ranges={"roll": (-0.3, 0.3), "pitch": (-0.3, 0.3)}),
+    "light_dir": mdp.RandomizeLightDir(
+        lights=".*", ranges={"roll": (-0.3, 0.3), "pitch": (-0.3, 0.3)}
+    ),
     "light_diffuse": mdp.RandomizeLightColor(lights="torch", ranges=(0.2, 0.9)),
     "light_ambient": mdp.RandomizeLightColor(lights="torch", part="ambient", ranges=(0.0, 0.2)),
     "light_specular": mdp.RandomizeLightColor(lights="torch", part="specular", ranges=(0.0, 0.2)),
     "material_color": mdp.RandomizeMaterialColor(materials="paint", ranges={0: (0.0, 1.0)}),
-    "material_emission": mdp.RandomizeMaterialShine(materials="paint", part="emission", ranges=(0.0, 1.0)),
+    "material_emission": mdp.RandomizeMaterialShine(
+        materials="paint", part="emission", ranges=(0.0, 1.0)
+    ),
     "material_specular": mdp.RandomizeMaterialShine(materials="paint", ranges=(0.0, 1.0)),
-    "material_shininess": mdp.RandomizeMaterialShine(materials="paint", part="shininess", ranges=(0.0, 1.0)),
+    "material_shininess": mdp.RandomizeMaterialShine(
+        materials="paint", part="shininess", ranges=(0.0, 1.0)
+    ),
     "geom_color": mdp.RandomizeGeomColor(geoms=".*_foot", ranges={1: (0.0, 1.0)}),
 }
 ALL = EVENTS | RICH_EVENTS | SEEN_EVENTS
@@ -137,7 +155,9 @@ def test_elements_turn_about_their_own_axes(rich_runners):
     mujoco.mju_quat2Mat(own, site.quat)
     mujoco.mju_quat2Mat(turned, rich_runners.world.field("site_quat")[0, site.id].double().numpy())
     own, turned = own.reshape(3, 3), turned.reshape(3, 3)
-    np.testing.assert_allclose(turned, np.stack((own[:, 1], -own[:, 0], own[:, 2]), axis=-1), atol=1e-6)
+    np.testing.assert_allclose(
+        turned, np.stack((own[:, 1], -own[:, 0], own[:, 2]), axis=-1), atol=1e-6
+    )
 
 
 def test_mass_com_and_inertia_events_of_one_reset_act_together(plain_runners):
@@ -167,7 +187,8 @@ def test_other_rows_keep_all_fields_and_constants_bit_for_bit(runners, name):
         if key.startswith("field/"):
             assert torch.equal(after[key][~mask_E], value[~mask_E]), key
     assert any(
-        not torch.equal(after[f"field/{f}"][1], before[f"field/{f}"][1]) for f in ALL[name].per_world_fields
+        not torch.equal(after[f"field/{f}"][1], before[f"field/{f}"][1])
+        for f in ALL[name].per_world_fields
     )
     for key in before:
         if not key.startswith("field/"):

@@ -47,6 +47,8 @@ def test_each_world_is_seen_as_its_model_would_be(runners, name, camera):
     assert (seen_EHW3[0] != seen_EHW3[1:]).any(), "the worlds do not differ"
     for row in range(E):
         assert (seen_EHW3[row] != undisturbed_HW3).any(), "it cannot be seen"
-        edited = World(runners.c_model(row, event.per_world_fields), num_envs=1, per_world_fields=RICH_FIELDS)
+        edited = World(
+            runners.c_model(row, event.per_world_fields), num_envs=1, per_world_fields=RICH_FIELDS
+        )
         edited.qpos_EL.copy_(runners.world.qpos_EL[:1])
         assert (picture(edited, camera)[0] - seen_EHW3[row]).abs().max() <= 1

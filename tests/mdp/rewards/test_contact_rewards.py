@@ -59,7 +59,11 @@ def substeps_above(model, height, *, steps, threshold):
 
 def test_self_collision_counts_the_substeps_of_a_hard_contact(make_bench):
     sensor = ContactSensor(
-        subtrees=("frame",), against="frame", against_kind="subtree", reduce="strongest", every_substep=True
+        subtrees=("frame",),
+        against="frame",
+        against_kind="subtree",
+        reduce="strongest",
+        every_substep=True,
     )
     bench = make_bench(HAMMER, 2, {"own": sensor})
     bench.place(qpos=[[0.06], [1.0]])
@@ -73,7 +77,9 @@ def test_self_collision_counts_the_substeps_of_a_hard_contact(make_bench):
     assert set(hovering[:20]) == {0.0}
     # It lands within an env step, and in the end the 20 N of its weight exceed 10 N in each substep, never 30 N.
     assert {count for count in expected if 0 < count < 10} and expected[-1] == 10
-    assert bench.read(mdp.SelfCollision(sensor="own", threshold=30.0), "rewards/x").tolist()[0] == 0.0
+    assert (
+        bench.read(mdp.SelfCollision(sensor="own", threshold=30.0), "rewards/x").tolist()[0] == 0.0
+    )
 
 
 @pytest.mark.parametrize("term", [mdp.ContactForceAbove, mdp.UndesiredContacts, mdp.SelfCollision])

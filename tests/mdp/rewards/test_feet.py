@@ -23,7 +23,9 @@ def test_clearance_weighs_the_height_error_by_the_horizontal_speed(free_body):
     free_body.command([MOVING, IDLE, [0.0, 0.0, -0.06]])
     term = mdp.FootClearance(sites=("left_foot", "right_foot"), target_height=0.1, **GATE)
     value = free_body.read(term, "rewards/x")
-    torch.testing.assert_close(value, 0.05 * (0.8 + 0.4) * torch.tensor([1.0, 0.0, 1.0]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        value, 0.05 * (0.8 + 0.4) * torch.tensor([1.0, 0.0, 1.0]), atol=1e-5, rtol=0
+    )
 
 
 def test_clearance_ignores_vertical_motion(free_body):
@@ -47,7 +49,9 @@ def slips_of_c(model, heights, *, steps):
             mujoco.mj_objectVelocity(
                 model, data, mujoco.mjtObj.mjOBJ_SITE, model.site(name).id, velocity_6, False
             )
-            slips[-1] += (data.sensor(f"touch_{name}").data[0] > 0) * float(np.square(velocity_6[3:5]).sum())
+            slips[-1] += (data.sensor(f"touch_{name}").data[0] > 0) * float(
+                np.square(velocity_6[3:5]).sum()
+            )
     return slips
 
 
@@ -133,7 +137,9 @@ def test_swing_height_is_paid_at_landing_and_starts_anew(boxes):
     lower = float(boxes.world.site_xpos_EL[0, 1, 2])
     boxes.place(qpos=boxes_at(0.0, 0.0), qvel=torch.zeros(12))
     boxes.step()
-    torch.testing.assert_close(read(), torch.tensor([(lower / 0.2 - 1.0) ** 2, 0.0]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        read(), torch.tensor([(lower / 0.2 - 1.0) ** 2, 0.0]), atol=1e-5, rtol=0
+    )
 
 
 def test_swing_height_forgets_at_a_reset(boxes):
@@ -209,7 +215,12 @@ def test_gait_phase_is_the_share_of_feet_in_the_wanted_phase(boxes):
     boxes.place(qpos=boxes_at(0.0, 0.5))
     boxes.step()
     # Box a stands, box b is in the air. Sines ask: swing where positive.
-    for sines, share in (((-0.5, 0.5), 1.0), ((0.5, -0.5), 0.0), ((-0.5, -0.5), 0.5), ((0.5, 0.5), 0.5)):
+    for sines, share in (
+        ((-0.5, 0.5), 1.0),
+        ((0.5, -0.5), 0.0),
+        ((-0.5, -0.5), 0.5),
+        ((0.5, 0.5), 0.5),
+    ):
         boxes.driver.readings.commands["gait"] = torch.tensor([[*sines, 9.0, 9.0]]).expand(2, 4)
         assert boxes.read(term, "rewards/x").tolist() == [share, share]
     boxes.command([MOVING, IDLE])

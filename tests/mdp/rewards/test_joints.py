@@ -15,12 +15,16 @@ def wheels(make_bench):
 
 
 def check(bench, term, expected, atol=1e-5):
-    torch.testing.assert_close(bench.read(term, "rewards/x"), torch.tensor(expected), atol=atol, rtol=1e-5)
+    torch.testing.assert_close(
+        bench.read(term, "rewards/x"), torch.tensor(expected), atol=atol, rtol=1e-5
+    )
 
 
 def test_position_limits_count_the_overshoot_of_the_soft_range(free_body):
     # Half of (-1, 1) is (-0.5, 0.5), half of (0, 2) is (0.5, 1.5).
-    free_body.place(qpos=[(0, 0, 1, 1, 0, 0, 0, *angles) for angles in ((0.4, 1.4), (-0.7, 1.6), (0.8, 0.1))])
+    free_body.place(
+        qpos=[(0, 0, 1, 1, 0, 0, 0, *angles) for angles in ((0.4, 1.4), (-0.7, 1.6), (0.8, 0.1))]
+    )
     check(free_body, mdp.JointPosLimits(), [0.0, 0.3, 0.7])
     check(free_body, mdp.JointPosLimits(joints="left_hip"), [0.0, 0.2, 0.3])
 

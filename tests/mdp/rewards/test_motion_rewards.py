@@ -19,7 +19,9 @@ SPINNER = """
 
 def check(bench, term, expected, atol=1e-5):
     value = bench.read(term, "rewards/x")
-    torch.testing.assert_close(value, torch.as_tensor(expected).expand_as(value), atol=atol, rtol=1e-5)
+    torch.testing.assert_close(
+        value, torch.as_tensor(expected).expand_as(value), atol=atol, rtol=1e-5
+    )
 
 
 def test_off_axis_velocities_are_the_roots_own(free_body):

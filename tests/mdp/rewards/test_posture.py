@@ -35,7 +35,9 @@ def test_upright_of_another_body_sees_its_joint(free_body):
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0.5, 0))
     left = free_body.read(mdp.Upright(std=1.0, body="left"), "rewards/x")
     trunk = free_body.read(mdp.Upright(std=1.0), "rewards/x")
-    torch.testing.assert_close(left, torch.full((3,), math.exp(-(math.sin(0.5) ** 2))), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        left, torch.full((3,), math.exp(-(math.sin(0.5) ** 2))), atol=1e-5, rtol=0
+    )
     torch.testing.assert_close(trunk, torch.ones(3))
 
 
@@ -93,14 +95,23 @@ def test_tilt_about_one_axis_alone(free_body, body, about, axis):
         value = free_body.read(mdp.TiltL2(body=body, about=wanted), "rewards/x")
         torch.testing.assert_close(value, torch.full((3,), expected), atol=1e-5, rtol=0)
         upright = free_body.read(mdp.Upright(std=0.5, body=body, about=wanted), "rewards/x")
-        torch.testing.assert_close(upright, torch.full((3,), math.exp(-expected / 0.25)), atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            upright, torch.full((3,), math.exp(-expected / 0.25)), atol=1e-5, rtol=0
+        )
     rate = free_body.read(mdp.AngVelXYL2(about=about), "rewards/x")
     torch.testing.assert_close(rate, torch.full((3,), (0.5, 0.7)[axis - 1] ** 2))
 
 
 def test_a_root_height_inside_a_range_earns_one(free_body):
     term = mdp.RootHeightInside(height=(0.5, 0.8), margin=0.2)
-    for height, expected in ((0.5, 1.0), (0.7, 1.0), (0.45, 0.75), (0.9, 0.5), (0.3, 0.0), (1.2, 0.0)):
+    for height, expected in (
+        (0.5, 1.0),
+        (0.7, 1.0),
+        (0.45, 0.75),
+        (0.9, 0.5),
+        (0.3, 0.0),
+        (1.2, 0.0),
+    ):
         free_body.place(qpos=(0, 0, height, 1, 0, 0, 0, 0, 0))
         torch.testing.assert_close(
             free_body.read(term, "rewards/x"), torch.full((3,), expected), atol=1e-5, rtol=0
@@ -110,7 +121,9 @@ def test_a_root_height_inside_a_range_earns_one(free_body):
 def test_root_height_is_above_the_ground(free_body):
     term = mdp.RootHeightL2(target_height=0.6)
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0, 0))
-    torch.testing.assert_close(free_body.read(term, "rewards/x"), torch.full((3,), 0.16), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        free_body.read(term, "rewards/x"), torch.full((3,), 0.16), atol=1e-5, rtol=0
+    )
     free_body.driver.ground = Plateau(3, free_body.view.device)
     # A quantity is computed once in each state.
     free_body.driver.forget()

@@ -17,9 +17,14 @@ def test_beyond_the_margin():
     far = torch.tensor([0.0, -3.0])
     linear = tolerance(far, low=2.0, margin=4.0, value_at_margin=0.5, shape="linear")
     torch.testing.assert_close(linear, torch.tensor([0.75, 1.0 - 0.5 * 1.25]))
-    assert tolerance(torch.tensor(-10.0), low=2.0, margin=4.0, shape="linear", value_at_margin=0.0) == 0.0
+    assert (
+        tolerance(torch.tensor(-10.0), low=2.0, margin=4.0, shape="linear", value_at_margin=0.0)
+        == 0.0
+    )
     # Two margins away, a gaussian has the value to the fourth power.
-    torch.testing.assert_close(tolerance(torch.tensor(3.0), high=1.0, margin=1.0), torch.tensor(0.1**4))
+    torch.testing.assert_close(
+        tolerance(torch.tensor(3.0), high=1.0, margin=1.0), torch.tensor(0.1**4)
+    )
 
 
 def test_an_open_side_is_right_however_far():

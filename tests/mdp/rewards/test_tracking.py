@@ -22,7 +22,9 @@ def test_linear_tracking_compares_in_the_roots_frame(free_body):
 def test_angular_tracking_punishes_roll_and_pitch_rates(free_body):
     free_body.place(qpos=(0, 0, 1, *YAW_90, 0, 0), qvel=(0, 0, 0, 0.3, 0.4, 0.5, 0, 0))
     free_body.command([[9.0, 9.0, 0.5], [9.0, 9.0, -0.5], [9.0, 9.0, 0.0]])
-    value = free_body.read(mdp.TrackAngularVelocity(command="twist", std=math.sqrt(0.5)), "rewards/x")
+    value = free_body.read(
+        mdp.TrackAngularVelocity(command="twist", std=math.sqrt(0.5)), "rewards/x"
+    )
     squared = torch.tensor([0.0, 1.0, 0.25]) + 0.25
     torch.testing.assert_close(value, torch.exp(-squared / 0.5), atol=1e-5, rtol=0)
 
@@ -56,7 +58,9 @@ def test_position_tracking_in_both_frames(free_body):
         [[0.0, 0.2, -0.4], [0.3, 0.2, -0.4], [0.8, 2.0, 2.6]]
     )
     own = mdp.TrackPosition(command="reach", std=0.3, site="left_foot")
-    assert free_body.read(own, "rewards/x")[:2].tolist() == pytest.approx([1.0, math.exp(-1.0)], abs=1e-5)
+    assert free_body.read(own, "rewards/x")[:2].tolist() == pytest.approx(
+        [1.0, math.exp(-1.0)], abs=1e-5
+    )
     world = mdp.TrackPosition(command="reach", std=0.3, site="left_foot", frame="world")
     assert free_body.read(world, "rewards/x")[2].item() == pytest.approx(1.0, abs=1e-5)
     hip = mdp.TrackPosition(command="reach", std=0.4, body="left")
@@ -68,13 +72,20 @@ def test_position_tracking_in_both_frames(free_body):
 def test_orientation_tracking_takes_the_angle(free_body):
     # The left leg is turned by 0.5 rad about the root's y axis, and the root by 90 degrees to the left.
     free_body.place(qpos=(0, 0, 1, *YAW_90, 0.5, 0))
-    turned, opposite = (math.cos(0.1), 0.0, math.sin(0.1), 0.0), (-math.cos(0.25), 0.0, -math.sin(0.25), 0.0)
+    turned, opposite = (
+        (math.cos(0.1), 0.0, math.sin(0.1), 0.0),
+        (-math.cos(0.25), 0.0, -math.sin(0.25), 0.0),
+    )
     targets = [(1.0, 0.0, 0.0, 0.0), turned, opposite]
-    free_body.driver.readings.commands["pose"] = torch.tensor([(9.0, 9.0, 9.0, *quat) for quat in targets])
+    free_body.driver.readings.commands["pose"] = torch.tensor(
+        [(9.0, 9.0, 9.0, *quat) for quat in targets]
+    )
     own = mdp.TrackOrientation(command="pose", std=0.5, body="left")
     check(free_body, own, torch.exp(-torch.tensor([1.0, 0.36, 0.0])))
     world = mdp.TrackOrientation(command="pose", std=0.5, body="trunk", frame="world")
-    assert free_body.read(world, "rewards/x")[0].item() == pytest.approx(math.exp(-(math.pi**2)), abs=1e-5)
+    assert free_body.read(world, "rewards/x")[0].item() == pytest.approx(
+        math.exp(-(math.pi**2)), abs=1e-5
+    )
     free_body.driver.readings.commands["pose"] = torch.zeros(3, 3)
     with pytest.raises(ValueError, match="'pose' has 3 numbers"):
         free_body.read(own, "rewards/x")
@@ -82,6 +93,8 @@ def test_orientation_tracking_takes_the_angle(free_body):
 
 def test_joint_tracking_takes_the_mean_error(free_body):
     free_body.place(qpos=(0, 0, 1, 1, 0, 0, 0, 0.3, 0.7))
-    free_body.driver.readings.commands["joints"] = torch.tensor([[0.7, 0.3], [0.7, 0.7], [0.3, 0.3]])
+    free_body.driver.readings.commands["joints"] = torch.tensor(
+        [[0.7, 0.3], [0.7, 0.7], [0.3, 0.3]]
+    )
     term = mdp.TrackJointPosition(command="joints", std=0.2, joints=("right_hip", "left_hip"))
     check(free_body, term, torch.exp(-torch.tensor([0.0, 2.0, 2.0])))

@@ -69,7 +69,9 @@ def recurrent_module() -> RecurrentMotor:
     with torch.random.fork_rng():
         torch.manual_seed(3)
         module = RecurrentMotor().requires_grad_(False)
-    module.lstm.load_state_dict({name: 3.0 * weight for name, weight in module.lstm.state_dict().items()})
+    module.lstm.load_state_dict(
+        {name: 3.0 * weight for name, weight in module.lstm.state_dict().items()}
+    )
     module.head.bias.zero_()
     return module
 
@@ -79,7 +81,11 @@ def feed_forward_module() -> nn.Sequential:
     with torch.random.fork_rng():
         torch.manual_seed(4)
         return nn.Sequential(
-            nn.Linear(2 * len(MLP_LAGS), 8), nn.Softsign(), nn.Linear(8, 6), nn.Softsign(), nn.Linear(6, 1)
+            nn.Linear(2 * len(MLP_LAGS), 8),
+            nn.Softsign(),
+            nn.Linear(8, 6),
+            nn.Softsign(),
+            nn.Linear(6, 1),
         ).requires_grad_(False)
 
 
@@ -93,12 +99,16 @@ def written(module: nn.Module, folder: Path, **metadata: str) -> str:
 def one_of_each(folder: Path) -> tuple[Actuator, ...]:
     """Return an actuator of another kind for each joint, in another order than the joints'."""
     lstm = written(recurrent_module(), folder, effort_scale="8.0", velocity_scale="0.1")
-    mlp = written(feed_forward_module(), folder, activation="softsign", input_lags=str(list(MLP_LAGS)))
+    mlp = written(
+        feed_forward_module(), folder, activation="softsign", input_lags=str(list(MLP_LAGS))
+    )
     pd = {"stiffness": 20.0, "damping": 0.8, "effort_limit": 4.0}
     return (
         LSTMActuator(joints="elbow", file=lstm, effort_limit=3.0),
         DelayedActuator(
-            actuator=PositionActuator(joints="ankle", stiffness=15.0, damping=0.5, effort_limit=5.0),
+            actuator=PositionActuator(
+                joints="ankle", stiffness=15.0, damping=0.5, effort_limit=5.0
+            ),
             min_lag=1,
             max_lag=6,
         ),

@@ -4,7 +4,13 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, MjcfRobot, ObservationGroupCfg, SceneCfg
+from ksim_rl.envs import (
+    ManagerBasedRlEnv,
+    ManagerBasedRlEnvCfg,
+    MjcfRobot,
+    ObservationGroupCfg,
+    SceneCfg,
+)
 from ksim_rl.scene.actuators import DelayedActuator, IdealPDActuator, PositionActuator
 from ksim_rl.transforms import ObservationTermCfg
 
@@ -54,7 +60,11 @@ def make(servo: str, action=None) -> ManagerBasedRlEnv:
         ManagerBasedRlEnvCfg(
             decimation=5,
             scene=SceneCfg(
-                robots={"hinges": MjcfRobot(source=HINGES.format(actuators=actuators), actuators=entries)},
+                robots={
+                    "hinges": MjcfRobot(
+                        source=HINGES.format(actuators=actuators), actuators=entries
+                    )
+                },
                 num_envs=2,
             ),
             observations={"actor": group},
@@ -81,7 +91,9 @@ def test_at_rest_the_encoder_reads_the_target(servo):
     root_E = step(env, env.reset(), action_E2, times=150)
     asked_E2 = torch.tensor([0.2, -0.1]) + action_E2.flip(-1)
     torch.testing.assert_close(root_E["obs", "read"], asked_E2, atol=1e-4, rtol=0)
-    torch.testing.assert_close(root_E["obs", "true"], asked_E2 - torch.tensor(BIAS), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        root_E["obs", "true"], asked_E2 - torch.tensor(BIAS), atol=1e-4, rtol=0
+    )
     # What terms read as the target is what the policy asked for.
     torch.testing.assert_close(env.view.joint_pos_target_EL, asked_E2)
 

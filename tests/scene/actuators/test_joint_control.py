@@ -88,7 +88,9 @@ def test_a_joint_turns_as_fast_as_it_is_asked_to(kind):
 
 @pytest.mark.parametrize("kind", POSITION)
 def test_a_reset_lets_servos_hold_the_default_pose(kind):
-    text = hinge(POSITION[kind]).replace("</mujoco>", '<keyframe><key qpos="0.3"/></keyframe></mujoco>')
+    text = hinge(POSITION[kind]).replace(
+        "</mujoco>", '<keyframe><key qpos="0.3"/></keyframe></mujoco>'
+    )
     env = make(text, JointPositionAction(joints="hinge"))
     env.reset()
     env.world.step(500)

@@ -66,7 +66,9 @@ def chain_env(
     terms = {"pos": ObservationTermCfg(term=JointPos()), "vel": ObservationTermCfg(term=JointVel())}
     defaults = {
         "decimation": DECIMATION,
-        "scene": SceneCfg(robots={"chain": MjcfRobot(source=source, actuators=actuators)}, num_envs=E),
+        "scene": SceneCfg(
+            robots={"chain": MjcfRobot(source=source, actuators=actuators)}, num_envs=E
+        ),
         "observations": {"actor": ObservationGroupCfg(terms=terms)},
         "actions": {"joints": action},
         "events": {"swing": Swing()},
@@ -109,7 +111,10 @@ class ByHand:
     """The laws of `one_of_each` as loops over numbers, one row at a time."""
 
     def __init__(self, lag_ankle: int, lag_neck: int) -> None:
-        self.recurrent, self.feed_forward = recurrent_module().double(), feed_forward_module().double()
+        self.recurrent, self.feed_forward = (
+            recurrent_module().double(),
+            feed_forward_module().double(),
+        )
         self.targets = {"ankle": deque(maxlen=lag_ankle + 1), "neck": deque(maxlen=lag_neck + 1)}
         self.seen_by_lstm: list[list[float]] = []
         self.seen_by_mlp: list[tuple[float, float]] = []
@@ -181,7 +186,9 @@ def test_the_trajectory_is_that_of_the_c_engine_with_the_laws_by_hand(env):
     env.seed(5)
     env.reset()
     buffers = env.view.buffers.by_name()
-    ankle_lags, neck_lags = (buffer.tolist() for name, buffer in buffers.items() if name.endswith("lag_E"))
+    ankle_lags, neck_lags = (
+        buffer.tolist() for name, buffer in buffers.items() if name.endswith("lag_E")
+    )
     start = torch.cat((env.world.qpos_EL, env.world.qvel_EL), dim=-1).double().numpy()
     actions_TEL = actions(6)
     reached_TEL = run(env, actions_TEL)
@@ -254,7 +261,9 @@ def test_controls_that_a_law_writes_are_not_for_actions(folder):
 
 
 def test_a_law_that_takes_positions_refuses_efforts(folder):
-    with pytest.raises(ValueError, match="'elbow' is asked for an effort, but its actuator takes a position"):
+    with pytest.raises(
+        ValueError, match="'elbow' is asked for an effort, but its actuator takes a position"
+    ):
         chain_env(one_of_each(folder), JointEffortAction(joints="elbow"))
 
 
@@ -281,7 +290,9 @@ def test_robots_of_one_scene_have_their_own_entries():
         "law": MjcfRobot(
             source=CHAINS, actuators=(IdealPDActuator(joints="knee", stiffness=3.0, damping=0.0),)
         ),
-        "servo": MjcfRobot(source=CHAINS, actuators=(PositionActuator(joints="knee", stiffness=3.0),)),
+        "servo": MjcfRobot(
+            source=CHAINS, actuators=(PositionActuator(joints="knee", stiffness=3.0),)
+        ),
         "none": MjcfRobot(source=CHAINS),
     }
     env = chain_env(

@@ -65,7 +65,9 @@ def test_each_world_may_have_its_own_numbers(pd):
 def test_a_number_that_a_joint_does_not_have_is_refused(pd):
     with pytest.raises(ValueError, match="'stifness'.*'stiffness'"):
         pd.view.actuator_param("stifness")
-    with pytest.raises(ValueError, match="joint 'neck' has no parameter 'stiffness'.*actuator_gainprm"):
+    with pytest.raises(
+        ValueError, match="joint 'neck' has no parameter 'stiffness'.*actuator_gainprm"
+    ):
         pd.view.actuator_param("stiffness", ("knee", "neck"))
 
 
@@ -73,7 +75,11 @@ def test_a_number_that_a_joint_does_not_have_is_refused(pd):
 def dc():
     return ChainBench(
         DCMotorActuator(
-            joints="knee", effort_limit=LIMIT, saturation_effort=STALL, velocity_limit=NO_LOAD, **STIFF
+            joints="knee",
+            effort_limit=LIMIT,
+            saturation_effort=STALL,
+            velocity_limit=NO_LOAD,
+            **STIFF,
         ),
         num_envs=7,
     )
@@ -86,11 +92,17 @@ def test_torque_falls_along_the_speed_torque_line(dc, direction):
     dc.move("knee", pos=0.0, vel=direction * speeds)
     dc.view.write_joint_pos_target("knee", torch.full((7, 1), direction))
     expected = [LIMIT, LIMIT, STALL / 2, 0.0, -STALL / 2, LIMIT, LIMIT]
-    torch.testing.assert_close(dc.efforts("knee"), direction * torch.tensor(expected), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(
+        dc.efforts("knee"), direction * torch.tensor(expected), atol=1e-5, rtol=0.0
+    )
 
 
 def test_braking_has_the_whole_current(dc):
-    dc.move("knee", pos=0.0, vel=[NO_LOAD, 2 * NO_LOAD, 0.5 * NO_LOAD, 0.0, -NO_LOAD, -9.0 * NO_LOAD, 0.1])
+    dc.move(
+        "knee",
+        pos=0.0,
+        vel=[NO_LOAD, 2 * NO_LOAD, 0.5 * NO_LOAD, 0.0, -NO_LOAD, -9.0 * NO_LOAD, 0.1],
+    )
     dc.view.write_joint_pos_target("knee", torch.full((7, 1), -1.0))
     expected = [-LIMIT, -LIMIT, -LIMIT, -LIMIT, 0.0, LIMIT, -LIMIT]
     torch.testing.assert_close(dc.efforts("knee"), torch.tensor(expected), atol=1e-5, rtol=0.0)
@@ -128,8 +140,12 @@ def test_a_signal_arrives_shifted_by_exactly_the_lag_of_its_row(late):
         arrived.append((late.efforts("knee"), late.world.ctrl_EL[:, 1].clone()))
     for row, lag in enumerate(lags(late, 0).tolist()):
         expected = [signal[max(0, substep - lag)] for substep in range(len(signal))]
-        assert [knee[row].item() for knee, _ in arrived] == expected, "the first target counts as older, too"
-    assert [neck[0].item() for _, neck in arrived] == [-signal[max(0, k - 3)] for k in range(len(signal))]
+        assert [knee[row].item() for knee, _ in arrived] == expected, (
+            "the first target counts as older, too"
+        )
+    assert [neck[0].item() for _, neck in arrived] == [
+        -signal[max(0, k - 3)] for k in range(len(signal))
+    ]
 
 
 def test_a_row_that_resets_sees_its_own_first_target_and_the_others_go_on(late):
@@ -155,7 +171,9 @@ def test_draws_depend_on_row_and_count_of_resets_only(late):
     late.reset(*range(0, 64, 2))
     again = ChainBench(
         DelayedActuator(
-            actuator=IdealPDActuator(joints="knee", stiffness=1.0, damping=0.0), min_lag=2, max_lag=4
+            actuator=IdealPDActuator(joints="knee", stiffness=1.0, damping=0.0),
+            min_lag=2,
+            max_lag=4,
         ),
         num_envs=64,
     )
@@ -172,7 +190,10 @@ def test_entries_of_a_group_have_one_lag():
         return ChainBench(
             *(
                 DelayedActuator(
-                    actuator=IdealPDActuator(joints=joint, **pd), min_lag=low, max_lag=high, lag_group=group
+                    actuator=IdealPDActuator(joints=joint, **pd),
+                    min_lag=low,
+                    max_lag=high,
+                    lag_group=group,
                 )
                 for joint, group, (low, high) in zip(joints, groups, bounds, strict=True)
             ),
@@ -182,7 +203,10 @@ def test_entries_of_a_group_have_one_lag():
     together, apart = chain("bus", "bus"), chain("left", "right")
     for _ in range(2):
         together.reset(*range(64))
-        assert torch.equal(lags(together, 0), lags(together, 1)) and len(set(lags(together, 0).tolist())) == 6
+        assert (
+            torch.equal(lags(together, 0), lags(together, 1))
+            and len(set(lags(together, 0).tolist())) == 6
+        )
     assert not torch.equal(lags(apart, 0), lags(apart, 1))
     with pytest.raises(ValueError, match="lag_group='bus': lags from 0 to 5 and from 1 to 5"):
         chain("bus", "bus", bounds=((0, 5), (1, 5)))

@@ -45,7 +45,9 @@ def lstm(tmp_path_factory):
     module, folder = recurrent_module(), tmp_path_factory.mktemp("lstm")
     file = written(module, folder, velocity_scale="0.2", effort_scale="30")
     fields = {"position_scale": 2.0, "effort_limit": 2.0}
-    return module, ChainBench(LSTMActuator(joints=("elbow", "wrist"), file=file, **fields), num_envs=ROWS)
+    return module, ChainBench(
+        LSTMActuator(joints=("elbow", "wrist"), file=file, **fields), num_envs=ROWS
+    )
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +81,9 @@ def feed_forward_answer(module, errors_ENT, velocities_ENT):
     return torch.stack(answers, dim=-1)
 
 
-@pytest.mark.parametrize(("kind", "answer"), [("lstm", recurrent_answer), ("mlp", feed_forward_answer)])
+@pytest.mark.parametrize(
+    ("kind", "answer"), [("lstm", recurrent_answer), ("mlp", feed_forward_answer)]
+)
 def test_efforts_are_those_of_the_torch_module_and_start_anew_after_a_reset(request, kind, answer):
     module, bench = request.getfixturevalue(kind)
     bench.reset(0, 1, 2)
@@ -115,7 +119,9 @@ def changed(file: str, change, **metadata: str) -> None:
     tensors = load_file(file)
     change(tensors)
     save_file(
-        {name: tensor.contiguous() for name, tensor in tensors.items()}, file, metadata=metadata or None
+        {name: tensor.contiguous() for name, tensor in tensors.items()},
+        file,
+        metadata=metadata or None,
     )
 
 
@@ -140,13 +146,23 @@ def nothing(tensors) -> None:
         (MLP_METADATA | {"effort_scale": "nan"}, nothing, "effort_scale=nan"),
         (MLP_METADATA, lambda t: t.update({"2.bias": torch.zeros(3)}), r"2\.bias has shape \(3,\)"),
         (MLP_METADATA, lambda t: t.pop("2.bias"), r"no tensor '2\.bias'"),
-        (MLP_METADATA, lambda t: t.update({"4.weight": torch.zeros(2, 6)}), r"4\.weight.*expected \(1, 6\)"),
-        (MLP_METADATA, lambda t: t["0.bias"].fill_(torch.nan), r"0\.bias holds numbers that are not finite"),
+        (
+            MLP_METADATA,
+            lambda t: t.update({"4.weight": torch.zeros(2, 6)}),
+            r"4\.weight.*expected \(1, 6\)",
+        ),
+        (
+            MLP_METADATA,
+            lambda t: t["0.bias"].fill_(torch.nan),
+            r"0\.bias holds numbers that are not finite",
+        ),
         (MLP_METADATA, lambda t: t.update(norm=torch.zeros(1)), r"unknown tensors \['norm'\]"),
         (MLP_METADATA, lambda t: t.clear(), r"no tensor '0\.weight'"),
     ],
 )
-def test_a_feed_forward_file_that_does_not_fit_is_refused_in_one_line(tmp_path, metadata, change, message):
+def test_a_feed_forward_file_that_does_not_fit_is_refused_in_one_line(
+    tmp_path, metadata, change, message
+):
     file = written(feed_forward_module(), tmp_path)
     changed(file, change, **metadata)
     refused(MLPActuator(joints="elbow", file=file), message, file)
@@ -161,7 +177,10 @@ def test_a_feed_forward_file_that_does_not_fit_is_refused_in_one_line(tmp_path, 
             lambda t: t.update({"lstm.weight_ih_l0": torch.zeros(4 * LSTM_SIZE, 3)}),
             r"weight_ih_l0.*\(20, 2\)",
         ),
-        (lambda t: t.update({"head.weight": torch.zeros(1, 4)}), r"head\.weight.*expected \(1, 5\)"),
+        (
+            lambda t: t.update({"head.weight": torch.zeros(1, 4)}),
+            r"head\.weight.*expected \(1, 5\)",
+        ),
         (lambda t: t.update(norm=torch.zeros(1)), r"unknown tensors \['norm'\]"),
         (lambda t: t.clear(), r"no tensor 'lstm\.weight_hh_l0'"),
     ],

@@ -105,8 +105,16 @@ def test_built_in_ones_compile_to_what_mjcf_of_their_own_says():
         ours, theirs = (getattr(m, f"actuator_{field}") for m in (model, by_hand))
         np.testing.assert_array_equal(ours, theirs, err_msg=field)
     limited = by_hand.actuator_ctrllimited.astype(bool)
-    np.testing.assert_array_equal(model.actuator_ctrlrange[limited], by_hand.actuator_ctrlrange[limited])
-    for field in ("dof_armature", "dof_frictionloss", "dof_damping", "jnt_actfrclimited", "sensor_objid"):
+    np.testing.assert_array_equal(
+        model.actuator_ctrlrange[limited], by_hand.actuator_ctrlrange[limited]
+    )
+    for field in (
+        "dof_armature",
+        "dof_frictionloss",
+        "dof_damping",
+        "jnt_actfrclimited",
+        "sensor_objid",
+    ):
         np.testing.assert_array_equal(getattr(model, field), getattr(by_hand, field), err_msg=field)
     assert model.sensor("torque").objid[0] == model.actuator("a").id
 
@@ -116,18 +124,23 @@ def test_explicit_ones_compile_to_plain_motors_that_nothing_else_clamps():
     model = compiled(
         IdealPDActuator(joints="b", armature=0.5, **pd),
         DelayedActuator(
-            actuator=DCMotorActuator(joints="a", saturation_effort=9.0, velocity_limit=1.0, **pd), max_lag=2
+            actuator=DCMotorActuator(joints="a", saturation_effort=9.0, velocity_limit=1.0, **pd),
+            max_lag=2,
         ),
     )
     assert [model.actuator(i).name for i in range(model.nu)] == ["cable", "old_d", "b", "a"]
     for name in ("a", "b"):
         motor, joint = model.actuator(name), model.joint(name)
         assert motor.gainprm[0] == 1.0 and motor.gear[0] == 1.0 and not motor.biasprm.any()
-        assert not model.actuator_ctrllimited[motor.id] and not model.actuator_forcelimited[motor.id]
+        assert (
+            not model.actuator_ctrllimited[motor.id] and not model.actuator_forcelimited[motor.id]
+        )
         assert not model.jnt_actfrclimited[joint.id]
     assert model.dof_armature[model.joint("b").dofadr[0]] == 0.5
     assert model.dof_armature[model.joint("a").dofadr[0]] == 0.01
-    assert model.jnt_actfrclimited[model.joint("c").id], "a joint that nothing drives keeps its limit"
+    assert model.jnt_actfrclimited[model.joint("c").id], (
+        "a joint that nothing drives keeps its limit"
+    )
 
 
 def test_no_entries_leave_the_model_as_it_is():

@@ -56,7 +56,9 @@ def test_feet_stand_on_the_ground_and_take_turns(clip, model):
             foot = model.geom(f"{side}_foot").id
             end = data.geom_xmat[foot].reshape(3, 3)[2, 2] * model.geom_size[foot, 1]
             row.append(data.geom_xpos[foot, 2] - abs(end) - model.geom_size[foot, 0])
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.geom_bodyid[foot], speed, 0)
+            mujoco.mj_objectVelocity(
+                model, data, mujoco.mjtObj.mjOBJ_BODY, model.geom_bodyid[foot], speed, 0
+            )
             velocities.append(speed[3])
         heights.append(row)
     heights = np.array(heights)

@@ -53,7 +53,9 @@ def biped(sole="box", *, mirrored=False, actuators="", root="<freejoint/>"):
         LEG.format(side=side, y=y, sign=-1 if mirrored and y < 0 else 1, sole=SOLES[sole])
         for side, y in (("left", 0.1), ("right", -0.1))
     )
-    corners = " ".join(f"{x} {y} {z}" for x in (-0.07, 0.13) for y in (-0.04, 0.04) for z in (-0.04, -0.02))
+    corners = " ".join(
+        f"{x} {y} {z}" for x in (-0.07, 0.13) for y in (-0.04, 0.04) for z in (-0.04, -0.02)
+    )
     return f"""
 <mujoco model="Biped X">
   <asset><mesh name="sole" vertex="{corners}"/></asset>
@@ -92,7 +94,11 @@ def check_proposals(found, num_feet):
     pose = model.key_qpos[0, 7:][model.jnt_limited[1:] == 1]
     assert ((pose >= limits[:, 0] - 1e-6) & (pose <= limits[:, 1] + 1e-6)).all()
     for joint in found.joints:
-        assert joint.stiffness > 0.0 and joint.servo_damping > 0.0 and 0.15 <= joint.action_scale <= 0.5
+        assert (
+            joint.stiffness > 0.0
+            and joint.servo_damping > 0.0
+            and 0.15 <= joint.action_scale <= 0.5
+        )
     assert found.njmax >= 8 and found.nconmax >= 8
     assert all(joint.name in found.table() for joint in found.joints)
 
@@ -122,7 +128,9 @@ def test_a_biped_without_motors_armature_ranges_or_pose_stands(sole, mirrored):
     found = analyse(biped(sole, mirrored=mirrored))
     check_proposals(found, 2)
     assert found.robot.name == "biped_x" and found.robot.root_body == "torso"
-    assert set(found.foot_bodies) == {"left_foot", "right_foot"} and len(found.robot.foot_geoms) == 4
+    assert (
+        set(found.foot_bodies) == {"left_foot", "right_foot"} and len(found.robot.foot_geoms) == 4
+    )
     assert set(found.pitch_joints) == {
         f"{s}_{j}" for s in ("left", "right") for j in ("hip", "knee", "ankle")
     }

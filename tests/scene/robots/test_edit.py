@@ -38,7 +38,9 @@ def spec():
 
 
 def test_driven_joints_lose_damping_and_friction_and_passive_ones_keep_them(spec):
-    spec.body("arm").add_joint(name="loose", type=mujoco.mjtJoint.mjJNT_HINGE, damping=[2.0, 0.0, 0.0])
+    spec.body("arm").add_joint(
+        name="loose", type=mujoco.mjtJoint.mjJNT_HINGE, damping=[2.0, 0.0, 0.0]
+    )
     edit.clear_joint_losses(spec, (PositionActuator(joints="arm_joint", stiffness=1.0),))
     model = spec.compile()
     assert model.dof_damping.tolist() == [0.0] * 7 + [2.0]
@@ -47,9 +49,15 @@ def test_driven_joints_lose_damping_and_friction_and_passive_ones_keep_them(spec
 
 def test_replaced_geoms_ignore_default_classes_and_keep_looks_and_mass(spec):
     before = spec.copy().compile().body_mass.copy()
-    ball = edit.CollisionGeom(name="ball", body="arm", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.05,))
+    ball = edit.CollisionGeom(
+        name="ball", body="arm", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.05,)
+    )
     rod = edit.CollisionGeom(
-        name="rod", body="base", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=(0.01,), fromto=(0, 0, 0, 0, 0, 0.4)
+        name="rod",
+        body="base",
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        size=(0.01,),
+        fromto=(0, 0, 0, 0, 0, 0.4),
     )
     edit.replace_collision_geoms(spec, (ball, rod))
     model = spec.compile()
@@ -59,9 +67,19 @@ def test_replaced_geoms_ignore_default_classes_and_keep_looks_and_mass(spec):
     plain = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><geom name='ball' size='0.05'/></worldbody></mujoco>"
     )
-    for field in ("friction", "condim", "margin", "solref", "solimp", "priority", "contype", "conaffinity"):
+    for field in (
+        "friction",
+        "condim",
+        "margin",
+        "solref",
+        "solimp",
+        "priority",
+        "contype",
+        "conaffinity",
+    ):
         np.testing.assert_array_equal(
-            getattr(model, f"geom_{field}")[model.geom("ball").id], getattr(plain, f"geom_{field}")[0]
+            getattr(model, f"geom_{field}")[model.geom("ball").id],
+            getattr(plain, f"geom_{field}")[0],
         )
     assert model.geom("rod").size[1] == pytest.approx(0.2)
     assert model.geom("rod").pos[2] == pytest.approx(0.2)
@@ -91,30 +109,40 @@ STOOL = """
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
 @pytest.mark.parametrize("looks", ["", 'contype="0" conaffinity="0"'], ids=["collides", "visual"])
 @pytest.mark.parametrize("infer", ["true", "auto", "false"])
-@pytest.mark.parametrize("others", ["", 'settotalmass="7" balanceinertia="true"', 'fusestatic="true"'])
+@pytest.mark.parametrize(
+    "others", ["", 'settotalmass="7" balanceinertia="true"', 'fusestatic="true"']
+)
 def test_no_body_gains_or_loses_mass_by_its_hulls(infer, looks, others):
     xml = STOOL.format(looks=looks, compiler=f'inertiafromgeom="{infer}" {others}')
     if infer == "false":  # then every body that moves needs an inertia of its own
         xml = xml.replace(
-            '<joint name="hip"', '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><joint name="hip"'
+            '<joint name="hip"',
+            '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><joint name="hip"',
         )
     spec = mujoco.MjSpec.from_string(xml)
     before = mujoco.MjSpec.from_string(xml).compile()
     hulls = [
-        edit.sphere(f"{body}_hull", body, 0.05, (0.0, 0.0, 0.1)) for body in ("seat", "leg", "toe", "bare")
+        edit.sphere(f"{body}_hull", body, 0.05, (0.0, 0.0, 0.1))
+        for body in ("seat", "leg", "toe", "bare")
     ]
     edit.replace_collision_geoms(spec, hulls)
     after = spec.compile()
     assert before.nbody == after.nbody and {"seat_hull", "leg_hull"} <= {g.name for g in spec.geoms}
     for field in ("body_mass", "body_ipos", "body_inertia", "body_subtreemass"):
-        np.testing.assert_allclose(getattr(after, field), getattr(before, field), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            getattr(after, field), getattr(before, field), rtol=1e-9, atol=1e-12
+        )
     turned = np.abs((after.body_iquat * before.body_iquat).sum(-1))
     np.testing.assert_allclose(turned[before.body_mass > 0], 1.0, rtol=1e-9)
 
 
 def test_hulls_may_be_turned(spec):
     box = edit.CollisionGeom(
-        name="box", body="arm", type=mujoco.mjtGeom.mjGEOM_BOX, size=(1, 2, 3), quat=(0.0, 1.0, 0.0, 0.0)
+        name="box",
+        body="arm",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(1, 2, 3),
+        quat=(0.0, 1.0, 0.0, 0.0),
     )
     edit.replace_collision_geoms(spec, (box,))
     np.testing.assert_allclose(spec.compile().geom("box").quat, (0, 1, 0, 0))
@@ -132,7 +160,11 @@ def test_keyframe_holds_pose_and_matching_controls(spec):
     servo = PositionActuator(joints="arm_joint", stiffness=10.0)
     set_actuators(spec, (servo,))
     edit.set_keyframe(
-        spec, "start", init_pos=(1.0, 2.0, 3.0), init_quat=(1.0, 0.0, 0.0, 0.0), joint_pos={"arm_joint": 0.25}
+        spec,
+        "start",
+        init_pos=(1.0, 2.0, 3.0),
+        init_quat=(1.0, 0.0, 0.0, 0.0),
+        joint_pos={"arm_joint": 0.25},
     )
     model = spec.compile()
     assert model.nkey == 1 and model.key(0).name == "start"
@@ -143,7 +175,11 @@ def test_keyframe_holds_pose_and_matching_controls(spec):
 def test_keyframe_asks_motors_for_no_effort(spec):
     set_actuators(spec, (MotorActuator(joints="arm_joint"),))
     edit.set_keyframe(
-        spec, "start", init_pos=(0.0, 0.0, 1.0), init_quat=(1.0, 0.0, 0.0, 0.0), joint_pos={"arm_joint": 0.25}
+        spec,
+        "start",
+        init_pos=(0.0, 0.0, 1.0),
+        init_quat=(1.0, 0.0, 0.0, 0.0),
+        joint_pos={"arm_joint": 0.25},
     )
     assert list(spec.compile().key_ctrl[0]) == [0.0]
 
@@ -156,8 +192,16 @@ def test_options_go_back_to_mujocos_own(spec):
 
 def test_values_spread_over_names():
     names = ["a_hip", "a_knee", "b_hip"]
-    assert edit.spread({".*_hip": 0.5, "a_knee": 1.0}, names) == {"a_hip": 0.5, "a_knee": 1.0, "b_hip": 0.5}
-    assert edit.spread({"b_.*": 2.0}, names, default=0.0) == {"a_hip": 0.0, "a_knee": 0.0, "b_hip": 2.0}
+    assert edit.spread({".*_hip": 0.5, "a_knee": 1.0}, names) == {
+        "a_hip": 0.5,
+        "a_knee": 1.0,
+        "b_hip": 0.5,
+    }
+    assert edit.spread({"b_.*": 2.0}, names, default=0.0) == {
+        "a_hip": 0.0,
+        "a_knee": 0.0,
+        "b_hip": 2.0,
+    }
     with pytest.raises(ValueError, match=r"'a_knee' matches 0 of the patterns.*default=0\.0"):
         edit.spread({".*_hip": 0.5}, names)
     with pytest.raises(ValueError, match="'a_hip' matches 2 of the patterns"):
@@ -169,13 +213,19 @@ def test_values_spread_over_names():
 def test_inertia_of_a_gear_train_keeps_its_kinetic_energy():
     # At a joint speed of 1 rad/s the rotor turns 4 * 3 times as fast, the first stage's output 3 times.
     energy = 0.5 * 2e-5 * (4.0 * 3.0) ** 2 + 0.5 * 1e-5 * 3.0**2 + 0.5 * 3e-5
-    assert 0.5 * edit.reflected_inertia((2e-5, 1e-5, 3e-5), (4.0, 3.0)) == pytest.approx(energy, rel=1e-12)
+    assert 0.5 * edit.reflected_inertia((2e-5, 1e-5, 3e-5), (4.0, 3.0)) == pytest.approx(
+        energy, rel=1e-12
+    )
 
 
 def test_sites_are_moved_or_added_and_sensors_replaced(spec):
     spec.body("base").add_site(name="imu", pos=[9.0, 9.0, 9.0])
     edit.set_sites(
-        spec, (edit.Site(name="imu", body="base", pos=(0.1, 0.0, 0.0)), edit.Site(name="hand", body="arm"))
+        spec,
+        (
+            edit.Site(name="imu", body="base", pos=(0.1, 0.0, 0.0)),
+            edit.Site(name="hand", body="arm"),
+        ),
     )
     edit.replace_sensors(spec, edit.root_sensors(imu="imu", root="base"))
     edit.replace_sensors(spec, edit.root_sensors(imu="imu", root="base"))
@@ -190,11 +240,18 @@ def test_sites_are_moved_or_added_and_sensors_replaced(spec):
 def test_a_site_moves_to_the_body_that_it_is_given(spec):
     spec.body("base").add_site(name="imu", pos=[9.0, 9.0, 9.0], quat=[0.0, 1.0, 0.0, 0.0])
     spec.add_sensor(
-        name="gyro", type=mujoco.mjtSensor.mjSENS_GYRO, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu"
+        name="gyro",
+        type=mujoco.mjtSensor.mjSENS_GYRO,
+        objtype=mujoco.mjtObj.mjOBJ_SITE,
+        objname="imu",
     )
     edit.set_sites(spec, (edit.Site(name="imu", body="base", pos=(0.2, 0.0, 0.0)),))
     model = spec.copy().compile()
-    assert list(model.site("imu").quat) == [0, 1, 0, 0] and list(model.site("imu").pos) == [0.2, 0, 0]
+    assert list(model.site("imu").quat) == [0, 1, 0, 0] and list(model.site("imu").pos) == [
+        0.2,
+        0,
+        0,
+    ]
     edit.set_sites(spec, (edit.Site(name="imu", body="arm", pos=(0.1, 0.0, 0.0)),))
     model = spec.compile()
     assert model.body(model.site_bodyid[model.site("imu").id]).name == "arm"

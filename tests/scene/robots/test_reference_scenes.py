@@ -52,7 +52,17 @@ ACTUATOR_FIELDS = (
     "ctrlrange",
     "ctrllimited",
 )
-SENSOR_FIELDS = ("type", "datatype", "needstage", "objtype", "reftype", "intprm", "dim", "noise", "cutoff")
+SENSOR_FIELDS = (
+    "type",
+    "datatype",
+    "needstage",
+    "objtype",
+    "reftype",
+    "intprm",
+    "dim",
+    "noise",
+    "cutoff",
+)
 ROBOTS = {"unitree_go1": UnitreeGo1(), "unitree_g1": UnitreeG1()}
 
 
@@ -135,7 +145,9 @@ def test_bodies_that_may_overlap_agree(model, reference):
     def pairs(mj_model):
         signatures = mj_model.exclude_signature
         bodies = [(int(s) >> 16, int(s) & 0xFFFF) for s in signatures]
-        return {frozenset(mj_model.body(i).name.removeprefix("robot/") for i in pair) for pair in bodies}
+        return {
+            frozenset(mj_model.body(i).name.removeprefix("robot/") for i in pair) for pair in bodies
+        }
 
     assert pairs(model) == pairs(reference)
 
@@ -169,7 +181,9 @@ def test_figures_are_those_of_the_task(name, robot):
     assert list(robot.joint_names) == figures["joint_names"]
     assert robot.action_scale == figures["action_scale"]
     assert robot.default_joint_pos == pytest.approx(figures["default_joint_pos"], abs=1e-6)
-    assert [*robot.init_pos, *robot.init_quat] == pytest.approx(figures["default_root_state"][:7], abs=1e-6)
+    assert [*robot.init_pos, *robot.init_quat] == pytest.approx(
+        figures["default_root_state"][:7], abs=1e-6
+    )
     assert robot.soft_joint_pos_limit_factor == figures["soft_joint_pos_limit_factor"]
 
 
@@ -200,7 +214,9 @@ def test_sensors_of_the_robot_agree(model, reference):
     theirs = _names(reference, mujoco.mjtObj.mjOBJ_SENSOR, reference.nsensor)
     # Contact sensors belong to the scene; terms read the same from ours, which have another form.
     wanted = [
-        i for i in range(reference.nsensor) if reference.sensor_type[i] != mujoco.mjtSensor.mjSENS_CONTACT
+        i
+        for i in range(reference.nsensor)
+        if reference.sensor_type[i] != mujoco.mjtSensor.mjSENS_CONTACT
     ]
     assert [theirs[i] for i in wanted] == ours
     for mine, other in enumerate(wanted):

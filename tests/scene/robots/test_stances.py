@@ -11,7 +11,14 @@ from ksim_rl.scene.robots.unitree_go import UnitreeGo1, UnitreeGo2
 from tests.scene.robots.standing import on_a_plane, stand, uprightness
 
 # G1's reference gains are too soft to stand on for long without balancing: it tips over after a second.
-SECONDS = {UnitreeGo1: 2.0, UnitreeGo2: 2.0, UnitreeG1: 0.7, BoosterT1: 2.0, Quadruped: 2.0, Humanoid: 2.0}
+SECONDS = {
+    UnitreeGo1: 2.0,
+    UnitreeGo2: 2.0,
+    UnitreeG1: 0.7,
+    BoosterT1: 2.0,
+    Quadruped: 2.0,
+    Humanoid: 2.0,
+}
 
 
 @pytest.fixture(scope="module", params=SECONDS, ids=lambda robot: robot.name)
@@ -46,7 +53,9 @@ def test_default_pose_is_on_the_ground_and_touches_nothing_else(robot, model):
 
 def test_facts_name_what_the_model_has(robot, model):
     hinges = [
-        model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] != mujoco.mjtJoint.mjJNT_FREE
+        model.joint(i).name
+        for i in range(model.njnt)
+        if model.jnt_type[i] != mujoco.mjtJoint.mjJNT_FREE
     ]
     assert sorted(robot.joint_names) == sorted(hinges)
     assert sorted(model.actuator(i).name for i in range(model.nu)) == sorted(hinges)
@@ -69,5 +78,9 @@ def test_default_pose_is_inside_the_soft_limits(robot, model):
 def test_what_collides_is_few_and_cheap(model):
     colliding = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     kinds = [mujoco.mjtGeom(int(kind)) for kind in model.geom_type[colliding]]
-    cheap = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_PLANE)
+    cheap = (
+        mujoco.mjtGeom.mjGEOM_SPHERE,
+        mujoco.mjtGeom.mjGEOM_CAPSULE,
+        mujoco.mjtGeom.mjGEOM_PLANE,
+    )
     assert sum(kind not in cheap for kind in kinds) <= 1 and len(colliding) <= 34

@@ -80,14 +80,18 @@ REFERRING = {
 
 @pytest.mark.parametrize("extra", REFERRING.values(), ids=REFERRING)
 def test_what_refers_to_replaced_elements_goes_with_them(extra):
-    motors = "".join(f'<motor joint="{name}_{joint}"/>' for name in CORNERS for joint in ("hip", "knee"))
+    motors = "".join(
+        f'<motor joint="{name}_{joint}"/>' for name in CORNERS for joint in ("hip", "knee")
+    )
     xml = dog(extra=f"{extra}<actuator>{motors}</actuator>")
     xml = xml.replace("<freejoint/>", f"<freejoint/>{SECOND}<site name='tip' pos='0 0 0.2'/>")
     given = mujoco.MjModel.from_xml_string(xml)
     found = analyse(xml)
     mj_model = found.robot.spec().compile()
     assert found.stands_s == 5.0 and len(found.foot_bodies) == 4
-    assert mj_model.npair == 0 and names(mj_model, "actuator", mj_model.nu) == set(found.robot.joint_names)
+    assert mj_model.npair == 0 and names(mj_model, "actuator", mj_model.nu) == set(
+        found.robot.joint_names
+    )
     assert mj_model.body_subtreemass[0] == pytest.approx(given.body_subtreemass[0])
     np.testing.assert_allclose(mj_model.body("pack").inertia, given.body("pack").inertia)
 
@@ -118,7 +122,9 @@ def test_ball_joints_stay_as_they_are_and_the_robot_stands():
     first = mj_model.jnt_qposadr[mj_model.joint("tail").id]
     np.testing.assert_array_equal(mj_model.key_qpos[0, first : first + 4], [1.0, 0.0, 0.0, 0.0])
     for name, angle in found.robot.default_joint_pos.items():
-        assert mj_model.key_qpos[0, mj_model.jnt_qposadr[mj_model.joint(name).id]] == pytest.approx(angle)
+        assert mj_model.key_qpos[0, mj_model.jnt_qposadr[mj_model.joint(name).id]] == pytest.approx(
+            angle
+        )
 
 
 # -- poses -------------------------------------------------------------------------------------------------------
@@ -177,7 +183,9 @@ def test_a_root_whose_z_axis_is_not_up_stands_as_the_same_robot_does(inertial):
     # The frame of the root has its z axis up, as all that walking tasks read needs, and its inertia is the same.
     models = [analysis.robot.spec().compile() for analysis in (found, expected)]
     states = [posed(mj_model, models[1].key_qpos[0]) for mj_model in models]
-    np.testing.assert_allclose(states[0].body("trunk").xmat, states[1].body("trunk").xmat, atol=1e-5)
+    np.testing.assert_allclose(
+        states[0].body("trunk").xmat, states[1].body("trunk").xmat, atol=1e-5
+    )
     np.testing.assert_allclose(states[0].site_xpos, states[1].site_xpos, atol=2e-3)
     matrices = []
     for mj_model, data in zip(models, states, strict=True):
@@ -225,7 +233,9 @@ def test_wheels_are_no_feet():
         for n, (x, y) in CORNERS.items()
     )
     box = '<geom type="box" size="0.3 0.1 0.05" mass="5"/>'
-    xml = f"<mujoco><worldbody><body name='cart'><freejoint/>{box}{cart}</body></worldbody></mujoco>"
+    xml = (
+        f"<mujoco><worldbody><body name='cart'><freejoint/>{box}{cart}</body></worldbody></mujoco>"
+    )
     with pytest.raises(
         ValueError, match="'front_left' is a wheel, which turns about joint 'front_left_axle'"
     ):
@@ -344,8 +354,13 @@ def test_robots_without_visual_geoms_keep_their_looks_and_inertia():
 
 
 def test_visual_geoms_of_a_file_are_all_that_one_sees():
-    both = TOE + '<geom name="look_{name}" size="0.03" contype="0" conaffinity="0" group="2" mass="0"/>'
-    spec = mujoco.MjSpec.from_string(dog(foot=both.replace("_{name}", "")).replace('name="look"', ""))
+    both = (
+        TOE
+        + '<geom name="look_{name}" size="0.03" contype="0" conaffinity="0" group="2" mass="0"/>'
+    )
+    spec = mujoco.MjSpec.from_string(
+        dog(foot=both.replace("_{name}", "")).replace('name="look"', "")
+    )
     replace_collision_geoms(spec, [])
     shanks = [geom for geom in spec.geoms if geom.parent.name.endswith("shank")]
     assert len(shanks) == 4 and all(geom.group == 2 and not geom.contype for geom in shanks)

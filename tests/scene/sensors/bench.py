@@ -33,9 +33,15 @@ class SensorBench:
             sensor.add_to(spec, name)
         prepare_spec(spec, per_world_fields)
         self.world = World(
-            load_model(spec), num_envs=num_envs, per_world_fields=per_world_fields, device=device, **world
+            load_model(spec),
+            num_envs=num_envs,
+            per_world_fields=per_world_fields,
+            device=device,
+            **world,
         )
-        self.driver = EnvDriver(self.world, step_dt=step_dt or SUBSTEPS * self.world.timestep, **view or {})
+        self.driver = EnvDriver(
+            self.world, step_dt=step_dt or SUBSTEPS * self.world.timestep, **view or {}
+        )
         self.view = self.driver.view
         self.driver.add_sensors(sensors)
 

@@ -36,9 +36,13 @@ LOOK = {"width": WIDTH, "height": HEIGHT, "depth": True, "segmentation": True}
 SENSORS = {
     "front": CameraSensor(camera="front", **LOOK),
     # The same place and direction, added to the model.
-    "added": CameraSensor(pos=(-2.0, 0.0, 0.8), xyaxes=(0.0, -1.0, 0.0, 0.1, 0.0, 1.0), fovy=50.0, **LOOK),
+    "added": CameraSensor(
+        pos=(-2.0, 0.0, 0.8), xyaxes=(0.0, -1.0, 0.0, 0.1, 0.0, 1.0), fovy=50.0, **LOOK
+    ),
     # Looks down from above the box's face, 2 m over the floor.
-    "top": CameraSensor(body="box", pos=(0.0, 0.0, 1.5), xyaxes=(0.0, -1.0, 0.0, 1.0, 0.0, 0.0), **LOOK),
+    "top": CameraSensor(
+        body="box", pos=(0.0, 0.0, 1.5), xyaxes=(0.0, -1.0, 0.0, 1.0, 0.0, 0.0), **LOOK
+    ),
 }
 
 
@@ -124,7 +128,9 @@ def test_the_pictures_are_of_the_present_state_and_stay_as_they_are(bench):
     here_EHW = bench.view.camera("front").segmentation_EHW
     bench.place(qpos=[[-0.4], [0.4]])
     there_EHW = bench.view.camera("front").segmentation_EHW
-    columns = [np.nonzero(picture.numpy() == 1)[1].mean() for picture in (here_EHW[0], there_EHW[0])]
+    columns = [
+        np.nonzero(picture.numpy() == 1)[1].mean() for picture in (here_EHW[0], there_EHW[0])
+    ]
     assert columns[1] - columns[0] > 3, "world -y is the right of the picture"
     assert torch.equal(here_EHW[1], there_EHW[1])
     bench.place(qpos=[[0.0], [0.4]])
@@ -152,7 +158,9 @@ def image_env(**groups) -> ManagerBasedRlEnv:
     scene = type(cfg.scene)(robots=cfg.scene.robots, sensors={"eye": camera}, num_envs=2)
     state = ObservationTermCfg(term=JointPos())
     observations = {"actor": ObservationGroupCfg(terms={"position": state}), **groups}
-    return ManagerBasedRlEnv(puck_cfg(num_envs=2, limit=None, scene=scene, observations=observations))
+    return ManagerBasedRlEnv(
+        puck_cfg(num_envs=2, limit=None, scene=scene, observations=observations)
+    )
 
 
 def test_an_image_is_an_observation_of_its_own_shape():
@@ -161,7 +169,9 @@ def test_an_image_is_an_observation_of_its_own_shape():
     from ksim_rl.envs import MaskedTransformedEnv
 
     groups = {
-        "image": ObservationGroupCfg(terms={"rgb": ObservationTermCfg(term=CameraImage(sensor="eye"))}),
+        "image": ObservationGroupCfg(
+            terms={"rgb": ObservationTermCfg(term=CameraImage(sensor="eye"))}
+        ),
         "depth": ObservationGroupCfg(
             terms={"depth": ObservationTermCfg(term=CameraImage(sensor="eye", output="depth"))}
         ),
@@ -175,7 +185,10 @@ def test_an_image_is_an_observation_of_its_own_shape():
     assert rollout["image"].shape == (2, 4, 12, 16, 3) and rollout["image"].dtype == torch.uint8
     assert rollout["depth"].shape == (2, 4, 12, 16) and rollout["depth"].dtype == torch.float32
     assert rollout["actor"].shape == (2, 4, 1)
-    assert "observations/image (12, 16, 3)" in base.explain() and "observations/actor (1,)" in base.explain()
+    assert (
+        "observations/image (12, 16, 3)" in base.explain()
+        and "observations/actor (1,)" in base.explain()
+    )
     # The puck moves to the right (+x) at 1 and 2 m/s, under a camera whose right is x.
     near = rollout["depth"] < 0.99
     middle = [(near[1, k].float() * torch.arange(16.0)).sum() / near[1, k].sum() for k in (0, 3)]
@@ -188,7 +201,9 @@ def test_an_image_cannot_share_a_group():
         "rgb": ObservationTermCfg(term=CameraImage(sensor="eye")),
         "position": ObservationTermCfg(term=JointPos()),
     }
-    with pytest.raises(ValueError, match="'rgb' is an image, which is not concatenated with 'position'"):
+    with pytest.raises(
+        ValueError, match="'rgb' is an image, which is not concatenated with 'position'"
+    ):
         ObservationGroupCfg(terms=terms)
 
 
@@ -210,7 +225,10 @@ def test_cameras_out_of_range_are_refused(fields, message):
 @pytest.mark.parametrize(
     ("sensor", "message"),
     [
-        (CameraSensor(camera="frond"), r"scene\.sensors\.eye: no camera 'frond': did you mean 'front'"),
+        (
+            CameraSensor(camera="frond"),
+            r"scene\.sensors\.eye: no camera 'frond': did you mean 'front'",
+        ),
         (CameraSensor(body="bax"), r"scene\.sensors\.eye: no body 'bax': did you mean 'box'"),
     ],
 )

@@ -10,7 +10,9 @@ from tests.envs.probe_env import PUCK_XML
 
 SENSORS = {
     "feet": ContactSensor(geoms=("FL", "F."), every_substep=True),
-    "self": ContactSensor(subtrees=("base",), against="base", against_kind="subtree", reduce="strongest"),
+    "self": ContactSensor(
+        subtrees=("base",), against="base", against_kind="subtree", reduce="strongest"
+    ),
     "anything": ContactSensor(bodies=("base",), against=None),
     "imu": ImuSensor(body="base", pos=(0.1, 0.0, 0.0)),
     "chip": ImuSensor(site="chip"),
@@ -26,7 +28,9 @@ def test_sensors_survive_the_way_through_a_tree():
 def test_a_tree_without_a_target_or_with_an_unknown_field_names_its_path():
     tree = to_tree(SceneCfg(robots={"puck": MjcfRobot(source=PUCK_XML)}, sensors=SENSORS))
     del tree["sensors"]["imu"]["_target_"]
-    with pytest.raises(ValueError, match=r"scene\.sensors\.imu: needs _target_, the class of this Sensor"):
+    with pytest.raises(
+        ValueError, match=r"scene\.sensors\.imu: needs _target_, the class of this Sensor"
+    ):
         from_tree(SceneCfg, tree, "scene")
     tree = to_tree(SceneCfg(robots={"puck": MjcfRobot(source=PUCK_XML)}, sensors=SENSORS))
     tree["sensors"]["eye"]["widht"] = 3
@@ -44,7 +48,9 @@ def test_the_nan_guard_is_a_part_of_the_simulation_settings():
 
 
 def test_a_sensor_that_takes_one_element_refuses_several_before_anything_is_built():
-    with pytest.raises(ValueError, match=r"against=\('a', 'b'\): a contact sensor takes one geom there"):
+    with pytest.raises(
+        ValueError, match=r"against=\('a', 'b'\): a contact sensor takes one geom there"
+    ):
         ContactSensor(geoms=("foot",), against=("a", "b"), against_kind="geom")  # pyright: ignore
     spec = mujoco.MjSpec()
     for name in ("left_foot", "right_foot"):

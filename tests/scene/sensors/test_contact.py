@@ -65,7 +65,10 @@ class Drop(EventTerm):
 
 
 def falling_env(
-    heights: Sequence[float] = HEIGHTS, geoms=("ball", "box"), against="terrain", every_substep=False
+    heights: Sequence[float] = HEIGHTS,
+    geoms=("ball", "box"),
+    against="terrain",
+    every_substep=False,
 ) -> ManagerBasedRlEnv:
     group = ObservationGroupCfg(terms={"height": ObservationTermCfg(term=JointPos())})
     touch = ContactSensor(geoms=geoms, against=against, every_substep=every_substep)
@@ -146,7 +149,9 @@ def test_a_start_on_the_ground_is_a_contact_but_no_flight():
 
 def test_a_lift_takes_weight_off():
     state = contacts(falling_env(heights=(0.0, 0.0)), 100, effort=5.0)[-1]
-    torch.testing.assert_close(state.force_EN3[..., 2], 5.0 - WEIGHT.expand(2, 2), atol=0.05, rtol=0)
+    torch.testing.assert_close(
+        state.force_EN3[..., 2], 5.0 - WEIGHT.expand(2, 2), atol=0.05, rtol=0
+    )
 
 
 def test_what_is_lifted_off_counts_its_flight():
@@ -188,12 +193,18 @@ def test_a_lifted_robot_reads_no_contact_after_the_reset():
 
 def test_columns_follow_the_order_of_geoms():
     state = contacts(falling_env(heights=(0.0, 0.0), geoms=("box", "ball")), 100)[-1]
-    torch.testing.assert_close(state.force_EN3[..., 2], -WEIGHT.flip(0).expand(2, 2), atol=0.05, rtol=0)
+    torch.testing.assert_close(
+        state.force_EN3[..., 2], -WEIGHT.flip(0).expand(2, 2), atol=0.05, rtol=0
+    )
 
 
 def test_only_contact_with_the_named_body_counts():
     state = contacts(falling_env(heights=(0.0, 0.0), geoms=("ball",), against="box"), 50)[-1]
-    assert state.found_EN.shape == (2, 1) and state.found_EN.eq(0.0).all() and state.force_EN3.eq(0.0).all()
+    assert (
+        state.found_EN.shape == (2, 1)
+        and state.found_EN.eq(0.0).all()
+        and state.force_EN3.eq(0.0).all()
+    )
 
 
 def test_with_every_substep_the_flight_is_timed_in_substeps():
@@ -207,7 +218,10 @@ def test_with_every_substep_the_flight_is_timed_in_substeps():
             assert state.first_contact_EN[row].eq(float(lands)).all()
             if flying:
                 torch.testing.assert_close(state.air_time_EN[row], torch.full((2,), n * DT))
-                assert state.last_air_time_EN[row].eq(0.0).all() and state.contact_time_EN[row].eq(0.0).all()
+                assert (
+                    state.last_air_time_EN[row].eq(0.0).all()
+                    and state.contact_time_EN[row].eq(0.0).all()
+                )
             if lands:
                 fall = (2 * height / GRAVITY) ** 0.5
                 torch.testing.assert_close(
@@ -327,7 +341,10 @@ def test_clocks_of_any_sequence_of_substeps_are_those_of_plain_python_to_the_las
             ContactSensor(geoms=("ball", "bx")),
             r"scene\.sensors\.feet: no geom matches 'bx': did you mean 'box'",
         ),
-        (ContactSensor(geoms=("ball",), against="terain"), r"no body 'terain': did you mean 'terrain'"),
+        (
+            ContactSensor(geoms=("ball",), against="terain"),
+            r"no body 'terain': did you mean 'terrain'",
+        ),
     ],
 )
 def test_unknown_geoms_and_bodies_are_refused(sensor, message):
@@ -338,5 +355,7 @@ def test_unknown_geoms_and_bodies_are_refused(sensor, message):
 
 @pytest.mark.parametrize("given", [{}, {"geoms": ("ball",), "bodies": ("ball",)}])
 def test_a_sensor_needs_one_kind_of_element(given):
-    with pytest.raises(ValueError, match=r"geoms=.*, bodies=.*, subtrees=.*: give exactly one of them"):
+    with pytest.raises(
+        ValueError, match=r"geoms=.*, bodies=.*, subtrees=.*: give exactly one of them"
+    ):
         ContactSensor(**given)

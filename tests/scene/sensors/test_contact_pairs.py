@@ -132,7 +132,9 @@ def test_contacts_agree_with_the_c_engine(settled):
     )
     np.testing.assert_allclose(state.position_EN3[0, 0], contact.pos, atol=1e-4)
     # The ball of the leg's foot is a box: its point of contact is the middle of its sole.
-    np.testing.assert_allclose(settled.view.contact("limb").position_EN3[0, 0, :2], (2.0, 0.0), atol=1e-4)
+    np.testing.assert_allclose(
+        settled.view.contact("limb").position_EN3[0, 0, :2], (2.0, 0.0), atol=1e-4
+    )
 
 
 def test_rows_without_contact_have_no_position(settled):
@@ -158,5 +160,7 @@ def test_what_has_no_meaning_is_refused(fields, message):
 def test_unknown_others_name_the_kind_and_the_near_names():
     spec = mujoco.MjSpec.from_string(SCENE)
     sensor = ContactSensor(bodies=("left",), against="gripperr", against_kind="subtree")
-    with pytest.raises(ValueError, match=r"scene\.sensors\.x: no body 'gripperr': did you mean 'gripper'"):
+    with pytest.raises(
+        ValueError, match=r"scene\.sensors\.x: no body 'gripperr': did you mean 'gripper'"
+    ):
         sensor.add_to(spec, "x")

@@ -32,9 +32,12 @@ def bench_of(**fields):
     sensor = ContactPoints(bodies=("plank",), against=PARTNERS, **fields)
     bench = SensorBench(SCENE, 2, {"points": sensor})
     # The second row stands 0.1 m away from the wall.
-    pose = torch.tensor([[0.0, 0.0, 0.048, 1.0, 0.0, 0.0, 0.0], [-0.1, 0.0, 0.048, 1.0, 0.0, 0.0, 0.0]])
+    pose = torch.tensor(
+        [[0.0, 0.0, 0.048, 1.0, 0.0, 0.0, 0.0], [-0.1, 0.0, 0.048, 1.0, 0.0, 0.0, 0.0]]
+    )
     bench.place(
-        qpos=pose, qvel=torch.tensor([[0.5, 0.3, -0.2, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
+        qpos=pose,
+        qvel=torch.tensor([[0.5, 0.3, -0.2, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]]),
     )
     return bench
 
@@ -43,7 +46,10 @@ def contacts_of_c(bench, row, substeps):
     """Return by substep and partner the contacts of the C engine: force, torque, distance, position, normal."""
     model = bench.world.mj_model
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = bench.world.qpos_EL[row].double(), bench.world.qvel_EL[row].double()
+    data.qpos[:], data.qvel[:] = (
+        bench.world.qpos_EL[row].double(),
+        bench.world.qvel_EL[row].double(),
+    )
     plank = model.body("plank").id
     by_substep = []
     for _ in range(substeps):
@@ -85,7 +91,9 @@ def test_contacts_are_those_of_the_c_engine_in_their_order(order):
         for place, partner in enumerate(PARTNERS):
             ordered = sorted(expected[row][partner], key=KEYS[order])
             slots = slice(3 * place, 3 * place + 3)
-            assert state.found_EN[row, slots].tolist() == [1.0] * len(ordered) + [0.0] * (3 - len(ordered))
+            assert state.found_EN[row, slots].tolist() == [1.0] * len(ordered) + [0.0] * (
+                3 - len(ordered)
+            )
             for slot, contact in enumerate(ordered, start=3 * place):
                 for leaf, value, atol in zip(
                     (
@@ -101,7 +109,11 @@ def test_contacts_are_those_of_the_c_engine_in_their_order(order):
                 ):
                     np.testing.assert_allclose(leaf[row, slot], value, atol=atol, rtol=5e-3)
     # Row 0 slides along the ground and presses against the wall; row 1 stands on the ground alone.
-    assert len(expected[0]["terrain"]) == 2 and len(expected[0]["wall"]) == 1 and not expected[1]["wall"]
+    assert (
+        len(expected[0]["terrain"]) == 2
+        and len(expected[0]["wall"]) == 1
+        and not expected[1]["wall"]
+    )
     assert state.torque_EN3[0].norm(dim=-1).max() > 1e-3
     term = mdp.ContactReading(sensor="points", quantity="torque")
     with bench.driver.scope("observations/x"):
@@ -150,4 +162,6 @@ def test_without_partners_anything_counts_and_names_are_checked():
     with pytest.raises(ValueError, match="num_slots=0"):
         ContactPoints(geoms=("left",), num_slots=0)
     with pytest.raises(ValueError, match="no ContactPoints 'touch'"):
-        SensorBench(SCENE, 1, {"touch": ContactSensor(geoms=("left",))}).view.contact_points("touch")
+        SensorBench(SCENE, 1, {"touch": ContactSensor(geoms=("left",))}).view.contact_points(
+            "touch"
+        )

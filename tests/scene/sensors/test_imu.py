@@ -39,7 +39,9 @@ def bench():
 
 
 def assert_reads(actual_EL, *expected, atol=1e-3):
-    torch.testing.assert_close(actual_EL, torch.tensor(expected).expand_as(actual_EL), atol=atol, rtol=0)
+    torch.testing.assert_close(
+        actual_EL, torch.tensor(expected).expand_as(actual_EL), atol=atol, rtol=0
+    )
 
 
 def test_at_rest_the_accelerometer_reads_gravity_upwards(bench):
@@ -62,7 +64,9 @@ def test_in_free_fall_the_accelerometer_reads_nothing(bench):
 def test_angular_velocity_and_gravity_are_in_the_axes_of_the_unit(bench):
     # The body is turned by 90 degrees about x (its z axis points to world -y), and spins about its own x and z.
     half = 0.5**0.5
-    bench.place(qpos=[0.0, 0.0, 3.0, half, half, 0.0, 0.0] + AXLE, qvel=[0.0, 0.0, 0.0, 3.0, 0.0, 5.0, 0.0])
+    bench.place(
+        qpos=[0.0, 0.0, 3.0, half, half, 0.0, 0.0] + AXLE, qvel=[0.0, 0.0, 0.0, 3.0, 0.0, 5.0, 0.0]
+    )
     body, chip = bench.view.imu("body"), bench.view.imu("chip")
     assert_reads(body.ang_vel_EL, 3.0, 0.0, 5.0)
     assert_reads(body.projected_gravity_EL, 0.0, -1.0, 0.0)

@@ -62,7 +62,9 @@ class Bench:
         self.driver.add_sensors({"scan": sensor})
         self.tracker = self.view.sensors["scan"]
         quat = torch.nn.functional.normalize(torch.tensor([0.8, 0.1, -0.2, 0.5]), dim=0).tolist()
-        self.place(torch.tensor([[0.1 * row, 0.2, 1.0 + 0.1 * row, *quat] for row in range(NUM_ENVS)]))
+        self.place(
+            torch.tensor([[0.1 * row, 0.2, 1.0 + 0.1 * row, *quat] for row in range(NUM_ENVS)])
+        )
 
     def place(self, pose_E7) -> None:
         self.world.qpos_EL.copy_(pose_E7)
@@ -79,7 +81,9 @@ class Bench:
         mujoco.mj_kinematics(mj_model, mj_data)
         group = np.array([number in groups for number in range(6)], dtype=np.uint8)
         normal, geom = np.zeros(3), np.zeros(1, dtype=np.int32)
-        distance = mujoco.mj_ray(mj_model, mj_data, start, direction, group, 1, exclude, geom, normal)
+        distance = mujoco.mj_ray(
+            mj_model, mj_data, start, direction, group, 1, exclude, geom, normal
+        )
         return distance, normal
 
     def frame(self, row):
@@ -162,13 +166,21 @@ def test_rays_over_several_sites_are_those_of_each_site_one_after_the_other():
     pattern = RingPattern(num_rays=6, elevations=(-60.0,))
     both = Bench(RayCaster(pattern=pattern, sites=("eye", "toe"), max_distance=3.0), scene)
     states = [
-        Bench(RayCaster(pattern=pattern, site=site, max_distance=3.0), scene) for site in ("eye", "toe")
+        Bench(RayCaster(pattern=pattern, site=site, max_distance=3.0), scene)
+        for site in ("eye", "toe")
     ]
-    for leaf, *parts in zip(both.tracker.state, *(one.tracker.state for one in states), strict=True):
+    for leaf, *parts in zip(
+        both.tracker.state, *(one.tracker.state for one in states), strict=True
+    ):
         assert torch.equal(leaf, torch.cat(parts, dim=1))
-    assert both.tracker.state.hit_EN.any() and both.tracker.state.distance_EN.shape == (NUM_ENVS, 12)
+    assert both.tracker.state.hit_EN.any() and both.tracker.state.distance_EN.shape == (
+        NUM_ENVS,
+        12,
+    )
     origins = torch.cat([one.tracker.origin_EN3 for one in states], dim=1)
-    assert torch.equal(both.tracker.origin_EN3, origins) and not torch.equal(origins[:, 0], origins[:, 6])
+    assert torch.equal(both.tracker.origin_EN3, origins) and not torch.equal(
+        origins[:, 0], origins[:, 6]
+    )
     with pytest.raises(ValueError, match="no site matches 'ey'"):
         RayCaster(pattern=pattern, sites=("ey",)).add_to(mujoco.MjSpec.from_string(SCENE), "scan")
     with pytest.raises(ValueError, match="give the sites alone"):
@@ -176,14 +188,19 @@ def test_rays_over_several_sites_are_those_of_each_site_one_after_the_other():
 
 
 def test_patterns_are_what_they_say():
-    start, direction = GridPattern(size=(1.0, 0.5), resolution=0.5, height=0.2, direction=(0, 0, -2)).rays()
+    start, direction = GridPattern(
+        size=(1.0, 0.5), resolution=0.5, height=0.2, direction=(0, 0, -2)
+    ).rays()
     assert np.allclose(
-        start[:, :2], [[-0.5, -0.25], [0, -0.25], [0.5, -0.25], [-0.5, 0.25], [0, 0.25], [0.5, 0.25]]
+        start[:, :2],
+        [[-0.5, -0.25], [0, -0.25], [0.5, -0.25], [-0.5, 0.25], [0, 0.25], [0.5, 0.25]],
     )
     assert np.allclose(start[:, 2], 0.2) and np.allclose(direction, [0, 0, -1])
     start, direction = PinholePattern(width=2, height=2, fovy=90.0).rays()
     assert np.allclose(start, 0.0)
-    expected = np.array([[1, 0.5, 0.5], [1, -0.5, 0.5], [1, 0.5, -0.5], [1, -0.5, -0.5]]) / math.sqrt(1.5)
+    expected = np.array(
+        [[1, 0.5, 0.5], [1, -0.5, 0.5], [1, 0.5, -0.5], [1, -0.5, -0.5]]
+    ) / math.sqrt(1.5)
     assert np.allclose(direction, expected)
     _, direction = RingPattern(num_rays=4, elevations=(0.0, 45.0)).rays()
     root = math.sqrt(0.5)

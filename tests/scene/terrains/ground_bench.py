@@ -56,7 +56,11 @@ class GroundBench:
     """Worlds, their view and their ground; `mj_model(row)` is the C engine's model of one of them."""
 
     def __init__(
-        self, grid: TerrainGrid = GRID, num_envs: int = NUM_ENVS, things: str = THINGS, sim: SimCfg = ROOM
+        self,
+        grid: TerrainGrid = GRID,
+        num_envs: int = NUM_ENVS,
+        things: str = THINGS,
+        sim: SimCfg = ROOM,
     ) -> None:
         spec = mujoco.MjSpec.from_string(things)
         grid.add_to(spec)
@@ -70,7 +74,10 @@ class GroundBench:
 
     def mj_model(self, row: int) -> mujoco.MjModel:
         """Return the model whose terrain geom has the height field of one world, by its name."""
-        level, column = int(self.ground.levels_E[row]), row * GRID.num_columns // self.world.num_envs
+        level, column = (
+            int(self.ground.levels_E[row]),
+            row * GRID.num_columns // self.world.num_envs,
+        )
         spec = mujoco.MjSpec.from_string(THINGS)
         GRID.add_to(spec)
         spec.geom("terrain").hfieldname = f"terrain_{level}_{column}"
@@ -87,7 +94,10 @@ class GroundBench:
     def mj_data(self, row: int, mj_model: mujoco.MjModel) -> mujoco.MjData:
         """Return the C engine's data at the present state of one world, after its forward pass."""
         mj_data = mujoco.MjData(mj_model)
-        mj_data.qpos[:], mj_data.qvel[:] = self.world.qpos_EL[row].numpy(), self.world.qvel_EL[row].numpy()
+        mj_data.qpos[:], mj_data.qvel[:] = (
+            self.world.qpos_EL[row].numpy(),
+            self.world.qvel_EL[row].numpy(),
+        )
         mujoco.mj_forward(mj_model, mj_data)
         return mj_data
 

@@ -53,12 +53,18 @@ def walker_env(render_mode=None, viewer=None, **fields) -> ManagerBasedRlEnv:
     scan = ObservationTermCfg(term=HeightScan(size=(0.4, 0.4), resolution=0.2, offset=0.1))
     group = ObservationGroupCfg(terms={"pos": ObservationTermCfg(term=RootPos()), "scan": scan})
     command = UniformVelocityCommand(
-        resampling_time_range_s=(5.0, 5.0), lin_vel_x=(1.0, 1.0), lin_vel_y=(0.0, 0.0), ang_vel_z=(0.0, 0.0)
+        resampling_time_range_s=(5.0, 5.0),
+        lin_vel_x=(1.0, 1.0),
+        lin_vel_y=(0.0, 0.0),
+        ang_vel_z=(0.0, 0.0),
     )
     defaults = {
         "events": {"start": ResetRootUniform(**TURN)},
         "scene": SceneCfg(
-            robots={"walker": MjcfRobot(source=WALKER)}, terrain=GRID, num_envs=NUM_ENVS, spacing=GRID.size
+            robots={"walker": MjcfRobot(source=WALKER)},
+            terrain=GRID,
+            num_envs=NUM_ENVS,
+            spacing=GRID.size,
         ),
     }
     return ManagerBasedRlEnv(
@@ -137,7 +143,9 @@ def test_a_walk_over_the_edge_ends_in_a_truncation_and_a_higher_level(env):
 
 def test_levels_and_patches_survive_a_checkpoint(env):
     root_E = env.reset()
-    env.view.terrain.set_levels(torch.ones(NUM_ENVS, dtype=torch.bool), 2 - torch.arange(NUM_ENVS) % 3)
+    env.view.terrain.set_levels(
+        torch.ones(NUM_ENVS, dtype=torch.bool), 2 - torch.arange(NUM_ENVS) % 3
+    )
     root_E = step(env, root_E, 3)
     levels, state = env.view.terrain.levels_E.tolist(), env.state_dict()
     expected = step(env, root_E.clone(), 5)
@@ -161,7 +169,9 @@ def test_pictures_show_the_patch_that_the_env_stands_on():
     pictures = {}
     for row in (0, 1, 4, 9):
         env = walker_env("rgb_array", dataclasses.replace(viewer, env_index=row), events={})
-        env.view.terrain.set_levels(torch.ones(NUM_ENVS, dtype=torch.bool), torch.full((NUM_ENVS,), 2))
+        env.view.terrain.set_levels(
+            torch.ones(NUM_ENVS, dtype=torch.bool), torch.full((NUM_ENVS,), 2)
+        )
         env.world.qpos_EL[:] = torch.tensor([0.0, 0.0, 9.0, 1.0, 0.0, 0.0, 0.0, 0.0])
         env.world.refresh()
         env.driver.refreshed()
@@ -182,7 +192,9 @@ def even_env(num_envs=NUM_ENVS, **fields):
     grid = dataclasses.replace(
         GRID, patches=patches, num_levels=2, num_columns=2, size=6.0, max_initial_level=1
     )
-    event = ResetRootOnEvenGround(**({"edge": 0.4, "max_difference": 0.02, "num_places": 8} | fields))
+    event = ResetRootOnEvenGround(
+        **({"edge": 0.4, "max_difference": 0.02, "num_places": 8} | fields)
+    )
     scene = SceneCfg(
         robots={"walker": MjcfRobot(source=WALKER)}, terrain=grid, num_envs=num_envs, spacing=6.0
     )
@@ -212,7 +224,9 @@ def test_ground_without_an_even_square_is_named():
         ValueError, match=r"no square of 1\.5 m of level 0 of the ground 'slope' is even within"
     ):
         even_env(edge=1.5)
-    with pytest.raises(ValueError, match="edge=7.0: the patches of the terrain have edges of 6.0 m"):
+    with pytest.raises(
+        ValueError, match="edge=7.0: the patches of the terrain have edges of 6.0 m"
+    ):
         even_env(edge=7.0)
     with pytest.raises(ValueError, match="even everywhere: use ResetRootUniform"):
         Ground(2, torch.device("cpu")).places_on_even_ground(edge=1.0, max_difference=0.1, count=2)

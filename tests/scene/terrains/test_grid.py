@@ -34,7 +34,9 @@ def test_columns_follow_the_proportions_and_no_kind_is_left_out():
     }
     assert TerrainGrid(patches=patches, num_columns=3).columns == ("a", "b", "c")
     columns = TerrainGrid(patches=patches, num_columns=12).columns
-    assert [columns.count(name) for name in "abc"] == [7, 4, 1] and columns == tuple(sorted(columns))
+    assert [columns.count(name) for name in "abc"] == [7, 4, 1] and columns == tuple(
+        sorted(columns)
+    )
 
 
 def test_difficulty_rises_from_0_to_1():
@@ -65,7 +67,9 @@ def test_mujoco_has_each_patch_with_its_heights(mj_model):
         expected = GRID.heights(*divmod(number, 5))
         rows, columns = int(mj_model.hfield_nrow[number]), int(mj_model.hfield_ncol[number])
         first = mj_model.hfield_adr[number]
-        heights = mj_model.hfield_data[first : first + rows * columns] * mj_model.hfield_size[number, 2]
+        heights = (
+            mj_model.hfield_data[first : first + rows * columns] * mj_model.hfield_size[number, 2]
+        )
         assert np.allclose(heights.reshape(rows, columns), expected, atol=1e-6)
         assert np.allclose(mj_model.hfield_size[number, :2], 2.0)
     assert mj_model.body("terrain").id > 0 and mj_model.body("terrain").mass == 0.0

@@ -31,7 +31,9 @@ def mj_models(bench):
 
 
 def spread(low=-1.6, high=1.6, seed=0):
-    return torch.empty(NUM_ENVS, 2).uniform_(low, high, generator=torch.Generator().manual_seed(seed))
+    return torch.empty(NUM_ENVS, 2).uniform_(
+        low, high, generator=torch.Generator().manual_seed(seed)
+    )
 
 
 def on_ground(bench, place_E2, height):
@@ -44,7 +46,9 @@ def test_each_level_and_kind_has_its_env(bench):
     assert bench.ground.levels_E.tolist() == [0, 1, 2] * 5
     columns_E = bench.ground.patches_E - 5 * bench.ground.levels_E
     assert columns_E.tolist() == [column for column in range(5) for _ in range(3)]
-    assert bench.ground.half_width == 2.0 and bench.ground.num_levels == 3 and not bench.ground.is_flat
+    assert (
+        bench.ground.half_width == 2.0 and bench.ground.num_levels == 3 and not bench.ground.is_flat
+    )
 
 
 def test_model_fields_are_those_that_mujoco_compiles_for_the_height_field(bench, mj_models):
@@ -74,7 +78,9 @@ def test_heights_are_where_rays_of_the_c_engine_hit(bench, mj_models):
 
 def test_beyond_the_edge_the_ground_is_that_of_the_nearest_point(bench):
     outside = torch.tensor([[3.0, 0.3], [-9.0, 9.0], [0.3, -2.0001]]).expand(NUM_ENVS, -1, -1)
-    assert torch.equal(bench.ground.heights(outside), bench.ground.heights(outside.clamp(-2.0, 2.0)))
+    assert torch.equal(
+        bench.ground.heights(outside), bench.ground.heights(outside.clamp(-2.0, 2.0))
+    )
 
 
 def test_clearance_is_the_height_above_the_ground(bench):
@@ -88,7 +94,9 @@ def test_nothing_stands_out_above_the_origins_where_envs_start(bench, mj_models)
 
     def highest(mj_model, width):
         reach = np.linspace(-1.0, 1.0, 21) * min(width / 2, 1.99)
-        return ground_heights(mj_model, np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)).max()
+        return ground_heights(
+            mj_model, np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
+        ).max()
 
     for row, mj_model in enumerate(mj_models):
         x, y, z = bench.ground.origins_E3[row].tolist()
@@ -161,9 +169,7 @@ def test_other_levels_move_the_masked_rows_only():
 
 def test_a_height_field_of_the_robots_own_is_left_alone():
     own = '<geom name="hat" type="hfield" hfield="hat" pos="0 0 9" contype="0" conaffinity="0"/>'
-    hat = (
-        '<asset><hfield name="hat" size="0.1 0.1 0.2 0.1" nrow="3" ncol="2" elevation="0 1 0 1 0 1"/></asset>'
-    )
+    hat = '<asset><hfield name="hat" size="0.1 0.1 0.2 0.1" nrow="3" ncol="2" elevation="0 1 0 1 0 1"/></asset>'
     things = THINGS.replace("<worldbody>", f"{hat}<worldbody>{own}", 1)
     bench, twin = GroundBench(num_envs=5, things=things), GroundBench(num_envs=5)
     points_EN2 = torch.rand(5, 20, 2) * 3.0 - 1.5

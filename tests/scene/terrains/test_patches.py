@@ -92,7 +92,9 @@ def test_stairs_are_the_same_on_all_four_sides():
 @pytest.mark.parametrize(("difficulty", "gradient"), [(0.0, 0.1), (1.0, 0.5)])
 @pytest.mark.parametrize(("inverted", "sign"), [(False, -1), (True, 1)])
 def test_slopes_have_one_angle(difficulty, gradient, inverted, sign):
-    x, z = along_x(PyramidSlope(gradient=(0.1, 0.5), platform_width=2.0, inverted=inverted), difficulty)
+    x, z = along_x(
+        PyramidSlope(gradient=(0.1, 0.5), platform_width=2.0, inverted=inverted), difficulty
+    )
     assert np.allclose(z[x <= 1.0], 0.0)
     assert np.allclose(np.diff(z) / np.diff(x), np.where(x[:-1] < 1.0, 0.0, sign * gradient))
 
@@ -139,7 +141,11 @@ def test_stones_and_the_gaps_between_them_have_their_widths(difficulty, width, g
         [(stop - 1 - start) * 0.05 for start, stop in stones[:-1]], width
     )  # the last one is cut off
     assert np.allclose(
-        [(after - (stop - 1)) * 0.05 for (_, stop), (after, _) in zip(stones, stones[1:], strict=False)], gap
+        [
+            (after - (stop - 1)) * 0.05
+            for (_, stop), (after, _) in zip(stones, stones[1:], strict=False)
+        ],
+        gap,
     )
     assert np.allclose(row[row <= -0.2], -0.5)
     assert np.abs(row[row > -0.2]).max() <= 0.05 * difficulty + 1e-12
@@ -148,7 +154,9 @@ def test_stones_and_the_gaps_between_them_have_their_widths(difficulty, width, g
 
 @pytest.mark.parametrize(("difficulty", "width"), [(0.0, 0.1), (0.6, 0.4), (1.0, 0.6)])
 def test_gaps_have_their_width_and_depth(difficulty, width):
-    x, z = along_x(Gaps(width=(0.1, 0.6), spacing=0.8, depth=0.4, platform_width=1.5, cell=0.05), difficulty)
+    x, z = along_x(
+        Gaps(width=(0.1, 0.6), spacing=0.8, depth=0.4, platform_width=1.5, cell=0.05), difficulty
+    )
     holes = runs(z < -0.2)
     brinks = [(x[start - 1], x[stop]) for start, stop in holes if stop < len(x)]
     assert np.isclose(brinks[0][0], 0.75)
@@ -174,12 +182,16 @@ def test_perlin_noise_has_its_height_and_one_level_where_its_waves_meet():
 
 
 def test_random_stairs_rise_by_drawn_steps():
-    patch = RandomStairs(step_height=(0.1, 0.2), least_share=0.5, step_width=0.6, platform_width=2.0)
+    patch = RandomStairs(
+        step_height=(0.1, 0.2), least_share=0.5, step_width=0.6, platform_width=2.0
+    )
     x, z = along_x(patch, 1.0)
     rises = np.diff(z)
     risers = np.flatnonzero(rises)
     assert np.allclose(x[risers], 1.0 + 0.6 * np.arange(5)) and np.allclose(z[x <= 1.0], 0.0)
-    assert rises[risers].min() >= 0.1 and rises[risers].max() <= 0.2 and np.ptp(rises[risers]) > 0.01
+    assert (
+        rises[risers].min() >= 0.1 and rises[risers].max() <= 0.2 and np.ptp(rises[risers]) > 0.01
+    )
     easy = np.diff(along_x(patch, 0.0)[1])
     assert np.allclose(easy, 0.5 * rises), "the same shares of half the height"
 
@@ -210,7 +222,9 @@ def test_tilted_squares_are_planes_within_their_tilt():
 
 
 def test_boxes_stand_on_the_ground_and_are_turned():
-    patch = RandomBoxes(height=(0.1, 0.4), least_share=0.5, width=(0.8, 0.8), num_boxes=1, platform_width=0.0)
+    patch = RandomBoxes(
+        height=(0.1, 0.4), least_share=0.5, width=(0.8, 0.8), num_boxes=1, platform_width=0.0
+    )
     for seed in range(20):
         # One that lies wholly inside of the patch has its whole area, whichever way it is turned.
         z = heights(dataclasses.replace(patch, cell=0.02), 1.0, seed)
@@ -223,13 +237,16 @@ def test_boxes_stand_on_the_ground_and_are_turned():
     assert on.any(0).sum() * 0.02 > 0.85
     many = heights(RandomBoxes(height=(0.1, 0.4), platform_width=1.5), 1.0)
     assert (
-        np.all(many[Lattice(SIZE, RandomBoxes().cell).ring_RC <= 0.75] == 0.0) and (many > 0.0).mean() > 0.2
+        np.all(many[Lattice(SIZE, RandomBoxes().cell).ring_RC <= 0.75] == 0.0)
+        and (many > 0.0).mean() > 0.2
     )
 
 
 @pytest.mark.parametrize(("difficulty", "ring", "gap"), [(0.0, 0.6, 0.1), (1.0, 0.3, 0.3)])
 def test_rings_and_the_trenches_between_them_have_their_widths(difficulty, ring, gap):
-    patch = NestedRings(ring_width=(0.6, 0.3), gap=(0.1, 0.3), height=0.1, depth=0.4, platform_width=1.5)
+    patch = NestedRings(
+        ring_width=(0.6, 0.3), gap=(0.1, 0.3), height=0.1, depth=0.4, platform_width=1.5
+    )
     x, z = along_x(patch, difficulty)
     holes = runs(z < -0.3)
     brinks = [(x[start - 1], x[stop]) for start, stop in holes if stop < len(x)]
@@ -241,12 +258,16 @@ def test_rings_and_the_trenches_between_them_have_their_widths(difficulty, ring,
 
 @pytest.mark.parametrize(("difficulty", "width"), [(0.0, 0.5), (1.0, 0.3)])
 def test_beams_lead_outwards_over_a_pit(difficulty, width):
-    patch = NarrowBeams(beam_width=(0.5, 0.3), num_beams=4, depth=0.4, platform_width=1.5, cell=0.05)
+    patch = NarrowBeams(
+        beam_width=(0.5, 0.3), num_beams=4, depth=0.4, platform_width=1.5, cell=0.05
+    )
     z = heights(patch, difficulty)
     # At the edge of the patch one beam is left, across the x axis; as many on each side.
     beams = runs(z[:, -1] == 0.0)
     assert [(stop - 1 - start) * 0.05 for start, stop in beams] == [pytest.approx(width)]
-    assert np.array_equal(z, z.T) and np.array_equal(z, z[::-1]) and set(np.unique(z)) == {-0.4, 0.0}
+    assert (
+        np.array_equal(z, z.T) and np.array_equal(z, z[::-1]) and set(np.unique(z)) == {-0.4, 0.0}
+    )
     assert np.all(z[Lattice(SIZE, 0.05).ring_RC <= 0.75] == 0.0)
 
 

@@ -35,7 +35,9 @@ def injected(env, states: Sequence[Moment], *, command: str, joints):
     reward_E = inner.reward_manager.step(everybody_E)
     rewards_ER = inner.reward_manager.episode_sums_ER - before_ER
     torch.testing.assert_close(rewards_ER.sum(-1), reward_E, rtol=1e-4, atol=1e-4)
-    return inner.observation_manager.read(), dict(zip(inner.reward_manager.names, rewards_ER.T, strict=True))
+    return inner.observation_manager.read(), dict(
+        zip(inner.reward_manager.names, rewards_ER.T, strict=True)
+    )
 
 
 def assert_near(found: torch.Tensor, expected: np.ndarray, name: str) -> None:

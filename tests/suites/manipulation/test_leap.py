@@ -73,7 +73,11 @@ def test_steps_reward_actions_and_move_goals_as_the_formulas_say(env, mj_model):
         target_EL = np.clip(target_EL + 0.5 * actions[0], low, high)
         assert_near(world.ctrl_EL, target_EL, "targets")
         earned = dict(
-            zip(inner.reward_manager.names, (inner.reward_manager.episode_sums_ER - sums_ER).T, strict=True)
+            zip(
+                inner.reward_manager.names,
+                (inner.reward_manager.episode_sums_ER - sums_ER).T,
+                strict=True,
+            )
         )
         for row in range(COUNT):
             now = truth.Moment(
@@ -84,9 +88,14 @@ def test_steps_reward_actions_and_move_goals_as_the_formulas_say(env, mj_model):
                 sensordata=world.sensordata_EL[row].double().numpy(),
                 actuator_force=world.actuator_force_EL[row].double().numpy(),
             )
-            expected = truth.leap_rewards(mj_model, now, tuple(action_EL[row] for action_EL in actions[:3]))
+            expected = truth.leap_rewards(
+                mj_model, now, tuple(action_EL[row] for action_EL in actions[:3])
+            )
             for name, value in expected.items():
-                assert abs(float(earned[name][row]) - value) < 2e-5 * (1.0 + abs(value)), (name, row)
+                assert abs(float(earned[name][row]) - value) < 2e-5 * (1.0 + abs(value)), (
+                    name,
+                    row,
+                )
             new_goal = root["command", "goal"][row].double().numpy()
             if expected["reached"]:
                 num_reached += 1
@@ -117,7 +126,9 @@ def test_rows_that_reset_leave_the_goals_of_the_others_alone(env):
         _, root = env.step_and_maybe_reset(env.rand_action(root))
     inner = env.base_env
     before = {
-        name: value.clone() for name, value in inner.state_dict().items() if value.shape[:1] == (COUNT,)
+        name: value.clone()
+        for name, value in inner.state_dict().items()
+        if value.shape[:1] == (COUNT,)
     }
     env.reset(env_ids=[1, 4])
     after, others = inner.state_dict(), [0, 2, 3, 5, 6, 7]
@@ -142,10 +153,14 @@ def test_it_has_the_sizes_and_times_of_playground(env, mj_model):
         "geom_friction",
         "qpos0",
     ):
-        np.testing.assert_allclose(getattr(ours, field), getattr(mj_model, field), atol=1e-9, err_msg=field)
+        np.testing.assert_allclose(
+            getattr(ours, field), getattr(mj_model, field), atol=1e-9, err_msg=field
+        )
     assert ours.opt.ccd_iterations == 10 and ours.opt.integrator == mj_model.opt.integrator
     goal = mj_model.key_mpos[0]
-    np.testing.assert_allclose(inner.world.view("mocap_pos")[:, 0], np.tile(goal, (COUNT, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        inner.world.view("mocap_pos")[:, 0], np.tile(goal, (COUNT, 1)), atol=1e-6
+    )
 
 
 def test_episodes_end_where_the_cube_falls(env):
@@ -162,7 +177,10 @@ def test_hands_cubes_and_goals_start_as_playground_draws_them(mj_model):
     env = envs.make("leap_cube_reorient", num_envs=512, seed=3)
     world = env.base_env.world
     goal_E4 = env.reset()["command", "goal"].clone()
-    first_EL, home = world.qpos_EL.clone(), torch.tensor(mj_model.key("home").qpos, dtype=torch.float32)
+    first_EL, home = (
+        world.qpos_EL.clone(),
+        torch.tensor(mj_model.key("home").qpos, dtype=torch.float32),
+    )
     low, high = torch.tensor(mj_model.actuator_ctrlrange, dtype=torch.float32).T
     hand_EL = first_EL[:, :16]
     assert ((hand_EL >= low - 1e-6) & (hand_EL <= high + 1e-6)).all()

@@ -38,7 +38,9 @@ def test_it_observes_and_rewards_as_the_formulas_say(env, mj_model):
     moments = states(mj_model)
     observations, rewards = injected(env, moments, command="target", joints=DRIVEN)
     found_EL = torch.cat(list(observations.values()), dim=-1)
-    assert_near(found_EL, np.stack([truth.panda_observation(mj_model, now) for now in moments]), "obs")
+    assert_near(
+        found_EL, np.stack([truth.panda_observation(mj_model, now) for now in moments]), "obs"
+    )
     expected = [truth.panda_rewards(mj_model, now) for now in moments]
     assert set(rewards) == set(expected[0])
     for name, found_E in rewards.items():
@@ -67,8 +69,17 @@ def test_it_has_the_sizes_and_times_of_playground(env, mj_model):
     assert (inner.step_dt, inner.physics_dt) == pytest.approx((0.02, 0.005))
     assert inner.max_episode_length == 150
     ours = inner.world.mj_model
-    for field in ("body_mass", "dof_damping", "actuator_gainprm", "geom_friction", "eq_data", "qpos0"):
-        np.testing.assert_allclose(getattr(ours, field), getattr(mj_model, field), atol=1e-9, err_msg=field)
+    for field in (
+        "body_mass",
+        "dof_damping",
+        "actuator_gainprm",
+        "geom_friction",
+        "eq_data",
+        "qpos0",
+    ):
+        np.testing.assert_allclose(
+            getattr(ours, field), getattr(mj_model, field), atol=1e-9, err_msg=field
+        )
     for option in ("iterations", "ls_iterations", "integrator", "cone", "disableflags"):
         assert getattr(ours.opt, option) == getattr(mj_model.opt, option), option
 
@@ -81,7 +92,9 @@ def test_targets_move_by_the_action_within_the_control_ranges(env, mj_model):
     random = np.random.default_rng(1)
     for _ in range(4):
         action_EL = 2.0 * random.uniform(-1.0, 1.0, size=(COUNT, 8))
-        _, root = env.step_and_maybe_reset(root.set("action", torch.tensor(action_EL, dtype=torch.float32)))
+        _, root = env.step_and_maybe_reset(
+            root.set("action", torch.tensor(action_EL, dtype=torch.float32))
+        )
         expected_EL = np.clip(
             expected_EL + 0.04 * np.clip(action_EL, -1.0, 1.0), *mj_model.actuator_ctrlrange.T
         )
@@ -91,7 +104,13 @@ def test_targets_move_by_the_action_within_the_control_ranges(env, mj_model):
 def test_episodes_end_where_the_box_is_lost_and_after_150_steps(env):
     env.reset()
     inner = env.base_env
-    places = [[0.7, 0.0, 0.03], [1.01, 0.0, 0.03], [0.5, -1.01, 0.03], [0.5, 0.0, -0.001], [0.5, 0.0, 1.01]]
+    places = [
+        [0.7, 0.0, 0.03],
+        [1.01, 0.0, 0.03],
+        [0.5, -1.01, 0.03],
+        [0.5, 0.0, -0.001],
+        [0.5, 0.0, 1.01],
+    ]
     places += [[0.99, 0.99, 0.99], [-1.01, 0.0, 0.5], [-0.99, -0.99, 0.001]]
     inner.world.qpos_EL[:, 9:12] = torch.tensor(places)
     inner.world.refresh()
@@ -119,7 +138,10 @@ def test_boxes_and_targets_start_in_their_ranges_and_only_in_rows_that_reset(mj_
     env = envs.make("panda_pick_cube", num_envs=256, seed=3)
     world = env.base_env.world
     target_E3 = env.reset()["command", "target"].clone()
-    first_EL, home = world.qpos_EL.clone(), torch.tensor(mj_model.key("home").qpos, dtype=torch.float32)
+    first_EL, home = (
+        world.qpos_EL.clone(),
+        torch.tensor(mj_model.key("home").qpos, dtype=torch.float32),
+    )
     assert torch.equal(first_EL[:, :9], home[:9].expand(256, 9)) and not world.qvel_EL.any()
     assert torch.allclose(first_EL[:, 11:], home[11:])
     for column, low, high in ((first_EL[:, 9], 0.5, 0.9), (first_EL[:, 10], -0.2, 0.2)):
@@ -127,7 +149,9 @@ def test_boxes_and_targets_start_in_their_ranges_and_only_in_rows_that_reset(mj_
     for column, low, high in zip(target_E3.T, (0.5, -0.2, 0.23), (0.9, 0.2, 0.43), strict=True):
         is_uniform(column, low, high)
     again_E3 = env.reset(env_ids=torch.arange(10))["command", "target"]
-    assert torch.equal(world.qpos_EL[10:], first_EL[10:]) and torch.equal(again_E3[10:], target_E3[10:])
+    assert torch.equal(world.qpos_EL[10:], first_EL[10:]) and torch.equal(
+        again_E3[10:], target_E3[10:]
+    )
     assert not torch.isclose(world.qpos_EL[:10, 9:11], first_EL[:10, 9:11]).any()
     assert not torch.isclose(again_E3[:10], target_E3[:10]).any()
     env.close()

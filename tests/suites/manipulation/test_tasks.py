@@ -49,7 +49,9 @@ def test_a_masked_reset_at_every_step_is_the_eager_one(name):
                 if stepped["next", "done"].any():
                     root = env.reset(root.clone().set("_reset", stepped["next", "done"]))
             found.append(
-                torch.cat((stepped["next", "actor"], root["critic"], stepped["next", "reward"]), dim=-1)
+                torch.cat(
+                    (stepped["next", "actor"], root["critic"], stepped["next", "reward"]), dim=-1
+                )
             )
         rollouts.append(torch.stack(found))
         env.close()
@@ -59,7 +61,9 @@ def test_a_masked_reset_at_every_step_is_the_eager_one(name):
 @pytest.mark.usefixtures("models")
 @pytest.mark.parametrize("name", TASKS)
 def test_two_iterations_train(name, tmp_path):
-    cfg = conf.compose([f"task={name}", *SMALL.split(), "trainer.eval_episodes=0", "trainer.video=false"])
+    cfg = conf.compose(
+        [f"task={name}", *SMALL.split(), "trainer.eval_episodes=0", "trainer.video=false"]
+    )
     cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, episode_length_s=0.5))
     outcome = run(cfg, tmp_path / "run", progress=RunProgress(2))
     assert outcome.env_states == 2 * 64

