@@ -10,6 +10,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
+from itertools import pairwise
 from typing import Annotated, Any, Literal, TypeAlias
 
 from ksim_rl.checks import MOST_COUNT, check_choice, check_count, check_in_range, check_pair
@@ -67,6 +68,9 @@ Range = Annotated[tuple[float, float], Within(ordered=True)]
 NonNegativeRange = Annotated[tuple[float, float], Within(low=0.0, ordered=True)]
 Name = Annotated[str, Filled("expected a name")]
 
+# A weight itself, its gradient, and the two moments of Adam.
+NUMBERS_PER_WEIGHT = 4
+
 
 class Checked:
     """A base of dataclasses whose fields are checked against their annotations when one is built.
@@ -90,6 +94,12 @@ class Checked:
         Those of configs in its fields are left out. `ksim_rl.device.memory.check_room` compares them with a machine.
         """
         return {}
+
+
+def numbers_of_layers(widths: Sequence[int]) -> float:
+    """Return how many numbers layers of these widths need to learn: those of the weights between them, and biases."""
+    weights = sum(below * above for below, above in pairwise(widths))
+    return NUMBERS_PER_WEIGHT * (sum(widths) + weights)
 
 
 @cache

@@ -1,18 +1,21 @@
 """Reads what docstrings and comments say of the attributes of a class, for help and for pages."""
 
+import ast
 import dataclasses
 import inspect
+import io
 import re
+import textwrap
+import tokenize
 
 _HEAD = re.compile(r"^(?:Attributes|Args):$", re.MULTILINE)
 _ENTRY = re.compile(r"    ([A-Za-z_]\w*(?:, [A-Za-z_]\w*)*): (.*)")
-_COMMENTED = re.compile(r"^    (\w+): .*?  # (.*)$", re.MULTILINE)
 
 
 def attribute_texts(owner: type) -> dict[str, str]:
     """Return the text of each attribute under "Attributes:" in the docstrings of a class and its bases, by name.
 
-    Of fields of dataclasses it is also the comment at the end of their line. A class's text of an attribute counts more
+    Of fields of dataclasses it is also the comment at the end of their lines. A class's text counts more
     than its base's.
     """
     texts: dict[str, str] = {}
@@ -31,7 +34,7 @@ def first_sentence(text: str, most: int) -> str:
 
 
 def _comments(owner: type) -> dict[str, str]:
-    """Return the comments at the ends of the lines of fields."""
+    """Return the comments at the ends of the lines of each field."""
     if not dataclasses.is_dataclass(owner):
         return {}
     try:
@@ -39,7 +42,24 @@ def _comments(owner: type) -> dict[str, str]:
     except (OSError, TypeError):
         # A class that was made at run time has no source.
         return {}
-    return {match[1]: match[2] for match in _COMMENTED.finditer(source)}
+    source = textwrap.dedent(source)
+    comments: dict[int, str] = {}
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        # A comment alone in its line is no text of a field.
+        if token.type == tokenize.COMMENT and token.line[: token.start[1]].strip():
+            comments[token.start[0]] = token.string.removeprefix("#").strip()
+    texts: dict[str, str] = {}
+    (tree,) = ast.parse(source).body
+    assert isinstance(tree, ast.ClassDef)
+    for field in tree.body:
+        if not isinstance(field, ast.AnnAssign) or not isinstance(field.target, ast.Name):
+            continue
+        # A field may take several lines, of which any may have the comment.
+        lines = range(field.lineno, (field.end_lineno or field.lineno) + 1)
+        said = [comments[line] for line in lines if line in comments]
+        if said:
+            texts[field.target.id] = " ".join(said)
+    return texts
 
 
 def _of_docstring(text: str) -> dict[str, str]:

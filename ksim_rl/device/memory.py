@@ -4,10 +4,9 @@ import gc
 import os
 import re
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from itertools import pairwise
 
 import torch
 
@@ -19,8 +18,6 @@ ROLLOUT_PARTS = 4
 _UNITS = {None: 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 # Of a number in memory: float32 nearly everywhere.
 _NUMBER_BYTES = 4
-# A weight itself, its gradient, and the two moments of Adam.
-NUMBERS_PER_WEIGHT = 4
 
 
 class TooManyEnvsError(ValueError):
@@ -29,12 +26,6 @@ class TooManyEnvsError(ValueError):
     def __init__(self, text: str, *, per_env: int) -> None:
         super().__init__(text)
         self.per_env = per_env
-
-
-def numbers_of_layers(widths: Sequence[int]) -> float:
-    """Return how many numbers layers of these widths need to learn: those of the weights between them, and biases."""
-    weights = sum(below * above for below, above in pairwise(widths))
-    return NUMBERS_PER_WEIGHT * (sum(widths) + weights)
 
 
 def check_room(cfg: Checked, *, num_envs: int, device: torch.device, path: str = "") -> None:

@@ -9,8 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import ValueOperator
 
-from ksim_rl.checked import Count, NonNegative
-from ksim_rl.device.memory import numbers_of_layers
+from ksim_rl.checked import Count, NonNegative, numbers_of_layers
 from ksim_rl.modules.mlp import Device, mlp
 from ksim_rl.modules.network import (
     LayeredNetwork,

@@ -11,9 +11,8 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Composite
 
-from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative
+from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative, numbers_of_layers
 from ksim_rl.checks import check_choice, check_in_range
-from ksim_rl.device.memory import numbers_of_layers
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.ranks.running_moments import RunningMoments, publish

@@ -21,8 +21,7 @@ from torchrl.envs import EnvBase, InitTracker
 from torchrl.envs.transforms import TensorDictPrimer, Transform
 from torchrl.modules import SafeProbabilisticTensorDictSequential, recurrent_mode
 
-from ksim_rl.checked import Checked, Count
-from ksim_rl.device.memory import NUMBERS_PER_WEIGHT
+from ksim_rl.checked import NUMBERS_PER_WEIGHT, Checked, Count
 from ksim_rl.modules.actor import make_actor
 from ksim_rl.modules.actor_cfg import ActorCfg
 from ksim_rl.modules.critic import CriticCfg, make_critic

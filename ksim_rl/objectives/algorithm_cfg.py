@@ -5,9 +5,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
-from ksim_rl.checked import Checked, Count, Filled, NonNegative, Positive, Repeats, Share, Within
+from ksim_rl.checked import (
+    Checked,
+    Count,
+    Filled,
+    NonNegative,
+    Positive,
+    Repeats,
+    Share,
+    Within,
+    numbers_of_layers,
+)
 from ksim_rl.checks import check_in_range
-from ksim_rl.device.memory import numbers_of_layers
 
 PositiveShare = Annotated[float, Within(low=0.0, high=1.0, low_open=True)]
 Schedule = Literal["adaptive", "fixed"]

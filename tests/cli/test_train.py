@@ -211,7 +211,9 @@ def test_what_an_export_will_leave_out_is_said_before_the_first_iteration(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    own = "+task.rewards.force={_target_:ksim_rl.mdp.ActuatorForceL2,weight:-0.001}"
+    noise = "{_target_:ksim_rl.transforms.GaussianNoise,std:0.1}"
+    target = "ksim_rl.transforms.ObservationNoise"
+    own = f"+task.transforms.noise={{_target_:{target},in_keys:[actor],noise:{noise}}}"
     quick = (
         "trainer.num_iterations=1",
         "trainer.video=false",
@@ -220,4 +222,4 @@ def test_what_an_export_will_leave_out_is_said_before_the_first_iteration(
     )
     run("train", *SMALL, *quick, own, f"hydra.run.dir={tmp_path / 'run'}")
     said = capsys.readouterr().out
-    assert "task.rewards.force is left out of sim2sim: ActuatorForceL2" in " ".join(said.split())
+    assert "task.transforms.noise acts in training only" in " ".join(said.split())

@@ -34,6 +34,8 @@ class Child(Parent):
 
     shared: int = 3
     commented: float = 1.0  # m, at most
+    # Of nothing.
+    wrapped: float = 2.0  # of a line that is too long
 
 
 def test_texts_come_from_docstrings_and_comments_and_children_count_more():
@@ -41,6 +43,7 @@ def test_texts_come_from_docstrings_and_comments_and_children_count_more():
         "shared": "its own.",
         "other": "of both; and more. A second sentence.",
         "commented": "m, at most",
+        "wrapped": "of a line that is too long",
     }
     assert first_sentence("Of both; and more. A second sentence.", 60) == "Of both; and more"
     assert first_sentence("one two three four", 13) == "one two ..."

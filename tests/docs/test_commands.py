@@ -28,7 +28,8 @@ def train_commands() -> list[str]:
 
 
 def overrides(command: str) -> list[str]:
-    words = shlex.split(command)
+    # What the shell fills in from a file is not known here.
+    words = shlex.split(re.sub(r"\$\([^)]*\)", "", command))
     for flag, values in FLAGS.items():
         if flag in words:
             start = words.index(flag)

@@ -42,7 +42,8 @@ METHODS = {"read_text", "from_file", "from_xml_path"}
 OTHERS = {
     "compiled/packages.py": {"distribution.read_text"},
     "diagnosis/doctor.py": {"NVIDIA.read_text"},
-    "export/folder.py": {"(STANDALONE / f'{name}.py').read_text", "onnx.load"},
+    "export/folder.py": {"(STANDALONE / f'{name}.py').read_text"},
+    "export/onnx_file.py": {"onnx.load"},
     "export/sim2sim.py": {"output.read_text"},
     "export/standalone/files.py": {"np.load", "mujoco.MjModel.from_xml_path"},
     "physics/load.py": {"mujoco.MjSpec.from_file"},
