@@ -111,6 +111,7 @@ def ksim_rl(site, *arguments):
     )
 
 
+@pytest.mark.full
 def test_an_algorithm_from_another_package_trains(site, tmp_path):
     words = (*SMALL, "trainer.warm_up=true", f"hydra.run.dir={tmp_path / 'run'}")
     done = ksim_rl(site, "train", "objective=mine", *words)

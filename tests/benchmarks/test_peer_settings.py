@@ -237,6 +237,7 @@ class _Pool:
         return SimpleNamespace(result=lambda: made_up(rises_by=rises_by, seed=cfg.seed))
 
 
+@pytest.mark.full
 def test_figures_seeds_curves_and_picture_are_written(monkeypatch, tmp_path):
     monkeypatch.setattr(peer_settings, "ProcessPoolExecutor", _Pool)
     monkeypatch.setattr(report, "write", functools.partial(report.write, folder=tmp_path))

@@ -15,6 +15,7 @@ def test_the_list_has_forty_files_and_says_of_each_what_it_is():
     assert len(listed) == len(yaml.safe_load(LIST.read_text()))
 
 
+@pytest.mark.full
 def test_a_walker_is_trained_and_other_feet_are_not_as_listed(tmp_path):
     (tmp_path / "dog.xml").write_text(dog())
     feet = [f"{end}_{side}_shank" for end in ("front", "rear") for side in ("left", "right")]

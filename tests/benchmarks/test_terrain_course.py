@@ -94,6 +94,7 @@ def test_a_task_without_levels_or_of_other_speeds_is_refused():
         course_of(dataclasses.replace(task, commands={"twist": slow}))
 
 
+@pytest.mark.full
 def test_robots_are_spread_evenly_and_an_untrained_policy_gets_nowhere(untrained):
     course = course_of(untrained.cfg.task)
     outcomes = walk(untrained, course, num_envs=NUM_ENVS)

@@ -3,6 +3,8 @@
 import os
 import time
 
+import pytest
+
 from benchmarks.judge.workers import in_processes
 
 
@@ -39,6 +41,7 @@ def test_a_process_that_is_spoilt_does_nothing_further():
     assert others[0][1] != others[1][1]
 
 
+@pytest.mark.full
 def test_what_runs_too_long_after_the_end_is_given_up():
     begun = time.monotonic()
     tasks = ["a", "hang"]
