@@ -42,13 +42,16 @@ def test_from_a_plan_to_numbers(tmp_path, capsys):
 
 REFUSED = {
     "neither": ((), "give either the LOG"),
-    "both": (("log.csv", "--propose", "go2"), "give either the LOG"),
+    "both": (("log.csv", "--propose", "quadruped"), "give either the LOG"),
     "no robot": (("log.csv",), "--robot: which robot"),
-    "kind": (("--propose", "go2", "--targets", "pos,speed"), "--targets='speed'"),
-    "base": (("--propose", "go2", "--base", "1,0,0"), "--base 1,0,0: expected a unit quaternion"),
-    "seconds": (("--propose", "go2", "--seconds", "1"), "--seconds=1.0"),
+    "kind": (("--propose", "quadruped", "--targets", "pos,speed"), "--targets='speed'"),
+    "base": (
+        ("--propose", "quadruped", "--base", "1,0,0"),
+        "--base 1,0,0: expected a unit quaternion",
+    ),
+    "seconds": (("--propose", "quadruped", "--seconds", "1"), "--seconds=1.0"),
     "task of a proposal": (
-        ("--propose", "go2", "--task", "go2_velocity_flat"),
+        ("--propose", "quadruped", "--task", "go2_velocity_flat"),
         "--task: it is of logs",
     ),
 }

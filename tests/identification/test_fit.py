@@ -67,13 +67,13 @@ def test_positions_alone_tell_the_sum_of_both_dampings_and_no_torque_constant(ro
 
 @pytest.mark.full
 def test_a_motion_without_speed_leaves_the_armature_open(robot, tmp_path):
-    # So slow that inertia is nothing beside friction and the servo.
+    # So slow that inertia is little beside friction and the servo, read by a poor encoder.
     time_T = np.arange(3000) / 500.0
-    slow_T = 0.1 * np.sin(1.5 * time_T)
+    slow_T = 0.1 * np.sin(0.3 * time_T)
     pos_TN = np.stack((slow_T, -0.8 + slow_T), axis=1)
     secret = hidden.Secret()
     read_TN = hidden.follow(secret, time_T, {"pos": pos_TN})
-    read_TN = read_TN + np.random.default_rng(0).normal(0.0, NOISE, read_TN.shape)
+    read_TN = read_TN + np.random.default_rng(0).normal(0.0, 0.05, read_TN.shape)
     path = tmp_path / "slow.csv"
     path.write_text(hidden.log_text(time_T, {"pos": pos_TN}, read_TN))
     findings = fit(robot, read_log(path, robot))

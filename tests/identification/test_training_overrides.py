@@ -48,9 +48,7 @@ def test_a_training_takes_them():
 @pytest.mark.full
 def test_an_env_draws_them():
     lines = overrides(found("go2", UnitreeGo2.joint_names), envs.task("go2_velocity_flat").cfg())
-    # `envs.make` takes the overrides of a task without its prefix.
-    own = [line.replace("task.", "", 1) for line in lines]
-    env = envs.make("go2_velocity_flat", num_envs=4, device="cpu", overrides=own)
+    env = envs.make("go2_velocity_flat", num_envs=4, device="cpu", overrides=lines)
     drawn = env.view.field("dof_armature")[:, 6:]
     assert 0.011 <= drawn.min() < drawn.max() <= 0.013
     stiffness = env.view.actuator_param("stiffness")
