@@ -7,11 +7,13 @@ import pytest
 from ksim_rl.identification.excitation import propose
 from ksim_rl.identification.held_robot import hold
 from ksim_rl.scene.robots import UnitreeGo2
+from tests.absent_models import skipped_without_models
 from tests.identification import hidden
 
 
 def test_a_quadruped_is_moved_widely_and_harmlessly():
-    robot = hold("go2")
+    with skipped_without_models():
+        robot = hold("go2")
     plan = propose(robot, ("pos", "vel", "effort"), seconds=5.0)
     again = propose(robot, ("pos", "vel", "effort"), seconds=5.0)
     assert all((plan.by_kind[kind] == again.by_kind[kind]).all() for kind in plan.by_kind)

@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 
 from ksim_rl.identification.held_robot import hold
+from tests.absent_models import skipped_without_models
 from tests.identification import hidden
 
 
 def test_a_robot_of_explicit_motors_keeps_its_gains_and_limits():
-    robot = hold("go2")
+    with skipped_without_models():
+        robot = hold("go2")
     assert len(robot.limbs()) == 4 and robot.mj_model.nv == 12
     calf = robot.joints[robot.joint_names.index("RL_calf_joint")]
     assert calf.nominal["stiffness"] == 30.0 and calf.nominal["servo_damping"] == 1.0

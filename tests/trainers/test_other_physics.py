@@ -8,11 +8,14 @@ from ksim_rl import conf
 from ksim_rl.scene.actuators import DelayedActuator
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.other_physics import judged_by
+from tests.scene.robots.reference import loaded_spec
 
 
 @pytest.fixture(scope="module")
 def by_c() -> RunCfg:
-    return conf.compose(["task=go1_velocity_flat", "num_envs=64", "task.sim.engine=c"])
+    cfg = conf.compose(["task=go1_velocity_flat", "num_envs=64", "task.sim.engine=c"])
+    loaded_spec(cfg.task.scene.robots["go1"])
+    return cfg
 
 
 def test_a_run_of_warp_is_judged_as_it_is(by_c):

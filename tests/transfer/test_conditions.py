@@ -13,6 +13,7 @@ from ksim_rl.scene.robots import Cartpole, Cheetah, Quadruped, UnitreeGo2
 from ksim_rl.scene.scene import build_spec
 from ksim_rl.transfer.changed_robot import changed, entries
 from ksim_rl.transfer.conditions import CONDITIONS
+from tests.scene.robots.reference import loaded_spec
 
 BY_NAME = {condition.name: condition.change for condition in CONDITIONS}
 
@@ -67,6 +68,7 @@ def test_actions_are_late_in_physics_steps(quadruped):
 
 def test_motors_are_of_another_kind_with_the_same_gains():
     cfg = envs.task("go2_velocity_flat").cfg()
+    loaded_spec(cfg.scene.robots["go2"])
     motors = BY_NAME["DC motors with back-EMF"](cfg).scene.robots["go2"].actuators
     own = UnitreeGo2().actuators
     assert all(isinstance(motor, DCMotorActuator) for motor in motors)
