@@ -42,9 +42,8 @@ def first_iteration_s(overrides: list[str], cache: str) -> float:
     said = subprocess.run(
         command, check=True, env=environment, stdout=subprocess.PIPE, text=True
     ).stdout
-    return (
-        float(said.split()[-1]) - began
-    )  # the clock of the machine: an exit frees memory for a while
+    # The clock of the machine: an exit frees memory for a while.
+    return float(said.split()[-1]) - began
 
 
 def main() -> None:

@@ -237,10 +237,8 @@ def compare(tasks: str, size: int, *, device: str, label: str, saved: Callable[.
         "task", "envs", "1: ms", f"{size}: ms", "1: env states/s", f"{size}: env states/s", "ratio"
     )
     by_size: list[list[dict[str, float]]] = []
-    for count in (
-        1,
-        size,
-    ):  # all tasks in the same processes, whose start takes longer than what they measure
+    # All tasks in the same processes, whose start takes longer than what they measure.
+    for count in (1, size):
         began, here = time.monotonic(), Path(__file__).parents[1]
         text = output(start(count, "benchmarks.ranks", "worker", device, tasks, folder=here))
         by_size.append([json.loads(line) for line in text.splitlines() if line.startswith("{")])

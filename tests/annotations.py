@@ -113,9 +113,8 @@ def _union_check(parts: Iterable[object]) -> Check:
 
 
 def _kind_check(kind: type) -> Check:
-    kinds = (
-        (int, float) if kind is float else kind
-    )  # an int will do for a float, as type checkers have it
+    # An int will do for a float, as type checkers have it.
+    kinds = (int, float) if kind is float else kind
     return lambda value, sizes: (
         "" if isinstance(value, kinds) else f"is of type {type(value).__name__}"
     )

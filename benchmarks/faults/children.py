@@ -116,9 +116,8 @@ class Child:
 def start(work: Callable[[], int], *, hangs_s: float = HANGS_S) -> Child:
     """Fork, and let the child do `work` and exit with what it returns; its output goes to the parent."""
     warm()
-    torch.set_num_threads(
-        1
-    )  # again: who ran in between may have set more, and a fork would wait for them
+    # Again: who ran in between may have set more, and a fork would wait for them.
+    torch.set_num_threads(1)
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     reading, writing = os.pipe()

@@ -25,10 +25,8 @@ GO1 = ("task=go1_velocity_flat", "device=cuda", "trainer.eval_episodes=0", "trai
 # so that one number is tried: each takes a process, which spends most of its time before it trains.
 ALGORITHMS = {
     "ppo": (49152, "collector.rollout_length=24"),
-    "sac": (
-        40960,
-        "data.capacity=256",
-    ),  # with the steps of a run's replay, hardly an env would fit
+    # With the steps of a run's replay, hardly an env would fit.
+    "sac": (40960, "data.capacity=256"),
     # Its own replay of 1024 steps is nine tenths of what an env takes. The batches of 48 gradient steps would take
     # gigabytes beside it, however few the envs are, and compiling takes a minute each time.
     "fast_sac": (61440, "objective.compile=false", "data.num_minibatches=4"),

@@ -147,9 +147,8 @@ def overflow(folder: Path) -> Figures:
     ):
         world = fallen(room)
         world.step(2)
-        world.reset(
-            torch.ones(4, dtype=torch.bool)
-        )  # a reset clears what the physics itself remembers
+        # A reset clears what the physics itself remembers.
+        world.reset(torch.ones(4, dtype=torch.bool))
         world.step(1)
         text = " ".join(world.overflow_report().messages)
         cases += 1
@@ -165,9 +164,8 @@ def same_seed(folder: Path, *, iterations: int) -> Figures:
     for run in runs:
 
         def work(run=run) -> int:
-            trainer = build(
-                conf.compose([*children.SMALLEST, "logger=none"])
-            )  # anew, not the parent's
+            # Anew, not the parent's.
+            trainer = build(conf.compose([*children.SMALLEST, "logger=none"]))
             for _ in range(iterations):
                 trainer.iterate()
             checkpoint.save(run, trainer.state_dict(), iteration=trainer.iteration, config={})

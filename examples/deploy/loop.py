@@ -75,9 +75,8 @@ def main() -> None:
     spec = importlib.util.spec_from_file_location("runner", options.folder / "runner.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(
-        module
-    )  # your own export: the folder of a stranger is for `ksim-rl sim2sim`
+    # Your own export: the folder of a stranger is for `ksim-rl sim2sim`.
+    spec.loader.exec_module(module)
     runner = module.Runner(options.folder)
     meta = json.loads((options.folder / "export.json").read_text())
     if options.command:

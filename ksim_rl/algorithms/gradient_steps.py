@@ -281,10 +281,8 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: State, *, what
                     f"{what}: {name} of parameter {index} has shape {list(moments[index][name].shape)} in the "
                     f"checkpoint and {list(parameter.shape)} in this run"
                 )
-    if state.get("initial_learning_rate") in (
-        None,
-        group.get("initial_lr"),
-    ):  # or else it is given again
+    # Or else it is given again.
+    if state.get("initial_learning_rate") in (None, group.get("initial_lr")):
         group["lr"].copy_(torch.as_tensor(state["learning_rate"]))
     for index, parameter in enumerate(parameters):
         # In place where there are moments, whose addresses a captured graph holds.

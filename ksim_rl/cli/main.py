@@ -134,9 +134,8 @@ def _dispatch(words: list[str]) -> int:
         return run(rest)
     with importlib.import_module("ksim_rl.ranks").joined(command):
         code = run(rest)
-    return (
-        0 if code == 1 else code
-    )  # not solved is no failure of a rank, which torchrun would start again
+    # Not solved is no failure of a rank, which torchrun would start again.
+    return 0 if code == 1 else code
 
 
 def _without_plugins(arguments: list[str]) -> tuple[list[str], list[str]]:

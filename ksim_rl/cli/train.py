@@ -77,9 +77,8 @@ def train(arguments: list[str]) -> int:
         try:
             codes.append(_train_one(config, groups, given, began))
         except Exception as error:
-            if (
-                os.getpid() != process
-            ):  # some launchers run jobs elsewhere; only Hydra can bring it here then
+            # Some launchers run jobs elsewhere; only Hydra can bring it here then.
+            if os.getpid() != process:
                 raise
             # Kept from Hydra, which would print a line of its own about it and start no other job.
             codes.append(report(error, about=_job_of_a_multirun()))
@@ -174,9 +173,8 @@ def _with_models_of(began: Path | None, cfg: RunCfg, *, note: Callable[[str], No
 def _train_one(
     config: DictConfig, groups: Sequence[Path], given: Sequence[str], began: Path | None
 ) -> int:
-    plugins.load(
-        ()
-    )  # plug-ins of the environment, where a launcher runs the job in another process
+    # Plug-ins of the environment, where a launcher runs the job in another process.
+    plugins.load(())
     plain: Any = OmegaConf.to_container(config, resolve=True)
     for path, value in reaching_outside(plain, given=given) if groups else ():
         raise ValueError(

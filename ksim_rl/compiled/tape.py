@@ -29,9 +29,8 @@ MOST_OPERATIONS = 200
 """At most so many operations in one kernel; its compilation takes longer the more there are."""
 MOST_BYTES = 40_000
 """Shared memory of a block for the arrays of its rows; a kernel that needs more gets one thread per row."""
-_COUNTS = frozenset(
-    {"count_non_finite"}
-)  # all rows add to the same numbers, in an order that does not matter
+# All rows add to the same numbers, in an order that does not matter.
+_COUNTS = frozenset({"count_non_finite"})
 
 
 def _storage(tensor: Tensor) -> int:

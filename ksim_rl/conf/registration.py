@@ -138,12 +138,10 @@ def check_groups(folder: Path) -> None:
         text = read_bytes(folder / path, limit=MOST_GROUP_BYTES).decode(errors="replace")
         try:
             plain_data.check_events(folder / path, text)
-            with naming(
-                f"{folder / path}: cannot be read"
-            ):  # numbers of more digits than Python reads
-                tree = yaml.safe_load(
-                    text
-                )  # as well as the text, in which a name may be spelled with escapes
+            # Numbers of more digits than Python reads.
+            with naming(f"{folder / path}: cannot be read"):
+                # As well as the text, in which a name may be spelled with escapes.
+                tree = yaml.safe_load(text)
         except yaml.YAMLError as error:
             raise ValueError(
                 f"{folder / path}: cannot be read: {' '.join(str(error).split())}"

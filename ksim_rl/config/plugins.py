@@ -100,9 +100,8 @@ def environment() -> dict[str, str]:
     folders = _folders()
     for name in sorted({name.split(".")[0] for name in _named} | _allowed):
         module = sys.modules.get(name)
-        if (
-            module is None or module.__spec__ is None
-        ):  # one that was only allowed may not be imported yet
+        # One that was only allowed may not be imported yet.
+        if module is None or module.__spec__ is None:
             continue
         # A package has places, and of a module that is one file this is the place.
         places = module.__spec__.submodule_search_locations or [module.__spec__.origin]

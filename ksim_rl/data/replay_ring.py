@@ -206,22 +206,14 @@ class ReplayCfg(Checked):
     num_env_states_per_minibatch: Count  # env states of a gradient step
     num_minibatches: Repeats  # per iteration
     num_steps: Count = 1  # of each env per iteration
-    capacity: Count = (
-        1024  # env states per env; an episode's end takes one more, for its last observation
-    )
+    capacity: Count = 1024  # env states per env; the end of an episode takes one more
     n_step: Repeats = 1  # rewards that a target sums before it bootstraps
-    learning_starts: Count = (
-        10  # steps of each env with random actions before the first gradient step
-    )
-    prioritized: bool = (
-        False  # by the last temporal-difference error (Schaul et al., arXiv 1511.05952)
-    )
+    learning_starts: Count = 10  # steps of each env with random actions before any update
+    prioritized: bool = False  # by the last TD error (Schaul et al., arXiv 1511.05952)
     priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
     priority_beta: Share = 0.4  # how far the weights of the losses undo that; 1 is wholly
     save_replay: bool = True  # in checkpoints, so that a resumed run goes on as it would have
-    shards: Count = (
-        1  # equal parts of the envs, of which minibatches have as many each, as with ranks
-    )
+    shards: Count = 1  # equal parts of the envs, each in all minibatches, as with ranks
 
     def _check_fields(self) -> None:
         """Refuse a ring that is too small for its rollouts."""

@@ -23,9 +23,8 @@ def _remove(folder: Path, error: Exception, attempt: int) -> None:
         raise RuntimeError(
             f"Warp's cache: {folder} cannot be read or written: {why}; {ADVICE}"
         ) from error
-    if (
-        folder.exists() and folder.parent not in _said
-    ):  # a damaged cache has many, and hundreds of lines would hide all else
+    # A damaged cache has many, and hundreds of lines would hide all else.
+    if folder.exists() and folder.parent not in _said:
         _said.add(folder.parent)
         show(
             f"warning: Warp's cache {folder.parent} is damaged ({folder.name}: {why}): what cannot be read is "

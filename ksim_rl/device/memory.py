@@ -92,9 +92,8 @@ def memory_for(
             taken = max(0, free - (free_bytes(device) or 0))
         # A lower bound: the block might have asked for more after this.
         per_env = max(1, (taken + asked) // num_envs)
-        if isinstance(
-            error, TooManyEnvsError
-        ):  # raised nearer to it, before anything was given back
+        # Raised nearer to it, before anything was given back.
+        if isinstance(error, TooManyEnvsError):
             per_env = max(per_env, error.per_env)
         most = num_envs
         fits = ""

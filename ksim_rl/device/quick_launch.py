@@ -65,9 +65,8 @@ class QuickLaunch:
         self._block_dim = block_dim
         self._kernel: NativeKernel | None = None
         self._making = threading.Lock()
-        QuickLaunch.existing = WeakSet(
-            [*QuickLaunch.existing, self]
-        )  # a thread may go through the old one
+        # A thread may go through the old one.
+        QuickLaunch.existing = WeakSet([*QuickLaunch.existing, self])
 
     def __call__(self, device: torch.device, dim: tuple[int, int], *values: float) -> None:
         """Launch with one value per field of the struct, in their order; do nothing for a dim of 0."""

@@ -41,28 +41,14 @@ class ManagerBasedRlEnvCfg(Checked):
     sim: SimCfg = field(default_factory=SimCfg)
     viewer: ViewerCfg = field(default_factory=ViewerCfg)  # the camera of `render()`
     episode_length_s: NonNegative = 0.0  # 0: no episode ends by time, and no term may be a time-out
-    rewards: Mapping[str, RewardTerm] = field(
-        default_factory=dict
-    )  # a term of weight 0 is not computed
-    terminations: Mapping[str, TerminationTerm] = field(
-        default_factory=dict
-    )  # always: non-finite physics
-    commands: Mapping[str, CommandTerm] = field(
-        default_factory=dict
-    )  # emitted as `("command", name)`
+    rewards: Mapping[str, RewardTerm] = field(default_factory=dict)  # weight 0: not computed
+    terminations: Mapping[str, TerminationTerm] = field(default_factory=dict)  # and NaN
+    commands: Mapping[str, CommandTerm] = field(default_factory=dict)  # ("command", name)
     curriculum: Mapping[str, CurriculumTerm] = field(default_factory=dict)  # what gets harder
-    metrics: Mapping[str, MetricTerm] = field(
-        default_factory=dict
-    )  # logged, and learned from by nobody
-    is_finite_horizon: bool = (
-        False  # True: a time-out is `terminated`, else `truncated` and bootstrapped
-    )
-    scale_rewards_by_dt: bool = (
-        True  # rewards are per second and are multiplied by the env step's seconds
-    )
-    transforms: Mapping[str, TransformCfg] = field(
-        default_factory=dict
-    )  # TorchRL's, after the groups
+    metrics: Mapping[str, MetricTerm] = field(default_factory=dict)  # logged, not learned from
+    is_finite_horizon: bool = False  # True: a time-out is `terminated`, not bootstrapped
+    scale_rewards_by_dt: bool = True  # rewards are per second, times the env step, s
+    transforms: Mapping[str, TransformCfg] = field(default_factory=dict)  # after the groups
 
     def _check_fields(self) -> None:
         super()._check_fields()

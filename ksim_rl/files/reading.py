@@ -50,8 +50,7 @@ def read_bytes(path: Path, *, limit: int, follows_links: bool = False) -> bytes:
     """Read a file that `open_regular` opens."""
     with open_regular(path, limit=limit, follows_links=follows_links) as file:
         try:
-            return file.read(
-                os.fstat(file.fileno()).st_size
-            )  # Python takes memory for all that is asked for
+            # Python takes memory for all that is asked for.
+            return file.read(os.fstat(file.fileno()).st_size)
         except OSError as error:
             raise ValueError(f"{path}: cannot be read: {error.strerror}") from error

@@ -80,9 +80,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     check_own(path)
     # In the same folder: only within one file system does a file replace another at one moment.
-    temporary = path.with_name(
-        f"{WRITING}{secrets.token_hex(4)}-{path.name}"
-    )  # another writer has another
+    # Another writer has another.
+    temporary = path.with_name(f"{WRITING}{secrets.token_hex(4)}-{path.name}")
     try:
         with _named(path):
             yield temporary

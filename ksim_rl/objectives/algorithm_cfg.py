@@ -220,9 +220,7 @@ class AMPCfg(PPOCfg):
     discriminator_activation: str = "relu"
     discriminator_learning_rate: Positive = 3e-4
     discriminator_weight_decay: NonNegative = 1e-4
-    gradient_penalty: NonNegative = (
-        10.0  # of the discriminator's squared gradient at reference transitions
-    )
+    gradient_penalty: NonNegative = 10.0  # of its squared gradient at reference transitions
     logit_decay: NonNegative = 0.05  # of the squares of its last layer's weights
     num_discriminator_steps: Repeats = 10  # per rollout
     num_transitions_per_step: Count = 4096

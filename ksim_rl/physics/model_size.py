@@ -45,14 +45,12 @@ class _Files:
     folder: Path  # of the model itself
     counts: dict[Path, tuple[int, int]] = field(default_factory=dict)
     folders: set[Path] = field(default_factory=set)
-    below: set[str] = field(
-        default_factory=lambda: {""}
-    )  # folders of assets, as any of the texts has them
+    # Folders of assets, as any of the texts has them.
+    below: set[str] = field(default_factory=lambda: {""})
     named: set[str] = field(default_factory=set)
     included: list[Path] = field(default_factory=list)
-    recoded: dict[str, bytes] = field(
-        default_factory=dict
-    )  # UTF-8, by the path under which MuJoCo looks
+    # UTF-8, by the path under which MuJoCo looks.
+    recoded: dict[str, bytes] = field(default_factory=dict)
 
     def text(self, path: Path, called: str) -> str:
         """Read a file that is included or attached, which MuJoCo looks for under `called`."""

@@ -103,9 +103,8 @@ def _kernel(
     struct = wp.struct(Problem)
     # Constants of C++, not arguments: loops over them are unrolled.
     named = "".join(f"constexpr int {name} = {value};\n" for name, value in constants)
-    named += (
-        "__builtin_assume(lane >= 0 && lane < LANES);\n"  # or else loops over nothing are compiled
-    )
+    # Or else loops over nothing are compiled.
+    named += "__builtin_assume(lane >= 0 && lane < LANES);\n"
 
     @wp.func_native(named + source)
     def body(world: int, lane: int, problem: struct) -> None: ...

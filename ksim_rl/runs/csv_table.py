@@ -35,9 +35,8 @@ class CsvTable:
             pass
         # The last row, and those before it that could not be written yet.
         self._rows: list[dict[str, str]] = []
-        self._last_begins: int | None = (
-            None  # its place in the file; None: the whole table has to be copied
-        )
+        # Its place in the file; None: the whole table has to be copied.
+        self._last_begins: int | None = None
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
         """Append one row, or complete the last one."""

@@ -77,9 +77,8 @@ def _take(folder: Path) -> IO[str]:
                     f"{folder}: {_described(holder)} writes this run: wait for it, or end it"
                 )
             else:
-                time.sleep(
-                    0.05
-                )  # another looks whether it is locked, or is about to write its name
+                # Another looks whether it is locked, or is about to write its name.
+                time.sleep(0.05)
         except BaseException:
             file.close()
             raise

@@ -102,16 +102,12 @@ class SceneCfg(Checked):
         Mapping[str, Robot], Filled("name at least one robot")
     ]  # the first is what terms mean
     objects: Mapping[str, Robot] = field(default_factory=dict)  # cubes, balls, doors
-    placements: Mapping[str, Placement] = field(
-        default_factory=dict
-    )  # of robots and objects, by name
+    placements: Mapping[str, Placement] = field(default_factory=dict)  # by entity
     terrain: Terrain | None = None  # None: the robot's own model has its ground
     sensors: Mapping[str, Sensor] = field(default_factory=dict)  # of contacts, rays, cameras, IMUs
     num_envs: Count = 1  # a run's own number takes its place
     spacing: NonNegative = 2.0  # m between neighbouring envs when several are drawn in one picture
-    soft_joint_pos_limit_factor: Share = (
-        1.0  # of each joint's range, about its middle: the soft limits
-    )
+    soft_joint_pos_limit_factor: Share = 1.0  # of each joint's range, about its middle
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return the numbers of the smallest worlds."""

@@ -19,11 +19,7 @@ class ViewerCfg(Checked):
     """
 
     body: str | None = None  # the body that it follows
-    lookat: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.5,
-    )  # where no body is followed: m, world frame
+    lookat: tuple[float, float, float] = (0.0, 0.0, 0.5)  # m, where no body is followed
     distance: Positive = 3.0  # m from the body or point that it looks at
     elevation: Annotated[
         float, Within(low=-90.0, high=90.0)

@@ -73,9 +73,8 @@ def reproduce(arguments: Sequence[str]) -> int:
     ]
     # One seed is enough to check a row's config.
     for name in {name for name, _ in jobs}:
-        run_cfg(
-            rows[name], 1, device="cpu", smoke=smoke
-        )  # what is wrong is said before anything runs
+        # What is wrong is said before anything runs.
+        run_cfg(rows[name], 1, device="cpu", smoke=smoke)
     gpus = gpus_for(device, per_gpu=options.per_gpu)
     left = runs.run(jobs, gpus=gpus, until=began + 60.0 * options.minutes, note=write)
     write(f"{left} runs are missing; the table is {output / table.name}.md")

@@ -374,9 +374,8 @@ class VelocityTask(Task):
             description=f"{own} follows a velocity command on flat ground",
             cfg=cfg,
             training=training(num_iterations=num_iterations),
-            other_trainings=(
-                fast_sac_training(symmetry="none"),
-            ),  # left and right are seldom quite equal
+            # Left and right are seldom quite equal.
+            other_trainings=(fast_sac_training(symmetry="none"),),
         )
 
 

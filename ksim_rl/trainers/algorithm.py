@@ -115,20 +115,15 @@ class Algorithm:
     """
 
     name: str  # as in `objective=<name>`
-    cfg: type[
-        AlgorithmCfg
-    ]  # a run whose objective is one of these, or of a subclass, is trained by it
+    # A run whose objective is one of these, or of a subclass, is trained by it.
+    cfg: type[AlgorithmCfg]
     update: Callable[[RunCfg, EnvBase, State | None], Update]
-    policy: Callable[
-        [RunCfg, EnvBase], TensorDictModuleBase
-    ]  # its weights: `update/actor` of a checkpoint
-    data: (
-        DatasetCfg | ReplayCfg
-    )  # chosen by `objective=<name>` along with its settings, as are the modules
+    # Its weights: `update/actor` of a checkpoint.
+    policy: Callable[[RunCfg, EnvBase], TensorDictModuleBase]
+    # Chosen by `objective=<name>` along with its settings, as are the modules.
+    data: DatasetCfg | ReplayCfg
     modules: ModulesCfg = field(default_factory=ModulesCfg)
-    on_ranks: bool = (
-        False  # whether several ranks may train with it: its update takes means over them
-    )
+    on_ranks: bool = False  # whether several ranks may train with it
 
 
 def part_of(cfg: RunCfg, field: str, kind: type[Part]) -> Part:

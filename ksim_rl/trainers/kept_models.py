@@ -203,9 +203,8 @@ def _sources(cfg: RunCfg) -> Iterator[tuple[str, str]]:
 def _with_source(entity: MjcfRobot | MenagerieRobot, source: str) -> MjcfRobot | ModelRobot:
     if isinstance(entity, MjcfRobot):
         return dataclasses.replace(entity, source=source)
-    assert isinstance(
-        entity, ModelRobot
-    )  # others name a model of the menagerie, of which no copy is kept
+    # Others name a model of the menagerie, of which no copy is kept.
+    assert isinstance(entity, ModelRobot)
     return dataclasses.replace(entity, model=source)
 
 

@@ -44,9 +44,7 @@ class WandbCfg(Checked):
     entity: str | None = None
     name: str | None = None
     tags: tuple[str, ...] = ()
-    offline: bool = (
-        False  # write into the run folder only; `wandb sync RUN/wandb/offline-*` sends it later
-    )
+    offline: bool = False  # write into the run folder only, for `wandb sync` later
 
 
 def open_wandb(cfg: WandbCfg, run_folder: Path, config: Tree) -> MetricLogger:

@@ -74,9 +74,7 @@ class TrainerCfg(Checked):
     warm_up: bool = False  # compile and capture updates before the first env step and its seconds
     # Where threads cannot be made, torch ends the process instead of raising.
     num_threads: Annotated[int, Within(low=1, high=1024)] | None = None
-    matmul_precision: Literal["highest", "high", "medium"] = (
-        "high"  # of float32 on CUDA; "high" is TF32
-    )
+    matmul_precision: Literal["highest", "high", "medium"] = "high"  # on CUDA; "high" is TF32
     video: bool = True  # of the final policy
     video_s: Annotated[float, Within(low=0.0, high=3600.0, low_open=True)] = 10.0  # its length, s
 
@@ -189,9 +187,7 @@ class RunCfg(TrainingCfg):
     task_name: str  # the registered task that `task` began as; names the run and its threshold
     task: ManagerBasedRlEnvCfg  # the env; its number of envs and its seed are set to the run's
     device: str = "auto"  # "cpu", "cuda", "cuda:<index>", or "auto" for CUDA where there is a GPU
-    checkpoint: str | None = (
-        None  # a run folder or a checkpoint: its networks and normalizers are the start
-    )
+    checkpoint: str | None = None  # a run or checkpoint whose networks are the start
     logger: LoggerCfg = field(default_factory=LoggerCfg)
     viewer: BrowserCfg = field(default_factory=BrowserCfg)
 

@@ -180,9 +180,8 @@ class Trainer:
         self.interrupt = InterruptRequest()
         self.clock = RunClock()
         self.progress = RunProgress(cfg.num_iterations, enabled=False)
-        self.watch: Callable[[], None] = lambda: (
-            None
-        )  # called in each iteration, before anything is written
+        # Called in each iteration, before anything is written.
+        self.watch: Callable[[], None] = lambda: None
         self.notes: Sequence[str] = ()
         self._own_hooks = tuple(hooks)
         self._hooks: list[Hook] = [*hooks, CheckpointHook(interval=cfg.checkpoint_interval)]
@@ -196,9 +195,8 @@ class Trainer:
         self._unread: list[tuple[int, PendingMetrics]] = []  # oldest first
         self.collecting = ranks.Timing(update.device)
         self._target_met = False
-        self._warnings = SaidOnce(
-            lambda text: self.progress.note(text)
-        )  # of the progress at that time
+        # Of the progress at that time.
+        self._warnings = SaidOnce(lambda text: self.progress.note(text))
         self._told_to_end = False  # by any rank
 
     @property
@@ -345,9 +343,8 @@ class Trainer:
             longest_s = 0.0  # rewards are then per episode, not per second
         else:
             longest_s = clock.max_episode_length_s
-        self.metrics = episode_means(
-            read, max_episode_length_s=longest_s
-        )  # sums become means of episodes
+        # Sums become means of episodes.
+        self.metrics = episode_means(read, max_episode_length_s=longest_s)
         self.metrics |= physics.metrics | {
             "iteration": iteration,
             "seconds": self.clock.total,

@@ -117,9 +117,8 @@ def test_an_algorithm_from_another_package_trains(site, tmp_path):
     done = ksim_rl(site, "train", "objective=mine", *words)
     assert done.returncode in (0, 1), done.stderr
     assert "2 iterations" in done.stdout
-    assert (
-        done.stdout.count("MineUpdate has no warm_up(rollout_ET)") == 1
-    )  # an option that does nothing says so
+    # An option that does nothing says so.
+    assert done.stdout.count("MineUpdate has no warm_up(rollout_ET)") == 1
 
 
 @pytest.mark.full

@@ -203,9 +203,8 @@ def as_many_as_there_are(patch):
 
 @sabotage("payloads")
 def configs_are_not_checked(patch):
-    without_the_check_of_config(
-        patch
-    )  # the short form always has the first of the families that it stops
+    # The short form always has the first of the families that it stops.
+    without_the_check_of_config(patch)
 
 
 @sabotage("data_files")

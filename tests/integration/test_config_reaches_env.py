@@ -60,9 +60,8 @@ def test_scene_num_envs():
 
 
 def test_scene_robots():
-    with pytest.raises(
-        ValueError, match="did you mean 'other/slider'"
-    ):  # several robots have prefixes
+    # Several robots have prefixes.
+    with pytest.raises(ValueError, match="did you mean 'other/slider'"):
         made("+task.scene.robots.other={_target_: ksim_rl.scene.robots.Cartpole}")
 
 

@@ -103,9 +103,8 @@ def test_returns_that_leak_over_the_end_of_an_episode(advantage, monkeypatch):
 
     def buggy(self, *args):
         found = signals(self, *args)
-        object.__setattr__(
-            found, "done_ET", found.terminated_ET
-        )  # "time is up" is taken for "goes on"
+        # "time is up" is taken for "goes on".
+        object.__setattr__(found, "done_ET", found.terminated_ET)
         return found
 
     monkeypatch.setattr(RolloutEstimator, "_signals", buggy)

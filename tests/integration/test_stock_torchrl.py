@@ -21,9 +21,8 @@ EPISODE_STEPS = 6  # short, so that each rollout holds several resets
 TASKS = (
     "cartpole_balance",
     pytest.param("go1_velocity_flat", marks=pytest.mark.full),
-    pytest.param(
-        "go1_velocity_rough", marks=pytest.mark.full
-    ),  # tests/scene/terrains has an env on rough ground
+    # tests/scene/terrains has an env on rough ground.
+    pytest.param("go1_velocity_rough", marks=pytest.mark.full),
     "quadruped_velocity_flat",
     pytest.param("arm_push", marks=pytest.mark.full),
 )

@@ -117,10 +117,8 @@ def test_both_ways_to_score_a_sample_agree():
 
 
 def test_rounded_parameters_leave_actions_near_a_bound_where_they_are():
-    loc, scale = (
-        torch.tensor([[4.0, -3.5, 0.0]]),
-        torch.tensor([[0.5, 0.5, 1.0]]),
-    )  # bfloat16 has them all
+    # Bfloat16 has them all.
+    loc, scale = (torch.tensor([[4.0, -3.5, 0.0]]), torch.tensor([[0.5, 0.5, 1.0]]))
     value = torch.tanh(torch.tensor([[4.25, -3.75, 0.5]]))
     rounded = TanhGaussian(loc.bfloat16(), scale.bfloat16()).log_prob(value)
     torch.testing.assert_close(

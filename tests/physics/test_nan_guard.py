@@ -58,9 +58,8 @@ def test_a_failed_world_is_saved_with_the_states_that_led_there(tmp_path):
     world = sleds(tmp_path)
     push(world, row=1, light=0.0, steps=2)
     assert world.nan_report().ok
-    push(
-        world, row=1, light=1e9
-    )  # geared to 1e34 N, on a microgram: no float32 holds the acceleration
+    # Geared to 1e34 N, on a microgram: no float32 holds the acceleration.
+    push(world, row=1, light=1e9)
     report = world.nan_report()
     assert report.worlds == (1,) and len(report.files) == 1 and not report.ok
     assert (
@@ -73,9 +72,8 @@ def test_a_failed_world_is_saved_with_the_states_that_led_there(tmp_path):
     assert failure.world == 1 and failure.substep == 2 * SUBSTEPS + 1
     times = np.arange(failure.substep - HISTORY, failure.substep) * 0.01
     np.testing.assert_allclose(failure.states["time"][:, 0], times, atol=1e-6)
-    np.testing.assert_allclose(
-        failure.states["qvel"][:, HEAVY], times / 2, atol=1e-6
-    )  # 1 N on 2 kg
+    # 1 N on 2 kg.
+    np.testing.assert_allclose(failure.states["qvel"][:, HEAVY], times / 2, atol=1e-6)
     assert failure.states["ctrl"][-1].tolist() == [1.0, np.float32(1e9)]
     assert failure.states["ctrl"][-2].tolist() == [1.0, 0.0]
     assert not np.isfinite(failure.reached["qvel"][LIGHT])

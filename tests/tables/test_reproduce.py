@@ -179,9 +179,8 @@ def test_a_job_that_another_process_took_first_is_no_failure(reproduce, monkeypa
 
     monkeypatch.setattr(runner.run_lock, "is_locked", is_locked)
     code, started, _ = reproduce("--rows", "ppo/Balance", "--seeds", "1", fail=("ppo/Balance", 1))
-    assert (
-        started == [("ppo/Balance", 1)] * 2 and code == 1
-    )  # it fails again, and nobody else does it
+    # It fails again, and nobody else does it.
+    assert started == [("ppo/Balance", 1)] * 2 and code == 1
 
 
 def test_a_job_belongs_to_who_has_its_log_until_that_process_ends(reproduce, tmp_path):

@@ -38,9 +38,8 @@ def env(request):
 def test_zero_action_stands_for_two_seconds(env):
     base = env.base_env
     (robot,) = base.cfg.scene.robots.values()
-    seconds = (
-        0.7 if robot.name == "g1" else 2.0
-    )  # whose reference gains are too soft to stand on for longer
+    # Whose reference gains are too soft to stand on for longer.
+    seconds = 0.7 if robot.name == "g1" else 2.0
     td = env.reset()
     zero = torch.zeros(env.action_spec.shape)
     for _ in range(round(seconds / base.step_dt)):

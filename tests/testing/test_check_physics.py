@@ -45,9 +45,8 @@ def test_what_differs_is_named(env, monkeypatch, rows, by, message):
 
 
 def test_where_only_the_c_engine_stops_early_it_is_asked_to_solve_to_the_end(env, monkeypatch):
-    monkeypatch.setattr(
-        env.base_env.world.mj_model.opt, "iterations", 1
-    )  # not of the model that Warp has
+    # Not of the model that Warp has.
+    monkeypatch.setattr(env.base_env.world.mj_model.opt, "iterations", 1)
     check_c_engine(env, 20)
     monkeypatch.setattr(check_physics, "SOLVED", 1)
     with pytest.raises(AssertionError, match="differs from the C engine's"):

@@ -38,9 +38,8 @@ def assert_same(one, other):
 def test_a_resumed_run_is_bit_identical(tmp_path):
     straight = trained(iterations=6)
     trained(tmp_path, iterations=3)
-    resumed = make_trainer(
-        iterations=6, seed=123
-    )  # another seed: all of it must come from the checkpoint
+    # Another seed: all of it must come from the checkpoint.
+    resumed = make_trainer(iterations=6, seed=123)
     resumed.load(tmp_path)
     assert resumed.iteration == 3
     resumed.train()

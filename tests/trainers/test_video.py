@@ -98,9 +98,8 @@ def test_a_signal_that_comes_while_the_encoder_is_forked_is_not_lost(tmp_path, m
         frames = 0
 
         def append_data(self, frame):
-            with suppress(
-                KeyboardInterrupt
-            ):  # Python drops what is raised in its hooks around a fork
+            # Python drops what is raised in its hooks around a fork.
+            with suppress(KeyboardInterrupt):
                 os.kill(os.getpid(), signal.SIGTERM)
             self.frames += 1
 

@@ -231,9 +231,8 @@ def pushes(viewer, session, values):
     session.push = taken.append
     with page_of(viewer.address) as link:
         known = widgets(link)
-        link.send(
-            msgspec.msgpack.encode(CAMERA)
-        )  # viser calls back for a page that has said where it looks from
+        # Viser calls back for a page that has said where it looks from.
+        link.send(msgspec.msgpack.encode(CAMERA))
         for value in values:
             wanted = len(taken) + 1
             update = {

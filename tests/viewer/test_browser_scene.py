@@ -143,9 +143,8 @@ def test_a_height_field_has_its_heights():
     for x, y in ((-2.9, 1.9), (0.1, 0.4), (2.0, -1.0)):
         down, hit = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
         distance = mujoco.mj_ray(model, data, np.array([x, y, 5.0]), down, None, 1, -1, hit, None)
-        assert _height(vertices, faces, x, y) == pytest.approx(
-            5.0 - distance, abs=0.13
-        )  # which diagonal is split
+        # Which diagonal is split.
+        assert _height(vertices, faces, x, y) == pytest.approx(5.0 - distance, abs=0.13)
     assert (
         np.cross(
             vertices[faces[:, 1]] - vertices[faces[:, 0]],

@@ -131,9 +131,7 @@ class RandomizePseudoInertia(Randomize):
 
     bodies: Patterns
     alpha: Pair = _NOTHING  # half the logarithm of the mass's factor
-    stretch: Pair = (
-        _NOTHING  # d1, d2, d3: logarithms of the mass's stretch along each principal axis
-    )
+    stretch: Pair = _NOTHING  # d1, d2, d3: logarithms of the stretch along principal axes
     shear: Pair = _NOTHING  # s12, s13, s23
     shift: Pair = _NOTHING  # t1, t2, t3: m that the centre of mass moves along each principal axis
     operation: Literal["add"] = "add"

@@ -246,9 +246,7 @@ def power_of_two(number: int) -> int:
 class Tuning:
     """How work is cut. `of` gives the fastest sizes on an H200 for layers of 512, 256 and 128, but for `lower`."""
 
-    block: int = (
-        64  # rows of a minibatch that one program takes through a network, or through one layer
-    )
+    block: int = 64  # rows of a minibatch that one program takes through a network or layer
     chunk: int = 32  # columns of the widest layer that exist at a time
     stages: int = 3  # how far loads of weights run ahead
     warps: int = 4

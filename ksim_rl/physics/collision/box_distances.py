@@ -27,9 +27,8 @@ FAR = wp.constant(1.0e10)
 TOUCHING = wp.constant(1.0e-5)
 # The sine below which two edges are parallel, and have no common normal.
 PARALLEL = wp.constant(1.0e-6)
-AXES = wp.constant(
-    15
-)  # the normals of three faces of each box, and what is normal to an edge of each
+# The normals of three faces of each box, and what is normal to an edge of each.
+AXES = wp.constant(15)
 EDGE_PAIRS = wp.constant(144)
 
 

@@ -23,9 +23,8 @@ _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPA
 # What `body_simple` says of a body that has slides only, along axes of the world, and carries no other.
 SLIDES_ALONE = 2
 LANES = 128  # threads that share the work of one world on a GPU: a block
-_MOST_FLOATS_ON_CHIP = (
-    40 * 1024 // 4
-)  # of the 48 KiB of shared memory that any block has, some is Warp's
+# Of the 48 KiB of shared memory that any block has, some is Warp's.
+_MOST_FLOATS_ON_CHIP = 40 * 1024 // 4
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 

@@ -40,9 +40,8 @@ def ready_urdf(text: str, folder: Path) -> str:
         # Paths of meshes stay whole, and links that are fixed stay bodies.
         compiler = f'<compiler strippath="false" fusestatic="false" discardvisual="{discards}"/>'
         text = _ROBOT.sub(lambda found: f"{found[0]}<mujoco>{compiler}</mujoco>", text, count=1)
-    folder = Path(
-        os.path.abspath(folder)
-    )  # as it is called, since links may be what holds packages together
+    # As it is called, since links may be what holds packages together.
+    folder = Path(os.path.abspath(folder))
 
     def found_mesh(match: re.Match[str]) -> str:
         # XML may escape characters of a path.

@@ -79,9 +79,8 @@ def layout(
         tile = lanes
     else:
         tile = 0
-    bounds = (
-        rows if elliptic else padded(min(nv + ntendon, njmax))
-    )  # of cones, or else of dry friction
+    # Of cones, or else of dry friction.
+    bounds = rows if elliptic else padded(min(nv + ntendon, njmax))
     # The inertia matrix and one vector, rows of the Jacobian, workspace, a vector by limbs, bounds, numbers per row.
     floats = (
         (nv + 1) * stride

@@ -98,9 +98,8 @@ class DelayedActuator(Actuator):
     before.
     """
 
-    is_explicit: ClassVar[bool] = (
-        True  # built-in actuators too get their control before each substep
-    )
+    # Built-in actuators too get their control before each substep.
+    is_explicit: ClassVar[bool] = True
     counts_substeps: ClassVar[bool] = True
 
     actuator: Actuator

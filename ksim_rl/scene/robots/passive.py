@@ -14,9 +14,8 @@ def passive_joints(mj_model: mujoco.MjModel) -> list[int]:
     which joints these move is not told by the model, and each joint counts as driven.
     """
     joints = scalar_joint_ids(mj_model)
-    moving = np.flatnonzero(
-        mj_model.actuator_trntype != mujoco.mjtTrn.mjTRN_BODY
-    )  # adhesion moves nothing
+    # Adhesion moves nothing.
+    moving = np.flatnonzero(mj_model.actuator_trntype != mujoco.mjtTrn.mjTRN_BODY)
     if not moving.size:
         # Without actuators, as in files from CAD, only a spring tells a joint that is not meant to be driven.
         return [joint for joint in joints if mj_model.jnt_stiffness[joint] > 0.0]

@@ -211,9 +211,8 @@ class Simulation:
                 f"{name.replace('/', '.')}: it ends the program: {error!r}"
             ) from error
         except Exception as error:
-            error.add_note(
-                f"(in {name.replace('/', '.')})"
-            )  # of the same class, which others look for
+            # Of the same class, which others look for.
+            error.add_note(f"(in {name.replace('/', '.')})")
             raise
         # Outside of a term nobody reads or owns buffers.
         finally:

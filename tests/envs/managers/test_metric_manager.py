@@ -43,9 +43,8 @@ def finished(env, steps):
 )
 def test_each_reduction_over_whole_episodes(reduce, value):
     env = puck_env(limit=None, episode_length_s=4 * DT, metrics={"wave": Wave(reduce=reduce)})
-    log = finished(
-        env, 11
-    )  # two episodes of four steps in each of three envs, and three steps that are not over
+    # Two episodes of four steps in each of three envs, and three steps that are not over.
+    log = finished(env, 11)
     torch.testing.assert_close(log["metric/wave"], torch.tensor(2 * value * (1 + 2 + 3)))
     assert log["episodes"] == 6
 

@@ -137,9 +137,8 @@ def test_stones_and_the_gaps_between_them_have_their_widths(difficulty, width, g
     )
     row = heights(patch, difficulty)[0]
     stones = runs(row > -0.2)
-    assert np.allclose(
-        [(stop - 1 - start) * 0.05 for start, stop in stones[:-1]], width
-    )  # the last one is cut off
+    # The last one is cut off.
+    assert np.allclose([(stop - 1 - start) * 0.05 for start, stop in stones[:-1]], width)
     assert np.allclose(
         [
             (after - (stop - 1)) * 0.05
