@@ -31,7 +31,7 @@ from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.mdp.randomization.randomize import Randomize
 from ksim_rl.physics import load_model
-from ksim_rl.scene.scene import build_spec
+from ksim_rl.scene.scene import scene_spec
 from ksim_rl.trainers import RunCfg
 
 VARIANTS = ("none", "startup", "reset")
@@ -88,9 +88,7 @@ def measure(cfg: RunCfg, episode_steps: int) -> dict[str, float]:
 
 def _bodies_and_step(task: ManagerBasedRlEnvCfg) -> tuple[tuple[str, ...], float]:
     """Return patterns of the bodies that have a mass, and the seconds of an env step."""
-    spec = build_spec(task.scene)
-    task.sim.apply_to(spec)
-    model = load_model(spec)
+    model = load_model(scene_spec(task.scene, task.sim))
     heavy = [
         model.body(i).name
         for i in range(model.nbody)

@@ -35,7 +35,7 @@ from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build_env, build_evaluator
 from ksim_rl.trainers.evaluation import Evaluator
-from ksim_rl.trainers.other_physics import judged_by
+from ksim_rl.trainers.other_physics import in_c_engine, judged_by
 from ksim_rl.trainers.run_folder import Policy, policy_of
 from ksim_rl.zoo import locate
 
@@ -186,8 +186,8 @@ def _policy(options: dict[str, str], overrides: list[str], *, cfg: RunCfg | None
 
 def _in_c(cfg: RunCfg, given: list[str]) -> tuple[RunCfg, str]:
     """Return the config by which the C engine judges, and the words for that."""
-    sim = dataclasses.replace(cfg.task.sim, engine="c", one_kernel_dynamics=None)
-    in_c = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, sim=sim), device="cpu")
+    task = dataclasses.replace(cfg.task, sim=in_c_engine(cfg.task.sim))
+    in_c = dataclasses.replace(cfg, task=task, device="cpu")
     return judged_by(in_c, trained=cfg.task.sim.engine, given=given)
 
 

@@ -31,7 +31,7 @@ from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.view import EnvView
 from ksim_rl.physics import World, load_model
-from ksim_rl.scene.scene import build_spec
+from ksim_rl.scene.scene import scene_spec
 from ksim_rl.scene.terrains import (
     Ground,
     PlaneTerrain,
@@ -118,10 +118,8 @@ def summary(milliseconds_by_kind: Mapping[str, float]) -> dict[str, float]:
 @torch.no_grad()
 def _physics_ms(cfg: ManagerBasedRlEnvCfg, terrain: Terrain, device: torch.device) -> float:
     scene = dataclasses.replace(cfg.scene, terrain=terrain)
-    spec = build_spec(scene)
-    cfg.sim.apply_to(spec)
     world = World(
-        load_model(spec),
+        load_model(scene_spec(scene, cfg.sim)),
         num_envs=scene.num_envs,
         device=device,
         sim=cfg.sim,

@@ -91,13 +91,13 @@ class Checked:
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return how many numbers of four bytes must lie in memory at least, by the names of the fields that say so.
 
-        Those of configs in its fields are left out. `ksim_rl.device.memory.check_room` compares them with a machine.
+        Numbers of configs in its fields are left out. `ksim_rl.device.memory.check_room` compares them with a machine.
         """
         return {}
 
 
 def numbers_of_layers(widths: Sequence[int]) -> float:
-    """Return how many numbers layers of these widths need to learn: those of the weights between them, and biases."""
+    """Return how many numbers layers of these widths need to learn, for the weights between them and the biases."""
     weights = sum(below * above for below, above in pairwise(widths))
     return NUMBERS_PER_WEIGHT * (sum(widths) + weights)
 

@@ -62,7 +62,7 @@ class _Words:
 
     def wrong(self, what: str) -> ValueError:
         return refused(
-            self.path, f"line {self.line}: {what}", "expected a BVH file; export it anew"
+            self.path, f"line {self.line}: {what}", "expected a BVH file; export it again"
         )
 
 

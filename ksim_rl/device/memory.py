@@ -31,7 +31,7 @@ class TooManyEnvsError(ValueError):
 def check_room(cfg: Checked, *, num_envs: int, device: torch.device, path: str = "") -> None:
     """Refuse a config of which one part alone takes more memory than a device has in all.
 
-    The sizes are those of `Checked.least_numbers`, so that nothing has to be allocated to know them. What passes may
+    `Checked.least_numbers` gives the sizes, so that nothing has to be allocated to know them. What passes may
     still be too much: a failed allocation tells. The ValueError names the fields, which stand at `path`.
     """
     for where, part in _parts(cfg, path):

@@ -29,7 +29,7 @@ from ksim_rl.files.writing import check_folder, check_own, whole_folder
 from ksim_rl.physics import prepare_spec
 from ksim_rl.runs import record
 from ksim_rl.scene.keyframes import add_joined
-from ksim_rl.scene.scene import build_spec
+from ksim_rl.scene.scene import scene_spec
 from ksim_rl.scene.state.default_state import default_data
 from ksim_rl.terminal import show
 from ksim_rl.trainers import checkpoint
@@ -90,7 +90,7 @@ README = """# {task}, iteration {iteration}
 | `episodes.npz`, `trace.npz` | starts, commands and pushes of recorded episodes, and steps to compare with |
 
 The policy's actions equal the trained network's within {difference:.1e} on {checked} observations, and the observations
-those of training within {obs[difference]:.1e}. One step lasts
+equal the observations of training within {obs[difference]:.1e}. One step lasts
 {step_dt:g} s, of {decimation} physics steps. Joints, in the order of actions: {joints}.
 """
 
@@ -245,8 +245,7 @@ def _fill(
         zip((j for law in meta["actuators"] for j in law["joints"]), first, strict=True)
     )
     # The scene's spec once more: the env's own was compiled, and XML is written of a spec.
-    spec = build_spec(cfg.task.scene)
-    cfg.task.sim.apply_to(spec)
+    spec = scene_spec(cfg.task.scene, cfg.task.sim)
     prepare_spec(spec, [])
     if not len(spec.keys):
         # What the env starts from without a keyframe: servos that hold the model's own pose.

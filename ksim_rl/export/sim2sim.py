@@ -218,7 +218,7 @@ def run_export(arguments: Sequence[str]) -> int:
         "--episodes", type=int, default=100, help="to record for sim2sim; 0 for none"
     )
     parser.add_argument(
-        "--seed", type=int, help="of the recorded episodes; default: that of evaluations"
+        "--seed", type=int, help="of the recorded episodes; default: the seed of evaluations"
     )
     parser.add_argument(
         "--device", default="cpu", help="of the recorded episodes: cpu, cuda or auto"

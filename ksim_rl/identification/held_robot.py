@@ -11,12 +11,12 @@ from jaxtyping import Float
 from ksim_rl.checks import near
 from ksim_rl.physics import load_spec
 from ksim_rl.scene import robots
-from ksim_rl.scene.actuators import Actuator, DelayedActuator
+from ksim_rl.scene.actuators import Actuator, without_delay
 from ksim_rl.scene.actuators.actuator import ExplicitActuator
 from ksim_rl.scene.actuators.joint_drives import driven_joints
 from ksim_rl.scene.names import actuators_of_joint, scalar_joint_ids
 from ksim_rl.scene.robots.edit import drop_bodies
-from ksim_rl.scene.state.joint_control import TargetKind, joint_control
+from ksim_rl.scene.state.joint_control import TargetKind, force_limit, joint_control
 
 TIME_STEP = 0.002
 """Of the simulation, s: with the Runge-Kutta integrator its error is far below what encoders resolve."""
@@ -152,8 +152,7 @@ def _motors(
     laws = {}
     for entry, driven in driven_joints(actuators, names):
         # A delay is found, and not taken from the robot.
-        law = entry.actuator if isinstance(entry, DelayedActuator) else entry
-        laws |= dict.fromkeys(driven, law)
+        laws |= dict.fromkeys(driven, without_delay(entry))
     found = {}
     for name in names:
         of_joint = actuators_of_joint(mj_model, mj_model.joint(name).id)
@@ -219,22 +218,15 @@ def _builtin(robot: str, name: str, mj_model: mujoco.MjModel, actuator: int) -> 
     control = joint_control(mj_model, actuator)
     if control.refusal:
         raise ValueError(f"--robot {robot}: the actuator of joint {name!r}: {control.refusal}")
-    limit = np.inf
-    if mj_model.actuator_forcelimited[actuator]:
-        # The force goes through the gear.
-        limit = float(
-            np.abs(
-                mj_model.actuator_forcerange[actuator] * mj_model.actuator_gear[actuator, 0]
-            ).min()
-        )
-    elif control.kind == "effort" and mj_model.actuator_ctrllimited[actuator]:
+    limit = force_limit(mj_model, actuator)
+    if limit is None and control.kind == "effort" and mj_model.actuator_ctrllimited[actuator]:
         # A motor's control is its effort, before gear and gain.
         per_control = mj_model.actuator_gear[actuator, 0] * mj_model.actuator_gainprm[actuator, 0]
         limit = float(np.abs(mj_model.actuator_ctrlrange[actuator] * per_control).min())
     return _Motor(
         stiffness=control.stiffness,
         damping=control.damping,
-        effort_limit=limit,
+        effort_limit=np.inf if limit is None else limit,
         takes=frozenset({control.kind}),
     )
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import mujoco.batch
@@ -34,24 +35,29 @@ class Targets:
     time_T: Float[Array, " T"]
     by_kind: Mapping[TargetKind, Float[Array, "T N"]]
 
+    @cached_property
+    def _integrals(self) -> dict[TargetKind, Float[Array, "T N"]]:
+        """Integrals of the targets from the first time on; linear in between, so means of any stretch are exact."""
+        lasts_T1 = np.diff(self.time_T)[:, None]
+        found = {}
+        for kind, values_TN in self.by_kind.items():
+            sums_TN = np.cumsum(values_TN[:-1] * lasts_T1, axis=0)
+            found[kind] = np.vstack((np.zeros_like(values_TN[:1]), sums_TN))
+        return found
+
     def of_steps(
         self, start_s: float, count: int, delay_s: float
     ) -> dict[TargetKind, Float[Array, "S N"]]:
         """Return the means of the targets over `count` time steps from `start_s` on, as they arrive, late."""
         edges_S = start_s - delay_s + TIME_STEP * np.arange(count + 1)
+        # Before the first target it was there already, and after the last it stays.
+        early_S = np.minimum(edges_S - self.time_T[0], 0.0)
+        late_S = np.maximum(edges_S - self.time_T[-1], 0.0)
         means = {}
         for kind, values_TN in self.by_kind.items():
-            # The integral of a held signal is linear between its changes: means of any stretch are exact.
-            lasts_T1 = np.diff(self.time_T)[:, None]
-            integral_TN = np.vstack(
-                (np.zeros_like(values_TN[:1]), np.cumsum(values_TN[:-1] * lasts_T1, axis=0))
-            )
-            # Before the first target it was there already, and after the last it stays.
-            early_S = np.minimum(edges_S - self.time_T[0], 0.0)
-            late_S = np.maximum(edges_S - self.time_T[-1], 0.0)
             columns = []
             for column_T, first, last in zip(
-                integral_TN.T, values_TN[0], values_TN[-1], strict=True
+                self._integrals[kind].T, values_TN[0], values_TN[-1], strict=True
             ):
                 inside_S = np.interp(edges_S, self.time_T, column_T)
                 columns.append(np.diff(inside_S + early_S * first + late_S * last) / TIME_STEP)

@@ -15,7 +15,7 @@ from ksim_rl.mdp.randomization.joints import (
     RandomizeJointField,
     RandomizeJointFrictionLoss,
 )
-from ksim_rl.scene.actuators import Actuator, DelayedActuator
+from ksim_rl.scene.actuators import Actuator, DelayedActuator, without_delay
 
 EVENTS: Mapping[str, type[RandomizeJointField]] = {
     "armature": RandomizeJointArmature,
@@ -72,7 +72,7 @@ def _late(
     late: list[Actuator] = []
     for entry in actuators:
         # A delay that the robot had before is replaced.
-        inner = entry.actuator if isinstance(entry, DelayedActuator) else entry
+        inner = without_delay(entry)
         late.append(DelayedActuator(actuator=inner, lag_group="bus", **lags))
     return late
 

@@ -158,12 +158,18 @@ def build_spec(cfg: SceneCfg) -> mujoco.MjSpec:
     return spec
 
 
+def scene_spec(cfg: SceneCfg, sim: SimCfg) -> mujoco.MjSpec:
+    """Return the spec of a scene under the options of `sim`."""
+    spec = build_spec(cfg)
+    sim.apply_to(spec)
+    return spec
+
+
 def load_scene(
     cfg: SceneCfg, sim: SimCfg, *, per_world_fields: Iterable[str] = ()
 ) -> mujoco.MjModel:
     """Return the model of a scene under the options of `sim`, in which worlds may differ in some fields."""
-    spec = build_spec(cfg)
-    sim.apply_to(spec)
+    spec = scene_spec(cfg, sim)
     # Before compilation, which may specialize these fields.
     prepare_spec(spec, per_world_fields)
     return load_model(spec)

@@ -8,7 +8,8 @@ import mujoco
 
 from ksim_rl.config.trees import Tree
 from ksim_rl.envs import ManagerBasedRlEnvCfg
-from ksim_rl.scene.scene import build_spec
+from ksim_rl.physics import SimCfg
+from ksim_rl.scene.scene import scene_spec
 from ksim_rl.trainers.run_cfg import RunCfg
 
 ENGINES = {"auto": "the engine that suits", "warp": "MuJoCo Warp", "c": "MuJoCo's C engine"}
@@ -22,6 +23,11 @@ def trained_with(tree: Tree) -> Literal["auto", "warp", "c"]:
     """Return the engine that made a run, from its tree of config; those that name none were made by Warp."""
     sim: Tree = tree.get("task", {}).get("sim", {})
     return sim.get("engine", "warp")
+
+
+def in_c_engine(sim: SimCfg) -> SimCfg:
+    """Return the settings of a simulation for MuJoCo's C engine, which has no kernels of ours."""
+    return dataclasses.replace(sim, engine="c", one_kernel_dynamics=None)
 
 
 def check_physics_alone(fields: Collection[str], command: str) -> None:
@@ -78,8 +84,7 @@ def _changes(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return the fields of `SimCfg` to change, and how to say that."""
     # The model's own options count where the config leaves them open.
-    spec = build_spec(task.scene)
-    task.sim.apply_to(spec)
+    spec = scene_spec(task.scene, task.sim)
     changes: dict[str, Any] = {}
     words: list[str] = []
     if f"{PREFIX}integrator" not in given:
@@ -89,7 +94,7 @@ def _changes(
     if f"{PREFIX}timestep" in given:
         return changes, words
     # Lags in substeps would be half as long in seconds with half the time step.
-    if _counts_substeps(task):
+    if counts_substeps(task):
         words.append(same_time_step(timestep))
         return changes, words
     changes["timestep"] = 0.5 * timestep
@@ -97,7 +102,7 @@ def _changes(
     return changes, words
 
 
-def _counts_substeps(task: ManagerBasedRlEnvCfg) -> bool:
+def counts_substeps(task: ManagerBasedRlEnvCfg) -> bool:
     """Whether an actuator would mean another time by as many substeps."""
     for robot in task.scene.entities.values():
         for actuator in getattr(robot, "actuators", ()):

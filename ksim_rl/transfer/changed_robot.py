@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import mujoco
-import numpy as np
 
 from ksim_rl.scene.actuators import (
     Actuator,
@@ -13,11 +12,12 @@ from ksim_rl.scene.actuators import (
     PositionActuator,
     VelocityActuator,
     set_actuators,
+    without_delay,
 )
 from ksim_rl.scene.actuators.joint_drives import driven_joints
 from ksim_rl.scene.names import TO_JOINTS, scalar_joint_ids
 from ksim_rl.scene.scene import Robot
-from ksim_rl.scene.state.joint_control import joint_control
+from ksim_rl.scene.state.joint_control import force_limit, joint_control
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,10 +87,7 @@ def _entry(mj_model: mujoco.MjModel, actuator: int, joint: str) -> Actuator:
     if control.refusal:
         raise ValueError(f"the actuator of joint {joint!r}: {control.refusal}")
     gear = float(mj_model.actuator_gear[actuator, 0])
-    limit = None
-    if mj_model.actuator_forcelimited[actuator]:
-        limit = float(np.abs(mj_model.actuator_forcerange[actuator] * gear).min())
-    how = {"joints": (joint,), "effort_limit": limit}
+    how = {"joints": (joint,), "effort_limit": force_limit(mj_model, actuator)}
     if control.kind == "pos":
         return PositionActuator(stiffness=control.stiffness, damping=control.damping, **how)
     if control.kind == "vel":
@@ -107,7 +104,8 @@ def late(steps: tuple[int, int]) -> Callable[[Actuator], Actuator]:
     """Return the change that lets targets arrive late, by a number of physics steps that each episode draws."""
 
     def change(entry: Actuator) -> Actuator:
-        inner = entry.actuator if isinstance(entry, DelayedActuator) else entry
-        return DelayedActuator(actuator=inner, min_lag=steps[0], max_lag=steps[1], lag_group="card")
+        return DelayedActuator(
+            actuator=without_delay(entry), min_lag=steps[0], max_lag=steps[1], lag_group="card"
+        )
 
     return change

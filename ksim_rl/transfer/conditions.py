@@ -24,13 +24,14 @@ from ksim_rl.mdp.randomization.joints import (
 from ksim_rl.scene.actuators import (
     Actuator,
     DCMotorActuator,
-    DelayedActuator,
     IdealPDActuator,
     PositionActuator,
+    without_delay,
 )
 from ksim_rl.scene.names import scalar_joint_ids
-from ksim_rl.scene.scene import build_spec
+from ksim_rl.scene.scene import build_spec, scene_spec
 from ksim_rl.scene.terrains import PlaneTerrain
+from ksim_rl.trainers.other_physics import counts_substeps
 from ksim_rl.transfer.changed_robot import GearedMotor, changed, entries, late
 from ksim_rl.transfer.tilted_plane import TiltedPlane
 from ksim_rl.transforms.noise.cfg import NoiseCfg, UniformNoise
@@ -72,7 +73,7 @@ def _time_step(timestep: float) -> Change:
         count = round(step_s / timestep)
         if count < 1 or abs(count * timestep - step_s) > 1e-9:
             raise ValueError(f"an env step of {step_s:g} s is no multiple of {timestep:g} s")
-        if _counts_substeps(cfg):
+        if counts_substeps(cfg):
             raise ValueError("its actuators count their lags in physics steps")
         sim = dataclasses.replace(cfg.sim, timestep=timestep)
         return dataclasses.replace(cfg, sim=sim, decimation=count)
@@ -204,7 +205,7 @@ def _actuators(kind: type[Actuator]) -> Change:
     """Return the change to another model of the servos, with their own gains and limits."""
 
     def swap(entry: Actuator) -> Actuator:
-        inner = entry.actuator if isinstance(entry, DelayedActuator) else entry
+        inner = without_delay(entry)
         if not isinstance(inner, (IdealPDActuator, PositionActuator)):
             raise ValueError(f"its {type(inner).__name__} has no position servo")
         named = ("joints", "armature", "frictionloss", "effort_limit", "stiffness", "damping")
@@ -314,16 +315,7 @@ def _with_actuators(
 
 
 def _timestep(cfg: ManagerBasedRlEnvCfg) -> float:
-    spec = build_spec(cfg.scene)
-    cfg.sim.apply_to(spec)
-    return float(spec.option.timestep)
-
-
-def _counts_substeps(cfg: ManagerBasedRlEnvCfg) -> bool:
-    for robot in cfg.scene.robots.values():
-        if any(entry.counts_substeps for entry in getattr(robot, "actuators", ())):
-            return True
-    return False
+    return float(scene_spec(cfg.scene, cfg.sim).option.timestep)
 
 
 def _root(mj_model: mujoco.MjModel) -> int:

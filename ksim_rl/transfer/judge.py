@@ -20,6 +20,7 @@ from ksim_rl.tasks.velocity import FEET
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.build import build_evaluator
 from ksim_rl.trainers.evaluation import Evaluator
+from ksim_rl.trainers.other_physics import in_c_engine
 from ksim_rl.transfer.conditions import Condition
 
 TRACKING = (LinearVelocityError, AngularVelocityError)
@@ -67,8 +68,7 @@ def judge(
     """
     task = condition.change(cfg.task)
     # Changes of actuators would keep Warp's own settings, which C has none of.
-    sim = dataclasses.replace(task.sim, engine="c", one_kernel_dynamics=None)
-    task = dataclasses.replace(task, sim=sim)
+    task = dataclasses.replace(task, sim=in_c_engine(task.sim))
     changed = dataclasses.replace(cfg, task=task, device="cpu")
     with warnings.catch_warnings():
         # A condition changes more geoms or joints than matter in this task.

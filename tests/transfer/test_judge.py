@@ -10,6 +10,7 @@ from ksim_rl.envs.contract import part
 from ksim_rl.scene.scene import build_spec
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.build import build_evaluator
+from ksim_rl.trainers.other_physics import in_c_engine
 from ksim_rl.trainers.run_folder import policy_of
 from ksim_rl.transfer.conditions import CONDITIONS
 from ksim_rl.transfer.judge import judge
@@ -26,8 +27,7 @@ def policy():
 @pytest.mark.full
 def test_as_trained_is_an_evaluation_on_the_c_engine(policy):
     found = judge(policy.cfg, policy.actor, CONDITIONS[0], episodes=4, seconds=1.0)
-    sim = dataclasses.replace(policy.cfg.task.sim, engine="c", one_kernel_dynamics=None)
-    task = dataclasses.replace(policy.cfg.task, sim=sim)
+    task = dataclasses.replace(policy.cfg.task, sim=in_c_engine(policy.cfg.task.sim))
     evaluator = build_evaluator(
         dataclasses.replace(policy.cfg, task=task), policy.actor, episodes=4
     )
@@ -45,8 +45,8 @@ def test_as_trained_is_an_evaluation_on_the_c_engine(policy):
 def test_limits_of_effort_reach_the_worlds(policy):
     # A good policy may need no more than what is left of them: returns would tell nothing.
     weak = BY_NAME["a battery that is empty"].change(policy.cfg.task)
-    sim = dataclasses.replace(weak.sim, engine="c", one_kernel_dynamics=None)
-    cfg = dataclasses.replace(policy.cfg, task=dataclasses.replace(weak, sim=sim), device="cpu")
+    weak = dataclasses.replace(weak, sim=in_c_engine(weak.sim))
+    cfg = dataclasses.replace(policy.cfg, task=weak, device="cpu")
     env = build_evaluator(cfg, policy.actor, episodes=2).env
     env.reset()
     base = part(env, ManagerBasedRlEnv)

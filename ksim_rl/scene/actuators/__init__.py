@@ -7,12 +7,18 @@ entry says by name or pattern which joints it drives.
 from ksim_rl.scene.actuators.actuator import Actuator
 from ksim_rl.scene.actuators.builtin import MotorActuator, PositionActuator, VelocityActuator
 from ksim_rl.scene.actuators.joint_drives import JointDrives, set_actuators
-from ksim_rl.scene.actuators.motors import DCMotorActuator, DelayedActuator, IdealPDActuator
+from ksim_rl.scene.actuators.motors import (
+    DCMotorActuator,
+    DelayedActuator,
+    IdealPDActuator,
+    without_delay,
+)
 from ksim_rl.scene.actuators.nets import LSTMActuator, MLPActuator
 from ksim_rl.scene.state.buffers import ActuatorParams
 from ksim_rl.scene.state.joint_targets import JointTargets
 
 __all__ = [
     "set_actuators",
+    "without_delay",
     *sorted(name for name, value in vars().items() if isinstance(value, type)),
 ]  # pyright: ignore

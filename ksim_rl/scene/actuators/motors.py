@@ -88,6 +88,11 @@ class DCMotorActuator(IdealPDActuator):
         return effort_EN
 
 
+def without_delay(actuator: Actuator) -> Actuator:
+    """Return the actuator behind a delay; one that is not delayed is returned as it is."""
+    return actuator.actuator if isinstance(actuator, DelayedActuator) else actuator
+
+
 @dataclass(frozen=True, kw_only=True)
 class DelayedActuator(Actuator):
     """Another actuator, built-in or explicit, that sees its targets some physics substeps late.

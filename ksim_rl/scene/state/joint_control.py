@@ -53,6 +53,15 @@ def joint_control(mj_model: mujoco.MjModel, actuator: int) -> JointControl:
     )
 
 
+def force_limit(mj_model: mujoco.MjModel, actuator: int) -> float | None:
+    """Return the least effort at the joint that an actuator's force range allows both ways, N m or N; None without."""
+    if not mj_model.actuator_forcelimited[actuator]:
+        return None
+    # The force goes through the gear.
+    range_2 = mj_model.actuator_forcerange[actuator] * mj_model.actuator_gear[actuator, 0]
+    return float(np.abs(range_2).min())
+
+
 def control_of_spec(actuator: mujoco.MjsActuator) -> JointControl:
     """Return the meaning of the control of an actuator that is not compiled yet."""
     return _control(
