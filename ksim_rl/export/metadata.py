@@ -31,9 +31,10 @@ def metadata(
     actions = controls.actions(ours)
     laws = controls.actuators(ours)
     # Joints of the actions first, in their order; then the others, which observations may name.
-    asked = list(
-        dict.fromkeys(n for action in actions if action["kind"] != "ctrl" for n in action["names"])
-    )
+    asked: list[str] = []
+    for action in actions:
+        if action["kind"] != "ctrl":
+            asked += [name for name in action["names"] if name not in asked]
     names = [*asked, *(n for n in joint_names(view, None) if n not in asked)]
     # Controllers for mjlab's policies read the first entries, by these names.
     gains = _gains(ours, laws, names)
@@ -42,8 +43,15 @@ def metadata(
         by_term = [view.default_qpos_L[view.joints(n).qpos].tolist() for n in (asked, names)]
     else:
         by_term = [[], []]
-    scales = [s for a in actions for s in np.broadcast_to(a["scale"], len(a["names"])).tolist()]
-    sensors = {n: s for n, s in cfg.scene.sensors.items() if isinstance(s, ContactSensor)}
+    scales = []
+    for action in actions:
+        # One number may stand for all of an action's joints.
+        scales += np.broadcast_to(action["scale"], len(action["names"])).tolist()
+    sensors = {
+        name: sensor
+        for name, sensor in cfg.scene.sensors.items()
+        if isinstance(sensor, ContactSensor)
+    }
     return {
         "format": FORMAT,
         "joint_names": asked,
@@ -65,16 +73,22 @@ def metadata(
         },
         "contacts": {
             name: {
-                "elements": [f"{name}_{e}" for e in s.elements(view.resolver.names("geom" if s.geoms else "body"))],
+                "elements": [
+                    f"{name}_{e}"
+                    for e in s.elements(view.resolver.names("geom" if s.geoms else "body"))
+                ],
                 "strongest": s.reduce == "strongest",
                 "every_substep": s.every_substep,
             }
             for name, s in sensors.items()
         },
         **traced.described(),
-        "rewards": {name: {"weight": cfg.rewards[name].weight} for name in traced.scored["rewards"]},
+        "rewards": {
+            name: {"weight": cfg.rewards[name].weight} for name in traced.scored["rewards"]
+        },
         "terminations": {
-            name: {"time_out": cfg.terminations[name].time_out} for name in traced.scored["terminations"]
+            name: {"time_out": cfg.terminations[name].time_out}
+            for name in traced.scored["terminations"]
         },
         "metrics": list(traced.scored["metrics"]),
         "left_out": list(traced.left_out),
@@ -83,11 +97,13 @@ def metadata(
         "physics_dt": ours.physics_dt,
         "decimation": cfg.decimation,
         "step_dt": ours.step_dt,
-        "episode_steps": ours.max_episode_length if any(t.time_out for t in cfg.terminations.values()) else 0,
+        "episode_steps": ours.max_episode_length
+        if any(t.time_out for t in cfg.terminations.values())
+        else 0,
         "encoders": "targets of positions are readings of encoders, as biased observations are: a robot's servos take "
         "them as they are. Only a simulation, whose servos see true positions, takes the encoders' bias off them",
         "frames": "x forward, y left, z up; quaternions (w, x, y, z); root velocities and gravity in its own axes",
-    }  # fmt: skip
+    }
 
 
 def _gains(

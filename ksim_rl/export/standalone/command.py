@@ -51,7 +51,8 @@ def _run(number: int) -> dict[str, float]:
 def _replay(runner: Runner, path: Path) -> None:
     record = read_arrays(runner.folder / "trace.npz")
     found = {"dt": np.array(runner.model.opt.timestep), "decimation": np.array(runner.decimation)}
-    laws, joint = runner.meta["actuators"], runner.model.joint
+    laws = runner.meta["actuators"]
+    joint = runner.model.joint
     pairs = [pair for law in laws for pair in zip(law["joints"], law["actuators"], strict=True)]
     drives = [joint(int(runner.model.actuator(name).trnid[0])).name for _, name in pairs]
     found["crossed"] = np.array([own != d for (own, _), d in zip(pairs, drives, strict=True)], bool)

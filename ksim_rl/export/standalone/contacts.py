@@ -13,12 +13,14 @@ class Contacts:
     """
 
     def __init__(self, spec: Json, mj_model: mujoco.MjModel, substeps: int) -> None:
-        self.strongest, self.every = spec["strongest"], spec["every_substep"]
+        self.strongest = spec["strongest"]
+        self.every = spec["every_substep"]
         # One MuJoCo sensor reads found, force and position (7 numbers); of the strongest
         # contact also normal and tangent (13).
         first = [mj_model.sensor(name).adr[0] for name in spec["elements"]]
         self.index = np.add.outer(first, np.arange(13 if self.strongest else 7))
-        self.kept, self.refine = (substeps if self.every else 1), 1
+        self.kept = substeps if self.every else 1
+        self.refine = 1
         self.reset()
 
     def reset(self) -> None:
@@ -36,22 +38,28 @@ class Contacts:
     def update(self, data: mujoco.MjData, dt: float, starts: bool) -> None:
         """Let `dt` seconds pass; `starts` where this begins an env step."""
         # "found" is needed at the next update, to tell landing from standing.
-        reading, kept = data.sensordata[self.index], self.fields
+        reading = data.sensordata[self.index]
+        kept = self.fields
         force = reading[:, 1:4]
         # The force of the strongest contact is in the contact's own axes: turn it into the world's.
         if self.strongest:
-            normal, tangent = reading[:, 7:10], reading[:, 10:13]
+            normal = reading[:, 7:10]
+            tangent = reading[:, 10:13]
             axes = np.stack((normal, tangent, np.cross(normal, tangent)), -1)
             force = np.einsum("nij,nj->ni", axes, force)
-        kept["force"], kept["position"] = force, reading[:, 4:7]
+        kept["force"] = force
+        kept["position"] = reading[:, 4:7]
         # A substep that is divided leaves the force of its last part.
         self.updates = 0 if starts else self.updates + 1
         kept["force_history"][self.updates // self.refine] = force
         # Rising and falling edges of contact.
-        touches, touched = reading[:, 0] > 0, kept["found"] > 0
-        lands, leaves = touches & ~touched, touched & ~touches
+        touches = reading[:, 0] > 0
+        touched = kept["found"] > 0
+        lands = touches & ~touched
+        leaves = touched & ~touches
         # The time up to and including this update, so that a landing reports the whole flight.
-        flight, stance = kept["air_time"] + dt, kept["contact_time"] + dt
+        flight = kept["air_time"] + dt
+        stance = kept["contact_time"] + dt
         # Elements that stood from the start have flown for no time: that is no flight.
         kept["last_air_time"] = np.where(
             lands & (kept["air_time"] > 0), flight, kept["last_air_time"]

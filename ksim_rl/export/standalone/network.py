@@ -26,11 +26,13 @@ class Network:
             raise ValueError(f"{path}: weights outside of the file: expected all of them in it")
         # Episodes run in parallel processes; a small network gains nothing from threads.
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
         self.session = onnxruntime.InferenceSession(
             data, options, providers=["CPUExecutionProvider"]
         )
-        self.path, self.specs = path, states
+        self.path = path
+        self.specs = states
         self.outputs = [output, *(spec["output"] for spec in states)]
         self.inputs = {value.name: self._example(value) for value in self.session.get_inputs()}
         self.reset()

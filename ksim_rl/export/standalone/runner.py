@@ -21,10 +21,12 @@ class Runner(Signals):
     def __init__(self, folder: str | Path, seed: int = 0) -> None:
         super().__init__(folder, seed)
         meta = self.meta
-        self.policy, self.noisy = Policy(self.folder, meta), bool(meta.get("noisy", True))
+        self.policy = Policy(self.folder, meta)
+        self.noisy = bool(meta.get("noisy", True))
         self.lags: list[Lag] = []
         self.noises: list[Noise] = []
-        self.readings, self.scores = Values(self, "obs"), Values(self, "scores")
+        self.readings = Values(self, "obs")
+        self.scores = Values(self, "scores")
         self.terms = [self._term(spec) for spec in meta["observations"]]
         self.stops = np.cumsum([spec["size"] for spec in meta["observations"]])
         kinds = ("terminations", "rewards", "metrics")
@@ -88,7 +90,9 @@ class Runner(Signals):
         return low_pass
 
     def _action(self, spec: Json) -> Callable[[Array], None]:
-        columns, kind, names = slice(*spec["columns"]), spec["kind"], spec["names"]
+        columns = slice(*spec["columns"])
+        kind = spec["kind"]
+        names = spec["names"]
         shape = self._shaping(spec)
         # The model's own actuator, driven without a law in between.
         if kind == "ctrl":
@@ -103,7 +107,8 @@ class Runner(Signals):
         second = self._shaping(spec["velocity"]) if spec.get("velocity") else None
 
         def joints(action: Array) -> None:
-            given, value = action[columns], None
+            given = action[columns]
+            value = None
             if second:
                 given, value = np.split(given, 2)
                 self.targets["vel"].update(zip(names, second(value), strict=True))
@@ -120,7 +125,9 @@ class Runner(Signals):
 
     def _shaping(self, spec: Json) -> Callable[[Array], Array]:
         low, high = spec["clip"] or (-np.inf, np.inf)
-        scale, offset, alpha = np.asarray(spec["scale"]), np.asarray(spec["offset"]), spec["alpha"]
+        scale = np.asarray(spec["scale"])
+        offset = np.asarray(spec["offset"])
+        alpha = spec["alpha"]
         kept: list[Any] = [0.0]
         self.resets.append(lambda: kept.__setitem__(0, 0.0))
 
@@ -136,7 +143,9 @@ class Runner(Signals):
 
     def _law(self, spec: Json) -> Callable[[], None]:
         """Return a function that sets some actuators' controls from their joints' targets before each substep."""
-        names, takes, kind = spec["joints"], spec["takes"], spec["kind"]
+        names = spec["joints"]
+        takes = spec["takes"]
+        kind = spec["kind"]
         pos = np.array([self.joints[name][0] for name in names], int)
         vel = np.array([self.joints[name][1] for name in names], int)
         ctrl = [self.model.actuator(name).id for name in spec["actuators"]]
@@ -145,7 +154,8 @@ class Runner(Signals):
         self.numbers = getattr(self, "numbers", []) + [(names, numbers)]
         lag = Lag(spec["delay"], self) if spec["delay"] else None
         self.lags += [lag] if lag else []
-        scale, offset = np.asarray(spec["scale"]), np.asarray(spec["offset"])
+        scale = np.asarray(spec["scale"])
+        offset = np.asarray(spec["offset"])
 
         # Targets stay the same for all substeps of an env step; measured state does not.
         def law() -> None:
@@ -162,16 +172,20 @@ class Runner(Signals):
                 self.data.ctrl[ctrl] = target[takes[0]] * scale + offset
                 return
             # Ideal PD at the joint, with a feed-forward effort.
-            now, moves = self.data.qpos[pos], self.data.qvel[vel]
+            now = self.data.qpos[pos]
+            moves = self.data.qvel[vel]
             effort = target["effort"] + numbers["stiffness"] * (target["pos"] - now)
             effort = effort + numbers["damping"] * (target["vel"] - moves)
             limit = numbers["effort_limit"]
-            low, high = -limit, limit
+            low = -limit
+            high = limit
             # Torque-speed line: the torque left at a speed falls to none at the no-load speed.
             if kind == "dc_motor":
                 stall = numbers["saturation_effort"]
                 lost = stall * moves / numbers["velocity_limit"]
-                low, high = np.clip(-stall - lost, low, high), np.clip(stall - lost, low, high)
+                lowest = np.clip(-stall - lost, low, high)
+                high = np.clip(stall - lost, low, high)
+                low = lowest
             self.data.ctrl[ctrl] = np.clip(effort, low, high)
 
         return law
@@ -186,7 +200,8 @@ class Runner(Signals):
             mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         for name, value in (start or {}).items():
             self._apply(name, value)
-        self.steps, self.terminated = 0, False
+        self.steps = 0
+        self.terminated = False
         self.action = self.last_action = np.zeros_like(self.action)
         for kind in KINDS:
             self.targets[kind] = (
@@ -335,7 +350,9 @@ class Runner(Signals):
             for name, v in record.items()
             if name.startswith("trace/") and v.ndim
         }
-        joints, found, self.noisy = [at for _, at in self.joints.values()], {}, False
+        joints = [at for _, at in self.joints.values()]
+        found = {}
+        self.noisy = False
         self._begin(record, number)
         for delay in self.lags:
             delay.lag = min(max(lag, int(delay.spec["min"])), delay.most)

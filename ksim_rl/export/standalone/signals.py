@@ -30,19 +30,22 @@ class Lag:
     """A value as it was some steps ago; before an episode's first value lies that value, or `initial`."""
 
     def __init__(self, spec: Json, signals: "Signals") -> None:
-        self.spec, self.signals = spec, signals
+        self.spec = spec
+        self.signals = signals
         self.most = check_count("steps of a delay", spec["max"])
         self.reset()
 
     def reset(self) -> None:
         """Begin an episode."""
-        self.kept, self.age = [], 0
+        self.kept = []
+        self.age = 0
         self.lag = self._draw()
 
     def _draw(self) -> int:
         # Those that share a lag draw it once.
         # The age is in the key, so a later draw of the same group is a new one.
-        drawn, key = self.signals.drawn, (self.spec.get("shared") or id(self), self.age)
+        drawn = self.signals.drawn
+        key = (self.spec.get("shared") or id(self), self.age)
         if key not in drawn:
             drawn[key] = int(self.signals.draws.integers(self.spec["min"], self.most + 1))
             # Not at the first draw: there is no earlier lag to hold.
@@ -62,7 +65,8 @@ class Lag:
         else:
             first = np.full_like(value, self.spec["initial"])
         # Newest first. The list is filled up at the first call, so that every lag finds a value.
-        self.kept = [value, *(self.kept or [first] * self.most)][: self.most + 1]
+        before = self.kept or [first] * self.most
+        self.kept = [value, *before][: self.most + 1]
         return self.kept[self.lag]
 
 
@@ -70,7 +74,11 @@ class Noise:
     """A sensor's errors: bias, walk, noise, resolution, dropout, in this order."""
 
     def __init__(self, spec: Json, signals: "Signals") -> None:
-        self.spec, self.signals, self.bias, self.walk, self.last = spec, signals, None, 0.0, None
+        self.spec = spec
+        self.signals = signals
+        self.bias = None
+        self.walk = 0.0
+        self.last = None
 
     def _sample(self, spec: Json, size: int) -> Array:
         # Uniform draws lie in [0, 1), gaussian ones have std 1; offset and spread map them to the range.
@@ -82,12 +90,15 @@ class Noise:
 
     def reset(self) -> None:
         """Begin an episode."""
-        self.bias, self.walk, self.last = None, 0.0, None
+        self.bias = None
+        self.walk = 0.0
+        self.last = None
 
     def __call__(self, value: Array) -> Array:
         """Return the reading of a value."""
         # There is no last reading before the first one of an episode.
-        spec, first = self.spec, self.last is None
+        spec = self.spec
+        first = self.last is None
         # A constant error of the episode, such as of calibration: drawn once, then kept.
         if spec["bias"]:
             if self.bias is None:
@@ -101,8 +112,12 @@ class Noise:
             self.walk = self.walk + np.asarray(
                 spec["walk_std"]
             ) * self.signals.draws.standard_normal(len(value))
-        value, sample = value + self.walk, self._sample(spec, len(value))
-        value = value * sample if spec["operation"] == "multiply" else value + sample
+        value = value + self.walk
+        sample = self._sample(spec, len(value))
+        if spec["operation"] == "multiply":
+            value = value * sample
+        else:
+            value = value + sample
         # Round to the steps of the converter; where the resolution is 0 the value passes unchanged.
         grain = np.broadcast_to(spec["resolution"], value.shape)
         value = np.where(
@@ -124,7 +139,8 @@ class Values:
     def __init__(self, signals: "Signals", name: str) -> None:
         spec = signals.meta[name]
         # A task without rewards, metrics and terminations has none.
-        self.network, self.read = None, {}
+        self.network = None
+        self.read = {}
         if spec is not None:
             self.network = Network(signals.folder / f"{name}.onnx", spec["states"], spec["output"])
             self.read = {one["input"]: signals.quantity(one) for one in spec["measurements"]}
@@ -191,7 +207,8 @@ class Signals:
         self.action = self.last_action = np.zeros(
             check_count("policy.num_actions", meta["policy"]["num_actions"])
         )
-        self.steps, self.terminated = 0, False
+        self.steps = 0
+        self.terminated = False
         # Height fields are the terrain; where there is none, the ground is the plane z = 0.
         self.ground = [
             g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_HFIELD
@@ -215,7 +232,8 @@ class Signals:
 
     def refresh(self) -> None:
         """Recompute all that follows from position and velocity; contacts and forces stay from the last substep."""
-        model, data = self.model, self.data
+        model = self.model
+        data = self.data
         # Velocities of subtrees, too: sensors of momentum take those of the last substep where nobody computes them.
         stages = (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel, mujoco.mj_subtreeVel)
         for compute in stages:
@@ -244,7 +262,8 @@ class Signals:
         ):
             if kind in node:
                 return read(name, node)
-        data, model = self.data, self.model
+        data = self.data
+        model = self.model
         # A sensor of the model, any width.
         if name == "sensor":
             start = int(model.sensor(node["sensor"]).adr[0])
@@ -252,7 +271,8 @@ class Signals:
             # A copy: the array would change under a lag that keeps it.
             return lambda: data.sensordata[start:stop].copy()
         if name == "contact":
-            tracker, field = self.contacts[node["sensor"]], node["field"]
+            tracker = self.contacts[node["sensor"]]
+            field = node["field"]
             tracker.fields[field]  # refused now, not in the first step
             return lambda: tracker.fields[field]
         if name == "command":
@@ -339,7 +359,8 @@ class Signals:
     def _of_root(self, name: str, node: Json) -> Value:
         """The root, in its own axes where the frame says so."""
         data = self.data
-        body, local = self.model.body(node["body"]).id, node.get("frame") == "root"
+        body = self.model.body(node["body"]).id
+        local = node.get("frame") == "root"
         return {
             "root_pos": lambda: data.xpos[body],
             "root_quat": lambda: data.xquat[body],
@@ -382,7 +403,8 @@ class Signals:
     def _scan(self, body: int, points: Array) -> Array:
         """Return how far the ground is below a body at points [N, 2] that turn with its yaw."""
         # The scan turns with yaw only: pitch and roll of the body leave its points in place.
-        axis, origin = self.data.xmat[body].reshape(3, 3)[:, 0], self.data.xpos[body]
+        axis = self.data.xmat[body].reshape(3, 3)[:, 0]
+        origin = self.data.xpos[body]
         yaw = math.atan2(axis[1], axis[0])
         turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
         # The inverse rotation, since points are rows that multiply from the left.

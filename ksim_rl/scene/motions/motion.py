@@ -19,7 +19,8 @@ from ksim_rl.scene.near_names import NearNames
 KEYS = ("fps", "qpos", "qvel")
 _OPTIONAL = ("joint_names",)
 # Frames per second: beyond these, a motion would last for years, or no time at all.
-SLOWEST, FASTEST = 1e-2, 1e5
+SLOWEST = 1e-2
+FASTEST = 1e5
 
 
 @dataclass(frozen=True, kw_only=True)
