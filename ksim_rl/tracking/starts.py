@@ -57,15 +57,17 @@ class StartInMotion(ResetToMotion):
         lin_vel_E3 = robot.root_lin_vel_w_EL
         ang_vel_E3 = robot.root_ang_vel_w_EL
         # Read before the pose is written, since velocities in the world follow from it.
-        moved_E6, kick_E6 = (
-            draw_by_axis(view, ranges) for ranges in (self.pose_range, self.velocity_range)
-        )
+        moved_E6 = draw_by_axis(view, self.pose_range)
+        kick_E6 = draw_by_axis(view, self.velocity_range)
         # The error turns the robot about world axes.
-        quat_E4 = quaternion.multiply(
-            quaternion.from_euler_xyz(*moved_E6[:, 3:].unbind(-1)), robot.root_quat_EL
-        )
-        robot.write_root_pose(mask_E, robot.root_pos_EL + moved_E6[:, :3], quat_E4)
-        robot.write_root_velocity(mask_E, lin_vel_E3 + kick_E6[:, :3], ang_vel_E3 + kick_E6[:, 3:])
+        roll_E, pitch_E, yaw_E = moved_E6[:, 3:].unbind(-1)
+        turn_E4 = quaternion.from_euler_xyz(roll_E, pitch_E, yaw_E)
+        quat_E4 = quaternion.multiply(turn_E4, robot.root_quat_EL)
+        pos_E3 = robot.root_pos_EL + moved_E6[:, :3]
+        robot.write_root_pose(mask_E, pos_E3, quat_E4)
+        lin_vel_E3 = lin_vel_E3 + kick_E6[:, :3]
+        ang_vel_E3 = ang_vel_E3 + kick_E6[:, 3:]
+        robot.write_root_velocity(mask_E, lin_vel_E3, ang_vel_E3)
         low_L, high_L = joints.soft_limits_L2.unbind(-1)
         off_EL = view.uniform(len(joints), -self.joint_range, self.joint_range)
         # Within the soft limits, where the action can reach.
@@ -126,8 +128,7 @@ class FailedParts(OfMotion, CurriculumTerm):
         mixed_B = failed_B + (counts_B - failed_B) / self.memory
         failed_B.copy_(torch.where(ranks.any_of(lived_E), mixed_B, failed_B))
         # A share is even over all parts, so that none is forgotten.
-        chance_B = self.uniform / parts + (1.0 - self.uniform) * failed_B / failed_B.sum().clamp(
-            min=1e-9
-        )
+        share_of_failures_B = failed_B / failed_B.sum().clamp(min=1e-9)
+        chance_B = self.uniform / parts + (1.0 - self.uniform) * share_of_failures_B
         weights_EB.copy_(torch.where(mask_E[:, None], chance_B, weights_EB))
         return chance_B.max() / chance_B.sum()
