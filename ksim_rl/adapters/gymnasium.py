@@ -153,7 +153,8 @@ class GymnasiumVectorEnv(VectorEnv):
         # Gymnasium's layout: None where no episode ended.
         final = np.full(done_E.shape, fill_value=None, dtype=object)
         for row in np.flatnonzero(done_E):
-            final[row] = self._names.out({name: value[row].copy() for name, value in obs.items()})
+            last = {name: value[row].copy() for name, value in obs.items()}
+            final[row] = self._names.out(last)
         return {"final_obs": final, "_final_obs": done_E}
 
 
@@ -286,4 +287,6 @@ def _one_seed(seeds: Sequence[int | None], num_envs: int) -> int | None:
     if all(seed == first + row for row, seed in enumerate(seeds)):
         return first
     # Mixed into one seed; shifted to fit a signed integer.
-    return int(np.random.SeedSequence([int(seed or 0) for seed in seeds]).generate_state(1)[0] >> 1)
+    sequence = np.random.SeedSequence([int(seed or 0) for seed in seeds])
+    mixed = sequence.generate_state(1)[0]
+    return int(mixed >> 1)

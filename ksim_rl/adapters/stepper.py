@@ -134,10 +134,10 @@ class Stepper:
         """Reset the rows of a mask, and return the observations of all."""
         self._followed.follow()
         root = self.root
-        root.update_(
-            self._reset_where(root.clone(), mask_E.to(self.device)).select(*root.keys(True, True))
-        )
-        self._ended_E.masked_fill_(mask_E.to(self.device), 0)
+        mask_E = mask_E.to(self.device)
+        begun = self._reset_where(root.clone(), mask_E)
+        root.update_(begun.select(*root.keys(True, True)))
+        self._ended_E.masked_fill_(mask_E, 0)
         return self.read(root)
 
     def as_action(self, values: Any) -> Shaped[Tensor, "*batch"]:

@@ -107,10 +107,13 @@ def schedule(works: Sequence[Work], own: Sequence[Own]) -> dict[str, str]:
             work.follow(before, kinds)
     for name, used in users.items():
         # An array that lives in one level, at one place per lane, needs no memory: a register will do.
-        if all(
-            len(one.texts[name]) == 1 and one.level == used[0].level and one.shares(name, used[0])
-            for one in used
-        ):
+        first = used[0]
+        is_private = True
+        for one in used:
+            has_one_place = len(one.texts[name]) == 1
+            in_one_level = one.level == first.level
+            is_private &= has_one_place and in_one_level and one.shares(name, first)
+        if is_private:
             kinds[name] = _PRIVATE
     return kinds
 

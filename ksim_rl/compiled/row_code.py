@@ -156,7 +156,13 @@ def _join(name: str, args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) 
 
 
 def _cross(args: OpArgs, kwargs: OpKwargs, out: Tensor, cells: Cells) -> None:
-    dim = kwargs.get("dim", args[2] if len(args) > 2 else -1) % out.ndim - int(bool(cells.rows))
+    dim = kwargs.get("dim", -1)
+    if len(args) > 2:
+        dim = args[2]
+    # Counted from the first dim; where a kernel has rows, they are a dim that its C++ does not see.
+    dim = dim % out.ndim
+    if cells.rows:
+        dim -= 1
     if dim < 0:
         raise NotARowError("a cross product of rows")
     shape = cells.inner(out)

@@ -127,9 +127,11 @@ def explain(
     show("metrics", ("term", "reduced by", "parameters"), rows)
 
     # Groups first, as observations pass them first.
-    of_groups = compile_groups(cfg.observations)
-    rows = [("(groups)", _keys(transform), type(transform).__name__) for transform in of_groups]
-    rows += [(name, _keys(each.build()), _call(each)) for name, each in cfg.transforms.items()]
+    rows = []
+    for transform in compile_groups(cfg.observations):
+        rows.append(("(groups)", _keys(transform), type(transform).__name__))
+    for name, transform_cfg in cfg.transforms.items():
+        rows.append((name, _keys(transform_cfg.build()), _call(transform_cfg)))
     show("transforms (actions pass them from last to first)", ("term", "keys", "parameters"), rows)
     return "\n".join(line.rstrip() for line in output.getvalue().splitlines()) + "\n"
 

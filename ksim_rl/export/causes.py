@@ -127,10 +127,11 @@ def _of_motion(meta: Json, signal: Any, *, rates: bool) -> Cause | None:
     size = np.abs(ours - before).mean() + 1e-4
     touches = np.zeros(len(error), bool)
     for name in meta["contacts"]:
-        touches |= (signal(f"found_{name}")[0] > 0).any(1) | (signal(f"found_{name}")[1] > 0).any(1)
-    on_ground, in_air = (
-        float(np.mean(error[rows])) / size if rows.any() else 0.0 for rows in (touches, ~touches)
-    )
+        found_here, found_there, _ = signal(f"found_{name}")
+        touches |= (found_here > 0).any(1)
+        touches |= (found_there > 0).any(1)
+    on_ground = _mean_of(error, touches) / size
+    in_air = _mean_of(error, ~touches) / size
     # Rounding and the tolerance of the solvers stay below this.
     if max(on_ground, in_air) <= 3 * SAME:
         return None
@@ -139,6 +140,13 @@ def _of_motion(meta: Json, signal: Any, *, rates: bool) -> Cause | None:
     if on_ground > 5 * in_air:
         return Cause("contact parameters", "robot.xml", evidence)
     return Cause("mass or inertia", "robot.xml", evidence)
+
+
+def _mean_of(error: np.ndarray, rows: np.ndarray) -> float:
+    """Return the mean of these rows, 0 where there are none."""
+    if not rows.any():
+        return 0.0
+    return float(np.mean(error[rows]))
 
 
 def _of_observation(
@@ -157,9 +165,11 @@ def _of_observation(
         return [Cause("scale", about, f"x {np.median(ratios):.3g}")]
     # Only vectors of three can be turned.
     if ours.shape[1] % 3 == 0:
-        lengths = [np.linalg.norm(x.reshape(-1, 3), axis=1) for x in (ours, theirs)]
+        our_lengths = np.linalg.norm(ours.reshape(-1, 3), axis=1)
+        their_lengths = np.linalg.norm(theirs.reshape(-1, 3), axis=1)
         # A sensor that does not sit in the body's origin feels its turning too.
-        if _error(*lengths) <= max(LIKE, 0.3 * _error(ours, theirs)):
+        most = max(LIKE, 0.3 * _error(ours, theirs))
+        if _error(our_lengths, their_lengths) <= most:
             return [
                 Cause("frame", about, "lengths agree, directions do not: it is given in other axes")
             ]
@@ -214,11 +224,11 @@ def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.nda
     # Each possible lag was replayed, under "<lag>/<episode>/<signal>".
     lags = sorted({key.split("/")[0] for key in replay if "/" in key})
     for number, recorded in enumerate(trace[f"trace/{name}"]):
-        fits = [
-            replay[f"{lag}/{number}/{name}"] for lag in lags if f"{lag}/{number}/{name}" in replay
-        ]
+        keys = [f"{lag}/{number}/{name}" for lag in lags]
+        fits = [replay[key] for key in keys if key in replay]
         # Up to the first end; the appended True ends an episode that has none.
-        length = int(np.argmax(np.append(trace["trace/done"][number].ravel() > 0, True))) + 1
+        is_end = trace["trace/done"][number].ravel() > 0
+        length = int(np.argmax(np.append(is_end, True))) + 1
         flat = recorded[:length].reshape(min(length, len(recorded)), -1)
         found = [fit[: len(flat)].reshape(len(flat), -1) for fit in fits] or [flat]
         ours.append(flat)

@@ -353,9 +353,11 @@ def _statistics(policy: ExportedPolicy) -> tuple[np.ndarray, np.ndarray]:
             for column in policy.columns:
                 stop += column.size * column.length
                 newest += range(stop - column.size, stop)
-            mean = module.mean.detach().cpu().double().numpy()[newest]
+            mean_L = module.mean.detach().cpu().double()
+            std_L = module.var.detach().cpu().double().sqrt()
+            mean = mean_L.numpy()[newest]
             # A column that never moved has no spread; it is drawn a little about its mean.
-            std = module.var.detach().cpu().double().sqrt().clamp(min=1e-3).numpy()[newest]
+            std = std_L.clamp(min=1e-3).numpy()[newest]
     return mean, std
 
 

@@ -112,8 +112,11 @@ class Recording:
     @property
     def figures(self) -> list[dict[str, float]]:
         """The figures of each episode."""
-        columns = {name: sum_E.tolist() for name, sum_E in self._sums.items()}
-        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        columns = [sum_E.tolist() for sum_E in self._sums.values()]
+        episodes = []
+        for row in zip(*columns, strict=True):
+            episodes.append(dict(zip(self._sums, row, strict=True)))
+        return episodes
 
     def _watch(self, run_events: Callable[[], None]) -> None:
         before_EL = self._ours.world.qvel_EL.clone()

@@ -197,9 +197,9 @@ def ratio_error(ours: np.ndarray, theirs: np.ndarray) -> float:
     if len(ours) < 2 or mean == 0.0:
         return float("nan")
     # Delta method: the spread of theirs around the ratio's line through the pairs.
-    return float(
-        np.std(theirs - ours * theirs.mean() / mean, ddof=1) / np.sqrt(len(ours)) / abs(mean)
-    )
+    left = theirs - ours * theirs.mean() / mean
+    spread_of_mean = np.std(left, ddof=1) / np.sqrt(len(ours))
+    return float(spread_of_mean / abs(mean))
 
 
 def run_export(arguments: Sequence[str]) -> int:

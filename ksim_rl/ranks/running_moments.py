@@ -56,7 +56,8 @@ def _count(
         (2 * dim + 1) * (parts + groups) + 1, dtype=torch.float64, device=count.device
     )
     at = [address(own) for own in (values_NL, valid_N, counts_N, moments, count, mean_L, squares_L)]
-    for stage, size in enumerate(((num_rows, dim // span), (parts, dim), (groups, dim), (1, dim))):
+    sizes = ((num_rows, dim // span), (parts, dim), (groups, dim), (1, dim))
+    for stage, size in enumerate(sizes):
         _quick(
             count.device,
             size,

@@ -34,9 +34,11 @@ def gathered(own: Mapping[str, Shaped[Tensor, "*?leaf"]]) -> dict[str, Any]:
     """
     # The same order on all ranks.
     names = sorted(own)
-    digests_N = torch.tensor(
-        [zlib.crc32(_bytes(own[name]).numpy().tobytes()) for name in names], dtype=torch.int64
-    )
+    digests = []
+    for name in names:
+        raw = _bytes(own[name]).numpy().tobytes()
+        digests.append(zlib.crc32(raw))
+    digests_N = torch.tensor(digests, dtype=torch.int64)
     parts = [torch.empty_like(digests_N) for _ in range(size())]
     dist.all_gather(parts, digests_N)
     # Only digests travel so far; equal tensors, such as the networks, never do.

@@ -195,10 +195,13 @@ def saved(folder: Path) -> list[Path]:
 
 def newest_until(folder: Path, iteration: int) -> Path | None:
     """Return the newest checkpoint in `folder` of this iteration or an earlier one, None without such."""
-    found = [entry for entry in saved(folder) if (_order(entry.name) or (0, 0))[0] <= iteration]
-    if found:
-        return found[-1]
-    return None
+    newest = None
+    # In the order of their iterations.
+    for entry in saved(folder):
+        order = _order(entry.name)
+        if order is None or order[0] <= iteration:
+            newest = entry
+    return newest
 
 
 def load_latest(path: Path, *, note: Callable[[str], None] = warnings.warn) -> Checkpoint:

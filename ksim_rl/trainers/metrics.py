@@ -53,8 +53,10 @@ def start_copy(
     # The order of the vector: by dtype, not the order of the argument.
     names = tuple(itertools.chain(*of_kind.values()))
     # float64 holds every count of env states exactly. One by one, a conversion each, took a kernel each.
-    kinds = (torch.stack([*own.values()]).to(torch.float64) for own in of_kind.values())
-    values_M = torch.cat([*kinds])
+    parts = []
+    for of_dtype in of_kind.values():
+        parts.append(torch.stack(list(of_dtype.values())).to(torch.float64))
+    values_M = torch.cat(parts)
     if device.type != "cuda":
         return PendingMetrics(names, values_M)
     on_host_M = torch.empty(values_M.shape, dtype=values_M.dtype, pin_memory=True)

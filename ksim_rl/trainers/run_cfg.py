@@ -266,7 +266,9 @@ class RunCfg(TrainingCfg):
         Beside the fields it names the plug-ins of this process and of the classes in the config.
         """
         tree = without_env_size(to_tree(self, type(self)))
-        needed = [*plugins.named(), *(target.split(".")[0] for target in class_paths.foreign(tree))]
+        needed = list(plugins.named())
+        for target in class_paths.foreign(tree):
+            needed.append(target.split(".")[0])
         if needed:
             return {**tree, PLUGINS: list(dict.fromkeys(needed))}
         return tree

@@ -118,12 +118,17 @@ def _listen(child: "Popen[str]", hook: GiveWeights, note: Callable[[str], None])
     hook.is_watched = False
 
 
+def _end_with_training() -> None:
+    """Wait for the training's end of the pipe, which it holds for as long as it lives, and end this process."""
+    sys.stdin.read()
+    os._exit(0)
+
+
 def main(folder: Path) -> None:
     """Serve the policies of the training in the other process, until that ends."""
     from ksim_rl.viewer.browser import BrowserViewer
 
-    # The training holds the other end of the pipe for as long as it lives.
-    threading.Thread(target=lambda: (sys.stdin.read(), os._exit(0)), daemon=True).start()
+    threading.Thread(target=_end_with_training, daemon=True).start()
     torch.set_num_threads(1)
     go_to_parents_folder()
     plugins.load(())

@@ -1,7 +1,7 @@
 """The panel beside the scene holds the controls of a session, in viser's widgets."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 
 import viser
@@ -168,8 +168,14 @@ class Panel:
     def _add_drawing(self, name: str) -> None:
         self.drawn.add(name)
         widget = self._gui.add_checkbox(name, True)
-        act: dict[bool, Callable[[str], None]] = {True: self.drawn.add, False: self.drawn.discard}
-        widget.on_update(lambda _: self._session.ask(partial(act[widget.value], name)))
+
+        def change(_: viser.GuiEvent) -> None:
+            if widget.value:
+                self._session.ask(partial(self.drawn.add, name))
+            else:
+                self._session.ask(partial(self.drawn.discard, name))
+
+        widget.on_update(change)
 
 
 def _at_share(share: float, low: float, high: float) -> float:

@@ -169,9 +169,11 @@ class Session:
         """The clean reading of each observation term that is a vector, of the shown env."""
         # The root of the next step: the policy's present input. Images are left out.
         terms = self._root_E.get("obs")
-        return {
-            key: terms.get(key)[self.env_index] for key in terms.keys() if terms.get(key).ndim == 2
-        }
+        vectors = {}
+        for key, value in terms.items():
+            if value.ndim == 2:
+                vectors[key] = value[self.env_index]
+        return vectors
 
     @property
     def commands(self) -> Mapping[str, Float[Tensor, " ?L"]]:

@@ -88,7 +88,11 @@ def _of_run(saved: checkpoint.Checkpoint, *, name: str) -> Card:
             f"{run}: made of {commit}: train in a clean clone of one commit, and add that run"
         )
     rows = listing.metric_rows(run)
-    earned = [(int(row[STEP]), value) for row in rows for value in listing.numbers([row], RETURN)]
+    earned = []
+    for row in rows:
+        # One number, or none where the row has no return.
+        for value in listing.numbers([row], RETURN):
+            earned.append((int(row[STEP]), value))
     # Every so many points, so that the card stays small.
     earned = earned[:: max(1, len(earned) // CURVE_POINTS)]
     return Card(

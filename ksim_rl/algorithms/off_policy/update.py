@@ -121,7 +121,8 @@ class OffPolicyUpdate(RolloutUpdate):
             self.optimizers["alpha"] = FlatAdamW(free, [loss.log_alpha], learning_rate=rate)
         self.steps_made = 0
         # Zero until learning starts.
-        self._means.update({name: torch.zeros((), device=self.device) for name in logged.values()})
+        for name in logged.values():
+            self._means[name] = torch.zeros((), device=self.device)
         # Two graphs: one for rollouts that are only stored, and one that learns as well.
         self._store_only = Captured(self._store, device=self.device)
         self._work.insert(0, self._store_only)

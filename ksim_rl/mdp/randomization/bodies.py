@@ -155,9 +155,10 @@ class RandomizePseudoInertia(Randomize):
         axes_N4 = array_constant(model.body_iquat[rows], view.device)
         spread_N3 = array_constant(second_moments(view, ids), view.device)
         # Ten parameters per body, in columns: alpha, 3 of stretch, 3 of shear, 3 of shift.
-        drawn = self.draw(
-            view, len(ids), [self.alpha, *[self.stretch] * 3, *[self.shear] * 3, *[self.shift] * 3]
-        )
+        ranges = [self.alpha]
+        for range_of_three in (self.stretch, self.shear, self.shift):
+            ranges += [range_of_three] * 3
+        drawn = self.draw(view, len(ids), ranges)
         # The mass is J's lower right entry, which U scales by exp(alpha) from both sides.
         density_EN1 = torch.exp(2.0 * drawn[..., 0:1])
         shift_EN3 = drawn[..., 7:10]

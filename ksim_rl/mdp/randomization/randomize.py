@@ -80,7 +80,9 @@ class Randomize(EventTerm):
         # The kernel reads floats from one table: both ends, then columns, rows, own values, and the
         # follower's ratios.
         low, high = zip(*pairs.values(), strict=True)
-        table_L = constant((*low, *high, *pairs, *ids, *own_NC.flat, *follower[1]), view.device)
+        _, ratios = follower
+        numbers_of_table = (*low, *high, *pairs, *ids, *own_NC.flat, *ratios)
+        table_L = constant(numbers_of_table, view.device)
         # The kernel knows kinds and operations by their places in the literals.
         kinds = (
             get_args(Distribution).index(self.distribution),

@@ -242,8 +242,10 @@ def _broken_dofs(mj_model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -
         else:
             end = mj_model.nq
         # A broken position counts for all dofs of its joint, unless a velocity tells which one.
-        if not np.isfinite(qpos[start:end]).all() and not broken[mj_model.dof_jntid == joint].any():
-            broken[mj_model.dof_jntid == joint] = True
+        is_of_joint = mj_model.dof_jntid == joint
+        is_finite = np.isfinite(qpos[start:end]).all()
+        if not is_finite and not broken[is_of_joint].any():
+            broken[is_of_joint] = True
     return tuple(int(dof) for dof in np.flatnonzero(broken))
 
 

@@ -50,9 +50,12 @@ class Leg:
     def pitch_joints(self, data: mujoco.MjData) -> dict[int, float]:
         """Return the joints that turn about the y axis, from the hip down, with the sign of that turn."""
         # Joints within 45 degrees of y; the sign tells which way they turn.
-        return {
-            j: float(np.sign(data.xaxis[j, 1])) for j in self.joints if abs(data.xaxis[j, 1]) > 0.7
-        }
+        signs = {}
+        for j in self.joints:
+            along_y = data.xaxis[j, 1]
+            if abs(along_y) > 0.7:
+                signs[j] = float(np.sign(along_y))
+        return signs
 
     @property
     def geoms(self) -> list[CollisionGeom]:
@@ -103,7 +106,8 @@ def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
     inner = {int(weld[mj_model.body_parentid[b]]) for b in moving}
     ends = [b for b in points if b not in {root, *inner}]
     # Feet are at the ground in the given pose.
-    lowest = [b for b in ends if points[b][:, 2].min() < heights.min() + REACHES_GROUND * height]
+    reached = heights.min() + REACHES_GROUND * height
+    lowest = [b for b in ends if points[b][:, 2].min() < reached]
     if not lowest:
         raise ValueError(
             "no chain of joints ends at the lowest point of the model: it has no feet to stand on"
@@ -250,7 +254,10 @@ def lowest_point(mj_model: mujoco.MjModel, data: mujoco.MjData) -> float:
     """Return the height of the lowest point of all bodies that move, m."""
     # Body 0 and all welded to the world do not move.
     bodies = [b for b in range(mj_model.nbody) if mj_model.body_weldid[b] == b and b > 0]
-    lowest = [points[:, 2].min() for b in bodies for points in _points(mj_model, data, b).values()]
+    lowest = []
+    for b in bodies:
+        for points in _points(mj_model, data, b).values():
+            lowest.append(points[:, 2].min())
     return float(min(lowest, default=0.0))
 
 

@@ -66,7 +66,8 @@ class CollisionGeom:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "type", int(self.type))  # so that it can stand in a config file
-        if self.fromto is not None and (any(self.pos) or tuple(self.quat) != (1.0, 0.0, 0.0, 0.0)):
+        is_placed = any(self.pos) or tuple(self.quat) != (1.0, 0.0, 0.0, 0.0)
+        if self.fromto is not None and is_placed:
             raise ValueError(
                 f"geom {self.name!r}: fromto={self.fromto} with pos={self.pos}, quat={self.quat}: give fromto alone, "
                 "or pos and quat with half the length in size"

@@ -29,7 +29,8 @@ def propose(
     every_joint = scalar_joint_ids(mj_model)
     root_at = int(mj_model.jnt_qposadr[mj_model.jnt_type.argmin()])
     # Adding 0 turns -0 into 0, for code that is read by people.
-    w, x, y, z = (round(float(value), 6) + 0.0 for value in data.qpos[root_at + 3 : root_at + 7])
+    quat = data.qpos[root_at + 3 : root_at + 7]
+    w, x, y, z = (round(float(value), 6) + 0.0 for value in quat)
     positions = rounded(data.qpos[mj_model.jnt_qposadr[every_joint]])
     stance = {
         mj_model.joint(j).name: position for j, position in zip(every_joint, positions, strict=True)

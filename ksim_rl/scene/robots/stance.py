@@ -69,7 +69,8 @@ def find_stance(
         if len(pitch) > 1 and np.abs(angles).max() < 0.2:
             # Knees forward for two legs; the other way for more.
             bend = BEND[: len(pitch)] * (1.0 if len(legs) == 2 else -1.0)
-            for (joint, sign), turn in zip(list(pitch.items())[-3:], bend, strict=False):
+            lowest_joints = list(pitch.items())[-3:]
+            for (joint, sign), turn in zip(lowest_joints, bend, strict=False):
                 data.qpos[mj_model.jnt_qposadr[joint]] += sign * turn
     # Unlimited joints may go half a turn each way.
     is_limited = mj_model.jnt_limited[joints]

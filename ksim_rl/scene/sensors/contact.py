@@ -307,8 +307,11 @@ class ContactTracker(SensorTracker):
 
 def columns_of(view: WorldView, names: Sequence[str]) -> Index:
     """Return the columns of `sensordata` [E, L] that hold all numbers of the model's sensors of these names."""
-    found = [view.world.mj_model.sensor(name) for name in names]
-    columns = [int(one.adr[0]) + place for one in found for place in range(int(one.dim[0]))]
+    columns: list[int] = []
+    for name in names:
+        sensor = view.world.mj_model.sensor(name)
+        first = int(sensor.adr[0])
+        columns += range(first, first + int(sensor.dim[0]))
     return as_index(columns, view.device)
 
 

@@ -78,7 +78,8 @@ class Entity(NearNames):
         self.name = name
         self.prefix = prefix
         # Kinematic trees of the entity, by the prefix of their root bodies; body 0 is the world.
-        roots = {r for r in model.body_rootid[1:].tolist() if model.body(r).name.startswith(prefix)}
+        all_roots = set(model.body_rootid[1:].tolist())
+        roots = {root for root in all_roots if model.body(root).name.startswith(prefix)}
         # All bodies of these trees: parts of an attached model may have names without the prefix.
         bodies = [b for b in range(1, model.nbody) if model.body_rootid[b] in roots]
         if prefix and not bodies:
