@@ -1,4 +1,4 @@
-"""`ksim-rl identify` proposes what to command to a robot that is held, and reads its numbers out of the log."""
+"""`ksim-rl identify` proposes what to command to a robot that is held, and finds its numbers or networks in the log."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,19 +8,26 @@ import numpy as np
 
 from ksim_rl import envs
 from ksim_rl.checks import OneLineParser, check_choice, check_in_range
-from ksim_rl.files.writing import write_whole
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.files.writing import make_folder, write_whole
+from ksim_rl.identification.actuator_nets import fit_nets
 from ksim_rl.identification.excitation import RATE, SECONDS, propose
 from ksim_rl.identification.fit import fit
 from ksim_rl.identification.held_robot import TARGETS, HeldRobot, hold
-from ksim_rl.identification.joint_log import LEAST_S, TARGET_COLUMNS, TIME, read_log
+from ksim_rl.identification.joint_log import LEAST_S, TARGET_COLUMNS, TIME, JointLog, read_log
 from ksim_rl.identification.simulation import Targets
-from ksim_rl.identification.training_overrides import overrides
+from ksim_rl.identification.training_overrides import (
+    as_word,
+    net_override,
+    overrides,
+    time_step,
+)
 from ksim_rl.scene.state.joint_control import TargetKind
 from ksim_rl.terminal import show
 
 
 def identify(arguments: Sequence[str]) -> int:
-    """Write a plan of commands, or find a robot's numbers; the code is 1 where those of a joint are doubtful."""
+    """Write a plan of commands, or find a robot's numbers or networks; the code is 1 where one of them is doubtful."""
     options: Any = _parser().parse_args(arguments)
     if (options.propose is None) == (options.log is None):
         raise ValueError("give either the LOG of a robot, or --propose ROBOT")
@@ -32,11 +39,15 @@ def identify(arguments: Sequence[str]) -> int:
         raise ValueError(
             f"--robot: which robot is {options.log} of? A name, or the path of a model"
         )
+    if options.nets is not None:
+        return _find_nets(options)
+    if options.timestep is not None:
+        raise ValueError("--timestep: it is of networks: give --nets FOLDER, too")
     return _find(options)
 
 
 def _propose(options: Any) -> int:
-    for name in ("robot", "task"):
+    for name in ("robot", "task", "nets", "timestep"):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name}: it is of logs; --propose has the name of the robot itself")
     check_in_range("--seconds", options.seconds, low=LEAST_S, high=3600.0)
@@ -59,9 +70,7 @@ def _find(options: Any) -> int:
     robot = hold(options.robot, quat=options.base)
     # Everything that could be refused is, before minutes of work.
     cfg = None if options.task is None else envs.task(options.task).cfg()
-    log = read_log(options.log, robot)
-    if log.unread:
-        show(f"columns that are not read: {', '.join(log.unread)}")
+    log = _read(options.log, robot)
     findings = fit(robot, log, note=show)
     by_task: dict[str, list[str]] = {}
     if cfg is not None:
@@ -77,6 +86,62 @@ def _find(options: Any) -> int:
         write_whole(words, "\n".join(lines) + "\n")
         show(f"{words}: for ksim-rl train task={task} $(cat {words})")
     return int(bool(findings.warnings))
+
+
+def _find_nets(options: Any) -> int:
+    cfg = None if options.task is None else envs.task(options.task).cfg()
+    timestep = _time_step(options.timestep, cfg)
+    folder = options.nets.absolute()
+    # What is wrong with the override is said before minutes of work.
+    if cfg is not None:
+        as_word(str(folder))
+        net_override(options.robot, (), cfg)
+    robot = hold(options.robot, quat=options.base)
+    nets = fit_nets(
+        robot, _read(options.log, robot), timestep=timestep, seed=options.seed, note=show
+    )
+    entries = []
+    doubts = []
+    make_folder(folder, below=folder.parent)
+    for number, net in enumerate(nets):
+        # Names of joints are a model's, and might lead elsewhere.
+        path = folder / f"motors_{number}.safetensors"
+        write_whole(path, net.file)
+        entries.append(net.entry(path))
+        show(
+            f"{path}: off by {net.error:.1%} of the efforts in {net.held_out_s:.1f} s that were held out; the best "
+            f"proportional-derivative law is off by {net.pd_error:.1%}"
+        )
+        if net.doubt:
+            doubts.append(net.doubt)
+    for line in doubts:
+        show(f"warning: {line}")
+    if cfg is not None:
+        words = folder / "nets.overrides"
+        write_whole(words, net_override(robot.name, entries, cfg) + "\n")
+        show(f"{words}: for ksim-rl train task={options.task} $(cat {words})")
+    return int(bool(doubts))
+
+
+def _time_step(given: float | None, cfg: ManagerBasedRlEnvCfg | None) -> float:
+    """Return the physics step in which networks run, s."""
+    if cfg is not None:
+        if given is not None:
+            raise ValueError("--timestep: --task says it: leave out one of the two")
+        return time_step(cfg)
+    if given is None:
+        raise ValueError(
+            "--nets: in which physics steps will the networks run? Give --task, or --timestep in s"
+        )
+    check_in_range("--timestep", given, low=1e-4, high=0.02)
+    return given
+
+
+def _read(path: Path, robot: HeldRobot) -> JointLog:
+    log = read_log(path, robot)
+    if log.unread:
+        show(f"columns that are not read: {', '.join(log.unread)}")
+    return log
 
 
 def _kinds(text: str | None, robot: HeldRobot) -> list[TargetKind]:
@@ -135,6 +200,15 @@ def _parser() -> OneLineParser:
         "--task", help="whose training gets what was found: also write overrides for it"
     )
     parser.add_argument(
+        "--nets",
+        type=Path,
+        metavar="FOLDER",
+        help="write networks of the motors in place of numbers; the log has measured efforts",
+    )
+    parser.add_argument(
+        "--timestep", type=float, help="in which networks will run, s; default: that of --task"
+    )
+    parser.add_argument(
         "--propose", metavar="ROBOT", help="write what to command, in place of reading a log"
     )
     parser.add_argument(
@@ -143,7 +217,7 @@ def _parser() -> OneLineParser:
     parser.add_argument(
         "--seconds", type=float, default=SECONDS, help="of the proposal; default: 60"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the proposal")
+    parser.add_argument("--seed", type=int, default=0, help="of the proposal or the networks")
     parser.add_argument(
         "--base", metavar="W,X,Y,Z", help="how the held base is turned; default: as it stands"
     )

@@ -2,7 +2,7 @@
 
 A log is a table with the column `time` (s) and, for each joint, `<joint>.position` (the encoder, rad or m) and what was
 commanded: `<joint>.target_position`, `.target_velocity` and `.target_effort` (rad or m, per second, N m or N). Each
-command holds until the next line.
+command holds until the next line. `<joint>.effort` is a measured effort, which actuator networks are fitted to.
 """
 
 import io
@@ -22,6 +22,7 @@ from ksim_rl.scene.state.joint_control import TargetKind
 Array = np.ndarray
 TIME = "time"
 POSITION = "position"
+EFFORT = "effort"
 TARGET_COLUMNS: Mapping[TargetKind, str] = {
     "pos": "target_position",
     "vel": "target_velocity",
@@ -47,6 +48,8 @@ class JointLog:
     time_T: Float[Array, " T"]
     pos_TN: Float[Array, "T N"]
     targets: Targets
+    effort_TN: Float[Array, "T N"] | None = None
+    """Measured efforts, N m or N, where the log has them."""
     unread: tuple[str, ...] = ()
     """Columns of the file that are no part of this."""
 
@@ -59,6 +62,7 @@ class JointLog:
             time_T=self.time_T,
             pos_TN=self.pos_TN[:, columns],
             targets=Targets(time_T=self.targets.time_T, by_kind=by_kind),
+            effort_TN=None if self.effort_TN is None else self.effort_TN[:, columns],
         )
 
 
@@ -80,17 +84,13 @@ def read_log(path: Path, robot: HeldRobot) -> JointLog:
         read.add(name)
     by_kind: dict[TargetKind, Array] = {}
     for kind, ending in TARGET_COLUMNS.items():
-        names = [f"{joint}.{ending}" for joint in robot.joint_names]
-        given = [name for name in names if name in columns]
-        if not given:
-            continue
-        for name in names:
-            if name not in columns:
-                raise ValueError(
-                    f"{path}: no column {name!r}, though there is {given[0]!r}: give it, or zeros"
-                )
-        by_kind[kind] = np.stack([columns[name] for name in names], axis=1)
-        read.update(names)
+        values_TN = _of_joints(path, robot, columns, ending)
+        if values_TN is not None:
+            by_kind[kind] = values_TN
+            read.update(f"{joint}.{ending}" for joint in robot.joint_names)
+    effort_TN = _of_joints(path, robot, columns, EFFORT)
+    if effort_TN is not None:
+        read.update(f"{joint}.{EFFORT}" for joint in robot.joint_names)
     if not by_kind:
         wanted = ", ".join(f"{robot.joint_names[0]}.{ending}" for ending in TARGET_COLUMNS.values())
         raise ValueError(
@@ -103,11 +103,28 @@ def read_log(path: Path, robot: HeldRobot) -> JointLog:
         time_T=time_T - time_T[0],
         pos_TN=np.stack(positions, axis=1),
         targets=Targets(time_T=time_T - time_T[0], by_kind=by_kind),
+        effort_TN=effort_TN,
         unread=tuple(name for name in columns if name not in read),
     )
     for place, joint in enumerate(robot.joints):
         _check_joint(path, joint, log, place)
     return log
+
+
+def _of_joints(
+    path: Path, robot: HeldRobot, columns: Mapping[str, Float[Array, " T"]], ending: str
+) -> Float[Array, "T N"] | None:
+    """Return the columns with an ending, of all joints; None where no joint has one."""
+    names = [f"{joint}.{ending}" for joint in robot.joint_names]
+    given = [name for name in names if name in columns]
+    if not given:
+        return None
+    for name in names:
+        if name not in columns:
+            raise ValueError(
+                f"{path}: no column {name!r}, though there is {given[0]!r}: give it, or zeros"
+            )
+    return np.stack([columns[name] for name in names], axis=1)
 
 
 def _read_columns(path: Path) -> dict[str, Float[Array, " T"]]:

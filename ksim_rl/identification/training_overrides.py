@@ -1,6 +1,7 @@
-"""Says what was found of a robot in the words of `ksim-rl train`: a delay, and ranges to draw from."""
+"""Says what was found of a robot in the words of `ksim-rl train`: a delay, ranges to draw from, and networks."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -32,15 +33,13 @@ def overrides(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> list[str]:
     One lets the robot's actuators get their targets late, the others draw each joint's numbers from their intervals. A
     ValueError says that the robot is not in the scene.
     """
-    key = _robot_of(findings, cfg)
+    key = _robot_of(findings.robot, cfg)
     found = []
     actuators: Sequence[Actuator] = getattr(cfg.scene.robots[key], "actuators", ())
     # Servos of a model's own file have no entry that could be late.
     if actuators and findings.delay_s.is_told:
-        late = _late(actuators, findings.delay_s, cfg.sim.timestep)
-        found.append(
-            f"task.scene.robots.{key}.actuators={_value(to_tree(late, Sequence[Actuator]))}"
-        )
+        late = _late(actuators, findings.delay_s, time_step(cfg))
+        found.append(_driven_by(key, late))
     # Of several robots each has its name before those of its joints.
     prefix = "" if len(cfg.scene.robots) == 1 else f"{key}/"
     for name, event in _events(findings, prefix).items():
@@ -48,23 +47,44 @@ def overrides(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> list[str]:
     return found
 
 
-def _robot_of(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> str:
-    for key, robot in cfg.scene.robots.items():
-        if findings.robot in (key, getattr(robot, "name", None)):
-            return key
-    raise ValueError(
-        f"--task: its robots are {', '.join(cfg.scene.robots)}, and none is {findings.robot!r}: give another task"
-    )
-
-
-def _late(
-    actuators: Sequence[Actuator], delay_s: Estimate, timestep: float | None
-) -> list[Actuator]:
-    """Return actuators whose targets arrive late by what was found, in whole physics steps from below to above."""
+def time_step(cfg: ManagerBasedRlEnvCfg) -> float:
+    """Return the physics step of a task, s, in which delays and the past of networks count."""
+    timestep = cfg.sim.timestep
     if timestep is None:
         raise ValueError(
             "--task: it leaves its time step to the model, and delays count in these: choose a task that sets one"
         )
+    return timestep
+
+
+def net_override(robot: str, entries: Sequence[Actuator], cfg: ManagerBasedRlEnvCfg) -> str:
+    """Return the override that lets these entries drive a robot in a task.
+
+    A ValueError says that the robot is not in the scene, or has no entries.
+    """
+    key = _robot_of(robot, cfg)
+    if not hasattr(cfg.scene.robots[key], "actuators"):
+        raise ValueError(
+            f"--task: its robot {key!r} has no field `actuators`: give a task with another robot"
+        )
+    return _driven_by(key, entries)
+
+
+def _driven_by(key: str, entries: Sequence[Actuator]) -> str:
+    return f"task.scene.robots.{key}.actuators={_value(to_tree(entries, Sequence[Actuator]))}"
+
+
+def _robot_of(name: str, cfg: ManagerBasedRlEnvCfg) -> str:
+    for key, robot in cfg.scene.robots.items():
+        if name in (key, getattr(robot, "name", None)):
+            return key
+    raise ValueError(
+        f"--task: its robots are {', '.join(cfg.scene.robots)}, and none is {name!r}: give another task"
+    )
+
+
+def _late(actuators: Sequence[Actuator], delay_s: Estimate, timestep: float) -> list[Actuator]:
+    """Return actuators whose targets arrive late by what was found, in whole physics steps from below to above."""
     lags = {
         "min_lag": math.floor(delay_s.low / timestep),
         "max_lag": math.ceil(delay_s.high / timestep),
@@ -119,4 +139,13 @@ def _value(tree: Any) -> str:
         return str(tree).lower()
     if tree == "":
         return "''"
-    return str(tree)
+    return as_word(str(tree))
+
+
+def as_word(text: str) -> str:
+    """Return a text that a shell and Hydra take as it is; a ValueError refuses others."""
+    if re.fullmatch(r"[\w./:+*-]+", text) is None:
+        raise ValueError(
+            f"--task: {text!r} cannot stand in words of a shell: letters, digits and ./:+*-_ can, so rename it"
+        )
+    return text

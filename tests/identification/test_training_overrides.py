@@ -4,8 +4,8 @@ import pytest
 
 from ksim_rl import conf, envs
 from ksim_rl.identification.findings import Estimate, Findings
-from ksim_rl.identification.training_overrides import overrides
-from ksim_rl.scene.actuators import DelayedActuator
+from ksim_rl.identification.training_overrides import net_override, overrides
+from ksim_rl.scene.actuators import DelayedActuator, MLPActuator
 from ksim_rl.scene.robots import UnitreeGo2
 
 
@@ -67,6 +67,19 @@ def test_what_was_not_told_is_left_as_it_was():
     assert not any("identified_damping" in line for line in lines)
     gains = [line for line in lines if "identified_gains" in line]
     assert len(gains) == 12 and all("stiffness:null" in line for line in gains)
+
+
+def test_networks_drive_the_robot_of_a_task(tmp_path):
+    cfg = envs.task("go2_velocity_flat").cfg()
+    entries = [MLPActuator(joints=UnitreeGo2.joint_names, effort_limit=20.0, file="a.safetensors")]
+    line = net_override("go2", entries, cfg)
+    assert not set(line) & set(" \t'\"$")
+    changed = conf.compose(["task=go2_velocity_flat", line]).task
+    assert list(changed.scene.robots["go2"].actuators) == entries
+    with pytest.raises(ValueError, match="'a b' cannot stand in words of a shell"):
+        net_override("go2", [MLPActuator(joints="a b", file="a")], cfg)
+    with pytest.raises(ValueError, match="'cartpole' has no field `actuators`"):
+        net_override("cartpole", entries, envs.task("cartpole_balance").cfg())
 
 
 def test_another_robots_task_is_refused():
