@@ -1,7 +1,8 @@
 """The letters of the batch dims, and the one function that labels them.
 
 `E` envs, `T` time in the rollout, `D` dataset, `B` minibatch. `L` (the last, non-batch dim of a leaf) is a spelling
-convention of variable names only: tensordict names batch dims, not leaf dims.
+convention of variable names only: tensordict names batch dims, not leaf dims. So are `H`, `W` and `C`, the rows,
+columns and channels of a picture, which stand where a vector has `L`: `rgb_EHWC`, uint8, whose first row is the top.
 
 Names are labels that are set at boundaries (env output, rollout, dataset, minibatch). They are never computed with
 inside compiled code, where tensordict drops them.

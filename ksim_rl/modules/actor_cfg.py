@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ksim_rl.checked import NonNegative, Positive
-from ksim_rl.modules.network import OnPolicyNetworkCfg
+from ksim_rl.modules.network import NetworkCfg
 
 MIN_STD = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActorCfg(OnPolicyNetworkCfg):
+class ActorCfg(NetworkCfg):
     """The policy network.
 
     Attributes:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Num
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import TensorSpec
@@ -53,16 +53,22 @@ class SquashedActorCfg(BoundedActorCfg):
 
 
 class BoundedActor(ObservingNetwork):
-    """Normalization, hidden layers, and a last layer: [..., L] to [..., outputs_per_action * action_dim]."""
+    """Normalization, hidden layers, and a last layer: [..., L_i] to [..., outputs_per_action * action_dim]."""
 
     outputs_per_action: ClassVar[int] = 1
     low: Tensor
     high: Tensor
 
     def __init__(
-        self, cfg: BoundedActorCfg, *, obs_dim: int, action_spec: TensorSpec, device: Device = None
+        self,
+        cfg: BoundedActorCfg,
+        *,
+        obs_dim: int,
+        action_spec: TensorSpec,
+        encoded_dim: int = 0,
+        device: Device = None,
     ) -> None:
-        super().__init__(cfg, obs_dim=obs_dim, device=device)
+        super().__init__(cfg, obs_dim=obs_dim, encoded_dim=encoded_dim, device=device)
         self.cfg = cfg
         # Persistent buffers: a checkpoint for other bounds is refused by them.
         low, high = action_range(action_spec, cfg.action_bound, device=device)
@@ -72,36 +78,38 @@ class BoundedActor(ObservingNetwork):
             obs_dim, self.outputs_per_action * action_spec.shape[-1], device=device
         )
 
-    def output(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch output_dim"]:
+    def output(self, *observations: Num[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch output_dim"]:
         """Return the outputs of the last layer, in float32 at least."""
         # Half precision would round the squashed action, and its density.
-        out = self.layers(self.observe(obs))
+        out = self.layers(self.observe(*observations))
         return out.to(torch.promote_types(out.dtype, torch.float32))
 
 
 class DeterministicPolicy(BoundedActor):
-    """Maps an observation [..., L] to the action [..., action_dim]."""
+    """Maps observations [..., L_i] to the action [..., action_dim]."""
 
-    def forward(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch action_dim"]:
+    def forward(
+        self, *observations: Num[Tensor, "*batch ?L"]
+    ) -> Float[Tensor, "*batch action_dim"]:
         """Return the action, in [low, high]."""
         center = (self.high + self.low) / 2
         half_range = (self.high - self.low) / 2
         # The tanh keeps actions in the box, and lets gradients through everywhere.
-        return center + half_range * self.output(obs).tanh()
+        return center + half_range * self.output(*observations).tanh()
 
 
 class SquashedPolicy(BoundedActor):
-    """Maps an observation [..., L] to `loc` and `scale` before squashing, each [..., action_dim]."""
+    """Maps observations [..., L_i] to `loc` and `scale` before squashing, each [..., action_dim]."""
 
     outputs_per_action = 2
     cfg: SquashedActorCfg
 
     def forward(
-        self, obs: Float[Tensor, "*batch L"]
+        self, *observations: Num[Tensor, "*batch ?L"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch action_dim"]]:
         """Return `(loc, scale)`."""
         # The first half of the outputs are means, the second one become standard deviations.
-        loc, raw = self.output(obs).chunk(2, dim=-1)
+        loc, raw = self.output(*observations).chunk(2, dim=-1)
         # A tanh instead of a clamp: the gradient never vanishes wholly at a bound.
         low = self.cfg.log_std_min
         high = self.cfg.log_std_max
@@ -115,20 +123,21 @@ class SquashedPolicy(BoundedActor):
 
 
 def make_deterministic_actor(cfg: DeterministicActorCfg, **network: Any) -> TensorDictModule:
-    """Build a policy that reads "actor" and writes "action" [..., action_dim], within the bounds of the spec."""
+    """Build a policy that reads `cfg.in_keys` and writes "action" [..., action_dim], within the bounds of the spec."""
     policy = DeterministicPolicy(cfg, **network)
-    return TensorModule(policy, in_keys=["actor"], out_keys=["action"])
+    return TensorModule(policy, in_keys=list(cfg.in_keys), out_keys=["action"])
 
 
 def make_squashed_actor(cfg: SquashedActorCfg, **network: Any) -> ProbabilisticActor:
     """Build the policy as TorchRL's `ProbabilisticActor`, within the spec's bounds.
 
-    It reads "actor" [..., obs_dim] and writes `loc`, `scale` (before squashing) and `action` [..., action_dim]. It
-    samples unless TorchRL's exploration type says otherwise; `ExplorationType.DETERMINISTIC` gives the median.
+    It reads `cfg.in_keys`, `obs_dim` numbers side by side, and writes `loc`, `scale` (before squashing) and `action`
+    [..., action_dim]. It samples unless TorchRL's exploration type says otherwise; `ExplorationType.DETERMINISTIC`
+    gives the median.
     """
     policy = SquashedPolicy(cfg, **network)
     return ProbabilisticActor(
-        TensorModule(policy, in_keys=["actor"], out_keys=["loc", "scale"]),
+        TensorModule(policy, in_keys=list(cfg.in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=["action"],
         # A method, so that the bounds are the policy's wherever it is moved or copied.

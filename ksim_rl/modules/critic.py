@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Num
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import ValueOperator
@@ -13,17 +13,17 @@ from ksim_rl.checked import Count, NonNegative, numbers_of_layers
 from ksim_rl.modules.mlp import Device, mlp
 from ksim_rl.modules.network import (
     LayeredNetwork,
+    NetworkCfg,
     ObservationKeys,
     ObservationNormalizer,
     ObservingNetwork,
     OffPolicyNetworkCfg,
-    OnPolicyNetworkCfg,
 )
 from ksim_rl.modules.upstream import TensorModule
 
 
 @dataclass(frozen=True, kw_only=True)
-class CriticCfg(OnPolicyNetworkCfg):
+class CriticCfg(NetworkCfg):
     """The value network.
 
     Attributes:
@@ -37,9 +37,16 @@ class CriticCfg(OnPolicyNetworkCfg):
 class ValueNetwork(LayeredNetwork):
     """Maps observations [..., L_i] to a state value [..., 1]."""
 
-    def __init__(self, cfg: CriticCfg, *, obs_dim: int, device: Device = None) -> None:
+    def __init__(
+        self, cfg: CriticCfg, *, obs_dim: int, encoded_dim: int = 0, device: Device = None
+    ) -> None:
         super().__init__(
-            cfg, obs_dim=obs_dim, output_dim=1, output_gain=cfg.output_gain, device=device
+            cfg,
+            obs_dim=obs_dim,
+            encoded_dim=encoded_dim,
+            output_dim=1,
+            output_gain=cfg.output_gain,
+            device=device,
         )
 
 
@@ -47,12 +54,15 @@ class Critic(TensorModule, ValueOperator):
     """TorchRL's `ValueOperator` of a network whose outputs are tensors."""
 
 
-def make_critic(cfg: CriticCfg, *, obs_dim: int, device: Device = None) -> ValueOperator:
+def make_critic(
+    cfg: CriticCfg, *, obs_dim: int, encoded_dim: int = 0, device: Device = None
+) -> ValueOperator:
     """Build the critic as TorchRL's `ValueOperator`.
 
-    Reads `cfg.in_keys`, `obs_dim` numbers side by side, and writes `state_value` [..., 1].
+    Reads `cfg.in_keys`, `obs_dim` numbers side by side, the last `encoded_dim` of which are features of encoders (see
+    `make_for_spec`), and writes `state_value` [..., 1].
     """
-    network = ValueNetwork(cfg, obs_dim=obs_dim, device=device)
+    network = ValueNetwork(cfg, obs_dim=obs_dim, encoded_dim=encoded_dim, device=device)
     return Critic(network, in_keys=list(cfg.in_keys), out_keys=["state_value"])
 
 
@@ -64,6 +74,7 @@ class QNetworkCfg(OffPolicyNetworkCfg):
     arXiv 1707.06887); 1 predicts the value itself.
     """
 
+    in_keys: ObservationKeys = ("critic",)
     num_networks: Count = 2  # critics side by side
     num_atoms: Count = 1  # values of which each predicts the probability; 1 predicts the value
     v_min: float = -10.0  # the lowest atom
@@ -82,14 +93,20 @@ class QNetworkCfg(OffPolicyNetworkCfg):
 
 
 class QNetwork(ObservingNetwork):
-    """Maps observation [..., L] and action [..., action_dim] to predictions of N networks, with atoms at `support`."""
+    """Maps observations and action [..., action_dim] to predictions of N networks, with atoms at `support`."""
 
     support: Tensor | None
 
     def __init__(
-        self, cfg: QNetworkCfg, *, obs_dim: int, action_dim: int, device: Device = None
+        self,
+        cfg: QNetworkCfg,
+        *,
+        obs_dim: int,
+        action_dim: int,
+        encoded_dim: int = 0,
+        device: Device = None,
     ) -> None:
-        super().__init__(cfg, obs_dim=obs_dim, device=device)
+        super().__init__(cfg, obs_dim=obs_dim, encoded_dim=encoded_dim, device=device)
         self.cfg = cfg
         support = torch.linspace(cfg.v_min, cfg.v_max, cfg.num_atoms, device=device)
         # It follows from the config, so that it is no part of a checkpoint.
@@ -100,11 +117,15 @@ class QNetwork(ObservingNetwork):
         )
 
     def forward(
-        self, obs: Float[Tensor, "*batch L"], action: Float[Tensor, "*batch action_dim"]
+        self, *inputs: Num[Tensor, "*batch ?L"]
     ) -> Float[Tensor, "*batch N"] | Float[Tensor, "*batch N A"]:
-        """Return action values [..., N], or with atoms the logits of their probabilities [..., N, A]."""
+        """Return action values [..., N], or with atoms the logits of their probabilities [..., N, A].
+
+        The inputs are observations, which stand side by side, and the action as the last one.
+        """
+        *observations, action = inputs
         # Actions are not normalized: the bounds of the env fix their range.
-        features = torch.cat((self.observe(obs), action), dim=-1)
+        features = torch.cat((self.observe(*observations), action), dim=-1)
         batch = features.shape[:-1]
         # One copy of the features for all networks, then [N, B, A] to [..., N, A].
         out = (
@@ -118,19 +139,26 @@ class QNetwork(ObservingNetwork):
 
 
 def make_q_network(
-    cfg: QNetworkCfg, *, obs_dim: int, action_dim: int, device: Device = None
+    cfg: QNetworkCfg,
+    *,
+    obs_dim: int,
+    action_dim: int,
+    encoded_dim: int = 0,
+    device: Device = None,
 ) -> TensorDictModule:
-    """Build the networks as a TensorDict module, which reads "critic" [..., obs_dim] and "action" [..., action_dim].
+    """Build the networks as a TensorDict module, which reads `cfg.in_keys` and "action" [..., action_dim].
 
-    It writes "state_action_value" [..., N], or with atoms "state_action_logits" [..., N, A].
+    It writes "state_action_value" [..., N], or with atoms "state_action_logits" [..., N, A]. `obs_dim` and
+    `encoded_dim` are explained at `make_critic`.
     """
-    network = QNetwork(cfg, obs_dim=obs_dim, action_dim=action_dim, device=device)
+    sizes = {"obs_dim": obs_dim, "encoded_dim": encoded_dim, "action_dim": action_dim}
+    network = QNetwork(cfg, **sizes, device=device)
     # The key tells values from logits of the atoms.
     if cfg.num_atoms == 1:
         out_key = "state_action_value"
     else:
         out_key = "state_action_logits"
-    return TensorModule(network, in_keys=["critic", "action"], out_keys=[out_key])
+    return TensorModule(network, in_keys=[*cfg.in_keys, "action"], out_keys=[out_key])
 
 
 class Discriminator(nn.Module):

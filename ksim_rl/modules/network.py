@@ -1,21 +1,23 @@
 """The parts that networks share: observations, their normalization, fields of configs, a trunk."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Num
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import Composite
+from torchrl.data import Composite, TensorSpec, Unbounded
 
 from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative, numbers_of_layers
 from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.modules.encoders import EncoderCfg
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.ranks.running_moments import RunningMoments, publish
+from ksim_rl.transforms.specs import spell
 
 ObservationKey = str | tuple[str, ...]
 _NestedKey = Annotated[
@@ -26,15 +28,38 @@ ObservationKeys = Annotated[
 ]
 
 
-def observation_dim(spec: Composite, keys: Sequence[ObservationKey]) -> int:
-    """Return the size of the last dim of the observations at `keys`, side by side; ValueError where one is missing."""
+def leaf_spec(spec: Composite, key: ObservationKey) -> TensorSpec:
+    """Return shape and dtype of an observation, without batch dims; ValueError where there is none."""
     there = list(spec.keys(True, True))
+    if key not in there:
+        raise ValueError(
+            f"in_keys: the env has no observation {key!r}; it has {sorted(map(str, there))}"
+        )
+    leaf = spec[key]
+    # A nested TensorDict may have more batch dims than the env, such as one of agents.
+    if isinstance(key, tuple):
+        batch_dims = spec[key[:-1]].ndim
+    else:
+        batch_dims = spec.ndim
+    return Unbounded(leaf.shape[batch_dims:], dtype=leaf.dtype)
+
+
+def observation_dim(spec: Composite, keys: Sequence[ObservationKey]) -> int:
+    """Return the sum of the sizes of the observations at `keys`, which stand side by side.
+
+    ValueError where one is missing, or is no vector: a network would read a picture as so many rows of numbers.
+    """
+    total = 0
     for key in keys:
-        if key not in there:
+        leaf = leaf_spec(spec, key)
+        if leaf.ndim != 1 or leaf.dtype == torch.uint8:
             raise ValueError(
-                f"in_keys: the env has no observation {key!r}; it has {sorted(map(str, there))}"
+                f"in_keys: {key!r} is no vector of numbers, but {leaf.dtype} of shape {list(leaf.shape)} in each env: "
+                f"a picture needs an encoder, `encoders: {{{spell(key)}: {{}}}}`; other shapes have to be flattened by "
+                "a transform"
             )
-    return sum(spec[key].shape[-1] for key in keys)
+        total += leaf.shape[0]
+    return total
 
 
 def side_by_side(observations: Sequence[Float[Tensor, "*batch ?L"]]) -> Float[Tensor, "*batch L"]:
@@ -52,23 +77,46 @@ class ObservationNormalizer(RunningMoments):
     of them have to call it. Statistics are exact, and both methods can be captured in a CUDA graph: see
     `RunningMoments`. They stop once `until` observations are counted. The default of `eps` bounds the standard
     deviation below by 0.01: a constant component stays small when it starts to move.
+
+    The last `encoded_dim` numbers of what it reads are features of encoders, beyond the `dim` that it normalizes, and
+    stay as they are: the statistics of what is learned would be those of networks that are long gone.
     """
 
     def __init__(
-        self, dim: int, *, eps: float = 1e-4, until: int | None = None, device: Device = None
+        self,
+        dim: int,
+        *,
+        encoded_dim: int = 0,
+        eps: float = 1e-4,
+        until: int | None = None,
+        device: Device = None,
     ) -> None:
         # Zero would divide a component that never moves by zero.
         check_in_range("eps", eps, low=0.0, low_open=True)
         super().__init__(dim, until=until, device=device)
         self.eps = eps
+        self.encoded_dim = encoded_dim
 
     def forward(self, obs: Float[Tensor, "*batch L"]) -> Float[Tensor, "*batch L"]:
         """Normalize observations."""
-        return self.normalized(obs, self.eps)
+        if not self.encoded_dim:
+            return self.normalized(obs, self.eps)
+        measured, encoded = obs.split((self.dim, self.encoded_dim), dim=-1)
+        return torch.cat((self.normalized(measured, self.eps), encoded), -1)
 
     def extra_repr(self) -> str:
         """Describe the module in its repr."""
         return f"dim={self.dim}, eps={self.eps}, until={self.until}"
+
+
+def make_normalizer(
+    is_wanted: bool, obs_dim: int, encoded_dim: int, device: Device
+) -> ObservationNormalizer | None:
+    """Build the normalizer of a network whose last `encoded_dim` inputs are features, or None where it has none."""
+    # Features alone leave nothing to normalize.
+    if not is_wanted or obs_dim == encoded_dim:
+        return None
+    return ObservationNormalizer(obs_dim - encoded_dim, encoded_dim=encoded_dim, device=device)
 
 
 def update_normalizers(tensordict: TensorDictBase, *networks: nn.Module) -> None:
@@ -106,6 +154,17 @@ def _observation(tensordict: TensorDictBase, module: TensorDictModule, dim: int)
     return side_by_side(observations)
 
 
+def _hashable(key: str | Sequence[str]) -> str | tuple[str, ...]:
+    """Return a key as a TensorDict has it: a text, or a tuple of two or more."""
+    if isinstance(key, str):
+        return key
+    # A list of one name is that name, as TensorDict would have it.
+    parts = tuple(key)
+    if len(parts) == 1:
+        return parts[0]
+    return parts
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetworkCfg(Checked):
     """The fields of the configs of all networks, which can normalize observations by running statistics inside.
@@ -113,20 +172,32 @@ class NetworkCfg(Checked):
     A subclass with a `build` of its own makes any network of it, and configs name it by `_target_`.
 
     Attributes:
+        in_keys: observation groups, read side by side; a list of names is a nested key.
         hidden_dims: widths of the hidden layers.
         activation: between the layers.
-        obs_normalization: shift and scale observations by running statistics.
+        obs_normalization: shift and scale observations by running statistics, but for pictures, which encoders scale.
+        encoders: by the name of an observation that is a picture, what makes features of it; see `make_for_spec`.
     """
 
+    in_keys: ObservationKeys = ("actor",)
     hidden_dims: tuple[Count, ...] = (512, 256, 128)
     activation: str = "elu"
     obs_normalization: bool = True
+    encoders: Mapping[str, EncoderCfg] = field(default_factory=dict)
 
     def _check_fields(self) -> None:
         super()._check_fields()
         # The class is frozen; a config file gives a list.
         object.__setattr__(self, "hidden_dims", tuple(self.hidden_dims))
         check_choice("activation", self.activation, ACTIVATIONS)
+        keys = tuple(_hashable(key) for key in self.in_keys)
+        # Read twice, an observation would count twice in `obs_dim`, by mistake more likely than by intent.
+        if len(set(keys)) < len(keys):
+            raise ValueError(f"in_keys={keys!r}: each key can be read once")
+        object.__setattr__(self, "in_keys", keys)
+        # An encoder of what the network does not read would do nothing.
+        for name in self.encoders:
+            check_choice("encoders", name, [spell(key) for key in keys])
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return what the hidden layers need."""
@@ -174,37 +245,6 @@ def built(
     return layers, outputs.shape[-1]
 
 
-def _hashable(key: str | Sequence[str]) -> str | tuple[str, ...]:
-    """Return a key as a TensorDict has it: a text, or a tuple of two or more."""
-    if isinstance(key, str):
-        return key
-    # A list of one name is that name, as TensorDict would have it.
-    parts = tuple(key)
-    if len(parts) == 1:
-        return parts[0]
-    return parts
-
-
-@dataclass(frozen=True, kw_only=True)
-class OnPolicyNetworkCfg(NetworkCfg):
-    """The fields of networks that choose what they read.
-
-    Attributes:
-        in_keys: observation groups, read side by side; a list of names is a nested key.
-    """
-
-    in_keys: ObservationKeys = ("actor",)
-
-    def _check_fields(self) -> None:
-        """Make the keys hashable, and refuse one that comes twice."""
-        super()._check_fields()
-        keys = tuple(_hashable(key) for key in self.in_keys)
-        # Read twice, an observation would count twice in `obs_dim`, by mistake more likely than by intent.
-        if len(set(keys)) < len(keys):
-            raise ValueError(f"in_keys={keys!r}: each key can be read once")
-        object.__setattr__(self, "in_keys", keys)
-
-
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyNetworkCfg(NetworkCfg):
     """The fields of the networks of off-policy methods; `output_gain` scales the last layer's weights."""
@@ -221,26 +261,39 @@ class OffPolicyNetworkCfg(NetworkCfg):
 
 
 class ObservingNetwork(nn.Module):
-    """The base of networks that normalize their observations by their `normalizer`, if they have one."""
+    """The base of networks that normalize their observations by their `normalizer`, if they have one.
 
-    def __init__(self, cfg: NetworkCfg, *, obs_dim: int, device: Device = None) -> None:
+    The last `encoded_dim` of the `obs_dim` numbers that they read are features of encoders.
+    """
+
+    def __init__(
+        self, cfg: NetworkCfg, *, obs_dim: int, encoded_dim: int = 0, device: Device = None
+    ) -> None:
         super().__init__()
+        if cfg.encoders:
+            raise ValueError(
+                f"encoders={sorted(cfg.encoders)}: a network reads numbers; `make_for_spec` puts encoders in front"
+            )
         self.obs_dim = obs_dim
         # The normalizer is part of the network, so that checkpoints and exports have it without further work.
-        if cfg.obs_normalization:
-            self.normalizer = ObservationNormalizer(obs_dim, device=device)
-        else:
-            self.normalizer = None
+        self.normalizer = make_normalizer(cfg.obs_normalization, obs_dim, encoded_dim, device)
 
-    def observe(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
+    def observe(self, *observations: Num[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
         """Return the inputs of the first layer: observations side by side, normalized."""
         obs = self.joined(*observations)
         if self.normalizer is None:
             return obs
         return self.normalizer(obs)
 
-    def joined(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
-        """Return observations side by side; a ValueError for another number than the network was built for."""
+    def joined(self, *observations: Num[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch L"]:
+        """Return observations side by side; a ValueError for pictures, or other numbers than it was built for."""
+        for obs in observations:
+            # A picture whose width or number of channels is `obs_dim` would be taken for many vectors.
+            if obs.dtype == torch.uint8:
+                raise ValueError(
+                    f"the network reads numbers, and no uint8 of shape {list(obs.shape)}: build it with an encoder for "
+                    "pictures, by `make_for_spec`"
+                )
         obs = side_by_side(observations)
         if obs.shape[-1] != self.obs_dim:
             raise ValueError(
@@ -253,7 +306,7 @@ FEATURES = "features"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SharedTrunkCfg(OnPolicyNetworkCfg):
+class SharedTrunkCfg(NetworkCfg):
     """Layers below actor and critic, which read the outputs of these layers at "features"."""
 
     hidden_dims: Annotated[tuple[Count, ...], Filled("expected at least one width")] = (512, 256)
@@ -268,20 +321,23 @@ class LayeredNetwork(ObservingNetwork):
         *,
         obs_dim: int,
         output_dim: int | None,
+        encoded_dim: int = 0,
         device: Device = None,
         **options: Any,
     ) -> None:
-        super().__init__(cfg, obs_dim=obs_dim, device=device)
+        super().__init__(cfg, obs_dim=obs_dim, encoded_dim=encoded_dim, device=device)
         self.layers, self.output_dim = built(cfg, obs_dim, output_dim, device=device, **options)
 
-    def forward(self, *observations: Float[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch M"]:
+    def forward(self, *observations: Num[Tensor, "*batch ?L"]) -> Float[Tensor, "*batch M"]:
         """Return the outputs for observations that stand side by side."""
         return self.layers(self.observe(*observations))
 
 
 def make_shared_trunk(
-    cfg: SharedTrunkCfg, *, obs_dim: int, device: Device = None
+    cfg: SharedTrunkCfg, *, obs_dim: int, encoded_dim: int = 0, device: Device = None
 ) -> TensorDictModule:
     """Build the layers that write "features" [..., L], the common part of TorchRL's `ActorValueOperator`."""
-    network = LayeredNetwork(cfg, obs_dim=obs_dim, output_dim=None, device=device)
+    network = LayeredNetwork(
+        cfg, obs_dim=obs_dim, encoded_dim=encoded_dim, output_dim=None, device=device
+    )
     return TensorModule(network, in_keys=list(cfg.in_keys), out_keys=[FEATURES])

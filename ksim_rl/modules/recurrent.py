@@ -26,7 +26,7 @@ from ksim_rl.modules.actor import make_actor
 from ksim_rl.modules.actor_cfg import ActorCfg
 from ksim_rl.modules.critic import CriticCfg, make_critic
 from ksim_rl.modules.mlp import Device
-from ksim_rl.modules.network import ObservationKey, ObservationNormalizer, side_by_side
+from ksim_rl.modules.network import ObservationKey, make_normalizer, side_by_side
 from ksim_rl.modules.recurrent_cells import GRU, LSTM
 
 
@@ -105,15 +105,13 @@ class RecurrentNetwork(nn.Module):
         cfg: RecurrentCfg,
         *,
         obs_dim: int,
+        encoded_dim: int = 0,
         obs_normalization: bool = False,
         device: Device = None,
     ) -> None:
         super().__init__()
         self.cfg = cfg
-        if obs_normalization:
-            self.normalizer = ObservationNormalizer(obs_dim, device=device)
-        else:
-            self.normalizer = None
+        self.normalizer = make_normalizer(obs_normalization, obs_dim, encoded_dim, device)
         # Named as torch names them, so that weights of `torch.nn.LSTM` and `torch.nn.GRU` can be loaded.
         for layer in range(cfg.num_layers):
             input_dim = cfg.hidden_dim if layer else obs_dim
@@ -194,11 +192,16 @@ class RecurrentModule(TensorDictModule):
         obs_dim: int,
         in_keys: Sequence[ObservationKey],
         name: str,
+        encoded_dim: int = 0,
         obs_normalization: bool = False,
         device: Device = None,
     ) -> None:
         network = RecurrentNetwork(
-            cfg, obs_dim=obs_dim, obs_normalization=obs_normalization, device=device
+            cfg,
+            obs_dim=obs_dim,
+            encoded_dim=encoded_dim,
+            obs_normalization=obs_normalization,
+            device=device,
         )
         self.obs_keys = list(in_keys)
         self.state_keys = state_keys(cfg, name)
@@ -272,24 +275,29 @@ class RecurrentModule(TensorDictModule):
 
 
 def make_recurrent_actor(
-    cfg: RecurrentCfg, actor: ActorCfg, *, obs_dim: int, **options: Any
+    cfg: RecurrentCfg, actor: ActorCfg, *, obs_dim: int, encoded_dim: int = 0, **options: Any
 ) -> ProbabilisticTensorDictSequential:
     """Build a policy behind a recurrent module, which normalizes the policy's observations; see `make_actor`."""
-    return _made_behind(make_actor, cfg, actor, obs_dim=obs_dim, name="actor", options=options)
+    recurrent = _recurrent_of(cfg, actor, "actor", obs_dim, encoded_dim, options.get("device"))
+    return behind(
+        recurrent, make_actor(_reading(actor, recurrent), obs_dim=cfg.hidden_dim, **options)
+    )
 
 
 def make_recurrent_critic(
-    cfg: RecurrentCfg, critic: CriticCfg, *, obs_dim: int, **options: Any
+    cfg: RecurrentCfg, critic: CriticCfg, *, obs_dim: int, encoded_dim: int = 0, **options: Any
 ) -> TensorDictModule:
     """Build a critic behind its own recurrent module; as `make_recurrent_actor`."""
-    return _made_behind(make_critic, cfg, critic, obs_dim=obs_dim, name="critic", options=options)
+    recurrent = _recurrent_of(cfg, critic, "critic", obs_dim, encoded_dim, options.get("device"))
+    network = make_critic(_reading(critic, recurrent), obs_dim=cfg.hidden_dim, **options)
+    return behind(recurrent, network)
 
 
-def behind(recurrent: RecurrentModule, network: AnyModule) -> AnyModule:
-    """Return an actor or a critic that reads the features of a recurrent module, at its `feature_key`."""
+def behind(first: TensorDictModuleBase, network: AnyModule) -> AnyModule:
+    """Return an actor, a critic or a trunk that reads what the first module writes, such as a `feature_key`."""
     if isinstance(network, ProbabilisticTensorDictSequential):
-        return SafeProbabilisticTensorDictSequential(recurrent, *network.module)  # type: ignore[return-value, arg-type]
-    return TensorDictSequential(recurrent, network)  # type: ignore[return-value]
+        return SafeProbabilisticTensorDictSequential(first, *network.module)  # type: ignore[return-value, arg-type]
+    return TensorDictSequential(first, network)  # type: ignore[return-value]
 
 
 def recurrent_modules(*networks: nn.Module) -> list[Any]:
@@ -325,23 +333,29 @@ def state_spec(cfg: RecurrentCfg, name: str) -> Composite:
     return Composite({STATE_KEY: Composite({name: Composite(parts)})})
 
 
-def _made_behind(
-    make: Any,
+def _recurrent_of(
     cfg: RecurrentCfg,
     network: AnyCfg,
-    *,
-    obs_dim: int,
     name: str,
-    options: dict[str, Any],
-) -> Any:
-    """Return a network that `make` builds, behind a recurrent module whose features it reads, not observations."""
-    # The module in front takes over observations and normalizer; the network then reads features.
-    reads = {"in_keys": network.in_keys, "obs_normalization": network.obs_normalization}
-    recurrent = RecurrentModule(
-        cfg, obs_dim=obs_dim, name=name, device=options.get("device"), **reads
+    obs_dim: int,
+    encoded_dim: int,
+    device: Device,
+) -> RecurrentModule:
+    """Return the recurrent module that stands before a network, and takes over its observations and normalizer."""
+    return RecurrentModule(
+        cfg,
+        obs_dim=obs_dim,
+        in_keys=network.in_keys,
+        name=name,
+        encoded_dim=encoded_dim,
+        obs_normalization=network.obs_normalization,
+        device=device,
     )
-    network = replace(network, in_keys=(recurrent.feature_key,), obs_normalization=False)
-    return behind(recurrent, make(network, obs_dim=cfg.hidden_dim, **options))
+
+
+def _reading(network: AnyCfg, recurrent: RecurrentModule) -> AnyCfg:
+    """Return the config of a network that reads the features of a recurrent module."""
+    return replace(network, in_keys=(recurrent.feature_key,), obs_normalization=False)
 
 
 def _layer_parameters(cfg: RecurrentCfg, input_dim: int) -> dict[str, Tensor]:

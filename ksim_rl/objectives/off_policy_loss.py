@@ -181,11 +181,12 @@ class OffPolicyLoss(LossModule):
         keys = [key for key in critic.in_keys if key != self.tensor_keys.action]
         # A selection is a new TensorDict, so the minibatch keeps the action of the data.
         inputs = observed.select(*keys).set(self.tensor_keys.action, action)
-        out = critic(inputs).get(critic.out_keys[0])
+        predicted = critic(inputs)
         if self.support_A is None:
+            out = predicted.get("state_action_value")
             # Errors of values are differences of large numbers: bfloat16 would lose most of their digits.
             return out.to(torch.promote_types(out.dtype, torch.float32))
-        return out
+        return predicted.get("state_action_logits")
 
     def _value(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """Return the value of an action [B], which the actor climbs; no gradients reach the critics."""

@@ -42,6 +42,8 @@ LATER = re.compile(
     r'|"dropped": \[\], |"rel_world_envs": 0.0, |"lag_group": "", |"per_substep": false, '
     # Of an ActuatorAction, whose last field is its scale.
     r'|"offset": 0.0, (?="scale": [^,{}]*\})'
+    # Of the networks of off-policy methods, which read one group before they could choose.
+    r'|"encoders": \{\}, |"in_keys": \["(actor|critic)"\], (?="layer_norm")'
     r'|"free_root": false, |"root_turn": \[1.0, 0.0, 0.0, 0.0\], '
 )
 

@@ -29,7 +29,10 @@ def assert_dims(td: TensorDictBase, *names: str) -> None:
 
 
 def assert_leaf(td: TensorDictBase, key: str | tuple[str, ...], *leaf_shape: int) -> None:
-    """Check the shape of a leaf beyond the batch dims: `assert_leaf(rollout_ET, "actor", 48)` for [E, T, 48]."""
+    """Check the shape of a leaf beyond the batch dims: `assert_leaf(rollout_ET, "actor", 48)` for [E, T, 48].
+
+    A picture has several: `assert_leaf(rollout_ET, "rgb", 64, 64, 3)` for H, W, C.
+    """
     found = tuple(td[key].shape[td.batch_dims :])
     assert found == leaf_shape, (
         f"{key!r} has shape {found} beyond {td.names}: expected {leaf_shape}"

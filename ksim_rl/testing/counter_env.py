@@ -1,5 +1,6 @@
 """A probe env whose every answer is known in closed form."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,8 +19,9 @@ class CounterEnv(EnvBase):
 
     Observations ([E, 1] float32 unless stated): "count" (steps since the reset), "episode" (resets so far), "row" (its
     own number), "drawn" (uniform on [0, 1), drawn at the reset from seed, row and episode), and ("obs", "vector") [E,
-    3] = count + (0, 100, 200). Reward is the action's sum. Even rows terminate, odd rows are truncated. Without
-    `lengths` it is one env with batch size [] that ends after 3 steps.
+    3] = count + (0, 100, 200). With the H, W, C of a `picture` also "rgb" (uint8 [E, H, W, C]): 40 * count + the number
+    of the byte in its picture, modulo 256. Reward is the action's sum. Even rows terminate, odd rows are truncated.
+    Without `lengths` it is one env with batch size [] that ends after 3 steps.
     """
 
     count_E: Tensor
@@ -28,9 +30,15 @@ class CounterEnv(EnvBase):
     length_E: Tensor
     row_E: Tensor
     offset_L: Tensor
+    byte_HWC: Tensor | None
 
     def __init__(
-        self, lengths: Sequence[int] = (3, 5, 4), *, action_size: int = 2, device: Any = "cpu"
+        self,
+        lengths: Sequence[int] = (3, 5, 4),
+        *,
+        action_size: int = 2,
+        picture: Sequence[int] | None = None,
+        device: Any = "cpu",
     ) -> None:
         batch = torch.Size([len(lengths)] if lengths else [])
         super().__init__(device=torch.device(device), batch_size=batch)
@@ -43,6 +51,9 @@ class CounterEnv(EnvBase):
             "seed_value": torch.tensor(0),
             "row_E": torch.arange(self.num_rows),
         }
+        # The number of each byte; a buffer, as it moves with the others.
+        byte_HWC = None if picture is None else torch.arange(math.prod(picture)).view(*picture)
+        self.register_buffer("byte_HWC", None if byte_HWC is None else byte_HWC.to(device))
         for name, held in {**counters, "offset_L": torch.tensor([0.0, 100.0, 200.0])}.items():
             self.register_buffer(name, held.to(device))
         scalar = Unbounded(1)
@@ -57,6 +68,8 @@ class CounterEnv(EnvBase):
             "reward": {"reward": scalar},
             "done": {name: flag.clone() for name in ("done", "terminated", "truncated")},
         }
+        if byte_HWC is not None:
+            specs["observation"]["rgb"] = Unbounded(byte_HWC.shape, dtype=torch.uint8)
         for which, leaves in specs.items():
             # All specs are made for one row, then expanded to the batch.
             spec = Composite(leaves).expand(batch).to(self.device)
@@ -68,7 +81,7 @@ class CounterEnv(EnvBase):
         keys = random.row_keys(self.seed_value, 1, self.episode_E, self.num_rows)
         count_E1 = self.count_E[:, None].float()
         batch = self.batch_size
-        return {
+        values: dict[str, Any] = {
             "count": count_E1.reshape(*batch, 1),
             "episode": self.episode_E.float().reshape(*batch, 1),
             "row": self.row_E.float().reshape(*batch, 1),
@@ -77,6 +90,10 @@ class CounterEnv(EnvBase):
                 {"vector": (count_E1 + self.offset_L).reshape(*batch, 3)}, batch, device=self.device
             ),
         }
+        if self.byte_HWC is not None:
+            rgb_EHWC = 40 * self.count_E[:, None, None, None] + self.byte_HWC
+            values["rgb"] = (rgb_EHWC % 256).to(torch.uint8).reshape(*batch, *self.byte_HWC.shape)
+        return values
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")

@@ -135,8 +135,7 @@ class ModulesCfg(Checked):
         return [key for key in dict.fromkeys((*shared, *own)) if key != FEATURES]
 
     def _read_by(self, name: str) -> tuple[ObservationKey, ...]:
-        # The networks of off-policy methods read the group of their own name.
-        return getattr(getattr(self, name), "in_keys", (name,))
+        return getattr(self, name).in_keys
 
 
 @dataclass(frozen=True, kw_only=True)

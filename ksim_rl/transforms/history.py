@@ -14,7 +14,7 @@ from ksim_rl.transforms import ring
 from ksim_rl.transforms.checked_keys import Keys
 from ksim_rl.transforms.columns import side_by_side
 from ksim_rl.transforms.row_transform import RowTransform
-from ksim_rl.transforms.specs import bounded, bounds
+from ksim_rl.transforms.specs import bounded, bounds, check_no_picture
 
 
 class RingTransform(RowTransform):
@@ -169,19 +169,19 @@ class ObservationHistory(RingTransform):
         self.num_slots = cfg.num_slots
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        leaves = self._replace_leaves(
-            observation_spec, lambda index, spec: self._repeated(spec, self.batch_dims[index])
-        )
+        leaves = self._replace_leaves(observation_spec, self._repeated)
         self._size_rings(observation_spec, leaves)
         return observation_spec
 
-    def _repeated(self, spec: TensorSpec, batch_dims: int) -> TensorSpec:
+    def _repeated(self, index: int, spec: TensorSpec) -> TensorSpec:
+        batch_dims = self.batch_dims[index]
         batch = spec.shape[:batch_dims]
         leaf = spec.shape[batch_dims:]
         # A frame dim behind the batch dims of the observation.
         stacked = spec.unsqueeze(batch_dims).expand(*batch, self.num_frames, *leaf)
         if not self.flat:
             return stacked.clone()
+        check_no_picture(self.in_keys[index], spec, batch_dims, "stack its frames by flat=False")
         shape = torch.Size([*batch, self.num_frames * leaf.numel()])
         if not isinstance(spec, Bounded) or not spec.dtype.is_floating_point:
             return Unbounded(shape, dtype=spec.dtype, device=spec.device)

@@ -37,6 +37,13 @@ def leaf_spec(observation_spec: Composite, key: NestedKey, owner: str) -> Tensor
     return observation_spec[key]
 
 
+def check_no_picture(key: NestedKey, spec: TensorSpec, batch_dims: int, advice: str) -> None:
+    """Refuse to flatten a picture: bytes of two dims or more are one, whose pixels are no numbers of a vector."""
+    leaf = list(spec.shape[batch_dims:])
+    if spec.dtype == torch.uint8 and len(leaf) > 1:
+        raise ValueError(f"{key!r} is a picture, uint8 {leaf}, and would be flattened: {advice}")
+
+
 def set_leaf_spec(observation_spec: Composite, key: NestedKey, spec: TensorSpec) -> None:
     """Set the spec of `key`, with the nested specs above it, if its shape begins with the batch size of these."""
     path = path_of(key)

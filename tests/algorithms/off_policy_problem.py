@@ -1,5 +1,7 @@
 """Off-policy learning of `TargetEnv`, whose best action values are known."""
 
+from dataclasses import replace
+
 import torch
 
 from ksim_rl.collectors import RolloutCollector
@@ -8,9 +10,11 @@ from ksim_rl.envs.signal_keys import STANDARD
 from ksim_rl.modules import (
     DeterministicActorCfg,
     ExploringPolicy,
+    QNetwork,
     QNetworkCfg,
     SquashedActorCfg,
     make_deterministic_actor,
+    make_for_spec,
     make_q_network,
     make_squashed_actor,
 )
@@ -43,9 +47,13 @@ def make_update(
     obs_dim=1,
     support=(-15.0, 15.0),
     signals=STANDARD,
+    sees=None,
     **data,
 ):
-    """Return the update of an algorithm for an env with actions of one number; `data` are fields of `ReplayCfg`."""
+    """Return the update of an algorithm for an env with actions of one number; `data` are fields of `ReplayCfg`.
+
+    Fields in `sees` say what both networks read of the env, `obs_dim` numbers unless given.
+    """
     cfg = objective or OBJECTIVES[name]
     fields = {
         "num_env_states_per_minibatch": 128,
@@ -54,32 +62,34 @@ def make_update(
         "capacity": 200,
         "learning_starts": 8,
     }
-    sizes = {"obs_dim": obs_dim, "action_spec": env.action_spec[0], "device": device}
+
+    def build(make, network, **options):
+        if sees is None:
+            return make(network, obs_dim=obs_dim, device=device, **options)
+        seeing = replace(network, **sees)
+        return make_for_spec(make, seeing, env.observation_spec, device=device, **options)
+
     make, kind = (
         (make_squashed_actor, SquashedActorCfg)
         if isinstance(cfg, SACCfg)
         else (make_deterministic_actor, DeterministicActorCfg)
     )
-    actor = make(
-        kind(hidden_dims=(32,), activation="silu", action_bound=2.0, layer_norm=True), **sizes
-    )
+    policy = kind(hidden_dims=(32,), activation="silu", action_bound=2.0, layer_norm=True)
+    actor = build(make, policy, action_spec=env.action_spec[0])
     # The support reaches beyond the best value of each probe.
     atoms = (
         {"num_atoms": 41, "v_min": support[0], "v_max": support[1]}
         if name.startswith("fast")
         else {}
     )
-    critic = make_q_network(
-        QNetworkCfg(hidden_dims=(64, 64), activation="silu", **atoms),
-        obs_dim=obs_dim,
-        action_dim=1,
-        device=device,
-    )
+    judge = QNetworkCfg(hidden_dims=(64, 64), activation="silu", **atoms)
+    critic = build(make_q_network, judge, action_dim=1)
+    (values,) = [part for part in critic.modules() if isinstance(part, QNetwork)]
     low, high = torch.full((2, 1), 2.0, device=device) * torch.tensor(
         [[-1.0], [1.0]], device=device
     )
     shared = {
-        "support_A": critic.module.support,
+        "support_A": values.support,
         "gamma": cfg.gamma,
         "value_reduction": cfg.value_reduction,
     }

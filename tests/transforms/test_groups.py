@@ -1,9 +1,11 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import CatTensors
 
-from ksim_rl.transforms import ObservationGroups
+from ksim_rl.testing import CounterEnv
+from ksim_rl.transforms import ObservationGroups, ObservationHistory
 from tests.transforms.chains import VECTOR, counter, fixed_rollout
 
 
@@ -75,3 +77,16 @@ def test_wrong_groups_are_refused(groups):
 def test_a_group_does_not_replace_the_observations():
     with pytest.raises(ValueError, match="rename the group"):
         counter(ObservationGroups({"obs": ["count"]})).output_spec  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("transform", "advice"),
+    [
+        (ObservationGroups({"actor": ["count", "rgb"]}), "read it by an encoder"),
+        (ObservationHistory("rgb", length=2), "flat=False"),
+    ],
+)
+def test_pictures_are_not_flattened(transform, advice):
+    env = TransformedEnv(CounterEnv(picture=(4, 5, 3)), transform)
+    with pytest.raises(ValueError, match=rf"'rgb' is a picture, uint8 \[4, 5, 3\].*{advice}"):
+        env.observation_spec  # noqa: B018 (making the specs is what checks)

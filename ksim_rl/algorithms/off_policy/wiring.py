@@ -7,6 +7,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl.algorithms.off_policy.update import OffPolicyUpdate
+from ksim_rl.checks import naming
 from ksim_rl.data import ReplayCfg
 from ksim_rl.device.state_tree import State
 from ksim_rl.envs.signal_keys import signal_keys
@@ -14,9 +15,11 @@ from ksim_rl.mdp.mirror_maps import mirror_maps
 from ksim_rl.modules import (
     DeterministicActorCfg,
     ExploringPolicy,
+    QNetwork,
     QNetworkCfg,
     SquashedActorCfg,
     make_deterministic_actor,
+    make_for_spec,
     make_q_network,
     make_squashed_actor,
 )
@@ -32,17 +35,19 @@ def make_off_policy_update(
     """Build the update of a run; one that is resumed is built like a new one."""
     objective: Any = cfg.objective
     actor: Any = make_off_policy_policy(cfg, env)
-    spec: Any = env.observation_spec
-    critic = make_q_network(
-        part_of(cfg, "modules.critic", QNetworkCfg),
-        obs_dim=spec["critic"].shape[-1],
-        action_dim=env.action_spec.shape[-1],
-        device=cfg.resolved_device(),
-    )
+    with naming("modules.critic"):
+        critic: Any = make_for_spec(
+            make_q_network,
+            part_of(cfg, "modules.critic", QNetworkCfg),
+            env.observation_spec,
+            action_dim=env.action_spec.shape[-1],
+            device=cfg.resolved_device(),
+        )
+    judge = next(module for module in critic.modules() if isinstance(module, QNetwork))
     # The bounds of the actions are buffers of the actor, whatever modules wrap it.
     bounded = next(module for module in actor.modules() if isinstance(module, BoundedActor))
     bounds: dict[str, Any] = {"low_L": bounded.low, "high_L": bounded.high}
-    learned: dict[str, Any] = {"support_A": critic.module.support}
+    learned: dict[str, Any] = {"support_A": judge.support}
     # Both losses take the discount and the way in which critics are reduced.
     learned |= {name: getattr(objective, name) for name in ("gamma", "value_reduction")}
     noise = {}
@@ -80,19 +85,20 @@ def make_off_policy_update(
 
 def make_off_policy_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
     """Build the policy of a run: with SAC's settings one that draws its actions, with TD3's one that does not."""
-    spec: Any = env.observation_spec
     # The settings of the algorithm decide the kind of policy, which the config of the networks has to match.
     draws = isinstance(cfg.objective, SACCfg)
     if draws:
         make: Any = make_squashed_actor
     else:
         make = make_deterministic_actor
-    return make(
-        part_of(cfg, "modules.actor", SquashedActorCfg if draws else DeterministicActorCfg),
-        obs_dim=spec["actor"].shape[-1],
-        action_spec=env.action_spec,
-        device=cfg.resolved_device(),
-    )
+    with naming("modules.actor"):
+        return make_for_spec(
+            make,
+            part_of(cfg, "modules.actor", SquashedActorCfg if draws else DeterministicActorCfg),
+            env.observation_spec,
+            action_spec=env.action_spec,
+            device=cfg.resolved_device(),
+        )
 
 
 OFF_POLICY = partial(

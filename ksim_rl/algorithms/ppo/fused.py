@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate
 from ksim_rl.data import EpochSampler
-from ksim_rl.modules import DiagonalGaussian, PolicyNetwork, TanhGaussian, ValueNetwork
+from ksim_rl.modules import DiagonalGaussian, Encoder, PolicyNetwork, TanhGaussian, ValueNetwork
 from ksim_rl.modules.action_heads import GaussianHead, TanhGaussianHead
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.objectives import SymmetricAugmentation
@@ -110,6 +110,8 @@ def fused_networks(
     actor: ProbabilisticTensorDictSequential, critic: TensorDictModuleBase
 ) -> FusedNetworks | NotFused:
     """Return the description of `make_actor`'s and `make_critic`'s networks for the kernels, or why they are others."""
+    if any(isinstance(part, Encoder) for own in (actor, critic) for part in own.modules()):
+        return NotFused("the networks read pictures")
     policy = getattr(actor[0], "module", None)
     value = getattr(critic, "module", None)
     # Exact types: a subclass may compute something else.

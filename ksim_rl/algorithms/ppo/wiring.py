@@ -2,12 +2,14 @@
 
 from functools import partial
 
+import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torchrl.data import Composite
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules import ActorValueOperator
 
 from ksim_rl.algorithms.ppo.update import PPOUpdate
+from ksim_rl.checks import naming
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.mdp.mirror_maps import mirror_maps
@@ -15,14 +17,14 @@ from ksim_rl.modules import (
     FEATURES,
     ActorCfg,
     CriticCfg,
-    ObservationKey,
     make_actor,
     make_critic,
+    make_for_spec,
     make_recurrent_actor,
     make_recurrent_critic,
     make_shared_trunk,
-    observation_dim,
 )
+from ksim_rl.modules.network import LayeredNetwork
 from ksim_rl.objectives import PPOCfg, observation_keys
 from ksim_rl.trainers.algorithm import part_of
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -55,24 +57,20 @@ def build_networks(
     cfg: RunCfg, env: EnvBase
 ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
     """Build actor and critic for an env's observations and actions; a ValueError refuses an off-policy method's."""
-    device = cfg.resolved_device()
     modules = cfg.modules
     actor_cfg = part_of(cfg, "modules.actor", ActorCfg)
     critic_cfg = part_of(cfg, "modules.critic", CriticCfg)
     spec: Composite = env.observation_spec
+    made = partial(make_for_spec, device=cfg.resolved_device())
 
-    # A trunk adds the width of its features to the inputs of both networks.
     trunk = None
-    shared = 0
     if modules.trunk is not None:
-        trunk = make_shared_trunk(
-            modules.trunk, obs_dim=observation_dim(spec, modules.trunk.in_keys), device=device
-        )
-        shared = trunk.module.output_dim
-
-    def width(keys: tuple[ObservationKey, ...]) -> int:
-        # The trunk's features are no observation of the env, and have their own width.
-        return observation_dim(spec, [key for key in keys if key != FEATURES]) + shared
+        with naming("modules.trunk"):
+            trunk = made(make_shared_trunk, modules.trunk, spec)
+        layers = next(own for own in trunk.modules() if isinstance(own, LayeredNetwork))
+        # Both networks read its features as one more observation.
+        spec = spec.clone()
+        spec[FEATURES] = Unbounded(torch.Size([*spec.shape, layers.output_dim]))
 
     # Behind a recurrent module, where there is one.
     if m := modules.recurrent_actor:
@@ -83,10 +81,10 @@ def build_networks(
         new_critic = partial(make_recurrent_critic, m)
     else:
         new_critic = make_critic
-    action_spec = env.full_action_spec
-    obs_dim = width(actor_cfg.in_keys)
-    actor = new_actor(actor_cfg, obs_dim=obs_dim, action_spec=action_spec, device=device)
-    critic = new_critic(critic_cfg, obs_dim=width(critic_cfg.in_keys), device=device)
+    with naming("modules.actor"):
+        actor = made(new_actor, actor_cfg, spec, action_spec=env.full_action_spec)
+    with naming("modules.critic"):
+        critic = made(new_critic, critic_cfg, spec)
     if trunk is None:
         return actor, critic
     # Both operators run the same trunk, and so learn the same weights in it.

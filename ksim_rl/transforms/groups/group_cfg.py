@@ -94,6 +94,18 @@ class ObservationGroupCfg(Checked):
                 f"terms: {images[0]!r} is an image, which is not concatenated with {other!r}: "
                 "give it a group of its own"
             )
+        # Both kinds of history are flat where they are given by their length.
+        for name in images:
+            for where, history in (
+                (f"terms.{name}.", self.terms[name].history),
+                ("", self.history),
+            ):
+                frames = history_cfg(history)
+                if frames is not None and frames.flat:
+                    raise ValueError(
+                        f"{where}history would flatten the image {name!r}: stack the frames of its group, "
+                        f"history=HistoryCfg(length={frames.length}, flat=False)"
+                    )
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return the numbers of a history that is given by its length."""

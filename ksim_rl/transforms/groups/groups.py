@@ -17,6 +17,7 @@ from ksim_rl.transforms.specs import (
     Device,
     bounded,
     bounds,
+    check_no_picture,
     drop_leaf,
     leaf_spec,
     set_leaf_spec,
@@ -130,6 +131,10 @@ class ObservationGroups(CheckedKeys):
                     f"group {name!r} would replace the observations under {name!r}: rename the group"
                 )
             specs = [leaf_spec(observation_spec, term, type(self).__name__) for term in terms]
+            for term, spec in zip(terms, specs, strict=True):
+                check_no_picture(
+                    term, spec, len(batch_size), "leave it alone, and read it by an encoder"
+                )
             vectors[name] = self._vector_spec(specs, batch_size, observation_spec.device)
             # Vectors can be concatenated as they are; other shapes are flattened in each step.
             if all(spec.ndim == len(batch_size) + 1 for spec in specs):

@@ -207,6 +207,15 @@ def test_an_image_cannot_share_a_group():
         ObservationGroupCfg(terms=terms)
 
 
+@pytest.mark.parametrize("where", ["group", "term"])
+def test_frames_of_an_image_are_stacked_and_never_flattened(where):
+    term = {"term": CameraImage(sensor="eye")}
+    group = {"history": 2} if where == "group" else {}
+    own = {"history": 2} if where == "term" else {}
+    with pytest.raises(ValueError, match=r"history would flatten the image 'rgb': .*flat=False"):
+        ObservationGroupCfg(terms={"rgb": ObservationTermCfg(**term, **own)}, **group)
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

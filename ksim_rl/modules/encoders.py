@@ -1,0 +1,205 @@
+"""Encoders make features of pictures; they stand in front of any network, which then reads features as numbers."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor, nn
+from torchrl.data import TensorSpec
+from torchrl.modules import ConvNet
+
+from ksim_rl.checked import NUMBERS_PER_WEIGHT, Checked, Count, Range
+from ksim_rl.checks import check_choice
+from ksim_rl.modules.mlp import ACTIVATIONS, Device
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderCfg(Checked):
+    """Makes features of the pictures of one observation: here by TorchRL's `ConvNet`, one layer per number of channels.
+
+    A subclass with a `build` of its own makes any encoder, and configs name it by `_target_`.
+
+    Attributes:
+        channels: of the outputs of each convolution.
+        kernel_sizes, strides: of each convolution, pixels.
+        activation: after each convolution.
+        spatial_softmax: where each channel is brightest, instead of all its pixels; see `SpatialSoftmax`.
+        value_range: the values that become 0 and 1; None takes [0, 255] for uint8, and floats as they are.
+        layout: of one picture; "CHW" is what TorchRL's `ToTensorImage` gives.
+    """
+
+    channels: tuple[Count, ...] = (32, 64, 64)
+    kernel_sizes: tuple[Count, ...] = (8, 4, 3)
+    strides: tuple[Count, ...] = (4, 2, 1)
+    activation: str = "relu"
+    spatial_softmax: bool = False
+    value_range: Range | None = None
+    layout: Literal["HWC", "CHW"] = "HWC"
+
+    def _check_fields(self) -> None:
+        super()._check_fields()
+        check_choice("activation", self.activation, ACTIVATIONS)
+        if not self.channels:
+            raise ValueError("channels=(): expected at least one convolution")
+        for name in ("channels", "kernel_sizes", "strides"):
+            numbers = tuple(getattr(self, name))
+            # The class is frozen; a config file gives a list.
+            object.__setattr__(self, name, numbers)
+            if len(numbers) != len(self.channels):
+                raise ValueError(
+                    f"{name}={numbers}: expected {len(self.channels)} numbers, one for each of channels={self.channels}"
+                )
+        if self.value_range is not None and self.value_range[0] == self.value_range[1]:
+            raise ValueError(f"value_range={self.value_range}: expected low < high")
+
+    def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
+        """Return what the convolutions need, of pictures with one channel."""
+        below = (1, *self.channels[:-1])
+        weights = 0
+        for inputs, outputs, size in zip(below, self.channels, self.kernel_sizes, strict=True):
+            weights += inputs * outputs * size**2
+        return {("channels", "kernel_sizes"): NUMBERS_PER_WEIGHT * weights}
+
+    def build(self, spec: TensorSpec, *, device: Device = None) -> nn.Module:
+        """Return the module that maps pictures [B, *shape] as the env gives them to features [B, F].
+
+        `spec` has the shape and the dtype of one picture, or of N stacked ones: [H, W], [H, W, C] or [N, H, W, C].
+        """
+        if spec.dtype not in (torch.uint8, torch.float32):
+            raise ValueError(
+                f"it reads pictures of {spec.dtype}, and those of uint8 or float32 are amounts of light or distances: "
+                "map ids to colours first, or name an encoder of your own by _target_"
+            )
+        self._check_layout(spec)
+        low, high = self._ends(spec.dtype)
+        first = _ToChannels(len(spec.shape), self.layout, low=low, high=high)
+        # Drawn on the CPU, so that one seed gives the same network on every device.
+        convolutions = ConvNet(
+            in_features=first.num_channels(spec.shape),
+            num_cells=list(self.channels),
+            kernel_sizes=list(self.kernel_sizes),
+            strides=list(self.strides),
+            activation_class=ACTIVATIONS[self.activation],
+            aggregator_class=SpatialSoftmax if self.spatial_softmax else nn.Flatten,
+            aggregator_kwargs={},
+        )
+        return nn.Sequential(first, convolutions).to(device)
+
+    def _check_layout(self, spec: TensorSpec) -> None:
+        """Refuse a shape whose dims are no picture's, or are in another order."""
+        shape = list(spec.shape)
+        if len(shape) not in (2, 3, 4):
+            raise ValueError(
+                f"it reads pictures [H, W], [H, W, C] or stacked ones [N, H, W, C], and these are {shape}"
+            )
+        if len(shape) == 2:
+            return
+        picture = shape[-3:]
+        channel = picture.pop(self.layout.index("C"))
+        # Frames of a depth camera, [N, H, W], would be read as very low pictures with W channels.
+        if channel > min(picture):
+            raise ValueError(
+                f"layout={self.layout!r} gives pictures {shape} {channel} channels, more than pixels along a side: "
+                "choose the other layout; stacked pictures of one channel, [N, H, W], are read as 'CHW'"
+            )
+
+    def _ends(self, dtype: torch.dtype) -> tuple[float, float]:
+        """Return the values that become 0 and 1."""
+        if self.value_range is not None:
+            return self.value_range
+        if dtype == torch.uint8:
+            return 0.0, 255.0
+        return 0.0, 1.0
+
+
+class SpatialSoftmax(nn.Module):
+    """Where each of C channels is brightest: the mean place x, y in [-1, 1], weighted by the softmax of its pixels.
+
+    Maps [B, C, H, W] to [B, 2 C], all x first; x runs to the right and y downwards. Levine et al., "End-to-end training
+    of deep visuomotor policies", JMLR 2016.
+    """
+
+    def forward(self, channels_BCHW: Float[Tensor, "B C H W"]) -> Float[Tensor, "B F"]:
+        """Return the places."""
+        height, width = channels_BCHW.shape[-2:]
+        # Half precision would round the places to some pixels.
+        channels_BCHW = channels_BCHW.float()
+        device = channels_BCHW.device
+        weights_BCHW = channels_BCHW.flatten(-2).softmax(-1).unflatten(-1, (height, width))
+        x_W = torch.linspace(-1.0, 1.0, width, device=device)
+        y_H = torch.linspace(-1.0, 1.0, height, device=device)
+        x_BC = (weights_BCHW.sum(-2) * x_W).sum(-1)
+        y_BC = (weights_BCHW.sum(-1) * y_H).sum(-1)
+        return torch.cat((x_BC, y_BC), -1)
+
+
+class _ToChannels(nn.Module):
+    """Maps pictures [B, *shape] to float32 [B, C, H, W], scaled; the channels of N stacked pictures stand in a row."""
+
+    def __init__(self, num_dims: int, layout: str, *, low: float, high: float) -> None:
+        super().__init__()
+        self.num_dims = num_dims
+        self.layout = layout
+        self.low = low
+        self.factor = 1.0 / (high - low)
+
+    def num_channels(self, shape: Sequence[int]) -> int:
+        """Return C for pictures of this shape."""
+        return self._channels_first(torch.empty(1, *shape, device="meta")).shape[1]
+
+    def forward(self, pictures: Shaped[Tensor, " B *shape"]) -> Float[Tensor, "B C H W"]:
+        """Return the pictures as the convolutions read them."""
+        # Floats are made here, for the pictures at hand only: datasets keep bytes.
+        return (self._channels_first(pictures).float() - self.low) * self.factor
+
+    def _channels_first(self, pictures: Tensor) -> Tensor:
+        if self.num_dims == 2:
+            return pictures[:, None]
+        if self.layout == "HWC":
+            pictures = pictures.movedim(-1, -3)
+        # Frames, and the channels of each.
+        if self.num_dims == 4:
+            return pictures.flatten(1, 2)
+        return pictures
+
+
+class Encoder(nn.Module):
+    """Maps pictures [*batch, *shape] to features [*batch, F], by what a config builds for one batch dim.
+
+    `spec` is that of one picture. A ValueError tells where the config's module does not fit, or other pictures come.
+    """
+
+    def __init__(self, cfg: EncoderCfg, spec: TensorSpec, *, device: Device = None) -> None:
+        super().__init__()
+        self.shape = spec.shape
+        maker = f"{type(cfg).__name__}.build for pictures {list(spec.shape)}"
+        self.layers = cfg.build(spec, device=device)
+        if not isinstance(self.layers, nn.Module):
+            raise ValueError(f"{maker} returns a {type(self.layers).__name__}: expected a module")
+        # Tried on two pictures; statistics of batches stay as they are.
+        self.layers.eval()
+        pictures = torch.zeros(2, *spec.shape, dtype=spec.dtype, device=device)
+        try:
+            with torch.no_grad():
+                features = self.layers(pictures)
+        except (RuntimeError, TypeError, ValueError) as error:
+            raise ValueError(f"{maker}: it cannot map two of them: {error}") from error
+        finally:
+            self.layers.train()
+        fits = isinstance(features, Tensor) and features.ndim == 2 and len(features) == 2
+        if not fits:
+            found = list(features.shape) if isinstance(features, Tensor) else type(features)
+            raise ValueError(f"{maker}: it maps two of them to {found}: expected [2, features]")
+        self.num_features: int = features.shape[1]
+
+    def forward(self, pictures: Shaped[Tensor, "*pictures"]) -> Float[Tensor, "*features"]:
+        """Return the features."""
+        start = pictures.ndim - len(self.shape)
+        if start < 0 or pictures.shape[start:] != self.shape:
+            raise ValueError(
+                f"the encoder was built for pictures {list(self.shape)}, and reads {list(pictures.shape)}"
+            )
+        features = self.layers(pictures.reshape(-1, *self.shape))
+        return features.reshape(*pictures.shape[:start], self.num_features)
