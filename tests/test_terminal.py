@@ -24,6 +24,7 @@ OBEYED = set("\x1b\x07\x9b\u202e\r\x08")
 OTHERS = {
     "envs/explain.py": {"console.print"},
     "export/standalone/command.py": {"print"},
+    "export/standalone/loop_command.py": {"print"},
     "scene/robots/analysis.py": {
         "Console(file=text, force_jupyter=False, width=240, highlight=False).print"
     },

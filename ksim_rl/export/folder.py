@@ -39,8 +39,35 @@ from ksim_rl.trainers.run_folder import Policy, policy_of
 
 STANDALONE = Path(__file__).parent / "standalone"
 # Each needs only those before it, since they become one file.
-PARTS = ("files", "contacts", "network", "signals", "runner", "command")
+PARTS = (
+    "files",
+    "models",
+    "contacts",
+    "network",
+    "signals",
+    "stages",
+    "runner",
+    "robot_link",
+    "simulated_robot",
+    "command",
+)
 """The modules of `runner.py`, in this order."""
+LOOP_PARTS = (
+    "files",
+    "network",
+    "stages",
+    "robot_link",
+    "policy_control",
+    "safety",
+    "states",
+    "deadlines",
+    "journal",
+    "words",
+    "loop",
+    "loop_command",
+)
+"""The modules of `loop.py`, which has to run where there is no MuJoCo."""
+_SIMULATED = "from ksim_rl.export.standalone.simulated_robot import SimulatedRobot\n"
 # Episodes of trace.npz and env steps of each: enough for the causes, and small beside the recorded episodes.
 TRACED = 4
 TRACED_STEPS = 60
@@ -52,6 +79,7 @@ FILES = (
     "robot.xml",
     "export.json",
     "runner.py",
+    "loop.py",
     "README.md",
     "episodes.npz",
     "trace.npz",
@@ -87,6 +115,7 @@ README = """# {task}, iteration {iteration}
 | `robot.xml` | the robot's model; actuators stand in the order of the actions |
 | `export.json` | names, order, scales, gains, rates, noise, lags; which quantities the ONNX files read |
 | `runner.py` | `python runner.py --episodes 100` runs it on MuJoCo's C engine; needs numpy, onnxruntime, mujoco |
+| `loop.py` | `python loop.py --simulate` runs it as a loop in real time, as a robot's computer does |
 | `episodes.npz`, `trace.npz` | starts, commands and pushes of recorded episodes, and steps to compare with |
 
 The policy's actions equal the trained network's within {difference:.1e} on {checked} observations, and the observations
@@ -291,6 +320,7 @@ def _fill(
     # NaN is no JSON, and stands for a mistake of ours.
     (folder / "export.json").write_text(json.dumps(meta, indent=1, allow_nan=False) + "\n")
     (folder / "runner.py").write_text(runner_source())
+    (folder / "loop.py").write_text(loop_source())
     (folder / "README.md").write_text(
         README.format(
             **{**meta, **own, "joints": ", ".join(meta["joint_names"])},
@@ -329,14 +359,24 @@ def _check_transforms(
 
 
 def runner_source() -> str:
-    """Return the text of `runner.py`: the modules of the folder `standalone` as one."""
-    *parts, command = ((STANDALONE / f"{name}.py").read_text() for name in PARTS)
+    """Return the text of `runner.py`: modules of the folder `standalone` as one."""
+    return _as_one_file(PARTS)
+
+
+def loop_source() -> str:
+    """Return the text of `loop.py`."""
+    text = _as_one_file(LOOP_PARTS)
+    # With MuJoCo it takes its robot from the file beside it.
+    return text.replace(_SIMULATED, "from runner import SimulatedRobot\n")
+
+
+def _as_one_file(names: Sequence[str]) -> str:
+    *parts, command = ((STANDALONE / f"{name}.py").read_text() for name in names)
     # The docstring of the command becomes the file's; the other modules lose theirs.
     doc, body = re.split(r'(?<=\n""")\n', command, maxsplit=1)
     inner = [re.sub(r'\A""".*?"""\n', "", text, flags=re.DOTALL) for text in parts]
+    text = "\n\n".join([*inner, body])
     # Imports of the package go, on one line or several: all names are in the one file then.
     return (
-        doc
-        + "\n"
-        + re.sub(r"from ksim_rl\S* import (\([^)]*\)|[^\n]*)\n", "", "\n\n".join([*inner, body]))
+        doc + "\n" + re.sub(r"^from ksim_rl\S* import (\([^)]*\)|[^\n]*)\n", "", text, flags=re.M)
     )

@@ -62,7 +62,14 @@ def metadata(
         "command_names": list(cfg.commands),
         "observation_names": [term["name"] for term in terms],
         "observation_history_lengths": [term["history_length"] for term in terms],
-        "joints": {"names": names, "default_pos": by_term[1], "limits": _limits(ours, names)},
+        "joints": {
+            "names": names,
+            "default_pos": by_term[1],
+            "stiffness": gains[0],
+            "damping": gains[1],
+            "effort_scale": _effort_scales(ours, laws, names),
+            "limits": {**_limits(ours, names), "velocity": _no_load_speeds(laws, names)},
+        },
         "observations": [{**term, "reads": traced.reads(term["name"])} for term in terms],
         "actions": actions,
         "action_chain": transforms.stages,
@@ -113,6 +120,14 @@ def _gains(
     # Gains of servos are in the model, gains of laws in the numbers that the laws were given.
     model = ours.world.mj_model
     found = dict.fromkeys(names, (0.0, 0.0))
+    # Joints that no action moves are held by their servos all the same.
+    for actuator in range(model.nu):
+        if not drives_scalar_joint(model, actuator):
+            continue
+        joint = model.joint(int(model.actuator_trnid[actuator, 0])).name
+        control = joint_control(model, actuator)
+        if joint in found and control.kind == "pos":
+            found[joint] = (control.stiffness, control.damping)
     for law in laws:
         for k, (joint, actuator) in enumerate(zip(law["joints"], law["actuators"], strict=True)):
             control = joint_control(model, model.actuator(actuator).id)
@@ -125,6 +140,32 @@ def _gains(
     stiffness_of = [found[name][0] for name in names]
     damping_of = [found[name][1] for name in names]
     return stiffness_of, damping_of
+
+
+def _effort_scales(
+    ours: ManagerBasedRlEnv, laws: Sequence[Json], names: Sequence[str]
+) -> list[float]:
+    """Return the effort at the joint that one of a target of effort stands for, by joint: gear times gain of motors."""
+    model = ours.world.mj_model
+    found = dict.fromkeys(names, 1.0)
+    for law in laws:
+        # Laws of ours compute the effort at the joint.
+        if law["kind"] != "builtin" or "effort" not in law["takes"]:
+            continue
+        for joint, name in zip(law["joints"], law["actuators"], strict=True):
+            actuator = model.actuator(name).id
+            gain = model.actuator_gainprm[actuator, 0]
+            found[joint] = float(model.actuator_gear[actuator, 0] * gain)
+    return [found[name] for name in names]
+
+
+def _no_load_speeds(laws: Sequence[Json], names: Sequence[str]) -> list[float | None]:
+    """Return the speeds at which motors have no torque left, by joint; null where their model has none."""
+    found: dict[str, float] = {}
+    for law in laws:
+        if "velocity_limit" in law["numbers"]:
+            found |= zip(law["joints"], law["numbers"]["velocity_limit"], strict=True)
+    return [found.get(name) for name in names]
 
 
 def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> Json:

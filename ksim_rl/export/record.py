@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.export.robot import activation_order
-from ksim_rl.export.standalone.files import CHOICE, FIELDS
+from ksim_rl.export.standalone.models import CHOICE, FIELDS
 from ksim_rl.scene.sensors import ContactSensor
 
 Arrays = dict[str, np.ndarray]

@@ -24,7 +24,9 @@ from ksim_rl.export import export_policy, sim2sim  # noqa: E402
 from ksim_rl.export.onnx_file import OPSET  # noqa: E402
 from ksim_rl.export.sim2sim import ratio_error  # noqa: E402
 from ksim_rl.export.standalone.files import read_arrays  # noqa: E402
+from ksim_rl.export.standalone.policy_control import PolicyControl  # noqa: E402
 from ksim_rl.export.standalone.runner import Runner  # noqa: E402
+from ksim_rl.export.standalone.simulated_robot import SimulatedRobot  # noqa: E402
 from ksim_rl.modules import update_normalizers  # noqa: E402
 from ksim_rl.trainers.algorithm import make_policy  # noqa: E402
 from ksim_rl.trainers.build import build_env  # noqa: E402
@@ -253,16 +255,38 @@ def test_runner_needs_neither_torch_nor_this_library(cartpole, tmp_path):
     assert "return" in done.stdout
 
 
-def test_the_loop_of_the_examples_runs_an_export(cartpole):
-    loop = EXAMPLES / "loop.py"
-    done = subprocess.run(
-        [sys.executable, str(loop), str(cartpole), "--seconds", "0.1"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "0.1 s at 100 Hz" in done.stdout
+def test_the_loop_of_an_export_acts_as_its_runner(cartpole):
+    control = PolicyControl(cartpole, json.loads((cartpole / "export.json").read_text()))
+    robot = SimulatedRobot(cartpole, control.estimated)
+    runner = Runner(cartpole)
+    for data in (robot.data, runner.data):
+        data.qpos[1] = 0.1
+    robot.runner.refresh()
+    runner.refresh()
+    runner.frame = runner.observe(advances=False)
+    for _ in range(20):
+        robot.write(control(robot.read()))
+        runner.step(runner.act())
+        assert robot.data.qpos == pytest.approx(runner.data.qpos, abs=1e-6)
+    assert abs(runner.data.qpos).min() > 1e-3
+
+
+@pytest.mark.full
+def test_the_loop_of_a_quadruped_acts_as_its_runner(quadruped):
+    meta = json.loads((quadruped / "export.json").read_text())
+    control = PolicyControl(quadruped, meta)
+    runner = Runner(quadruped)
+    runner.noisy = False
+    # Lags are of the training: a robot has its own.
+    for lag in runner.lags:
+        lag.most = lag.spec["min"] = lag.spec["max"] = 0
+    runner.reset()
+    robot = SimulatedRobot(quadruped, control.estimated)
+    for _ in range(20):
+        robot.write(control(robot.read()))
+        runner.step(runner.act())
+        assert control.action == pytest.approx(runner.action, abs=1e-4)
+        assert robot.data.qpos == pytest.approx(runner.data.qpos, abs=1e-4)
 
 
 def test_the_loop_in_cpp_compiles(tmp_path):

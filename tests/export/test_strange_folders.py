@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("onnxruntime", reason="needs the extra: pip install ksim_rl[export]")
 pytest.importorskip("onnx", reason="needs the extra: pip install ksim_rl[export]")
 
-from ksim_rl.export.standalone.files import CHOICE, FIELDS, check_record
+from ksim_rl.export.standalone.models import CHOICE, FIELDS, check_record
 from ksim_rl.physics.upstream import per_world_fields
 from tests.export.strange_folders import STRANGE, said_of
 from tests.export.test_sim2sim import exported

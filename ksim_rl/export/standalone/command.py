@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, as_text, check_record, read_arrays, read_json
+from ksim_rl.export.standalone.files import Array, as_text, read_arrays, read_json
+from ksim_rl.export.standalone.models import check_record
 from ksim_rl.export.standalone.runner import Runner
 from ksim_rl.export.standalone.signals import INTEGRATORS
 

@@ -1,8 +1,7 @@
 """The loop of an exported policy, its commands and pushes in its robot's model on MuJoCo's C engine."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,6 +9,12 @@ import numpy as np
 from ksim_rl.export.standalone.files import Array, Json
 from ksim_rl.export.standalone.network import Policy
 from ksim_rl.export.standalone.signals import KINDS, Lag, Noise, Signals, Values
+from ksim_rl.export.standalone.stages import (
+    JointAction,
+    clipped_and_scaled,
+    shaping,
+    stage,
+)
 
 # Fields of MjData that a recording may set.
 STATE = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
@@ -39,11 +44,7 @@ class Runner(Signals):
     # -- observations --------------------------------------------------------------------------------------------
 
     def _term(self, spec: Json) -> Callable[[Array, bool], Array]:
-        low, high = spec["clip"]
-        # JSON has no infinity: None is a side without a bound.
-        low = -np.inf if low is None else low
-        high = np.inf if high is None else high
-        scale = np.asarray(spec["scale"])
+        shaped = clipped_and_scaled(spec)
         lag = None
         noise = Noise(spec["noise"], self) if spec["noise"] else None
         self.noises += [noise] if noise else []
@@ -55,7 +56,7 @@ class Runner(Signals):
             # As in training: noise on the raw value, then clip, scale and delay.
             if noise and self.noisy:
                 value = noise(value)
-            value = np.clip(value, low, high) * scale
+            value = shaped(value)
             return value if lag is None else lag(value, advances)
 
         return term
@@ -74,72 +75,31 @@ class Runner(Signals):
             lag = Lag(spec, self)
             self.lags.append(lag)
             return lag
-        if spec["kind"] == "clip":
-            return lambda action: np.clip(action, spec["low"], spec["high"])
-        if spec["kind"] == "scale":
-            return lambda action: action * np.asarray(spec["scale"]) + np.asarray(spec["offset"])
-        # Low-pass. A list of one, since the closure has to write it; None starts at the first action.
-        kept: list[Any] = [None]
-        self.resets.append(lambda: kept.__setitem__(0, spec["initial"]))
-
-        def low_pass(action: Array) -> Array:
-            before = action if kept[0] is None else kept[0]
-            kept[0] = before + spec["alpha"] * (action - before)
-            return kept[0]
-
-        return low_pass
+        return stage(spec, self.resets)
 
     def _action(self, spec: Json) -> Callable[[Array], None]:
-        columns = slice(*spec["columns"])
-        kind = spec["kind"]
-        names = spec["names"]
-        shape = self._shaping(spec)
         # The model's own actuator, driven without a law in between.
-        if kind == "ctrl":
-            at = [self.model.actuator(name).id for name in names]
+        if spec["kind"] == "ctrl":
+            columns = slice(*spec["columns"])
+            shape = shaping(spec, self.resets)
+            controls = [self.model.actuator(name).id for name in spec["names"]]
 
             def control(action: Array) -> None:
-                self.data.ctrl[at] = np.clip(shape(action[columns]), *spec["limits"])
+                self.data.ctrl[controls] = np.clip(shape(action[columns]), *spec["limits"])
 
             return control
+        asked = JointAction(spec, self.resets)
+        names = asked.names
         at = np.array([self.joints[name][0] for name in names])
-        # Some actions give a velocity target too: then the first half of the columns is position.
-        second = self._shaping(spec["velocity"]) if spec.get("velocity") else None
 
         def joints(action: Array) -> None:
-            given = action[columns]
-            value = None
-            if second:
-                given, value = np.split(given, 2)
-                self.targets["vel"].update(zip(names, second(value), strict=True))
-            value = shape(given)
-            if spec["relative"]:
-                # A robot's own encoders tell where it is.
-                value = value + self.data.qpos[at] + self.bias_of(names)
-            # The offset has the model's own pose in it.
-            if spec["from_default"]:
-                value = value + [self.default[name] - self.own_default[name] for name in names]
-            self.targets[kind].update(zip(names, np.clip(value, *spec["limits"]), strict=True))
+            shift = np.array([self.default[name] - self.own_default[name] for name in names])
+            # A robot's own encoders tell where it is.
+            encoders = self.data.qpos[at] + self.bias_of(names)
+            for kind, values in asked(action, encoders, shift).items():
+                self.targets[kind].update(zip(names, values, strict=True))
 
         return joints
-
-    def _shaping(self, spec: Json) -> Callable[[Array], Array]:
-        low, high = spec["clip"] or (-np.inf, np.inf)
-        scale = np.asarray(spec["scale"])
-        offset = np.asarray(spec["offset"])
-        alpha = spec["alpha"]
-        kept: list[Any] = [0.0]
-        self.resets.append(lambda: kept.__setitem__(0, 0.0))
-
-        def shaped(action: Array) -> Array:
-            action = np.clip(action, low, high)
-            action = (np.tanh(action) if spec["tanh"] else action) * scale
-            # Here the state is the scaled action, and begins at 0 in each episode.
-            if alpha is not None:
-                kept[0] = action = kept[0] + alpha * (action - kept[0])
-            return action + offset
-
-        return shaped
 
     def _law(self, spec: Json) -> Callable[[], None]:
         """Return a function that sets some actuators' controls from their joints' targets before each substep."""
@@ -249,27 +209,12 @@ class Runner(Signals):
     ) -> Json:
         """Run one env step; return rewards by term, metrics and the ending. `command` holds from the next frame on."""
         # Stages of the chain hold memory: run each of them once per env step.
-        for stage in self.chain:
-            action = stage(action)
+        for change in self.chain:
+            action = change(action)
         self.last_action, self.action = self.action, np.asarray(action, np.float64)
         for write in self.asked:
             write(self.action)
-        dt = self.model.opt.timestep
-        for substep in range(self.decimation):
-            for law in self.laws:
-                law()
-            mujoco.mj_step(self.model, self.data)
-            for tracker in self.contacts.values():
-                if tracker.every:
-                    tracker.update(self.data, dt, starts=not substep)
-        for keep in self.of_contacts:
-            keep()
-        # mj_step integrates last: derived poses and sensors lag behind qpos by a substep.
-        self.refresh()
-        self.steps += 1
-        for tracker in self.contacts.values():
-            if not tracker.every:
-                tracker.update(self.data, self.step_dt, starts=True)
+        self.run_physics(self.laws)
         # Endings come before rewards, since a reward may read whether the episode was terminated.
         scores = self.scores.named(self.scored)
         endings = self.meta["terminations"]
@@ -295,6 +240,25 @@ class Runner(Signals):
             "terminated": self.terminated,
             "done": self.terminated or timed or bool(ended),
         }
+
+    def run_physics(self, laws: Sequence[Callable[[], None]]) -> None:
+        """Run the substeps of one env step, each after the laws that set its controls."""
+        dt = self.model.opt.timestep
+        for substep in range(self.decimation):
+            for law in laws:
+                law()
+            mujoco.mj_step(self.model, self.data)
+            for tracker in self.contacts.values():
+                if tracker.every:
+                    tracker.update(self.data, dt, starts=not substep)
+        for keep in self.of_contacts:
+            keep()
+        # mj_step integrates last: derived poses and sensors lag behind qpos by a substep.
+        self.refresh()
+        self.steps += 1
+        for tracker in self.contacts.values():
+            if not tracker.every:
+                tracker.update(self.data, self.step_dt, starts=True)
 
     def _begin(self, record: dict[str, Array], number: int) -> None:
         self.command |= self._commands(record, number, 0)

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from ksim_rl.export.standalone.contacts import Contacts
-from ksim_rl.export.standalone.files import Array, Json, check_count, read_json, read_model
+from ksim_rl.export.standalone.files import Array, Json, check_count, read_json
+from ksim_rl.export.standalone.models import read_model
 from ksim_rl.export.standalone.network import Network
 
 Value = Callable[[], Array]

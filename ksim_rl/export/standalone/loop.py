@@ -1,0 +1,105 @@
+"""The loop: at each deadline read the robot, ask the state machine, write the command, and log it."""
+
+import gc
+import os
+import sys
+from collections.abc import Sequence
+from typing import Protocol
+
+from ksim_rl.export.standalone.deadlines import Punctuality, next_deadline
+from ksim_rl.export.standalone.journal import Journal
+from ksim_rl.export.standalone.robot_link import Measurement, Robot
+from ksim_rl.export.standalone.states import StateMachine
+from ksim_rl.export.standalone.words import Operator, sort_words
+
+WAIT_S = 5.0
+"""For the first message of a robot."""
+PRIORITY = 20
+"""Of the loop's thread among those of real time, 1 to 99."""
+
+
+class Clock(Protocol):
+    """What tells the time, s, and waits."""
+
+    def now(self) -> float:
+        """Return the time."""
+        ...
+
+    def sleep_until(self, deadline: float) -> None:
+        """Return at a time, or at once where it has passed."""
+        ...
+
+
+def first_measurement(robot: Robot, clock: Clock, period: float) -> Measurement:
+    """Wait for a robot's first message, and return it; a ValueError says that there is none."""
+    until = clock.now() + WAIT_S
+    while clock.now() < until:
+        measurement = robot.read()
+        if measurement is not None:
+            return measurement
+        clock.sleep_until(clock.now() + period)
+    raise ValueError(
+        f"no message from the robot in {WAIT_S:g} s: is it on, and is it this network?"
+    )
+
+
+def run_loop(
+    robot: Robot,
+    machine: StateMachine,
+    operators: Sequence[Operator],
+    journal: Journal,
+    *,
+    clock: Clock,
+    period: float,
+) -> Punctuality:
+    """Run a robot until the motors are damped at the end, and return how punctual that was."""
+    punctuality = Punctuality()
+    longest = machine.watch.limits.late_periods * period
+    deadline = clock.now()
+    while True:
+        clock.sleep_until(deadline)
+        woken = clock.now()
+        if woken - deadline > longest:
+            machine.fail(
+                woken, f"the loop ran {woken - deadline:.3f} s late: is the computer busy?"
+            )
+        measurement = None
+        try:
+            measurement = robot.read()
+        except Exception as error:  # whatever a robot's own code raises
+            machine.fail(woken, f"read: {type(error).__name__}: {' '.join(str(error).split())}")
+        said = [word for operator in operators for word in operator.words(woken, machine)]
+        words = sort_words(said, machine, woken)
+        command = machine.tick(woken, measurement, words)
+        sent = clock.now()
+        try:
+            robot.write(command)
+        except Exception as error:  # whatever a robot's own code raises
+            machine.fail(sent, f"write: {type(error).__name__}: {' '.join(str(error).split())}")
+        journal.period(woken, machine.state, measurement, command)
+        punctuality.add(deadline, woken, sent)
+        if machine.is_over(sent):
+            return punctuality
+        done = clock.now()
+        if done - woken > longest:
+            machine.fail(done, f"a period took {done - woken:.3f} s: is the computer busy?")
+        deadline, missed = next_deadline(deadline, period, done)
+        punctuality.missed += missed
+
+
+def calm_python() -> None:
+    """Keep what would make a period late out of the loop: the garbage collector, and long turns of other threads."""
+    gc.collect()
+    # The loop makes no circles of references, so that nothing is left for the collector.
+    gc.freeze()
+    gc.disable()
+    sys.setswitchinterval(1e-4)
+
+
+def ask_for_real_time() -> str:
+    """Ask the system to run this process before others; return a line that says whether it does."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except OSError as error:
+        return f"no real-time priority: {error}"
+    return f"real-time priority {PRIORITY}"

@@ -1,0 +1,183 @@
+"""Runs an exported policy on a robot, at the policy's own rate; it needs numpy and onnxruntime, and nothing else.
+
+    python loop.py --simulate               # a robot of MuJoCo's C engine stands up and walks
+    python loop.py --simulate --seconds 0   # the same, with words of yours: stand, policy, stop, damp
+
+States follow each other: damp, stand, policy, stop. Late, lost or wrong messages, limits of joints, tilt, errors and
+your stop lead to damped motors. What happened is in a log that `ksim-rl identify` reads. For a robot of yours write a
+class with `read`, `write` and `close` (see `Robot`), and give it to `drive`.
+"""
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from ksim_rl.export.standalone.deadlines import MonotonicClock
+from ksim_rl.export.standalone.files import Json, read_json
+from ksim_rl.export.standalone.journal import Journal
+from ksim_rl.export.standalone.loop import (
+    ask_for_real_time,
+    calm_python,
+    first_measurement,
+    run_loop,
+)
+from ksim_rl.export.standalone.policy_control import PolicyControl
+from ksim_rl.export.standalone.robot_link import Robot
+from ksim_rl.export.standalone.safety import Limits
+from ksim_rl.export.standalone.states import StateMachine, Times
+from ksim_rl.export.standalone.words import Interrupts, Keyboard, Operator, Unattended
+
+UNATTENDED_S = 10.0
+HELP = {
+    "late_periods": "periods without a new message, or by which the loop may be late",
+    "most_tilt": "of the root from the vertical, rad",
+    "position_margin": "beyond the limits of joints in export.json, rad or m",
+    "most_speed": "of joints without a speed limit in export.json, per s",
+    "effort_share": "of the effort limits in export.json; begin with little",
+    "stand_seconds": "from the measured pose to the default pose",
+    "blend_seconds": "from standing to the policy's targets",
+    "stop_seconds": "from the gains of the moment to none",
+    "damp_seconds": "of braking at the end",
+    "damping_factor": "of joint_damping in export.json, while motors only brake",
+}
+
+
+def loop_parser() -> argparse.ArgumentParser:
+    """Return the options of a loop, to which a robot's own program may add."""
+    parser = argparse.ArgumentParser(description="Run an exported policy on a robot.")
+    parser.add_argument("folder", nargs="?", type=Path, default=Path(__file__).parent)
+    parser.add_argument("--simulate", action="store_true", help="a robot of MuJoCo's C engine")
+    parser.add_argument(
+        "--hang",
+        action="store_true",
+        help="the simulated robot hangs until its motors hold the default pose, as a humanoid has to",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        help="of the policy, without an operator; 0: words of yours lead from state to state "
+        f"(default: {UNATTENDED_S:g} with --simulate, else 0)",
+    )
+    parser.add_argument("--command", type=float, nargs="*", help="the policy's first command")
+    parser.add_argument("--log", type=Path, help="a new CSV file; default: named by the time")
+    parser.add_argument("--report", type=Path, help="a JSON file for how punctual the loop was")
+    for owner in (Limits, Times):
+        for field in dataclasses.fields(owner):
+            name = "--" + field.name.replace("_", "-")
+            text = f"{HELP[field.name]} (default: {field.default:g})"
+            parser.add_argument(name, type=float, default=field.default, help=text)
+    return parser
+
+
+def drive(robot: Robot | None, control: PolicyControl, options: argparse.Namespace) -> int:
+    """Run a policy on a robot with the options of `loop_parser`, and return the exit code: 1 after a fault.
+
+    Without a robot it is the simulated one. A ValueError says what is wrong before anything moves.
+    """
+    period = float(control.meta["step_dt"])
+    chosen = vars(options)
+    limits = Limits(**{field.name: chosen[field.name] for field in dataclasses.fields(Limits)})
+    times = Times(**{field.name: chosen[field.name] for field in dataclasses.fields(Times)})
+    _set_command(control, options.command)
+    if robot is None:
+        robot = _simulated(options, control)
+    clock = MonotonicClock()
+    lacking = control.lacking(first_measurement(robot, clock, period))
+    if lacking:
+        raise ValueError(
+            f"the policy observes {', '.join(lacking)}, which this robot does not measure: give estimates, or train "
+            "without these observations"
+        )
+    path = options.log
+    if path is None:
+        path = Path(time.strftime("loop_%Y%m%d_%H%M%S.csv"))
+    journal = Journal(path, control.joints, _say)
+    machine = StateMachine(control, period=period, limits=limits, times=times, note=journal.event)
+    interrupts = Interrupts()
+    interrupts.listen()
+    operators: list[Operator] = [interrupts]
+    seconds = options.seconds
+    if seconds is None:
+        seconds = UNATTENDED_S if options.simulate else 0.0
+    operators.append(Unattended(seconds) if seconds else Keyboard(sys.stdin))
+    calm_python()
+    journal.event(clock.now(), ask_for_real_time())
+    try:
+        punctuality = run_loop(robot, machine, operators, journal, clock=clock, period=period)
+    finally:
+        robot.close()
+        journal.close()
+    summary = {
+        **punctuality.summary(),
+        "period_ms": 1e3 * period,
+        "fault": machine.fault,
+        "clipped": machine.effort_limit.clipped(),
+        "log": str(path),
+        "lines_lost": journal.lost,
+    }
+    _tell(summary, journal.failure)
+    if options.report:
+        options.report.write_text(json.dumps(summary, indent=1) + "\n")
+    return 1 if machine.fault else 0
+
+
+def _simulated(options: argparse.Namespace, control: PolicyControl) -> Robot:
+    # Here, so that a robot's computer needs no MuJoCo.
+    try:
+        from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
+    except ImportError as error:
+        raise ValueError(f"--simulate: {error}: install mujoco, and keep runner.py here") from None
+    robot = SimulatedRobot(options.folder, control.estimated)
+    if options.hang:
+        robot.hang(control.joints.stiffness)
+    return robot
+
+
+def _set_command(control: PolicyControl, values: Sequence[float] | None) -> None:
+    if not values:
+        return
+    for name, command in control.command.items():
+        if len(values) != len(command):
+            raise ValueError(f"--command: {len(values)} numbers: {name} has {len(command)}")
+        command[:] = values
+        return
+    raise ValueError("--command: this policy takes no command")
+
+
+def _tell(summary: Json, failure: str) -> None:
+    _say(
+        f"{summary['periods']} periods of {summary['period_ms']:g} ms, {summary['missed_periods']} missed; 99 % with "
+        f"own jitter up to {summary['own_jitter_ms_p99']:.2f} ms, and sent up to "
+        f"{summary['sent_after_deadline_ms_p99']:.2f} ms after the deadline"
+    )
+    if summary["clipped"]:
+        _say(f"commands at the effort limit, by joint: {summary['clipped']}")
+    _say(f"log: {summary['log']}, {summary['lines_lost']} lines lost")
+    if failure:
+        _say(f"the log is not whole: {failure}")
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def main() -> None:
+    """Run the loop on the simulated robot."""
+    parser = loop_parser()
+    options = parser.parse_args()
+    if not options.simulate:
+        parser.error("give --simulate, or run the program of your robot, which calls `drive`")
+    try:
+        control = PolicyControl(options.folder, read_json(options.folder / "export.json"))
+        code = drive(None, control, options)
+    except (ValueError, OSError) as error:
+        parser.exit(2, f"loop.py: error: {' '.join(str(error).split())}\n")
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,178 @@
+"""Runs an exported policy on what a robot measures: measurement to observation, to action, to targets of joints."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ksim_rl.export.standalone.files import Array, Json, check_count
+from ksim_rl.export.standalone.network import Network, Policy
+from ksim_rl.export.standalone.robot_link import (
+    DOWN,
+    DescribedJoints,
+    JointCommand,
+    Measurement,
+    to_root_axes,
+    to_world_axes,
+)
+from ksim_rl.export.standalone.stages import JointAction, Stage, clipped_and_scaled, stage
+
+Reading = Callable[[Measurement], Array]
+# What follows from joints, from the attitude, and from what the loop itself did.
+OF_JOINTS = ("joint_pos", "joint_pos_rel", "joint_vel", "joint_effort")
+OF_TARGETS = {"joint_pos_target": "pos", "joint_vel_target": "vel", "joint_effort_target": "effort"}
+OF_ROOT = ("root_quat", "projected_gravity", "root_ang_vel")
+
+
+class PolicyControl:
+    """An exported policy, its observations and its actions, for one robot."""
+
+    def __init__(self, folder: Path, meta: Json) -> None:
+        for action in meta["actions"]:
+            if action["kind"] == "ctrl":
+                raise ValueError(
+                    f"export.json: the action {action['name']!r} writes controls of a model's actuators, which a robot "
+                    "does not have: train with actions of joints"
+                )
+        self.meta = meta
+        self.joints = DescribedJoints(meta)
+        self.observe = Network(folder / "obs.onnx", meta["obs"]["states"], meta["obs"]["output"])
+        self.policy = Policy(folder, meta)
+        self.command: dict[str, Array] = {}
+        for name, spec in meta["commands"].items():
+            self.command[name] = np.zeros(check_count(f"commands.{name}.size", spec["size"]))
+        self.estimated: list[str] = []
+        self.needs_root = False
+        self.sources: dict[str, Reading] = {}
+        for node in meta["obs"]["measurements"]:
+            self.sources[node["input"]] = self._source(node)
+        self.terms = [clipped_and_scaled(spec) for spec in meta["observations"]]
+        self.stops = np.cumsum([spec["size"] for spec in meta["observations"]])
+        self.resets: list[Callable[[], None]] = []
+        # Delays are of the training: a robot has lags of its own.
+        self.chain: list[Stage] = []
+        for spec in meta["action_chain"]:
+            if spec["kind"] != "delay":
+                self.chain.append(stage(spec, self.resets))
+        self.actions = [JointAction(spec, self.resets) for spec in meta["actions"]]
+        self.places = [self.joints.columns(action.names) for action in self.actions]
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin an episode: forget states, actions and time; commands stay."""
+        self.steps = 0
+        self.action = np.zeros(self.meta["policy"]["num_actions"])
+        self.last_action = self.action
+        still = np.zeros(len(self.joints.names))
+        self.targets = {"pos": self.joints.default_pos.copy(), "vel": still, "effort": still}
+        self.observe.reset()
+        self.policy.reset()
+        for forget in self.resets:
+            forget()
+
+    def lacking(self, measurement: Measurement) -> list[str]:
+        """Return the inputs of `obs.onnx` that a robot's measurements do not give."""
+        found = [name for name in self.estimated if name not in measurement.estimates]
+        if self.needs_root and measurement.root_quat is None:
+            found.append("root_quat")
+        if self.needs_root and measurement.root_ang_vel is None:
+            found.append("root_ang_vel")
+        return found
+
+    def __call__(self, measurement: Measurement) -> JointCommand:
+        """Run one step of the policy, and return what it asks of the motors."""
+        given = {}
+        for name, source in self.sources.items():
+            given[name] = source(measurement)
+        raw = np.split(self.observe.run(given), self.stops[:-1])
+        self.observe.advance()
+        frame = [term(part) for term, part in zip(self.terms, raw, strict=True)]
+        action = self.policy(np.concatenate(frame))
+        for change in self.chain:
+            action = change(action)
+        self.last_action = self.action
+        self.action = action
+        targets = {}
+        for kind, values in self.targets.items():
+            targets[kind] = values.copy()
+        # The model's own pose: robots have no other.
+        for asked, places in zip(self.actions, self.places, strict=True):
+            encoders = measurement.joint_pos[places]
+            for kind, values in asked(action, encoders, np.zeros(len(places))).items():
+                targets[kind][places] = values
+        self.targets = targets
+        self.steps += 1
+        return JointCommand(
+            pos=targets["pos"],
+            vel=targets["vel"],
+            # What a target of effort is in the model, a motor exerts at its joint.
+            effort=self.joints.effort_scale * targets["effort"],
+            stiffness=self.joints.stiffness,
+            damping=self.joints.damping,
+        )
+
+    def _source(self, node: Json) -> Reading:
+        """Return what fills an input of `obs.onnx`: what is none of the loop's own is an estimate of the robot."""
+        quantity = node["quantity"]
+        if quantity in OF_TARGETS:
+            kind = OF_TARGETS[quantity]
+            columns = self.joints.columns(node["joints"])
+            return lambda _: self.targets[kind][columns]
+        if quantity in OF_JOINTS:
+            return self._of_joints(quantity, self.joints.columns(node["joints"]))
+        if quantity in OF_ROOT:
+            return self._of_root(quantity, node.get("frame", "root"))
+        if quantity == "command":
+            name = node["command"]
+            return lambda _: self.command[name]
+        if quantity == "default_joint_pos":
+            default = self.joints.default_pos[self.joints.columns(node["joints"])]
+            return lambda _: default
+        if quantity == "encoder_bias":
+            # Readings of a robot have it in them.
+            zeros = np.zeros(len(node["joints"]))
+            return lambda _: zeros
+        step_dt = float(self.meta["step_dt"])
+        of_the_loop: dict[str, Reading] = {
+            "action": lambda _: self.action,
+            "last_action": lambda _: self.last_action,
+            "terminated": lambda _: np.array([False]),
+            "step": lambda _: np.array([self.steps]),
+            "time_out_offset": lambda _: np.zeros(1),
+            "time": lambda _: np.array([self.steps * step_dt]),
+        }
+        if quantity in of_the_loop:
+            return of_the_loop[quantity]
+        name = node["input"]
+        self.estimated.append(name)
+        return lambda measurement: measurement.estimates[name]
+
+    def _of_joints(self, quantity: str, columns: Array) -> Reading:
+        default = self.joints.default_pos[columns]
+        readings: dict[str, Reading] = {
+            "joint_pos": lambda measured: measured.joint_pos[columns],
+            "joint_pos_rel": lambda measured: measured.joint_pos[columns] - default,
+            "joint_vel": lambda measured: measured.joint_vel[columns],
+            "joint_effort": lambda measured: measured.joint_effort[columns],
+        }
+        return readings[quantity]
+
+    def _of_root(self, quantity: str, frame: str) -> Reading:
+        self.needs_root = True
+
+        def quat(measured: Measurement) -> Array:
+            assert measured.root_quat is not None  # `lacking` was asked
+            return measured.root_quat
+
+        def ang_vel(measured: Measurement) -> Array:
+            assert measured.root_ang_vel is not None  # `lacking` was asked
+            if frame == "root":
+                return measured.root_ang_vel
+            return to_world_axes(quat(measured), measured.root_ang_vel)
+
+        readings: dict[str, Reading] = {
+            "root_quat": quat,
+            "projected_gravity": lambda measured: to_root_axes(quat(measured), DOWN),
+            "root_ang_vel": ang_vel,
+        }
+        return readings[quantity]

@@ -1,0 +1,109 @@
+"""What passes between a loop and a robot: measurements one way, commands of joints the other."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from ksim_rl.export.standalone.files import Array, Json
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """What a robot measured at one moment; arrays have the joints of `joints.names` in export.json, in this order.
+
+    Attributes:
+        stamp: when it arrived, s of `time.monotonic`.
+        joint_pos: rad, or m for slides.
+        joint_vel: per second.
+        joint_effort: N m, or N.
+        root_quat: attitude of the root (w, x, y, z); None of a robot that is fixed to the world.
+        root_ang_vel: rad/s, in the root's own axes: x forward, y left, z up.
+        estimates: what else `obs.onnx` reads, by the names of its inputs, such as `sensor_imu_ang_vel`.
+    """
+
+    stamp: float
+    joint_pos: Array
+    joint_vel: Array
+    joint_effort: Array
+    root_quat: Array | None = None
+    root_ang_vel: Array | None = None
+    estimates: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointCommand:
+    """What motors are asked for, by joint, in the order of `joints.names`; a joint without a motor has zeros.
+
+    A motor exerts `effort + stiffness * (pos - measured pos) + damping * (vel - measured vel)`.
+    """
+
+    pos: Array
+    vel: Array
+    effort: Array
+    stiffness: Array
+    damping: Array
+
+
+class Robot(Protocol):
+    """What a loop asks of a robot; none of these may wait for the robot."""
+
+    def read(self) -> Measurement | None:
+        """Return the newest measurement, or None before the first."""
+        ...
+
+    def write(self, command: JointCommand) -> None:
+        """Send a command."""
+        ...
+
+    def close(self) -> None:
+        """End the connection; motors are left as the last command has them."""
+        ...
+
+
+class DescribedJoints:
+    """The joints of export.json: gains, the pose that a policy stands in, and what they may not pass."""
+
+    def __init__(self, meta: Json) -> None:
+        joints = meta["joints"]
+        limits = joints["limits"]
+        self.names: list[str] = joints["names"]
+        self.default_pos = np.array(joints["default_pos"], float)
+        self.stiffness = np.array(joints["stiffness"], float)
+        self.damping = np.array(joints["damping"], float)
+        self.effort_scale = np.array(joints["effort_scale"], float)
+        self.lowest = _or([low for low, _ in limits["position"]], -np.inf)
+        self.highest = _or([high for _, high in limits["position"]], np.inf)
+        self.most_effort = _or(limits["effort"], np.inf)
+        self.most_speed = _or(limits["velocity"], np.inf)
+        asked = set(meta["joint_names"])
+        driven = [name in asked for name in self.names]
+        self.driven = np.array(driven, bool) | (self.stiffness > 0.0) | (self.damping > 0.0)
+
+    def columns(self, names: list[str]) -> Array:
+        """Return the places of some joints."""
+        return np.array([self.names.index(name) for name in names], int)
+
+
+def _or(values: list[float | None], otherwise: float) -> Array:
+    # JSON has no infinity: None is a side without a bound.
+    numbers = np.array(values, float)
+    return np.where(np.isnan(numbers), otherwise, numbers)
+
+
+def to_root_axes(quat: Array, vector: Array) -> Array:
+    """Return a vector of the world in the axes of a root whose attitude is `quat` (w, x, y, z), of length 1."""
+    turned_back = quat * np.array([1.0, -1.0, -1.0, -1.0])
+    return to_world_axes(turned_back, vector)
+
+
+def to_world_axes(quat: Array, vector: Array) -> Array:
+    """Return a vector of a root's axes in those of the world."""
+    axis = quat[1:]
+    twice = 2.0 * np.cross(axis, vector)
+    return vector + quat[0] * twice + np.cross(axis, twice)
+
+
+DOWN = np.array([0.0, 0.0, -1.0])
+"""Gravity's direction in the world."""

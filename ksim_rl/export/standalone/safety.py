@@ -1,0 +1,151 @@
+"""What ends a loop's motion: measurements that are late, wrong or beyond limits; and the limit of a motor's torque."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ksim_rl.export.standalone.files import Array
+from ksim_rl.export.standalone.robot_link import (
+    DOWN,
+    DescribedJoints,
+    JointCommand,
+    Measurement,
+    to_root_axes,
+)
+
+
+class Fault(Exception):  # noqa: N818
+    """Why motors are damped from now on, in one line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What a robot may not pass.
+
+    Attributes:
+        late_periods: periods without a new message, or by which the loop itself may be late.
+        most_tilt: of the root's z axis from the vertical, rad.
+        position_margin: beyond the limits of positions in export.json, rad or m.
+        most_speed: of joints whose motors have no speed limit in export.json, rad/s or m/s.
+        effort_share: of the effort limits in export.json that commands may ask for.
+    """
+
+    late_periods: float = 3.0
+    most_tilt: float = 1.0
+    position_margin: float = 0.2
+    most_speed: float = 35.0
+    effort_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            lowest = 1.0 if field.name == "late_periods" else 0.0
+            highest = 1.0 if field.name == "effort_share" else math.inf
+            if not lowest <= value <= highest:
+                option = field.name.replace("_", "-")
+                raise ValueError(f"--{option} {value:g}: expected {lowest:g} to {highest:g}")
+
+
+class Watch:
+    """Finds what is wrong with a robot's measurements; each method raises Fault with one line that names it."""
+
+    def __init__(self, joints: DescribedJoints, limits: Limits, period: float) -> None:
+        self.joints = joints
+        self.limits = limits
+        self.longest = limits.late_periods * period
+        no_limit = np.isinf(joints.most_speed)
+        self.most_speed = np.where(no_limit, limits.most_speed, joints.most_speed)
+
+    def message(self, now: float, measurement: Measurement | None) -> Measurement:
+        """Refuse a measurement that is missing, late, incomplete or not finite."""
+        if measurement is None:
+            raise Fault("no message from the robot")
+        age = now - measurement.stamp
+        if age > self.longest:
+            raise Fault(
+                f"no message from the robot for {age:.3f} s: expected one in {self.longest:.3f} s"
+            )
+        self._numbers(measurement)
+        return measurement
+
+    def _numbers(self, measurement: Measurement) -> None:
+        names = self.joints.names
+        for what in ("joint_pos", "joint_vel", "joint_effort"):
+            values = getattr(measurement, what)
+            if values.shape != (len(names),):
+                raise Fault(f"{what} has the shape {values.shape}: expected ({len(names)},)")
+            bad = np.flatnonzero(~np.isfinite(values))
+            if bad.size:
+                raise Fault(f"{what} of {names[bad[0]]} is {values[bad[0]]}")
+        others = {"root_quat": measurement.root_quat, "root_ang_vel": measurement.root_ang_vel}
+        for what, values in (others | dict(measurement.estimates)).items():
+            if values is not None and not np.isfinite(values).all():
+                raise Fault(f"{what} is {values.tolist()}")
+        if measurement.root_quat is not None:
+            length = float(np.linalg.norm(measurement.root_quat))
+            if not 0.99 <= length <= 1.01:
+                raise Fault(f"root_quat has the length {length:.3f}: expected 1")
+
+    def motion(self, measurement: Measurement) -> None:
+        """Refuse joints that are out of their limits, or too fast, and a robot that falls."""
+        joints = self.joints
+        margin = self.limits.position_margin
+        low = joints.lowest - margin
+        high = joints.highest + margin
+        pos = measurement.joint_pos
+        for place in np.flatnonzero((pos < low) | (pos > high)):
+            raise Fault(
+                f"{joints.names[place]} is at {pos[place]:.3f}: expected {low[place]:.3f} to {high[place]:.3f}"
+            )
+        speed = np.abs(measurement.joint_vel)
+        for place in np.flatnonzero(speed > self.most_speed):
+            raise Fault(
+                f"{joints.names[place]} moves with {speed[place]:.1f} per s: expected at most "
+                f"{self.most_speed[place]:.1f}"
+            )
+        if measurement.root_quat is not None:
+            tilt = tilt_of(measurement.root_quat)
+            if tilt > self.limits.most_tilt:
+                raise Fault(
+                    f"tilted by {math.degrees(tilt):.0f} degrees: expected at most "
+                    f"{math.degrees(self.limits.most_tilt):.0f}"
+                )
+
+
+def tilt_of(root_quat: Array) -> float:
+    """Return the angle between a root's z axis and the vertical, rad."""
+    down = to_root_axes(root_quat, DOWN)
+    return math.acos(min(1.0, max(-1.0, -float(down[2]))))
+
+
+class EffortLimit:
+    """Moves targets so far that motors stay within their effort limits at the measured state, and counts that."""
+
+    def __init__(self, joints: DescribedJoints, share: float) -> None:
+        self.names = joints.names
+        self.most = share * joints.most_effort
+        self.counts = np.zeros(len(joints.names), int)
+
+    def __call__(self, command: JointCommand, measurement: Measurement) -> JointCommand:
+        """Return the command whose efforts, at the measured positions and speeds, are within the limits."""
+        away = command.pos - measurement.joint_pos
+        faster = command.vel - measurement.joint_vel
+        effort = command.effort + command.stiffness * away + command.damping * faster
+        excess = np.clip(effort, -self.most, self.most) - effort
+        over = excess != 0.0
+        if not over.any():
+            return command
+        self.counts += over
+        # By the target where a stiffness makes effort of it, else by the effort itself.
+        is_stiff = command.stiffness > 0.0
+        divisor = np.where(is_stiff, command.stiffness, 1.0)
+        pos = command.pos + np.where(is_stiff, excess / divisor, 0.0)
+        feed_forward = command.effort + np.where(is_stiff, 0.0, excess)
+        return dataclasses.replace(command, pos=pos, effort=feed_forward)
+
+    def clipped(self) -> dict[str, int]:
+        """Return how many commands were moved, by joint, of those that were."""
+        places = np.flatnonzero(self.counts)
+        return {self.names[place]: int(self.counts[place]) for place in places}

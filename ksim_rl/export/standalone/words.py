@@ -1,0 +1,111 @@
+"""Words of an operator: stand, policy, stop, damp, and numbers of a command."""
+
+import math
+import queue
+import signal
+import threading
+from collections.abc import Sequence
+from types import FrameType
+from typing import Protocol, TextIO
+
+from ksim_rl.export.standalone.states import State, StateMachine
+
+REST_S = 1.0
+"""With damped motors at the beginning, where nobody says more."""
+
+
+class Operator(Protocol):
+    """Whoever says what comes next."""
+
+    def words(self, now: float, machine: StateMachine) -> list[str]:
+        """Return what was said since the last period."""
+        ...
+
+
+class Keyboard:
+    """Lines of a terminal: each is a word, or the numbers of a command; an empty line is `stop`."""
+
+    def __init__(self, lines: TextIO) -> None:
+        self.lines = lines
+        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        threading.Thread(target=self._listen, name="keyboard", daemon=True).start()
+
+    def _listen(self) -> None:
+        for line in self.lines:
+            self.said.put(line.strip() or "stop")
+        # Nobody can stop it any more.
+        self.said.put("stop")
+
+    def words(self, now: float, machine: StateMachine) -> list[str]:
+        """Return what was said since the last period."""
+        found = []
+        while not self.said.empty():
+            found.append(self.said.get())
+        return found
+
+
+class Unattended:
+    """Says what leads from one state to the next: stand after a rest, policy, and stop after some seconds of it."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self.began: float | None = None
+
+    def words(self, now: float, machine: StateMachine) -> list[str]:
+        """Return the word that leads on from a state that is done."""
+        if machine.fault or machine.ends_at < math.inf:
+            return []
+        if self.began is None:
+            self.began = now
+        if machine.state is State.DAMP and now - self.began >= REST_S:
+            return ["stand"]
+        if machine.is_standing(now):
+            return ["policy"]
+        if machine.state is State.POLICY and now - machine.since >= self.seconds:
+            return ["stop"]
+        return []
+
+
+class Interrupts:
+    """Makes `stop` of the first interrupt or end that the system sends to this process, and `damp` of the next."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.said = 0
+
+    def listen(self) -> None:
+        """Take the place of Python's handlers, which would leave the loop."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._heard)
+
+    def _heard(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+
+    def words(self, now: float, machine: StateMachine) -> list[str]:
+        """Return a word for each signal since the last period."""
+        found = []
+        while self.said < self.count:
+            found.append("damp" if self.said else "stop")
+            self.said += 1
+        return found
+
+
+def sort_words(said: Sequence[str], machine: StateMachine, now: float) -> list[str]:
+    """Return the words among what was said, and take over what are numbers of the policy's first command."""
+    found = []
+    for line in said:
+        try:
+            values = [float(part) for part in line.split()]
+        except ValueError:
+            found.append(line)
+            continue
+        commands = machine.control.command
+        first = next(iter(commands), None)
+        wanted = 0 if first is None else len(commands[first])
+        is_finite = all(math.isfinite(value) for value in values)
+        if first is None or len(values) != wanted or not is_finite:
+            machine.note(now, f"operator: {line!r}: expected {wanted} numbers")
+            continue
+        commands[first][:] = values
+        machine.note(now, f"operator: {first} {line}")
+    return found
