@@ -140,7 +140,7 @@ def _time_step(given: float | None, cfg: ManagerBasedRlEnvCfg | None) -> float:
 def _read(path: Path, robot: HeldRobot) -> JointLog:
     log = read_log(path, robot)
     if log.unread:
-        show(f"columns that are not read: {', '.join(log.unread)}")
+        show(f"not read: {', '.join(log.unread)}")
     return log
 
 
@@ -191,7 +191,11 @@ def _parser() -> OneLineParser:
         description="Find armature, damping, dry friction, gains, torque constants and the delay of a robot's joints.",
     )
     parser.add_argument(
-        "log", nargs="?", type=Path, metavar="LOG", help="commands and encoders: .csv or .parquet"
+        "log",
+        nargs="?",
+        type=Path,
+        metavar="LOG",
+        help="commands and encoders: .csv, .parquet or .mcap",
     )
     parser.add_argument(
         "--robot", help="that the log is of: a name of the package, or the path of a model"

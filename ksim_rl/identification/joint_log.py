@@ -1,8 +1,9 @@
 """Reads logs of commands and encoders, and refuses those that would be fitted to nonsense.
 
-A log is a table with the column `time` (s) and, for each joint, `<joint>.position` (the encoder, rad or m) and what was
-commanded: `<joint>.target_position`, `.target_velocity` and `.target_effort` (rad or m, per second, N m or N). Each
-command holds until the next line. `<joint>.effort` is a measured effort, which actuator networks are fitted to.
+A log is a table, CSV, Parquet or MCAP, with the column `time` (s) and, for each joint, `<joint>.position` (the encoder,
+rad or m) and what was commanded: `<joint>.target_position`, `.target_velocity` and `.target_effort` (rad or m, per
+second, N m or N). Each command holds until the next line. `<joint>.effort` is a measured effort, to which actuator
+networks are fitted.
 """
 
 import io
@@ -16,6 +17,7 @@ from jaxtyping import Float
 from ksim_rl.checks import near
 from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
 from ksim_rl.identification.held_robot import DrivenJoint, HeldRobot
+from ksim_rl.identification.mcap_log import read_mcap
 from ksim_rl.identification.simulation import Targets
 from ksim_rl.scene.state.joint_control import TargetKind
 
@@ -51,7 +53,7 @@ class JointLog:
     effort_TN: Float[Array, "T N"] | None = None
     """Measured efforts, N m or N, where the log has them."""
     unread: tuple[str, ...] = ()
-    """Columns of the file that are no part of this."""
+    """Columns and topics of the file that are no part of this."""
 
     def part(self, columns: Sequence[int]) -> "JointLog":
         """Return the log of some of the joints."""
@@ -67,8 +69,8 @@ class JointLog:
 
 
 def read_log(path: Path, robot: HeldRobot) -> JointLog:
-    """Read a CSV or Parquet file with the joints of a robot; a ValueError names the column or joint, and the fix."""
-    columns = _read_columns(path)
+    """Read a log of the joints of a robot; a ValueError names the column or joint, and the fix."""
+    columns, left_out = _read_columns(path)
     if TIME not in columns:
         raise ValueError(f"{path}: no column {TIME!r} (s): {near(TIME, columns)}")
     time_T = columns[TIME]
@@ -104,7 +106,7 @@ def read_log(path: Path, robot: HeldRobot) -> JointLog:
         pos_TN=np.stack(positions, axis=1),
         targets=Targets(time_T=time_T - time_T[0], by_kind=by_kind),
         effort_TN=effort_TN,
-        unread=tuple(name for name in columns if name not in read),
+        unread=(*(name for name in columns if name not in read), *left_out),
     )
     for place, joint in enumerate(robot.joints):
         _check_joint(path, joint, log, place)
@@ -127,13 +129,19 @@ def _of_joints(
     return np.stack([columns[name] for name in names], axis=1)
 
 
-def _read_columns(path: Path) -> dict[str, Float[Array, " T"]]:
-    """Return the columns of numbers of a table by their names."""
+def _read_columns(path: Path) -> tuple[dict[str, Float[Array, " T"]], list[str]]:
+    """Return the columns of numbers of a table by their names, and what of the file is no part of it."""
     data = read_bytes(path, limit=MOST_TEXT_BYTES, follows_links=True)
+    if path.suffix == ".mcap":
+        return read_mcap(path, data, time=TIME, most_cells=MOST_CELLS)
     if path.suffix == ".parquet":
-        return _read_parquet(path, data)
-    if path.suffix != ".csv":
-        raise ValueError(f"{path}: expected a file that ends in .csv or .parquet")
+        return _read_parquet(path, data), []
+    if path.suffix == ".csv":
+        return _read_csv(path, data), []
+    raise ValueError(f"{path}: expected a file that ends in .csv, .parquet or .mcap")
+
+
+def _read_csv(path: Path, data: bytes) -> dict[str, Float[Array, " T"]]:
     try:
         head, _, body = data.decode().partition("\n")
     except UnicodeDecodeError:

@@ -130,9 +130,9 @@ def test_what_is_wrong_is_said_by_name(robot, tmp_path, fault):
 
 
 def test_other_files_are_refused(robot, tmp_path):
-    (tmp_path / "log.mcap").write_bytes(b"")
-    with pytest.raises(ValueError, match="ends in .csv or .parquet"):
-        read_log(tmp_path / "log.mcap", robot)
+    (tmp_path / "log.db3").write_bytes(b"")
+    with pytest.raises(ValueError, match="ends in .csv, .parquet or .mcap"):
+        read_log(tmp_path / "log.db3", robot)
     (tmp_path / "log.csv").write_bytes(b"\xff\xfe")
     with pytest.raises(ValueError, match="it is no text"):
         read_log(tmp_path / "log.csv", robot)
