@@ -10,7 +10,7 @@ ARGS ?=
 # Whole files go to one worker, since their tests share envs and compiled kernels.
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup train check lint types imports house docs test test-full test-oldest test-newest dist figures clean
+.PHONY: setup train check lint types imports house headers docs test test-full test-oldest test-newest dist figures clean
 
 setup: $(STAMP)
 
@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 train: setup
 	$(BIN)/ksim-rl train $(if $(findstring task=,$(ARGS)),,task=pendulum_swingup) $(ARGS)
 
-check: lint types imports house
+check: lint types imports house headers
 
 lint: setup
 	$(BIN)/ruff check .
@@ -40,6 +40,10 @@ imports: setup
 
 house: setup
 	$(BIN)/python -m tests.house
+
+# C++ compiles header by header, where there is a compiler.
+headers: setup
+	$(BIN)/python -m tests.headers
 
 # Warnings, such as links that lead nowhere, are errors (with --quiet they would not be).
 docs: setup

@@ -1,8 +1,8 @@
 """Finds the kernels of the package, and has for each the test that compares its bits.
 
-Kernels are Triton functions that are launched, Warp's, and what `QuickLaunch` and `native.launcher` make of C++, by the
-function that makes them or the name that they get. Their bits are those of equal runs, of other numbers of lanes, or of
-what they must come to; tests in tests/gpu run where there is a GPU.
+Kernels are Triton functions that are launched, Warp's, and what `QuickLaunch`, `launch_of` and `native.launcher` make
+of C++, by the function that makes them or the name that they get. Their bits are those of equal runs, of other numbers
+of lanes, or of what they must come to; tests in tests/gpu run where there is a GPU.
 """
 
 import ast
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from tests.docs.guide import REPOSITORY
 
-MAKERS = ("QuickLaunch", "launcher")
+MAKERS = ("QuickLaunch", "launch_of", "launcher")
 EQUAL_WORLDS = "gpu/test_repeatability.py::test_equal_worlds_stay_equal_bit_for_bit"
 CAPTURED_STEPS = "gpu/test_fused_ppo.py::test_captured_steps_are_the_eager_ones_bit_for_bit"
 LAYERS = "gpu/test_off_policy.py::test_layers_in_half_precision_err_as_torch_does"
@@ -24,6 +24,7 @@ TESTS = {
         "_launcher": "gpu/test_copying.py::test_copies_of_all_types_widths_and_layouts_are_exact"
     },
     "device/native_kernel.py": {"kernel": EQUAL_WORLDS},
+    "device/quick_launch.py": {"launch_of": EQUAL_WORLDS},
     "device/random.py": {
         "_launch": "gpu/test_transforms.py::test_draws_are_the_hash_that_they_say_they_are"
     },

@@ -227,7 +227,7 @@ def _count_non_finite(
     ]
     body += [f"const long long place = {plain.at(step, [])} * {table.shape[0]} + row;"]
     body += [
-        f"count_up(&{plain.at(count, ['term'])}); least(&{plain.at(first, ['term'])}, place); }}"
+        f"count_up(&{plain.at(count, ['term'])}); keep_least(&{plain.at(first, ['term'])}, place); }}"
     ]
     cells.loop(table.shape[1:], body)
 

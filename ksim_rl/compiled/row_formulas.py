@@ -85,38 +85,6 @@ TESTS = {
     "lt": "a < b",
     "ne": "a != b",
 }
-PRELUDE = r"""
-    auto high = [](auto x, auto y) { return x > y || x != x ? x : (decltype(x))y; };
-    auto low = [](auto x, auto y) { return x < y || x != x ? x : (decltype(x))y; };
-    auto count_up = [](long long* count) {
-    #if defined(__CUDA_ARCH__)
-        atomicAdd((unsigned long long*)count, 1ull);
-    #else
-        *count += 1;
-    #endif
-    };
-    auto least = [](long long* kept, long long value) {
-    #if defined(__CUDA_ARCH__)
-        atomicMin((unsigned long long*)kept, (unsigned long long)value);
-    #else
-        *kept = value < *kept ? value : *kept;
-    #endif
-    };
-    // Exact to rounding, by W. Kahan; not every compiler's library has them.
-    auto log_1_plus = [](auto x) {
-        const auto u = 1 + x;
-        return u == 1 ? x : u - 1 == u ? log(u) : log(u) * x / (u - 1);
-    };
-    auto exp_less_1 = [](auto x) {
-        const auto u = exp(x);
-        return u == 1 ? x : u - 1 == u ? u : u - 1 == -1 ? (decltype(x))-1 : (decltype(x))((u - 1) * x / log(u));
-    };
-    auto modulo = [](auto x, auto y) {
-        auto rest = (decltype(x))(x - (decltype(x))(long long)(x / y) * y);
-        if constexpr ((decltype(x))0.5 != 0) rest = (decltype(x))fmod(x, y);
-        return rest != 0 && (rest < 0) != (y < 0) ? (decltype(x))(rest + y) : rest;
-    };
-"""
 
 
 def write_pointwise(

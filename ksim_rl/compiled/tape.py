@@ -15,10 +15,10 @@ import warp as wp
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.compiled import row_code, row_formulas
+from ksim_rl.compiled import row_code
 from ksim_rl.compiled.cells import CTYPES, Cells, Element, Loop, NotARowError
 from ksim_rl.compiled.lanes import BLOCK, DEAL, LANES, SHARED, Own, Work, schedule, source
-from ksim_rl.device import kernel_loading, random
+from ksim_rl.device import headers, kernel_loading
 from ksim_rl.device.extents import extent
 from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, arguments_of
 from ksim_rl.device.recording import Operation, Recorder
@@ -29,6 +29,7 @@ MOST_OPERATIONS = 200
 """At most so many operations in one kernel; its compilation takes longer the more there are."""
 MOST_BYTES = 40_000
 """Shared memory of a block for the arrays of its rows; a kernel that needs more gets one thread per row."""
+_FUNCTIONS = headers.text_of("ksim_rl/compiled/row_formulas.cuh")
 # All rows add to the same numbers, in an order that does not matter.
 _COUNTS = frozenset({"count_non_finite"})
 
@@ -346,9 +347,12 @@ class Tape:
         body = source(works, own, kinds, read if lanes else None)
         body = [f"auto run = [&]({pointers}) {{", *body, "};", f"run({calls});"]
         sizes = f"#define LANES {max(lanes, 1)}\n#define BLOCK {BLOCK}"
-        text = "\n".join([sizes, DEAL, random.DRAWS, row_formulas.PRELUDE, *body])
+        used = "using namespace draws;\nusing namespace row_formulas;"
+        text = "\n".join([sizes, DEAL, used, *body])
         fields = " ".join(names[place] for place in given)
-        launch = QuickLaunch(arguments_of((ADDRESS, fields)), text, block_dim=BLOCK)
+        launch = QuickLaunch(
+            arguments_of((ADDRESS, fields)), text, preamble=_FUNCTIONS, block_dim=BLOCK
+        )
         kernel.launch = partial(launch, self._device, (self._num_rows, max(lanes, 1)), *given)
         # Tensors that only this kernel uses need no reference here.
         self._kept += [

@@ -6,15 +6,11 @@ from functools import cache
 from jaxtyping import Shaped
 from torch import Tensor
 
+from ksim_rl.device import headers
 from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, arguments_of
 
 LANES = 32
-_COPY = """
-    auto copy = [&](auto* to, const auto* from, size_t width, size_t to_stride, size_t from_stride) {
-        for (size_t i = lane; i < width; i += LANES)
-            to[row * to_stride + i] = from[row * from_stride + i];
-    };
-"""
+_COPY = headers.text_of("ksim_rl/device/copying.cuh", {"LANES": LANES})
 
 
 def copy_rows(
@@ -47,11 +43,12 @@ def copy_rows(
 @cache
 def _launcher(layouts: tuple[tuple[int, int, int, int], ...]) -> QuickLaunch:
     """Return the copy of tensors, each in units of so many bytes: of a row, and from row to row in both."""
-    lines = [f"constexpr int LANES = {LANES};", _COPY]
     # Sizes are compiled in, so that the kernel needs addresses only.
+    lines: list[str] = []
     for place, (unit, *sizes) in enumerate(layouts):
         kind = "int" if unit == 4 else "char"
         numbers = ", ".join(map(str, sizes))
-        lines.append(f"copy(({kind}*)a.to_{place}, (const {kind}*)a.from_{place}, {numbers});")
+        tensors = f"({kind}*)a.to_{place}, (const {kind}*)a.from_{place}"
+        lines.append(f"copying::copy_row(row, lane, {tensors}, {numbers});")
     fields = " ".join(f"to_{place} from_{place}" for place in range(len(layouts)))
-    return QuickLaunch(arguments_of((ADDRESS, fields)), "\n".join(lines))
+    return QuickLaunch(arguments_of((ADDRESS, fields)), "\n".join(lines), preamble=_COPY)

@@ -22,7 +22,7 @@ class Keys(NamedTuple):
 
 
 def mix(x: Int64[Tensor, "*shape"]) -> Int64[Tensor, "*shape"]:
-    """Mix 32 bits, as `draws.cpp` does."""
+    """Mix 32 bits, as `draws.cuh` does."""
     # Constants of Wellons' hash: the product is cut to 32 bits after each step.
     x = ((x ^ (x >> 16)) * 0x21F0AAAD) & MASK
     x = ((x ^ (x >> 15)) * 0xD35A2D97) & MASK

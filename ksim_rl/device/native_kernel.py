@@ -28,6 +28,8 @@ class NativeKernel:
         fields: Mapping[str, type | str],
         source: str,
         indices: tuple[str, str],
+        *,
+        preamble: str,
         block_dim: int,
     ) -> None:
         types = {name: _type_of(kind) for name, kind in fields.items()}
@@ -37,7 +39,12 @@ class NativeKernel:
         @wp.func_native(f"const int {indices[0]} = index_0, {indices[1]} = index_1;\n{source}")
         def run(index_0: int, index_1: int, a: arguments): ...  # type: ignore[valid-type]
 
-        @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+        @wp.kernel(
+            module="unique",
+            enable_backward=False,
+            grid_stride=False,
+            module_options={"extra_build_options": upstream.with_preamble(preamble)},
+        )
         def kernel(a: arguments):  # type: ignore[valid-type]
             index_0, index_1 = wp.tid()
             run(index_0, index_1, a)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
 from importlib.resources import files
 from inspect import signature
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from weakref import WeakSet
 
@@ -16,7 +17,7 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.device import recording
+from ksim_rl.device import headers, recording
 
 if TYPE_CHECKING:
     import warp as wp
@@ -42,10 +43,37 @@ def source_of(package: str, *parts: str) -> str:
     return "".join((files(package) / f"{part}.cpp").read_text() for part in parts)
 
 
+_KINDS: dict[str, type | str] = {
+    "int": int,
+    "float": float,
+    "long long": "int64",
+    "unsigned": "uint32",
+}
+
+
+def launch_of(header: str, constants: Mapping[str, int] | None = None) -> "QuickLaunch":
+    """Return the launch of the kernel of a header; see `headers`.
+
+    Its `run` gets the two indices of a thread and the struct `Arguments`, whose fields are the values of a launch in
+    order: numbers, and addresses of tensors where it has pointers. The constants are those that the header is given.
+    """
+    text = headers.text_of(header, constants)
+    name = PurePosixPath(header).stem
+    fields = headers.arguments_of(text)
+    kinds: dict[str, type | str] = {}
+    values: list[str] = []
+    for field, ctype in fields.items():
+        kinds[field] = ADDRESS if ctype.endswith("*") else _KINDS[ctype]
+        values.append(f"({ctype})a.{field}")
+    call = f"{name}::run(row, lane, {name}::Arguments {{{', '.join(values)}}});"
+    return QuickLaunch(kinds, call, preamble=text)
+
+
 class QuickLaunch:
     """One kernel in C++ whose only argument, `a`, is a struct of numbers and addresses, launched on torch's stream.
 
-    The source runs for each pair of `indices` within the launch's dim. The kernel has no gradients. It is made at the
+    The source runs for each pair of `indices` within the launch's dim, and may use what the text of the `preamble`
+    defines. The kernel has no gradients. It is made at the
     first launch, so that a module with a kernel can be imported where there is no Warp.
     """
 
@@ -57,11 +85,13 @@ class QuickLaunch:
         source: str,
         indices: tuple[str, str] = ("row", "lane"),
         *,
+        preamble: str = "",
         block_dim: int = 256,
     ) -> None:
         self._arguments = arguments
         self._source = source
         self._indices = indices
+        self._preamble = preamble
         self._block_dim = block_dim
         self._kernel: NativeKernel | None = None
         self._making = threading.Lock()
@@ -93,7 +123,11 @@ class QuickLaunch:
         with self._making:
             if self._kernel is None:
                 self._kernel = NativeKernel(
-                    self._arguments, self._source, self._indices, self._block_dim
+                    self._arguments,
+                    self._source,
+                    self._indices,
+                    preamble=self._preamble,
+                    block_dim=self._block_dim,
                 )
         return self._kernel
 

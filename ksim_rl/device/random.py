@@ -22,10 +22,7 @@ from torch import Tensor
 
 from ksim_rl.device import draws_in_torch as in_torch
 from ksim_rl.device import group
-from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, arguments_of, as_operator, source_of
-
-DRAWS = source_of("ksim_rl.device", "draws")
-"""C++ of all kernels that draw: `key_of` once per row, `bits_of` per number, `unit` or `normal` of these bits."""
+from ksim_rl.device.quick_launch import as_operator, launch_of
 
 _UNIFORM, _NORMAL, _INTEGER, _ORDER = range(4)
 
@@ -106,18 +103,7 @@ def permutations(keys: RowKeys, n: int) -> Int64[Tensor, "E L"]:
 
 
 # On the CPU one thread fills all rows, in loops of vector instructions.
-_launch = QuickLaunch(
-    arguments_of(
-        (int, "rows columns n kind"),
-        (float, "low high"),
-        ("int64", "start span"),
-        ("uint32", "stream"),
-        (int, "counter_stride first_row"),
-        (ADDRESS, "seed counter out"),
-    ),
-    DRAWS + source_of("ksim_rl.device", "draw"),
-    indices=("part", "chunk"),
-)
+_launch = launch_of("ksim_rl/device/draw.cuh")
 
 
 def _draw_now(

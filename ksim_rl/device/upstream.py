@@ -86,6 +86,14 @@ def put_apart(kernels: Collection[wp.Kernel]) -> None:
             kernel.module = own
 
 
+def with_preamble(text: str) -> wp.ModuleBuildOptions:
+    """Return the options of a module whose C++ begins with a text, which is a part of its hash in Warp's cache.
+
+    Warp calls them experimental. Checked with Warp 1.19.
+    """
+    return wp.ModuleBuildOptions(extra_cpu_preamble=text, extra_cuda_preamble=text)
+
+
 def watch_loads(mend: Callable[[Path, Exception, int], None]) -> None:
     """Call `mend(folder, error, attempt)` where files of the cache cannot be read, and load that module once more.
 

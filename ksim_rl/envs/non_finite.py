@@ -6,32 +6,13 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator
+from ksim_rl.device.quick_launch import address, as_operator, launch_of
 
 # Beyond any place, so that a minimum over places replaces it.
 _NEVER = 2**62
 
 
-_ARGUMENTS = arguments_of(
-    (int, "width num_envs"), (ADDRESS, "table term_of_column step first count")
-)
-_quick = QuickLaunch(
-    _ARGUMENTS,
-    """
-    if (fabsf(((const float*)a.table)[(long long)row * a.width + column]) <= 3.402823466e38f) return;
-    const int term = ((const int*)a.term_of_column)[column];
-    const long long place = *(const long long*)a.step * a.num_envs + row;
-    #if defined(__CUDA_ARCH__)
-        atomicAdd((unsigned long long*)a.count + term, 1ull);
-        atomicMin((unsigned long long*)a.first + term, (unsigned long long)place);
-    #else
-        ((long long*)a.count)[term] += 1;
-        long long* first = (long long*)a.first + term;
-        *first = place < *first ? place : *first;
-    #endif
-""",
-    indices=("row", "column"),
-)
+_quick = launch_of("ksim_rl/device/non_finite.cuh")
 
 
 def _count_now(

@@ -8,14 +8,7 @@ from torch import Tensor, nn
 
 from ksim_rl.checks import check_in_range
 from ksim_rl.device import group
-from ksim_rl.device.quick_launch import (
-    ADDRESS,
-    QuickLaunch,
-    address,
-    arguments_of,
-    as_operator,
-    source_of,
-)
+from ksim_rl.device.quick_launch import address, as_operator, launch_of
 from ksim_rl.ranks.reduce import merged
 
 # Parts of a batch whose moments are taken side by side: at most so many, of at least so many rows. Short ones hold up
@@ -23,15 +16,7 @@ from ksim_rl.ranks.reduce import merged
 MOST_PARTS = 2048
 LEAST_ROWS = 16
 GROUP = 32
-# Stages 0 to 3 are of an element (which rows count), of a column of a part, of a group, and of the batch.
-_quick = QuickLaunch(
-    arguments_of(
-        (int, "stage num_rows dim rows parts groups ranks span"),
-        ("int64", "until"),
-        (ADDRESS, "values valid counts moments count mean squares"),
-    ),
-    f"constexpr int GROUP = {GROUP};\n" + source_of("ksim_rl.ranks", "moments"),
-)
+_quick = launch_of("ksim_rl/ranks/moments.cuh", {"GROUP": GROUP})
 
 
 def _count(

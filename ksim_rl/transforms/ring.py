@@ -12,26 +12,9 @@ from torch import Tensor
 
 from ksim_rl import ranks
 from ksim_rl.device import draws_in_torch as in_torch
-from ksim_rl.device.quick_launch import (
-    ADDRESS,
-    QuickLaunch,
-    address,
-    arguments_of,
-    as_operator,
-    source_of,
-)
-from ksim_rl.device.random import DRAWS
+from ksim_rl.device.quick_launch import address, as_operator, launch_of
 
-_ARGUMENTS = arguments_of(
-    (
-        int,
-        "width lanes num_bytes value_stride num_slots num_frames stride num_parts counts first_row",
-    ),
-    ("uint32", "stream"),
-    (int, "lowest span"),
-    (ADDRESS, "seed draw_count age lag mask parts value ring out"),
-)
-_quick = QuickLaunch(_ARGUMENTS, DRAWS + source_of("ksim_rl.transforms", "ring"))
+_quick = launch_of("ksim_rl/transforms/ring.cuh")
 _LANES = 32
 _MANY_LANES = 256
 """Threads that share a row on the GPU: a warp, or a block for large rows."""

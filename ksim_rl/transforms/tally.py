@@ -3,35 +3,9 @@
 import torch
 from torch import Tensor
 
-from ksim_rl.device.quick_launch import ADDRESS, QuickLaunch, address, arguments_of, as_operator
+from ksim_rl.device.quick_launch import address, as_operator, launch_of
 
-_ARGUMENTS = arguments_of((int, "rows"), (ADDRESS, "mask reward total step total_out step_out"))
-# The CPU's compiler takes parameters not to overlap, so that loops become vector instructions.
-_quick_tally = QuickLaunch(
-    _ARGUMENTS,
-    r"""
-    const int begin = part * a.rows, end = begin + a.rows;
-    auto begin_anew = [=](auto* __restrict__ kept, auto* __restrict__ out, const unsigned char* __restrict__ mask) {
-        for (int row = begin; row < end; ++row) out[row] = kept[row] = mask[row] ? 0 : kept[row];
-    };
-    auto add = [=](float* __restrict__ kept, float* __restrict__ out, const float* __restrict__ reward) {
-        for (int row = begin; row < end; ++row) out[row] = kept[row] = kept[row] + reward[row];
-    };
-    auto count = [=](long long* __restrict__ kept, long long* __restrict__ out) {
-        for (int row = begin; row < end; ++row) out[row] = kept[row] = kept[row] + 1;
-    };
-    float *total = (float*)a.total, *total_out = (float*)a.total_out;
-    long long *step = (long long*)a.step, *step_out = (long long*)a.step_out;
-    if (a.mask) {
-        begin_anew(total, total_out, (const unsigned char*)a.mask);
-        begin_anew(step, step_out, (const unsigned char*)a.mask);
-    } else {
-        add(total, total_out, (const float*)a.reward);
-        count(step, step_out);
-    }
-""",
-    indices=("part", "lane"),
-)
+_quick_tally = launch_of("ksim_rl/transforms/tally.cuh")
 
 
 def _tally(

@@ -8,55 +8,66 @@ from torch import Tensor
 
 from ksim_rl import ranks
 from ksim_rl.device import draws_in_torch as draws
-from ksim_rl.device.quick_launch import (
-    ADDRESS,
-    QuickLaunch,
-    address,
-    arguments_of,
-    as_operator,
-    source_of,
-)
-from ksim_rl.device.random import DRAWS
+from ksim_rl.device.quick_launch import address, as_operator, launch_of
 
-GAUSSIAN, MULTIPLY, BIAS_GAUSSIAN, BIAS_MULTIPLY, BY_LEVEL, HOLD = (1 << bit for bit in range(6))
-"""The bits of a column's flags; the bits above them are the number of its observation."""
+# The bits of a column's flags; the bits above them are the number of its observation.
+GAUSSIAN = 1
+MULTIPLY = 2
+BIAS_GAUSSIAN = 4
+BIAS_MULTIPLY = 8
+BY_LEVEL = 16
+HOLD = 32
 KEY_SHIFT = 6
 
-HAS_BIAS, HAS_WALK, HAS_RESOLUTION, HAS_DROPOUT, HAS_GAUSSIAN = (1 << bit for bit in range(5))
-"""Features that at least one column of the transform has; the common combinations have separate loops in the kernel."""
+# Features that at least one column of the transform has; common combinations have loops of their own in the kernel.
+HAS_BIAS = 1
+HAS_WALK = 2
+HAS_RESOLUTION = 4
+HAS_DROPOUT = 8
+HAS_GAUSSIAN = 16
 
-OFFSET, SPREAD, BIAS_OFFSET, BIAS_SPREAD, WALK_STD, RESOLUTION, DROPOUT = range(7)
-"""The rows of the table of parameters."""
+# The rows of the table of parameters.
+OFFSET = 0
+SPREAD = 1
+BIAS_OFFSET = 2
+BIAS_SPREAD = 3
+WALK_STD = 4
+RESOLUTION = 5
+DROPOUT = 6
 NUM_PARAMETERS = 7
 
 BIAS_INDEX = 0x40000000
 WALK_INDEX = 0x80000000
 DROPOUT_INDEX = 0xC0000000
-"""Where the draws of biases, of drifts and of lost readings begin among a row's draws, as in `noise.cpp`."""
+"""Where the draws of biases, of drifts and of lost readings begin among a row's draws, as in `noise.cuh`."""
 
 _MODES = {"forward": 0, "step": 1, "reset": 2}
 
 
-_ARGUMENTS = arguments_of(
-    (int, "n mode features first_row"),
-    ("uint32", "stream"),
-    (ADDRESS, "seed counter enabled level mask table flags clean bias walk last out"),
-)
 _LANES = 32
 """Threads that share a row on the GPU; the CPU has one, which takes the columns in vector instructions."""
 
-_DEVICE = f"""
-    #if defined(__CUDA_ARCH__)
-        #define LANES {_LANES}
-        #define SYNC __syncwarp();
-    #else
-        #define LANES 1
-        #define SYNC
-    #endif
-"""
-
-
-_quick = QuickLaunch(_ARGUMENTS, _DEVICE + DRAWS + source_of("ksim_rl.transforms.noise", "noise"))
+_CONSTANTS = {
+    "GPU_LANES": _LANES,
+    "HAS_BIAS": HAS_BIAS,
+    "HAS_WALK": HAS_WALK,
+    "HAS_RESOLUTION": HAS_RESOLUTION,
+    "HAS_DROPOUT": HAS_DROPOUT,
+    "HAS_GAUSSIAN": HAS_GAUSSIAN,
+    "GAUSSIAN": GAUSSIAN,
+    "MULTIPLY": MULTIPLY,
+    "BIAS_GAUSSIAN": BIAS_GAUSSIAN,
+    "BIAS_MULTIPLY": BIAS_MULTIPLY,
+    "BY_LEVEL": BY_LEVEL,
+    "HOLD": HOLD,
+    "KEY_SHIFT": KEY_SHIFT,
+    "OFFSET": OFFSET,
+    "BIAS_OFFSET": BIAS_OFFSET,
+    "WALK_STD": WALK_STD,
+    "RESOLUTION": RESOLUTION,
+    "DROPOUT": DROPOUT,
+}
+_quick = launch_of("ksim_rl/transforms/noise/noise.cuh", _CONSTANTS)
 
 
 def _launch(

@@ -1,0 +1,69 @@
+"""Reads the C++ headers of kernels: what they include, the struct that a kernel takes, and its constants.
+
+A kernel is a header `x.cuh` whose namespace `x` has a struct `Arguments` and a function `run`. Includes are written as
+paths from the root of the package, so that compilers and editors find them with that folder alone. Warp gets the text
+of all headers of a kernel, so that its cache has a kernel for each text.
+"""
+
+import re
+from collections.abc import Mapping
+from importlib.resources import files
+
+_INCLUDE = re.compile(r'(?m)^#include "(.*)"\n')
+_ARGUMENTS = re.compile(r"struct Arguments \{\n(.*?)\n\};", re.DOTALL)
+_FIELD = re.compile(r"^ +(\w[\w ]*?[ *]+)(\w+);(?: +//.*)?$|^ *//.*$")
+_GIVEN = re.compile(r"namespace given \{\n(.*?)\n\}", re.DOTALL)
+_CONSTANT = re.compile(r"(?m)^(constexpr int (\w+) = )(-?\d+);")
+WARP = "builtin.h"
+"""Warp's own header, which stands before all of ours when Warp compiles them."""
+
+
+def text_of(header: str, constants: Mapping[str, int] | None = None) -> str:
+    """Return the text of a header behind the headers that it includes, each once.
+
+    Args:
+        header: its path, such as `ksim_rl/ranks/moments.cuh`.
+        constants: the values of those in the namespaces `given` of these headers, all of them by name.
+    """
+    texts: dict[str, str] = {}
+    _collect(header, texts)
+    text = "".join(texts.values())
+    return _with_constants(header, text, constants or {})
+
+
+def _collect(header: str, texts: dict[str, str]) -> None:
+    package, _, path = header.partition("/")
+    text = files(package).joinpath(path).read_text()
+    for included in _INCLUDE.findall(text):
+        if included not in texts and included != WARP:
+            _collect(included, texts)
+    texts[header] = _INCLUDE.sub("", text).replace("#pragma once\n", "")
+
+
+def _with_constants(header: str, text: str, constants: Mapping[str, int]) -> str:
+    declared: set[str] = set()
+
+    def valued(constant: re.Match[str]) -> str:
+        begin = constant[1]
+        name = constant[2]
+        declared.add(name)
+        return f"{begin}{constants.get(name, 0)};"
+
+    text = _GIVEN.sub(lambda given: _CONSTANT.sub(valued, given[0]), text)
+    # A sample value must never reach a kernel.
+    assert declared == {*constants}, (
+        f"{header}: constants {sorted(declared ^ {*constants})} are declared or given, but not both"
+    )
+    return text
+
+
+def arguments_of(text: str) -> dict[str, str]:
+    """Return the types of the fields of the last struct `Arguments` of a text, by name and in order, as in C++."""
+    *_, body = _ARGUMENTS.findall(text)
+    fields: dict[str, str] = {}
+    for line in body.splitlines():
+        field = _FIELD.match(line)
+        assert field is not None, f"a field is a line of its own: {line!r}"
+        if field[2]:
+            fields[field[2]] = field[1].strip()
+    return fields
