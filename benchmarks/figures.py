@@ -43,6 +43,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "imports": (*LEARN[1:4], "ksim_rl/transforms", "ksim_rl/device", "ksim_rl/physics"),
     "learning": (*STEP, *LEARN, *TASK),
     "manipulation": (*STEP, *LEARN, "ksim_rl/suites"),
+    "loop": ("ksim_rl/export/standalone",),
     "nan_names": ("ksim_rl/envs/non_finite.py", "ksim_rl/device/quick_launch.py"),
     "narrow_phase": ("ksim_rl/physics",),
     "num_envs": (*STEP, *LEARN),

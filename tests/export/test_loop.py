@@ -454,6 +454,8 @@ def test_identify_reads_the_log(control, tmp_path):
     assert log.targets.by_kind["pos"] == pytest.approx(sent, rel=1e-6)
     assert log.time_T == pytest.approx(PERIOD * np.arange(len(sent)), abs=1e-5)
     lines = (tmp_path / "a.csv").read_text().splitlines()
+    first = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
+    assert float(first["projected_gravity.z"]) == -1.0 and float(first["root_ang_vel.x"]) == 0.0
     events = [line for line in lines if line.startswith("#")]
     assert [line.removeprefix("# ") for line in events] == shown and len(events) == 4
     with pytest.raises(FileExistsError):
@@ -510,6 +512,7 @@ def test_quantiles_of_durations_are_those_of_numpy():
         durations.add(value)
     for share in (0.5, 0.99):
         assert durations.quantile(share) == pytest.approx(np.quantile(seconds, share), abs=3e-5)
+    assert durations.count_beyond(3e-3) == pytest.approx((seconds > 3e-3).sum(), abs=30)
     assert durations.longest == seconds.max() and math.isnan(Durations().quantile(0.5))
 
 

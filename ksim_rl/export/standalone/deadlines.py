@@ -50,6 +50,10 @@ class Durations:
         place = int(np.searchsorted(np.cumsum(self.counts), share * total))
         return min((place + 1) * RESOLUTION, self.longest)
 
+    def count_beyond(self, seconds: float) -> int:
+        """Return how many durations were longer, to `RESOLUTION`."""
+        return int(self.counts[int(seconds / RESOLUTION) + 1 :].sum())
+
 
 class Punctuality:
     """How punctual a loop was.
@@ -85,7 +89,7 @@ class Punctuality:
             del self.memory[1::2]
 
     def summary(self) -> Json:
-        """Return the figures, in ms and MiB."""
+        """Return the figures, in ms and MiB, of at least one period."""
         median = self.own.quantile(0.5)
         return {
             "periods": self.periods,
@@ -96,9 +100,10 @@ class Punctuality:
             "woken_late_ms_p99": 1e3 * self.woken.quantile(0.99),
             "sent_after_deadline_ms_p99": 1e3 * self.late.quantile(0.99),
             "sent_after_deadline_ms_largest": 1e3 * self.late.longest,
-            "memory_mib_first": self.memory[0] if self.memory else math.nan,
-            "memory_mib_last": self.memory[-1] if self.memory else math.nan,
-            "memory_mib_largest": max(self.memory, default=math.nan),
+            # After a tenth of the time all has been used once.
+            "memory_mib_early": self.memory[len(self.memory) // 10],
+            "memory_mib_last": self.memory[-1],
+            "memory_mib_largest": max(self.memory),
         }
 
 

@@ -9,7 +9,14 @@ from typing import NamedTuple, TextIO
 
 import numpy as np
 
-from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
+from ksim_rl.export.standalone.files import Array
+from ksim_rl.export.standalone.robot_link import (
+    DOWN,
+    DescribedJoints,
+    JointCommand,
+    Measurement,
+    to_root_axes,
+)
 from ksim_rl.export.standalone.states import State
 
 MOST_WAITING = 1000
@@ -26,6 +33,10 @@ COLUMNS = (
     "damping",
 )
 
+OF_ROOT = tuple(
+    f"{what}.{axis}" for what in ("projected_gravity", "root_ang_vel") for axis in "xyz"
+)
+
 
 class Line(NamedTuple):
     """A line of the log, whose text is made in the thread that writes it."""
@@ -38,8 +49,9 @@ class Line(NamedTuple):
 class Journal:
     """A table of all periods as CSV, and a line with `#` in front for each event.
 
-    Columns are `time` (s since the first period), `state`, `message_age` (s), and those of each joint. Nothing here
-    waits for the disk or the terminal: what they cannot take is dropped, and counted in `lost`. Events are shown, too.
+    Columns are `time` (s since the first period), `state`, `message_age` (s), gravity's direction and the turning of
+    the root in its own axes (NaN without a root), and those of each joint. Nothing here waits for the disk or the
+    terminal: what they cannot take is dropped, and counted in `lost`. Events are shown, too.
     """
 
     def __init__(self, path: Path, joints: DescribedJoints, show: Callable[[str], None]) -> None:
@@ -48,7 +60,7 @@ class Journal:
         self.lost = 0
         self.failure = ""
         self.started: float | None = None
-        names = ["time", "state", "message_age"]
+        names = ["time", "state", "message_age", *OF_ROOT]
         for joint in joints.names:
             names += [f"{joint}.{column}" for column in COLUMNS]
         self.form = ",".join(["%.6f", "%d", *["%.9g"] * (len(names) - 2)]) + "\n"
@@ -72,7 +84,8 @@ class Journal:
             age = now - measurement.stamp
         asked = (command.pos, command.vel, command.effort, command.stiffness, command.damping)
         by_joint = np.stack([*readings, *asked], axis=1)
-        values = (self._since(now), state.value, age, *by_joint.ravel().tolist())
+        root = _of_root(measurement).tolist()
+        values = (self._since(now), state.value, age, *root, *by_joint.ravel().tolist())
         self._put(Line(form=self.form, values=values, is_event=False))
 
     def event(self, now: float, text: str) -> None:
@@ -110,3 +123,15 @@ class Journal:
                         flushed = time.monotonic()
         except OSError as error:
             self.failure = f"{self.path}: {error.strerror}"
+
+
+def _of_root(measurement: Measurement | None) -> Array:
+    """Return the numbers of `OF_ROOT`."""
+    found = np.full(len(OF_ROOT), np.nan)
+    if measurement is None:
+        return found
+    if measurement.root_quat is not None:
+        found[:3] = to_root_axes(measurement.root_quat, DOWN)
+    if measurement.root_ang_vel is not None:
+        found[3:] = measurement.root_ang_vel
+    return found

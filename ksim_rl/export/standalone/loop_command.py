@@ -64,6 +64,12 @@ def loop_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--command", type=float, nargs="*", help="the policy's first command")
     parser.add_argument("--log", type=Path, help="a new CSV file; default: named by the time")
+    parser.add_argument(
+        "--real-time",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="ask the system to run the loop before all else; whether it does is in the log",
+    )
     parser.add_argument("--report", type=Path, help="a JSON file for how punctual the loop was")
     for owner in (Limits, Times):
         for field in dataclasses.fields(owner):
@@ -73,10 +79,17 @@ def loop_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def drive(robot: Robot | None, control: PolicyControl, options: argparse.Namespace) -> int:
+def drive(
+    robot: Robot | None,
+    control: PolicyControl,
+    options: argparse.Namespace,
+    *,
+    operators: Sequence[Operator] = (),
+) -> int:
     """Run a policy on a robot with the options of `loop_parser`, and return the exit code: 1 after a fault.
 
-    Without a robot it is the simulated one. A ValueError says what is wrong before anything moves.
+    Without a robot it is the simulated one. `operators` are heard beside the keyboard. A ValueError says what is wrong
+    before anything moves.
     """
     period = float(control.meta["step_dt"])
     chosen = vars(options)
@@ -99,21 +112,24 @@ def drive(robot: Robot | None, control: PolicyControl, options: argparse.Namespa
     machine = StateMachine(control, period=period, limits=limits, times=times, note=journal.event)
     interrupts = Interrupts()
     interrupts.listen()
-    operators: list[Operator] = [interrupts]
+    heard: list[Operator] = [interrupts, *operators]
     seconds = options.seconds
     if seconds is None:
         seconds = UNATTENDED_S if options.simulate else 0.0
-    operators.append(Unattended(seconds) if seconds else Keyboard(sys.stdin))
+    heard.append(Unattended(seconds) if seconds else Keyboard(sys.stdin))
     calm_python()
-    journal.event(clock.now(), ask_for_real_time())
+    priority = ask_for_real_time() if options.real_time else "no real-time priority: not asked for"
+    journal.event(clock.now(), priority)
     try:
-        punctuality = run_loop(robot, machine, operators, journal, clock=clock, period=period)
+        punctuality = run_loop(robot, machine, heard, journal, clock=clock, period=period)
     finally:
         robot.close()
         journal.close()
     summary = {
         **punctuality.summary(),
         "period_ms": 1e3 * period,
+        "three_periods_late": punctuality.woken.count_beyond(3.0 * period),
+        "priority": priority,
         "fault": machine.fault,
         "clipped": machine.effort_limit.clipped(),
         "log": str(path),

@@ -1,0 +1,1 @@
+"""Joins exported policies of ksim_rl to Unitree's robots over DDS."""

@@ -1,0 +1,49 @@
+"""Runs an exported policy on a Go2 or G1.
+
+python -m unitree_bridge go2 RUN/export --interface eth0
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from unitree_bridge.robot import UnitreeRobot
+from unitree_bridge.robots import KINDS
+
+
+def main() -> int:
+    """Run the loop of the exported folder on the robot, and return its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m unitree_bridge",
+        description=__doc__,
+        epilog="Options of the folder's loop.py may follow.",
+    )
+    parser.add_argument("robot", choices=sorted(KINDS))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument(
+        "--interface", required=True, help="of the network, such as eth0; lo: the stub"
+    )
+    parser.add_argument("--domain", type=int, default=0)
+    options, others = parser.parse_known_args()
+    # Your own export: the folder of a stranger is for `ksim-rl sim2sim`.
+    sys.path.insert(0, str(options.folder.absolute()))
+    import loop
+
+    chosen = loop.loop_parser().parse_args([str(options.folder), *others])
+    if chosen.simulate:
+        parser.error(
+            "--simulate is of loop.py alone: here `python -m unitree_bridge.stub` simulates"
+        )
+    try:
+        meta = loop.read_json(options.folder / "export.json")
+        control = loop.PolicyControl(options.folder, meta)
+        robot = UnitreeRobot(
+            KINDS[options.robot], loop, meta, interface=options.interface, domain=options.domain
+        )
+        return loop.drive(robot, control, chosen, operators=[robot])
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
