@@ -28,6 +28,15 @@ LEARN = (
     "ksim_rl/collectors",
 )
 TASK = ("ksim_rl/tasks", "ksim_rl/trainers/trainer.py")
+# What finds the numbers of joints; networks of motors have no part in it.
+IDENTIFY = (
+    "ksim_rl/identification/excitation.py",
+    "ksim_rl/identification/fit.py",
+    "ksim_rl/identification/free_numbers.py",
+    "ksim_rl/identification/held_robot.py",
+    "ksim_rl/identification/joint_log.py",
+    "ksim_rl/identification/simulation.py",
+)
 # What each benchmark measures; a result takes the longest name that it begins with.
 MEASURED: dict[str, tuple[str, ...]] = {
     "agreement": STEP[:1],
@@ -39,7 +48,8 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "diagnosis": ("ksim_rl/diagnosis", *LEARN),
     "g1_ppo": (*STEP, *LEARN, *TASK),
     "humanoids": (*STEP, *LEARN, *TASK),
-    "identification": ("ksim_rl/identification",),
+    "identification": IDENTIFY,
+    "identified_policy": (*IDENTIFY, "ksim_rl/identification/training_overrides.py", *STEP, *LEARN),
     "imports": (*LEARN[1:4], "ksim_rl/transforms", "ksim_rl/device", "ksim_rl/physics"),
     "learning": (*STEP, *LEARN, *TASK),
     "manipulation": (*STEP, *LEARN, "ksim_rl/suites"),
