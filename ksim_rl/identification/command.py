@@ -18,6 +18,7 @@ from ksim_rl.identification.joint_log import LEAST_S, TARGET_COLUMNS, TIME, Join
 from ksim_rl.identification.simulation import Targets
 from ksim_rl.identification.training_overrides import (
     as_word,
+    left_out,
     net_override,
     overrides,
     time_step,
@@ -73,8 +74,10 @@ def _find(options: Any) -> int:
     log = _read(options.log, robot)
     findings = fit(robot, log, note=show)
     by_task: dict[str, list[str]] = {}
+    not_carried: list[str] = []
     if cfg is not None:
         by_task[str(options.task)] = overrides(findings, cfg)
+        not_carried = left_out(findings, cfg)
     path = options.output or options.log.with_name(f"{options.log.stem}_found.json")
     write_whole(path, findings.text(by_task))
     show(findings.table())
@@ -85,6 +88,8 @@ def _find(options: Any) -> int:
         words = path.with_suffix(".overrides")
         write_whole(words, "\n".join(lines) + "\n")
         show(f"{words}: for ksim-rl train task={task} $(cat {words})")
+    for line in not_carried:
+        show(f"not in it: {line}")
     return int(bool(findings.warnings))
 
 

@@ -23,6 +23,8 @@ EVENTS: Mapping[str, type[RandomizeJointField]] = {
     "damping": RandomizeJointDamping,
     "frictionloss": RandomizeJointFrictionLoss,
 }
+LEAST_DELAY_S = 0.001
+"""What is shorter makes no difference to a policy."""
 GAINS = {"stiffness": "stiffness", "servo_damping": "damping"}
 """What `RandomizeActuatorGains` calls the numbers of a servo."""
 
@@ -44,6 +46,27 @@ def overrides(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> list[str]:
     prefix = "" if len(cfg.scene.robots) == 1 else f"{key}/"
     for name, event in _events(findings, prefix).items():
         found.append(f"+task.events.identified_{name}={_value(to_tree(event, EventTerm))}")
+    return found
+
+
+def left_out(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> list[str]:
+    """Return a line for each kind of number that was found and that no override carries."""
+    key = _robot_of(findings.robot, cfg)
+    found = []
+    delay_s = findings.delay_s
+    has_entries = bool(getattr(cfg.scene.robots[key], "actuators", ()))
+    if not has_entries and delay_s.is_told and delay_s.high > LEAST_DELAY_S:
+        found.append(
+            f"the delay of {1e3 * delay_s.value:.1f} ms: servos of a model's own file cannot be late; give the robot "
+            "`actuators`"
+        )
+    off = []
+    for name, numbers in findings.joints.items():
+        constant = numbers["torque_constant"]
+        if constant.is_told and not constant.low <= 1.0 <= constant.high:
+            off.append(f"{name} {constant.value:.3g}")
+    if off:
+        found.append(f"torque constants: divide commanded efforts by them: {', '.join(off)}")
     return found
 
 

@@ -4,9 +4,9 @@ import pytest
 
 from ksim_rl import conf, envs
 from ksim_rl.identification.findings import Estimate, Findings
-from ksim_rl.identification.training_overrides import net_override, overrides
+from ksim_rl.identification.training_overrides import left_out, net_override, overrides
 from ksim_rl.scene.actuators import DelayedActuator, MLPActuator
-from ksim_rl.scene.robots import UnitreeGo2
+from ksim_rl.scene.robots import Arm, UnitreeGo2
 
 
 def found(robot, names, **left_out):
@@ -67,6 +67,17 @@ def test_what_was_not_told_is_left_as_it_was():
     assert not any("identified_damping" in line for line in lines)
     gains = [line for line in lines if "identified_gains" in line]
     assert len(gains) == 12 and all("stiffness:null" in line for line in gains)
+
+
+def test_what_no_override_carries_is_said():
+    go2 = envs.task("go2_velocity_flat").cfg()
+    assert left_out(found("go2", UnitreeGo2.joint_names), go2) == []
+    weak = {"torque_constant": Estimate(value=0.8, half_width=0.1)}
+    (line,) = left_out(found("go2", ("FL_hip_joint",), **weak), go2)
+    assert "FL_hip_joint 0.8" in line
+    # Its servos are of the model's own file.
+    (line,) = left_out(found("arm", Arm.joints), envs.task("arm_reach").cfg())
+    assert "the delay of 8.2 ms" in line
 
 
 def test_networks_drive_the_robot_of_a_task(tmp_path):
