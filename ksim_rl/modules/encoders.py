@@ -1,8 +1,7 @@
 """Encoders make features of pictures; they stand in front of any network, which then reads features as numbers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Shaped
@@ -13,6 +12,7 @@ from torchrl.modules import ConvNet
 from ksim_rl.checked import NUMBERS_PER_WEIGHT, Checked, Count, Range
 from ksim_rl.checks import check_choice
 from ksim_rl.modules.mlp import ACTIVATIONS, Device
+from ksim_rl.transforms.pictures.layout import Layout, check_layout, framed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class EncoderCfg(Checked):
     activation: str = "relu"
     spatial_softmax: bool = False
     value_range: Range | None = None
-    layout: Literal["HWC", "CHW"] = "HWC"
+    layout: Layout = "HWC"
 
     def _check_fields(self) -> None:
         super()._check_fields()
@@ -72,12 +72,14 @@ class EncoderCfg(Checked):
                 f"it reads pictures of {spec.dtype}, and those of uint8 or float32 are amounts of light or distances: "
                 "map ids to colours first, or name an encoder of your own by _target_"
             )
-        self._check_layout(spec)
+        check_layout(spec.shape, self.layout)
         low, high = self._ends(spec.dtype)
-        first = _ToChannels(len(spec.shape), self.layout, low=low, high=high)
+        first = _ToChannels(self.layout, low=low, high=high)
+        # Counted on pictures without memory.
+        num_channels = first(torch.empty(1, *spec.shape, device="meta")).shape[1]
         # Drawn on the CPU, so that one seed gives the same network on every device.
         convolutions = ConvNet(
-            in_features=first.num_channels(spec.shape),
+            in_features=num_channels,
             num_cells=list(self.channels),
             kernel_sizes=list(self.kernel_sizes),
             strides=list(self.strides),
@@ -86,24 +88,6 @@ class EncoderCfg(Checked):
             aggregator_kwargs={},
         )
         return nn.Sequential(first, convolutions).to(device)
-
-    def _check_layout(self, spec: TensorSpec) -> None:
-        """Refuse a shape whose dims are no picture's, or are in another order."""
-        shape = list(spec.shape)
-        if len(shape) not in (2, 3, 4):
-            raise ValueError(
-                f"it reads pictures [H, W], [H, W, C] or stacked ones [N, H, W, C], and these are {shape}"
-            )
-        if len(shape) == 2:
-            return
-        picture = shape[-3:]
-        channel = picture.pop(self.layout.index("C"))
-        # Frames of a depth camera, [N, H, W], would be read as very low pictures with W channels.
-        if channel > min(picture):
-            raise ValueError(
-                f"layout={self.layout!r} gives pictures {shape} {channel} channels, more than pixels along a side: "
-                "choose the other layout; stacked pictures of one channel, [N, H, W], are read as 'CHW'"
-            )
 
     def _ends(self, dtype: torch.dtype) -> tuple[float, float]:
         """Return the values that become 0 and 1."""
@@ -138,31 +122,17 @@ class SpatialSoftmax(nn.Module):
 class _ToChannels(nn.Module):
     """Maps pictures [B, *shape] to float32 [B, C, H, W], scaled; the channels of N stacked pictures stand in a row."""
 
-    def __init__(self, num_dims: int, layout: str, *, low: float, high: float) -> None:
+    def __init__(self, layout: Layout, *, low: float, high: float) -> None:
         super().__init__()
-        self.num_dims = num_dims
-        self.layout = layout
+        self.layout: Layout = layout
         self.low = low
         self.factor = 1.0 / (high - low)
 
-    def num_channels(self, shape: Sequence[int]) -> int:
-        """Return C for pictures of this shape."""
-        return self._channels_first(torch.empty(1, *shape, device="meta")).shape[1]
-
     def forward(self, pictures: Shaped[Tensor, " B *shape"]) -> Float[Tensor, "B C H W"]:
         """Return the pictures as the convolutions read them."""
+        channels_BNCHW = framed(pictures, self.layout).movedim(-1, -3)
         # Floats are made here, for the pictures at hand only: datasets keep bytes.
-        return (self._channels_first(pictures).float() - self.low) * self.factor
-
-    def _channels_first(self, pictures: Tensor) -> Tensor:
-        if self.num_dims == 2:
-            return pictures[:, None]
-        if self.layout == "HWC":
-            pictures = pictures.movedim(-1, -3)
-        # Frames, and the channels of each.
-        if self.num_dims == 4:
-            return pictures.flatten(1, 2)
-        return pictures
+        return (channels_BNCHW.flatten(1, 2).float() - self.low) * self.factor
 
 
 class Encoder(nn.Module):

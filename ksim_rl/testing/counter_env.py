@@ -69,7 +69,7 @@ class CounterEnv(EnvBase):
             "done": {name: flag.clone() for name in ("done", "terminated", "truncated")},
         }
         if byte_HWC is not None:
-            specs["observation"]["rgb"] = Unbounded(byte_HWC.shape, dtype=torch.uint8)
+            specs["observation"]["rgb"] = Bounded(0, 255, byte_HWC.shape, dtype=torch.uint8)
         for which, leaves in specs.items():
             # All specs are made for one row, then expanded to the batch.
             spec = Composite(leaves).expand(batch).to(self.device)

@@ -26,6 +26,7 @@ from ksim_rl.transforms.groups.groups import (
     observation_columns,
 )
 from ksim_rl.transforms.history import HistoryCfg, ObservationHistory
+from ksim_rl.transforms.hold import ObservationHold
 from ksim_rl.transforms.low_pass import ActionLowPass
 from ksim_rl.transforms.mirror.mirror import (
     AXIAL,
@@ -45,6 +46,20 @@ from ksim_rl.transforms.mirror.robot_mirror import (
 from ksim_rl.transforms.noise.cfg import ConstantNoise, GaussianNoise, NoiseCfg, UniformNoise
 from ksim_rl.transforms.noise.observation_noise import ObservationNoise
 from ksim_rl.transforms.normalization import ObservationNormalization
+from ksim_rl.transforms.pictures.effects import (
+    Blur,
+    Brightness,
+    Contrast,
+    CutOut,
+    DepthHoles,
+    DepthRange,
+    DepthSteps,
+    PictureEffect,
+    PixelNoise,
+    RandomCrop,
+    RandomShift,
+)
+from ksim_rl.transforms.pictures.picture_effects import PictureEffects
 from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, follow_level
 from ksim_rl.transforms.trackers import EpisodeTracker, SuccessTracker, TimeAwareObservation
 from ksim_rl.transforms.transform_cfg import TransformCfg

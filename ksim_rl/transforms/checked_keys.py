@@ -100,10 +100,11 @@ class CheckedKeys(Transform):
             self.batch_dims = batch_dims
         # The policy's key takes the place of the env's key in the specs of actions.
         replaced = [new_spec(index, spec) for index, spec in enumerate(found)]
-        for key, out_key in zip(in_keys, out_keys, strict=True):
+        for key, out_key in zip(in_keys, out_keys[: len(in_keys)], strict=True):
             if is_inverse and key != out_key:
                 drop_leaf(specs, key)
-        for out_key, spec in zip(out_keys, replaced, strict=True):
+        # Further out keys are of the subclass, which sets their specs itself.
+        for out_key, spec in zip(out_keys[: len(in_keys)], replaced, strict=True):
             set_leaf_spec(specs, out_key, spec)
         return found
 

@@ -183,13 +183,14 @@ class KeyedTransform(RowTransform):
             self.stream = type(self).__name__ + "".join(map(str, every))
         else:
             self.stream = stream
-        # Streams are named, so that one more transform in a chain changes no draws of the others.
-        self._stream_ids = {
-            name: random.stream_id(f"{self.stream}/{name}") for name in self.purposes
-        }
+        self._name_streams(self.purposes)
         self._is_seeded = seed is not None
         self.register_buffer("seed_value", torch.tensor(_NO_SEED if seed is None else seed))
         self.register_buffer("step_count", torch.zeros((), dtype=torch.int64))
+
+    def _name_streams(self, purposes: Iterable[str]) -> None:
+        """Name the streams of draws: with names, one more transform in a chain changes no draws of the others."""
+        self._stream_ids = {name: random.stream_id(f"{self.stream}/{name}") for name in purposes}
 
     def seed_(self, seed: int) -> Self:
         """Set the seed and start the counters again, in place."""
@@ -258,6 +259,31 @@ def seed_transforms(env: EnvBase, seed: int) -> None:
     """Seed all transforms of an env that have draws or counters."""
     for transform in held_transforms(env, KeyedTransform):
         transform.seed_(seed)
+
+
+class Switched(Transform):
+    """Mixin of transforms that are for training only: the buffer `enabled` follows the mode of the env."""
+
+    enabled: Tensor
+
+    def _register_switch(self, enabled: bool) -> None:
+        # The wish of the user, which `train()` restores after an evaluation.
+        self._wanted = enabled
+        self.register_buffer("enabled", torch.tensor(enabled), persistent=False)
+
+    def enable_(self, enabled: bool = True) -> Self:
+        """Turn it on or off, in place: a captured or compiled step follows."""
+        self._wanted = enabled
+        self.enabled.fill_(enabled)
+        return self
+
+    def train(self, mode: bool = True) -> Self:
+        """Follow the mode of the env."""
+        super().train(mode)
+        # TorchRL calls `eval()` while it attaches a transform, which is no wish to turn it off.
+        if upstream.is_in_env(self):
+            self.enabled.fill_(self._wanted and mode)
+        return self
 
 
 class FollowsLevel(Transform):

@@ -8,7 +8,7 @@ from torchrl.envs.transforms import Transform
 PACKAGE = "torchrl"
 
 _DATA = """
-    ActionDiscretizer ActionMask ActionScaling BinarizeReward CatFrames CatTensors CenterCrop ClipTransform Crop
+    ActionDiscretizer ActionMask ActionScaling BinarizeReward CatFrames CatTensors ClipTransform
     DiscreteActionProjection DoubleToFloat ExpandAs FlattenAction FlattenObservation GrayScale InitTracker
     LineariseRewards ObservationNorm PermuteTransform RemoveEmptySpecs RenameTransform RewardClipping RewardScaling
     RewardSum SignTransform SqueezeTransform Stack StepCounter SuccessReward TargetReturn TimeMaxPool ToTensorImage
@@ -61,6 +61,9 @@ _BY_REASON = {
     _DRAWS: "RandomTruncationTransform",
     "it runs in another process": "RayTransform",
     "it needs torchvision, which is no part of this library": "Resize",
+    "it needs torchvision, which is no part of this library; `ksim_rl.envs.transforms.RandomCrop` crops": (
+        "CenterCrop Crop"
+    ),
     _NAMELESS: "SelectTransform",
     "it takes specs; recurrent networks add the primers that they need": "TensorDictPrimer",
     f"{_FUNCTION}, or a termination term": "TerminateTransform",

@@ -16,7 +16,8 @@ from tests.transforms.transform_checks import KINDS
 
 def on_gpu(kind: str) -> MaskedTransformedEnv:
     chain = full_chain() if kind == "chain" else [KINDS[kind]()]
-    env = MaskedTransformedEnv(CounterEnv((3, 5, 4, 7), device="cuda"), Compose(*chain))
+    counter = CounterEnv((3, 5, 4, 7), picture=(6, 8, 3), device="cuda")
+    env = MaskedTransformedEnv(counter, Compose(*chain))
     env.set_seed(3)
     return env
 

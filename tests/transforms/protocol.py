@@ -35,9 +35,12 @@ from ksim_rl.transforms import (
     ObservationDelay,
     ObservationGroups,
     ObservationHistory,
+    ObservationHold,
     ObservationNoise,
     ObservationNormalization,
     ObservationScale,
+    PictureEffects,
+    RandomShift,
     RewardClip,
     RewardScale,
     SuccessTracker,
@@ -74,6 +77,8 @@ KINDS: dict[str, Callable[[LeafEnv], Transform]] = {
     "ObservationScale": lambda env: ObservationScale(env.key, scale=2.0),
     "ObservationDelay": lambda env: ObservationDelay(env.key, delay=LATE),
     "ObservationDelay of two": lambda env: ObservationDelay([env.key, "again"], delay=LATE),
+    "ObservationHold": lambda env: ObservationHold(env.key, every=2, fresh_key="fresh"),
+    "PictureEffects": lambda env: PictureEffects(env.key, effects={"shift": RandomShift()}),
     "ObservationHistory": lambda env: ObservationHistory(env.key, length=3),
     "ObservationHistory of two": lambda env: ObservationHistory([env.key, "again"], length=3),
     "ObservationHistory stacked": lambda env: ObservationHistory(env.key, length=3, flat=False),
@@ -106,6 +111,8 @@ def is_refused(kind: str, shape: str) -> bool:
         return shape in ("whole", "flags")
     if kind.startswith(("ActionClip", "ActionScale", "ActionLowPass")):
         return shape == "whole"
+    if kind == "PictureEffects":
+        return shape not in ("matrix, no batch", "nested", "agents, no batch")
     return kind == "Mirror" and shape.startswith("scalars")
 
 

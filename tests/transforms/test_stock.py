@@ -4,27 +4,25 @@ import pytest
 import torch
 import torchrl.envs.transforms as torchrl_transforms
 from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import Compose, Transform
 
 from ksim_rl.envs import MaskedTransformedEnv, from_tree
 from ksim_rl.envs.transforms import TransformCfg
 from ksim_rl.testing import CounterEnv
 from ksim_rl.transforms import stock
 
-IMAGES = {"in_keys": ["image"]}
+IMAGES = {"in_keys": ["rgb"]}
 ARGUMENTS = {
     "ActionDiscretizer": {"num_intervals": 4},
     "ActionMask": {},
     "ActionScaling": {"loc": 0.0, "scale": 2.0},
     "CatFrames": {"N": 3, "dim": -1, "in_keys": ["count"]},
     "CatTensors": {"in_keys": ["count"], "out_key": "all", "del_keys": False},
-    "CenterCrop": {"w": 2, **IMAGES},
     "ClipTransform": {"in_keys": ["count"], "low": -1.0, "high": 1.0},
-    "Crop": {"w": 2, **IMAGES},
     "DiscreteActionProjection": {"num_actions_effective": 2, "max_actions": 3},
     "ExpandAs": {"in_key": "reward", "ref_key": "count", "out_key": "wide"},
     "FlattenAction": {"first_dim": -2, "last_dim": -1},
-    "FlattenObservation": {"first_dim": -2, "last_dim": -1, "in_keys": ["image"]},
+    "FlattenObservation": {"first_dim": -2, "last_dim": -1, **IMAGES},
     "GrayScale": IMAGES,
     "LineariseRewards": {"in_keys": ["reward"], "weights": [2.0]},
     "ObservationNorm": {"loc": 0.5, "scale": 2.0, "in_keys": ["count"]},
@@ -43,7 +41,7 @@ ARGUMENTS = {
     "UnsqueezeTransform": {"dim": -1, "in_keys": ["count"]},
 }
 # Those that need images, discrete actions or several action dims only have to be built.
-NEEDS_ANOTHER_ENV = {name for name, given in ARGUMENTS.items() if "image" in given.get("in_keys", ())} | {
+NEEDS_ANOTHER_ENV = {name for name, given in ARGUMENTS.items() if "rgb" in given.get("in_keys", ())} | {
     "ActionMask", "ActionScaling", "ActionDiscretizer", "DiscreteActionProjection", "FlattenAction", "LineariseRewards",
     "BinarizeReward", "SuccessReward",
 }  # fmt: skip
@@ -63,6 +61,16 @@ def test_each_name_of_torchrl_is_in_one_of_the_two_tables():
 @pytest.mark.parametrize("name", stock.DATA)
 def test_each_listed_one_is_built_from_data(name):
     assert type(described(name).build()) is getattr(torchrl_transforms, name)
+
+
+def test_those_of_images_step_as_in_torchrl():
+    chain = [described(name) for name in ("ToTensorImage", "GrayScale")]
+    ours, theirs = (
+        wrapper(CounterEnv(picture=(4, 6, 3)), Compose(*(cfg.build() for cfg in chain)))
+        for wrapper in (MaskedTransformedEnv, TransformedEnv)
+    )
+    a, b = (env.rollout(8, break_when_any_done=False)["next", "rgb"] for env in (ours, theirs))
+    assert a.shape[2:] == (1, 4, 6) and torch.equal(a, b)
 
 
 @pytest.mark.parametrize("name", sorted(set(stock.DATA) - NEEDS_ANOTHER_ENV))

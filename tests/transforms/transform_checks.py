@@ -1,6 +1,6 @@
 """Every transform that we export, in the variants that the checks of `test_every_transform` run over."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from torchrl.envs.transforms import Transform
 
@@ -13,7 +13,9 @@ from ksim_rl.transforms import (
     ActionDelay,
     ActionLowPass,
     ActionScale,
+    Brightness,
     ConstantNoise,
+    CutOut,
     DelayCfg,
     EpisodeTracker,
     GaussianNoise,
@@ -23,9 +25,14 @@ from ksim_rl.transforms import (
     ObservationDelay,
     ObservationGroups,
     ObservationHistory,
+    ObservationHold,
     ObservationNoise,
     ObservationNormalization,
     ObservationScale,
+    PictureEffects,
+    PixelNoise,
+    RandomCrop,
+    RandomShift,
     RewardClip,
     RewardScale,
     SuccessTracker,
@@ -70,6 +77,14 @@ KINDS: dict[str, Callable[[], Transform]] = {
     "history_strided": lambda: ObservationHistory([VECTOR, "drawn"], [NEW, "drawn"], length=3, stride=2),
     "groups": lambda: ObservationGroups({"actor": [VECTOR, "count"], ("my", "critic"): ["drawn"]}, drop=[VECTOR]),
     "groups_drop_all": lambda: ObservationGroups({"actor": [VECTOR, "count"]}, drop=True),
+    "hold": lambda: ObservationHold([VECTOR, "count"], [NEW, "count"], every=3),
+    "hold_dropped": lambda: ObservationHold("rgb", dropped=0.4, fresh_key=("my", "fresh")),
+    "pictures": lambda: PictureEffects(
+        "rgb", effects={"light": Brightness(), "shift": RandomShift(pixels=1, each="episode"), "noise": PixelNoise()}
+    ),
+    "pictures_cropped": lambda: PictureEffects(
+        "rgb", ("my", "rgb"), effects={"crop": RandomCrop(height=4, width=5), "hole": CutOut(pixels=(1, 3))}
+    ),
     "normalization": lambda: ObservationNormalization([VECTOR, "count"], [NEW, "count"]),
     "action_delay": lambda: ActionDelay(delay=DelayCfg(max_lag=2, resample_every=3)),
     "action_delay_renamed": lambda: ActionDelay("action", "wish", delay=DelayCfg(min_lag=1, max_lag=1)),
@@ -98,8 +113,13 @@ def has_episodes(transform: Transform) -> bool:
     return isinstance(transform, RowTransform) and type(transform).forward is RowTransform.forward
 
 
+def seen(lengths: Sequence[int]) -> CounterEnv:
+    """Return the counter env of all kinds, which shows pictures, too."""
+    return CounterEnv(lengths, picture=(6, 8, 3))
+
+
 def masked(kind: str) -> MaskedTransformedEnv:
     """Return the counter env with a variant, seeded."""
-    env = MaskedTransformedEnv(CounterEnv((3, 5, 4)), [KINDS[kind]()])
+    env = MaskedTransformedEnv(seen((3, 5, 4)), [KINDS[kind]()])
     env.set_seed(1)
     return env

@@ -10,17 +10,21 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
 from ksim_rl.checks import naming
-from ksim_rl.transforms import upstream
 from ksim_rl.transforms.checked_keys import Keys, one_per_key
 from ksim_rl.transforms.columns import side_by_side, split
 from ksim_rl.transforms.noise import kernel as noise_kernel
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
 from ksim_rl.transforms.noise.kernel import HAS_BIAS, HAS_DROPOUT, HAS_WALK, add_noise
-from ksim_rl.transforms.row_transform import FollowsLevel, KeyedTransform, RowTransform
+from ksim_rl.transforms.row_transform import (
+    FollowsLevel,
+    KeyedTransform,
+    RowTransform,
+    Switched,
+)
 from ksim_rl.transforms.specs import Device, bounded, bounds, multiply_bounds
 
 
-class ObservationNoise(FollowsLevel, KeyedTransform):
+class ObservationNoise(FollowsLevel, Switched, KeyedTransform):
     """Noise on floating-point observations, drawn once per env step, for the reset observation too.
 
     Given other `out_keys`, the clean reading stays as well as the noisy one (for an asymmetric critic). All keys of one
@@ -36,7 +40,6 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
 
     purposes = ("step", "reset", "forward")
 
-    enabled: Tensor
     step_count_E: Tensor
     bias_EL: Tensor | None
     walk_EL: Tensor | None
@@ -55,32 +58,16 @@ class ObservationNoise(FollowsLevel, KeyedTransform):
         super().__init__(in_keys, out_keys, seed=seed, stream=stream)
         self._register_rows("step_count_E", "bias_EL", "walk_EL", "last_EL")
         self.noise = _one_per_key(noise, self.in_keys)
-        # The wish of the user, which `train()` restores after an evaluation.
-        self._wanted = enabled
         self._layout: tuple[int, list[torch.Size]] | None = None
         self.noise_columns: NoiseColumns | None = None
-        self.register_buffer("enabled", torch.tensor(enabled), persistent=False)
+        self._register_switch(enabled)
         self._register_level(is_used=any(cfg.by_level for cfg in self.noise))
-
-    def enable_(self, enabled: bool = True) -> Self:
-        """Turn the noise on or off, in place."""
-        self._wanted = enabled
-        self.enabled.fill_(enabled)
-        return self
 
     def seed_(self, seed: int) -> Self:
         """Set the seed and start the counters again, in place."""
         if self._buffers["step_count_E"] is not None:
             self.step_count_E.zero_()
         return super().seed_(seed)
-
-    def train(self, mode: bool = True) -> Self:
-        """Follow the mode of the env: noise is for training only."""
-        super().train(mode)
-        # TorchRL calls `eval()` while it attaches a transform, which is no wish to turn noise off.
-        if upstream.is_in_env(self):
-            self.enabled.fill_(self._wanted and mode)
-        return self
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         batch_dims = observation_spec.ndim
