@@ -221,9 +221,10 @@ def _time(name: str, options: Options, figures: dict[str, float], outcome: Outco
 
 
 def sizes(env: EnvBase) -> dict[str, float]:
-    """Return the lengths of the vectors that networks read and write."""
+    """Return how many numbers networks read and write, bytes of pictures included."""
     spec: Any = env.observation_spec
-    found = {f"{group}_size": spec[group].shape[-1] for group in ("actor", "critic")}
+    # All but the batch dim: a picture has several.
+    found = {f"{group}_size": spec[group].shape[1:].numel() for group in ("actor", "critic")}
     return {**found, "action_size": env.action_spec.shape[-1]}
 
 

@@ -34,7 +34,12 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "walking": learned.walking,
         "suite": learned.suite,
     },
-    "memory.md": {"per env": memory.per_env, "of many": memory.of_many, "speed": memory.speed},
+    "memory.md": {
+        "per env": memory.per_env,
+        "of many": memory.of_many,
+        "pictures": memory.pictures,
+        "speed": memory.speed,
+    },
     "notes/go1.md": {"settings": lambda: peer_settings.text(results("peer_settings"))},
     "notes/rough_ground.md": {"course": lambda: terrain_course.table(results("terrain_course"))},
     "reliability.md": {"judge": lambda: judge.text(results("agreement"))},

@@ -8,6 +8,16 @@ ROBOTS = {
     "Go1 on flat ground, 12 joints": "h200/go1_velocity_flat/4096",
     "G1 on flat ground, 29 joints": "h200/g1_velocity_flat/4096",
 }
+# Bytes in an env: colours take one each, distances four.
+PICTURES = {
+    "64 x 64 RGB": 64 * 64 * 3,
+    "64 x 64 RGB, 3 frames": 3 * 64 * 64 * 3,
+    "64 x 64 depth": 64 * 64 * 4,
+    "128 x 128 RGB": 128 * 128 * 3,
+}
+ENVS = 4096
+STEPS = 24
+REPLAYED = 1000
 NUM_ENVS = (1024, 4096, 8192, 16384, 32768, 65536)
 
 
@@ -37,6 +47,19 @@ def of_many() -> str:
     for num_envs in NUM_ENVS:
         rows.append([str(num_envs), *(f"{num_envs * total / 1e9:.1f}" for total in totals)])
     return table(("num_envs", "Go1", "G1"), rows)
+
+
+def pictures() -> str:
+    """Return the table of what pictures take, computed from their sizes."""
+    rows = []
+    for name, size in PICTURES.items():
+        # A rollout, and the dataset that is a copy of it; a critic that sees reads the state that follows, too.
+        rollout = 2 * STEPS * ENVS * size
+        gigabytes = [rollout, 2 * rollout, REPLAYED * ENVS * size]
+        cells = [f"{number / 1e9:.1f}" for number in gigabytes]
+        rows.append([name, f"{size / 1000:.1f}", *cells])
+    columns = ("kB per env state", "policy sees", "critic too", "replay")
+    return table(("picture", *columns), rows)
 
 
 def speed() -> str:

@@ -7,8 +7,9 @@ import gymnasium
 
 # Those of `envs.names()` without plug-ins, which `tests/adapters/test_gymnasium_ids.py` compares.
 _TASKS = """
-    arm_push arm_reach cartpole_balance cartpole_swingup cheetah_run dm_control_acrobot_swingup
-    dm_control_acrobot_swingup_sparse dm_control_ball_in_cup_catch dm_control_cartpole_balance
+    arm_push arm_reach cartpole_balance cartpole_balance_pixels cartpole_swingup cheetah_run
+    dm_control_acrobot_swingup dm_control_acrobot_swingup_sparse dm_control_ball_in_cup_catch
+    dm_control_cartpole_balance
     dm_control_cartpole_balance_sparse dm_control_cartpole_swingup dm_control_cartpole_swingup_sparse
     dm_control_cheetah_run dm_control_finger_spin dm_control_finger_turn_easy
     dm_control_finger_turn_hard dm_control_fish_swim dm_control_hopper_hop dm_control_hopper_stand

@@ -65,6 +65,8 @@ def explain(
         whole = widths[0]
         if len(widths) > 1:
             whole = (sum(shape[0] for shape in widths),)
+        if group_cfg.num_stacked is not None:
+            whole = (group_cfg.num_stacked, *whole)
         show(f"observations/{group} {whole}", ("term", "shape", "chain", "parameters"), rows)
 
     rows = [

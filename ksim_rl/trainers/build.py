@@ -8,12 +8,13 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl import envs, ranks
 from ksim_rl.collectors import RolloutCollector
+from ksim_rl.data import ReplayCfg
 from ksim_rl.device.eager import eagerly
 from ksim_rl.device.memory import check_bytes, check_room
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
@@ -115,16 +116,23 @@ def build(
 
 
 def _check_rollout(cfg: RunCfg, env: EnvBase, keys: Sequence[NestedKey]) -> None:
-    """Refuse rollouts whose observations alone no memory holds, before the first of their steps."""
-    observations = env.observation_spec.items(include_nested=True, leaves_only=True)
-    # Of one step of all envs.
-    stored = sum(
-        leaf.shape.numel() * leaf.dtype.itemsize for key, leaf in observations if key in keys
-    )
+    """Refuse rollouts, and a replay, whose observations alone no memory holds, before the first of their steps."""
+    now = following = 0
+    for key, leaf in env.observation_spec.items(include_nested=True, leaves_only=True):
+        # Of one env state.
+        size = leaf.shape.numel() * leaf.dtype.itemsize // cfg.num_envs
+        if key in keys:
+            now += size
+        if unravel_key(("next", key)) in keys:
+            following += size
     length = cfg.data.rollout_length(cfg.num_envs)
+    needed = length * cfg.num_envs * (now + following)
+    # A replay keeps each observation once; the dataset of an update that copies none is the rollout.
+    if isinstance(cfg.data, ReplayCfg):
+        needed += cfg.data.capacity * cfg.num_envs * now
     check_bytes(
-        f"rollouts of {length} steps, by {cfg.data}",
-        length * stored,
+        f"rollouts of {length} steps, by {cfg.data}, with {now + following:,} bytes of observations in each env state",
+        needed,
         num_envs=cfg.num_envs,
         device=cfg.resolved_device(),
     )

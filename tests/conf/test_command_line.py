@@ -130,7 +130,7 @@ def test_cfg_job_prints_the_composed_config(capsys, tmp_path, monkeypatch):
 def test_help_lists_the_tasks_and_the_groups(capsys):
     code, output = run(capsys, "train", "--help")
     assert code == 0
-    assert "cartpole_balance, cartpole_swingup" in output.out
+    assert "cartpole_balance, cartpole_balance_pixels" in output.out
     for group in ("collector", "data", "objective", "modules", "trainer", "logger"):
         assert f"\n{group}: " in output.out
     assert "task/training" not in output.out, "of the groups that nobody chooses from"

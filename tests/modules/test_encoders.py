@@ -11,6 +11,7 @@ from torchrl.modules import set_recurrent_mode
 from ksim_rl.modules import (
     ActorCfg,
     CriticCfg,
+    DeterministicActorCfg,
     Encoder,
     EncoderCfg,
     QNetworkCfg,
@@ -20,6 +21,7 @@ from ksim_rl.modules import (
     SquashedActorCfg,
     make_actor,
     make_critic,
+    make_deterministic_actor,
     make_for_spec,
     make_q_network,
     make_recurrent_actor,
@@ -138,6 +140,7 @@ NETWORKS = {
     "critic": (make_critic, CriticCfg, {}, "state_value"),
     "trunk": (make_shared_trunk, SharedTrunkCfg, {}, "features"),
     "squashed": (make_squashed_actor, SquashedActorCfg, ACTION, "loc"),
+    "deterministic": (make_deterministic_actor, DeterministicActorCfg, ACTION, "action"),
     "q": (make_q_network, QNetworkCfg, {"action_dim": 2}, "state_action_value"),
 }
 
@@ -231,7 +234,7 @@ def test_what_a_network_cannot_read_is_refused(keys, encoders, message):
     [
         ((H, W, 3), torch.int32, "torch.int32"),
         # Frames of a depth camera would be taken for rows.
-        ((3, H, W), torch.float32, "stacked pictures of one channel"),
+        ((3, H, W), torch.float32, r"stacked \[N, H, W\]"),
         ((3,), torch.uint8, r"these are \[3\]"),
     ],
 )

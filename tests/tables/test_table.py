@@ -66,7 +66,15 @@ def test_a_table_that_does_not_exist_gives_the_near_names():
 
 
 def test_the_shipped_tables_name_tasks_that_exist():
-    assert shipped() == ["dm_control", "humanoids", "manipulation", "tasks", "tracking", "velocity"]
+    assert shipped() == [
+        "dm_control",
+        "humanoids",
+        "manipulation",
+        "pixels",
+        "tasks",
+        "tracking",
+        "velocity",
+    ]
     for name in shipped():
         assert {row.task for row in load(name).rows.values()} <= set(envs.names())
 
@@ -95,6 +103,7 @@ def test_the_other_algorithm_stays_within_its_env_states():
     [
         "velocity:fast_sac/go1",
         "humanoids:g1_flat",
+        "pixels:cartpole_balance_pixels",
         "manipulation:panda_pick_cube",
         "manipulation:leap_cube_reorient",
         *(f"tracking:{clip}" for clip in ("walk", "squat", "turn", "kick")),
@@ -119,7 +128,7 @@ def test_the_tables_have_every_task_and_that_of_tasks_asks_of_each_what_the_task
     rows = load("tasks").rows
     elsewhere = {
         row.task
-        for name in ("velocity", "humanoids", "tracking")
+        for name in ("velocity", "humanoids", "tracking", "pixels")
         for row in load(name).rows.values()
     }
     own = [name for name in envs.names() if not envs.task(name).suite]

@@ -111,6 +111,14 @@ class ObservationGroupCfg(Checked):
         """Return the numbers of a history that is given by its length."""
         return _numbers_of_frames(self.history, num_envs)
 
+    @property
+    def num_stacked(self) -> int | None:
+        """How many vectors or images the group stacks, or None where there is no dim of frames."""
+        frames = history_cfg(self.history)
+        if frames is None or frames.flat:
+            return None
+        return frames.length
+
     def num_frames(self, term: str) -> int:
         """Return how many frames of a term the vector holds side by side."""
         for history in (self.terms[term].history, self.history):

@@ -23,8 +23,8 @@ def check_layout(shape: Sequence[int], layout: Layout) -> None:
     # Frames of a depth camera, [N, H, W], would be read as very low pictures with W channels.
     if channels > min(sides):
         raise ValueError(
-            f"layout={layout!r} gives pictures {dims} {channels} channels, more than pixels along a side: choose the "
-            "other layout; stacked pictures of one channel, [N, H, W], are read as 'CHW'"
+            f"layout={layout!r} gives pictures {dims} {channels} channels, more than rows or columns: choose the "
+            "other, as for stacked [N, H, W]"
         )
 
 

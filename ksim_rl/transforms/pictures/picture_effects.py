@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import torch
 from jaxtyping import Shaped
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
@@ -91,7 +91,8 @@ class PictureEffects(Switched, KeyedTransform):
         """Change a batch of samples, each by draws of its own."""
         self._check_samples(tensordict, is_floating=False)
         for key in self.in_keys:
-            check_layout(tensordict.get(key).shape[tensordict.ndim :], self.layout)
+            leaf = tensordict.get(key).shape[_batch_dims(tensordict, key) :]
+            check_layout(leaf, self.layout)
         self._take_seed()
         self.step_count.add_(1)
         return self._emit(tensordict, "forward", self.step_count)
@@ -100,8 +101,7 @@ class PictureEffects(Switched, KeyedTransform):
         num_rows = tensordict.batch_size.numel()
         for index, key in enumerate(self.in_keys):
             value = tensordict.get(key)
-            # Samples without an env have no dims but their own.
-            batch_dims = max(tensordict.ndim, self.batch_dims[index] if self.batch_dims else 0)
+            batch_dims = _batch_dims(tensordict, key)
             batch = value.shape[:batch_dims]
             leaf = value.shape[batch_dims:]
             framed_BNHWC = framed(value.reshape(-1, *leaf), self.layout)
@@ -138,6 +138,13 @@ class PictureEffects(Switched, KeyedTransform):
                 changed_ENHWC = torch.where(enabled, changed_ENHWC, pictures_ENHWC)
             pictures_ENHWC = changed_ENHWC
         return pictures_ENHWC
+
+
+def _batch_dims(tensordict: TensorDictBase, key: NestedKey) -> int:
+    """Return the batch dims of the TensorDict in which a key lies: a nested one may have one of agents."""
+    if isinstance(key, str):
+        return tensordict.ndim
+    return tensordict.get(key[:-1]).ndim
 
 
 def _check_kind(effect: PictureEffect, dtype: torch.dtype, ends: Ends) -> None:

@@ -184,7 +184,7 @@ def test_it_compiles_without_a_graph_break():
         (Bounded(0.0, 2.0, (3, 4, 5)), Brightness(), "these may be from 0.0 to 2.0"),
         (Unbounded((3, 9)), RandomShift(), r"these are \[9\]"),
         # Frames of a depth camera would be taken for rows.
-        (Unbounded((3, 3, 6, 8)), RandomShift(), "stacked pictures of one channel"),
+        (Unbounded((3, 3, 6, 8)), RandomShift(), r"stacked \[N, H, W\]"),
         (Unbounded((3, 4, 5)), RandomCrop(height=5, width=5), r"effects\.it: height=5"),
     ],
 )  # fmt: skip

@@ -1,0 +1,104 @@
+"""Tasks that are seen: what their policy reads, and that each kind of algorithm trains on it."""
+
+import json
+
+import pytest
+import torch
+
+from ksim_rl import conf, envs
+from ksim_rl.algorithms.ppo.wiring import build_networks
+from ksim_rl.trainers import build
+from tests.cli.test_train import run
+
+TINY = [
+    "task=cartpole_balance_pixels",
+    "device=cpu",
+    "logger=none",
+    "num_envs=4",
+    "task.scene.sensors.side.width=36",
+    "task.scene.sensors.side.height=36",
+    "trainer.num_iterations=2",
+    "trainer.eval_episodes=0",
+    "trainer.video=false",
+]
+PPO = ["data.num_env_states_per_minibatch=16", "data.num_minibatches=2"]
+ALONE = ["modules.trunk=null", "modules.actor.in_keys=[actor]", "modules.critic.in_keys=[critic]"]
+SEES = "+modules.actor.encoders.actor={spatial_softmax: true}"
+
+
+def cart_column(rgb_EHWC):
+    """The mean column of the cart, whose lower edge is grey before the sky, below the rail and the pole."""
+    edge_EW = rgb_EHWC[:, 33:35].int().amax(-1).amax(1)
+    is_cart_EW = edge_EW < 180
+    counts_E = is_cart_EW.sum(-1)
+    # 0.4 m of 2.5 m in 64 columns.
+    assert bool(((counts_E >= 9) & (counts_E <= 12)).all())
+    return (is_cart_EW * torch.arange(64.0)).sum(-1) / counts_E
+
+
+def test_its_policy_reads_the_last_three_pictures_and_nothing_else():
+    env = envs.make("cartpole_balance_pixels", num_envs=2, seed=0)
+    root = env.reset()
+    frames_ENHWC = root["actor"]
+    assert frames_ENHWC.shape == (2, 3, 64, 64, 3) and frames_ENHWC.dtype == torch.uint8
+    assert "observations/actor (3, 64, 64, 3)" in env.base_env.explain()
+    actor, critic = build_networks(conf.compose(["task=cartpole_balance_pixels"]), env)
+    assert {*actor.in_keys, *critic.in_keys} - {"loc", "scale"} == {"actor"}
+    first = cart_column(frames_ENHWC[:, -1])
+    for _ in range(15):
+        before = root["actor"]
+        _, root = env.step_and_maybe_reset(actor(root).set("action", torch.full((2, 1), 10.0)))
+        assert torch.equal(root["actor"][:, :-1], before[:, 1:])
+    # 10 N on 1.1 kg for 0.15 s are 0.1 m, of 2.5 m in 64 columns.
+    moved_E = cart_column(root["actor"][:, -1]) - first
+    assert bool(((moved_E > 1.5) & (moved_E < 4.0)).all())
+
+
+def test_a_policy_without_an_encoder_and_a_replay_without_memory_are_refused():
+    with pytest.raises(ValueError, match="modules.trunk: in_keys: 'actor' is no vector"):
+        build(conf.compose([*TINY, *PPO, "~modules.trunk.encoders.actor"]))
+    # Three frames of 36 x 36 colours, and the critic's five numbers, now and next.
+    huge = ["objective=fast_sac", "data.capacity=10000000", SEES]
+    with pytest.raises(ValueError, match="23,368 bytes of observations in each env state.*GB"):
+        build(conf.compose([*TINY, *huge]))
+
+
+KINDS = {
+    "ppo": PPO,
+    "recurrent": [*ALONE, *PPO, SEES, "modules.actor.obs_normalization=true", "data.sequence_length=4",
+                  "+modules.recurrent_actor={kind: gru, hidden_dim: 8}"],
+    "fast_sac": ["objective=fast_sac", SEES, "data.capacity=64", "data.num_env_states_per_minibatch=16",
+                 "data.num_minibatches=4", "data.learning_starts=2"],
+}  # fmt: skip
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_trains_with_effects_a_slow_camera_and_a_lag(kind):
+    look = (
+        "{_target_: ksim_rl.transforms.PictureEffects, in_keys: [actor], effects: {shift: "
+        "{_target_: ksim_rl.transforms.RandomShift, pixels: 2}}}"
+    )
+    slow = (
+        "{_target_: ksim_rl.transforms.ObservationHold, in_keys: [actor], every: 2, dropped: 0.1}"
+    )
+    chain = [f"+task.transforms.look={look}", f"+task.transforms.slow={slow}"]
+    trainer = build(conf.compose([*TINY, *KINDS[kind], *chain]))
+    before = [weight.clone() for weight in trainer.update.actor.parameters()]
+    trainer.train()
+    metrics = {name: float(value) for name, value in trainer.update.metrics().items()}
+    assert metrics["update/skipped_steps"] == 0 and metrics["update/non_finite_env_states"] == 0
+    after = list(trainer.update.actor.parameters())
+    assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+@pytest.mark.full
+def test_a_run_is_evaluated_resumed_and_refused_by_an_export(tmp_path, capsys):
+    folder = tmp_path / "run"
+    words = [word for word in TINY if "eval" not in word]
+    words += [*PPO, "trainer.eval_episodes=2", "task.episode_length_s=0.2"]
+    run("train", *words, f"hydra.run.dir={folder}")
+    assert json.loads((folder / "evaluation.json").read_text())["episodes"] == 2
+    assert run("resume", str(folder), "trainer.num_iterations=3") in (0, 1)
+    assert run("export", str(folder)) == 2
+    assert "CameraImage reads the camera 'side', which an export has not" in capsys.readouterr().err
