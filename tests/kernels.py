@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from tests.docs.guide import REPOSITORY
 
-MAKERS = ("QuickLaunch", "launch_of", "launcher")
+MAKERS = ("QuickLaunch", "launch_of", "launcher", "launcher_of")
 EQUAL_WORLDS = "gpu/test_repeatability.py::test_equal_worlds_stay_equal_bit_for_bit"
 CAPTURED_STEPS = "gpu/test_fused_ppo.py::test_captured_steps_are_the_eager_ones_bit_for_bit"
 LAYERS = "gpu/test_off_policy.py::test_layers_in_half_precision_err_as_torch_does"

@@ -6,12 +6,14 @@ of all headers of a kernel, so that its cache has a kernel for each text.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.resources import files
+from pathlib import PurePosixPath
 
 _INCLUDE = re.compile(r'(?m)^#include "(.*)"\n')
 _ARGUMENTS = re.compile(r"struct Arguments \{\n(.*?)\n\};", re.DOTALL)
-_FIELD = re.compile(r"^ +(\w[\w ]*?[ *]+)(\w+);(?: +//.*)?$|^ *//.*$")
+_TYPE = r"(?:const )?(?:(?:unsigned|long) )*[\w:]+(?:<[\w:<>, ]+>)?\*?"
+_FIELD = re.compile(rf"^ +({_TYPE}) (\w+);(?: +//.*)?$|^ *//.*$")
 _GIVEN = re.compile(r"namespace given \{\n(.*?)\n\}", re.DOTALL)
 _CONSTANT = re.compile(r"(?m)^(constexpr int (\w+) = )(-?\d+);")
 WARP = "builtin.h"
@@ -65,5 +67,11 @@ def arguments_of(text: str) -> dict[str, str]:
         field = _FIELD.match(line)
         assert field is not None, f"a field is a line of its own: {line!r}"
         if field[2]:
-            fields[field[2]] = field[1].strip()
+            fields[field[2]] = field[1]
     return fields
+
+
+def call_of(header: str, indices: str, values: Iterable[str]) -> str:
+    """Return the call of a header's `run` with two indices and its arguments, in their order."""
+    name = PurePosixPath(header).stem
+    return f"{name}::run({indices}, {name}::Arguments {{{', '.join(values)}}});"

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
 from importlib.resources import files
 from inspect import signature
-from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from weakref import WeakSet
 
@@ -58,14 +57,13 @@ def launch_of(header: str, constants: Mapping[str, int] | None = None) -> "Quick
     order: numbers, and addresses of tensors where it has pointers. The constants are those that the header is given.
     """
     text = headers.text_of(header, constants)
-    name = PurePosixPath(header).stem
     fields = headers.arguments_of(text)
     kinds: dict[str, type | str] = {}
     values: list[str] = []
     for field, ctype in fields.items():
         kinds[field] = ADDRESS if ctype.endswith("*") else _KINDS[ctype]
         values.append(f"({ctype})a.{field}")
-    call = f"{name}::run(row, lane, {name}::Arguments {{{', '.join(values)}}});"
+    call = headers.call_of(header, "row, lane", values)
     return QuickLaunch(kinds, call, preamble=text)
 
 

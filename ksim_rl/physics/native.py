@@ -12,7 +12,8 @@ from typing import Any
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.device import quick_launch
+from ksim_rl.device import headers, quick_launch
+from ksim_rl.device.upstream import with_preamble
 from ksim_rl.physics.structs import Field, filled, values_of
 from ksim_rl.physics.upstream import Struct
 
@@ -42,6 +43,14 @@ class Build:
     max_registers: int | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """The C++ of a kernel: the body of its function, and what stands before that function."""
+
+    body: str
+    preamble: str = ""
+
+
 def launcher(
     source: str,
     constants: Mapping[str, int],
@@ -61,13 +70,65 @@ def launcher(
     """
     # The C++ itself says which arrays it reads, so that no list of them can go out of date.
     names = dict.fromkeys(re.findall(r"\bproblem\.(\w+)", source))
-    owners = own, warp_model, warp_model.opt, warp_data_E
-    types = tuple((name, _type_of(value)) for name, value in values_of(names, *owners).items())
     # Constants are whole numbers, so that kernels of equal sizes are one in the cache.
+    values = _constants(constants, lanes, threads)
+    named = "".join(f"constexpr int {name} = {value};\n" for name, value in values.items())
+    owners = own, warp_model, warp_model.opt, warp_data_E
+    return _launch_of(
+        Source(body=named + source), tuple(names), owners, lanes=lanes, threads=threads, build=build
+    )
+
+
+def launcher_of(
+    header: str,
+    constants: Mapping[str, int],
+    own: Mapping[str, Field],
+    warp_model: mjw.Model,
+    warp_data_E: mjw.Data,
+    *,
+    lanes: int,
+    threads: int,
+    build: Build = Build(),
+) -> Callable[..., None]:
+    """Return a launcher of the kernel of a header over (worlds, lanes); see `launcher`, and `headers`.
+
+    A field of its `Arguments` is the one of that name of `own`, or else of the model, its options or its worlds.
+    """
+    text = headers.text_of(header, _constants(constants, lanes, threads))
+    fields = headers.arguments_of(text)
+    body = headers.call_of(header, "world, lane", [f"problem.{name}" for name in fields])
+    owners = own, warp_model, warp_model.opt, warp_data_E
+    return _launch_of(
+        Source(body=body, preamble=text),
+        tuple(fields),
+        owners,
+        lanes=lanes,
+        threads=threads,
+        build=build,
+    )
+
+
+def _constants(constants: Mapping[str, int], lanes: int, threads: int) -> dict[str, int]:
     values = {name.upper(): int(value) for name, value in constants.items()}
-    values |= {"LANES": lanes, "THREADS": threads}
-    kernel, struct = _kernel(source, tuple(values.items()), types, threads, build)
+    values["LANES"] = lanes
+    values["THREADS"] = threads
+    return values
+
+
+def _launch_of(
+    source: Source,
+    names: tuple[str, ...],
+    owners: tuple[Mapping[str, Field], mjw.Model, mjw.Option, mjw.Data],
+    *,
+    lanes: int,
+    threads: int,
+    build: Build,
+) -> Callable[..., None]:
+    fields = values_of(names, *owners)
+    types = tuple((name, _type_of(value)) for name, value in fields.items())
+    kernel, struct = _kernel(source, types, lanes, threads, build)
     problem = filled(struct, *owners)
+    *_, warp_data_E = owners
     dim = (warp_data_E.nworld, lanes)
     device = warp_data_E.qpos.device
 
@@ -88,9 +149,9 @@ def _type_of(value: Any) -> type:
 
 @functools.cache
 def _kernel(
-    source: str,
-    constants: tuple[tuple[str, int], ...],
+    source: Source,
     types: tuple[tuple[str, type], ...],
+    lanes: int,
     threads: int,
     build: Build,
 ) -> tuple[wp.Kernel, Struct]:
@@ -101,12 +162,10 @@ def _kernel(
 
     Problem.__annotations__ = dict(types)
     struct = wp.struct(Problem)
-    # Constants of C++, not arguments: loops over them are unrolled.
-    named = "".join(f"constexpr int {name} = {value};\n" for name, value in constants)
     # Or else loops over nothing are compiled.
-    named += "__builtin_assume(lane >= 0 && lane < LANES);\n"
+    known = f"__builtin_assume(lane >= 0 && lane < {lanes});\n"
 
-    @wp.func_native(named + source)
+    @wp.func_native(known + source.body)
     def body(world: int, lane: int, problem: struct) -> None: ...
 
     @wp.kernel(
@@ -114,7 +173,11 @@ def _kernel(
         enable_backward=False,
         grid_stride=False,
         cuda_max_registers=build.max_registers,
-        module_options={"block_dim": threads, "fast_math": build.fast_math},
+        module_options={
+            "block_dim": threads,
+            "fast_math": build.fast_math,
+            "extra_build_options": with_preamble(source.preamble),
+        },
     )
     def kernel(problem: struct):
         world, lane = wp.tid()

@@ -1,7 +1,7 @@
 """Launches the collision pass of a substep: one kernel, which owns a world, and MuJoCo Warp's for the rest.
 
 MuJoCo Warp's has a thread for each pair of geoms, and each that passes waits for the one counter of all worlds, as each
-contact does afterwards. Read the parts in their order: broad_phase.cpp, shapes.cpp, narrow_phase.cpp.
+contact does afterwards. The kernel is collisions.cuh.
 """
 
 import dataclasses
@@ -21,6 +21,7 @@ LANES = 32
 CUDA_THREADS = 128
 REGISTERS = 64
 FILTERS = mjw.BroadphaseFilter.PLANE | mjw.BroadphaseFilter.SPHERE | mjw.BroadphaseFilter.OBB
+TYPES = ("PLANE", "SPHERE", "CAPSULE", "CYLINDER", "BOX")
 # How many contacts a pair of these types has at most.
 MOST_CONTACTS = {
     "plane": {"sphere": 1, "capsule": 2, "cylinder": 4, "box": 8},
@@ -99,8 +100,6 @@ def collisions(
         "pairs": wp.array(pairs, dtype=wp.vec3i, device=device),
         "lists": 1,
     }
-    source = native.source_of("rows", ("layout",))
-    source += native.source_of("collision", ("broad_phase", "shapes", "narrow_phase"))
     if device.is_cuda:
         lanes = lanes or LANES
         threads = CUDA_THREADS
@@ -112,7 +111,7 @@ def collisions(
         build = native.Build()
     margins = m.geom_margin, m.geom_gap, m.pair_margin, m.pair_gap
     constants = {
-        **upstream.GEOM_TYPES,
+        **{name: upstream.GEOM_TYPES[name] for name in TYPES},
         # Margins that differ between worlds may be drawn at any time.
         "has_margins": any(field.shape[0] > 1 or bool(field.numpy().any()) for field in margins),
         "has_pairs": m.pair_dim.size > 0,
@@ -120,8 +119,9 @@ def collisions(
         "others": others.size > 0,
         "has_rows": HAS_ROWS,
     }
-    collide = native.launcher(
-        source, constants, own, m, d, lanes=lanes, threads=threads, build=build
+    header = "ksim_rl/physics/collision/collisions.cuh"
+    collide = native.launcher_of(
+        header, constants, own, m, d, lanes=lanes, threads=threads, build=build
     )
     # MuJoCo Warp's narrow phase launches kernels by these counts: only of the pairs that are left.
     theirs = dataclasses.replace(m, geom_pair_type_count=upstream.pair_type_counts(m, others))

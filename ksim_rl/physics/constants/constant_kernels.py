@@ -1,6 +1,6 @@
 """These Warp kernels recompute the constants that MuJoCo derives at `qpos0`, in the worlds of a mask only.
 
-Constants that follow from the joint-space inertia are computed in C++, see `constants_of_inertia.cpp`.
+Constants that follow from the joint-space inertia are computed in C++, see `constants_of_inertia.cuh`.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
@@ -8,12 +8,13 @@ Constants that follow from the joint-space inertia are computed in C++, see `con
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 
 import functools
-from importlib.resources import files
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from ksim_rl.device import headers
+from ksim_rl.device.upstream import with_preamble
 from ksim_rl.physics.structs import struct_with
 from ksim_rl.physics.upstream import mul_quat, quat_to_mat, rot_vec_quat
 
@@ -24,7 +25,7 @@ KIN0 = wp.constant(int(mjw.SetConstGroup.KIN0))
 INERT0 = wp.constant(int(mjw.SetConstGroup.INERT0))
 # Below this speed of its centre of mass, in m/s, a body whose joint moves at unit speed is one that does not move.
 STANDS = wp.constant(1.0e-6)
-_SOURCE = files("ksim_rl.physics.constants").joinpath("constants_of_inertia.cpp").read_text()
+_HEADER = "ksim_rl/physics/constants/constants_of_inertia.cuh"
 
 
 @struct_with(
@@ -264,16 +265,25 @@ def constants_kernel(nv: int, nbody: int, lanes: int, on_chip: bool) -> wp.Kerne
     Its arrays are on the chip (in shared memory), or else in the scratch memory of its `Constants`.
     """
     # Sizes are compile-time constants, so that arrays in shared memory have them; the cache keeps one kernel for each.
-    sizes = f"NV = {nv}, NB = {nbody}, FLOATS = {floats_per_world(nv, nbody)}, LANES = {lanes}, ON_CHIP = {+on_chip}"
+    sizes = {
+        "NV": nv,
+        "NB": nbody,
+        "FLOATS": floats_per_world(nv, nbody),
+        "ON_CHIP": int(on_chip),
+        "LANES": lanes,
+        "THREADS": lanes,
+    }
+    text = headers.text_of(_HEADER, sizes)
+    values = [f"c.{name}" for name in headers.arguments_of(text)]
 
-    @wp.func_native(f"constexpr int {sizes};\n{_SOURCE}")
+    @wp.func_native(headers.call_of(_HEADER, "world, lane", values))
     def constants_of_inertia(world: int, lane: int, c: Constants) -> None: ...
 
     @wp.kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
-        module_options={"block_dim": lanes},
+        module_options={"block_dim": lanes, "extra_build_options": with_preamble(text)},
     )
     def constants_at_qpos0(c: Constants, groups: int):
         world, lane = wp.tid()

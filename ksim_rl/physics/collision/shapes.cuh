@@ -1,33 +1,47 @@
 // Part 2: where two shapes touch, or how far they are apart. The sources are engine_collision_primitive.c and, of boxes,
 // engine_collision_box.c. A pair has several of them, of which a lane finds one at a time. Normals point from the first geom to the second.
+#pragma once
+#include "ksim_rl/physics/collision/broad_phase.cuh"
+
+namespace collisions {
 
 constexpr float FAR = 1e10f;
 struct Touch {
     float distance = FAR;
     vec3 position, normal;
 };
-const wp::vec3* const sizes = model_row(problem.geom_size);
 
-auto sign_of = [](int bits, int bit) { return bits >> bit & 1 ? 1.0f : -1.0f; };
-auto into = [](const wp::mat33& turn, const vec3& v) {
+CUDA_CALLABLE inline float sign_of(int bits, int bit)
+{
+    return bits >> bit & 1 ? 1.0f : -1.0f;
+}
+
+CUDA_CALLABLE inline vec3 into(const wp::mat33& turn, const vec3& v)
+{
     return vec3(
         turn.data[0][0] * v[0] + turn.data[1][0] * v[1] + turn.data[2][0] * v[2],
         turn.data[0][1] * v[0] + turn.data[1][1] * v[1] + turn.data[2][1] * v[2],
         turn.data[0][2] * v[0] + turn.data[1][2] * v[1] + turn.data[2][2] * v[2]
     );
-};
-auto plane_touches = [&](const vec3& normal, const vec3& origin, const vec3& point, float radius) {
+}
+
+CUDA_CALLABLE inline Touch plane_touches(const vec3& normal, const vec3& origin, const vec3& point, float radius)
+{
     const float distance = wp::dot(point - origin, normal) - radius;
     return Touch{distance, point - normal * (radius + 0.5f * distance), normal};
-};
-auto spheres_touch = [&](const vec3& center, float radius, const vec3& other, float other_radius) {
+}
+
+CUDA_CALLABLE inline Touch spheres_touch(const vec3& center, float radius, const vec3& other, float other_radius)
+{
     const vec3 between = other - center;
     const float length = wp::length(between), distance = length - radius - other_radius;
     const vec3 normal = length > 0.0f ? between / length : vec3(1.0f, 0.0f, 0.0f);
     return Touch{distance, center + normal * (radius + 0.5f * distance), normal};
-};
+}
+
 // The point in the middle is `center` in the axes of the box.
-auto sphere_touches_box = [&](const vec3& center, float radius, const vec3& size, const vec3& origin, const wp::mat33& turn) {
+CUDA_CALLABLE inline Touch sphere_touches_box(const vec3& center, float radius, const vec3& size, const vec3& origin, const wp::mat33& turn)
+{
     vec3 outwards, nearest;
     for (int i = 0; i < 3; ++i) {
         nearest[i] = wp::clamp(center[i], -size[i], size[i]);
@@ -51,13 +65,14 @@ auto sphere_touches_box = [&](const vec3& center, float radius, const vec3& size
     // Half way between the surfaces.
     const vec3 middle = center + normal * (0.5f * (distance + radius));
     return Touch{distance - radius, origin + wp::mul(turn, middle), wp::mul(turn, normal)};
-};
+}
 
 // Two segments are nearest each other at center + s * half and other + t * other_half, of -1 to 1 each. Parallel ones are
 // at both ends of where they overlap; the second of these is asked for by `second`.
-auto capsules_touch = [&](int a, int b, bool second) {
-    const vec3 half = axis(turns[a], 2) * sizes[a][1], other_half = axis(turns[b], 2) * sizes[b][1];
-    const vec3 between = positions[a] - positions[b], normal = wp::cross(half, other_half);
+CUDA_CALLABLE inline Touch capsules_touch(const Geoms& geoms, int a, int b, bool second)
+{
+    const vec3 half = axis(geoms.turns[a], 2) * geoms.sizes[a][1], other_half = axis(geoms.turns[b], 2) * geoms.sizes[b][1];
+    const vec3 between = geoms.positions[a] - geoms.positions[b], normal = wp::cross(half, other_half);
     const float aa = wp::dot(half, half), bb = wp::dot(other_half, other_half), ab = wp::dot(half, other_half);
     const float a_between = wp::dot(half, between), b_between = wp::dot(other_half, between);
     const float sines = wp::dot(normal, normal);
@@ -78,14 +93,15 @@ auto capsules_touch = [&](int a, int b, bool second) {
         t = t > 0.0f ? 1.0f : -1.0f;
         s = of_other(t);
     }
-    return spheres_touch(positions[a] + half * s, sizes[a][0], positions[b] + other_half * t, sizes[b][0]);
-};
+    return spheres_touch(geoms.positions[a] + half * s, geoms.sizes[a][0], geoms.positions[b] + other_half * t, geoms.sizes[b][0]);
+}
 
 // A capsule touches a box where they are nearest, and where it leaves what it lies along, a face or an edge.
-auto capsule_touches_box = [&](int a, int b, bool second) {
-    const wp::mat33 turn = turns[b];
-    const vec3 size = sizes[b], direction = into(turn, axis(turns[a], 2)), half = direction * sizes[a][1];
-    const vec3 center = into(turn, positions[a] - positions[b]);
+CUDA_CALLABLE inline Touch capsule_touches_box(const Geoms& geoms, int a, int b, bool second)
+{
+    const wp::mat33 turn = geoms.turns[b];
+    const vec3 size = geoms.sizes[b], direction = into(turn, axis(geoms.turns[a], 2)), half = direction * geoms.sizes[a][1];
+    const vec3 center = into(turn, geoms.positions[a] - geoms.positions[b]);
     float least = FAR, s = 0.0f, along_edge = 0.0f;
     int face = -1, corner = -1, edge = 0;  // of the box: the face, or else the corner or the edge from it, that is nearest
     bool found = false, at_corner = false;
@@ -150,7 +166,7 @@ auto capsule_touches_box = [&](int a, int b, bool second) {
     if (!found)
         return Touch();
     if (!second)
-        return sphere_touches_box(center + half * s, sizes[a][0], size, positions[b], turn);
+        return sphere_touches_box(center + half * s, geoms.sizes[a][0], size, geoms.positions[b], turn);
     // How far the second is from the first, and to which side.
     const int upwards = (half[0] > 0.0f) | (half[1] > 0.0f) << 1 | (half[2] > 0.0f) << 2;
     auto is_one_axis = [](int bits) { return bits == 1 || bits == 2 || bits == 4; };
@@ -194,52 +210,57 @@ auto capsule_touches_box = [&](int a, int b, bool second) {
         const float rest = (bool)(upwards >> edge & 1) == forwards ? 1.0f - along_edge : 1.0f + along_edge;
         further = wp::min(wp::min(1.0f - side * s, 2.0f * span(across)), rest * span(edge));
     }
-    return sphere_touches_box(center + half * (s + side * further), sizes[a][0], size, positions[b], turn);
-};
+    return sphere_touches_box(center + half * (s + side * further), geoms.sizes[a][0], size, geoms.positions[b], turn);
+}
+
 // The lowest points of both ends of a cylinder, then two more of the lower end, which make a triangle with its lowest.
-auto cylinder_touches_plane = [&](int a, int b, int which) {
-    const vec3 normal = axis(turns[a], 2), center = positions[b];
-    const float radius = sizes[b][0];
-    vec3 down = axis(turns[b], 2);
+CUDA_CALLABLE inline Touch cylinder_touches_plane(const Geoms& geoms, int a, int b, int which)
+{
+    const vec3 normal = axis(geoms.turns[a], 2), center = geoms.positions[b];
+    const float radius = geoms.sizes[b][0];
+    vec3 down = axis(geoms.turns[b], 2);
     if (wp::dot(down, normal) > 0.0f)
         down = -down;
     vec3 lowest = down * wp::dot(down, normal) - normal;
     const float length = wp::length(lowest);
-    lowest = length >= 1e-6f ? lowest * (radius / length) : axis(turns[b], 0) * radius;
-    down = down * sizes[b][1];
+    lowest = length >= 1e-6f ? lowest * (radius / length) : axis(geoms.turns[b], 0) * radius;
+    down = down * geoms.sizes[b][1];
     if (which < 2)
-        return plane_touches(normal, positions[a], center + lowest + down * (which ? -1.0f : 1.0f), 0.0f);
+        return plane_touches(normal, geoms.positions[a], center + lowest + down * (which ? -1.0f : 1.0f), 0.0f);
     const vec3 aside = wp::normalize(wp::cross(lowest, down)) * (radius * 0.8660254f * (which == 2 ? 1.0f : -1.0f));
-    return plane_touches(normal, positions[a], center + down - lowest * 0.5f + aside, 0.0f);
-};
+    return plane_touches(normal, geoms.positions[a], center + down - lowest * 0.5f + aside, 0.0f);
+}
 
-auto touch_of = [&](int a, int b, int which) {
-    const int kind = problem.geom_type.data[a], other = problem.geom_type.data[b];
-    const vec3 size = sizes[b], along = axis(turns[b], 2);
+CUDA_CALLABLE inline Touch touch_of(const Geoms& geoms, int a, int b, int which)
+{
+    const int kind = geoms.a.geom_type.data[a], other = geoms.a.geom_type.data[b];
+    const vec3 size = geoms.sizes[b], along = axis(geoms.turns[b], 2);
     if (kind == PLANE) {
-        const vec3 normal = axis(turns[a], 2);
+        const vec3 normal = axis(geoms.turns[a], 2);
         if (other == CYLINDER)
-            return cylinder_touches_plane(a, b, which);
+            return cylinder_touches_plane(geoms, a, b, which);
         if (other == SPHERE)
-            return plane_touches(normal, positions[a], positions[b], size[0]);
+            return plane_touches(normal, geoms.positions[a], geoms.positions[b], size[0]);
         if (other == CAPSULE)
-            return plane_touches(normal, positions[a], positions[b] + along * (which ? -size[1] : size[1]), size[0]);
+            return plane_touches(normal, geoms.positions[a], geoms.positions[b] + along * (which ? -size[1] : size[1]), size[0]);
         const vec3 corner = wp::mul(
-            turns[b], vec3(sign_of(which, 0) * size[0], sign_of(which, 1) * size[1], sign_of(which, 2) * size[2])
+            geoms.turns[b], vec3(sign_of(which, 0) * size[0], sign_of(which, 1) * size[1], sign_of(which, 2) * size[2])
         );
         // The other half of the corners is above the center.
-        return wp::dot(corner, normal) > 0.0f ? Touch() : plane_touches(normal, positions[a], positions[b] + corner, 0.0f);
+        return wp::dot(corner, normal) > 0.0f ? Touch() : plane_touches(normal, geoms.positions[a], geoms.positions[b] + corner, 0.0f);
     }
     if (kind == SPHERE && other == BOX)
         return sphere_touches_box(
-            into(turns[b], positions[a] - positions[b]), sizes[a][0], size, positions[b], turns[b]
+            into(geoms.turns[b], geoms.positions[a] - geoms.positions[b]), geoms.sizes[a][0], size, geoms.positions[b], geoms.turns[b]
         );
     if (kind == SPHERE) {
-        const float place = other == CAPSULE ? wp::dot(along, positions[a] - positions[b]) : 0.0f;
+        const float place = other == CAPSULE ? wp::dot(along, geoms.positions[a] - geoms.positions[b]) : 0.0f;
         const float reached = wp::clamp(place, -size[1], size[1]);
         return spheres_touch(
-            positions[a], sizes[a][0], other == CAPSULE ? positions[b] + along * reached : positions[b], size[0]
+            geoms.positions[a], geoms.sizes[a][0], other == CAPSULE ? geoms.positions[b] + along * reached : geoms.positions[b], size[0]
         );
     }
-    return other == CAPSULE ? capsules_touch(a, b, which) : capsule_touches_box(a, b, which);
-};
+    return other == CAPSULE ? capsules_touch(geoms, a, b, which) : capsule_touches_box(geoms, a, b, which);
+}
+
+}
