@@ -102,6 +102,8 @@ def builds_of_world(
         world._launch_once()
         for sensors in get_args(Sensors):
             world._launch_substep(sensors)
+        if world._substeps.stages.contacts is not None:
+            world._substeps.stages.contacts.rne_postconstraint(world.warp_model)
         world._substeps.refresh()
         world._launch_reset()
         world._overflow.record()

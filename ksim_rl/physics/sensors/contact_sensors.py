@@ -1,7 +1,7 @@
 """Reads contact sensors, and the forces that contacts exert on bodies, from each world's list of contacts.
 
 MuJoCo Warp sums and chooses in the order in which its threads come, which on a GPU is another one in each run. The
-kernels are rows/wrench.cpp with rows/sensors.cpp, and with rows/bodies.cpp. The first reads accelerometers as well, for
+kernels are contact_readings.cuh and contact_forces.cuh. The first reads accelerometers as well, for
 which MuJoCo Warp computes accelerations and forces of all bodies.
 """
 
@@ -74,11 +74,9 @@ class ContactReadings:
         # The same arrays, but the forces of contacts are among those that users apply, and it has no pool of contacts.
         self._without_pool = dataclasses.replace(d, xfrc_applied=own["forces"], naconmax=0)
         self._lists = lists
+        of_rows = {"njmax": d.njmax, "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC}
         constants = {
-            **(lists.constants | MATCHED),
-            "njmax": d.njmax,
-            "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
-            "bodies": m.nbody,
+            **(of_rows | MATCHED),
             "sensors": len(of_contacts),
             "accelerometers": len(accelerometers),
             "num_dofs": m.nv,
@@ -90,13 +88,13 @@ class ContactReadings:
             lanes = 4
         else:
             lanes = lists.lanes
-        parts = ("matching", "sensors", "accelerometers"), ("bodies",)
-        sources = [
-            native.source_of("rows", ("layout", "wrench", *own_parts)) for own_parts in parts
-        ]
-        self._read_sensors, self._sum_forces = (
-            native.launcher(source, constants, own, m, d, lanes=lanes, threads=lists.threads)
-            for source in sources
+        sizes = {"lanes": lanes, "threads": lists.threads}
+        self._read_sensors = native.launcher_of(
+            "ksim_rl/physics/sensors/contact_readings.cuh", constants, own, m, d, **sizes
+        )
+        constants = of_rows | {"bodies": m.nbody}
+        self._sum_forces = native.launcher_of(
+            "ksim_rl/physics/sensors/contact_forces.cuh", constants, own, m, d, **sizes
         )
 
     def list(self) -> None:

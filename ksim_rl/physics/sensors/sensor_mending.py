@@ -109,16 +109,16 @@ def _reading_of(
     own = {**vars(of_contacts), "sensors": wp.array(sensors, dtype=int, device=d.qpos.device)}
     site_types = {f"site_{name}": upstream.GEOM_TYPES[name] for name in _SITE_TYPES}
     constants = {
-        **(of_contacts.constants | MATCHED | site_types),
+        **(MATCHED | site_types),
         "site": int(mujoco.mjtObj.mjOBJ_SITE),
         "njmax": d.njmax,
         "elliptic": m.opt.cone == mjw.ConeType.ELLIPTIC,
         "sensors": len(sensors),
     }
-    source = native.source_of("rows", ("layout", "wrench", "matching", "slots"))
+    header = "ksim_rl/physics/sensors/contact_slots.cuh"
     lanes = of_contacts.lanes
     threads = of_contacts.threads
-    launch = native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads)
+    launch = native.launcher_of(header, constants, own, m, d, lanes=lanes, threads=threads)
 
     def read_sensors() -> None:
         if lists is None:

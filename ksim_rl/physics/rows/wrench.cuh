@@ -1,0 +1,59 @@
+// The force and torque of a contact, once the solver has found what its rows exert.
+#pragma once
+#include "ksim_rl/physics/lanes.cuh"
+
+namespace contacts {
+
+namespace given {
+constexpr int NJMAX = 64;    // rows of a world
+constexpr int ELLIPTIC = 0;  // whether friction cones are elliptic
+}
+
+using namespace given;
+using namespace lanes;
+using vec3 = wp::vec3;
+
+struct Wrench {
+    vec3 force, torque;
+};
+
+// What a contact exerts on its second geom, in its own axes: the normal and two tangents ("mj_contactForce").
+template <class Arguments>
+CUDA_CALLABLE inline Wrench wrench_of(const World& world, const Arguments& a, int contact)
+{
+    const int* const rows = a.contact_efc_address.data + (size_t)contact * a.contact_efc_address.shape[1];
+    const float* const friction = (const float*)(a.contact_friction.data + contact);
+    const float* const forces = world.row_of(a.efc_force);
+    // Rows beyond the last one that there is room for exert nothing.
+    auto of_row = [=](int row) { return row < NJMAX ? forces[row] : 0.0f; };
+    float along[6] = {};
+    const int dim = rows[0] < 0 ? 0 : a.contact_dim.data[contact];
+    if (ELLIPTIC || dim == 1)
+        for (int axis = 0; axis < dim; ++axis)
+            along[axis] = of_row(rows[axis]);
+    else
+        for (int axis = 1; axis < dim; ++axis) {
+            const float plus = of_row(rows[0] + 2 * axis - 2), minus = of_row(rows[0] + 2 * axis - 1);
+            along[0] += plus + minus;
+            along[axis] = (plus - minus) * friction[axis - 1];
+        }
+    if (dim > 0)
+        along[0] -= a.contact_adhesion.data[contact];
+    return Wrench {vec3(along[0], along[1], along[2]), vec3(along[3], along[4], along[5])};
+}
+
+template <class Arguments>
+CUDA_CALLABLE inline vec3 axis_of(const Arguments& a, int contact, int axis)
+{
+    const float* const axes = (const float*)(a.contact_frame.data + contact) + 3 * axis;
+    return vec3(axes[0], axes[1], axes[2]);
+}
+
+// A vector in the axes of a contact, in those of the world.
+template <class Arguments>
+CUDA_CALLABLE inline vec3 in_world(const Arguments& a, int contact, const vec3& v)
+{
+    return v[0] * axis_of(a, contact, 0) + v[1] * axis_of(a, contact, 1) + v[2] * axis_of(a, contact, 2);
+}
+
+}
