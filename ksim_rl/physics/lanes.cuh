@@ -33,6 +33,13 @@ struct World {
         return array.data + (array.shape[0] > 1 ? (size_t)world * array.shape[1] : 0);
     }
 
+    // The same of one value for each world.
+    template <class T>
+    CUDA_CALLABLE T of_world(const wp::array_t<T>& array) const
+    {
+        return array.data[array.shape[0] > 1 ? world : 0];
+    }
+
     // Calls work(item) for each item of so many that is this lane's.
     template <class Work>
     CUDA_CALLABLE void each(int count, Work work) const
@@ -84,6 +91,19 @@ CUDA_CALLABLE inline T of_lane(T value, int source)
     value = __shfl_sync(own_lanes(), value, source, LANES);
 #endif
     return value;
+}
+
+// The sum of what the lanes before this one have.
+CUDA_CALLABLE inline int sum_before(int lane, int value)
+{
+    int sum = value;
+#if defined(__CUDA_ARCH__)
+    for (int distance = 1; distance < LANES; distance *= 2) {
+        const int other = __shfl_up_sync(own_lanes(), sum, distance, LANES);
+        sum += lane >= distance ? other : 0;
+    }
+#endif
+    return sum - value;
 }
 
 // How many lanes before this one have something, and how many all.

@@ -2,7 +2,7 @@
 
 MuJoCo Warp launches about ten for them, whose threads take places for rows as they come, so that sums over rows round
 otherwise in each run on a GPU. Here some lanes of a warp own a world, and rows stand in the order of MuJoCo's C engine.
-Read the parts in their order: layout.cpp, order.cpp, row.cpp, joints.cpp, contacts.cpp. The sources are "Constraint
+The kernel is constraint_rows.cuh. Its sources are "Constraint
 model" in https://mujoco.readthedocs.io/en/stable/computation/index.html and mujoco_warp/_src/constraint.py.
 """
 
@@ -17,7 +17,6 @@ from ksim_rl.physics import native
 from ksim_rl.physics.rows.contact_lists import ContactLists
 from ksim_rl.physics.rows.second_limits import joints_between_limits
 
-PARTS = ("layout", "order", "row", "joints", "contacts")
 # The degrees of freedom that move a geom are bits of a number, and a geom of a pair is 15 bits of another.
 MOST_DOFS = 64
 MOST_GEOMS = 1 << 15
@@ -25,8 +24,16 @@ MOST_GEOMS = 1 << 15
 # 80 take less time: 6.435 ms instead of 6.566 for a control step of 32768 worlds of Go1 on an H200.
 THREADS_AT_ONCE = 512
 REGISTERS = 80
+_KINDS = (
+    "EQUALITY",
+    "FRICTION_DOF",
+    "LIMIT_JOINT",
+    "CONTACT_FRICTIONLESS",
+    "CONTACT_PYRAMIDAL",
+    "CONTACT_ELLIPTIC",
+)
 _ENUMS = {
-    **native.names_of(mujoco.mjtConstraint),
+    **{name: native.names_of(mujoco.mjtConstraint)[name] for name in _KINDS},
     "BALL": mujoco.mjtJoint.mjJNT_BALL,
     "OUT_OF_NONZEROS": mjw.OverflowType.NJMAX_NNZ,
 }
@@ -97,9 +104,9 @@ def constraint_rows(
     # Fewer registers pay only where not all threads are on the GPU at the same time.
     waits = device.is_cuda and d.nworld * lanes > THREADS_AT_ONCE * device.sm_count
     build = native.Build(max_registers=REGISTERS if waits else None)
-    source = native.source_of("rows", PARTS)
-    launch = native.launcher(
-        source, constants, own, m, d, lanes=lanes, threads=threads, build=build
+    header = "ksim_rl/physics/rows/constraint_rows.cuh"
+    launch = native.launcher_of(
+        header, constants, own, m, d, lanes=lanes, threads=threads, build=build
     )
 
     def make_rows() -> None:

@@ -41,11 +41,10 @@ class ContactLists:
         )
         # Contacts are sorted by these 64 bits, in C's order.
         self.keys = wp.empty((d.nworld, self.room), dtype=wp.uint64, device=device)
-        # For the kernels that read them, too.
+        # For the kernel of rows, too, which orders contacts on its way.
         self.constants = {
             "room": self.room,
             "sdf": bool(m.has_sdf_geom),
-            "has_rows": HAS_ROWS,
             "pairs": m.pair_dim.size,
             "repeated_pairs": bool(upstream.repeated_pairs(m).size),
         }
@@ -55,14 +54,14 @@ class ContactLists:
         else:
             self.lanes = 1
             self.threads = 1
+        given = vars(self), m, d
+        sizes = {"lanes": self.lanes, "threads": self.threads}
         # The first half appends, the second one sorts.
-        sources = [native.source_of("rows", parts) for parts in (("append",), ("layout", "order"))]
-        self._append, self.order = (
-            native.launcher(
-                source, self.constants, vars(self), m, d, lanes=self.lanes, threads=self.threads
-            )
-            for source in sources
-        )
+        has_rows = {"has_rows": HAS_ROWS}
+        append = "ksim_rl/physics/rows/contact_append.cuh"
+        self._append = native.launcher_of(append, has_rows, *given, **sizes)
+        order = "ksim_rl/physics/rows/contact_lists.cuh"
+        self.order = native.launcher_of(order, self.constants, *given, **sizes)
         self.are_appended = False
 
     def append(self) -> None:

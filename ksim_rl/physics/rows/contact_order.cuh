@@ -1,0 +1,118 @@
+// The contacts of a world, in the order of MuJoCo's C engine: by the pair of bodies, then those of explicit pairs, in their
+// order, before the others by their geoms, of which each contact has that of the lower type first
+// (engine_collision_driver.c).
+//
+// One thread writes the contacts of a pair one after another, so that their places in the pool are in its order. Only
+// contacts of signed distance fields are each written by another thread: these are ordered by where they are.
+#pragma once
+#include "ksim_rl/physics/lanes.cuh"
+
+namespace contact_order {
+
+namespace given {
+constexpr int ROOM = 64;            // contacts of a world that are listed
+constexpr int SDF = 0;              // whether there are signed distance fields
+constexpr int PAIRS = 1;            // of geoms, with laws of their own
+constexpr int REPEATED_PAIRS = 0;   // whether some of these are of the same geoms
+}
+
+using namespace given;
+using namespace lanes;
+using mask64 = unsigned long long;
+
+constexpr unsigned NOT_EXPLICIT = 1u << 31;
+constexpr int GEOM_BITS = 15;
+constexpr float LEAST_FRICTION = 1e-5f;
+
+template <class One, class Other>
+CUDA_CALLABLE inline bool equals(const One& one, const Other& other, int size)
+{
+    bool same = true;
+    for (int i = 0; i < size; ++i)
+        same &= one[i] == other[i];
+    return same;
+}
+
+// Of explicit pairs of the same geoms, a contact has the law of its own one.
+template <class Arguments>
+CUDA_CALLABLE inline bool has_law_of(const World& world, const Arguments& a, int contact, int pair)
+{
+    const auto& friction = world.model_row(a.pair_friction)[pair];
+    // Adhesion makes it one of dimension 1 where it is in a gap, and contacts without rows have a margin of their own.
+    const int dim = a.contact_dim.data[contact];
+    const float margin = a.contact_includemargin.data[contact];
+    bool same = dim == a.pair_dim.data[pair] || (dim == 1 && a.contact_adhesion.data[contact] != 0.0f);
+    same &= margin < 0.0f || margin == world.model_row(a.pair_margin)[pair];
+    for (int i = 0; i < 5; ++i)
+        same &= a.contact_friction.data[contact][i] == wp::max(LEAST_FRICTION, friction[i]);
+    same &= equals(a.contact_solref.data[contact], world.model_row(a.pair_solref)[pair], 2);
+    same &= equals(a.contact_solimp.data[contact], world.model_row(a.pair_solimp)[pair], 5);
+    const auto& across = world.model_row(a.pair_solreffriction)[pair];
+    return same && equals(a.contact_solreffriction.data[contact], across, 2);
+}
+
+// The pair of its own law that a contact is of, or -1.
+template <class Arguments>
+CUDA_CALLABLE inline int explicit_pair_of(const World& world, const Arguments& a, int contact)
+{
+    const auto& geoms = a.contact_geom.data[contact];
+#pragma unroll 1
+    for (int pair = 0; pair < PAIRS; ++pair) {
+        const int one = a.pair_geom1.data[pair], two = a.pair_geom2.data[pair];
+        const bool is_of = (one == geoms[0] && two == geoms[1]) || (two == geoms[0] && one == geoms[1]);
+        if (is_of && (!REPEATED_PAIRS || has_law_of(world, a, contact, pair)))
+            return pair;
+    }
+    return -1;
+}
+
+// Whether a contact comes before another one; keys that are equal leave it open.
+template <class Arguments>
+CUDA_CALLABLE inline bool precedes(const Arguments& a, const mask64* keys, const int* found, int item, int other)
+{
+    if (keys[item] != keys[other])
+        return keys[item] < keys[other];
+    const int one = found[item], two = found[other];
+    if (SDF) {
+        if (a.contact_dist.data[one] != a.contact_dist.data[two])
+            return a.contact_dist.data[one] < a.contact_dist.data[two];
+        for (int i = 0; i < 3; ++i)
+            if (a.contact_pos.data[one][i] != a.contact_pos.data[two][i])
+                return a.contact_pos.data[one][i] < a.contact_pos.data[two][i];
+    }
+    // Pairs that are the same in all have contacts of several threads.
+    if (REPEATED_PAIRS && a.contact_geomcollisionid.data[one] != a.contact_geomcollisionid.data[two])
+        return a.contact_geomcollisionid.data[one] < a.contact_geomcollisionid.data[two];
+    return one < two;
+}
+
+// Lists the contacts of a world in that order, and returns how many there are.
+template <class Arguments>
+CUDA_CALLABLE inline int order_contacts(const World& world, const Arguments& a)
+{
+    const int contacts = wp::min(a.appended.data[world.world], ROOM);
+    const int* const found = world.row_of(a.found);
+    mask64* const keys = (mask64*)world.row_of(a.keys);
+    int* const ids = world.row_of(a.ids);
+    world.each(contacts, [&](int item) {
+        const auto& geoms = a.contact_geom.data[found[item]];
+        const int body = a.geom_bodyid.data[geoms[0]], other = a.geom_bodyid.data[geoms[1]];
+        const unsigned bodies = (unsigned)wp::min(body, other) << 16 | (unsigned)wp::max(body, other);
+        const int pair = PAIRS > 0 ? explicit_pair_of(world, a, found[item]) : -1;
+        const unsigned of_geoms = (unsigned)geoms[0] << GEOM_BITS | (unsigned)geoms[1];
+        keys[item] = (unsigned long long)bodies << 32 | (pair >= 0 ? (unsigned)pair : NOT_EXPLICIT | of_geoms);
+    });
+    sync();
+    world.each(contacts, [&](int item) {
+        int place = 0;
+        for (int other = 0; other < contacts; ++other)
+            place += precedes(a, keys, found, other, item);
+        ids[place] = found[item];
+    });
+    sync();
+    if (world.lane == 0)
+        a.count.data[world.world] = contacts;
+    return contacts;
+}
+
+}
