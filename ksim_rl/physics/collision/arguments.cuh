@@ -1,6 +1,6 @@
 // What the collision pass takes: arrays of a model and its worlds, and lists of contacts.
 #pragma once
-#include "ksim_rl/physics/lanes.cuh"
+#include "ksim_rl/device/lanes.cuh"
 
 namespace collisions {
 

@@ -7,7 +7,7 @@
 // Few worlds reset at a time, so that what counts is how long one takes: its lanes, a block on a GPU, share each stage,
 // and what they work on lies in shared memory where it fits. All of them reach each `wait`.
 #pragma once
-#include "ksim_rl/physics/lanes.cuh"
+#include "ksim_rl/device/lanes.cuh"
 
 namespace constants_of_inertia {
 

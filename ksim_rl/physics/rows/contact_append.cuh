@@ -1,6 +1,6 @@
 // The first half of the lists where MuJoCo Warp's narrow phase has a part: all threads share out the pool.
 #pragma once
-#include "ksim_rl/physics/lanes.cuh"
+#include "ksim_rl/device/lanes.cuh"
 
 namespace contact_append {
 

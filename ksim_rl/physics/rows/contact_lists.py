@@ -55,13 +55,14 @@ class ContactLists:
             self.lanes = 1
             self.threads = 1
         given = vars(self), m, d
-        sizes = {"lanes": self.lanes, "threads": self.threads}
+        lanes = self.lanes
+        threads = self.threads
         # The first half appends, the second one sorts.
         has_rows = {"has_rows": HAS_ROWS}
         append = "ksim_rl/physics/rows/contact_append.cuh"
-        self._append = native.launcher_of(append, has_rows, *given, **sizes)
+        self._append = native.launcher_of(append, has_rows, *given, lanes=lanes, threads=threads)
         order = "ksim_rl/physics/rows/contact_lists.cuh"
-        self.order = native.launcher_of(order, self.constants, *given, **sizes)
+        self.order = native.launcher_of(order, self.constants, *given, lanes=lanes, threads=threads)
         self.are_appended = False
 
     def append(self) -> None:

@@ -5,7 +5,7 @@
 // One thread writes the contacts of a pair one after another, so that their places in the pool are in its order. Only
 // contacts of signed distance fields are each written by another thread: these are ordered by where they are.
 #pragma once
-#include "ksim_rl/physics/lanes.cuh"
+#include "ksim_rl/device/lanes.cuh"
 
 namespace contact_order {
 

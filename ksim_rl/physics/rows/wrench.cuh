@@ -1,6 +1,6 @@
 // The force and torque of a contact, once the solver has found what its rows exert.
 #pragma once
-#include "ksim_rl/physics/lanes.cuh"
+#include "ksim_rl/device/lanes.cuh"
 
 namespace contacts {
 

@@ -1,8 +1,8 @@
 """Reads contact sensors, and the forces that contacts exert on bodies, from each world's list of contacts.
 
 MuJoCo Warp sums and chooses in the order in which its threads come, which on a GPU is another one in each run. The
-kernels are contact_readings.cuh and contact_forces.cuh. The first reads accelerometers as well, for
-which MuJoCo Warp computes accelerations and forces of all bodies.
+kernels are contact_readings.cuh and contact_forces.cuh. The first reads accelerometers as well, for which MuJoCo Warp
+computes accelerations and forces of all bodies.
 """
 
 import dataclasses
@@ -88,13 +88,15 @@ class ContactReadings:
             lanes = 4
         else:
             lanes = lists.lanes
-        sizes = {"lanes": lanes, "threads": lists.threads}
+        threads = lists.threads
+        readings = "ksim_rl/physics/sensors/contact_readings.cuh"
         self._read_sensors = native.launcher_of(
-            "ksim_rl/physics/sensors/contact_readings.cuh", constants, own, m, d, **sizes
+            readings, constants, own, m, d, lanes=lanes, threads=threads
         )
         constants = of_rows | {"bodies": m.nbody}
+        forces = "ksim_rl/physics/sensors/contact_forces.cuh"
         self._sum_forces = native.launcher_of(
-            "ksim_rl/physics/sensors/contact_forces.cuh", constants, own, m, d, **sizes
+            forces, constants, own, m, d, lanes=lanes, threads=threads
         )
 
     def list(self) -> None:
