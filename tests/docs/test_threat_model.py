@@ -25,7 +25,7 @@ OPENS = {
     "listen",
 }
 # `serve` of this module is a function of its own.
-OWN_NAMES = {"viewer/play_command.py"}
+OWN_NAMES = {"viewer/play_command.py", "export/standalone/loop_command.py"}
 # They are what the others call, or open folders to flush and lock them.
 ROOM = {"files/reading.py", "files/writing.py"}
 
