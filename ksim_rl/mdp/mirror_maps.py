@@ -65,13 +65,19 @@ def mirror_maps(
         )
     maps: dict[NestedKey, MirrorMap] = {}
     for group in groups:
+        cfg = inner.cfg.observations.get(str(group))
+        # An image has no columns.
+        if cfg is not None and any(term.is_image for term in cfg.terms.values()):
+            raise ValueError(
+                f"group {group!r} is an image, whose mirror image is not known: set objective.symmetry=none"
+            )
         if group not in specs:
             raise ValueError(f"no observation group {group!r}: {near(str(group), map(str, specs))}")
         terms = inner.cfg.observations[str(group)].terms
         # A group's terms, each with its own image; `mirror_group` puts them together by the group's spec.
         images: dict[NestedKey, MirrorMap] = {
-            name: _named(f"observations.{group}.{name}", cfg.term, inner)
-            for name, cfg in terms.items()
+            name: _named(f"observations.{group}.{name}", term.term, inner)
+            for name, term in terms.items()
         }
         maps[group] = mirror_group(specs[group], images)
     maps["action"] = _action(inner)

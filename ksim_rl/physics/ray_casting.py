@@ -132,6 +132,17 @@ class BatchCamera:
             if "geom_dataid" in fields:
                 add_height_fields(self._context, model)
         self._shape = (world.num_envs, picture.height, picture.width)
+        drawn = {
+            "rgb": picture.rgb,
+            "depth": picture.depth,
+            "seg": picture.segmentation,
+        }
+        # Views of the renderer's memory, which stays; to make one in each step would wait for the device.
+        self._views = {
+            name: wp.to_torch(getattr(self._context, f"{name}_data"))
+            for name, is_drawn in drawn.items()
+            if is_drawn
+        }
 
     def render(self) -> None:
         """Draw the present state of all worlds."""
@@ -141,18 +152,18 @@ class BatchCamera:
     def rgb_EHW3(self) -> UInt8[Tensor, "E H W 3"]:
         """Colors."""
         # Four bytes per pixel, the lowest first: blue, green, red, alpha.
-        bytes_EHW4 = wp.to_torch(self._context.rgb_data).view(torch.uint8).view(*self._shape, 4)
+        bytes_EHW4 = self._views["rgb"].view(torch.uint8).view(*self._shape, 4)
         return bytes_EHW4[..., :3].flip(-1)
 
     @property
     def depth_EHW(self) -> Float32[Tensor, "E H W"]:
         """Distance along the camera's axis (not along the ray), m, 0 where nothing is hit."""
-        return wp.to_torch(self._context.depth_data).view(self._shape)
+        return self._views["depth"].view(self._shape)
 
     @property
     def segmentation_EHW2(self) -> Int32[Tensor, "E H W 2"]:
         """MuJoCo's id and type of the object that is hit, -1 for nothing."""
-        return wp.to_torch(self._context.seg_data).view(*self._shape, 2)
+        return self._views["seg"].view(*self._shape, 2)
 
     def _launch(self) -> None:
         # Bounding volumes follow the poses before rays are cast through them.

@@ -13,6 +13,7 @@ from ksim_rl.envs import (
 )
 from ksim_rl.mdp import CameraImage, JointPos
 from ksim_rl.scene.rendering import rendering
+from ksim_rl.testing import count_syncs
 from ksim_rl.transforms.groups.group_cfg import compile_groups
 from tests.envs.probe_env import puck_cfg
 from tests.scene.sensors.bench import SensorBench
@@ -189,6 +190,11 @@ def test_an_image_is_an_observation_of_its_own_shape():
         "observations/image (12, 16, 3)" in base.explain()
         and "observations/actor (1,)" in base.explain()
     )
+    # A step that draws makes nothing wait: on CUDA it can be captured.
+    root = env.rand_action(env.reset())
+    with count_syncs() as syncs:
+        env.step_and_maybe_reset(root)
+    assert syncs.total == 0, syncs.report()
     # The puck moves to the right (+x) at 1 and 2 m/s, under a camera whose right is x.
     near = rollout["depth"] < 0.99
     middle = [(near[1, k].float() * torch.arange(16.0)).sum() / near[1, k].sum() for k in (0, 3)]
