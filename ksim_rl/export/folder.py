@@ -58,6 +58,7 @@ LOOP_PARTS = (
     "stages",
     "robot_link",
     "policy_control",
+    "plan_control",
     "safety",
     "states",
     "deadlines",

@@ -12,8 +12,12 @@ from ksim_rl.export.exported_transforms import TaskTransforms
 from ksim_rl.export.standalone.files import FORMAT, Json
 from ksim_rl.export.traced_task import TracedTask
 from ksim_rl.scene.names import drives_scalar_joint
+from ksim_rl.scene.robots.proposal import effort_limit_of
 from ksim_rl.scene.sensors import ContactSensor
 from ksim_rl.scene.state.joint_control import joint_control
+
+NO_LIMIT = 1e30
+"""What stands for no limit in the numbers of laws, which JSON cannot have as infinity."""
 
 
 def metadata(
@@ -68,7 +72,7 @@ def metadata(
             "stiffness": gains[0],
             "damping": gains[1],
             "effort_scale": _effort_scales(ours, laws, names),
-            "limits": {**_limits(ours, names), "velocity": _no_load_speeds(laws, names)},
+            "limits": {**_limits(ours, laws, names), "velocity": _no_load_speeds(laws, names)},
         },
         "observations": [{**term, "reads": traced.reads(term["name"])} for term in terms],
         "actions": actions,
@@ -168,23 +172,25 @@ def _no_load_speeds(laws: Sequence[Json], names: Sequence[str]) -> list[float | 
     return [found.get(name) for name in names]
 
 
-def _limits(ours: ManagerBasedRlEnv, names: Sequence[str]) -> Json:
+def _limits(ours: ManagerBasedRlEnv, laws: Sequence[Json], names: Sequence[str]) -> Json:
     """Return soft limits of position, and of effort at the joint, behind the gear; null where there is none."""
     model = ours.world.mj_model
     if names:
         limits = ours.view.joints(list(names)).soft_limits_L2.tolist()
     else:
         limits = []
-    # Of effort only at joints: a tendon's force is no joint's torque.
     effort: dict[str, float] = {}
-    for i in range(model.nu):
-        if not drives_scalar_joint(model, i) or not model.actuator_forcelimited[i]:
-            continue
-        joint = int(model.actuator_trnid[i, 0])
-        # The motor's limit times its gear.
-        effort[model.joint(joint).name] = float(
-            abs(model.actuator_gear[i, 0]) * model.actuator_forcerange[i, 1]
-        )
+    for name in names:
+        limit = effort_limit_of(model, model.joint(name).id, most=NO_LIMIT)
+        if limit is not None:
+            effort[name] = limit
+    # Laws keep inside of theirs by themselves.
+    for law in laws:
+        for joint, limit in zip(
+            law["joints"], law["numbers"].get("effort_limit", ()), strict=False
+        ):
+            if limit < NO_LIMIT:
+                effort[joint] = min(limit, effort.get(joint, limit))
     finite = []
     for low, high in limits:
         # JSON has no infinity.

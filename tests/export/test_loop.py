@@ -1,5 +1,6 @@
 """The loop of an exported folder: it acts as `runner.py` does, and ends in damped motors whatever happens."""
 
+import ast
 import dataclasses
 import itertools
 import json
@@ -15,17 +16,19 @@ import pytest
 pytest.importorskip("onnxruntime", reason="needs the extra: pip install ksim_rl[export]")
 pytest.importorskip("onnx", reason="needs the extra: pip install ksim_rl[export]")
 
+from ksim_rl.export.folder import LOOP_PARTS, PARTS, STANDALONE
 from ksim_rl.export.standalone.deadlines import Durations, next_deadline
 from ksim_rl.export.standalone.files import read_json
 from ksim_rl.export.standalone.journal import MOST_WAITING, Journal
 from ksim_rl.export.standalone.loop import run_loop
+from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.policy_control import PolicyControl
 from ksim_rl.export.standalone.robot_link import JointCommand, Measurement
 from ksim_rl.export.standalone.runner import Runner
 from ksim_rl.export.standalone.safety import EffortLimit, Limits, tilt_of
 from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
 from ksim_rl.export.standalone.states import State, StateMachine, Times
-from ksim_rl.export.standalone.words import Unattended, sort_words
+from ksim_rl.export.standalone.words import EndOfPlan, Unattended, sort_words
 from ksim_rl.identification.held_robot import hold
 from ksim_rl.identification.joint_log import read_log
 from tests.export.toy_folder import DEFAULT, MODEL, toy_folder
@@ -181,6 +184,20 @@ def test_a_motor_exerts_what_the_command_says(folder, control):
     expected = command.effort + command.stiffness * (command.pos - before.joint_pos)
     expected = expected + command.damping * (command.vel - before.joint_vel)
     assert robot.read().joint_effort == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("parts", [PARTS, LOOP_PARTS], ids=["runner.py", "loop.py"])
+def test_no_module_of_a_file_takes_the_names_of_another(parts):
+    owners = {}
+    for part in parts:
+        for node in ast.parse((STANDALONE / f"{part}.py").read_text()).body:
+            names = [getattr(node, "name", "")]
+            if isinstance(node, ast.Assign):
+                names = [ast.unparse(target) for target in node.targets]
+            if isinstance(node, ast.AnnAssign):
+                names = [ast.unparse(node.target)]
+            for name in names:
+                assert owners.setdefault(name, part) == part or not name, (name, part)
 
 
 def test_a_policy_that_the_robot_cannot_observe_is_refused_by_name(control):
@@ -480,6 +497,59 @@ def test_a_disk_that_stands_still_delays_nothing_and_what_is_lost_is_counted(con
     journal.close()
     written = (tmp_path / "a.csv").read_text().splitlines()
     assert len(written) == 2 + MOST_WAITING + 50 - journal.lost
+
+
+def test_a_plan_is_followed_and_its_log_holds_nothing_else(folder, control, tmp_path):
+    time_T = 0.01 * np.arange(600)
+    plan = tmp_path / "plan.csv"
+    sines = 0.3 * np.sin(np.outer(time_T, (3.0, 4.0))) + (0.2, -0.1)
+    names = ["time", "right.target_position", "left.target_position"]
+    np.savetxt(plan, np.c_[time_T, sines], "%.9g", ",", header=",".join(names), comments="")
+    follows = PlanControl(control.meta, plan)
+    assert follows.period == pytest.approx(0.01)
+    robot = SimulatedRobot(folder, ())
+    robot.change_period(follows.period)
+    robot.hang(np.full(2, np.inf))
+    clock, _, _, lines = set_up(control)
+    robot.read = stamped(robot.read, clock)
+    machine = StateMachine(
+        follows,
+        period=PERIOD,
+        limits=Limits(),
+        times=dataclasses.replace(TIMES, blend_seconds=0.0),
+        note=lines.event,
+    )
+    journal = Journal(tmp_path / "a.csv", follows.joints, lambda text: None, only=State.POLICY)
+    operators = [Unattended(math.inf), EndOfPlan(follows)]
+    run_loop(robot, machine, operators, journal, clock=clock, period=follows.period)
+    journal.close()
+    assert not machine.fault and robot.data.qpos[:3] == pytest.approx([0.0, 0.0, 0.4], abs=1e-3)
+    (tmp_path / "leg.xml").write_text(MODEL)
+    leg = hold(str(tmp_path / "leg.xml"))
+    log = read_log(tmp_path / "a.csv", leg)
+    order = [follows.joints.names.index(name) for name in leg.joint_names]
+    assert log.targets.by_kind["pos"][:600] == pytest.approx(sines[:, order], rel=1e-6)
+    assert len(log.time_T) in (600, 601) and log.time_T[599] == pytest.approx(5.99, abs=1e-4)
+
+
+def stamped(read, clock):
+    """Return what reads a robot, whose messages are of a clock."""
+    return lambda: dataclasses.replace(read(), stamp=clock.now())
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("time,right.target_position\n0,1\n1,1\n", "no column left.target_position, though"),
+        ("time,x\n0,1\n1,1\n3,1\n", "'time': expected at least two lines at an even rate"),
+        ("time,x\n0,1\n1,nan\n", "expected 2 finite numbers in each line"),
+        ("time,x\n0,a\n", "no table of numbers"),
+    ],
+)
+def test_a_plan_that_cannot_be_followed_is_refused(control, tmp_path, text, said):
+    (tmp_path / "plan.csv").write_text(text)
+    with pytest.raises(ValueError, match=said):
+        PlanControl(control.meta, tmp_path / "plan.csv")
 
 
 # -- time --------------------------------------------------------------------------------------------------------

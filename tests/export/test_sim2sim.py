@@ -257,8 +257,12 @@ def test_runner_needs_neither_torch_nor_this_library(cartpole, tmp_path):
 
 def test_the_loop_of_an_export_acts_as_its_runner(cartpole):
     control = PolicyControl(cartpole, json.loads((cartpole / "export.json").read_text()))
+    # A motor's control range limits its effort, behind gear and gain.
+    (motor,) = range(mujoco.MjModel.from_xml_path(str(cartpole / "robot.xml")).nu)
     robot = SimulatedRobot(cartpole, control.estimated)
     runner = Runner(cartpole)
+    most = runner.model.actuator_ctrlrange[motor, 1] * runner.model.actuator_gear[motor, 0]
+    assert control.joints.most_effort.tolist() == [most, np.inf]
     for data in (robot.data, runner.data):
         data.qpos[1] = 0.1
     robot.runner.refresh()
@@ -282,6 +286,8 @@ def test_the_loop_of_a_quadruped_acts_as_its_runner(quadruped):
         lag.most = lag.spec["min"] = lag.spec["max"] = 0
     runner.reset()
     robot = SimulatedRobot(quadruped, control.estimated)
+    # Its motors are laws, whose limits no force range has.
+    assert np.isfinite(control.joints.most_effort).all()
     for _ in range(20):
         robot.write(control(robot.read()))
         runner.step(runner.act())

@@ -33,7 +33,7 @@ COLUMNS = (
     "damping",
 )
 
-OF_ROOT = tuple(
+ROOT_COLUMNS = tuple(
     f"{what}.{axis}" for what in ("projected_gravity", "root_ang_vel") for axis in "xyz"
 )
 
@@ -51,16 +51,25 @@ class Journal:
 
     Columns are `time` (s since the first period), `state`, `message_age` (s), gravity's direction and the turning of
     the root in its own axes (NaN without a root), and those of each joint. Nothing here waits for the disk or the
-    terminal: what they cannot take is dropped, and counted in `lost`. Events are shown, too.
+    terminal: what they cannot take is dropped, and counted in `lost`. Events are shown, too. With `only` it has the
+    periods of one state alone.
     """
 
-    def __init__(self, path: Path, joints: DescribedJoints, show: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        joints: DescribedJoints,
+        show: Callable[[str], None],
+        *,
+        only: State | None = None,
+    ) -> None:
         self.path = path
+        self.only = only
         self.show = show
         self.lost = 0
         self.failure = ""
         self.started: float | None = None
-        names = ["time", "state", "message_age", *OF_ROOT]
+        names = ["time", "state", "message_age", *ROOT_COLUMNS]
         for joint in joints.names:
             names += [f"{joint}.{column}" for column in COLUMNS]
         self.form = ",".join(["%.6f", "%d", *["%.9g"] * (len(names) - 2)]) + "\n"
@@ -75,6 +84,8 @@ class Journal:
         self, now: float, state: State, measurement: Measurement | None, command: JointCommand
     ) -> None:
         """Log a period; without a measurement the readings are NaN."""
+        if self.only not in (None, state):
+            return
         if measurement is None:
             unread = np.full(len(command.pos), np.nan)
             readings = (unread, unread, unread)
@@ -126,8 +137,8 @@ class Journal:
 
 
 def _of_root(measurement: Measurement | None) -> Array:
-    """Return the numbers of `OF_ROOT`."""
-    found = np.full(len(OF_ROOT), np.nan)
+    """Return the numbers of `ROOT_COLUMNS`."""
+    found = np.full(len(ROOT_COLUMNS), np.nan)
     if measurement is None:
         return found
     if measurement.root_quat is not None:

@@ -54,7 +54,7 @@ def run_loop(
 ) -> Punctuality:
     """Run a robot until the motors are damped at the end, and return how punctual that was."""
     punctuality = Punctuality()
-    longest = machine.watch.limits.late_periods * period
+    longest = machine.watch.longest
     deadline = clock.now()
     while True:
         clock.sleep_until(deadline)

@@ -11,10 +11,13 @@ class with `read`, `write` and `close` (see `Robot`), and give it to `drive`.
 import argparse
 import dataclasses
 import json
+import math
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from ksim_rl.export.standalone.deadlines import MonotonicClock
 from ksim_rl.export.standalone.files import Json, read_json
@@ -25,11 +28,12 @@ from ksim_rl.export.standalone.loop import (
     first_measurement,
     run_loop,
 )
+from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.policy_control import PolicyControl
 from ksim_rl.export.standalone.robot_link import Robot
 from ksim_rl.export.standalone.safety import Limits
-from ksim_rl.export.standalone.states import StateMachine, Times
-from ksim_rl.export.standalone.words import Interrupts, Keyboard, Operator, Unattended
+from ksim_rl.export.standalone.states import State, StateMachine, Times
+from ksim_rl.export.standalone.words import EndOfPlan, Interrupts, Keyboard, Operator, Unattended
 
 UNATTENDED_S = 10.0
 HELP = {
@@ -62,6 +66,12 @@ def loop_parser() -> argparse.ArgumentParser:
         help="of the policy, without an operator; 0: words of yours lead from state to state "
         f"(default: {UNATTENDED_S:g} with --simulate, else 0)",
     )
+    parser.add_argument(
+        "--plan",
+        type=Path,
+        help="commands of `ksim-rl identify --propose` in the policy's place, for a robot whose base is held; the log "
+        "has them alone",
+    )
     parser.add_argument("--command", type=float, nargs="*", help="the policy's first command")
     parser.add_argument("--log", type=Path, help="a new CSV file; default: named by the time")
     parser.add_argument(
@@ -91,15 +101,20 @@ def drive(
     Without a robot it is the simulated one. `operators` are heard beside the keyboard. A ValueError says what is wrong
     before anything moves.
     """
-    period = float(control.meta["step_dt"])
+    step_dt = float(control.meta["step_dt"])
+    plan = None
+    if options.plan is not None:
+        plan = PlanControl(control.meta, options.plan)
+    period = step_dt if plan is None else plan.period
+    driver = plan or control
     chosen = vars(options)
     limits = Limits(**{field.name: chosen[field.name] for field in dataclasses.fields(Limits)})
     times = Times(**{field.name: chosen[field.name] for field in dataclasses.fields(Times)})
     _set_command(control, options.command)
     if robot is None:
-        robot = _simulated(options, control)
+        robot = _simulated(options, control, period)
     clock = MonotonicClock()
-    lacking = control.lacking(first_measurement(robot, clock, period))
+    lacking = driver.lacking(first_measurement(robot, clock, period))
     if lacking:
         raise ValueError(
             f"the policy observes {', '.join(lacking)}, which this robot does not measure: give estimates, or train "
@@ -108,14 +123,20 @@ def drive(
     path = options.log
     if path is None:
         path = Path(time.strftime("loop_%Y%m%d_%H%M%S.csv"))
-    journal = Journal(path, control.joints, _say)
-    machine = StateMachine(control, period=period, limits=limits, times=times, note=journal.event)
+    # What is identified is the plan alone: gains change in other states.
+    only = None if plan is None else State.POLICY
+    journal = Journal(path, driver.joints, _say, only=only)
+    machine = StateMachine(driver, period=step_dt, limits=limits, times=times, note=journal.event)
     interrupts = Interrupts()
     interrupts.listen()
     heard: list[Operator] = [interrupts, *operators]
+    if plan is not None:
+        heard.append(EndOfPlan(plan))
     seconds = options.seconds
     if seconds is None:
         seconds = UNATTENDED_S if options.simulate else 0.0
+    if seconds and plan is not None:
+        seconds = math.inf
     heard.append(Unattended(seconds) if seconds else Keyboard(sys.stdin))
     calm_python()
     priority = ask_for_real_time() if options.real_time else "no real-time priority: not asked for"
@@ -141,14 +162,18 @@ def drive(
     return 1 if machine.fault else 0
 
 
-def _simulated(options: argparse.Namespace, control: PolicyControl) -> Robot:
+def _simulated(options: argparse.Namespace, control: PolicyControl, period: float) -> Robot:
     # Here, so that a robot's computer needs no MuJoCo.
     try:
         from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
     except ImportError as error:
         raise ValueError(f"--simulate: {error}: install mujoco, and keep runner.py here") from None
     robot = SimulatedRobot(options.folder, control.estimated)
-    if options.hang:
+    robot.change_period(period)
+    if options.plan is not None:
+        # The base of a robot that is identified is held.
+        robot.hang(np.full(len(control.joints.names), np.inf))
+    elif options.hang:
         robot.hang(control.joints.stiffness)
     return robot
 

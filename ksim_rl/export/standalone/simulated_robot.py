@@ -1,5 +1,6 @@
 """A robot of MuJoCo's C engine in the place of one of metal."""
 
+import math
 import time
 from collections.abc import Collection
 from pathlib import Path
@@ -57,7 +58,14 @@ class SimulatedRobot:
             model.actuator_ctrllimited[actuator] = 0
             model.actuator_gainprm[actuator] = 0.0
             model.actuator_biasprm[actuator] = 0.0
-            found.setdefault(joint, actuator)
+            if joint in found:
+                continue
+            found[joint] = actuator
+            limit = joints.most_effort[joints.names.index(joint)]
+            gear = abs(model.actuator_gear[actuator, 0])
+            if np.isfinite(limit):
+                model.actuator_forcelimited[actuator] = 1
+                model.actuator_forcerange[actuator] = (-limit / gear, limit / gear)
         for place in np.flatnonzero(joints.driven):
             if joints.names[place] not in found:
                 raise ValueError(f"robot.xml: no actuator drives the joint {joints.names[place]!r}")
@@ -105,6 +113,12 @@ class SimulatedRobot:
             self.runner.run_physics(())
         else:
             self.runner.run_physics((self._hold_root,))
+
+    def change_period(self, period: float) -> None:
+        """Let a command last `period` seconds, in physics steps that are no longer than the model's."""
+        option = self.model.opt
+        self.runner.decimation = math.ceil(period / option.timestep - 1e-9)
+        option.timestep = period / self.runner.decimation
 
     def hang(self, stiffness: Array) -> None:
         """Hold the root where it is until all motors have a stiffness, as a robot hangs that could not stand up."""

@@ -5,13 +5,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from ksim_rl.export.standalone.files import Array
-from ksim_rl.export.standalone.policy_control import PolicyControl
-from ksim_rl.export.standalone.robot_link import JointCommand, Measurement
+from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
 from ksim_rl.export.standalone.safety import EffortLimit, Fault, Limits, Watch
 
 
@@ -65,6 +64,21 @@ class Times:
                 raise ValueError(f"--{option} {value:g}: expected 0 or more")
 
 
+class Control(Protocol):
+    """What asks the motors for something once the robot stands; `command` is what an operator may change."""
+
+    joints: DescribedJoints
+    command: dict[str, Array]
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        ...
+
+    def __call__(self, measurement: Measurement) -> JointCommand:
+        """Return what the motors are asked for in this period."""
+        ...
+
+
 class StateMachine:
     """Gives a command of joints for each measurement, and ends in damped motors whatever happens.
 
@@ -73,7 +87,7 @@ class StateMachine:
 
     def __init__(
         self,
-        control: PolicyControl,
+        control: Control,
         *,
         period: float,
         limits: Limits,

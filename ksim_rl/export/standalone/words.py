@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import Protocol, TextIO
 
+from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.states import State, StateMachine
 
 REST_S = 1.0
@@ -64,6 +65,17 @@ class Unattended:
         if machine.state is State.POLICY and now - machine.since >= self.seconds:
             return ["stop"]
         return []
+
+
+class EndOfPlan:
+    """Says `stop` once all lines of a plan were sent."""
+
+    def __init__(self, plan: PlanControl) -> None:
+        self.plan = plan
+
+    def words(self, now: float, machine: StateMachine) -> list[str]:
+        """Return the word, in the state that follows the plan."""
+        return ["stop"] if machine.state is State.POLICY and self.plan.is_over() else []
 
 
 class Interrupts:

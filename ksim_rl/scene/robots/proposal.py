@@ -94,26 +94,34 @@ def drive_of(
     """
     kind = "none"
     gains = (0.0, 0.0)
-    limits = []
-    if mj_model.jnt_actfrclimited[joint]:
-        limits.append(np.abs(mj_model.jnt_actfrcrange[joint]).max())
     for a in actuators_of_joint(mj_model, joint):
-        gear = abs(mj_model.actuator_gear[a, 0])
         control = joint_control(mj_model, a)
         target = control.kind
         kind = {"pos": "position", "vel": "velocity", "effort": "motor"}[target]
         if target != "effort":
             gains = abs(control.stiffness), abs(control.damping)
+    limit = effort_limit_of(mj_model, joint, most=most)
+    return kind, gains, None if limit is None else three_digits(limit)
+
+
+def effort_limit_of(mj_model: mujoco.MjModel, joint: int, *, most: float) -> float | None:
+    """Return the least of all limits of a joint's effort, N m or N; None where there is none below `most`."""
+    limits = []
+    if mj_model.jnt_actfrclimited[joint]:
+        limits.append(np.abs(mj_model.jnt_actfrcrange[joint]).max())
+    for a in actuators_of_joint(mj_model, joint):
+        gear = abs(mj_model.actuator_gear[a, 0])
+        is_motor = joint_control(mj_model, a).kind == "effort"
         if mj_model.actuator_forcelimited[a]:
             limits.append(gear * np.abs(mj_model.actuator_forcerange[a]).max())
         # A motor's control range limits its force where no force range does.
-        elif mj_model.actuator_ctrllimited[a] and target == "effort":
+        elif mj_model.actuator_ctrllimited[a] and is_motor:
             control_limit = np.abs(
                 mj_model.actuator_gainprm[a, 0] * mj_model.actuator_ctrlrange[a]
             ).max()
             limits.append(gear * control_limit)
-    limits = [limit for limit in limits if 0.0 < limit < most]
-    return kind, gains, three_digits(min(limits)) if limits else None
+    limits = [float(limit) for limit in limits if 0.0 < limit < most]
+    return min(limits, default=None)
 
 
 def three_digits(number: float) -> float:

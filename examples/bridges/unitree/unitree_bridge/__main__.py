@@ -7,6 +7,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from unitree_bridge.exported import module_of
 from unitree_bridge.robot import UnitreeRobot
 from unitree_bridge.robots import KINDS
 
@@ -25,10 +26,10 @@ def main() -> int:
     )
     parser.add_argument("--domain", type=int, default=0)
     options, others = parser.parse_known_args()
-    # Your own export: the folder of a stranger is for `ksim-rl sim2sim`.
-    sys.path.insert(0, str(options.folder.absolute()))
-    import loop
-
+    try:
+        loop = module_of(options.folder, "loop")
+    except ValueError as error:
+        parser.error(str(error))
     chosen = loop.loop_parser().parse_args([str(options.folder), *others])
     if chosen.simulate:
         parser.error(

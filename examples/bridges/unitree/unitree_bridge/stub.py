@@ -4,7 +4,6 @@ python -m unitree_bridge.stub go2 RUN/export --interface lo
 """
 
 import argparse
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 
 from unitree_bridge import connection
 from unitree_bridge.checksum import checksum
+from unitree_bridge.exported import module_of
 from unitree_bridge.robot import SENSORS
 from unitree_bridge.robots import KINDS, Kind, zeros
 
@@ -94,17 +94,16 @@ def main() -> None:
     parser.add_argument("--interface", default="lo")
     parser.add_argument("--domain", type=int, default=0)
     options = parser.parse_args()
-    # Your own export: the folder of a stranger is for `ksim-rl sim2sim`.
-    sys.path.insert(0, str(options.folder.absolute()))
-    import runner
-
-    stub = Stub(
-        KINDS[options.robot],
-        runner,
-        options.folder,
-        interface=options.interface,
-        domain=options.domain,
-    )
+    try:
+        stub = Stub(
+            KINDS[options.robot],
+            module_of(options.folder, "runner"),
+            options.folder,
+            interface=options.interface,
+            domain=options.domain,
+        )
+    except ValueError as error:
+        parser.error(str(error))
     deadline = time.monotonic()
     while True:
         stub.step()
