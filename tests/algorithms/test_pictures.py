@@ -21,7 +21,7 @@ from ksim_rl.modules import (
     recurrent_modules,
     recurrent_transforms,
 )
-from ksim_rl.objectives import DistillationCfg, PPOCfg
+from ksim_rl.objectives import DistillationCfg, PPOCfg, make_loss
 from ksim_rl.testing import check_env, count_syncs
 from ksim_rl.trainers import Evaluator, PPOUpdate
 from tests.algorithms.off_policy_problem import make_update
@@ -89,6 +89,21 @@ def test_a_rollout_keeps_bytes_and_an_update_never_waits_for_the_device():
     with count_syncs() as syncs:
         update(rollout_ET)
     assert syncs.total == 0, syncs.report()
+
+
+@pytest.mark.full
+def test_losses_of_policies_that_see_compile_without_a_break():
+    env = seeing_env(8)
+    actor = actor_for(env)
+    update, _ = make_ppo(env, actor=actor)
+    data = actor(env.reset()).detach().exclude("encoded")
+    data["advantage"] = torch.randn(8, 1)
+    data["value_target"] = torch.randn(8, 1)
+    data["state_value"] = torch.zeros(8, 1)
+    loss = make_loss(PPOCfg(), actor, update.critic)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(data.clone())
+    for name, value in loss(data.clone()).items():
+        torch.testing.assert_close(compiled[name], value)
 
 
 @pytest.mark.full

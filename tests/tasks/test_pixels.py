@@ -82,10 +82,14 @@ def test_it_trains_with_effects_a_slow_camera_and_a_lag(kind):
         "{_target_: ksim_rl.transforms.RandomShift, pixels: 2}}}"
     )
     slow = (
-        "{_target_: ksim_rl.transforms.ObservationHold, in_keys: [actor], every: 2, dropped: 0.1}"
+        "{_target_: ksim_rl.transforms.ObservationHold, in_keys: [actor], every: 2, dropped: 0.1, "
+        "fresh_key: [camera, fresh]}"
     )
     chain = [f"+task.transforms.look={look}", f"+task.transforms.slow={slow}"]
-    trainer = build(conf.compose([*TINY, *KINDS[kind], *chain]))
+    # The flag is one more number that the policy reads, beside the features of pictures.
+    where = "trunk" if kind == "ppo" else "actor"
+    reads = f"modules.{where}.in_keys=[actor,[camera,fresh]]"
+    trainer = build(conf.compose([*TINY, *KINDS[kind], reads, *chain]))
     before = [weight.clone() for weight in trainer.update.actor.parameters()]
     trainer.train()
     metrics = {name: float(value) for name, value in trainer.update.metrics().items()}

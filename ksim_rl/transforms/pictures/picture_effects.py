@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Shaped
+from jaxtyping import Float, Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
@@ -121,16 +121,9 @@ class PictureEffects(Switched, KeyedTransform):
         assert enabled is not None
         for name, effect in self.effects.items():
             shape = pictures_ENHWC.shape[1:]
-            # A count of resets stays through an episode, and so do its draws.
-            if effect.each == "episode" and moment != "forward":
-                stream, count = f"{name}/episode", self.reset_count_E
-            else:
-                stream, count = f"{name}/{moment}", counter
-            keys = random.row_keys(
-                self.seed_value, self._stream_ids[stream], count, len(pictures_ENHWC)
+            draws_EK = self._draws(
+                name, effect.num_draws(shape), len(pictures_ENHWC), moment, counter
             )
-            draw = random.normal if effect.is_normal else random.uniform
-            draws_EK = draw(keys, effect.num_draws(shape))
             # The middle of what may be drawn is the middle of the picture for a crop, which has no other form.
             draws_EK = torch.where(enabled, draws_EK, 0.5)
             changed_ENHWC = effect(pictures_ENHWC, draws_EK)
@@ -138,6 +131,24 @@ class PictureEffects(Switched, KeyedTransform):
                 changed_ENHWC = torch.where(enabled, changed_ENHWC, pictures_ENHWC)
             pictures_ENHWC = changed_ENHWC
         return pictures_ENHWC
+
+    def _draws(
+        self, name: str, num_draws: int, num_rows: int, moment: str, counter: Tensor
+    ) -> Float[Tensor, "E K"]:
+        """Draw the numbers of one effect."""
+        effect = self.effects[name]
+        # No kernel is launched for none.
+        if num_draws == 0:
+            return torch.empty(num_rows, 0, device=counter.device)
+        # A count of resets stays through an episode, and so do its draws.
+        if effect.each == "episode" and moment != "forward":
+            moment = "episode"
+            counter = self.reset_count_E
+        stream = self._stream_ids[f"{name}/{moment}"]
+        keys = random.row_keys(self.seed_value, stream, counter, num_rows)
+        if effect.is_normal:
+            return random.normal(keys, num_draws)
+        return random.uniform(keys, num_draws)
 
 
 def _batch_dims(tensordict: TensorDictBase, key: NestedKey) -> int:
