@@ -24,7 +24,7 @@ OPENS = {
     "asyncio.start_server",
     "listen",
 }
-# `serve` of this module is a function of its own.
+# `serve` and `listen` of these modules are functions of their own.
 OWN_NAMES = {"viewer/play_command.py", "export/standalone/loop_command.py"}
 # They are what the others call, or open folders to flush and lock them.
 ROOM = {"files/reading.py", "files/writing.py"}
