@@ -6,10 +6,12 @@ import itertools
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import threading
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -29,6 +31,8 @@ from ksim_rl.export.standalone.safety import EffortLimit, Limits, tilt_of
 from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
 from ksim_rl.export.standalone.states import State, StateMachine, Times
 from ksim_rl.export.standalone.words import EndOfPlan, Unattended, sort_words
+from ksim_rl.identification.excitation import propose
+from ksim_rl.identification.fit import fit
 from ksim_rl.identification.held_robot import hold
 from ksim_rl.identification.joint_log import read_log
 from tests.export.toy_folder import DEFAULT, MODEL, toy_folder
@@ -505,31 +509,66 @@ def test_a_plan_is_followed_and_its_log_holds_nothing_else(folder, control, tmp_
     sines = 0.3 * np.sin(np.outer(time_T, (3.0, 4.0))) + (0.2, -0.1)
     names = ["time", "right.target_position", "left.target_position"]
     np.savetxt(plan, np.c_[time_T, sines], "%.9g", ",", header=",".join(names), comments="")
-    follows = PlanControl(control.meta, plan)
+    robot, follows, machine = follow(folder, control, tmp_path)
     assert follows.period == pytest.approx(0.01)
-    robot = SimulatedRobot(folder, ())
-    robot.change_period(follows.period)
-    robot.hang(np.full(2, np.inf))
-    clock, _, _, lines = set_up(control)
-    robot.read = stamped(robot.read, clock)
-    machine = StateMachine(
-        follows,
-        period=PERIOD,
-        limits=Limits(),
-        times=dataclasses.replace(TIMES, blend_seconds=0.0),
-        note=lines.event,
-    )
-    journal = Journal(tmp_path / "a.csv", follows.joints, lambda text: None, only=State.POLICY)
-    operators = [Unattended(math.inf), EndOfPlan(follows)]
-    run_loop(robot, machine, operators, journal, clock=clock, period=follows.period)
-    journal.close()
-    assert not machine.fault and robot.data.qpos[:3] == pytest.approx([0.0, 0.0, 0.4], abs=1e-3)
+    assert not machine.fault and robot.data.qpos[:3] == pytest.approx([0.0, 0.0, 0.9], abs=1e-3)
     (tmp_path / "leg.xml").write_text(MODEL)
     leg = hold(str(tmp_path / "leg.xml"))
     log = read_log(tmp_path / "a.csv", leg)
     order = [follows.joints.names.index(name) for name in leg.joint_names]
     assert log.targets.by_kind["pos"][:600] == pytest.approx(sines[:, order], rel=1e-6)
     assert len(log.time_T) in (600, 601) and log.time_T[599] == pytest.approx(5.99, abs=1e-4)
+
+
+def test_a_robot_that_hangs_moves_as_one_whose_base_is_fixed(folder):
+    robot = SimulatedRobot(folder, ())
+    robot.change_period(0.005)
+    robot.hang(np.full(2, np.inf), lift=0.5)
+    loose = re.sub(r"<freejoint[^>]*>|<keyframe>.*</keyframe>", "", MODEL)
+    fixed = mujoco.MjModel.from_xml_string(loose)
+    fixed.actuator_biasprm[:] = 0.0
+    data = mujoco.MjData(fixed)
+    data.qpos[:] = robot.data.qpos[7:]
+    still = dict.fromkeys([field.name for field in dataclasses.fields(JointCommand)], np.zeros(2))
+    for _ in range(40):
+        robot.write(JointCommand(**still))
+        mujoco.mj_step(fixed, data)
+    assert robot.data.qpos[7:] == pytest.approx(data.qpos, abs=1e-5)
+    assert np.abs(data.qvel).min() > 0.3
+
+
+@pytest.mark.full
+def test_identify_finds_a_robots_numbers_in_the_log_of_a_plan(folder, control, tmp_path):
+    (tmp_path / "leg.xml").write_text(MODEL)
+    leg = hold(str(tmp_path / "leg.xml"))
+    proposed = propose(leg, ["pos"], seconds=8.0)
+    names = ["time", *(f"{name}.target_position" for name in leg.joint_names)]
+    table = np.c_[proposed.time_T, proposed.by_kind["pos"]]
+    np.savetxt(tmp_path / "plan.csv", table, "%.9g", ",", header=",".join(names), comments="")
+    follow(folder, control, tmp_path)
+    found = fit(leg, read_log(tmp_path / "a.csv", leg), note=lambda text: None)
+    for name, stiffness in (("left", 20.0), ("right", 30.0)):
+        numbers = found.joints[name]
+        assert numbers["armature"].value == pytest.approx(0.02, rel=0.05)
+        assert numbers["stiffness"].value == pytest.approx(stiffness, rel=0.05)
+    assert found.delay_s.value < 1e-3 and not found.warnings
+
+
+def follow(folder, control, files):
+    """Let a simulated robot follow `plan.csv`, log it as `a.csv`, and return robot, plan and state machine."""
+    plan = PlanControl(control.meta, files / "plan.csv")
+    robot = SimulatedRobot(folder, ())
+    robot.change_period(plan.period)
+    robot.hang(np.full(2, np.inf), lift=0.5)
+    clock, _, _, lines = set_up(control)
+    robot.read = stamped(robot.read, clock)
+    times = dataclasses.replace(TIMES, blend_seconds=0.0)
+    machine = StateMachine(plan, period=PERIOD, limits=Limits(), times=times, note=lines.event)
+    journal = Journal(files / "a.csv", plan.joints, lambda text: None, only=State.POLICY)
+    operators = [Unattended(math.inf), EndOfPlan(plan)]
+    run_loop(robot, machine, operators, journal, clock=clock, period=plan.period)
+    journal.close()
+    return robot, plan, machine
 
 
 def stamped(read, clock):

@@ -36,6 +36,8 @@ from ksim_rl.export.standalone.states import State, StateMachine, Times
 from ksim_rl.export.standalone.words import EndOfPlan, Interrupts, Keyboard, Operator, Unattended
 
 UNATTENDED_S = 10.0
+LIFT = 1.0
+"""m, of a simulated robot that follows a plan: its legs hang freely."""
 HELP = {
     "late_periods": "periods without a new message, or by which the loop may be late",
     "most_tilt": "of the root from the vertical, rad",
@@ -171,8 +173,8 @@ def _simulated(options: argparse.Namespace, control: PolicyControl, period: floa
     robot = SimulatedRobot(options.folder, control.estimated)
     robot.change_period(period)
     if options.plan is not None:
-        # The base of a robot that is identified is held.
-        robot.hang(np.full(len(control.joints.names), np.inf))
+        # The base of a robot that is identified is held, and nothing touches.
+        robot.hang(np.full(len(control.joints.names), np.inf), lift=LIFT)
     elif options.hang:
         robot.hang(control.joints.stiffness)
     return robot

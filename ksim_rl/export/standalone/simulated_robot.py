@@ -12,6 +12,8 @@ from ksim_rl.export.standalone.files import Array
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
 from ksim_rl.export.standalone.runner import Runner
 
+HELD_INERTIA = 1e6
+"""kg, or kg m^2, of a root that is held: no robot moves it."""
 # Numbers, as arrays of a model hold them.
 TO_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
@@ -109,6 +111,7 @@ class SimulatedRobot:
         self.data.ctrl[at] = command.pos[columns]
         if self.hangs_below is not None and (command.stiffness >= self.hangs_below).all():
             self.hangs_below = None
+            self.model.dof_armature[:6] = self.free_inertia
         if self.hangs_below is None:
             self.runner.run_physics(())
         else:
@@ -120,12 +123,20 @@ class SimulatedRobot:
         self.runner.decimation = math.ceil(period / option.timestep - 1e-9)
         option.timestep = period / self.runner.decimation
 
-    def hang(self, stiffness: Array) -> None:
-        """Hold the root where it is until all motors have a stiffness, as a robot hangs that could not stand up."""
+    def hang(self, stiffness: Array, *, lift: float = 0.0) -> None:
+        """Hold the root until all motors have a stiffness, as a robot hangs that could not stand up.
+
+        It is held `lift` m above where it is.
+        """
         if not self.has_root:
             raise ValueError("--hang: this robot has no free root")
         self.hangs_below = stiffness
+        self.data.qpos[2] += lift
         self.root_pos = self.data.qpos[:7].copy()
+        # So that legs do not move the root within a step: they would swing as in free fall.
+        self.free_inertia = self.model.dof_armature[:6].copy()
+        self.model.dof_armature[:6] = HELD_INERTIA
+        self.runner.refresh()
 
     def _hold_root(self) -> None:
         self.data.qpos[:7] = self.root_pos
