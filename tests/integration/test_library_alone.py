@@ -16,9 +16,20 @@ import warnings
 
 import torch
 from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs.transforms import Compose, UnsqueezeTransform
 from torchrl.envs.utils import check_env_specs
+from ksim_rl.transforms import DepthSteps, PictureEffects, RandomShift
 from tests.transforms.portable import PORTABLE
 
+
+def seen(key):
+    # Three numbers are a picture of three pixels, one above the other.
+    effects = {"shift": RandomShift(pixels=1), "steps": DepthSteps(step=0.5)}
+    shown = UnsqueezeTransform(-1, in_keys=[key], out_keys=["picture"])
+    return Compose(shown, PictureEffects("picture", effects=effects))
+
+
+PORTABLE["PictureEffects"] = seen
 for name, make in PORTABLE.items():
     env = TransformedEnv(GymEnv("Pendulum-v1"), make("observation"))
     check_env_specs(env)
