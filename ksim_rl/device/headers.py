@@ -71,7 +71,8 @@ def arguments_of(text: str) -> dict[str, str]:
     return fields
 
 
-def call_of(header: str, indices: str, values: Iterable[str]) -> str:
-    """Return the call of a header's `run` with two indices and its arguments, in their order."""
+def call_of(header: str, indices: Iterable[str], values: Iterable[str]) -> str:
+    """Return the call of a header's `run` with the indices of a thread, and its arguments in their order."""
     name = PurePosixPath(header).stem
-    return f"{name}::run({indices}, {name}::Arguments {{{', '.join(values)}}});"
+    arguments = f"{name}::Arguments {{{', '.join(values)}}}"
+    return f"{name}::run({', '.join([*indices, arguments])});"

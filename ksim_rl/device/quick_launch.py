@@ -63,7 +63,7 @@ def launch_of(header: str, constants: Mapping[str, int] | None = None) -> "Quick
     for field, ctype in fields.items():
         kinds[field] = ADDRESS if ctype.endswith("*") else _KINDS[ctype]
         values.append(f"({ctype})a.{field}")
-    call = headers.call_of(header, "row, lane", values)
+    call = headers.call_of(header, ("row", "lane"), values)
     return QuickLaunch(kinds, call, preamble=text)
 
 

@@ -96,7 +96,8 @@ def launcher_of(
     """
     text = headers.text_of(header, _constants(constants, lanes, threads))
     fields = headers.arguments_of(text)
-    body = headers.call_of(header, "world, lane", [f"problem.{name}" for name in fields])
+    values = [f"problem.{name}" for name in fields]
+    body = headers.call_of(header, ("world", "lane"), values)
     owners = own, warp_model, warp_model.opt, warp_data_E
     return _launch_of(
         Source(body=body, preamble=text),

@@ -150,11 +150,7 @@ def _add_up_body(world: int, body: int, c: Constants):
     c.inertia[world, body] = axes @ wp.diag(moments) @ wp.transpose(axes)
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-__syncthreads();
-#endif
-""")
+@wp.func_native("constants_of_inertia::wait();")
 def _wait_for_all() -> None:
     """Wait until all lanes of a world have written: a barrier of the block."""
 
@@ -276,7 +272,7 @@ def constants_kernel(nv: int, nbody: int, lanes: int, on_chip: bool) -> wp.Kerne
     text = headers.text_of(_HEADER, sizes)
     values = [f"c.{name}" for name in headers.arguments_of(text)]
 
-    @wp.func_native(headers.call_of(_HEADER, "world, lane", values))
+    @wp.func_native(headers.call_of(_HEADER, ("world", "lane"), values))
     def constants_of_inertia(world: int, lane: int, c: Constants) -> None: ...
 
     @wp.kernel(

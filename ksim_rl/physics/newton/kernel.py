@@ -19,6 +19,8 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from ksim_rl.device import headers
+from ksim_rl.device.upstream import with_preamble
 from ksim_rl.physics import native
 from ksim_rl.physics.newton.limbs import Limbs, padded, row_stride
 
@@ -149,34 +151,11 @@ def launcher(
     return native.launcher(*given, lanes=lanes, threads=lanes, build=build)
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-constexpr int KEYS = 64;
-__shared__ int places[KEYS];  // how many worlds have a key, then where the next of them goes
-const int thread = threadIdx.x, threads = blockDim.x, worlds = order.shape[0];
-auto key_of = [&](int world) {
-    const int time = 2 * iterations.data[world] + rows.data[world] / 4;
-    return KEYS - 1 - wp::min(time, KEYS - 1);
-};
-for (int key = thread; key < KEYS; key += threads)
-    places[key] = 0;
-__syncthreads();
-for (int world = thread; world < worlds; world += threads)
-    atomicAdd(places + key_of(world), 1);
-__syncthreads();
-if (thread == 0) {
-    int before = 0;
-    for (int key = 0; key < KEYS; ++key) {
-        const int count = places[key];
-        places[key] = before;
-        before += count;
-    }
-}
-__syncthreads();
-for (int world = thread; world < worlds; world += threads)
-    order.data[atomicAdd(places + key_of(world), 1)] = world;
-#endif
-""")
+_SORT = "ksim_rl/physics/newton/sort_worlds.cuh"
+_SORT_TEXT = headers.text_of(_SORT)
+
+
+@wp.func_native(headers.call_of(_SORT, (), headers.arguments_of(_SORT_TEXT)))
 def sort_by_counting(order: wp.array[int], iterations: wp.array[int], rows: wp.array[int]) -> None:
     """Write the worlds in the order of their keys."""
 
@@ -185,7 +164,10 @@ def sort_by_counting(order: wp.array[int], iterations: wp.array[int], rows: wp.a
     module="unique",
     enable_backward=False,
     grid_stride=False,
-    module_options={"block_dim": SORTING_THREADS},
+    module_options={
+        "block_dim": SORTING_THREADS,
+        "extra_build_options": with_preamble(_SORT_TEXT),
+    },
 )
 def sort_worlds(order: wp.array[int], iterations: wp.array[int], rows: wp.array[int]):
     """Write the order of the worlds, by one block."""
