@@ -29,6 +29,7 @@ from ksim_rl.export.standalone.robot_link import JointCommand, Measurement
 from ksim_rl.export.standalone.runner import Runner
 from ksim_rl.export.standalone.safety import EffortLimit, Limits, tilt_of
 from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
+from ksim_rl.export.standalone.stages import LowPass
 from ksim_rl.export.standalone.states import State, StateMachine, Times
 from ksim_rl.export.standalone.words import EndOfPlan, Unattended, sort_words
 from ksim_rl.identification.excitation import propose
@@ -207,6 +208,12 @@ def test_no_module_of_a_file_takes_the_names_of_another(parts):
 def test_a_policy_that_the_robot_cannot_observe_is_refused_by_name(control):
     measurement = dataclasses.replace(Bench(Clock()).read(), estimates={}, root_quat=None)
     assert control.lacking(measurement) == ["sensor", "root_quat"]
+
+
+def test_a_filter_is_that_of_first_order():
+    low_pass = LowPass(0.3, 0.0)
+    found = [float(low_pass(np.array(1.0))) for _ in range(5)]
+    assert found == pytest.approx(1.0 - 0.7 ** np.arange(1, 6))
 
 
 # -- from state to state -----------------------------------------------------------------------------------------
