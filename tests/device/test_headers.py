@@ -9,6 +9,7 @@ import torch
 from ksim_rl.device import headers
 from ksim_rl.device.quick_launch import launch_of
 from tests import headers as syntax
+from tests.docs.guide import REPOSITORY
 
 CPU = torch.device("cpu")
 SHARED = """// What two share.
@@ -112,3 +113,17 @@ def test_headers_compile_alone(toy):
         )
     )
     assert "CUDA_CALLABLE" in syntax.errors_of(kernel, compiler, toy.parent)
+
+
+def test_each_file_of_cpp_is_a_part_of_a_kernel():
+    """Python names it, or another header includes it: what a move leaves behind would rot unseen."""
+    package = REPOSITORY / "ksim_rl"
+    texts = [path.read_text() for path in package.rglob("*.py")]
+    texts += [path.read_text() for path in package.rglob("*.cuh")]
+    code = "\n".join(texts)
+    for path in package.rglob("*.cuh"):
+        assert f'"{path.relative_to(REPOSITORY)}"' in code, f"{path}: nothing includes it"
+    # Fragments are named without their ending, by what lies in their folder.
+    for path in package.rglob("*.cpp"):
+        beside = "\n".join(own.read_text() for own in path.parent.glob("*.py"))
+        assert f'"{path.stem}"' in beside, f"{path}: no kernel has it"
