@@ -61,7 +61,11 @@ def launch_of(header: str, constants: Mapping[str, int] | None = None) -> "Quick
     kinds: dict[str, type | str] = {}
     values: list[str] = []
     for field, ctype in fields.items():
-        kinds[field] = ADDRESS if ctype.endswith("*") else _KINDS[ctype]
+        is_pointer = ctype.endswith("*")
+        assert is_pointer or ctype in _KINDS, (
+            f"{header}: {field} is of type {ctype!r}: expected a pointer, or one of {[*_KINDS]}"
+        )
+        kinds[field] = ADDRESS if is_pointer else _KINDS[ctype]
         values.append(f"({ctype})a.{field}")
     call = headers.call_of(header, ("row", "lane"), values)
     return QuickLaunch(kinds, call, preamble=text)
@@ -71,8 +75,8 @@ class QuickLaunch:
     """One kernel in C++ whose only argument, `a`, is a struct of numbers and addresses, launched on torch's stream.
 
     The source runs for each pair of `indices` within the launch's dim, and may use what the text of the `preamble`
-    defines. The kernel has no gradients. It is made at the
-    first launch, so that a module with a kernel can be imported where there is no Warp.
+    defines. The kernel has no gradients. It is made at the first launch, so that a module with a kernel can be imported
+    where there is no Warp.
     """
 
     existing: ClassVar[WeakSet["QuickLaunch"]] = WeakSet()

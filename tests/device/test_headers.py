@@ -94,11 +94,33 @@ def test_constants_are_declared_and_given(toy, constants):
         headers.text_of("toy/kernel.cuh", constants)
 
 
-def test_a_field_is_a_line_of_its_own(toy):
-    kernel = toy / "kernel.cuh"
-    kernel.write_text(KERNEL.replace("float slope;", "float slope, other;"))
-    with pytest.raises(AssertionError, match="a field is a line of its own"):
+GIVEN = "constexpr int OFFSET = 100;"
+
+
+@pytest.mark.parametrize(
+    ("written", "instead", "message"),
+    [
+        ("float slope;", "float slope, other;", "a field is a line of its own"),
+        ("float slope;", "bool slope;", "slope is of type 'bool': expected a pointer, or"),
+        ("struct Arguments {", "struct Fields {", "has a line `struct Arguments {`"),
+        ('shared.cuh"', 'shared.cuh"  // both', "an include is a line of its own: '#include"),
+        # Samples that nobody gives would reach the kernel.
+        ("given {", "given\n{", "`namespace given {` is a line of its own"),
+        (GIVEN, GIVEN + "\nconstexpr bool IS_FAST = true;", "and no 'constexpr bool IS_FAST"),
+        (GIVEN, GIVEN + "\n  constexpr int LENGTH = 3;", "and no '  constexpr int LENGTH"),
+        (GIVEN, GIVEN + "\nconstexpr int A = 1, B = 2;", "and no 'constexpr int A = 1, B"),
+    ],
+)
+def test_what_python_would_misread_is_refused(toy, written, instead, message):
+    assert KERNEL.count(written) == 1
+    (toy / "kernel.cuh").write_text(KERNEL.replace(written, instead))
+    with pytest.raises(AssertionError, match=message):
         launch_of("toy/kernel.cuh", {"OFFSET": 1})
+
+
+def test_a_constant_is_an_int_of_cpp(toy):
+    with pytest.raises(AssertionError, match="OFFSET=5000000000 is no int"):
+        headers.text_of("toy/kernel.cuh", {"OFFSET": 5_000_000_000})
 
 
 def test_headers_compile_alone(toy):
