@@ -144,6 +144,7 @@ class Encoder(nn.Module):
     def __init__(self, cfg: EncoderCfg, spec: TensorSpec, *, device: Device = None) -> None:
         super().__init__()
         self.shape = spec.shape
+        self.dtype = spec.dtype
         maker = f"{type(cfg).__name__}.build for pictures {list(spec.shape)}"
         self.layers = cfg.build(spec, device=device)
         if not isinstance(self.layers, nn.Module):
@@ -167,9 +168,12 @@ class Encoder(nn.Module):
     def forward(self, pictures: Shaped[Tensor, "*pictures"]) -> Float[Tensor, "*features"]:
         """Return the features."""
         start = pictures.ndim - len(self.shape)
-        if start < 0 or pictures.shape[start:] != self.shape:
+        is_shape = start >= 0 and pictures.shape[start:] == self.shape
+        # Bytes and floats have other scales.
+        if not is_shape or pictures.dtype != self.dtype:
             raise ValueError(
-                f"the encoder was built for pictures {list(self.shape)}, and reads {list(pictures.shape)}"
+                f"the encoder was built for pictures {list(self.shape)} of {self.dtype}, and reads "
+                f"{list(pictures.shape)} of {pictures.dtype}"
             )
         features = self.layers(pictures.reshape(-1, *self.shape))
         return features.reshape(*pictures.shape[:start], self.num_features)

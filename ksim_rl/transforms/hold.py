@@ -18,7 +18,8 @@ class ObservationHold(KeyedTransform):
     A reset shows its own observation. In each episode the first one after it arrives after 1 to `every` steps, drawn
     per env, since cameras do not wait for robots. A `dropped` share of those that are due is lost. `fresh_key` gets 1
     where the observation is of this step and 0 where it is an older one, float32 [E, 1]. All keys of one transform
-    arrive together, in any dtype and without copies of another; a camera's lag is an `ObservationDelay` behind it.
+    arrive together, in any dtype and without copies of another; a camera's lag is an `ObservationDelay` behind it, of
+    these keys and the flag.
 
     Example:
         >>> camera = ObservationHold("rgb", every=3, dropped=0.1, fresh_key="rgb_fresh")

@@ -13,6 +13,7 @@ def test_its_chain_of_a_camera_is_built():
     (text,) = re.findall(r"```yaml\n(.*?)```", (DOCS / "vision.md").read_text(), re.DOTALL)
     chain = yaml.safe_load(text)["transforms"]
     transforms = [from_tree(TransformCfg, node, name).build() for name, node in chain.items()]
-    assert transforms[1].out_keys == ["wrist", ("camera", "fresh")]
+    # Where a picture is late, the flag that tells whether it is new is as late.
+    assert transforms[1].out_keys == transforms[2].in_keys == ["wrist", ("camera", "fresh")]
     built = [type(transform).__name__ for transform in transforms]
     assert built == ["PictureEffects", "ObservationHold", "ObservationDelay", "ObservationHistory"]

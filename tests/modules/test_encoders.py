@@ -270,3 +270,6 @@ def test_encoders_are_of_what_is_read_and_pictures_reach_no_network_without():
     built = network(make_actor, ActorCfg, in_keys=("rgb",), **ACTION)
     with pytest.raises(ValueError, match=r"built for pictures \[9, 8, 3\]"):
         built(TensorDict({"rgb": torch.zeros(E, W, H, 3, dtype=torch.uint8)}, [E]))
+    # Floats in [0, 1] would be divided by 255 as bytes are.
+    with pytest.raises(ValueError, match=r"of torch.uint8, and reads .* of torch.float32"):
+        built(TensorDict({"rgb": torch.zeros(E, H, W, 3)}, [E]))

@@ -51,9 +51,15 @@ def test_what_is_shown_is_what_arrived_last(every, dropped):
 
 
 def test_a_delay_behind_it_is_the_lag_of_the_camera():
-    hold = ObservationHold("count", "held", every=4)
-    rollout_ET = rollout(
-        hold, ObservationDelay("held", "late", delay=DelayCfg(min_lag=2, max_lag=2))
-    )
+    hold = ObservationHold("count", "held", every=4, fresh_key="fresh")
+    lag = DelayCfg(min_lag=1, max_lag=3)
+    # The flag goes the way of its picture: it tells of the one that is shown.
+    delay = ObservationDelay(["held", "fresh"], ["late", "late_fresh"], delay=lag)
+    rollout_ET = rollout(hold, delay)
     held_ET, late_ET = rollout_ET["held"][:4], rollout_ET["late"][:4]
-    assert torch.equal(late_ET[:, 2:], held_ET[:, :-2])
+    lag_E = delay.lag_E[:4]
+    assert len(set(lag_E.tolist())) > 1
+    for env, lag in enumerate(lag_E.tolist()):
+        assert torch.equal(late_ET[env, lag:], held_ET[env, :-lag])
+    is_new_ET = rollout_ET["late_fresh"][:4, 4:, 0].bool()
+    assert torch.equal(is_new_ET, (late_ET.diff(dim=1) != 0)[:, 3:, 0])

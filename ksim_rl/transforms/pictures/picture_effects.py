@@ -8,10 +8,11 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
+from ksim_rl.checked import check_value
 from ksim_rl.checks import naming
 from ksim_rl.device import random
 from ksim_rl.transforms.checked_keys import Keys
-from ksim_rl.transforms.pictures.effects import Ends, PictureEffect
+from ksim_rl.transforms.pictures.effects import Ends, PictureEffect, top_of
 from ksim_rl.transforms.pictures.layout import Layout, check_layout, framed, unframed
 from ksim_rl.transforms.row_transform import KeyedTransform, Switched
 from ksim_rl.transforms.specs import bounded, bounds
@@ -25,7 +26,8 @@ class PictureEffects(Switched, KeyedTransform):
     Pictures are [H, W], [H, W, C] or stacked [N, H, W, C], uint8 or floats, in the order of `layout`; bytes stay bytes.
     All keys of one transform are changed alike, as pictures of one camera are. Each effect draws by its name, once per
     env step or per episode. `env.eval()` turns them off and `env.train()` on again, `enable_` does the same for one
-    transform; crops are then of the middle. Batches of samples get new draws for each sample.
+    transform; crops are then of the middle. Batches of samples get new draws for each sample. Effects of light take
+    floats of samples as within [0, 1], since no spec tells.
 
     Example:
         >>> effects = PictureEffects("rgb", effects={"shift": RandomShift(), "light": Brightness(each="episode")})
@@ -45,6 +47,8 @@ class PictureEffects(Switched, KeyedTransform):
         super().__init__(in_keys, out_keys, seed=seed, stream=stream)
         if not effects:
             raise ValueError("effects={}: expected at least one")
+        check_value("effects", effects, Mapping[str, PictureEffect])
+        check_value("layout", layout, Layout)
         self.effects = dict(effects)
         self.layout: Layout = layout
         self._name_streams(f"{name}/{moment}" for name in effects for moment in _MOMENTS)
@@ -57,27 +61,31 @@ class PictureEffects(Switched, KeyedTransform):
 
     def _changed(self, index: int, spec: TensorSpec) -> TensorSpec:
         batch_dims = self.batch_dims[index]
-        leaf = spec.shape[batch_dims:]
-        if spec.dtype != torch.uint8:
-            self._check_floating(self.in_keys[index], spec.dtype)
-        with naming(f"{type(self).__name__}: {self.in_keys[index]!r}"):
-            check_layout(leaf, self.layout)
-            low, high = bounds(spec)
-            ends = float(low.min()), float(high.max())
-            # Shapes are followed on pictures without memory.
-            pictures = torch.empty(1, *leaf, dtype=spec.dtype, device="meta")
-            shape = tuple(framed(pictures, self.layout).shape[1:])
-            for name, effect in self.effects.items():
-                with naming(f"effects.{name}"):
-                    _check_kind(effect, spec.dtype, ends)
-                    shape = effect.new_shape(shape)
-                top = 255.0 if spec.dtype == torch.uint8 else 1.0
-                ends = effect.new_ends(ends, top)
-        changed = torch.empty(1, *shape, device="meta")
-        leaf = unframed(changed, len(leaf), self.layout).shape[1:]
+        low, high = bounds(spec)
+        ends = float(low.min()), float(high.max())
+        # One picture of the spec, without memory.
+        picture = torch.empty(spec.shape[batch_dims:], dtype=spec.dtype, device="meta")
+        leaf, ends = self._followed(self.in_keys[index], picture, ends)
         whole = torch.Size([*spec.shape[:batch_dims], *leaf])
         low, high = (torch.full(whole, end, device=spec.device) for end in ends)
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
+
+    def _followed(
+        self, key: NestedKey, picture: Shaped[Tensor, "*leaf"], ends: Ends
+    ) -> tuple[torch.Size, Ends]:
+        """Return the shape and the ends of a picture after all effects; refuse one that they are not for."""
+        if picture.dtype != torch.uint8:
+            self._check_floating(key, picture.dtype)
+        with naming(f"{type(self).__name__}: {key!r}"):
+            check_layout(picture.shape, self.layout)
+            shape = tuple(framed(picture[None], self.layout).shape[1:])
+            for name, effect in self.effects.items():
+                with naming(f"effects.{name}"):
+                    _check_kind(effect, picture.dtype, ends)
+                    shape = effect.new_shape(shape)
+                ends = effect.new_ends(ends, top_of(picture))
+        changed = torch.empty(1, *shape, device="meta")
+        return unframed(changed, picture.ndim, self.layout).shape[1:], ends
 
     def _begin(self, tensordict_reset: TensorDictBase, mask_E: Tensor) -> TensorDictBase:
         return self._emit(tensordict_reset, "reset", self.reset_count_E)
@@ -91,8 +99,10 @@ class PictureEffects(Switched, KeyedTransform):
         """Change a batch of samples, each by draws of its own."""
         self._check_samples(tensordict, is_floating=False)
         for key in self.in_keys:
-            leaf = tensordict.get(key).shape[_batch_dims(tensordict, key) :]
-            check_layout(leaf, self.layout)
+            value = tensordict.get(key)
+            leaf = value.shape[_batch_dims(tensordict, key) :]
+            picture = torch.empty(leaf, dtype=value.dtype, device="meta")
+            self._followed(key, picture, (0.0, top_of(value)))
         self._take_seed()
         self.step_count.add_(1)
         return self._emit(tensordict, "forward", self.step_count)

@@ -148,6 +148,33 @@ def test_samples_get_draws_of_their_own():
     assert len(set(first.tolist())) > 8 and not torch.equal(first, second)
 
 
+@pytest.mark.parametrize(
+    ("dtype", "effect", "message"),
+    [
+        (torch.uint8, DepthSteps(), r"effects\.it: DepthSteps.*bytes are amounts of light"),
+        (torch.int64, PixelNoise(), "torch.int64: expected floating-point values"),
+        (torch.float32, RandomCrop(height=7, width=2), r"effects\.it: height=7"),
+    ],
+)
+def test_samples_that_an_effect_is_not_for_are_refused(dtype, effect, message):
+    batch = TensorDict({"rgb": torch.zeros(4, *SIZE, dtype=dtype)}, [4])
+    with pytest.raises(ValueError, match=message):
+        PictureEffects("rgb", effects={"it": effect})(batch)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"layout": "WHC"}, "layout='WHC': did you mean 'HWC'"),
+        ({"effects": {"it": RandomShift}}, r"effects\.it=.*expected a PictureEffect"),
+        ({"effects": {}}, "expected at least one"),
+    ],
+)
+def test_settings_that_are_none_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        PictureEffects("rgb", **{"effects": {"it": RandomShift()}, **fields})
+
+
 def test_a_config_names_effects_by_their_classes():
     cfg = TransformCfg(
         PictureEffects,
