@@ -134,7 +134,9 @@ def set_up(control, *, limits=None, times=TIMES):
     machine = StateMachine(
         control, period=PERIOD, limits=limits or Limits(), times=times, note=lines.event
     )
-    return clock, Bench(clock), machine, lines
+    robot = Bench(clock)
+    robot.lines = lines
+    return clock, robot, machine, lines
 
 
 def run(clock, robot, machine, lines, *operators):
@@ -292,6 +294,10 @@ def too_late(robot, machine):
     robot.harm = changed(stamp=robot.clock.now() - 0.005)
 
 
+def another_clock(robot, machine):
+    robot.harm = changed(stamp=robot.clock.now() + 1.0)
+
+
 def lost(robot, machine):
     robot.harm = lambda measurement: None
 
@@ -305,6 +311,27 @@ def read_fails(robot, machine):
 
 def write_fails(robot, machine):
     robot.write_fails = True
+
+
+def exits(robot, machine):
+    def leave(measurement):
+        sys.exit("a robot's own code")
+
+    robot.harm = leave
+
+
+def operator_fails(robot, machine):
+    raise RuntimeError("no remote")
+
+
+def log_fails(robot, machine):
+    log = robot.lines.period
+
+    def fail(now, state, measurement, command):
+        log(now, state, measurement, command)
+        raise RuntimeError("other columns")
+
+    robot.lines.period = fail
 
 
 def loop_waits(robot, machine):
@@ -370,6 +397,21 @@ FAULTS = {
         "left moves with 21.0 per s: expected at most 20.0",
     ),
     "tilted": (reads(root_quat=turned(75)), "tilted by 75 degrees: expected at most 57"),
+    "short attitude": (
+        reads(root_quat=UPRIGHT[:3]),
+        "root_quat has the shape (3,): expected (4,)",
+    ),
+    "another clock": (
+        another_clock,
+        "a message's stamp is 0.980 s ahead of the loop: expected s of time.monotonic",
+    ),
+    "no stamp": (
+        reads(stamp=math.nan),
+        "a message's stamp is nan s ahead of the loop: expected s of time.monotonic",
+    ),
+    "exits": (exits, "read: SystemExit: a robot's own code"),
+    "operator fails": (operator_fails, "operator: RuntimeError: no remote"),
+    "log fails": (log_fails, "log: RuntimeError: other columns"),
     "read fails": (read_fails, "read: ConnectionError: no route"),
     "write fails": (write_fails, "write: OSError: the cable is out"),
     "loop waits": (loop_waits, "the loop ran 0.200 s late: is the computer busy?"),

@@ -3,13 +3,14 @@
 import gc
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Protocol
 
 from ksim_rl.export.standalone.deadlines import Punctuality, next_deadline
 from ksim_rl.export.standalone.journal import Journal
 from ksim_rl.export.standalone.robot_link import Measurement, Robot
-from ksim_rl.export.standalone.states import StateMachine
+from ksim_rl.export.standalone.states import StateMachine, in_one_line
 from ksim_rl.export.standalone.words import Operator, sort_words
 
 WAIT_S = 5.0
@@ -43,6 +44,15 @@ def first_measurement(robot: Robot, clock: Clock, period: float) -> Measurement:
     )
 
 
+@contextmanager
+def damping_after(what: str, machine: StateMachine, clock: Clock) -> Iterator[None]:
+    """Make a fault of whatever others' code raises, an exit of the program too: motors would stay as they are."""
+    try:
+        yield
+    except BaseException as error:
+        machine.fail(clock.now(), f"{what}: {in_one_line(error)}")
+
+
 def run_loop(
     robot: Robot,
     machine: StateMachine,
@@ -64,19 +74,18 @@ def run_loop(
                 woken, f"the loop ran {woken - deadline:.3f} s late: is the computer busy?"
             )
         measurement = None
-        try:
+        words: list[str] = []
+        with damping_after("read", machine, clock):
             measurement = robot.read()
-        except Exception as error:  # whatever a robot's own code raises
-            machine.fail(woken, f"read: {type(error).__name__}: {' '.join(str(error).split())}")
-        said = [word for operator in operators for word in operator.words(woken, machine)]
-        words = sort_words(said, machine, woken)
+        with damping_after("operator", machine, clock):
+            said = [word for operator in operators for word in operator.words(woken, machine)]
+            words = sort_words(said, machine, woken)
         command = machine.tick(woken, measurement, words)
         sent = clock.now()
-        try:
+        with damping_after("write", machine, clock):
             robot.write(command)
-        except Exception as error:  # whatever a robot's own code raises
-            machine.fail(sent, f"write: {type(error).__name__}: {' '.join(str(error).split())}")
-        journal.period(woken, machine.state, measurement, command)
+        with damping_after("log", machine, clock):
+            journal.period(woken, machine.state, measurement, command)
         punctuality.add(deadline, woken, sent)
         if machine.is_over(sent):
             return punctuality

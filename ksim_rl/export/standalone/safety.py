@@ -59,7 +59,7 @@ class Watch:
         self.most_speed = np.where(no_limit, limits.most_speed, joints.most_speed)
 
     def message(self, now: float, measurement: Measurement | None) -> Measurement:
-        """Refuse a measurement that is missing, late, incomplete or not finite."""
+        """Refuse a measurement that is missing, late, stamped by another clock, incomplete or not finite."""
         if measurement is None:
             raise Fault("no message from the robot")
         age = now - measurement.stamp
@@ -67,15 +67,28 @@ class Watch:
             raise Fault(
                 f"no message from the robot for {age:.3f} s: expected one in {self.longest:.3f} s"
             )
+        # By such a clock no message would ever be late. A stamp that is NaN comes here, too.
+        if not age >= -self.longest:
+            raise Fault(
+                f"a message's stamp is {-age:.3f} s ahead of the loop: expected s of time.monotonic"
+            )
         self._numbers(measurement)
         return measurement
 
     def _numbers(self, measurement: Measurement) -> None:
         names = self.joints.names
-        for what in ("joint_pos", "joint_vel", "joint_effort"):
+        of_joints = ("joint_pos", "joint_vel", "joint_effort")
+        sizes: dict[str, int] = dict.fromkeys(of_joints, len(names))
+        if measurement.root_quat is not None:
+            sizes["root_quat"] = 4
+        if measurement.root_ang_vel is not None:
+            sizes["root_ang_vel"] = 3
+        for what, size in sizes.items():
             values = getattr(measurement, what)
-            if values.shape != (len(names),):
-                raise Fault(f"{what} has the shape {values.shape}: expected ({len(names)},)")
+            if values.shape != (size,):
+                raise Fault(f"{what} has the shape {values.shape}: expected ({size},)")
+        for what in of_joints:
+            values = getattr(measurement, what)
             bad = np.flatnonzero(~np.isfinite(values))
             if bad.size:
                 raise Fault(f"{what} of {names[bad[0]]} is {values[bad[0]]}")

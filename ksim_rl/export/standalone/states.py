@@ -130,7 +130,7 @@ class StateMachine:
             except Fault as fault:
                 self.fail(now, str(fault))
             except Exception as error:  # whatever a policy's files make a library raise
-                self.fail(now, f"{type(error).__name__}: {' '.join(str(error).split())}")
+                self.fail(now, in_one_line(error))
         return self._damped(self.pose)
 
     def fail(self, now: float, why: str) -> None:
@@ -213,6 +213,11 @@ class StateMachine:
 
     def _damped(self, pose: Array) -> JointCommand:
         return self._held(pose, 0.0)
+
+
+def in_one_line(error: BaseException) -> str:
+    """Return an error's kind and text."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def smooth(passed: float, seconds: float) -> float:
