@@ -2,11 +2,13 @@
 
 import ast
 import dataclasses
+import io
 import itertools
 import json
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -31,7 +33,15 @@ from ksim_rl.export.standalone.safety import EffortLimit, Limits, tilt_of
 from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
 from ksim_rl.export.standalone.stages import LowPass
 from ksim_rl.export.standalone.states import State, StateMachine, Times
-from ksim_rl.export.standalone.words import EndOfPlan, Unattended, sort_words
+from ksim_rl.export.standalone.words import (
+    OF_THE_TERMINAL,
+    STOPS,
+    EndOfPlan,
+    Interrupts,
+    Keyboard,
+    Unattended,
+    sort_words,
+)
 from ksim_rl.identification.excitation import propose
 from ksim_rl.identification.fit import fit
 from ksim_rl.identification.held_robot import hold
@@ -275,6 +285,52 @@ def test_an_operator_changes_the_command(control):
         "operator: '0.5': expected 2 numbers",
         "operator: 'nan 1': expected 2 numbers",
     ]
+
+
+@pytest.fixture
+def handlers():
+    kept = {number: signal.getsignal(number) for number in (*STOPS, *OF_THE_TERMINAL)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+def test_what_would_end_or_halt_the_program_is_stop_and_then_damp(handlers):
+    interrupts = Interrupts()
+    interrupts.listen()
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP"):
+        number = signal.Signals[name]
+        # Else the test itself would end here.
+        assert signal.getsignal(number) not in (signal.SIG_DFL, signal.default_int_handler)
+        signal.raise_signal(number)
+    assert interrupts.words(0.0, None) == ["stop", *4 * ["damp"]]
+    # Python would print to a terminal, or read of one, that another program has.
+    assert signal.getsignal(signal.SIGTTIN) == signal.getsignal(signal.SIGTTOU) == signal.SIG_IGN
+
+
+class Gone:
+    """A terminal that says a word, and then is away."""
+
+    def __iter__(self):
+        yield "stand\n"
+        raise OSError("Input/output error")
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (lambda: io.StringIO("stand\n\n"), ["stand", "stop"]),
+        (lambda: io.TextIOWrapper(io.BytesIO(b"\xff\n"), encoding="utf-8"), ["stop"]),
+        (Gone, ["stand"]),
+        (lambda: None, []),
+    ],
+    ids=["ends", "no text", "is gone", "no input"],
+)
+def test_a_keyboard_that_is_heard_no_more_says_stop_where_it_leads(lines, said):
+    for leads, expected in ((True, [*said, "stop"]), (False, said)):
+        keyboard = Keyboard(lines(), leads=leads)
+        keyboard.thread.join()
+        assert keyboard.words(0.0, None) == expected
 
 
 # -- faults ------------------------------------------------------------------------------------------------------

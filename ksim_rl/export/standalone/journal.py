@@ -74,7 +74,7 @@ class Journal:
             names += [f"{joint}.{column}" for column in COLUMNS]
         self.form = ",".join(["%.6f", "%d", *["%.9g"] * (len(names) - 2)]) + "\n"
         # "x": the log of an earlier run is never written over.
-        self.file: TextIO = path.open("x")
+        self.file: TextIO = path.open("x", encoding="utf-8", errors="backslashreplace")
         self.file.write(",".join(names) + "\n")
         self.waiting: queue.SimpleQueue[Line | None] = queue.SimpleQueue()
         self.thread = threading.Thread(target=self._write, name="journal", daemon=True)

@@ -9,6 +9,7 @@ class with `read`, `write` and `close` (see `Robot`), and give it to `drive`.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import math
@@ -65,7 +66,7 @@ def loop_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--seconds",
         type=float,
-        help="of the policy, without an operator; 0: words of yours lead from state to state "
+        help="of the policy, without an operator, who may still stop it; 0: words of yours lead from state to state "
         f"(default: {UNATTENDED_S:g} with --simulate, else 0)",
     )
     parser.add_argument(
@@ -139,7 +140,9 @@ def drive(
         seconds = UNATTENDED_S if options.simulate else 0.0
     if seconds and plan is not None:
         seconds = math.inf
-    heard.append(Unattended(seconds) if seconds else Keyboard(sys.stdin))
+    heard.append(Keyboard(sys.stdin, leads=not seconds))
+    if seconds:
+        heard.append(Unattended(seconds))
     calm_python()
     priority = ask_for_real_time() if options.real_time else "no real-time priority: not asked for"
     journal.event(clock.now(), priority)
@@ -205,7 +208,9 @@ def _tell(summary: Json, failure: str) -> None:
 
 
 def _say(text: str) -> None:
-    print(text, flush=True)
+    # A terminal that is gone ends neither the log nor the report.
+    with contextlib.suppress(OSError):
+        print(text, flush=True)
 
 
 def main() -> None:

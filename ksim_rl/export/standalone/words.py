@@ -11,6 +11,10 @@ from typing import Protocol, TextIO
 from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.states import State, StateMachine
 
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+"""Ctrl-C, kill, a terminal or connection that closes, Ctrl-\\, Ctrl-Z: each would leave the motors as they are."""
+OF_THE_TERMINAL = (signal.SIGTTIN, signal.SIGTTOU)
+"""By which a system halts a program in the background that uses the terminal."""
 REST_S = 1.0
 """With damped motors at the beginning, where nobody says more."""
 
@@ -24,18 +28,31 @@ class Operator(Protocol):
 
 
 class Keyboard:
-    """Lines of a terminal: each is a word, or the numbers of a command; an empty line is `stop`."""
+    """Lines of a terminal: each is a word, or the numbers of a command; an empty line is `stop`.
 
-    def __init__(self, lines: TextIO) -> None:
-        self.lines = lines
+    The end of lines is `stop`, too, where the keyboard `leads`: nobody can stop it any more.
+    """
+
+    def __init__(self, lines: TextIO | None, *, leads: bool) -> None:
+        # Python has None where the program was started without an input.
+        self.lines = lines or ()
+        self.leads = leads
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        threading.Thread(target=self._listen, name="keyboard", daemon=True).start()
+        self.thread = threading.Thread(target=self._listen, name="keyboard", daemon=True)
+        self.thread.start()
 
     def _listen(self) -> None:
-        for line in self.lines:
-            self.said.put(line.strip() or "stop")
-        # Nobody can stop it any more.
-        self.said.put("stop")
+        try:
+            for line in self.lines:
+                self.said.put(line.strip() or "stop")
+        except (
+            ValueError
+        ):  # bytes that are no text: somebody said something, and is not heard any more
+            self.said.put("stop")
+        except OSError:  # the terminal is gone, or another program has it
+            pass
+        if self.leads:
+            self.said.put("stop")
 
     def words(self, now: float, machine: StateMachine) -> list[str]:
         """Return what was said since the last period."""
@@ -86,9 +103,11 @@ class Interrupts:
         self.said = 0
 
     def listen(self) -> None:
-        """Take the place of Python's handlers, which would leave the loop."""
-        for number in (signal.SIGINT, signal.SIGTERM):
+        """Take the place of handlers that would leave the loop, or halt it."""
+        for number in STOPS:
             signal.signal(number, self._heard)
+        for number in OF_THE_TERMINAL:
+            signal.signal(number, signal.SIG_IGN)
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
         self.count += 1
