@@ -10,7 +10,13 @@ from torchrl.data import Composite
 from ksim_rl.checks import naming
 from ksim_rl.modules.encoders import Encoder
 from ksim_rl.modules.mlp import Device
-from ksim_rl.modules.network import NetworkCfg, ObservationKey, leaf_spec, observation_dim
+from ksim_rl.modules.network import (
+    NetworkCfg,
+    ObservationKey,
+    check_unused,
+    leaf_spec,
+    observation_dim,
+)
 from ksim_rl.modules.recurrent import behind
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.transforms.specs import spell
@@ -42,6 +48,7 @@ def make_for_spec(
     obs_dim = observation_dim(spec, vectors)
     if not cfg.encoders:
         return make(cfg, obs_dim=obs_dim, device=device, **options)
+    check_unused(spec, ENCODED)
     encoders = []
     encoded_dim = 0
     for key in cfg.in_keys:

@@ -44,6 +44,14 @@ def leaf_spec(spec: Composite, key: ObservationKey) -> TensorSpec:
     return Unbounded(leaf.shape[batch_dims:], dtype=leaf.dtype)
 
 
+def check_unused(spec: Composite, key: str) -> None:
+    """Refuse an env that shows an observation at a key where networks write: it would be lost."""
+    if key in spec.keys():
+        raise ValueError(
+            f"the env has an observation {key!r}, where networks write their features: give it another name"
+        )
+
+
 def observation_dim(spec: Composite, keys: Sequence[ObservationKey]) -> int:
     """Return the sum of the sizes of the observations at `keys`, which stand side by side.
 

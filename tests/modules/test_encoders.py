@@ -266,6 +266,11 @@ def test_encoders_are_of_what_is_read_and_pictures_reach_no_network_without():
     actor = make_actor(ActorCfg(in_keys=("rgb",)), obs_dim=3, action_dim=2)
     with pytest.raises(ValueError, match=r"no uint8 of shape \[6, 9, 8, 3\]"):
         actor(observations(E))
+    # An observation of the env that has the name of features.
+    taken = SPEC.clone()
+    taken["encoded", "rgb"] = Unbounded((E, 4))
+    with pytest.raises(ValueError, match="has an observation 'encoded', where networks write"):
+        make_for_spec(make_critic, CriticCfg(in_keys=("rgb",), encoders={"rgb": SMALL}), taken)
     # Pictures of another size than the encoder's.
     built = network(make_actor, ActorCfg, in_keys=("rgb",), **ACTION)
     with pytest.raises(ValueError, match=r"built for pictures \[9, 8, 3\]"):

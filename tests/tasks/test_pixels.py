@@ -57,6 +57,10 @@ def test_its_policy_reads_the_last_three_pictures_and_nothing_else():
 def test_a_policy_without_an_encoder_and_a_replay_without_memory_are_refused():
     with pytest.raises(ValueError, match="modules.trunk: in_keys: 'actor' is no vector"):
         build(conf.compose([*TINY, *PPO, "~modules.trunk.encoders.actor"]))
+    # The trunk's features would take the place of a group of that name.
+    group = "{terms: {joints: {term: {_target_: ksim_rl.mdp.JointPos}}}}"
+    with pytest.raises(ValueError, match="modules.trunk: the env has an observation 'features'"):
+        build(conf.compose([*TINY, *PPO, f"+task.observations.features={group}"]))
     with pytest.raises(ValueError, match="group 'actor' is an image.*objective.symmetry=none"):
         build(conf.compose([*TINY, *PPO, "objective.symmetry=augment"]))
     # Three frames of 36 x 36 colours, and the critic's five numbers, now and next.

@@ -24,7 +24,7 @@ from ksim_rl.modules import (
     make_recurrent_critic,
     make_shared_trunk,
 )
-from ksim_rl.modules.network import LayeredNetwork
+from ksim_rl.modules.network import LayeredNetwork, check_unused
 from ksim_rl.objectives import PPOCfg, observation_keys
 from ksim_rl.trainers.algorithm import part_of
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -66,6 +66,7 @@ def build_networks(
     trunk = None
     if modules.trunk is not None:
         with naming("modules.trunk"):
+            check_unused(spec, FEATURES)
             trunk = made(make_shared_trunk, modules.trunk, spec)
         layers = next(own for own in trunk.modules() if isinstance(own, LayeredNetwork))
         # Both networks read its features as one more observation.
