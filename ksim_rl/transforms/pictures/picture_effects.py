@@ -135,8 +135,10 @@ class PictureEffects(Switched, KeyedTransform):
                 name, effect.num_draws(shape), len(pictures_ENHWC), moment, counter
             )
             # The middle of what may be drawn is the middle of the picture for a crop, which has no other form.
-            draws_EK = torch.where(enabled, draws_EK, 0.5)
+            middle = 0.0 if effect.is_normal else 0.5
+            draws_EK = torch.where(enabled, draws_EK, middle)
             changed_ENHWC = effect(pictures_ENHWC, draws_EK)
+            _check_result(name, effect, pictures_ENHWC, changed_ENHWC)
             if changed_ENHWC.shape == pictures_ENHWC.shape:
                 changed_ENHWC = torch.where(enabled, changed_ENHWC, pictures_ENHWC)
             pictures_ENHWC = changed_ENHWC
@@ -166,6 +168,22 @@ def _batch_dims(tensordict: TensorDictBase, key: NestedKey) -> int:
     if isinstance(key, str):
         return tensordict.ndim
     return tensordict.get(key[:-1]).ndim
+
+
+def _check_result(
+    name: str,
+    effect: PictureEffect,
+    pictures_ENHWC: Shaped[Tensor, "E N H W C"],
+    changed_ENHWC: Shaped[Tensor, "*any"],
+) -> None:
+    """Refuse results that are not what the spec says: bytes would become floats, say."""
+    dtype = pictures_ENHWC.dtype
+    shape = [len(pictures_ENHWC), *effect.new_shape(pictures_ENHWC.shape[1:])]
+    if changed_ENHWC.dtype != dtype or list(changed_ENHWC.shape) != shape:
+        raise ValueError(
+            f"effects.{name}: {type(effect).__name__} gives {changed_ENHWC.dtype} {list(changed_ENHWC.shape)}: "
+            f"expected {dtype} {shape}"
+        )
 
 
 def _check_kind(effect: PictureEffect, dtype: torch.dtype, ends: Ends) -> None:

@@ -72,6 +72,36 @@ def test_draws_are_keyed_by_name_step_and_episode():
     assert torch.equal(rollout_ET["now"][..., 0, 0, 0][starts], expected[starts])
 
 
+class Tile(Shade):
+    """A user's own, of another size: pixels are 100, and ten times a standard normal draw."""
+
+    is_normal = True
+
+    def new_shape(self, shape):
+        return (shape[0], 2, 2, shape[3])
+
+    def __call__(self, pictures_ENHWC, draws_EK):
+        tile_E1111 = (100 + 10 * draws_EK)[:, :, None, None, None]
+        return tile_E1111.expand(-1, *self.new_shape(pictures_ENHWC.shape[1:])).to(torch.uint8)
+
+
+class Faulty(Shade):
+    """A user's own, whose results are floats."""
+
+    def __call__(self, pictures_ENHWC, draws_EK):
+        return pictures_ENHWC * 0.5
+
+
+def test_effects_of_a_user_keep_what_they_promise():
+    env = env_with(PictureEffects("rgb", "tile", effects={"tile": Tile()}))
+    env.eval()
+    # The mean of what is drawn, as crops are of the middle.
+    assert bool((env.reset()["tile"] == 100).all())
+    env = env_with(PictureEffects("rgb", effects={"half": Faulty()}))
+    with pytest.raises(ValueError, match=r"effects\.half: Faulty gives torch.float32.*torch.uint8"):
+        env.reset()
+
+
 def test_stacked_pictures_are_changed_alike_and_stay_bytes():
     env = env_with(
         ObservationHistory("rgb", "frames", length=3, flat=False),
