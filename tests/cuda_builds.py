@@ -264,6 +264,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in given.of:
         folder = given.out / name.replace(":", "_of_")
         folder.mkdir(parents=True, exist_ok=True)
+        # A kernel that is launched no more would stay, and equal the other tree's.
+        for old in folder.glob("*.ptx"):
+            old.unlink()
         for place, build in enumerate(builds_of(name)):
             text = ptx(build)
             (folder / f"{place:02}.ptx").write_text(text)

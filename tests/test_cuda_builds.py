@@ -29,6 +29,17 @@ def test_all_kernels_compile_for_a_gpu(name):
         assert any(".maxnreg" in text for text in texts)
 
 
+def test_kernels_of_an_earlier_run_do_not_stay(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cuda_builds, "builds_of", lambda name: ["one"])
+    monkeypatch.setattr(cuda_builds, "ptx", lambda build: f"{build}\n")
+    folder = tmp_path / "go1_of_many"
+    folder.mkdir()
+    (folder / "07.ptx").write_text("old\n")
+    cuda_builds.main(["--out", str(tmp_path), "--of", "go1:many"])
+    assert [path.name for path in folder.iterdir()] == ["00.ptx"]
+    assert capsys.readouterr().out == "go1:many 0: 1 lines\n"
+
+
 def test_equal_kernels_have_equal_text_whatever_their_names():
     fields = arguments_of((int, "slope"), (ADDRESS, "out"))
 
