@@ -25,9 +25,10 @@ from ksim_rl.export.standalone.deadlines import Durations, next_deadline
 from ksim_rl.export.standalone.files import read_json
 from ksim_rl.export.standalone.journal import MOST_WAITING, Journal
 from ksim_rl.export.standalone.loop import run_loop
+from ksim_rl.export.standalone.loop_command import drive, loop_parser
 from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.policy_control import PolicyControl
-from ksim_rl.export.standalone.robot_link import JointCommand, Measurement
+from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
 from ksim_rl.export.standalone.runner import Runner
 from ksim_rl.export.standalone.safety import EffortLimit, Limits, tilt_of
 from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
@@ -527,7 +528,8 @@ def test_a_message_that_is_late_once_is_no_fault(control):
 def test_targets_are_moved_so_far_that_efforts_stay_in_their_limits(control):
     limit = EffortLimit(control.joints, 0.5)
     draws = np.random.default_rng(2)
-    measured = Bench(Clock()).read()
+    # So fast that some brakes alone would be too strong.
+    measured = dataclasses.replace(Bench(Clock()).read(), joint_vel=np.array([7.0, -8.0]))
     moved = np.zeros(2, int)
     for _ in range(200):
         pos, vel, effort = draws.normal(0.0, 1.0, (3, 2))
@@ -542,6 +544,10 @@ def test_targets_are_moved_so_far_that_efforts_stay_in_their_limits(control):
 
         found = limit(command, measured)
         assert exerted(found) == pytest.approx(np.clip(exerted(command), -9.0, 9.0))
+        # Nothing new pushes: neither a target behind the measured position, nor an effort.
+        way = (found.pos - measured.joint_pos) / (command.pos - measured.joint_pos)
+        assert (way >= -1e-9).all() and (way <= 1.0 + 1e-9).all()
+        assert (np.abs(found.effort) <= np.abs(command.effort)).all()
         moved += np.abs(exerted(command)) > 9.0
     assert limit.clipped() == {"right": moved[0], "left": moved[1]} and min(moved) > 20
 
@@ -549,15 +555,42 @@ def test_targets_are_moved_so_far_that_efforts_stay_in_their_limits(control):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: Limits(effort_share=1.5), "--effort-share 1.5: expected 0 to 1"),
+        (lambda: Limits(effort_share=1.5), "--effort-share 1.5: expected 0.01 to 1"),
+        # Times a limit of inf it would be NaN.
+        (lambda: Limits(effort_share=0.0), "--effort-share 0: expected 0.01 to 1"),
         (lambda: Limits(late_periods=0.5), "--late-periods 0.5: expected 1 to inf"),
         (lambda: Limits(most_tilt=math.nan), "--most-tilt nan: expected 0 to inf"),
-        (lambda: Times(stand_seconds=-1.0), "--stand-seconds -1: expected 0 or more"),
+        (lambda: Times(stop_seconds=-1.0), "--stop-seconds -1: expected 0 or more"),
+        (lambda: Times(stand_seconds=0.0), "--stand-seconds 0: expected 0.1 or more"),
+        (lambda: Times(damping_factor=0.0), "--damping-factor 0: expected 0.1 or more"),
     ],
 )
 def test_wrong_options_are_refused(make, said):
     with pytest.raises(ValueError, match=said):
         make()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--simulate"], "--simulate and --hang are of the simulated robot"),
+        (["--seconds", "nan"], "--seconds nan: expected 0 or more"),
+        (["--command", "0", "nan"], "--command 0.0 nan: expected finite numbers"),
+    ],
+)
+def test_a_robot_is_not_driven_with_options_that_do_not_fit(control, arguments, said):
+    robot = Bench(Clock())
+    # It cannot even be read: all of it is refused before.
+    robot.harm = None
+    with pytest.raises(ValueError, match=said):
+        drive(robot, control, loop_parser().parse_args(arguments))
+
+
+@pytest.mark.parametrize(("value", "said"), [(None, "nan"), (-1.0, "-1"), (math.inf, "inf")])
+def test_gains_that_no_motor_may_be_given_are_refused(control, value, said):
+    joints = {**control.meta["joints"], "damping": [1.0, value]}
+    with pytest.raises(ValueError, match=f"joints.damping of 'left' is {said}: expected 0 to inf"):
+        DescribedJoints({**control.meta, "joints": joints})
 
 
 # -- the log -----------------------------------------------------------------------------------------------------

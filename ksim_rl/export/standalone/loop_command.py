@@ -104,6 +104,12 @@ def drive(
     Without a robot it is the simulated one. `operators` are heard beside the keyboard. A ValueError says what is wrong
     before anything moves.
     """
+    if robot is not None and (options.simulate or options.hang):
+        raise ValueError(
+            "--simulate and --hang are of the simulated robot: this program drives another one"
+        )
+    if options.seconds is not None and not options.seconds >= 0.0:
+        raise ValueError(f"--seconds {options.seconds:g}: expected 0 or more")
     step_dt = float(control.meta["step_dt"])
     plan = None
     if options.plan is not None:
@@ -186,6 +192,8 @@ def _simulated(options: argparse.Namespace, control: PolicyControl, period: floa
 def _set_command(control: PolicyControl, values: Sequence[float] | None) -> None:
     if not values:
         return
+    if not np.isfinite(values).all():
+        raise ValueError(f"--command {' '.join(map(str, values))}: expected finite numbers")
     for name, command in control.command.items():
         if len(values) != len(command):
             raise ValueError(f"--command: {len(values)} numbers: {name} has {len(command)}")

@@ -69,10 +69,10 @@ class DescribedJoints:
         joints = meta["joints"]
         limits = joints["limits"]
         self.names: list[str] = joints["names"]
-        self.default_pos = np.array(joints["default_pos"], float)
-        self.stiffness = np.array(joints["stiffness"], float)
-        self.damping = np.array(joints["damping"], float)
-        self.effort_scale = np.array(joints["effort_scale"], float)
+        self.default_pos = _finite("default_pos", joints)
+        self.stiffness = _finite("stiffness", joints, least=0.0)
+        self.damping = _finite("damping", joints, least=0.0)
+        self.effort_scale = _finite("effort_scale", joints)
         self.lowest = _or([low for low, _ in limits["position"]], -np.inf)
         self.highest = _or([high for _, high in limits["position"]], np.inf)
         self.most_effort = _or(limits["effort"], np.inf)
@@ -84,6 +84,17 @@ class DescribedJoints:
     def columns(self, names: list[str]) -> Array:
         """Return the places of some joints."""
         return np.array([self.names.index(name) for name in names], int)
+
+
+def _finite(what: str, joints: Json, *, least: float = -np.inf) -> Array:
+    """Return an entry of export.json with a number for each joint; what no motor may be given is refused."""
+    numbers = np.array(joints[what], float)
+    for name, number in zip(joints["names"], numbers, strict=True):
+        if not np.isfinite(number) or number < least:
+            raise ValueError(
+                f"export.json: joints.{what} of {name!r} is {number:g}: expected {least:g} to inf"
+            )
+    return numbers
 
 
 def _or(values: list[float | None], otherwise: float) -> Array:

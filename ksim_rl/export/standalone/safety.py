@@ -15,6 +15,9 @@ from ksim_rl.export.standalone.robot_link import (
     to_root_axes,
 )
 
+LEAST_LIMITS = {"late_periods": 1.0, "effort_share": 0.01}
+"""The least value of these; 0 of the others. Without effort no motor could brake."""
+
 
 class Fault(Exception):  # noqa: N818
     """Why motors are damped from now on, in one line."""
@@ -41,7 +44,7 @@ class Limits:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            lowest = 1.0 if field.name == "late_periods" else 0.0
+            lowest = LEAST_LIMITS.get(field.name, 0.0)
             highest = 1.0 if field.name == "effort_share" else math.inf
             if not lowest <= value <= highest:
                 option = field.name.replace("_", "-")
@@ -134,7 +137,12 @@ def tilt_of(root_quat: Array) -> float:
 
 
 class EffortLimit:
-    """Moves targets so far that motors stay within their effort limits at the measured state, and counts that."""
+    """Keeps what motors are asked for within their effort limits at the measured state, and counts where it has to.
+
+    Targets of positions are moved, to between the measured position and the target. Where damping and effort alone are
+    beyond the limit, all of a joint's command is made smaller: a target, or an effort, that made up for a brake that is
+    too strong would drive the joint as soon as it stands still.
+    """
 
     def __init__(self, joints: DescribedJoints, share: float) -> None:
         self.names = joints.names
@@ -145,18 +153,26 @@ class EffortLimit:
         """Return the command whose efforts, at the measured positions and speeds, are within the limits."""
         away = command.pos - measurement.joint_pos
         faster = command.vel - measurement.joint_vel
-        effort = command.effort + command.stiffness * away + command.damping * faster
-        excess = np.clip(effort, -self.most, self.most) - effort
-        over = excess != 0.0
+        others = command.effort + command.damping * faster
+        effort = command.stiffness * away + others
+        within = np.clip(effort, -self.most, self.most)
+        over = effort != within
         if not over.any():
             return command
         self.counts += over
-        # By the target where a stiffness makes effort of it, else by the effort itself.
-        is_stiff = command.stiffness > 0.0
-        divisor = np.where(is_stiff, command.stiffness, 1.0)
-        pos = command.pos + np.where(is_stiff, excess / divisor, 0.0)
-        feed_forward = command.effort + np.where(is_stiff, 0.0, excess)
-        return dataclasses.replace(command, pos=pos, effort=feed_forward)
+        is_smaller = over & (np.abs(others) > self.most)
+        is_moved = over & ~is_smaller
+        pos = command.pos.copy()
+        pos[is_moved] += (within - effort)[is_moved] / command.stiffness[is_moved]
+        share = np.ones(len(pos))
+        share[is_smaller] = within[is_smaller] / effort[is_smaller]
+        return dataclasses.replace(
+            command,
+            pos=pos,
+            effort=share * command.effort,
+            stiffness=share * command.stiffness,
+            damping=share * command.damping,
+        )
 
     def clipped(self) -> dict[str, int]:
         """Return how many commands were moved, by joint, of those that were."""

@@ -59,9 +59,14 @@ class Times:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not 0.0 <= value < math.inf:
+            least = LEAST_TIMES.get(field.name, 0.0)
+            if not least <= value < math.inf:
                 option = field.name.replace("_", "-")
-                raise ValueError(f"--{option} {value:g}: expected 0 or more")
+                raise ValueError(f"--{option} {value:g}: expected {least:g} or more")
+
+
+# A pose that is asked for at once is a jump, motors that do not brake let a robot fall, and one message may be lost.
+LEAST_TIMES = {"stand_seconds": 0.1, "damp_seconds": 0.1, "damping_factor": 0.1}
 
 
 class Control(Protocol):

@@ -31,9 +31,9 @@ def main() -> int:
     except ValueError as error:
         parser.error(str(error))
     chosen = loop.loop_parser().parse_args([str(options.folder), *others])
-    if chosen.simulate:
+    if chosen.simulate or chosen.hang:
         parser.error(
-            "--simulate is of loop.py alone: here `python -m unitree_bridge.stub` simulates"
+            "--simulate and --hang are of loop.py alone: here `python -m unitree_bridge.stub` simulates"
         )
     try:
         meta = loop.read_json(options.folder / "export.json")
