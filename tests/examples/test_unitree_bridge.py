@@ -202,14 +202,19 @@ def _arrived(reader):
 
 def test_buttons_of_the_remote_are_words_once_each(pair):
     _, robot, stub, _ = pair
+    # Held down before the loop began.
+    stub.remote = bytes([0, 0, 1 << 3, *bytes(37)])
+    time.sleep(0.1)
     loop.first_measurement(robot, MonotonicClock(), 0.02)
     found = []
-    for buttons in (0, 1 << 2, 1 << 2, 0, 1 << 9 | 1 << 8, 0):
+    for buttons in (1 << 3, 1 << 2, 1 << 2, 0, 1 << 9 | 1 << 8, 0):
         stub.remote = bytes([0, 0, *buttons.to_bytes(2, "little"), *bytes(36)])
         time.sleep(0.1)
         robot.read()
         robot.read()
         found.append(robot.words(0.0, None))
+        # A period without a message lets no button go.
+        assert robot.words(0.0, None) == []
     assert found == [[], ["stand"], [], [], ["policy", "damp"], []]
 
 

@@ -30,7 +30,7 @@ from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.policy_control import PolicyControl
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
 from ksim_rl.export.standalone.runner import Runner
-from ksim_rl.export.standalone.safety import EffortLimit, Limits, tilt_of
+from ksim_rl.export.standalone.safety import EffortLimit, Limits, tilt_of, unguarded
 from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
 from ksim_rl.export.standalone.stages import LowPass
 from ksim_rl.export.standalone.states import State, StateMachine, Times
@@ -591,6 +591,20 @@ def test_gains_that_no_motor_may_be_given_are_refused(control, value, said):
     joints = {**control.meta["joints"], "damping": [1.0, value]}
     with pytest.raises(ValueError, match=f"joints.damping of 'left' is {said}: expected 0 to inf"):
         DescribedJoints({**control.meta, "joints": joints})
+
+
+def test_what_nothing_limits_holds_or_brakes_is_named(control):
+    measurement = Bench(Clock()).read()
+    assert unguarded(control.joints, measurement) == []
+    control.joints.most_effort[0] = math.inf
+    control.joints.stiffness[1] = 0.0
+    control.joints.damping[:] = 0.0
+    assert unguarded(control.joints, dataclasses.replace(measurement, root_quat=None)) == [
+        "no limit of effort: right",
+        "no stiffness, so that nothing holds them in stand: left",
+        "no damping, so that nothing brakes them: right, left",
+        "no attitude: the tilt is not watched",
+    ]
 
 
 # -- the log -----------------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from ksim_rl.export.standalone.loop import (
 from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.policy_control import PolicyControl
 from ksim_rl.export.standalone.robot_link import Robot
-from ksim_rl.export.standalone.safety import Limits
+from ksim_rl.export.standalone.safety import Limits, unguarded
 from ksim_rl.export.standalone.states import State, StateMachine, Times
 from ksim_rl.export.standalone.words import EndOfPlan, Interrupts, Keyboard, Operator, Unattended
 
@@ -123,7 +123,8 @@ def drive(
     if robot is None:
         robot = _simulated(options, control, period)
     clock = MonotonicClock()
-    lacking = driver.lacking(first_measurement(robot, clock, period))
+    first = first_measurement(robot, clock, period)
+    lacking = driver.lacking(first)
     if lacking:
         raise ValueError(
             f"the policy observes {', '.join(lacking)}, which this robot does not measure: give estimates, or train "
@@ -151,7 +152,8 @@ def drive(
         heard.append(Unattended(seconds))
     calm_python()
     priority = ask_for_real_time() if options.real_time else "no real-time priority: not asked for"
-    journal.event(clock.now(), priority)
+    for line in [priority, *unguarded(driver.joints, first)]:
+        journal.event(clock.now(), line)
     try:
         punctuality = run_loop(robot, machine, heard, journal, clock=clock, period=period)
     finally:

@@ -130,6 +130,23 @@ class Watch:
                 )
 
 
+def unguarded(joints: DescribedJoints, measurement: Measurement) -> list[str]:
+    """Return a line for each thing that nothing limits, holds or brakes, as export.json or the robot has no number."""
+    lacks = {
+        "no limit of effort": np.isinf(joints.most_effort),
+        "no stiffness, so that nothing holds them in stand": joints.stiffness == 0.0,
+        "no damping, so that nothing brakes them": joints.damping == 0.0,
+    }
+    lines = []
+    for what, places in lacks.items():
+        names = [joints.names[place] for place in np.flatnonzero(places & joints.driven)]
+        if names:
+            lines.append(f"{what}: {', '.join(names)}")
+    if measurement.root_quat is None:
+        lines.append("no attitude: the tilt is not watched")
+    return lines
+
+
 def tilt_of(root_quat: Array) -> float:
     """Return the angle between a root's z axis and the vertical, rad."""
     down = to_root_axes(root_quat, DOWN)

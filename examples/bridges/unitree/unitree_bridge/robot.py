@@ -48,8 +48,10 @@ class UnitreeRobot:
         for motor in range(len(kind.joints)):
             self.command.motor_cmd[motor].mode = ENABLED
         self.newest: Any = None
-        self.pressed: set[str] = set()
-        self.held: set[str] = set()
+        # None since the last words: no message has come.
+        self.pressed: set[str] | None = None
+        # A button that is held down from the beginning was not meant for this loop.
+        self.held = set(BUTTONS)
 
     def read(self) -> Any:
         """Return the newest measurement, None before the first; one that arrived since the last call is of now."""
@@ -60,7 +62,8 @@ class UnitreeRobot:
         # G1 wants its own machine's number in each command.
         if hasattr(state, "mode_machine"):
             self.command.mode_machine = state.mode_machine
-        self.pressed |= pressed_buttons(bytes(state.wireless_remote))
+        pressed = pressed_buttons(bytes(state.wireless_remote))
+        self.pressed = pressed | (self.pressed or set())
         motors = [state.motor_state[motor] for motor in self.motors]
         imu = state.imu_state
         estimates = {}
@@ -91,9 +94,11 @@ class UnitreeRobot:
 
     def words(self, now: float, machine: Any) -> list[str]:
         """Return the words of the remote's buttons that were pressed since the last call."""
+        if self.pressed is None:
+            return []
         found = [WORDS[name] for name in sorted(self.pressed - self.held)]
         self.held = self.pressed
-        self.pressed = set()
+        self.pressed = None
         return found
 
     def close(self) -> None:
