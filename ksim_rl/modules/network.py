@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 
 from ksim_rl.checked import Checked, Count, Filled, Name, NonNegative, numbers_of_layers
-from ksim_rl.checks import check_choice, check_in_range
+from ksim_rl.checks import check_choice, check_in_range, near
 from ksim_rl.modules.encoders import EncoderCfg
 from ksim_rl.modules.mlp import ACTIVATIONS, Device, mlp
 from ksim_rl.modules.upstream import TensorModule
@@ -204,8 +204,10 @@ class NetworkCfg(Checked):
             raise ValueError(f"in_keys={keys!r}: each key can be read once")
         object.__setattr__(self, "in_keys", keys)
         # An encoder of what the network does not read would do nothing.
+        read = [spell(key) for key in keys]
         for name in self.encoders:
-            check_choice("encoders", name, [spell(key) for key in keys])
+            if name not in read:
+                raise ValueError(f"encoders={name!r}: in_keys={read} lacks it: {near(name, read)}")
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return what the hidden layers need."""

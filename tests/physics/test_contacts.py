@@ -163,7 +163,7 @@ LAWS = """
 LAW = ("solref", "solimp", "friction", "dim")
 
 
-@pytest.mark.parametrize("one_kernel", [True, False])
+@pytest.mark.parametrize("one_kernel", [pytest.param(True, marks=pytest.mark.full), False])
 def test_the_geom_of_priority_alone_says_how_stiff_a_contact_is(one_kernel: bool):
     mj_model = load_model(LAWS)
     sim = SimCfg(njmax=200, nconmax=60, one_kernel_dynamics=one_kernel)

@@ -18,7 +18,6 @@ from ksim_rl.checked import Checked, Count, NonNegative, NonNegativeRange, Posit
 Pictures = Shaped[Tensor, "E N H W C"]
 Changed = Shaped[Tensor, "E N H2 W2 C"]
 Draws = Float[Tensor, "E K"]
-Ends = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +43,7 @@ class PictureEffect(Checked, ABC):
         """Return the shape [N, H, W, C] of the results."""
         return tuple(shape)
 
-    def new_ends(self, ends: Ends, top: float) -> Ends:
+    def new_ends(self, ends: Range, top: float) -> Range:
         """Return the smallest and the largest value of the results; `top` is full light."""
         return ends
 
@@ -106,7 +105,7 @@ class Light(PictureEffect):
 
     kind = "light"
 
-    def new_ends(self, ends: Ends, top: float) -> Ends:
+    def new_ends(self, ends: Range, top: float) -> Range:
         return 0.0, top
 
 
@@ -217,7 +216,7 @@ class DepthHoles(PictureEffect):
     def num_draws(self, shape: Sequence[int]) -> int:
         return math.prod(self._blocks(shape))
 
-    def new_ends(self, ends: Ends, top: float) -> Ends:
+    def new_ends(self, ends: Range, top: float) -> Range:
         return _with(ends, self.missing)
 
     def __call__(self, pictures_ENHWC: Pictures, draws_EK: Draws) -> Changed:
@@ -241,7 +240,7 @@ class DepthSteps(PictureEffect):
     def num_draws(self, shape: Sequence[int]) -> int:
         return 0
 
-    def new_ends(self, ends: Ends, top: float) -> Ends:
+    def new_ends(self, ends: Range, top: float) -> Range:
         # Rounded as the values are, in float32.
         rounded = (torch.tensor(ends) / self.step).round() * self.step
         return float(rounded[0]), float(rounded[1])
@@ -262,7 +261,7 @@ class DepthRange(PictureEffect):
     def num_draws(self, shape: Sequence[int]) -> int:
         return 0
 
-    def new_ends(self, ends: Ends, top: float) -> Ends:
+    def new_ends(self, ends: Range, top: float) -> Range:
         low, high = self.reach
         return _with((max(ends[0], low), min(ends[1], high)), self.missing)
 
@@ -279,11 +278,11 @@ def top_of(pictures: Shaped[Tensor, "*pictures"]) -> float:
     return 1.0
 
 
-def _with(ends: Ends, value: float) -> Ends:
+def _with(ends: Range, value: float) -> Range:
     return min(ends[0], value), max(ends[1], value)
 
 
-def _between(draws_EK: Tensor, ends: Ends) -> Tensor:
+def _between(draws_EK: Tensor, ends: Range) -> Tensor:
     """Return one number per env between two, [E, 1, 1, 1, 1]."""
     low, high = ends
     return (low + draws_EK[:, 0] * (high - low))[:, None, None, None, None]

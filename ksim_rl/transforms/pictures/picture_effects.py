@@ -8,11 +8,11 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from ksim_rl.checked import check_value
+from ksim_rl.checked import Range, check_value
 from ksim_rl.checks import naming
 from ksim_rl.device import random
 from ksim_rl.transforms.checked_keys import Keys
-from ksim_rl.transforms.pictures.effects import Ends, PictureEffect, top_of
+from ksim_rl.transforms.pictures.effects import PictureEffect, top_of
 from ksim_rl.transforms.pictures.layout import Layout, check_layout, framed, unframed
 from ksim_rl.transforms.row_transform import KeyedTransform, Switched
 from ksim_rl.transforms.specs import bounded, bounds
@@ -71,8 +71,8 @@ class PictureEffects(Switched, KeyedTransform):
         return bounded(low, high, dtype=spec.dtype, device=spec.device)
 
     def _followed(
-        self, key: NestedKey, picture: Shaped[Tensor, "*leaf"], ends: Ends
-    ) -> tuple[torch.Size, Ends]:
+        self, key: NestedKey, picture: Shaped[Tensor, "*leaf"], ends: Range
+    ) -> tuple[torch.Size, Range]:
         """Return the shape and the ends of a picture after all effects; refuse one that they are not for."""
         if picture.dtype != torch.uint8:
             self._check_floating(key, picture.dtype)
@@ -186,7 +186,7 @@ def _check_result(
         )
 
 
-def _check_kind(effect: PictureEffect, dtype: torch.dtype, ends: Ends) -> None:
+def _check_kind(effect: PictureEffect, dtype: torch.dtype, ends: Range) -> None:
     """Refuse an effect on pictures that it is not for."""
     if effect.kind == "depth" and dtype == torch.uint8:
         raise ValueError(

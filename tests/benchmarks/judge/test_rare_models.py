@@ -26,6 +26,8 @@ def check(verdict: Verdict) -> None:
     assert not verdict.findings, "\n".join(told_of(verdict.findings))
 
 
+# The models compile for the better part of a minute.
+@pytest.mark.full
 @pytest.mark.parametrize("name", QUICK)
 def test_a_rare_model_is_as_in_c(verdicts: dict[str, Verdict], name: str):
     check(verdicts[name])
