@@ -576,6 +576,8 @@ def test_wrong_options_are_refused(make, said):
         (["--simulate"], "--simulate and --hang are of the simulated robot"),
         (["--seconds", "nan"], "--seconds nan: expected 0 or more"),
         (["--command", "0", "nan"], "--command 0.0 nan: expected finite numbers"),
+        (["--plan", "p.csv", "--command", "0"], "--command: a plan follows none"),
+        (["--plan", "p.csv", "--seconds", "3"], "--seconds: a plan says itself"),
     ],
 )
 def test_a_robot_is_not_driven_with_options_that_do_not_fit(control, arguments, said):

@@ -106,7 +106,9 @@ def calm_python() -> None:
 
 
 def ask_for_real_time() -> str:
-    """Ask the system to run this process before others; return a line that says whether it does."""
+    """Ask the system to run this thread before others; return a line that says whether it does."""
+    if sys.platform != "linux":
+        return "no real-time priority: only Linux is asked for it"
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError as error:

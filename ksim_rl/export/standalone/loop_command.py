@@ -110,6 +110,10 @@ def drive(
         )
     if options.seconds is not None and not options.seconds >= 0.0:
         raise ValueError(f"--seconds {options.seconds:g}: expected 0 or more")
+    if options.plan is not None and options.command is not None:
+        raise ValueError("--command: a plan follows none: leave out one of the two")
+    if options.plan is not None and options.seconds:
+        raise ValueError("--seconds: a plan says itself how long it is: leave out one of the two")
     step_dt = float(control.meta["step_dt"])
     plan = None
     if options.plan is not None:
