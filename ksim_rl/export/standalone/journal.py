@@ -50,9 +50,9 @@ class Journal:
     """A table of all periods as CSV, and a line with `#` in front for each event.
 
     Columns are `time` (s since the first period), `state`, `message_age` (s), gravity's direction and the turning of
-    the root in its own axes (NaN without a root), and those of each joint. Nothing here waits for the disk or the
-    terminal: what they cannot take is dropped, and counted in `lost`. Events are shown, too. With `only` it has the
-    periods of one state alone.
+    the root in its own axes (NaN without a root), and for each joint the `COLUMNS`. Nothing here waits for the disk
+    or the terminal: what they cannot take is dropped, and counted in `lost`. Events are shown, too. With `only` it has
+    the periods of one state alone.
     """
 
     def __init__(

@@ -16,7 +16,7 @@ from ksim_rl.export.standalone.words import Operator, sort_words
 WAIT_S = 5.0
 """For the first message of a robot."""
 PRIORITY = 20
-"""Of the loop's thread among those of real time, 1 to 99."""
+"""Of the loop's thread among threads of real time, 1 to 99."""
 
 
 class Clock(Protocol):

@@ -32,7 +32,7 @@ from ksim_rl.export.standalone.loop import (
 from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.policy_control import PolicyControl
 from ksim_rl.export.standalone.robot_link import Robot
-from ksim_rl.export.standalone.safety import Limits, unguarded
+from ksim_rl.export.standalone.safety import Limits, option_of, unguarded
 from ksim_rl.export.standalone.states import State, StateMachine, Times
 from ksim_rl.export.standalone.words import EndOfPlan, Interrupts, Keyboard, Operator, Unattended
 
@@ -86,9 +86,8 @@ def loop_parser() -> argparse.ArgumentParser:
     parser.add_argument("--report", type=Path, help="a JSON file for how punctual the loop was")
     for owner in (Limits, Times):
         for field in dataclasses.fields(owner):
-            name = "--" + field.name.replace("_", "-")
             text = f"{HELP[field.name]} (default: {field.default:g})"
-            parser.add_argument(name, type=float, default=field.default, help=text)
+            parser.add_argument(option_of(field.name), type=float, default=field.default, help=text)
     return parser
 
 
@@ -104,16 +103,7 @@ def drive(
     Without a robot it is the simulated one. `operators` are heard beside the keyboard. A ValueError says what is wrong
     before anything moves.
     """
-    if robot is not None and (options.simulate or options.hang):
-        raise ValueError(
-            "--simulate and --hang are of the simulated robot: this program drives another one"
-        )
-    if options.seconds is not None and not options.seconds >= 0.0:
-        raise ValueError(f"--seconds {options.seconds:g}: expected 0 or more")
-    if options.plan is not None and options.command is not None:
-        raise ValueError("--command: a plan follows none: leave out one of the two")
-    if options.plan is not None and options.seconds:
-        raise ValueError("--seconds: a plan says itself how long it is: leave out one of the two")
+    _check_options(options, has_robot=robot is not None)
     step_dt = float(control.meta["step_dt"])
     plan = None
     if options.plan is not None:
@@ -141,19 +131,7 @@ def drive(
     only = None if plan is None else State.POLICY
     journal = Journal(path, driver.joints, _say, only=only)
     machine = StateMachine(driver, period=step_dt, limits=limits, times=times, note=journal.event)
-    interrupts = Interrupts()
-    interrupts.listen()
-    heard: list[Operator] = [interrupts, *operators]
-    if plan is not None:
-        heard.append(EndOfPlan(plan))
-    seconds = options.seconds
-    if seconds is None:
-        seconds = UNATTENDED_S if options.simulate else 0.0
-    if seconds and plan is not None:
-        seconds = math.inf
-    heard.append(Keyboard(sys.stdin, leads=not seconds))
-    if seconds:
-        heard.append(Unattended(seconds))
+    heard = _operators(options, plan, operators)
     calm_python()
     priority = ask_for_real_time() if options.real_time else "no real-time priority: not asked for"
     for line in [priority, *unguarded(driver.joints, first)]:
@@ -177,6 +155,40 @@ def drive(
     if options.report:
         options.report.write_text(json.dumps(summary, indent=1) + "\n")
     return 1 if machine.fault else 0
+
+
+def _check_options(options: argparse.Namespace, *, has_robot: bool) -> None:
+    """Refuse options that do not go together, before a robot is even read."""
+    if has_robot and (options.simulate or options.hang):
+        raise ValueError(
+            "--simulate and --hang are of the simulated robot: this program drives another one"
+        )
+    if options.seconds is not None and not options.seconds >= 0.0:
+        raise ValueError(f"--seconds {options.seconds:g}: expected 0 or more")
+    if options.plan is not None and options.command is not None:
+        raise ValueError("--command: a plan follows none: leave out one of the two")
+    if options.plan is not None and options.seconds:
+        raise ValueError("--seconds: a plan says itself how long it is: leave out one of the two")
+
+
+def _operators(
+    options: argparse.Namespace, plan: PlanControl | None, others: Sequence[Operator]
+) -> list[Operator]:
+    """Return all who say what comes next; from here on signals of the system are words, too."""
+    interrupts = Interrupts()
+    interrupts.listen()
+    heard: list[Operator] = [interrupts, *others]
+    seconds = options.seconds
+    if seconds is None:
+        seconds = UNATTENDED_S if options.simulate else 0.0
+    if plan is not None:
+        heard.append(EndOfPlan(plan))
+        # The plan says itself when it is over; 0 stays, as an operator leads then.
+        seconds = math.inf if seconds else 0.0
+    heard.append(Keyboard(sys.stdin, leads=not seconds))
+    if seconds:
+        heard.append(Unattended(seconds))
+    return heard
 
 
 def _simulated(options: argparse.Namespace, control: PolicyControl, period: float) -> Robot:

@@ -25,21 +25,21 @@ class PlanControl:
         if len(time) < 2 or not steps.min() > 0.0 or np.ptp(steps) > UNEVEN_S:
             raise ValueError(f"{path}: column 'time': expected at least two lines at an even rate")
         self.period = float(np.median(steps))
+        still = np.zeros(len(self.joints.names))
+        # What has no target of its position holds the pose of standing.
+        absent = {"pos": self.joints.default_pos, "vel": still, "effort": still}
         self.targets = {}
-        for kind, ending in TARGETS.items():
-            self.targets[kind] = self._of_joints(path, columns, ending, len(time))
-        if np.isnan(self.targets["pos"]).any():
-            # What has no target of its position holds the pose of standing.
-            missing = np.isnan(self.targets["pos"])
-            self.targets["pos"] = np.where(missing, self.joints.default_pos, self.targets["pos"])
+        for kind, otherwise in absent.items():
+            self.targets[kind] = self._of_joints(path, columns, TARGETS[kind], otherwise)
         self.joints.default_pos = self.targets["pos"][0]
         self.num_lines = len(time)
         self.begin()
 
-    def _of_joints(self, path: Path, columns: dict[str, Array], ending: str, lines: int) -> Array:
-        """Return the targets of a kind [T, N]: NaN or 0 of joints that have none, of all or of none that are driven."""
-        absent = np.nan if ending == TARGETS["pos"] else 0.0
-        found = np.full((lines, len(self.joints.names)), absent)
+    def _of_joints(
+        self, path: Path, columns: dict[str, Array], ending: str, otherwise: Array
+    ) -> Array:
+        """Return the targets of a kind [T, N], `otherwise` of joints without; all driven joints have them, or none."""
+        found = np.tile(otherwise, (len(columns["time"]), 1))
         given = [name for name in self.joints.names if f"{name}.{ending}" in columns]
         for name in given:
             found[:, self.joints.names.index(name)] = columns[f"{name}.{ending}"]

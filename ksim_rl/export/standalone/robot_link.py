@@ -110,7 +110,7 @@ def to_root_axes(quat: Array, vector: Array) -> Array:
 
 
 def to_world_axes(quat: Array, vector: Array) -> Array:
-    """Return a vector of a root's axes in those of the world."""
+    """Return a vector of a root's axes in the axes of the world."""
     axis = quat[1:]
     twice = 2.0 * np.cross(axis, vector)
     return vector + quat[0] * twice + np.cross(axis, twice)

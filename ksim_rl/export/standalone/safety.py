@@ -47,8 +47,13 @@ class Limits:
             lowest = LEAST_LIMITS.get(field.name, 0.0)
             highest = 1.0 if field.name == "effort_share" else math.inf
             if not lowest <= value <= highest:
-                option = field.name.replace("_", "-")
-                raise ValueError(f"--{option} {value:g}: expected {lowest:g} to {highest:g}")
+                option = option_of(field.name)
+                raise ValueError(f"{option} {value:g}: expected {lowest:g} to {highest:g}")
+
+
+def option_of(name: str) -> str:
+    """Return the option of the loop that sets a field."""
+    return "--" + name.replace("_", "-")
 
 
 class Watch:

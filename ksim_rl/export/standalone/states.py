@@ -11,7 +11,7 @@ import numpy as np
 
 from ksim_rl.export.standalone.files import Array
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
-from ksim_rl.export.standalone.safety import EffortLimit, Fault, Limits, Watch
+from ksim_rl.export.standalone.safety import EffortLimit, Fault, Limits, Watch, option_of
 
 
 class State(Enum):
@@ -34,6 +34,8 @@ TRANSITIONS = {
     (State.STAND, "stop"): State.STOP,
     (State.POLICY, "stop"): State.STOP,
 }
+# A pose that is asked for at once is a jump, motors that do not brake let a robot fall, and one message may be lost.
+LEAST_TIMES = {"stand_seconds": 0.1, "damp_seconds": 0.1, "damping_factor": 0.1}
 # Arrays, or numbers, between which a hand-over leads.
 Between = TypeVar("Between", Array, float)
 
@@ -61,12 +63,8 @@ class Times:
             value = getattr(self, field.name)
             least = LEAST_TIMES.get(field.name, 0.0)
             if not least <= value < math.inf:
-                option = field.name.replace("_", "-")
-                raise ValueError(f"--{option} {value:g}: expected {least:g} or more")
-
-
-# A pose that is asked for at once is a jump, motors that do not brake let a robot fall, and one message may be lost.
-LEAST_TIMES = {"stand_seconds": 0.1, "damp_seconds": 0.1, "damping_factor": 0.1}
+                option = option_of(field.name)
+                raise ValueError(f"{option} {value:g}: expected {least:g} or more")
 
 
 class Control(Protocol):

@@ -45,9 +45,8 @@ class Keyboard:
         try:
             for line in self.lines:
                 self.said.put(line.strip() or "stop")
-        except (
-            ValueError
-        ):  # bytes that are no text: somebody said something, and is not heard any more
+        except ValueError:
+            # Bytes that are no text: somebody said something, and is not heard any more.
             self.said.put("stop")
         except OSError:  # the terminal is gone, or another program has it
             pass
