@@ -8,7 +8,7 @@ The secret robot is a Go2 on MuJoCo's C engine, 16 times finer in time than the 
 armature, damping, dry friction, gains and torque constant of each joint and the delay of the commands. Its encoders are
 noisy and count in steps. It follows the commands that `ksim-rl identify --propose` wrote, and its log is what
 `ksim-rl identify` reads; both run as commands. Figures go to benchmarks/results/identification.json: the largest error
-of a joint's number, as a share, and that of the delay, over all seeds that were asked for.
+of a joint's number, as a share, and the largest error of the delay, over all seeds that were asked for.
 """
 
 from __future__ import annotations

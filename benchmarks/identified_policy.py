@@ -3,7 +3,7 @@
     python -m benchmarks.identified_policy
     python -m benchmarks.identified_policy --seed 3 --trainings 5
 
-The hidden arm is that of `arm_reach`, worn: a seed draws its armature, damping, dry friction and the gains of its
+The hidden arm is the arm of `arm_reach`, worn: a seed draws its armature, damping, dry friction and the gains of its
 servos. It follows the commands of `ksim-rl identify --propose arm` on MuJoCo's C engine, and its encoders are noisy and
 count in steps. The task is trained as it is, and with the overrides that `ksim-rl identify` wrote, both for a minute on
 a CPU and with the same seeds; all policies are then judged on the hidden arm in the C engine. Delays are not hidden

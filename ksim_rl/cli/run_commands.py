@@ -212,9 +212,8 @@ def list_envs(arguments: list[str]) -> int:
         # Configs are built for the list; a task that cannot be built must not hide the others.
         try:
             cfg = task.cfg()
-        except (
-            Exception
-        ) as error:  # of a plug-in, or of its robot's file: the other tasks are listed
+        # Of a plug-in, or of its robot's file: the other tasks are listed.
+        except Exception as error:
             broken.append(name)
             say(
                 f"task {name!r} is left out of the list: {' '.join(str(error).split()) or type(error).__name__}"

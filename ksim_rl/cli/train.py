@@ -108,9 +108,8 @@ def train(arguments: list[str]) -> int:
     sys.argv = ["ksim-rl train", *options, *away, *overrides]
     try:
         job()
-    except (
-        HydraException
-    ) as error:  # all that is left for Hydra to find, such as another --config-name
+    # All that is left for Hydra to find, such as another --config-name.
+    except HydraException as error:
         raise ValueError(_with_first_cause(error)) from error
     return max(codes, default=0)
 

@@ -16,7 +16,7 @@ struct Arguments {
     long long start;  // the least whole number; of orders, bits of a number
     long long span;   // how many whole numbers there are; of orders, the rounds of the cipher
     unsigned stream;
-    int counter_stride;  // from the count of a row to that of the next; of orders, the rows of a count
+    int counter_stride;  // from the count of a row to the next count; of orders, the rows of a count
     int first_row;       // of this rank
     const long long* seed;
     const long long* counter;

@@ -1,7 +1,7 @@
 // How the lanes of a world share its work.
 //
 // The lanes of a world are some of the threads of a warp. Worlds of a warp have other numbers of contacts, so that lanes
-// wait for those of their own world only. Whatever the number of lanes, each place in memory is written by the same
+// wait for lanes of their own world only. Whatever the number of lanes, each place in memory is written by the same
 // formula, and sums are added in one order: the results have the same bits. The CPU has one lane.
 #pragma once
 #include "builtin.h"

@@ -36,9 +36,8 @@ def try_device(device: torch.device) -> list[tuple[str, str | None]]:
     for name, trial in trials.items():
         try:
             wrong = trial()
-        except (
-            Exception
-        ) as error:  # whatever a broken installation raises is what the report is for
+        # Whatever a broken installation raises is what the report is for.
+        except Exception as error:
             wrong = f"{type(error).__name__}: {' '.join(str(error).split())}"
         done.append((name, wrong))
     return done

@@ -37,9 +37,8 @@ def read_arrays(
             }
     except ValueError:
         raise
-    except (
-        Exception
-    ) as error:  # zipfile, its compressions and numpy's parser of headers raise a dozen kinds
+    # Zipfile, its compressions and numpy's parser of headers raise a dozen kinds.
+    except Exception as error:
         what = f"{type(error).__name__} {error}"
         raise ValueError(f"no archive of arrays: {' '.join(what.split())}") from error
 

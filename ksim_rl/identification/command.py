@@ -215,7 +215,7 @@ def _parser() -> OneLineParser:
         help="write networks of the motors in place of numbers; the log has measured efforts",
     )
     parser.add_argument(
-        "--timestep", type=float, help="in which networks will run, s; default: that of --task"
+        "--timestep", type=float, help="in which networks will run, s; default: the step of --task"
     )
     parser.add_argument(
         "--propose", metavar="ROBOT", help="write what to command, in place of reading a log"

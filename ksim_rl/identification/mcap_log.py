@@ -176,7 +176,7 @@ def _topics(path: Path, data: bytes, most_cells: int) -> list[Topic]:
 
 
 def _records(path: Path, data: bytes) -> Iterator["McapRecord"]:
-    """Yield the file's records, those of its chunks too."""
+    """Yield the file's records, the records of its chunks too."""
     from mcap import records
     from mcap.stream_reader import StreamReader, breakup_chunk
 

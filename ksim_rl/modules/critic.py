@@ -151,8 +151,9 @@ def make_q_network(
     It writes "state_action_value" [..., N], or with atoms "state_action_logits" [..., N, A]. `obs_dim` and
     `encoded_dim` are explained at `make_critic`.
     """
-    sizes = {"obs_dim": obs_dim, "encoded_dim": encoded_dim, "action_dim": action_dim}
-    network = QNetwork(cfg, **sizes, device=device)
+    network = QNetwork(
+        cfg, obs_dim=obs_dim, encoded_dim=encoded_dim, action_dim=action_dim, device=device
+    )
     # The key tells values from logits of the atoms.
     if cfg.num_atoms == 1:
         out_key = "state_action_value"

@@ -138,7 +138,7 @@ class _ToChannels(nn.Module):
 class Encoder(nn.Module):
     """Maps pictures [*batch, *shape] to features [*batch, F], by what a config builds for one batch dim.
 
-    `spec` is that of one picture. A ValueError tells where the config's module does not fit, or other pictures come.
+    `spec` is the spec of one picture. A ValueError tells where the config's module does not fit, or pictures differ.
     """
 
     def __init__(self, cfg: EncoderCfg, spec: TensorSpec, *, device: Device = None) -> None:

@@ -37,7 +37,7 @@ def make_for_spec(
     """Build a network, by `make_actor` or another maker, for the observations of an env that its config reads.
 
     Pictures [..., H, W, C] go through the encoders of `cfg.encoders` first; their features, at ("encoded", name), stand
-    behind the vectors. Each call makes encoders of its own; actor and critic share those of a trunk. `options` are the
+    behind the vectors. Each call makes encoders of its own; actor and critic share a trunk's. `options` are the
     maker's. Raises ValueError where an observation is missing, is no vector and has no encoder, or does not fit it.
 
     Example:

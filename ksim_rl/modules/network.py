@@ -87,7 +87,7 @@ class ObservationNormalizer(RunningMoments):
     deviation below by 0.01: a constant component stays small when it starts to move.
 
     The last `encoded_dim` numbers of what it reads are features of encoders, beyond the `dim` that it normalizes, and
-    stay as they are: the statistics of what is learned would be those of networks that are long gone.
+    stay as they are: statistics of what is learned would describe networks that are long gone.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-// The moments of a batch, stage by stage, and their union with those of all before.
+// The moments of a batch, stage by stage, and their union with the moments of all batches before.
 #pragma once
 #include "builtin.h"
 
@@ -110,7 +110,7 @@ CUDA_CALLABLE inline Moments moments_of_part(int part, int column, const Argumen
     return own;
 }
 
-// Stage 3: the union of a batch with all before, as of those of ranks in `ranks.merged`.
+// Stage 3: the union of a batch with all batches before, as `ranks.merged` unites ranks.
 CUDA_CALLABLE inline double unite(int column, long long before, const Moments& batch, const Arguments& a)
 {
     const double total = before + batch.weight, share = batch.weight / (total > 1.0 ? total : 1.0);

@@ -97,9 +97,8 @@ def check_env(env: EnvBase, *, num_steps: int = 4, skip: Collection[str] = ()) -
             check(env, num_steps)
         except AssertionError as finding:
             findings.append(f"[{name}] {finding}")
-        except (
-            Exception
-        ) as error:  # whatever an env raises belongs to the findings, with the term that it names
+        # Whatever an env raises belongs to the findings, with the term that it names.
+        except Exception as error:
             first = (str(error).splitlines() or [""])[0]
             notes = " ".join(getattr(error, "__notes__", []))
             findings.append(f"[{name}] {type(error).__name__}: {first} {notes}".rstrip())

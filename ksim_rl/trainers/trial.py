@@ -77,10 +77,8 @@ def main() -> int:
         trainer = build(cfg)
         for _ in range(ITERATIONS):
             trainer.iterate()
-    except (
-        RuntimeError,
-        ValueError,
-    ) as error:  # where memory lacks, libraries have many words for it
+    # Where memory lacks, libraries have many words for it.
+    except (RuntimeError, ValueError) as error:
         print(" ".join(str(error).split()), flush=True)
         return DOES_NOT
     left = free_bytes(device)

@@ -13,7 +13,7 @@ struct Arguments {
     int width;  // bytes of a word; any other number copies whole parts
     int lanes;  // of a row
     int num_bytes;     // of a value
-    int value_stride;  // bytes from the value of a row to that of the next
+    int value_stride;  // bytes from the value of a row to the next value
     int num_slots;
     int num_frames;  // values that are returned
     int stride;      // steps from a frame to the one before it

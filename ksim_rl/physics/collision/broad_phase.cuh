@@ -1,4 +1,4 @@
-// Part 1, the broad phase: which pairs of geoms may touch. The tests are those of engine_collision_driver.c: of a plane
+// The broad phase: which pairs of geoms may touch. The tests are as in engine_collision_driver.c: of a plane
 // and a bounding sphere, of two spheres, then of two boxes along the axes of both (Gottschalk et al., OBBTree, 1996).
 //
 // The lanes of a world share its pairs, and take places in the pool for all that pass together.

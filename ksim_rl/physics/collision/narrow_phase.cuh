@@ -1,4 +1,4 @@
-// Part 3: the contacts of pairs that are near each other, which are kept in shared memory and then written to the pool.
+// The narrow phase: the contacts of pairs that are near each other, which are kept in shared memory and then written to the pool.
 // What a contact has of its two geoms is in "Contact parameters" of
 // https://mujoco.readthedocs.io/en/stable/modeling.html#contact-parameters.
 #pragma once

@@ -1,4 +1,4 @@
-// Part 2: where two shapes touch, or how far they are apart. The sources are engine_collision_primitive.c and, of boxes,
+// Where two shapes touch, or how far they are apart. The sources are engine_collision_primitive.c and, of boxes,
 // engine_collision_box.c. A pair has several of them, of which a lane finds one at a time. Normals point from the first geom to the second.
 #pragma once
 #include "ksim_rl/physics/collision/broad_phase.cuh"

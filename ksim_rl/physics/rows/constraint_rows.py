@@ -32,8 +32,9 @@ _KINDS = (
     "CONTACT_PYRAMIDAL",
     "CONTACT_ELLIPTIC",
 )
+_CONSTRAINTS = native.names_of(mujoco.mjtConstraint)
 _ENUMS = {
-    **{name: native.names_of(mujoco.mjtConstraint)[name] for name in _KINDS},
+    **{name: _CONSTRAINTS[name] for name in _KINDS},
     "BALL": mujoco.mjtJoint.mjJNT_BALL,
     "OUT_OF_NONZEROS": mjw.OverflowType.NJMAX_NNZ,
 }

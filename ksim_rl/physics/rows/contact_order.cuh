@@ -1,5 +1,5 @@
-// The contacts of a world, in the order of MuJoCo's C engine: by the pair of bodies, then those of explicit pairs, in their
-// order, before the others by their geoms, of which each contact has that of the lower type first
+// The contacts of a world, in the order of MuJoCo's C engine: by the pair of bodies, then contacts of explicit pairs,
+// in their order, before the others by their geoms, of which each contact has the one of the lower type first
 // (engine_collision_driver.c).
 //
 // One thread writes the contacts of a pair one after another, so that their places in the pool are in its order. Only

@@ -1,7 +1,7 @@
 // The rows of contacts.
 //
-// A contact of dimension 1 has the row of its normal. Others have with an elliptic cone those of its normal and its
-// tangents, and with a pyramidal one two for each tangent: normal + and - friction * tangent ("Contact"). Tangents are
+// A contact of dimension 1 has the row of its normal. Others have with an elliptic cone rows of its normal and its
+// tangents, and with a pyramidal one two rows for each tangent: normal + and - friction * tangent ("Contact"). Tangents are
 // two of the plane, then rotations about the normal and about these two.
 #pragma once
 #include "ksim_rl/physics/rows/row.cuh"

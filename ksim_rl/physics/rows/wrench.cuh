@@ -49,7 +49,7 @@ CUDA_CALLABLE inline vec3 axis_of(const Arguments& a, int contact, int axis)
     return vec3(axes[0], axes[1], axes[2]);
 }
 
-// A vector in the axes of a contact, in those of the world.
+// A vector in the axes of a contact, in the axes of the world.
 template <class Arguments>
 CUDA_CALLABLE inline vec3 in_world(const Arguments& a, int contact, const vec3& v)
 {

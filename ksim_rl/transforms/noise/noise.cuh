@@ -32,7 +32,7 @@ constexpr int DROPOUT = 6;
 
 using namespace given;
 
-// Where the draws of biases, of drifts and of lost readings begin among those of a row, as in kernel.py.
+// Where the draws of biases, of drifts and of lost readings begin among the draws of a row, as in kernel.py.
 constexpr unsigned BIAS_INDEX = 0x40000000u, WALK_INDEX = 0x80000000u, DROPOUT_INDEX = 0xC0000000u;
 
 #if defined(__CUDA_ARCH__)

@@ -1,4 +1,4 @@
-"""Pictures change at random, as those of real cameras do, by the transform of this module."""
+"""Changes pictures at random, as real cameras do."""
 
 from collections.abc import Mapping
 
