@@ -1,5 +1,5 @@
-// The narrow phase: the contacts of pairs that are near each other, which are kept in shared memory and then written to the pool.
-// What a contact has of its two geoms is in "Contact parameters" of
+// The narrow phase: the contacts of pairs that are near each other, which are kept in shared memory and then written to
+// the pool. What a contact has of its two geoms is in "Contact parameters" of
 // https://mujoco.readthedocs.io/en/stable/modeling.html#contact-parameters.
 #pragma once
 #include "ksim_rl/physics/collision/shapes.cuh"
