@@ -2,6 +2,10 @@
 
 from ksim_rl.data.dataset_buffer import DatasetBuffer, DatasetCfg, rollout_length
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
+from ksim_rl.data.episode_folder import Leaf, Origin, mend
+from ksim_rl.data.episode_reader import Episodes, load, read_episodes
+from ksim_rl.data.episode_recorder import EpisodeRecorder, leaves_of
+from ksim_rl.data.episode_writer import EpisodeWriter
 from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SequenceSampler, sequence_length
 from ksim_rl.data.replay_ring import PrioritySampler, ReplayCfg, ReplayRing, ReplaySampler
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, BinaryIO
 
 # A name begins with this until its file is whole; who writes there next deletes leftovers of a crash.
 WRITING = ".writing-"
@@ -83,7 +83,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     # Another writer has another.
     temporary = path.with_name(f"{WRITING}{secrets.token_hex(4)}-{path.name}")
     try:
-        with _named(path):
+        with named(path):
             yield temporary
             # Readers see the old file or the new one, never a part.
             os.replace(temporary, path)
@@ -138,10 +138,21 @@ def unfinished_folder(folder: Path) -> Iterator[Path]:
     temporary = folder / f"{WRITING}{secrets.token_hex(4)}"
     temporary.mkdir()
     try:
-        with _held(temporary), _named(folder):
+        with _held(temporary), named(folder):
             yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def open_new(path: Path) -> BinaryIO:
+    """Open a new file to write bytes piece by piece; a ValueError where anything lies in its place."""
+    check_name(path)
+    try:
+        # Exclusively, so that no link is followed.
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+    except FileExistsError:
+        raise ValueError(f"{path}: it is there already: name another folder") from None
+    return os.fdopen(number, "wb")
 
 
 def open_own(path: Path) -> IO[str]:
@@ -178,7 +189,7 @@ def _check_status(path: Path, about: os.stat_result) -> None:
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
+def named(path: Path) -> Iterator[None]:
     """Name the path in errors that name none: a full disk answers a write without any name."""
     try:
         yield

@@ -35,12 +35,13 @@ def test_a_file_beyond_the_limit_and_what_is_no_file_are_refused_by_name(tmp_pat
 
 
 PACKAGE = Path(reading.__file__).parents[1]
-LOADS = {"np.load", "torch.load", "json.load", "onnx.load", "safe_open", "open"}
+LOADS = {"np.load", "torch.load", "json.load", "onnx.load", "safe_open", "open", "np.memmap"}
 METHODS = {"read_text", "from_file", "from_xml_path"}
 # What they read is the system's, an installed package's, their own child's, in a folder of their own, or was checked
 # before; `files.py` stands alone beside an export, and has a function of its own.
 OTHERS = {
     "compiled/packages.py": {"distribution.read_text"},
+    "data/episode_reader.py": {"np.memmap"},
     "diagnosis/doctor.py": {"NVIDIA.read_text"},
     "export/folder.py": {"(STANDALONE / f'{name}.py').read_text"},
     "export/onnx_file.py": {"onnx.load"},
@@ -83,5 +84,11 @@ def test_one_module_opens_files():
 
 
 def test_the_search_finds_others():
-    text = "path.read_text()\nnp.load(path)\nopen(path)\npath.read_bytes()"
-    assert readers(ast.parse(text)) == {"path.read_text", "np.load", "open", "path.read_bytes"}
+    text = "path.read_text()\nnp.load(path)\nopen(path)\npath.read_bytes()\nnp.memmap(path)"
+    assert readers(ast.parse(text)) == {
+        "path.read_text",
+        "np.load",
+        "open",
+        "path.read_bytes",
+        "np.memmap",
+    }

@@ -1,0 +1,100 @@
+"""Reads a folder of episodes, which may be a stranger's, as a TensorDict or as a TorchRL replay buffer."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Shaped
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorStorage
+from torchrl.data.replay_buffers import Sampler
+
+from ksim_rl import dims
+from ksim_rl.data.episode_folder import EPISODE_KEY, Contents, Leaf, read_contents
+from ksim_rl.files.reading import open_regular
+
+# Of one leaf: it is mapped, and no memory is taken for it.
+MOST_LEAF_BYTES = 2**42
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episodes:
+    """Whole episodes, one after the other, `["D"]`: on the CPU pages of their files, read when they are used."""
+
+    contents: Contents
+    env_states_D: TensorDict
+
+
+def read_episodes(folder: Path | str) -> Episodes:
+    """Return the whole episodes of a folder; writing into their numbers changes memory, and no file.
+
+    A ValueError names what is damaged: `episodes.json`, or a file of a leaf that is shorter than it says. Nothing in
+    the folder is run, and nothing is written.
+    """
+    folder = Path(folder)
+    contents = read_contents(folder)
+    if not contents.num_env_states:
+        raise ValueError(f"{folder}: no whole episode in it")
+    size = contents.num_env_states
+    leaves = {leaf.key: _mapped(leaf, folder, size) for leaf in contents.leaves}
+    episode_D = leaves[EPISODE_KEY]
+    last = contents.num_episodes - 1
+    if episode_D.shape != (size,) or episode_D[0] != 0 or episode_D[-1] != last:
+        raise ValueError(f"{folder}: damaged: its env states are not of episodes 0 to {last}")
+    env_states_D = TensorDict(batch_size=[size])
+    for key, leaf_D in leaves.items():
+        env_states_D.set(key, leaf_D)
+    return Episodes(contents=contents, env_states_D=dims.name(env_states_D, dims.D))
+
+
+def load(
+    folder: Path | str,
+    *,
+    sampler: Sampler | None = None,
+    batch_size: int | None = None,
+    device: torch.device | str = "cpu",
+) -> ReplayBuffer:
+    """Return the episodes of a folder as a TorchRL replay buffer of one dim, whose entries are env states.
+
+    Any sampler for storages of one dim draws from it: `EpochSampler`, `PrioritySampler`, and TorchRL's, of which
+    `SliceSampler(traj_key="episode", ...)` draws sequences. Without one, draws are uniform, with replacement. On the
+    CPU numbers stay in their files until they are drawn; another `device` takes all of them. Nothing can be added. See
+    `read_episodes` for errors.
+    """
+    env_states_D = read_episodes(folder).env_states_D
+    if torch.device(device).type != "cpu":
+        env_states_D = env_states_D.to(device)
+    if sampler is not None:
+        # Those with priorities draw only what they were told of.
+        sampler.extend(torch.arange(len(env_states_D)))
+    return ReplayBuffer(
+        storage=TensorStorage(env_states_D),
+        sampler=sampler,
+        writer=ImmutableDatasetWriter(),
+        batch_size=batch_size,
+    )
+
+
+def _mapped(leaf: Leaf, folder: Path, num_rows: int) -> Shaped[Tensor, "D *?leaf"]:
+    """Map the first rows of a leaf's file into memory, so that what is written there stays there."""
+    path = leaf.path(folder)
+    needed = num_rows * leaf.num_bytes
+    # The file that was checked is the one that is mapped.
+    with open_regular(path, limit=MOST_LEAF_BYTES) as file:
+        size = file.seek(0, 2)
+        # Beyond the end of its file a map has no memory: a process that reads there dies.
+        if size < needed:
+            raise ValueError(
+                f"{path}: damaged: {size} bytes, and {num_rows} env states need {needed}"
+            )
+        if needed == 0:
+            bytes_N = np.zeros(0, dtype=np.uint8)
+        else:
+            bytes_N = np.memmap(file, dtype=np.uint8, mode="c", shape=(needed,))
+    numbers = torch.from_numpy(bytes_N)
+    if leaf.torch_dtype == torch.bool:
+        # A stranger's byte may be neither 0 nor 1, and torch computes with bits of truths as they lie there.
+        return (numbers != 0).view(num_rows, *leaf.shape)
+    return numbers.view(leaf.torch_dtype).view(num_rows, *leaf.shape)
