@@ -103,7 +103,7 @@ class Lines:
     def __init__(self):
         self.events = []
 
-    def period(self, now, state, measurement, command):
+    def period(self, now, state, measurement, command, asked):
         self.state = state
 
     def event(self, now, text):

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ksim_rl.export.standalone.dry_run import DryRun
 from ksim_rl.export.standalone.loop import run_loop
 from ksim_rl.export.standalone.robot_link import Measurement
 from ksim_rl.export.standalone.safety import Limits
@@ -35,6 +36,8 @@ class Bench:
         self.commands = []
         self.harm = lambda measurement: measurement
         self.write_fails = False
+        # Of the gyroscope, which is never the same twice.
+        self.noise = np.random.default_rng(8)
 
     def read(self):
         return self.harm(
@@ -44,7 +47,7 @@ class Bench:
                 joint_vel=self.vel.copy(),
                 joint_effort=np.zeros(2),
                 root_quat=UPRIGHT,
-                root_ang_vel=np.zeros(3),
+                root_ang_vel=1e-3 * self.noise.normal(size=3),
                 estimates={"sensor": np.zeros(3)},
             )
         )
@@ -67,9 +70,11 @@ class Lines:
     def __init__(self):
         self.events = []
         self.states = []
+        self.asked = []
 
-    def period(self, now, state, measurement, command):
+    def period(self, now, state, measurement, command, asked):
         self.states.append(state)
+        self.asked.append(asked)
 
     def event(self, now, text):
         self.events.append(text)
@@ -87,11 +92,17 @@ class Script:
         return found
 
 
-def set_up(control, *, limits=None, times=TIMES):
+def set_up(control, *, limits=None, times=TIMES, dry_seconds=None):
+    """Return a clock, a robot, a machine and its log; the policy runs dry where `dry_seconds` says for how long."""
     clock = Clock()
     lines = Lines()
+    limits = limits or Limits()
+    dry = None
+    if dry_seconds is not None:
+        margin = limits.position_margin
+        dry = DryRun(control, period=PERIOD, seconds=dry_seconds, margin=margin, clock=clock.now)
     machine = StateMachine(
-        control, period=PERIOD, limits=limits or Limits(), times=times, note=lines.event
+        control, period=PERIOD, limits=limits, times=times, note=lines.event, dry=dry
     )
     robot = Bench(clock)
     robot.lines = lines

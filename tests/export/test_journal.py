@@ -57,7 +57,9 @@ def test_identify_reads_the_log(control, tmp_path):
     assert log.time_T == pytest.approx(PERIOD * np.arange(len(sent)), abs=1e-5)
     lines = (tmp_path / "a.csv").read_text().splitlines()
     first = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
-    assert float(first["projected_gravity.z"]) == -1.0 and float(first["root_ang_vel.x"]) == 0.0
+    assert (
+        float(first["projected_gravity.z"]) == -1.0 and 0.0 < float(first["root_ang_vel.x"]) < 0.01
+    )
     events = [line for line in lines if line.startswith("#")]
     assert [line.removeprefix("# ") for line in events] == shown and len(events) == 4
     with pytest.raises(FileExistsError):

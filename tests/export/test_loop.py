@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -110,6 +111,20 @@ def test_no_module_of_a_file_takes_the_names_of_another(parts):
 def test_a_policy_that_the_robot_cannot_observe_is_refused_by_name(control):
     measurement = dataclasses.replace(Bench(Clock()).read(), estimates={}, root_quat=None)
     assert control.lacking(measurement) == ["sensor", "root_quat"]
+
+
+def test_a_robot_that_is_fixed_to_the_world_has_its_attitude(folder, control, tmp_path):
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    robot = folder / "robot.xml"
+    text = robot.read_text().replace('<freejoint name="root"/>', "")
+    text = text.replace('pos="0 0 0.4"', 'pos="0 0 0.4" quat="0.8 0.6 0 0"').replace(
+        "0 0 0.4 1 0 0 0 ", ""
+    )
+    (tmp_path / "robot.xml").write_text(text)
+    measurement = SimulatedRobot(tmp_path, control.estimated).read()
+    assert measurement.root_quat == pytest.approx([0.8, 0.6, 0.0, 0.0])
+    # It has no gyroscope: only a policy that reads one cannot be run.
+    assert control.lacking(measurement) == ["root_ang_vel"]
 
 
 def test_a_filter_is_that_of_first_order():
@@ -264,6 +279,8 @@ def test_the_file_runs_by_itself_in_real_time(folder, tmp_path):
     for name in ("torch", "ksim_rl", "warp", "tensordict"):
         (tmp_path / f"{name}.py").write_text(f"raise ImportError('{name} is not here')\n")
     quick = (
+        "--dry-seconds",
+        "0.1",
         "--stand-seconds",
         "0.1",
         "--damp-seconds",
@@ -285,5 +302,6 @@ def test_the_file_runs_by_itself_in_real_time(folder, tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "report.json").read_text())
+    assert "dry -> damp: the dry run is over" in done.stdout
     assert report["periods"] >= 70 and not report["fault"] and report["period_ms"] == 20.0
     assert "stop -> damp: stopped" in done.stdout

@@ -75,8 +75,8 @@ def operator_fails(robot, machine):
 def log_fails(robot, machine):
     log = robot.lines.period
 
-    def fail(now, state, measurement, command):
-        log(now, state, measurement, command)
+    def fail(now, state, measurement, command, asked):
+        log(now, state, measurement, command, asked)
         raise RuntimeError("other columns")
 
     robot.lines.period = fail
@@ -253,6 +253,7 @@ def test_targets_are_moved_so_far_that_efforts_stay_in_their_limits(control):
         (lambda: Limits(most_tilt=math.nan), "--most-tilt nan: expected 0 to inf"),
         (lambda: Times(stop_seconds=-1.0), "--stop-seconds -1: expected 0 or more"),
         (lambda: Times(stand_seconds=0.0), "--stand-seconds 0: expected 0.1 or more"),
+        (lambda: Times(dry_seconds=0.0), "--dry-seconds 0: expected 0.1 or more"),
         (lambda: Times(damping_factor=0.0), "--damping-factor 0: expected 0.1 or more"),
     ],
 )
@@ -269,6 +270,8 @@ def test_wrong_options_are_refused(make, said):
         (["--command", "0", "nan"], "--command 0.0 nan: expected finite numbers"),
         (["--plan", "p.csv", "--command", "0"], "--command: a plan follows none"),
         (["--plan", "p.csv", "--seconds", "3"], "--seconds: a plan says itself"),
+        (["--plan", "p.csv", "--dry-run"], "--dry-run: a plan has no policy"),
+        (["--dry-run", "--seconds", "3"], "--seconds: a dry run has --dry-seconds"),
     ],
 )
 def test_a_robot_is_not_driven_with_options_that_do_not_fit(control, arguments, said):
@@ -298,3 +301,5 @@ def test_what_nothing_limits_holds_or_brakes_is_named(control):
         "no damping, so that nothing brakes them: right, left",
         "no attitude: the tilt is not watched",
     ]
+    unseen = dataclasses.replace(measurement, root_ang_vel=None)
+    assert "no gyroscope and no count" in unguarded(control.joints, unseen)[-1]

@@ -32,6 +32,8 @@ COLUMNS = (
     "stiffness",
     "damping",
 )
+DRY_COLUMNS = ("dry_position", "dry_velocity", "dry_effort")
+"""Of the policy's targets that were not sent."""
 
 ROOT_COLUMNS = tuple(
     f"{what}.{axis}" for what in ("projected_gravity", "root_ang_vel") for axis in "xyz"
@@ -52,7 +54,7 @@ class Journal:
     Columns are `time` (s since the first period), `state`, `message_age` (s), gravity's direction and the turning of
     the root in its own axes (NaN without a root), and for each joint the `COLUMNS`. Nothing here waits for the disk
     or the terminal: what they cannot take is dropped, and counted in `lost`. Events are shown, too. With `only` it has
-    the periods of one state alone.
+    the periods of one state alone. With `dry` it has `DRY_COLUMNS`, too, which are NaN where no dry run is going on.
     """
 
     def __init__(
@@ -62,8 +64,10 @@ class Journal:
         show: Callable[[str], None],
         *,
         only: State | None = None,
+        dry: bool = False,
     ) -> None:
         self.path = path
+        self.dry = dry
         self.only = only
         self.show = show
         self.lost = 0
@@ -72,6 +76,8 @@ class Journal:
         names = ["time", "state", "message_age", *ROOT_COLUMNS]
         for joint in joints.names:
             names += [f"{joint}.{column}" for column in COLUMNS]
+            if dry:
+                names += [f"{joint}.{column}" for column in DRY_COLUMNS]
         self.form = ",".join(["%.6f", "%d", *["%.9g"] * (len(names) - 2)]) + "\n"
         # "x": the log of an earlier run is never written over.
         self.file: TextIO = path.open("x", encoding="utf-8", errors="backslashreplace")
@@ -81,9 +87,14 @@ class Journal:
         self.thread.start()
 
     def period(
-        self, now: float, state: State, measurement: Measurement | None, command: JointCommand
+        self,
+        now: float,
+        state: State,
+        measurement: Measurement | None,
+        command: JointCommand,
+        asked: JointCommand | None = None,
     ) -> None:
-        """Log a period; without a measurement the readings are NaN."""
+        """Log a period; without a measurement the readings are NaN. `asked` is what a policy that runs dry asks for."""
         if self.only not in (None, state):
             return
         if measurement is None:
@@ -93,8 +104,11 @@ class Journal:
         else:
             readings = (measurement.joint_pos, measurement.joint_vel, measurement.joint_effort)
             age = now - measurement.stamp
-        asked = (command.pos, command.vel, command.effort, command.stiffness, command.damping)
-        by_joint = np.stack([*readings, *asked], axis=1)
+        sent = (command.pos, command.vel, command.effort, command.stiffness, command.damping)
+        columns = [*readings, *sent]
+        if self.dry:
+            columns += _dry(command, asked)
+        by_joint = np.stack(columns, axis=1)
         root = _of_root(measurement).tolist()
         values = (self._since(now), state.value, age, *root, *by_joint.ravel().tolist())
         self._put(Line(form=self.form, values=values, is_event=False))
@@ -134,6 +148,13 @@ class Journal:
                         flushed = time.monotonic()
         except OSError as error:
             self.failure = f"{self.path}: {error.strerror}"
+
+
+def _dry(command: JointCommand, asked: JointCommand | None) -> list[Array]:
+    """Return the numbers of `DRY_COLUMNS`, NaN where nothing runs dry."""
+    if asked is not None:
+        return [asked.pos, asked.vel, asked.effort]
+    return [np.full(len(command.pos), np.nan)] * len(DRY_COLUMNS)
 
 
 def _of_root(measurement: Measurement | None) -> Array:

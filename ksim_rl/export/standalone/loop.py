@@ -85,7 +85,7 @@ def run_loop(
         with damping_after("write", machine, clock):
             robot.write(command)
         with damping_after("log", machine, clock):
-            journal.period(woken, machine.state, measurement, command)
+            journal.period(woken, machine.state, measurement, command, machine.asked)
         punctuality.add(deadline, woken, sent)
         if machine.is_over(sent):
             return punctuality

@@ -3,9 +3,10 @@
     python loop.py --simulate               # a robot of MuJoCo's C engine stands up and walks
     python loop.py --simulate --seconds 0   # the same, with words of yours: stand, policy, stop, damp
 
-States follow each other: damp, stand, policy, stop. Late, lost or wrong messages, limits of joints, tilt, errors and
-your stop lead to damped motors. What happened is in a log that `ksim-rl identify` reads. For a robot of yours write a
-class with `read`, `write` and `close` (see `Robot`), and give it to `drive`.
+The policy runs dry first: what it would ask for is told and checked. Then come the states damp, stand, policy, stop.
+Late, lost, repeated or wrong messages, limits of joints, tilt, errors and your stop lead to damped motors. What
+happened is in a log that `ksim-rl identify` reads. For a robot of yours write a class with `read`, `write` and
+`close` (see `Robot`), and give it to `drive`.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from ksim_rl.export.standalone.deadlines import MonotonicClock
+from ksim_rl.export.standalone.dry_run import DryRun, HeardRobot
 from ksim_rl.export.standalone.files import Json, read_json
 from ksim_rl.export.standalone.journal import Journal
 from ksim_rl.export.standalone.loop import (
@@ -34,7 +36,14 @@ from ksim_rl.export.standalone.policy_control import PolicyControl
 from ksim_rl.export.standalone.robot_link import Robot
 from ksim_rl.export.standalone.safety import Limits, option_of, unguarded
 from ksim_rl.export.standalone.states import State, StateMachine, Times
-from ksim_rl.export.standalone.words import EndOfPlan, Interrupts, Keyboard, Operator, Unattended
+from ksim_rl.export.standalone.words import (
+    EndOfDryRun,
+    EndOfPlan,
+    Interrupts,
+    Keyboard,
+    Operator,
+    Unattended,
+)
 
 UNATTENDED_S = 10.0
 LIFT = 1.0
@@ -44,7 +53,9 @@ HELP = {
     "most_tilt": "of the root from the vertical, rad",
     "position_margin": "beyond the limits of joints in export.json, rad or m",
     "most_speed": "of joints without a speed limit in export.json, per s",
+    "same_seconds": "for which all that a robot with a gyroscope measures may be the same",
     "effort_share": "of the effort limits in export.json; begin with little",
+    "dry_seconds": "of the policy on what the robot measures, unsent, before it stands up and before it moves",
     "stand_seconds": "from the measured pose to the default pose",
     "blend_seconds": "from standing to the policy's targets",
     "stop_seconds": "from the gains of the moment to none",
@@ -61,7 +72,7 @@ def loop_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--hang",
         action="store_true",
-        help="the simulated robot hangs until its motors hold the default pose, as a humanoid has to",
+        help="the simulated robot hangs until the policy begins, as a humanoid has to",
     )
     parser.add_argument(
         "--seconds",
@@ -74,6 +85,11 @@ def loop_parser() -> argparse.ArgumentParser:
         type=Path,
         help="commands of `ksim-rl identify --propose` in the policy's place, for a robot whose base is held; the log "
         "has them alone",
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="end behind the first dry run; a robot is sent nothing, and may stand under another controller meanwhile",
     )
     parser.add_argument("--command", type=float, nargs="*", help="the policy's first command")
     parser.add_argument("--log", type=Path, help="a new CSV file; default: named by the time")
@@ -114,9 +130,20 @@ def drive(
     limits = Limits(**{field.name: chosen[field.name] for field in dataclasses.fields(Limits)})
     times = Times(**{field.name: chosen[field.name] for field in dataclasses.fields(Times)})
     _set_command(control, options.command)
-    if robot is None:
-        robot = _simulated(options, control, period)
     clock = MonotonicClock()
+    dry = None
+    if plan is None:
+        dry = DryRun(
+            control,
+            period=period,
+            seconds=times.dry_seconds,
+            margin=limits.position_margin,
+            clock=clock.now,
+        )
+    if robot is None:
+        robot = _simulated(options, control, period, holds=0 if dry is None else dry.num_steps)
+    elif options.dry_run:
+        robot = HeardRobot(robot)
     first = first_measurement(robot, clock, period)
     lacking = driver.lacking(first)
     if lacking:
@@ -129,8 +156,10 @@ def drive(
         path = Path(time.strftime("loop_%Y%m%d_%H%M%S.csv"))
     # What is identified is the plan alone: gains change in other states.
     only = None if plan is None else State.POLICY
-    journal = Journal(path, driver.joints, _say, only=only)
-    machine = StateMachine(driver, period=step_dt, limits=limits, times=times, note=journal.event)
+    journal = Journal(path, driver.joints, _say, only=only, dry=dry is not None)
+    machine = StateMachine(
+        driver, period=step_dt, limits=limits, times=times, note=journal.event, dry=dry
+    )
     heard = _operators(options, plan, operators)
     calm_python()
     priority = ask_for_real_time() if options.real_time else "no real-time priority: not asked for"
@@ -154,7 +183,8 @@ def drive(
     _tell(summary, journal.failure)
     if options.report:
         options.report.write_text(json.dumps(summary, indent=1) + "\n")
-    return 1 if machine.fault else 0
+    is_dry = dry is not None and dry.is_over()
+    return 1 if machine.fault or (options.dry_run and not is_dry) else 0
 
 
 def _check_options(options: argparse.Namespace, *, has_robot: bool) -> None:
@@ -169,6 +199,11 @@ def _check_options(options: argparse.Namespace, *, has_robot: bool) -> None:
         raise ValueError("--command: a plan follows none: leave out one of the two")
     if options.plan is not None and options.seconds:
         raise ValueError("--seconds: a plan says itself how long it is: leave out one of the two")
+
+    if options.dry_run and options.plan is not None:
+        raise ValueError("--dry-run: a plan has no policy that could run: leave out one of the two")
+    if options.dry_run and options.seconds:
+        raise ValueError("--seconds: a dry run has --dry-seconds: leave out one of the two")
 
 
 def _operators(
@@ -185,13 +220,20 @@ def _operators(
         heard.append(EndOfPlan(plan))
         # The plan says itself when it is over; 0 stays, as an operator leads then.
         seconds = math.inf if seconds else 0.0
+    if options.dry_run:
+        heard.append(EndOfDryRun())
+        # The end is said; whoever has no keyboard shall not end it sooner.
+        heard.append(Keyboard(sys.stdin, leads=False))
+        return heard
     heard.append(Keyboard(sys.stdin, leads=not seconds))
     if seconds:
         heard.append(Unattended(seconds))
     return heard
 
 
-def _simulated(options: argparse.Namespace, control: PolicyControl, period: float) -> Robot:
+def _simulated(
+    options: argparse.Namespace, control: PolicyControl, period: float, *, holds: int
+) -> Robot:
     # Here, so that a robot's computer needs no MuJoCo.
     try:
         from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
@@ -203,7 +245,8 @@ def _simulated(options: argparse.Namespace, control: PolicyControl, period: floa
         # The base of a robot that is identified is held, and nothing touches.
         robot.hang(np.full(len(control.joints.names), np.inf), lift=LIFT)
     elif options.hang:
-        robot.hang(control.joints.stiffness)
+        # No humanoid stands on stiff motors alone for as long as the dry run lasts.
+        robot.hang(control.joints.stiffness, holds=holds)
     return robot
 
 

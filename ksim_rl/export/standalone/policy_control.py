@@ -42,7 +42,7 @@ class PolicyControl:
         for name, spec in meta["commands"].items():
             self.command[name] = np.zeros(check_count(f"commands.{name}.size", spec["size"]))
         self.estimated: list[str] = []
-        self.needs_root = False
+        self.of_root: set[str] = set()
         self.sources: dict[str, Reading] = {}
         for node in meta["obs"]["measurements"]:
             self.sources[node["input"]] = self._source(node)
@@ -73,11 +73,7 @@ class PolicyControl:
     def lacking(self, measurement: Measurement) -> list[str]:
         """Return the inputs of `obs.onnx` that a robot's measurements do not give."""
         found = [name for name in self.estimated if name not in measurement.estimates]
-        if self.needs_root and measurement.root_quat is None:
-            found.append("root_quat")
-        if self.needs_root and measurement.root_ang_vel is None:
-            found.append("root_ang_vel")
-        return found
+        return found + [name for name in sorted(self.of_root) if getattr(measurement, name) is None]
 
     def __call__(self, measurement: Measurement) -> JointCommand:
         """Run one step of the policy, and return what it asks of the motors."""
@@ -158,7 +154,11 @@ class PolicyControl:
         return readings[quantity]
 
     def _of_root(self, quantity: str, frame: str) -> Reading:
-        self.needs_root = True
+        if quantity == "root_ang_vel":
+            self.of_root.add("root_ang_vel")
+        # What is in the axes of the world needs the attitude, too.
+        if quantity != "root_ang_vel" or frame != "root":
+            self.of_root.add("root_quat")
 
         def quat(measured: Measurement) -> Array:
             assert measured.root_quat is not None  # `lacking` was asked

@@ -20,6 +20,8 @@ class Measurement:
         joint_effort: N m, or N.
         root_quat: attitude of the root (w, x, y, z); None of a robot that is fixed to the world.
         root_ang_vel: rad/s, in the root's own axes: x forward, y left, z up.
+        count: the robot's own number or time of the state that it sent, where it has one: it stands still where its
+            firmware sends one state again and again.
         estimates: what else `obs.onnx` reads, by the names of its inputs, such as `sensor_imu_ang_vel`.
     """
 
@@ -29,6 +31,7 @@ class Measurement:
     joint_effort: Array
     root_quat: Array | None = None
     root_ang_vel: Array | None = None
+    count: int | None = None
     estimates: Mapping[str, Array] = field(default_factory=dict)
 
 
@@ -84,6 +87,21 @@ class DescribedJoints:
     def columns(self, names: list[str]) -> Array:
         """Return the places of some joints."""
         return np.array([self.names.index(name) for name in names], int)
+
+
+class Control(Protocol):
+    """What asks the motors for something once the robot stands; `command` is what an operator may change."""
+
+    joints: DescribedJoints
+    command: dict[str, Array]
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        ...
+
+    def __call__(self, measurement: Measurement) -> JointCommand:
+        """Return what the motors are asked for in this period."""
+        ...
 
 
 def _finite(what: str, joints: Json, *, least: float = -np.inf) -> Array:

@@ -32,6 +32,7 @@ class Limits:
         most_tilt: of the root's z axis from the vertical, rad.
         position_margin: beyond the limits of positions in export.json, rad or m.
         most_speed: of joints whose motors have no speed limit in export.json, rad/s or m/s.
+        same_seconds: for which all that a robot with a gyroscope measures may be the same.
         effort_share: of the effort limits in export.json that commands may ask for.
     """
 
@@ -39,6 +40,7 @@ class Limits:
     most_tilt: float = 1.0
     position_margin: float = 0.2
     most_speed: float = 35.0
+    same_seconds: float = 0.5
     effort_share: float = 1.0
 
     def __post_init__(self) -> None:
@@ -65,9 +67,14 @@ class Watch:
         self.longest = limits.late_periods * period
         no_limit = np.isinf(joints.most_speed)
         self.most_speed = np.where(no_limit, limits.most_speed, joints.most_speed)
+        # What the last message said, and since when.
+        self.count: int | None = None
+        self.counted_at = 0.0
+        self.readings: list[Array] = []
+        self.changed_at = 0.0
 
     def message(self, now: float, measurement: Measurement | None) -> Measurement:
-        """Refuse a measurement that is missing, late, stamped by another clock, incomplete or not finite."""
+        """Refuse a measurement that is missing, late, stamped by another clock, repeated, incomplete or not finite."""
         if measurement is None:
             raise Fault("no message from the robot")
         age = now - measurement.stamp
@@ -81,7 +88,41 @@ class Watch:
                 f"a message's stamp is {-age:.3f} s ahead of the loop: expected s of time.monotonic"
             )
         self._numbers(measurement)
+        self._news(measurement)
         return measurement
+
+    def _news(self, measurement: Measurement) -> None:
+        """Refuse a state that a firmware sends again and again, in messages that are new."""
+        # By the stamps of the messages: where none comes any more, the last one is late.
+        stamp = measurement.stamp
+        if measurement.count is None or measurement.count != self.count:
+            self.count = measurement.count
+            self.counted_at = stamp
+        stood = stamp - self.counted_at
+        if stood > self.longest:
+            raise Fault(
+                f"the robot sends one state again and again: its count is {self.count} for {stood:.3f} s"
+            )
+        # Encoders of a robot at rest may read the same for long; a gyroscope has noise.
+        if measurement.root_ang_vel is None:
+            return
+        readings = [measurement.joint_pos, measurement.joint_vel, measurement.joint_effort]
+        readings.append(measurement.root_ang_vel)
+        if measurement.root_quat is not None:
+            readings.append(measurement.root_quat)
+        is_same = len(readings) == len(self.readings) and all(
+            map(np.array_equal, readings, self.readings)
+        )
+        if not is_same:
+            # Copies: a robot may write into its arrays.
+            self.readings = [values.copy() for values in readings]
+            self.changed_at = stamp
+        same = stamp - self.changed_at
+        if same > self.limits.same_seconds:
+            raise Fault(
+                f"the robot has measured the same for {same:.3f} s, its gyroscope too: does it send one state again "
+                "and again?"
+            )
 
     def _numbers(self, measurement: Measurement) -> None:
         names = self.joints.names
@@ -135,6 +176,14 @@ class Watch:
                 )
 
 
+def check_finite(command: JointCommand, names: list[str]) -> None:
+    """Refuse a command that a policy made of numbers beyond all bounds."""
+    for field in dataclasses.fields(command):
+        bad = np.flatnonzero(~np.isfinite(getattr(command, field.name)))
+        if bad.size:
+            raise Fault(f"the policy's target of {names[bad[0]]} ({field.name}) is not finite")
+
+
 def unguarded(joints: DescribedJoints, measurement: Measurement) -> list[str]:
     """Return a line for each thing that nothing limits, holds or brakes, as export.json or the robot has no number."""
     lacks = {
@@ -149,6 +198,10 @@ def unguarded(joints: DescribedJoints, measurement: Measurement) -> list[str]:
             lines.append(f"{what}: {', '.join(names)}")
     if measurement.root_quat is None:
         lines.append("no attitude: the tilt is not watched")
+    if measurement.root_ang_vel is None and measurement.count is None:
+        lines.append(
+            "no gyroscope and no count: a state that is sent again and again is not noticed"
+        )
     return lines
 
 

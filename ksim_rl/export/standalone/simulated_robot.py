@@ -14,6 +14,7 @@ from ksim_rl.export.standalone.runner import Runner
 
 HELD_INERTIA = 1e6
 """kg, or kg m^2, of a root that is held: no robot moves it."""
+OF_ATTITUDE = ("root_quat", "projected_gravity")
 # Numbers, as arrays of a model hold them.
 TO_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
@@ -39,6 +40,7 @@ class SimulatedRobot:
         self.gear = model.actuator_gear[self.actuators, 0].copy()
         self.has_root = bool(model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE)
         self.hangs_below: Array | None = None
+        self.fixed_root = self._fixed_root()
         self.estimates = {}
         for node in runner.meta["obs"]["measurements"]:
             if node["input"] in estimated:
@@ -73,6 +75,13 @@ class SimulatedRobot:
                 raise ValueError(f"robot.xml: no actuator drives the joint {joints.names[place]!r}")
         return np.array(list(found.values()), int), joints.columns(list(found))
 
+    def _fixed_root(self) -> int | None:
+        """Return the body whose attitude a policy reads, of a robot that is fixed to the world."""
+        for node in self.runner.meta["obs"]["measurements"]:
+            if not self.has_root and node["quantity"] in OF_ATTITUDE:
+                return int(self.model.body(node["body"]).id)
+        return None
+
     def read(self) -> Measurement:
         """Return what the sensors read now; a message of a simulation is never late."""
         data = self.data
@@ -81,6 +90,8 @@ class SimulatedRobot:
         if self.has_root:
             root_quat = data.qpos[3:7].copy()
             root_ang_vel = data.qvel[3:6].copy()
+        elif self.fixed_root is not None:
+            root_quat = data.xquat[self.fixed_root].copy()
         estimates = {}
         for name, read in self.estimates.items():
             estimates[name] = np.array(read())
@@ -91,6 +102,8 @@ class SimulatedRobot:
             joint_effort=data.qfrc_actuator[self.vel],
             root_quat=root_quat,
             root_ang_vel=root_ang_vel,
+            # Of the simulation's steps: a robot at rest may measure the same to the bit.
+            count=round(data.time / self.model.opt.timestep),
             estimates=estimates,
         )
 
@@ -110,8 +123,10 @@ class SimulatedRobot:
         model.actuator_biasprm[at, 2] = -damping / gear**2
         self.data.ctrl[at] = command.pos[columns]
         if self.hangs_below is not None and (command.stiffness >= self.hangs_below).all():
-            self.hangs_below = None
-            self.model.dof_armature[:6] = self.free_inertia
+            self.holds_left -= 1
+            if self.holds_left < 0:
+                self.hangs_below = None
+                self.model.dof_armature[:6] = self.free_inertia
         if self.hangs_below is None:
             self.runner.run_physics(())
         else:
@@ -123,14 +138,15 @@ class SimulatedRobot:
         self.runner.decimation = math.ceil(period / option.timestep - 1e-9)
         option.timestep = period / self.runner.decimation
 
-    def hang(self, stiffness: Array, *, lift: float = 0.0) -> None:
+    def hang(self, stiffness: Array, *, holds: int = 0, lift: float = 0.0) -> None:
         """Hold the root until all motors have a stiffness, as a robot hangs that could not stand up.
 
-        It is held `lift` m above where it is.
+        It is held for `holds` more commands of that stiffness, and `lift` m above where it is.
         """
         if not self.has_root:
             raise ValueError("--hang: this robot has no free root")
         self.hangs_below = stiffness
+        self.holds_left = holds
         self.data.qpos[2] += lift
         self.root_pos = self.data.qpos[:7].copy()
         # So that legs do not move the root within a step: they would swing as in free fall.

@@ -5,13 +5,21 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
+from ksim_rl.export.standalone.dry_run import DryRun
 from ksim_rl.export.standalone.files import Array
-from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
-from ksim_rl.export.standalone.safety import EffortLimit, Fault, Limits, Watch, option_of
+from ksim_rl.export.standalone.robot_link import Control, JointCommand, Measurement
+from ksim_rl.export.standalone.safety import (
+    EffortLimit,
+    Fault,
+    Limits,
+    Watch,
+    check_finite,
+    option_of,
+)
 
 
 class State(Enum):
@@ -24,6 +32,8 @@ class State(Enum):
     POLICY = 2
     STOP = 3
     """The stiffness fades around the pose at the stop, until motors only brake."""
+    DRY = 4
+    """Motors brake, and the policy runs on what is measured: the beginning, where there is a dry run."""
 
 
 # What an operator may ask for, and when. A fault leads to DAMP from everywhere, and nothing leads out of that.
@@ -34,8 +44,14 @@ TRANSITIONS = {
     (State.STAND, "stop"): State.STOP,
     (State.POLICY, "stop"): State.STOP,
 }
-# A pose that is asked for at once is a jump, motors that do not brake let a robot fall, and one message may be lost.
-LEAST_TIMES = {"stand_seconds": 0.1, "damp_seconds": 0.1, "damping_factor": 0.1}
+# A pose that is asked for at once is a jump, motors that do not brake let a robot fall, one message may be lost, and
+# one step of a policy tells nothing.
+LEAST_TIMES = {
+    "dry_seconds": 0.1,
+    "stand_seconds": 0.1,
+    "damp_seconds": 0.1,
+    "damping_factor": 0.1,
+}
 # Arrays, or numbers, between which a hand-over leads.
 Between = TypeVar("Between", Array, float)
 
@@ -45,6 +61,7 @@ class Times:
     """How long hand-overs last, s, and how strong motors brake.
 
     Attributes:
+        dry_seconds: of the policy's dry runs, at the beginning and when the robot stands.
         stand_seconds: from the measured pose to the default pose.
         blend_seconds: from the pose of standing to the policy's targets.
         stop_seconds: from the gains of the moment to none.
@@ -52,6 +69,7 @@ class Times:
         damping_factor: damping while motors only brake, of `joint_damping` in export.json.
     """
 
+    dry_seconds: float = 2.0
     stand_seconds: float = 2.0
     blend_seconds: float = 0.5
     stop_seconds: float = 1.0
@@ -67,25 +85,12 @@ class Times:
                 raise ValueError(f"{option} {value:g}: expected {least:g} or more")
 
 
-class Control(Protocol):
-    """What asks the motors for something once the robot stands; `command` is what an operator may change."""
-
-    joints: DescribedJoints
-    command: dict[str, Array]
-
-    def begin(self) -> None:
-        """Begin an episode."""
-        ...
-
-    def __call__(self, measurement: Measurement) -> JointCommand:
-        """Return what the motors are asked for in this period."""
-        ...
-
-
 class StateMachine:
     """Gives a command of joints for each measurement, and ends in damped motors whatever happens.
 
-    `note` gets a line for each transition, with the time; `state` and `fault` tell where it is.
+    `note` gets a line for each transition, with the time; `state` and `fault` tell where it is. With `dry` the policy
+    runs dry before the robot stands up, and once more before it may move the robot; `asked` is what it would have asked
+    for in this period.
     """
 
     def __init__(
@@ -96,14 +101,17 @@ class StateMachine:
         limits: Limits,
         times: Times,
         note: Callable[[float, str], None],
+        dry: DryRun | None = None,
     ) -> None:
         self.control = control
+        self.dry = dry
+        self.asked: JointCommand | None = None
         self.joints = control.joints
         self.times = times
         self.note = note
         self.watch = Watch(self.joints, limits, period)
         self.effort_limit = EffortLimit(self.joints, limits.effort_share)
-        self.state = State.DAMP
+        self.state = State.DAMP if dry is None else State.DRY
         self.fault = ""
         self.since = 0.0
         self.ends_at = math.inf
@@ -117,6 +125,7 @@ class StateMachine:
 
     def tick(self, now: float, measurement: Measurement | None, words: list[str]) -> JointCommand:
         """Return the command of this period, s of `time.monotonic`; `words` are an operator's."""
+        self.asked = None
         if not self.fault:
             try:
                 measured = self.watch.message(now, measurement)
@@ -126,7 +135,7 @@ class StateMachine:
                 if self.state in (State.STAND, State.POLICY):
                     self.watch.motion(measured)
                 command = self._command(now, measured)
-                _check_finite(command, self.joints.names)
+                check_finite(command, self.joints.names)
                 command = self.effort_limit(command, measured)
                 self.pose = command.pos
                 return command
@@ -152,23 +161,33 @@ class StateMachine:
         """Whether the default pose has been reached, so that the policy may begin."""
         return self.state is State.STAND and now - self.since >= self.times.stand_seconds
 
+    def may_begin(self, now: float) -> bool:
+        """Whether the policy may begin: the robot stands, and the dry run in this pose is over."""
+        return self.is_standing(now) and (self.dry is None or self.dry.is_over())
+
     def _obey(self, now: float, measurement: Measurement, word: str) -> None:
-        if word == "damp" or (word == "stop" and self.state is State.DAMP):
+        if word == "damp" or (word == "stop" and self.state in (State.DAMP, State.DRY)):
             self._enter(now, State.DAMP, f"operator: {word}")
             self.ends_at = min(self.ends_at, now + self.times.damp_seconds)
+            return
+        if word == "stand" and self.state is State.DRY:
+            self.note(now, "operator: 'stand' has to wait until the dry run is over")
             return
         to = TRANSITIONS.get((self.state, word))
         # Behind a stop there is the end alone.
         if to is None or self.ends_at < math.inf:
             self.note(now, f"operator: {word!r} leads nowhere from {self.state.name.lower()}")
             return
-        if to is State.POLICY and not self.is_standing(now):
-            self.note(now, "operator: 'policy' has to wait until the robot stands")
+        if to is State.POLICY and not self.may_begin(now):
+            wanted = "the dry run is over" if self.is_standing(now) else "the robot stands"
+            self.note(now, f"operator: 'policy' has to wait until {wanted}")
             return
         self.first_share = self.share
         self.first_pose = measurement.joint_pos if self.share == 0.0 else self.pose
         if to is State.POLICY:
             self.control.begin()
+        if to is State.STAND and self.dry is not None:
+            self.dry.begin()
         self._enter(now, to, f"operator: {word}")
 
     def _enter(self, now: float, to: State, why: str) -> None:
@@ -180,7 +199,12 @@ class StateMachine:
         passed = now - self.since
         if self.state is State.DAMP:
             return self._damped(measurement.joint_pos)
+        if self.state is State.DRY:
+            self._run_dry(now, measurement, stands=False)
+            return self._damped(measurement.joint_pos)
         if self.state is State.STAND:
+            if self.is_standing(now):
+                self._run_dry(now, measurement, stands=True)
             share = smooth(passed, self.times.stand_seconds)
             pose = between(self.first_pose, self.joints.default_pos, share)
             return self._held(pose, between(self.first_share, 1.0, share))
@@ -193,6 +217,19 @@ class StateMachine:
         return dataclasses.replace(
             asked, pos=pos, vel=share * asked.vel, effort=share * asked.effort
         )
+
+    def _run_dry(self, now: float, measurement: Measurement, *, stands: bool) -> None:
+        """Run one step of the policy that nobody obeys, and tell after the last one what it would have asked for."""
+        if self.dry is None or self.dry.is_over():
+            return
+        self.asked = self.dry(measurement)
+        if not self.dry.is_over():
+            return
+        for line in self.dry.lines():
+            self.note(now, line)
+        self.dry.check(stands=stands)
+        if self.state is State.DRY:
+            self._enter(now, State.DAMP, "the dry run is over")
 
     def _stopping(self, now: float, passed: float) -> JointCommand:
         share = smooth(passed, self.times.stop_seconds)
@@ -234,11 +271,3 @@ def smooth(passed: float, seconds: float) -> float:
 def between(first: Between, last: Between, share: float) -> Between:
     """Return what lies between two values, at a share of the way."""
     return first + share * (last - first)
-
-
-def _check_finite(command: JointCommand, names: list[str]) -> None:
-    """Refuse a command that a policy made of numbers beyond all bounds."""
-    for field in dataclasses.fields(command):
-        bad = np.flatnonzero(~np.isfinite(getattr(command, field.name)))
-        if bad.size:
-            raise Fault(f"the policy's target of {names[bad[0]]} ({field.name}) is not finite")

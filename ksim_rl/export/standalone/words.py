@@ -76,7 +76,7 @@ class Unattended:
             self.began = now
         if machine.state is State.DAMP and now - self.began >= REST_S:
             return ["stand"]
-        if machine.is_standing(now):
+        if machine.may_begin(now):
             return ["policy"]
         if machine.state is State.POLICY and now - machine.since >= self.seconds:
             return ["stop"]
@@ -92,6 +92,16 @@ class EndOfPlan:
     def words(self, now: float, machine: StateMachine) -> list[str]:
         """Return the word, in the state that follows the plan."""
         return ["stop"] if machine.state is State.POLICY and self.plan.is_over() else []
+
+
+class EndOfDryRun:
+    """Says `stop` once the dry run at the beginning is over."""
+
+    def words(self, now: float, machine: StateMachine) -> list[str]:
+        """Return the word, in the state that follows the dry run."""
+        if machine.state is State.DAMP and machine.ends_at == math.inf:
+            return ["stop"]
+        return []
 
 
 class Interrupts:

@@ -76,6 +76,8 @@ class UnitreeRobot:
             joint_effort=np.array([motor.tau_est for motor in motors]),
             root_quat=np.array(imu.quaternion),
             root_ang_vel=np.array(imu.gyroscope),
+            # It stands still where the firmware sends one state again and again.
+            count=int(state.tick),
             estimates=estimates,
         )
         return self.newest

@@ -16,6 +16,9 @@ from unitree_bridge.exported import module_of
 from unitree_bridge.robot import SENSORS
 from unitree_bridge.robots import KINDS, Kind, zeros
 
+GYROSCOPE_NOISE = 1e-3
+"""rad/s, of the simulated gyroscope."""
+
 
 class Stub:
     """The simulated robot of an exported folder, behind the messages of a kind; `runner` is that folder's module."""
@@ -44,6 +47,7 @@ class Stub:
         self.refused = 0
         self.taken = 0
         self.remote = bytes(40)
+        self.draws = np.random.default_rng(0)
 
     def step(self) -> None:
         """Run one step of physics under the newest command, and send the state; before the first it stands still."""
@@ -78,7 +82,9 @@ class Stub:
             state.dq = float(read.joint_vel[place])
             state.tau_est = float(read.joint_effort[place])
         self.state.imu_state.quaternion = read.root_quat.tolist()
-        self.state.imu_state.gyroscope = read.root_ang_vel.tolist()
+        # No gyroscope reads the same twice, also while the robot stands still.
+        noise = GYROSCOPE_NOISE * self.draws.standard_normal(3)
+        self.state.imu_state.gyroscope = (read.root_ang_vel + noise).tolist()
         for field, sensor in self.sensors.items():
             setattr(self.state.imu_state, field, sensor().tolist())
         self.state.wireless_remote = list(self.remote)
