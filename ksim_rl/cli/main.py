@@ -25,6 +25,8 @@ usage: ksim-rl <command> [arguments]
   play     record a video:          ksim-rl play RUN --seconds 10
            watch and drive it:      ksim-rl play RUN --live
            without a policy:        ksim-rl play task=cartpole_swingup --agent random --live
+  collect  episodes of a policy, in a folder:  ksim-rl collect RUN --episodes 1000
+           without a policy:        ksim-rl collect task=cartpole_swingup --agent random
   demo     a policy of the zoo, without training: ksim-rl demo [--live]
   zoo      list those that come along:   ksim-rl zoo; ksim-rl play zoo:reacher
   runs     list runs, with return and speed:  ksim-rl runs [FOLDER]
@@ -61,6 +63,7 @@ COMMANDS = {
     "resume": "ksim_rl.cli.run_commands:resume",
     "eval": "ksim_rl.cli.run_commands:evaluate",
     "play": "ksim_rl.viewer.play_command:play",
+    "collect": "ksim_rl.cli.collect:collect",
     "demo": "ksim_rl.viewer.play_command:demo",
     "zoo": "ksim_rl.zoo.command:zoo",
     "runs": "ksim_rl.cli.runs:runs",

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -78,9 +77,6 @@ def _compiles(env: EnvBase, cfg: CollectorCfg) -> bool:
     return cfg.compile
 
 
-_exploring = partial(set_exploration_type, ExplorationType.RANDOM)
-
-
 class RolloutCollector:
     """Runs `policy` in `env` for T steps at a time; envs that end are reset within the rollout.
 
@@ -93,7 +89,7 @@ class RolloutCollector:
     CUDA the env's `step_and_maybe_reset` must not synchronize (`ManagerBasedRlEnv`, `MaskedTransformedEnv`); on CPU any
     TorchRL env of batch size [E] will do. The policy writes the action, and the tensors that training needs; one that
     has a context `steady()` acts within it, where its weights stay. Stored are the leaves at `keys`, None for all:
-    fewer cost fewer bytes and less time.
+    fewer cost fewer bytes and less time. Without `explores` a policy gives its deterministic actions.
     """
 
     def __init__(
@@ -104,6 +100,7 @@ class RolloutCollector:
         rollout_length: int,
         keys: Sequence[NestedKey] | None = None,
         cfg: CollectorCfg | None = None,
+        explores: bool = True,
     ) -> None:
         check_count("rollout_length", rollout_length)
         if len(env.batch_size) != 1:
@@ -122,6 +119,10 @@ class RolloutCollector:
         self.policy = policy
         self.rollout_length = rollout_length
         self._keys = None if keys is None else list(keys)
+        if explores:
+            self._exploration = ExplorationType.RANDOM
+        else:
+            self._exploration = ExplorationType.DETERMINISTIC
         self._root: TensorDict | None = None
         self._transforms: list[Transform] = []  # those that the running episodes have begun with
         self._storage_TE: TensorDict | None = None
@@ -183,7 +184,8 @@ class RolloutCollector:
         assert self._root is not None
         device = self._run.device
         # A copy of the tree, as the policy adds its leaves to it.
-        with torch.random.fork_rng([device] if device.type == "cuda" else []), _exploring():
+        devices = [device] if device.type == "cuda" else []
+        with torch.random.fork_rng(devices), set_exploration_type(self._exploration):
             return self.policy(self._root.copy())
 
     def _renew_root(self) -> None:
@@ -262,7 +264,8 @@ class RolloutCollector:
         # The policy's leaves are dropped between steps, so that they do not pile up in the root.
         root_keys = list(self._root.keys(True, True))
         root_E = self._root.copy()
-        with _exploring(), getattr(self.policy, "steady", nullcontext)():
+        steady = getattr(self.policy, "steady", nullcontext)
+        with set_exploration_type(self._exploration), steady():
             if self.compiled_step is not None:
                 for t in range(self.rollout_length):
                     env_state_E = self.policy(self._root.copy())

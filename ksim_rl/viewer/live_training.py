@@ -25,7 +25,8 @@ from ksim_rl.files.writing import write_whole
 from ksim_rl.trainers import Hook, RunCfg, Trainer
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build_env
-from ksim_rl.viewer.play_command import Played, addresses, check_viser, session_of
+from ksim_rl.viewer.play_command import addresses, check_viser, session_of
+from ksim_rl.viewer.played import Played
 
 # Seconds between two policies that are given away: a hook lets the host wait for the device, so these are rare.
 PERIOD_S = 2.0

@@ -7,45 +7,22 @@ import importlib.util
 import os
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from ksim_rl import conf
 from ksim_rl.checks import OneLineParser, check_count, check_in_range
 from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
-from ksim_rl.trainers import RunCfg, RunProgress, checkpoint, record_video
+from ksim_rl.trainers import RunProgress, record_video
 from ksim_rl.trainers.build import build_env
-from ksim_rl.trainers.other_physics import ENGINE, judged_by, trained_with
-from ksim_rl.trainers.run_cfg import check_run_tree
-from ksim_rl.trainers.run_folder import policy_of, without_nan_guard
 from ksim_rl.trainers.video import FPS
-from ksim_rl.viewer.session import AGENTS, Conditions, Session, UntrainedAgent, showing_motion
-from ksim_rl.zoo import locate
+from ksim_rl.viewer.played import Played, find
+from ksim_rl.viewer.session import AGENTS, Conditions, Session
 
 DEMO = "zoo:cartpole"
 VIDEO_SUFFIXES = (".mp4", ".gif")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Played:
-    """A policy or agent to play: a run's policy, or an agent in a task (`actor` is None, and `agent` its kind)."""
-
-    cfg: RunCfg
-    title: str
-    folder: Path
-    actor: TensorDictModuleBase | None = None
-    agent: str = ""
-
-    def policy(self, env: EnvBase) -> TensorDictModuleBase:
-        """Return the policy that acts in an env of `cfg`."""
-        if self.actor is None:
-            return UntrainedAgent(self.agent, env)
-        return self.actor
 
 
 def play(arguments: list[str]) -> int:
@@ -56,7 +33,9 @@ def play(arguments: list[str]) -> int:
     progress = RunProgress(1)
     with compile_notice(progress.status):
         # Kernels may compile for minutes: the notice says so.
-        played = _find(options)
+        played = find(
+            options.what, agent=options.agent, device=options.device, motion=options.motion
+        )
         if options.viewer is None:
             return _record(played, options, progress)
         session = session_of(played, num_envs=options.num_envs, seed=options.seed)
@@ -191,67 +170,6 @@ def _check(options: argparse.Namespace) -> None:
         importlib.import_module("ksim_rl.viewer.native").check_display()
     if options.viewer is not None and given:
         raise ValueError(f"{', '.join(given)}: of a video: leave that out, or leave out the viewer")
-
-
-def _find(options: argparse.Namespace) -> Played:
-    """Find the run or the task, with the changes to its config."""
-    if options.motion is not None:
-        return _motion(options)
-    first, *overrides = options.what
-    # A path may hold "=", so one that exists is a run.
-    if "=" in first and not Path(first).exists():
-        if options.agent is None or not any(text.startswith("task=") for text in options.what):
-            raise ValueError(
-                f"{first!r}: expected a run folder, or task=NAME with --agent zero or random, as it has no policy"
-            )
-        return _without_policy(
-            conf.compose([*options.what, f"device={options.device}"]), options.agent
-        )
-    changed = None
-    physics = ""
-    # `locate` also takes names of the zoo.
-    saved = checkpoint.load_latest(locate(first))
-    if overrides:
-        fields = conf.fields_of(overrides)
-        # A run's folder may be a stranger's: its config must not reach outside.
-        check_run_tree(saved.config, saved.path, given=fields)
-        changed = conf.changed({**saved.config, "device": options.device}, saved.path, overrides)
-        changed = dataclasses.replace(changed, device=options.device)
-        # Another engine brings another integrator and time step, which the title tells.
-        if ENGINE in fields:
-            changed, words = judged_by(changed, trained=trained_with(saved.config), given=fields)
-            physics = f", {words}"
-    policy = policy_of(saved, device=options.device, cfg=changed)
-    # An agent in a run's task: the policy is dropped, its config stays.
-    if options.agent is not None:
-        return _without_policy(policy.cfg, options.agent)
-    title = f"{policy.cfg.task_name}, iteration {policy.iteration}{physics}"
-    return Played(cfg=policy.cfg, title=title, folder=saved.run_folder, actor=policy.actor)
-
-
-def _motion(options: argparse.Namespace) -> Played:
-    """Return a motion to play in the scene of a task."""
-    if not any(text.startswith("task=") for text in options.what):
-        raise ValueError(
-            f"--motion {options.motion}: name a task with the motion's robot: task=NAME"
-        )
-    if options.agent is not None:
-        raise ValueError(
-            f"--motion {options.motion} with --agent {options.agent}: nothing acts in a motion"
-        )
-    cfg = conf.compose([*options.what, f"device={options.device}"])
-    shown = dataclasses.replace(cfg, task=showing_motion(cfg.task, options.motion))
-    played = _without_policy(shown, "zero")
-    return dataclasses.replace(played, title=f"{cfg.task_name}, motion {options.motion}")
-
-
-def _without_policy(cfg: RunCfg, agent: str) -> Played:
-    return Played(
-        cfg=without_nan_guard(cfg),
-        title=f"{cfg.task_name}, {agent} actions",
-        folder=Path(),
-        agent=agent,
-    )
 
 
 def _record(played: Played, options: argparse.Namespace, progress: RunProgress) -> int:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ksim_rl import envs
 from ksim_rl.collectors import CollectorCfg, RolloutCollector
@@ -119,6 +120,20 @@ def test_a_policy_is_steady_once_for_all_steps_of_a_rollout():
     collector.collect()
     collector.collect()
     assert policy.calls == [1] * STEPS + [2] * STEPS
+
+
+class ModePolicy(RandomPolicy):
+    """Acts by how it is asked to: 1 where actions are drawn, 0 where they are deterministic."""
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        drawn = exploration_type() == ExplorationType.RANDOM
+        return td.set("action", torch.full_like(super().forward(td)["action"], float(drawn)))
+
+
+@pytest.mark.parametrize("explores", [True, False])
+def test_a_policy_explores_unless_it_is_asked_not_to(explores):
+    collector = RolloutCollector(noisy_env(), ModePolicy(), rollout_length=2, explores=explores)
+    assert (collector.collect()["action"] == float(explores)).all()
 
 
 def test_dims_are_named_and_memory_is_reused():

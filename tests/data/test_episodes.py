@@ -2,7 +2,10 @@
 
 import json
 import os
+import random
 import shutil
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -305,3 +308,53 @@ def test_types_that_other_programs_do_not_know_are_refused():
     rollout = TensorDict({"x": torch.zeros(2, 3, 1, dtype=torch.bfloat16)}, batch_size=[2, 3])
     with pytest.raises(ValueError, match="dtype='bfloat16' of x: expected one of bool"):
         leaves_of(rollout)
+
+
+def numbers_of(episode):
+    """The numbers of an episode, which follow from its number: its length, too."""
+    length = 1 + episode % 7
+    return np.full((length, 3), episode, dtype=np.float32), np.arange(length)
+
+
+def write_until_killed(folder, pipe):
+    """Run in a fork: write episode after episode, and report each commit."""
+    leaves = [Leaf(key=("obs", "x"), shape=(3,)), Leaf(key=("step",), dtype="int64")]
+    writer = EpisodeWriter(folder, leaves, origin=Origin())
+    for episode in range(10**9):
+        x, step = numbers_of(episode)
+        writer.append({("obs", "x"): x, ("step",): step})
+        if episode % 3 == 2:
+            writer.commit()
+            os.write(pipe, f"{episode + 1}\n".encode())
+
+
+@pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.full)])
+def test_a_recording_that_is_killed_keeps_all_episodes_that_were_committed(tmp_path, times):
+    choose = random.Random(times)
+    for number in range(times):
+        folder = tmp_path / str(number)
+        reading, writing_end = os.pipe()
+        child = os.fork()
+        if child == 0:
+            try:
+                write_until_killed(folder, writing_end)
+            finally:
+                os._exit(1)
+        os.close(writing_end)
+        reported = os.read(reading, 10)
+        time.sleep(choose.uniform(0.0, 0.03))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        while more := os.read(reading, 4096):
+            reported += more
+        os.close(reading)
+
+        found = data.read_episodes(folder)
+        assert found.contents.num_episodes >= int(reported.split()[-1])
+        expected_numbers = [numbers_of(number) for number in range(found.contents.num_episodes)]
+        x_D3, step_D = map(np.concatenate, zip(*expected_numbers, strict=True))
+        assert np.array_equal(found.env_states_D["obs", "x"].numpy(), x_D3)
+        assert np.array_equal(found.env_states_D["step"].numpy(), step_D)
+        data.mend(folder)
+        alone = TensorDict.load_memmap(folder / "env_states", allow_pickle=False)
+        assert (alone == found.env_states_D).all()
