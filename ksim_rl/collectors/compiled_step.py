@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.collectors.step_check import StepCheck
+from ksim_rl.compiled.differences import NamedLeaves
 from ksim_rl.compiled.tape import Tape
 from ksim_rl.device.copying import copy_rows
 from ksim_rl.device.recording import recorded
@@ -28,7 +29,7 @@ class CompiledStep:
     the memory of `root_E`. The policy's leaves may lie elsewhere at each call. The constructor steps the env and then
     restores it. It raises a RuntimeError where the step cannot be recorded, or where the compiled step gives other
     numbers: the tolerance is 1e-4 relative, and more only in rows where the env's own step changes as much when its
-    inputs move by one unit in the last place.
+    inputs move by some units in the last place.
 
     With `nan_ends_rows` a row whose action is NaN ends its episode, so that resets are compared as well. For
     `by_term` see `StepCheck`.
@@ -79,6 +80,14 @@ class CompiledStep:
         Env, root and draws are left as they were.
         """
         return self._check.differences(self._run)
+
+    def given(self) -> dict[NestedKey, Tensor]:
+        """Return a copy of the policy's leaves for the last step."""
+        return {key: value.clone() for key, value in self._given.items()}
+
+    def outcome(self, given: Mapping[NestedKey, Shaped[Tensor, "*?shape"]]) -> NamedLeaves:
+        """Return all results of a step from the present state, with these leaves of the policy; nothing is changed."""
+        return self._check.outcome(self._run, given)
 
     def _run(self) -> TensorDictBase:
         self._tape()

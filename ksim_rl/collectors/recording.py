@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 from ksim_rl.collectors.compiled_step import CompiledStep
 from ksim_rl.collectors.graph_step import GraphStep
 from ksim_rl.collectors.step_check import StepCheck
+from ksim_rl.compiled.differences import equal
 from ksim_rl.compiled.python_watch import Change, listed
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.streams import waiting_allowed
@@ -176,23 +177,40 @@ class Recording:
             return
         # It is not known in which of these rollouts the change happened.
         suspects = self.unchecked_rollouts
-        if self.compiled_step is not None:
-            # Kernels that are made now agree, unless it is they that are wrong in this state: `compile` says that.
-            self._drop()
-            self.compile(root_E, act)
-            if self.compiled_step is None:
-                warnings.warn(
-                    f"they have made the last {suspects} rollouts", RuntimeWarning, stacklevel=4
-                )
-                return
         names = ", ".join(found[:3])
         if len(found) > 3:
             more = f" and {len(found) - 3} more"
         else:
             more = ""
+        if self.compiled_step is not None and self._kernels_are_wrong(root_E, act):
+            self._compiles = False
+            self._drop()
+            warnings.warn(
+                f"THE ENV'S STEP IS NOT COMPILED any more, and slower: in this state its kernels give another "
+                f"{names}{more} than the env; they have made the last {suspects} rollouts",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+            return
         raise FrozenPythonError(
             f"the env's own step gives another {names}{more} than what was recorded of it {self._rollouts} rollouts "
             f"ago, though no Python value has changed that can be seen (it may be in a file or a library): the last "
             f"{suspects} rollouts may be of what it was then. {KEEP}; {EAGER}",
             rollouts=suspects,
         )
+
+    def _kernels_are_wrong(self, root_E: TensorDictBase, act: Act) -> bool:
+        """Whether kernels that are made now from the env's Python do the same as the present ones, which they replace.
+
+        Then no Python has changed since: the kernels differ from the env in this state.
+        """
+        present = self.compiled_step
+        assert present is not None
+        given = present.given()
+        outcome = present.outcome(given)
+        self._drop()
+        self.compile(root_E, act)
+        if self.compiled_step is None:
+            # They do not even agree with the env at another action.
+            return True
+        return equal(self.compiled_step.outcome(given), outcome)

@@ -86,12 +86,12 @@ class StepCheck:
             with self._draws_forgotten():
                 found = self._results(recorded_step())
 
-            # The reference again, from inputs that are off by one unit in the last place: a row that reacts
+            # The reference again, from inputs that are off by some units in the last place: a row that reacts
             # strongly to that is chaotic, and may differ.
-            def moved(number: int) -> NamedLeaves:
+            def moved(number: int, units: int) -> NamedLeaves:
                 generator = torch.Generator().manual_seed(number)
-                self._return_to(start, partial(_nudged, generator=generator))
-                with self._draws_forgotten(), Nudging(generator):
+                self._return_to(start, partial(_nudged, generator=generator, units=units))
+                with self._draws_forgotten(), Nudging(generator, units=units):
                     env_state_E = self.own_step()
                 return self._results(env_state_E)
 
@@ -100,6 +100,20 @@ class StepCheck:
         finally:
             self._return_to(start)
         return [f"{name} in {number} rows" for name, number in rows.items()]
+
+    def outcome(
+        self,
+        recorded_step: Callable[[], TensorDictBase],
+        given: Mapping[NestedKey, Shaped[Tensor, "*?shape"]],
+    ) -> NamedLeaves:
+        """Return all results of a step from the present state, with these leaves of the policy.
+
+        Afterwards env, root, the policy's leaves and torch's random numbers are as they were.
+        """
+        with self.left_alone():
+            for key, value in given.items():
+                self.given[key].copy_(value)
+            return self._results(recorded_step())
 
     @contextmanager
     def left_alone(self) -> Iterator[None]:
@@ -146,9 +160,9 @@ class StepCheck:
         return results
 
 
-def _nudged(value: PyTree, generator: torch.Generator) -> PyTree:
+def _nudged(value: PyTree, generator: torch.Generator, units: int) -> PyTree:
     if isinstance(value, Tensor):
-        return nudged(value, generator)
+        return nudged(value, generator, units=units)
     return value
 
 

@@ -1,7 +1,8 @@
 """Names the results of a step that differ from the true ones by more than rounding can explain.
 
-A step has places where rounding decides: whether a contact begins, or a clock has run out. The true step is therefore
-repeated with its inputs and roundings moved by the smallest amount; rounding may change a row by as much as that does.
+A step has places where rounding decides: whether a contact begins, a clock has run out, or a solver stops an iteration
+earlier. The true step is therefore repeated with its inputs and roundings moved by a few units in the last place;
+rounding may change a row by as much as that does.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,20 +16,32 @@ TOLERANCE = 1e-4
 FLOOR = 1e-6
 """Errors below this share of the largest number in the same column, a few units in its last place, are accepted too."""
 ALLOWANCE = 10.0
-"""How many times the change by moved numbers an error may be: these are few samples."""
-MOST_MOVES = 16
-"""Moves before an error counts as unexplained; most are explained by the first."""
+"""How many times the change by moves of one unit an error may be: these are few samples."""
+MOVES = (1,) * 8 + (8,) * 4 + (64,) * 8
+"""Units in the last place of the moves before an error counts as unexplained; most are explained by the first.
+
+The larger ones are for rows with two outcomes, of which rounding chooses one. Of n moves of the error's own size all
+give the other outcome in one row of n + 1, which is too often for tens of thousands of rows that are compared again and
+again; a larger move crosses over every second time.
+"""
+SAME_OUTCOME = 0.25
+"""A larger move explains an error if it leaves at most this share of it: it has led to the outcome that was found."""
 
 NamedLeaves = Mapping[str, Shaped[Tensor, "*?shape"]]
 
 
 def differences(
-    found: NamedLeaves, true: NamedLeaves, *, num_rows: int, moved: Callable[[int], NamedLeaves]
+    found: NamedLeaves,
+    true: NamedLeaves,
+    *,
+    num_rows: int,
+    moved: Callable[[int, int], NamedLeaves],
 ) -> dict[str, int]:
     """Return the names of the leaves that differ, with the number of rows, in the order of `true`.
 
-    `moved(number)` gives the outcome of the true step when each number that it reads or rounds moves by one unit in its
-    last place, up or down, in another way for each `number`. Tensors whose first dim is not `num_rows` are one row.
+    `moved(number, units)` gives the outcome of the true step when each number that it reads or rounds moves by so many
+    units in its last place, up or down, in another way for each `number`. Tensors whose first dim is not `num_rows` are
+    one row.
     """
     too_far: dict[str, Tensor] = {}
     # First pass on the device: rows [rows] of each leaf that exceed the plain tolerance.
@@ -43,23 +56,42 @@ def differences(
         name: rows for (name, rows), is_one in zip(too_far.items(), is_open, strict=True) if is_one
     }
     # Second pass, only for leaves that failed: can rounding explain the error?
-    errors = {name: _error(found[name], true[name], num_rows) for name in open_rows}
-    for number in range(MOST_MOVES):
+    errors = {}
+    for name in open_rows:
+        errors[name] = _error(found[name], true[name], _scale(true[name]), num_rows)
+    for number, units in enumerate(MOVES):
         if not open_rows:
             break
         # Moves cost a step each, so they stop as soon as every row is explained.
-        other = moved(number)
+        other = moved(number, units)
         for name in list(open_rows):
-            spread = _error(other[name], true[name], num_rows)
-            # A row is explained once a single move changes it by nearly as much.
-            open_rows[name] &= errors[name] > ALLOWANCE * spread
+            scale = _scale(true[name])
+            if units == 1:
+                # A row is explained once a single move changes it by nearly as much.
+                change = _error(other[name], true[name], scale, num_rows)
+                explained = errors[name] <= ALLOWANCE * change
+            else:
+                left = _error(other[name], found[name], scale, num_rows)
+                # An infinite error is no share of itself.
+                explained = left < SAME_OUTCOME * errors[name]
+            open_rows[name] &= ~explained
             if not bool(open_rows[name].any()):
                 del open_rows[name]
     return {name: int(rows.sum()) for name, rows in open_rows.items()}
 
 
+def equal(found: NamedLeaves, true: NamedLeaves) -> bool:
+    """Whether all leaves are equal to the last bit; NaN equals NaN."""
+    assert found.keys() == true.keys()
+    return all(bool(_is_same(found[name], values).all()) for name, values in true.items())
+
+
+def _is_same(found: Tensor, true: Tensor) -> Tensor:
+    return (found == true) | (found.isnan() & true.isnan())
+
+
 def _is_too_far(found: Tensor, true: Tensor) -> Tensor:
-    same = (found == true) | (found.isnan() & true.isnan())
+    same = _is_same(found, true)
     if not true.is_floating_point():
         return ~same
     # The floor keeps a number near zero in a column of large ones from a hopeless relative bound.
@@ -68,22 +100,22 @@ def _is_too_far(found: Tensor, true: Tensor) -> Tensor:
     return ~(same | ((found - true).abs() <= allowed))
 
 
-def _error(found: Tensor, true: Tensor, num_rows: int) -> Float[Tensor, " rows"]:
-    """Return the largest error in each row, as a share of the scale of its column; infinite where only one is NaN."""
+def _error(found: Tensor, true: Tensor, scale: Tensor, num_rows: int) -> Float[Tensor, " rows"]:
+    """Return the largest error in each row, as a share of the `scale` of its column; infinite where only one is NaN."""
     if not true.is_floating_point():
         error = (found != true).float()
     else:
         # A column of zeros must not divide by zero.
-        scale = _scale(true).clamp_min(torch.finfo(true.dtype).tiny)
-        error = (found - true).abs() / scale
+        error = (found - true).abs() / scale.clamp_min(torch.finfo(true.dtype).tiny)
         # Equal infinities and NaN in the same place count as equal.
-        same = (found == true) | (found.isnan() & true.isnan())
-        error = torch.where(same, 0.0, error.nan_to_num(nan=torch.inf))
+        error = torch.where(_is_same(found, true), 0.0, error.nan_to_num(nan=torch.inf))
     return _rows(error, num_rows).amax(-1)
 
 
 def _scale(true: Tensor) -> Tensor:
     """Return the largest finite number in each column, of a tensor without rows in all of it."""
+    if not true.is_floating_point():
+        return torch.ones((), device=true.device)
     sizes = torch.where(true.isfinite(), true.abs(), 0.0)
     if true.ndim > 1:
         return sizes.amax(0, keepdim=True)

@@ -1,4 +1,4 @@
-"""Shows the effect of rounding on a result: it moves computed numbers by one unit in the last place.
+"""Shows the effect of rounding on a result: it moves computed numbers by units in the last place.
 
 A result may be far more sensitive than its size tells: 1 + cos(x) near pi keeps only the last bits of the cosine,
 which another library may round otherwise. This is the random arithmetic of Vignes, "A stochastic arithmetic for
@@ -6,6 +6,7 @@ reliable scientific computation" (1993), for torch's operators.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Shaped
@@ -25,8 +26,10 @@ ROUNDED = frozenset(_NAMES.split())
 """Operators whose results are rounded; others move numbers, compare them, or choose among them."""
 
 
-def nudged(value: Shaped[Tensor, "*shape"], generator: torch.Generator) -> Shaped[Tensor, "*shape"]:
-    """Return a tensor, each floating-point number of which has moved by one unit in the last place, up or down."""
+def nudged(
+    value: Shaped[Tensor, "*shape"], generator: torch.Generator, *, units: int = 1
+) -> Shaped[Tensor, "*shape"]:
+    """Return a tensor, each floating-point number of which has moved by `units` in the last place, up or down."""
     if not value.is_floating_point():
         return value
     # Drawn where the generator lives, on the CPU: the same directions for every device.
@@ -34,15 +37,20 @@ def nudged(value: Shaped[Tensor, "*shape"], generator: torch.Generator) -> Shape
         value.device
     )
     towards = torch.where(is_up.bool(), torch.inf, -torch.inf).to(value.dtype)
-    return torch.where(value.isfinite(), torch.nextafter(value, towards), value)
+    # A difference of neighbours is exact, and so is its product with a power of two.
+    unit = torch.nextafter(value, towards) - value
+    return torch.where(value.isfinite(), value + units * unit, value)
 
 
 class Nudging(TorchDispatchMode):
-    """Moves, within this context, each number that an operator of torch rounds; `generator` draws the directions."""
+    """Moves, within this context, each number that an operator of torch rounds, by `units` in the last place.
 
-    def __init__(self, generator: torch.Generator) -> None:
+    `generator` draws the directions.
+    """
+
+    def __init__(self, generator: torch.Generator, *, units: int = 1) -> None:
         super().__init__()
-        self._generator = generator
+        self._moved = partial(nudged, generator=generator, units=units)
 
     def __torch_dispatch__(
         self,
@@ -58,6 +66,6 @@ class Nudging(TorchDispatchMode):
             return result
         if name.endswith("_"):
             # In place: views of the tensor must see the moved numbers.
-            args[0].copy_(nudged(args[0], self._generator))
+            args[0].copy_(self._moved(args[0]))
             return result
-        return tree_map_only(Tensor, lambda value: nudged(value, self._generator), result)
+        return tree_map_only(Tensor, self._moved, result)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torchrl.envs import RewardScaling, RewardSum
 
+from ksim_rl.collectors.compiled_step import CompiledStep
 from ksim_rl.envs.recorded_python import FrozenPythonError
 from ksim_rl.envs.term import EventMode, EventTerm
 from tests.collectors.recorded_puck import Calling, Constant, collector_of, rewards_of
@@ -303,6 +304,19 @@ def test_what_an_event_does_otherwise_is_found_by_comparison():
     wind.ask.box.value = 1
     with pytest.raises(FrozenPythonError, match="another next.obs.position in 4 rows"):
         collector.collect()
+
+
+def test_kernels_that_differ_though_nothing_is_frozen_end_no_run(monkeypatch):
+    collector = collector_of(rewards={"term": Constant()})
+    before = rewards_of(collector)
+    given = CompiledStep.differences
+    found = iter([["rewards.term in 1 rows"]])
+    # The next comparison alone finds a difference; kernels that are made then agree.
+    monkeypatch.setattr(CompiledStep, "differences", lambda self: next(found, None) or given(self))
+    with pytest.warns(RuntimeWarning, match=r"NOT COMPILED any more.* another rewards\.term in 1"):
+        collector.collect()
+    assert collector.compiled_step is None
+    assert rewards_of(collector, 3) == before * 3
 
 
 def test_a_comparison_leaves_rollouts_as_they_are(monkeypatch):

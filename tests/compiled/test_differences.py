@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ksim_rl.compiled.differences import differences
+from ksim_rl.compiled.differences import MOVES, TOLERANCE, differences, equal
 
 ROWS = 1000
 
@@ -14,7 +14,7 @@ def found_in(found, true, moved=None):
         {"x": found},
         {"x": true},
         num_rows=ROWS,
-        moved=lambda _: {"x": true if moved is None else moved},
+        moved=lambda *_: {"x": true if moved is None else moved},
     )
 
 
@@ -48,7 +48,7 @@ def test_what_moved_inputs_do_to_a_row_explains_an_error_in_this_row_alone():
 def test_each_move_is_another_one():
     true, numbers = values(), []
 
-    def moved(number):
+    def moved(number, units):
         numbers.append(number)
         return {"x": with_row(true, 7, 0, 2.0) if number == 3 else true}
 
@@ -56,6 +56,49 @@ def test_each_move_is_another_one():
         differences({"x": with_row(true, 7, 0, 2.0)}, {"x": true}, num_rows=ROWS, moved=moved) == {}
     )
     assert numbers == [0, 1, 2, 3]
+
+
+def test_a_row_that_stands_at_a_border_is_explained():
+    """Contacts that begin, and solvers that stop: two outcomes, and rounding crosses from one to the other."""
+    # The last places of each row's input, as multiples of a unit; the recorded step rounds by one unit more.
+    generator = torch.Generator().manual_seed(0)
+    margin = torch.rand(ROWS, generator=generator)
+    true, found = torch.zeros(ROWS, 1), torch.ones(ROWS, 1)
+
+    def moved(number, units):
+        draws = torch.Generator().manual_seed(number)
+        # Several roundings of so many units each.
+        shift = units * (torch.rand(ROWS, 4, generator=draws) - 0.5).sum(-1)
+        return {"x": (shift > margin).float()[:, None]}
+
+    assert differences({"x": found}, {"x": true}, num_rows=ROWS, moved=moved) == {}
+    # Moves of one unit leave many unexplained.
+    small = differences(
+        {"x": found}, {"x": true}, num_rows=ROWS, moved=lambda number, _: moved(number, 1)
+    )
+    assert small["x"] > ROWS / 20
+
+
+@pytest.mark.parametrize("wrong", [0.5, float("nan"), 1e30])
+def test_a_large_move_explains_no_other_outcome(wrong):
+    true = torch.zeros(ROWS, 1)
+    crossed = torch.ones(ROWS, 1)
+
+    def moved(number, units):
+        return {"x": crossed if units > 1 else true}
+
+    found = with_row(crossed, 7, 0, wrong)
+    assert differences({"x": found}, {"x": true}, num_rows=ROWS, moved=moved) == {"x": 1}
+
+
+def test_moves_stay_below_the_tolerance():
+    assert max(MOVES) * torch.finfo(torch.float32).eps < TOLERANCE / 10
+
+
+def test_equal_leaves_are_equal_to_the_last_bit():
+    true = with_row(values(), 7, 0, float("nan"))
+    assert equal({"x": true.clone()}, {"x": true})
+    assert not equal({"x": torch.nextafter(true, torch.tensor(2.0))}, {"x": true})
 
 
 @pytest.mark.parametrize(

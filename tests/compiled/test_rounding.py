@@ -23,6 +23,16 @@ def test_each_number_moves_to_a_neighbour():
     )
 
 
+def test_a_number_moves_by_so_many_units():
+    x = torch.cat([torch.randn(1000), torch.tensor([0.0, 1.0])])
+    moved = nudged(x, generator(), units=8)
+    steps = moved.view(torch.int32) - x.view(torch.int32)
+    # Powers of two have smaller units below them.
+    assert set(steps[:1000].abs().tolist()) == {8}
+    assert float(moved[-2].abs()) == 8 * 2.0**-149
+    assert float((moved[-1] - 1.0).abs()) in (8 * 2.0**-23, 8 * 2.0**-24)
+
+
 def test_whole_numbers_stay():
     whole = torch.arange(5)
     assert nudged(whole, generator()) is whole
