@@ -24,7 +24,6 @@ from benchmarks.peers import TASKS, has_mjlab
 from ksim_rl import envs
 from ksim_rl.envs import ManagerBasedRlEnv, RewardTerm
 from ksim_rl.scene.names import scalar_joint_ids
-from ksim_rl.tasks.velocity import with_memory_of_mjlab
 
 PROGRAM = Path(__file__).with_name("peer_run.py")
 MOST = 1e-3
@@ -86,7 +85,7 @@ class Replay:
     """Our env in the states of a run of mjlab's; `values` are ours by term, [T, E, ...]."""
 
     def __init__(self, task: str, record: Record) -> None:
-        cfg = with_memory_of_mjlab(envs.task(task).cfg())
+        cfg = envs.task(task).cfg()
         scene = dataclasses.replace(cfg.scene, num_envs=len(record["encoder_bias"]))
         # As many iterations as there: a few would leave other contact forces than its solver leaves.
         sim = dataclasses.replace(cfg.sim, iterations=100, ls_iterations=50)

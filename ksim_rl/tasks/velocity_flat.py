@@ -15,7 +15,6 @@ from ksim_rl.scene.robots.booster_t1 import BoosterT1
 from ksim_rl.scene.robots.own_robots import Humanoid, Quadruped
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
 from ksim_rl.scene.robots.unitree_go import UnitreeGo1, UnitreeGo2
-from ksim_rl.scene.sensors import ContactSensor
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity, velocity_training
 from ksim_rl.tasks.rough_ground import on_rough_ground
@@ -75,7 +74,7 @@ def go1_velocity_flat() -> ManagerBasedRlEnvCfg:
         UNITREE_POSE,
         # An elliptic cone with a high impratio keeps feet from creeping while they stand.
         physics=velocity.sim(cone="elliptic", impratio=10.0),
-        feet=ContactSensor(geoms=GO1_ROBOT.foot_geoms),
+        feet=velocity.feet_sensor(geoms=GO1_ROBOT.foot_geoms),
         friction=GO1_FRICTION,
         viewer=dataclasses.replace(UNITREE_VIEW, body=GO1_ROBOT.root_body),
     )
@@ -86,7 +85,7 @@ def go2_velocity_flat() -> ManagerBasedRlEnvCfg:
     return velocity.flat_cfg(
         GO2_ROBOT,
         UNITREE_POSE,
-        feet=ContactSensor(geoms=GO2_ROBOT.foot_geoms),
+        feet=velocity.feet_sensor(geoms=GO2_ROBOT.foot_geoms),
         friction={"foot_friction": velocity.foot_friction(GO2_ROBOT, low=0.3, high=1.5)},
         viewer=dataclasses.replace(UNITREE_VIEW, body=GO2_ROBOT.root_body),
     )
@@ -97,7 +96,7 @@ def quadruped_velocity_flat() -> ManagerBasedRlEnvCfg:
     return velocity.flat_cfg(
         QUADRUPED_ROBOT,
         _four_legs_pose(".*_(roll|hip)", ".*_knee"),
-        feet=ContactSensor(geoms=QUADRUPED_ROBOT.foot_geoms),
+        feet=velocity.feet_sensor(geoms=QUADRUPED_ROBOT.foot_geoms),
         foot_height=0.08,
         viewer=ViewerCfg(
             body=QUADRUPED_ROBOT.root_body, distance=1.6, elevation=-15.0, azimuth=120.0
@@ -186,7 +185,7 @@ def g1_velocity_flat() -> ManagerBasedRlEnvCfg:
         G1_POSE,
         is_biped=True,
         # Each foot is seven capsules of one subtree: one element per foot, not per geom.
-        feet=ContactSensor(subtrees=G1_ROBOT.foot_bodies),
+        feet=velocity.feet_sensor(subtrees=G1_ROBOT.foot_bodies),
         torso=torso,
         # A robot that lies on its arms needs 221 rows, more than the probe of the model finds.
         physics=dataclasses.replace(velocity.sim(), njmax=256),
@@ -201,7 +200,7 @@ def t1_velocity_flat() -> ManagerBasedRlEnvCfg:
         T1_POSE,
         is_biped=True,
         # Feet of several geoms count as one element each.
-        feet=ContactSensor(subtrees=T1_ROBOT.foot_bodies),
+        feet=velocity.feet_sensor(subtrees=T1_ROBOT.foot_bodies),
         viewer=ViewerCfg(body=T1_ROBOT.root_body, distance=3.0, elevation=-10.0, azimuth=90.0),
     )
 
@@ -212,7 +211,7 @@ def humanoid_velocity_flat() -> ManagerBasedRlEnvCfg:
         HUMANOID_ROBOT,
         HUMANOID_POSE,
         is_biped=True,
-        feet=ContactSensor(bodies=HUMANOID_ROBOT.foot_bodies),
+        feet=velocity.feet_sensor(bodies=HUMANOID_ROBOT.foot_bodies),
         torso=HUMANOID_ROBOT.torso_body,
         foot_height=0.06,
         viewer=ViewerCfg(

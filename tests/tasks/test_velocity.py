@@ -170,7 +170,7 @@ def test_feet_of_several_geoms_are_refused_before_anything_is_built():
 
 
 def test_commands_become_faster_by_stages():
-    cfg = velocity.with_memory_of_mjlab(envs.task("quadruped_velocity_flat").cfg())
+    cfg = envs.task("quadruped_velocity_flat").cfg()
     scene = dataclasses.replace(cfg.scene, num_envs=3)
     base = ManagerBasedRlEnv(dataclasses.replace(cfg, scene=scene), device="cpu")
     base.reset()
