@@ -9,7 +9,7 @@ the rest.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -22,6 +22,8 @@ from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 
 Fields = Mapping[str, bool | float | str | tuple[float, ...]]
 """Values of some fields of a term."""
+CommandRanges = Mapping[str, tuple[float, float]]
+"""Ranges that a command is drawn from, (low, high) by field."""
 
 EventMode = Literal["startup", "reset", "start", "interval", "step"]
 """When an event happens: as the env is made, at a reset, at an episode's start, after drawn times, at each step."""
@@ -143,6 +145,13 @@ class CommandTerm(Term):
         """Return the present ranges, (low, high) [2, N] in the order of `ranges`; they start at those."""
         return view.shared("ranges_2N", tuple(zip(*self.ranges.values(), strict=True)))
 
+    def bounds(self, view: EnvView, ranges: CommandRanges) -> Sequence[tuple[float, float]] | None:
+        """Return what each column may be, (low, high), if it is drawn from `ranges`; None where this is not known.
+
+        A robot that runs the policy is kept from commands beyond.
+        """
+        return None
+
     @abstractmethod
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw new targets for the rows of `mask_E`, bool [E], into `view.buffer` buffers."""
@@ -204,6 +213,10 @@ class CurriculumTerm(Term):
         """
         return {}
 
+    def command_ranges(self, step_count: int) -> Mapping[str, Sequence[CommandRanges]]:
+        """Return the other ranges that this curriculum may have given until an env step, by command."""
+        return {}
+
     @property
     def first_level(self) -> float | None:
         """The first `view.level`, if this curriculum drives it; else None."""
@@ -212,3 +225,9 @@ class CurriculumTerm(Term):
     @abstractmethod
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         """Adapt and return the level to report, float32 []; its state lives in `view.buffer(..., keep=True)`."""
+
+
+def hull(ranges: Iterable[tuple[float, float]]) -> tuple[float, float]:
+    """Return the narrowest range, (low, high), that holds all of some."""
+    lows, highs = zip(*ranges, strict=True)
+    return min(lows), max(highs)

@@ -13,6 +13,7 @@ import numpy as np
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.contract import part
 from ksim_rl.export import controls, policy
+from ksim_rl.export.described_commands import described_commands
 from ksim_rl.export.exported_transforms import (
     TaskTransforms,
     check_equal,
@@ -41,6 +42,7 @@ STANDALONE = Path(__file__).parent / "standalone"
 # Each needs only those before it, since they become one file.
 PARTS = (
     "files",
+    "commands",
     "models",
     "contacts",
     "network",
@@ -54,6 +56,7 @@ PARTS = (
 """The modules of `runner.py`, in this order."""
 LOOP_PARTS = (
     "files",
+    "commands",
     "network",
     "stages",
     "robot_link",
@@ -239,7 +242,10 @@ def _fill(
     # Before files: a term that cannot be traced is refused before minutes of work.
     traced = _traced(cfg, [str(group) for group in groups], seed, note)
     observed = [term for of_group in terms.values() for term in of_group]
-    meta = metadata(ours, observed, transforms, traced)
+    # What a curriculum had changed by then has been seen, too.
+    step_count = trained.iteration * cfg.data.rollout_length(cfg.num_envs)
+    commands = described_commands(ours, trained.cfg.task.curriculum.values(), step_count)
+    meta = metadata(ours, observed, transforms, traced, commands)
     note("writing obs.onnx")
     traced.obs.write(folder / "obs.onnx")
     names = [term["name"] for term in observed]

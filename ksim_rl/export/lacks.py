@@ -7,6 +7,7 @@ from torchrl.envs import EnvBase
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.contract import part
 from ksim_rl.export import controls
+from ksim_rl.export.described_commands import described_commands
 from ksim_rl.export.exported_transforms import sort_transforms
 from ksim_rl.export.metadata import metadata
 from ksim_rl.export.traced_task import trace_task
@@ -26,6 +27,7 @@ def say_lacks(cfg: RunCfg, env: EnvBase, note: Callable[[str], None]) -> None:
         for name in transforms.training_only:
             note(f"task.transforms.{name} acts in training only: an export leaves it out")
         traced = trace_task(ours, groups, note)
-        metadata(ours, controls.observations(ours, groups), transforms, traced)
+        commands = described_commands(ours, ours.cfg.curriculum.values(), 0)
+        metadata(ours, controls.observations(ours, groups), transforms, traced, commands)
     except ValueError as error:
         note(f"`ksim-rl export` will refuse this run: {error}")

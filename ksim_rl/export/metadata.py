@@ -25,10 +25,12 @@ def metadata(
     terms: list[Json],
     transforms: TaskTransforms,
     traced: TracedTask,
+    commands: Json,
 ) -> Json:
     """Return the description of the env, whose terms are traced.
 
-    `terms` are those that the policy observes. Raises NotDescribedError, naming the term, for an action or actuator.
+    `terms` are those that the policy observes, `commands` as by `described_commands`. Raises NotDescribedError, naming
+    the term, for an action or actuator.
     """
     cfg = ours.cfg
     view = ours.view
@@ -78,10 +80,7 @@ def metadata(
         "actions": actions,
         "action_chain": transforms.stages,
         "actuators": laws,
-        "commands": {
-            name: {"size": value.shape[-1], "kind": type(cfg.commands[name]).__name__}
-            for name, value in ours.command_manager.values.items()
-        },
+        "commands": commands,
         "contacts": {
             name: {
                 "elements": [

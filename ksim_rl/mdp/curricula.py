@@ -17,7 +17,7 @@ from torch import Tensor
 from ksim_rl import ranks
 from ksim_rl.checked import Count, Filled, NonNegative, Range, Share, WholeNumber, Within
 from ksim_rl.checks import check_in_range, check_known
-from ksim_rl.envs.term import CurriculumTerm, Fields
+from ksim_rl.envs.term import CommandRanges, CurriculumTerm, Fields
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import OfCommand, OfEntity, distance_from_origin
@@ -306,6 +306,10 @@ class CommandRangesByStage(OfCommand, CurriculumTerm):
 
     stages: Annotated[Mapping[WholeNumber, Ranges], SOME_STAGE]
 
+    def command_ranges(self, step_count: int) -> Mapping[str, Sequence[CommandRanges]]:
+        begun = [ranges for step, ranges in self.stages.items() if step <= step_count]
+        return {self.command: begun}
+
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         fields: set[str] = set()
         fields.update(*self.stages.values())
@@ -329,6 +333,10 @@ class CommandRangesByLevel(OfCommand, CurriculumTerm):
 
     start: Ranges
     end: Ranges
+
+    def command_ranges(self, step_count: int) -> Mapping[str, Sequence[CommandRanges]]:
+        # The level that was reached is not known here.
+        return {self.command: [self.start, self.end]}
 
     def _check_fields(self) -> None:
         super()._check_fields()

@@ -181,6 +181,30 @@ def test_words_that_lead_nowhere_are_said_and_change_nothing(control):
     assert lines.events[2] == "stand -> damp: operator: damp" and not machine.fault
 
 
+def test_nothing_beyond_the_ranges_of_the_training_reaches_a_policy(folder, control):
+    _, robot, machine, lines = set_up(control)
+    assert sort_words(["9 0.5", "8 0.5", "0.5 0.5", "9 0.5"], machine, 0.0) == []
+    # A stick that is held beyond the range says so once.
+    assert lines.events == [
+        "operator: twist 9 0.5: clipped to -1 -0.5 to 2 1",
+        "operator: twist 0.5 0.5",
+        "operator: twist 9 0.5: clipped to -1 -0.5 to 2 1",
+    ]
+    assert control.command["twist"].tolist() == [2.0, 0.5]
+    measurement = robot.read()
+    expected = control(measurement).pos
+    # Whoever writes it past the operator's words asks for no more.
+    control.begin()
+    control.command["twist"][:] = (9.0, 0.5)
+    assert control(measurement).pos == pytest.approx(expected)
+    runner = Runner(folder)
+    runner.step(runner.act(), {"twist": np.array([2.0, 0.5])})
+    with pytest.raises(ValueError, match="'twist': 9 0.5: expected -1 -0.5 to 2 1"):
+        runner.step(runner.act(), {"twist": np.array([9.0, 0.5])})
+    with pytest.raises(ValueError, match="command 'speed': expected one of"):
+        runner.step(runner.act(), {"speed": np.array([9.0, 0.5])})
+
+
 def test_an_operator_changes_the_command(control):
     _, _, machine, lines = set_up(control)
     assert sort_words(["0.5 -0.25", "stop"], machine, 0.0) == ["stop"]

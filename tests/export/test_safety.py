@@ -268,6 +268,7 @@ def test_wrong_options_are_refused(make, said):
         (["--simulate"], "--simulate and --hang are of the simulated robot"),
         (["--seconds", "nan"], "--seconds nan: expected 0 or more"),
         (["--command", "0", "nan"], "--command 0.0 nan: expected finite numbers"),
+        (["--command", "9", "0"], "command 'twist': 9 0: expected -1 -0.5 to 2 1"),
         (["--plan", "p.csv", "--command", "0"], "--command: a plan follows none"),
         (["--plan", "p.csv", "--seconds", "3"], "--seconds: a plan says itself"),
         (["--plan", "p.csv", "--dry-run"], "--dry-run: a plan has no policy"),

@@ -317,6 +317,13 @@ def test_the_loop_in_cpp_compiles(tmp_path):
 
 
 @pytest.mark.full
+def test_recorded_commands_are_within_the_ranges_of_the_folder(quadruped):
+    commands = read_arrays(quadruped / "episodes.npz")["command/twist"].reshape(-1, 3)
+    spec = json.loads((quadruped / "export.json").read_text())["commands"]["twist"]
+    assert (commands >= np.array(spec["low"]) - 1e-6).all()
+    assert (commands <= np.array(spec["high"]) + 1e-6).all() and np.ptp(commands[:, 0]) > 0.1
+
+
 def test_an_unbroken_quadruped_differs_in_nothing(quadruped):
     assert report_of(quadruped).causes == []
 

@@ -153,7 +153,7 @@ def _meta(sizes):
             {"kind": "low_pass", "alpha": 0.8, "initial": None},
         ],
         "actuators": [{"joints": JOINTS, "actuators": JOINTS, **servo, **gears}],
-        "commands": {"twist": {"size": 2, "kind": "toy"}},
+        "commands": {"twist": {"size": 2, "kind": "toy", "low": [-1.0, -0.5], "high": [2.0, 1.0]}},
         "contacts": {},
         "obs": {"output": "obs", "measurements": measurements, "states": []},
         "scores": None,

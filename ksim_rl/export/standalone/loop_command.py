@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ksim_rl.export.standalone.commands import as_words
 from ksim_rl.export.standalone.deadlines import MonotonicClock
 from ksim_rl.export.standalone.dry_run import DryRun, HeardRobot
 from ksim_rl.export.standalone.files import Json, read_json
@@ -33,7 +34,7 @@ from ksim_rl.export.standalone.loop import (
 )
 from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.policy_control import PolicyControl
-from ksim_rl.export.standalone.robot_link import Robot
+from ksim_rl.export.standalone.robot_link import Control, Robot
 from ksim_rl.export.standalone.safety import Limits, option_of, unguarded
 from ksim_rl.export.standalone.states import State, StateMachine, Times
 from ksim_rl.export.standalone.words import (
@@ -163,7 +164,7 @@ def drive(
     heard = _operators(options, plan, operators)
     calm_python()
     priority = ask_for_real_time() if options.real_time else "no real-time priority: not asked for"
-    for line in [priority, *unguarded(driver.joints, first)]:
+    for line in [priority, *unguarded(driver.joints, first), *_said_of_commands(driver)]:
         journal.event(clock.now(), line)
     try:
         punctuality = run_loop(robot, machine, heard, journal, clock=clock, period=period)
@@ -258,9 +259,21 @@ def _set_command(control: PolicyControl, values: Sequence[float] | None) -> None
     for name, command in control.command.items():
         if len(values) != len(command):
             raise ValueError(f"--command: {len(values)} numbers: {name} has {len(command)}")
+        control.ranges[name].check(np.array(values))
         command[:] = values
         return
     raise ValueError("--command: this policy takes no command")
+
+
+def _said_of_commands(control: Control) -> list[str]:
+    """Return a line for each command: what it is at first, and what it may be."""
+    lines = []
+    for name, values in control.command.items():
+        allowed = control.ranges[name]
+        # No zero may be among what the policy has seen, as for the place where a hand should be.
+        values[:] = allowed.clip(values)
+        lines.append(f"command {name}: {as_words(values)}, of {allowed}")
+    return lines
 
 
 def _tell(summary: Json, failure: str) -> None:

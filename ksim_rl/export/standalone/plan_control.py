@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ksim_rl.export.standalone.commands import CommandRange
 from ksim_rl.export.standalone.files import Array, Json, read
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
 
@@ -19,6 +20,7 @@ class PlanControl:
     def __init__(self, meta: Json, path: Path) -> None:
         self.joints = DescribedJoints(meta)
         self.command: dict[str, Array] = {}
+        self.ranges: dict[str, CommandRange] = {}
         columns = _columns(path)
         time = columns.get("time", np.zeros(0))
         steps = np.diff(time)

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, Json, check_count
+from ksim_rl.export.standalone.commands import command_ranges
+from ksim_rl.export.standalone.files import Array, Json
 from ksim_rl.export.standalone.network import Network, Policy
 from ksim_rl.export.standalone.robot_link import (
     DOWN,
@@ -38,9 +39,10 @@ class PolicyControl:
         self.joints = DescribedJoints(meta)
         self.observe = Network(folder / "obs.onnx", meta["obs"]["states"], meta["obs"]["output"])
         self.policy = Policy(folder, meta)
+        self.ranges = command_ranges(meta)
         self.command: dict[str, Array] = {}
-        for name, spec in meta["commands"].items():
-            self.command[name] = np.zeros(check_count(f"commands.{name}.size", spec["size"]))
+        for name, allowed in self.ranges.items():
+            self.command[name] = np.zeros(allowed.size)
         self.estimated: list[str] = []
         self.of_root: set[str] = set()
         self.sources: dict[str, Reading] = {}
@@ -120,7 +122,8 @@ class PolicyControl:
             return self._of_root(quantity, node.get("frame", "root"))
         if quantity == "command":
             name = node["command"]
-            return lambda _: self.command[name]
+            # Whatever a stick says, the policy reads what it has seen.
+            return lambda _: self.ranges[name].clip(self.command[name])
         if quantity == "default_joint_pos":
             default = self.joints.default_pos[self.joints.columns(node["joints"])]
             return lambda _: default

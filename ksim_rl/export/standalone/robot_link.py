@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ksim_rl.export.standalone.commands import CommandRange
 from ksim_rl.export.standalone.files import Array, Json
 
 
@@ -90,10 +91,14 @@ class DescribedJoints:
 
 
 class Control(Protocol):
-    """What asks the motors for something once the robot stands; `command` is what an operator may change."""
+    """What asks the motors for something once the robot stands.
+
+    `command` is what an operator may change; what is beyond its `ranges` is clipped.
+    """
 
     joints: DescribedJoints
     command: dict[str, Array]
+    ranges: dict[str, CommandRange]
 
     def begin(self) -> None:
         """Begin an episode."""

@@ -207,7 +207,20 @@ class Runner(Signals):
     def step(
         self, action: Array, command: dict[str, Array] | None = None, *, observes: bool = True
     ) -> Json:
-        """Run one env step; return rewards by term, metrics and the ending. `command` holds from the next frame on."""
+        """Run one env step; return rewards by term, metrics and the ending. `command` holds from the next frame on.
+
+        A command beyond the ranges of the training is refused by a ValueError.
+        """
+        for name, values in (command or {}).items():
+            if name not in self.ranges:
+                raise ValueError(f"command {name!r}: expected one of {sorted(self.ranges)}")
+            self.ranges[name].check(values)
+        return self._run_step(action, command, observes=observes)
+
+    def _run_step(
+        self, action: Array, command: dict[str, Array] | None, *, observes: bool = True
+    ) -> Json:
+        """Run one env step, with a recorded command or a checked one."""
         # Stages of the chain hold memory: run each of them once per env step.
         for change in self.chain:
             action = change(action)
@@ -285,7 +298,7 @@ class Runner(Signals):
         while not result["done"] and self.steps < (self.limit or 1000):
             action = self.act()
             self._push(record, number, self.steps)
-            result = self.step(action, self._commands(record, number, self.steps + 1))
+            result = self._run_step(action, self._commands(record, number, self.steps + 1))
             now = {f"reward/{name}": value for name, value in result["rewards"].items()}
             now |= {f"metric/{name}": value for name, value in result["metrics"].items()}
             for name, tracker in self.contacts.items():
@@ -328,7 +341,9 @@ class Runner(Signals):
             frame = self.observe() if t else self.frame
             action = self.policy(trace["obs"][t] if trace["obs"].shape[1] == len(frame) else frame)
             self._push(record, number, t)
-            self.step(trace["action"][t], self._commands(record, number, t + 1), observes=False)
+            self._run_step(
+                trace["action"][t], self._commands(record, number, t + 1), observes=False
+            )
             target = [self.targets[kind][name] for kind in KINDS for name in self.joints]
             now = {
                 "obs": frame,

@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from ksim_rl.export.standalone.commands import command_ranges
 from ksim_rl.export.standalone.contacts import Contacts
 from ksim_rl.export.standalone.files import Array, Json, check_count, read_json
 from ksim_rl.export.standalone.models import read_model
@@ -198,10 +199,10 @@ class Signals:
         # Errors of joint encoders, rad, which a recorded start may set.
         self.bias = dict.fromkeys(names, 0.0)
         # Commands are zero until the caller gives one.
-        sizes = {
-            n: check_count(f"commands.{n}.size", c["size"]) for n, c in meta["commands"].items()
-        }
-        self.command: dict[str, Array] = {name: np.zeros(size) for name, size in sizes.items()}
+        self.ranges = command_ranges(meta)
+        self.command: dict[str, Array] = {}
+        for name, allowed in self.ranges.items():
+            self.command[name] = np.zeros(allowed.size)
         self.contacts = {
             name: Contacts(spec, model, self.decimation) for name, spec in meta["contacts"].items()
         }

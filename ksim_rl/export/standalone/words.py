@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import Protocol, TextIO
 
+import numpy as np
+
 from ksim_rl.export.standalone.plan_control import PlanControl
 from ksim_rl.export.standalone.states import State, StateMachine
 
@@ -146,6 +148,11 @@ def sort_words(said: Sequence[str], machine: StateMachine, now: float) -> list[s
         if first is None or len(values) != wanted or not is_finite:
             machine.note(now, f"operator: {line!r}: expected {wanted} numbers")
             continue
-        commands[first][:] = values
-        machine.note(now, f"operator: {first} {line}")
+        allowed = machine.control.ranges[first]
+        clipped = allowed.clip(np.array(values))
+        # A stick that is held beyond the range says so once.
+        if not np.array_equal(clipped, commands[first]):
+            beyond = "" if np.array_equal(clipped, values) else f": clipped to {allowed}"
+            machine.note(now, f"operator: {first} {line}{beyond}")
+        commands[first][:] = clipped
     return found

@@ -1,6 +1,7 @@
 """The command that sets the rhythm of a gait."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -9,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checked import Filled, NonNegativeRange
-from ksim_rl.envs.term import CommandTerm
+from ksim_rl.envs.term import CommandRanges, CommandTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
@@ -43,6 +44,9 @@ class SinusoidalGaitCommand(CommandTerm):
         offsets_F = constant(self.offsets, view.device)
         angle_EF = 2.0 * math.pi * (self._cycles(view)[:, None] + offsets_F)
         return torch.cat((torch.sin(angle_EF), torch.cos(angle_EF)), dim=-1)
+
+    def bounds(self, view: EnvView, ranges: CommandRanges) -> Sequence[tuple[float, float]]:
+        return [(-1.0, 1.0)] * (2 * len(self.offsets))
 
     def draw_debug(self, view: EnvView, visualizer: DebugVisualizer, env_index: int) -> None:
         """Write which feet should be in the air above the first robot's root: a 1 or a 0 for each."""

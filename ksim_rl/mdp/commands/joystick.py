@@ -1,6 +1,6 @@
 """The command that is set from outside."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checked import Filled, NonNegativeRange, Range
-from ksim_rl.envs.term import CommandTerm
+from ksim_rl.envs.term import CommandRanges, CommandTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.scene.rendering.visualizer import DebugVisualizer
 
@@ -39,6 +39,9 @@ class JoystickCommand(CommandTerm):
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
         return self.axes
+
+    def bounds(self, view: EnvView, ranges: CommandRanges) -> Sequence[tuple[float, float]]:
+        return list(ranges.values())
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw nothing: the values that were set stay."""

@@ -1,7 +1,7 @@
 """Commands that ask for poses of a root, joints, a body or a site."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checked import NonNegativeRange, Range
-from ksim_rl.envs.term import CommandTerm
+from ksim_rl.envs.term import CommandRanges, CommandTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.fields import InFrame, OfEntity, root_height
 from ksim_rl.scene import quaternion
@@ -114,6 +114,9 @@ class BaseHeightCommand(OfEntity, HeldCommand):
 
     height: Range
 
+    def bounds(self, view: EnvView, ranges: CommandRanges) -> Sequence[tuple[float, float]]:
+        return list(ranges.values())
+
     def held(self, view: EnvView) -> Float[Tensor, "E 1"]:
         return view.buffer("height_E1", 1)
 
@@ -139,6 +142,17 @@ class JointPositionCommand(HeldCommand):
 
     joints: Patterns
     offset: Range
+
+    def bounds(self, view: EnvView, ranges: CommandRanges) -> Sequence[tuple[float, float]]:
+        joints = view.joints(self.joints)
+        limits_N2 = joints.soft_limits_L2
+        # The model's own pose: events may draw others around it.
+        default_N = view.default_qpos_L[joints.qpos]
+        ends = []
+        for end in ranges["offset"]:
+            within_N = torch.clamp(default_N + end, limits_N2[:, 0], limits_N2[:, 1])
+            ends.append(within_N.tolist())
+        return list(zip(*ends, strict=True))
 
     def held(self, view: EnvView) -> Float[Tensor, "E N"]:
         return view.buffer("pos_EN", len(view.joints(self.joints)))
@@ -179,6 +193,13 @@ class CartesianCommand(InFrame, HeldCommand):
         # An orientation is drawn as three angles, but held as a quaternion of four numbers.
         axes = _AXES[: 3 if self.orientation is None else 6]
         return {axis: given.get(axis, (0.0, 0.0)) for axis in axes}
+
+    def bounds(self, view: EnvView, ranges: CommandRanges) -> Sequence[tuple[float, float]]:
+        position = list(ranges.values())[:3]
+        if self.orientation is None:
+            return position
+        # The four numbers of a quaternion.
+        return [*position, *[(-1.0, 1.0)] * 4]
 
     def held(self, view: EnvView) -> Float[Tensor, "E K"]:
         return view.buffer("target_EK", 3 if self.orientation is None else 7)

@@ -1,6 +1,7 @@
 """The command of a root's planar velocity."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ksim_rl.checked import NonNegative, Range, Share
-from ksim_rl.envs.term import CommandTerm
+from ksim_rl.envs.term import CommandRanges, CommandTerm, hull
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import OfEntity
@@ -81,6 +82,31 @@ class UniformVelocityCommand(OfEntity, CommandTerm):
         held_E2 = self._kind(view)
         held_E4.copy_(torch.where(mask_E[:, None], drawn_E4, held_E4))
         held_E2.copy_(torch.where(mask_E[:, None], is_kind_E3[:, :2], held_E2))
+
+    def bounds(self, view: EnvView, ranges: CommandRanges) -> Sequence[tuple[float, float]]:
+        columns = [[ranges[name]] for name in VELOCITY[:3]]
+        if self.rel_standing_envs > 0.0:
+            for pairs in columns:
+                pairs.append((0.0, 0.0))
+        if self.rel_forward_envs > 0.0:
+            columns[0].append(self._forward_speeds(*ranges["lin_vel_x"]))
+            for pairs in columns[1:]:
+                pairs.append((0.0, 0.0))
+        if self.rel_world_envs > 0.0:
+            # Turned by any heading.
+            corner = [max(map(abs, ranges[name])) for name in VELOCITY[:2]]
+            speed = math.hypot(*corner)
+            for pairs in columns[:2]:
+                pairs.append((-speed, speed))
+        return [hull(pairs) for pairs in columns]
+
+    def _forward_speeds(self, low: float, high: float) -> tuple[float, float]:
+        """Return the least and the greatest speed of forward envs, for a range of vx."""
+        ends = sorted((abs(low), abs(high)))
+        if low <= 0.0 <= high:
+            ends[0] = 0.0
+        slowest, fastest = (max(end, self.forward_min_speed) for end in ends)
+        return slowest, fastest
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E 3"]:
         target_E4 = self._target(view)

@@ -4,6 +4,7 @@ Its file `reorient.py` is the source of all formulas.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,14 @@ from torch.nn.functional import normalize
 from ksim_rl import mdp
 from ksim_rl.checked import NonNegativeRange, Positive, Range, Share
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-from ksim_rl.envs.term import CommandTerm, MetricTerm, ObservationTerm, Reduction, RewardTerm
+from ksim_rl.envs.term import (
+    CommandRanges,
+    CommandTerm,
+    MetricTerm,
+    ObservationTerm,
+    Reduction,
+    RewardTerm,
+)
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant
 from ksim_rl.mdp.fields import OfCommand, OfSensor
@@ -64,6 +72,9 @@ class GoalOrientation(CommandTerm):
     turn: Range = (2.0, 10.0)
     decay: Share = 0.8
     resampling_time_range_s: NonNegativeRange | None = None
+
+    def bounds(self, view: EnvView, ranges: CommandRanges) -> Sequence[tuple[float, float]]:
+        return [(-1.0, 1.0)] * 4
 
     def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Draw an orientation; its turn and its count of steps are zero in rows that reset."""
