@@ -8,13 +8,14 @@ import torch
 from ksim_rl.checks import OneLineParser, check_count
 from ksim_rl.cli.errors import say
 from ksim_rl.cli.report import shown, shown_working
-from ksim_rl.data import read_episodes
+from ksim_rl.data import check_lerobot, read_episodes, write_lerobot
 from ksim_rl.terminal import show
 from ksim_rl.trainers.collecting import CollectCfg, collect_episodes
 from ksim_rl.viewer.played import find
 from ksim_rl.viewer.session import AGENTS
 
 FOLDER = Path("datasets")
+LEROBOT = "lerobot"
 MOST_ENVS = 64
 
 
@@ -27,6 +28,9 @@ def collect(arguments: list[str]) -> int:
     else:
         check_count("--num-envs", options.num_envs)
         num_envs = options.num_envs
+    if options.lerobot:
+        # Before anything is recorded.
+        check_lerobot()
     how = CollectCfg(
         num_episodes=options.episodes,
         num_envs=num_envs,
@@ -42,6 +46,8 @@ def collect(arguments: list[str]) -> int:
         contents, interrupt = collect_episodes(
             played.cfg, played.policy, folder, how, title=played.title, note=say
         )
+        if options.lerobot and contents.num_episodes:
+            write_lerobot(folder, folder / LEROBOT)
     if contents.num_episodes:
         show(f"{played.title}: {_summary(folder)}; {shown(folder)}")
     if interrupt.signal is None:
@@ -98,5 +104,10 @@ def _parser() -> OneLineParser:
     parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     parser.add_argument(
         "--output", type=Path, help=f"a new folder; default: {FOLDER}/TASK/<date>_<time>"
+    )
+    parser.add_argument(
+        "--lerobot",
+        action="store_true",
+        help=f"also write them as a dataset of LeRobot, into the subfolder {LEROBOT}",
     )
     return parser

@@ -1,5 +1,6 @@
 """`ksim-rl collect` writes the episodes that a policy has in its env, as many of each env, and says how they were."""
 
+import json
 import os
 import signal
 
@@ -30,7 +31,7 @@ def run(*words):
 def collected(tmp_path_factory):
     folder = tmp_path_factory.mktemp("work") / "episodes"
     words = ("--episodes", "5", "--num-envs", "2", "--seed", "3", "--output", str(folder))
-    assert run(*TASK, *words) == 0
+    assert run(*TASK, *words, "--lerobot") == 0
     return folder
 
 
@@ -65,6 +66,12 @@ def test_the_folder_tells_where_it_came_from(collected):
     session = record.read(collected)[-1]
     assert session.status == "done"
     assert "torch" in session.versions
+
+
+def test_it_is_a_dataset_of_lerobot_too(collected):
+    info = json.loads((collected / "lerobot" / "meta" / "info.json").read_text())
+    assert (info["total_episodes"], info["total_frames"], info["fps"]) == (5, 100, 100)
+    assert info["features"]["observation.state"]["shape"] == [5]
 
 
 def test_an_interrupted_recording_says_what_is_whole(tmp_path, monkeypatch, capsys):
