@@ -31,7 +31,7 @@ usage: ksim-rl <command> [arguments]
   zoo      list those that come along:   ksim-rl zoo; ksim-rl play zoo:reacher
   runs     list runs, with return and speed:  ksim-rl runs [FOLDER]
   compare  a table and a picture:   ksim-rl compare RUN1 RUN2
-  export   a folder that runs elsewhere:  ksim-rl export RUN
+  export   a folder that runs elsewhere:  ksim-rl export RUN, or zoo:go1
   sim2sim  run it on MuJoCo's C engine:   ksim-rl sim2sim RUN/export --episodes 100
   card     what a policy keeps under other conditions:  ksim-rl card zoo:go1 --episodes 32
   identify the numbers of a robot's joints, from a log:  ksim-rl identify LOG.csv --robot go2
@@ -68,7 +68,7 @@ COMMANDS = {
     "zoo": "ksim_rl.zoo.command:zoo",
     "runs": "ksim_rl.cli.runs:runs",
     "compare": "ksim_rl.cli.runs:compare",
-    "export": "ksim_rl.export.sim2sim:run_export",
+    "export": "ksim_rl.cli.export:run_export",
     "sim2sim": "ksim_rl.export.sim2sim:run_sim2sim",
     "card": "ksim_rl.transfer.command:card",
     "identify": "ksim_rl.identification.command:identify",

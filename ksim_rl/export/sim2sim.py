@@ -1,4 +1,4 @@
-"""The commands `ksim-rl export` and `ksim-rl sim2sim`, and the report of the second one."""
+"""The command `ksim-rl sim2sim`, and its report."""
 
 import json
 import tempfile
@@ -13,7 +13,7 @@ import numpy as np
 from ksim_rl.checks import MISFITS, OneLineParser
 from ksim_rl.config.child_processes import run_python
 from ksim_rl.export.causes import Cause, find_causes
-from ksim_rl.export.folder import export, runner_source
+from ksim_rl.export.folder import runner_source
 from ksim_rl.export.standalone.files import Json, check_closed, lacking, read_arrays, read_json
 from ksim_rl.physics import load_spec
 from ksim_rl.terminal import printable, show
@@ -200,37 +200,6 @@ def ratio_error(ours: np.ndarray, theirs: np.ndarray) -> float:
     left = theirs - ours * theirs.mean() / mean
     spread_of_mean = np.std(left, ddof=1) / np.sqrt(len(ours))
     return float(spread_of_mean / abs(mean))
-
-
-def run_export(arguments: Sequence[str]) -> int:
-    """Run `ksim-rl export RUN`."""
-    parser = OneLineParser(
-        prog="ksim-rl export",
-        description="Write a policy into a folder that runs without this library.",
-    )
-    parser.add_argument(
-        "run", type=Path, metavar="RUN", help="a run folder, or one of its checkpoints"
-    )
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help="default: export in the run folder"
-    )
-    parser.add_argument(
-        "--episodes", type=int, default=100, help="to record for sim2sim; 0 for none"
-    )
-    parser.add_argument(
-        "--seed", type=int, help="of the recorded episodes; default: the seed of evaluations"
-    )
-    parser.add_argument(
-        "--device", default="cpu", help="of the recorded episodes: cpu, cuda or auto"
-    )
-    parser.add_argument(
-        "--no-noise", dest="noise", action="store_false", help="record without sensors' noise"
-    )
-    options: Any = parser.parse_args(arguments)
-    how = {"episodes": options.episodes, "seed": options.seed, "noise": options.noise}
-    folder = export(options.run, options.output, device=options.device, **how)
-    show(f"{folder}: see README.md in it; next: ksim-rl sim2sim {folder}")
-    return 0
 
 
 def run_sim2sim(arguments: Sequence[str]) -> int:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from ksim_rl.cli import export as cli_export
 from ksim_rl.cli.main import main
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.loggers import WandbCfg
@@ -58,6 +59,35 @@ def test_one_is_copied_into_a_run_folder(tmp_path, monkeypatch):
     assert "copied to runs/zoo" in said[0]
     assert locate(f"zoo:{NAMES[0]}", note=said.append) == copy
     assert locate("runs/mine") == Path("runs/mine")
+
+
+@pytest.mark.full
+def test_one_is_exported_by_its_name(tmp_path, monkeypatch):
+    pytest.importorskip("onnxscript", reason="needs the extra: pip install ksim_rl[export]")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="^0$"):
+        main(["export", "zoo:cartpole", "--episodes", "0"])
+    meta = json.loads(Path("runs/zoo/cartpole/export/export.json").read_text())
+    card = read_card("cartpole")
+    assert meta["commit"] == card.commit and meta["iteration"] == card.iteration
+    assert meta["task"] == card.task
+
+
+def test_an_export_finds_its_policy_by_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    asked = []
+
+    def note(run, folder, *, origin, **_):
+        asked.append((run, checkpoint.load_latest(run).iteration, origin))
+        return Path("export")
+
+    monkeypatch.setattr(cli_export, "export", note)
+    for words, code in ((["zoo:cartpole"], 0), (["runs/zoo/cartpole"], 0), (["zoo:cartpol"], 2)):
+        with pytest.raises(SystemExit, match=f"^{code}$"):
+            main(["export", *words])
+    card = read_card("cartpole")
+    run = Path("runs/zoo/cartpole")
+    assert asked == [(run, card.iteration, {"commit": card.commit}), (run, card.iteration, {})]
 
 
 @pytest.fixture
