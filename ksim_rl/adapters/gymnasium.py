@@ -1,7 +1,7 @@
 """Shows an env as Gymnasium's `VectorEnv` or `Env`, with NumPy arrays or with tensors that stay on the device."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Sequence
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -11,7 +11,15 @@ from torchrl.envs import EnvBase
 
 from ksim_rl import envs
 from ksim_rl.adapters.spaces import finite, space_of
-from ksim_rl.adapters.stepper import Autoreset, Infos, Keys, Observations, Stepper, to_numpy
+from ksim_rl.adapters.stepper import (
+    Autoreset,
+    Infos,
+    Keys,
+    Observations,
+    Shown,
+    Stepper,
+    to_numpy,
+)
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs.contract import EpisodeClock, part
 
@@ -30,8 +38,7 @@ MODES: dict[AutoresetMode, Autoreset] = {
     AutoresetMode.DISABLED: "disabled",
 }
 
-Shown: TypeAlias = Any
-"""One array of observations, or a dict of them by name; NumPy's, or torch's on the env's device."""
+Array = TypeVar("Array", np.ndarray, Tensor)
 Signal: TypeAlias = Shaped[np.ndarray, " E"] | Shaped[Tensor, " E"]
 """A reward or a flag of each env."""
 
@@ -134,7 +141,9 @@ class GymnasiumVectorEnv(VectorEnv):
         self.env.close()
 
     def _out(self, obs: Observations) -> Shown:
-        return self._names.out(obs if self.tensors else to_numpy(obs))
+        if self.tensors:
+            return self._names.out(obs)
+        return self._names.out(to_numpy(obs))
 
     def _reset_rows(self, seed: Any, options: dict[str, Any]) -> Shown:
         mask = torch.as_tensor(options.pop("reset_mask"))
@@ -231,7 +240,7 @@ class _Names:
         self._single = next(iter(boxes)) if len(boxes) == 1 else None
         self.space = spaces.Dict(boxes) if self._single is None else boxes[self._single]
 
-    def out(self, obs: Mapping[str, Shown]) -> Shown:
+    def out(self, obs: dict[str, Array]) -> Array | dict[str, Array]:
         """Return the one observation, or all by name."""
         return obs if self._single is None else obs[self._single]
 

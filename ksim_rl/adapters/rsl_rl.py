@@ -70,9 +70,7 @@ class RslRlVecEnv(VecEnv):
         """Step all envs; rows that ended come back with the first observation of their next episode."""
         step = self._stepper.step(action_EL)
         # A row that also failed has no value to bootstrap.
-        extras: dict[str, Tensor | dict[str, Tensor]] = {
-            "time_outs": step.truncated_E & ~step.terminated_E
-        }
+        extras: Infos = {"time_outs": step.truncated_E & ~step.terminated_E}
         self._steps += 1
         # Rarely, as figures are read back from the device.
         if self._steps % self._log_interval == 0:

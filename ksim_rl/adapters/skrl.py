@@ -96,7 +96,7 @@ class SkrlWrapper(Wrapper):
         step = self._stepper.step(self._stepper.as_action(actions))
         self._current = step.obs
         # The states reached, since `obs` of an ended row is of its next episode.
-        infos = {"final_obs": self._joined(step.final_obs, self._observed)}
+        infos: Infos = {"final_obs": self._joined(step.final_obs, self._observed)}
         flags = (step.reward_E, step.terminated_E, step.truncated_E)
         # skrl wants a column for each of them.
         reward_E1, terminated_E1, truncated_E1 = (flag.unsqueeze(-1) for flag in flags)

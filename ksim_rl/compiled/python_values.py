@@ -30,8 +30,9 @@ _CHANGES_BY_ITSELF = frozenset({"last_root"})
 _ITERATORS = ("builtins", "itertools")
 
 Values = Mapping[Any, Any]
-# An object whose Python a step runs: a term, a transform, a network. All kinds are looked into.
-Part: TypeAlias = Any
+# An object whose Python a step runs: a term, a transform, a network. All kinds are looked into, so that nothing is
+# known of one beforehand.
+Part: TypeAlias = object
 Parts: TypeAlias = Mapping[str, Part]
 
 

@@ -9,7 +9,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
 from ksim_rl.compiled.python_states import PLAIN
-from ksim_rl.compiled.python_values import Listed, Part, attributes_of
+from ksim_rl.compiled.python_values import Listed, Part, Parts, attributes_of
 from ksim_rl.compiled.python_watch import Change
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
@@ -102,12 +102,12 @@ def _leaves(transform: Any) -> list[Transform]:
     return [leaf for part in transform.transforms for leaf in _leaves(part)]
 
 
-def _of_wrapper(wrapper: TransformedEnv) -> dict[str, Part]:
+def _of_wrapper(wrapper: TransformedEnv) -> Parts:
     own = {name: value for name, value in attributes_of(wrapper).items() if name != _KEYS_OF_SPECS}
     return own | {"transform": wrapper.transform}
 
 
-def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Part]:
+def _of_managers(env: ManagerBasedRlEnv) -> Parts:
     """Return the objects that call the terms of an env, and the values other than tensors that they read."""
     driver = env.driver
     parts = {
@@ -126,7 +126,7 @@ def _of_managers(env: ManagerBasedRlEnv) -> dict[str, Part]:
     return parts
 
 
-def _of_env(env: ManagerBasedRlEnv) -> dict[str, Part]:
+def _of_env(env: ManagerBasedRlEnv) -> Parts:
     # The config is a separate part, since most of its fields are read once.
     left_out = ("cfg", _KEYS_OF_SPECS)
     own = {name: value for name, value in attributes_of(env).items() if name not in left_out}
@@ -134,19 +134,19 @@ def _of_env(env: ManagerBasedRlEnv) -> dict[str, Part]:
     return own | {"cfg.decimation": env.cfg.decimation}
 
 
-def _read_once(env: ManagerBasedRlEnv) -> dict[str, Part]:
+def _read_once(env: ManagerBasedRlEnv) -> Parts:
     """Return the fields of the config that are read while the env is built; seeds are given it later, too."""
     names = {field.name for field in fields(env.cfg)} - {"decimation", "seed", "viewer"}
     return {name: getattr(env.cfg, name) for name in sorted(names)}
 
 
-def _public(owner: Part) -> dict[str, Part]:
+def _public(owner: Part) -> Parts:
     return {name: value for name, value in _without_caches(owner).items() if name[0] != "_"}
 
 
-def _without_caches(owner: Part) -> dict[str, Part]:
+def _without_caches(owner: Part) -> Parts:
     return {name: value for name, value in vars(owner).items() if name not in _CACHES}
 
 
-def _plain(owner: Part) -> dict[str, Part]:
+def _plain(owner: Part) -> Parts:
     return {name: value for name, value in vars(owner).items() if issubclass(type(value), PLAIN)}

@@ -56,6 +56,13 @@ class FusedDataset:
         self.obs = torch.zeros(2, rows, layout.stored, dtype=dtype, device=device)
         self.records = torch.zeros(rows, 3 * layout.out + 8, device=device)
         self._signals = torch.zeros(4, size, device=device)
+        # Which env states take no part, of the actor and the critic; and how many next observations are listed.
+        self._faults = torch.zeros(2, rows, dtype=torch.int8, device=device)
+        self._count = torch.zeros(1, dtype=torch.int32, device=device)
+        places = torch.zeros(size, dtype=torch.int32, device=device)
+        # Powers of two, over the columns of an observation and of a record.
+        self._lanes = power_of_two(layout.stored)
+        self._record_lanes = power_of_two(self.records.shape[1])
         # The arguments of kernels, by the names of their parameters.
         self._arguments: dict[str, Argument] = {
             **dict(
@@ -66,22 +73,22 @@ class FusedDataset:
             "records": self.records,
             "num_obs": rows,
             "size": size,
-            "faults": torch.zeros(2, rows, dtype=torch.int8, device=device),
+            "faults": self._faults,
             "known": self.obs[1],
-            "places": torch.zeros(size, dtype=torch.int32, device=device),
-            "count": torch.zeros(1, dtype=torch.int32, device=device),
+            "places": places,
+            "count": self._count,
             "gamma": cfg.gamma,
             "decay": cfg.gamma * cfg.lmbda,
             "min_advantage_std": cfg.min_advantage_std,
-            "LANES": power_of_two(layout.stored),
+            "LANES": self._lanes,
             "RECORD": self.records.shape[1],
-            "RECORD_LANES": power_of_two(self.records.shape[1]),
+            "RECORD_LANES": self._record_lanes,
             "TF32": tf32,
             "STANDARDIZED": cfg.normalize_advantage == "dataset",
         }
-        self.listed = {
-            name: self._arguments[name] for name in ("places", "count") if layout.chained
-        }
+        self.listed: dict[str, Tensor] = {}
+        if layout.chained:
+            self.listed = {"places": places, "count": self._count}
 
     @torch.no_grad()
     def read(
@@ -93,7 +100,7 @@ class FusedDataset:
         """
         # First the observations, which are normalized by the statistics that the rollout was collected with.
         for part_ET, first in self._parts(rollout_ET):
-            for network, faults_D in enumerate(self._arguments["faults"]):
+            for network, faults_D in enumerate(self._faults):
                 self._take_observations(
                     network, part_ET, self.obs[network, first:], faults=faults_D[first:]
                 )
@@ -102,7 +109,7 @@ class FusedDataset:
         # Values of all env states, and of the next observations that differ from the following step's.
         next_obs = torch.empty_like(self.obs[1, : self.size])
         evaluate(self.obs[1, : self.size], self._signals[0])
-        self._arguments["count"].zero_()
+        self._count.zero_()
         self._take_observations(1, following, next_obs, num_envs=num_envs, LISTED=bool(self.listed))
         evaluate(next_obs, self._signals[1], **self.listed)
         programs = parts(num_envs, ENVS)
@@ -132,7 +139,7 @@ class FusedDataset:
     def _take_records(self, part_ET: TensorDictBase, first: int, moments: Tensor) -> Tensor:
         """Write records, and return of each program how many env states it left out."""
         rows = part_ET.numel()
-        block = _block(self._arguments["RECORD_LANES"])
+        block = _block(self._record_lanes)
         left_out = torch.empty(parts(rows, block), dtype=torch.int32, device=self.records.device)
         own = {
             "obs": self.obs[0, first:],
@@ -163,7 +170,7 @@ class FusedDataset:
         observer = self._networks.observers[network]
         # Inputs of the network side by side, in the order of the rows of `obs`.
         source = _time_major(observer.read(part_ET))
-        block = _block(self._arguments["LANES"])
+        block = _block(self._lanes)
         own = {
             "source": source,
             "obs": obs,

@@ -33,7 +33,7 @@ only_compiles = ContextVar("only_compiles", default=False)
 
 
 # An argument of a Triton kernel: an array, a number of the launch, or a constant that it is compiled for.
-Argument: TypeAlias = Any
+Argument: TypeAlias = Tensor | float | str | None
 
 
 @dataclass(frozen=True, kw_only=True)
