@@ -62,9 +62,12 @@ def check_c_engine(env: EnvBase, num_steps: int) -> None:
         [np.abs(other_EL - expected_EL) / scale_E1 for other_EL in moved], axis=(0, -1)
     )
     error_E = error_EL.max(axis=-1)
-    allowed_E = TOLERANCE + ALLOWANCE * spread_E
+    chaos_E = ALLOWANCE * spread_E
+    allowed_E = TOLERANCE + chaos_E
     worst = int(np.argmax(error_E - allowed_E))
-    if np.median(error_E) > MEDIAN_TOLERANCE or (error_E > allowed_E).any():
+    # Of two rows the median is the mean, so that one chaotic row is half of it.
+    median_differs = np.median(error_E - chaos_E) > MEDIAN_TOLERANCE
+    if median_differs or (error_E > allowed_E).any():
         joint = mj_model.joint(int(mj_model.dof_jntid[np.argmax(error_EL[worst])])).name
         raise AssertionError(
             f"after {SUBSTEPS} substeps qvel differs from the C engine's by {np.median(error_E):.2g} of its scale "
