@@ -14,7 +14,7 @@ import pytest
 import torch
 import warp as wp
 
-from tests import shapes
+from tests import known_functions, shapes
 
 # Read when Triton is imported: without CUDA its kernels run in its interpreter.
 if not torch.cuda.is_available():
@@ -29,6 +29,7 @@ if _MENAGERIE.is_dir():
 # MuJoCo Warp reads a version from its file six times for each env, a seventh of the time that a small one takes.
 importlib.metadata.version = functools.cache(importlib.metadata.version)
 
+known_functions.install()
 # Before any test imports the package.
 shapes.install()
 
