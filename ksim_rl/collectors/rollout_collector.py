@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Shaped
@@ -77,6 +77,16 @@ def _compiles(env: EnvBase, cfg: CollectorCfg) -> bool:
     return cfg.compile
 
 
+class Listener(Protocol):
+    """Takes each rollout as soon as it is made, without waiting for the device: see `RolloutCollector.listeners`."""
+
+    def record(self, rollout_ET: TensorDictBase, *, restarted: bool = False) -> None:
+        """Take a rollout `["E","T"]`, before which all envs were reset if they have `restarted`."""
+
+    def close(self) -> None:
+        """Finish: no rollout follows."""
+
+
 class RolloutCollector:
     """Runs `policy` in `env` for T steps at a time; envs that end are reset within the rollout.
 
@@ -90,6 +100,9 @@ class RolloutCollector:
     TorchRL env of batch size [E] will do. The policy writes the action, and the tensors that training needs; one that
     has a context `steady()` acts within it, where its weights stay. Stored are the leaves at `keys`, None for all:
     fewer cost fewer bytes and less time. Without `explores` a policy gives its deterministic actions.
+
+    Attributes:
+        listeners: what is given each rollout, such as a recorder of episodes; `close` closes them.
     """
 
     def __init__(
@@ -123,6 +136,8 @@ class RolloutCollector:
             self._exploration = ExplorationType.RANDOM
         else:
             self._exploration = ExplorationType.DETERMINISTIC
+        self.listeners: list[Listener] = []
+        self._restarted = False
         self._root: TensorDict | None = None
         self._transforms: list[Transform] = []  # those that the running episodes have begun with
         self._storage_TE: TensorDict | None = None
@@ -164,7 +179,17 @@ class RolloutCollector:
         if isinstance(self.env, MaskedReset):
             # The env's own reference points into the graph's memory, which the next replay overwrites.
             self.env.last_root = self._root
-        return self._stored_rollout()
+        rollout_ET = self._stored_rollout()
+        for listener in self.listeners:
+            listener.record(rollout_ET, restarted=self._restarted)
+        self._restarted = False
+        return rollout_ET
+
+    def close(self) -> None:
+        """Close the listeners; the env stays as it is."""
+        for listener in self.listeners:
+            listener.close()
+        self.listeners = []
 
     @torch.no_grad()
     def warm_up(self) -> None:
@@ -236,6 +261,7 @@ class RolloutCollector:
     def reset(self) -> None:
         """Reset all envs; the next rollout starts there."""
         root_E = self.env.reset()
+        self._restarted = True
         self._transforms = list(held_transforms(self.env, Transform))
         if self._root is None:
             self._root = root_E.clone()

@@ -27,6 +27,7 @@ class _HostBuffer:
 
     leaves: dict[Key, torch.Tensor]
     arrived: torch.cuda.Event | None = None
+    restarted: bool = False
 
 
 class EpisodeRecorder:
@@ -68,8 +69,11 @@ class EpisodeRecorder:
         """Whether all episodes have been written that were asked for."""
         return self._is_done.is_set()
 
-    def record(self, rollout_ET: TensorDictBase) -> None:
-        """Take a rollout, whose memory may be overwritten by what the same stream does next."""
+    def record(self, rollout_ET: TensorDictBase, *, restarted: bool = False) -> None:
+        """Take a rollout, whose memory may be overwritten by what the same stream does next.
+
+        Where all envs have `restarted` before it, the episodes that ran until then never end, and are left out.
+        """
         buffer = self._free.get()
         self._raise_failure()
         if buffer is None:
@@ -80,6 +84,7 @@ class EpisodeRecorder:
         if rollout_ET.device is not None and rollout_ET.device.type == "cuda":
             buffer.arrived = torch.cuda.Event()
             buffer.arrived.record(torch.cuda.current_stream(rollout_ET.device))
+        buffer.restarted = restarted
         self._full.put(buffer)
 
     def close(self) -> None:
@@ -115,6 +120,8 @@ class EpisodeRecorder:
     def _write_one(self, buffer: _HostBuffer) -> None:
         if buffer.arrived is not None:
             buffer.arrived.synchronize()
+        if buffer.restarted:
+            self._episodes.restart()
         self._episodes.add({key: host_TE.numpy() for key, host_TE in buffer.leaves.items()})
         self._writer.commit()
         if self._episodes.all_written:
@@ -164,6 +171,11 @@ class _RunningEpisodes:
     def all_written(self) -> bool:
         """Whether no env has to give another episode."""
         return not self._left_E.any()
+
+    def restart(self) -> None:
+        """Drop the running episodes."""
+        self._length_E[:] = 0
+        self._is_cut_E[:] = False
 
     def add(self, rollout_TE: dict[Key, np.ndarray]) -> None:
         """Take the next T steps of each env, and write the episodes that end in them, in the order of their ends."""

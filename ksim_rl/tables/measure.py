@@ -44,6 +44,7 @@ LATER = re.compile(
     r'|"offset": 0.0, (?="scale": [^,{}]*\})'
     # Of the networks of off-policy methods, which read one group before they could choose.
     r'|"encoders": \{\}, |"in_keys": \["(actor|critic)"\], (?="layer_norm")'
+    r'|"recorders": \{\}, '
     r'|"free_root": false, |"root_turn": \[1.0, 0.0, 0.0, 0.0\], '
 )
 

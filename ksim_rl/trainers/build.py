@@ -23,6 +23,7 @@ from ksim_rl.trainers.algorithm import HasWarmUp, make_update
 from ksim_rl.trainers.checkpoint import Checkpoint, fitting
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.loggers import check_installed, make_loggers
+from ksim_rl.trainers.recorders import make_recorders, recorded_keys
 from ksim_rl.trainers.run_cfg import RunCfg, with_engine
 from ksim_rl.trainers.sources import check_targets
 from ksim_rl.trainers.trainer import Hook, Trainer
@@ -75,13 +76,14 @@ def build(
         update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
     if cfg.trainer.stop_at and not hooks:  # which may log figures of their own
         check_targets(cfg, update.metrics())
-    _check_rollout(cfg, env, update.rollout_keys)
-    # It stores only the leaves that the update reads.
+    # It stores only the leaves that the update reads, or a recorder.
+    keys = list(dict.fromkeys([*update.rollout_keys, *recorded_keys(cfg, env)]))
+    _check_rollout(cfg, env, keys)
     collector = RolloutCollector(
         env,
         update.behavior,
         rollout_length=cfg.data.rollout_length(cfg.num_envs),
-        keys=update.rollout_keys,
+        keys=keys,
         cfg=cfg.collector,
     )
     trainer = Trainer(
@@ -112,6 +114,8 @@ def build(
     if run_folder is not None and ranks.rank() == 0:
         # Last, because a run that cannot be built must not show up anywhere.
         trainer.loggers = make_loggers(cfg.logger, run_folder, config=trainer.config)
+        recorders = make_recorders(cfg, env, run_folder, iteration=trainer.iteration)
+        collector.listeners.extend(recorders)
     return trainer
 
 

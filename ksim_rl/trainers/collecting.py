@@ -1,31 +1,28 @@
 """Collects whole episodes of a policy into a folder."""
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from omegaconf import OmegaConf
-from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl import envs, ranks
 from ksim_rl.checked import Checked, Count, Seed
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.data import EpisodeRecorder, EpisodeWriter, Origin, leaves_of
+from ksim_rl.data import EpisodeRecorder, EpisodeWriter, leaves_of
 from ksim_rl.data.episode_folder import Contents
+from ksim_rl.data.recorder_cfg import shared
 from ksim_rl.device.eager import eagerly
-from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.files.writing import write_whole
-from ksim_rl.physics.model_checks import model_bytes
 from ksim_rl.runs.listing import CONFIG
 from ksim_rl.runs.record import recorded
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.interrupt import InterruptRequest
+from ksim_rl.trainers.recorders import env_state_keys, max_length_of, origin_of
 from ksim_rl.trainers.run_cfg import RunCfg
-from ksim_rl.transforms import observation_columns
 
 # So many steps are on their way to the disk at once.
 ROLLOUT_LENGTH = 32
@@ -50,8 +47,7 @@ class CollectCfg(Checked):
     @property
     def episodes_E(self) -> list[int]:
         """How many episodes each env gives."""
-        each, rest = divmod(self.num_episodes, self.num_envs)
-        return [each + (env < rest) for env in range(self.num_envs)]
+        return shared(self.num_episodes, self.num_envs)
 
 
 def collect_episodes(
@@ -78,7 +74,7 @@ def collect_episodes(
     env = envs.with_room(partial(build_env, cfg, num_envs=how.num_envs, seed=how.seed), note=note)
     if not how.as_in_training:
         env.eval()
-    max_length = _max_length(env)
+    max_length = max_length_of(env)
     policy = make_policy(env)
     with eagerly(cfg.collector.eager):
         collector = RolloutCollector(
@@ -93,7 +89,7 @@ def collect_episodes(
     rollout_ET = collector.collect()
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
-    origin = _origin(cfg, env, policy, title=title)
+    origin = origin_of(cfg, env, title=title, policy=policy)
     said = "the recording ends after this rollout; once more ends it at once"
     with recorded(folder, note=note) as ended, InterruptRequest(said) as interrupt:
         writer = EpisodeWriter(folder, leaves_of(rollout_ET), origin=origin, asked=how.num_episodes)
@@ -107,53 +103,3 @@ def collect_episodes(
             ended("interrupted", f"by {interrupt.signal}")
     env.close(raise_if_closed=False)
     return writer.contents, interrupt
-
-
-def env_state_keys(env: EnvBase) -> list[NestedKey]:
-    """Return the keys of an EnvState: what the env observes, the action, and what follows it, without other outputs."""
-    observed = env.observation_spec.keys(True, True)
-    now = [*observed, *env.action_keys]
-    following = [*observed, *env.reward_keys, *env.done_keys]
-    return [*now, *(unravel_key(("next", key)) for key in following)]
-
-
-def _max_length(env: EnvBase) -> int:
-    clock = part(env, EpisodeClock)
-    longest = clock and clock.max_episode_length
-    if not longest:
-        raise ValueError(
-            "task.episode_length_s=0: episodes without an end are never whole: give one, task.episode_length_s=20"
-        )
-    return longest
-
-
-def _origin(cfg: RunCfg, env: EnvBase, policy: TensorDictModuleBase, *, title: str) -> Origin:
-    clock = part(env, EpisodeClock)
-    assert clock is not None
-    simulated = part(env, SimulatedWorld)
-    assert simulated is not None  # the env of a config is ours
-    model = hashlib.sha256(model_bytes(simulated.world.mj_model).tobytes())
-    columns = {
-        group: {term: (start, stop) for term, (start, stop) in terms.items()}
-        for group, terms in observation_columns(env).items()
-    }
-    return Origin(
-        task=cfg.task_name,
-        policy=title,
-        step_dt=clock.step_dt,
-        weights_sha256=_weights_sha256(policy),
-        model_sha256=model.hexdigest(),
-        columns=columns,
-    )
-
-
-def _weights_sha256(policy: TensorDictModuleBase) -> str:
-    """Return the hash of a policy's weights by name, or nothing for an agent without weights."""
-    weights = policy.state_dict()
-    if not weights:
-        return ""
-    found = hashlib.sha256()
-    for name, value in weights.items():
-        found.update(name.encode())
-        found.update(value.detach().cpu().contiguous().flatten().numpy().tobytes())
-    return found.hexdigest()

@@ -17,7 +17,7 @@ from ksim_rl.config import class_paths, plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.config.plain_data import check_plain
 from ksim_rl.config.trees import Plain, Tree
-from ksim_rl.data import DatasetCfg, ReplayCfg, sequence_length
+from ksim_rl.data import DatasetCfg, RecorderCfg, ReplayCfg, sequence_length
 from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.modules import (
     FEATURES,
@@ -189,6 +189,7 @@ class RunCfg(TrainingCfg):
     checkpoint: str | None = None  # a run or checkpoint whose networks are the start
     logger: LoggerCfg = field(default_factory=LoggerCfg)
     viewer: BrowserCfg = field(default_factory=BrowserCfg)
+    recorders: Mapping[str, RecorderCfg] = field(default_factory=dict)  # episodes to keep, by name
 
     def _check_fields(self) -> None:
         """Refuse values that no run can have, before any model is compiled."""
@@ -197,6 +198,11 @@ class RunCfg(TrainingCfg):
             raise ValueError(
                 f"task_name={self.task_name!r}: expected letters, digits and _.+-, as it names a folder"
             )
+        for name in self.recorders:
+            if not TASK_NAME.fullmatch(name):
+                raise ValueError(
+                    f"recorders.{name}: expected letters, digits and _.+-, as it names a folder"
+                )
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
             raise ValueError(
                 f"device={self.device!r}: expected 'auto', 'cpu', 'cuda' or 'cuda:<index>'"

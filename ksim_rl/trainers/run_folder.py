@@ -22,7 +22,7 @@ from ksim_rl.runs.listing import CONFIG, METRICS
 from ksim_rl.runs.record import recorded
 from ksim_rl.runs.run_lock import locked
 from ksim_rl.runs.watch import threads_that_fail, watch
-from ksim_rl.trainers import checkpoint, kept_models, video
+from ksim_rl.trainers import checkpoint, kept_models, recorders, video
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build, build_env
 from ksim_rl.trainers.other_physics import trained_with
@@ -34,7 +34,14 @@ from ksim_rl.trainers.trial import first_that_fits
 from ksim_rl.transforms import observation_columns
 
 # Folders in a run folder that a run writes to.
-FOLDERS = ("checkpoint", kept_models.FOLDER, "tensorboard", "wandb", "mlflow")
+FOLDERS = (
+    "checkpoint",
+    kept_models.FOLDER,
+    recorders.FOLDER,
+    "tensorboard",
+    "wandb",
+    "mlflow",
+)
 EVALUATION = "evaluation.json"
 CURVES = "curves.png"
 VIDEO = "video.mp4"

@@ -255,6 +255,7 @@ class Trainer:
                 for hook in self._hooks:
                     hook.at_end(self)
             finally:
+                self.collector.close()
                 for logger in self.loggers:
                     self._warnings.call(logger, logger.close, iteration=self.iteration)
         return Outcome(

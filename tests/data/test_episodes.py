@@ -135,6 +135,16 @@ def test_a_rollout_that_begins_within_episodes_gives_later_ones(tmp_path):
     assert found["obs", "step"].flatten().tolist() == [3, 4, 5, 5, 6, 7, 8, 9]
 
 
+def test_episodes_before_a_restart_of_all_envs_are_left_out(tmp_path):
+    rollout_ET = rollout_of(1, 12)
+    writer = EpisodeWriter(tmp_path / "episodes", leaves_of(rollout_ET), origin=Origin())
+    with EpisodeRecorder(writer, episodes_E=(4,), max_length=5) as recorder:
+        recorder.record(rollout_ET[:, :4])
+        recorder.record(rollout_ET[:, 6:10], restarted=True)
+    found = data.read_episodes(tmp_path / "episodes").env_states_D
+    assert found["obs", "step"].flatten().tolist() == [0, 1, 2, 6, 7, 8]
+
+
 def test_the_recorder_says_when_all_episodes_are_written(tmp_path):
     assert record(tmp_path / "a", rollout_of(2, 6), (2, 1)).is_done
     assert not record(tmp_path / "b", rollout_of(2, 6), (2, 2)).is_done

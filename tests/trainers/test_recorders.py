@@ -1,0 +1,118 @@
+"""Recorders keep whole episodes of a training, and change nothing of it."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ksim_rl import conf, data
+from ksim_rl.data import RecorderCfg
+from ksim_rl.data.episode_writer import EpisodeWriter
+from ksim_rl.trainers.build import build
+
+SMALL = (
+    "task=cartpole_swingup",
+    "device=cpu",
+    "num_envs=4",
+    "task.sim.engine=c",
+    "task.episode_length_s=0.1",
+    "data.num_env_states_per_minibatch=16",
+    "data.num_minibatches=2",
+    "modules.actor.hidden_dims=[8]",
+    "modules.critic.hidden_dims=[8]",
+    "trainer.num_iterations=6",
+    "trainer.eval_episodes=0",
+    "logger=none",
+)
+
+
+class Listening:
+    """Keeps each rollout."""
+
+    def __init__(self):
+        self.rollouts = []
+
+    def record(self, rollout_ET, *, restarted=False):
+        self.rollouts.append(rollout_ET.clone())
+
+    def close(self):
+        pass
+
+
+def train(folder, **recorders):
+    cfg = dataclasses.replace(conf.compose(list(SMALL)), recorders=recorders)
+    trainer = build(cfg, run_folder=folder)
+    listening = Listening()
+    trainer.collector.listeners.append(listening)
+    trainer.train()
+    return trainer, torch.cat(listening.rollouts, dim=1)
+
+
+def episodes_in(rollout_ET, env):
+    """The whole episodes of an env, found step by step."""
+    found = []
+    began = 0
+    for t, done in enumerate(rollout_ET["next", "done"][env].flatten().tolist()):
+        if done:
+            found.append(rollout_ET[env, began : t + 1])
+            began = t + 1
+    return found
+
+
+def test_episodes_are_those_of_the_rollouts_and_the_training_is_the_same(tmp_path):
+    plain, _ = train(None)
+    recorder = RecorderCfg(num_envs=2, num_episodes=5, keys=("obs/position", "action"))
+    later = RecorderCfg(num_envs=1, num_episodes=50, from_iteration=3)
+    trainer, rollout_ET = train(tmp_path, some=recorder, later=later)
+    for name, value in plain.update.state_dict()["actor"].items():
+        assert torch.equal(value, trainer.update.state_dict()["actor"][name]), name
+
+    some = data.read_episodes(tmp_path / "episodes" / "some" / "from_iteration_000001")
+    keys = set(some.env_states_D.keys(True, True))
+    assert keys == {("obs", "position"), "action", ("next", "done"), "episode"}
+    assert some.contents.num_episodes == 5
+    expected = [*episodes_in(rollout_ET, 0)[:3], *episodes_in(rollout_ET, 1)[:2]]
+    own = [some.env_states_D[some.env_states_D["episode"] == number] for number in range(5)]
+    actions = sorted(episode["action"].flatten().tolist() for episode in own)
+    assert actions == sorted(episode["action"].flatten().tolist() for episode in expected)
+
+    # From the third rollout on, without the episode that ran when it began.
+    rest = data.read_episodes(tmp_path / "episodes" / "later" / "from_iteration_000001")
+    length = rollout_ET.shape[1] // 6
+    expected = torch.cat(episodes_in(rollout_ET[:, 2 * length :], 0)[1:])
+    own_D = rest.env_states_D.exclude("episode")
+    assert len(own_D) > 10
+    assert (own_D == expected.select(*own_D.keys(True, True))).all()
+    assert rest.env_states_D["next", "obs", "velocity"].shape[1] == 2
+
+
+def test_a_full_disk_costs_the_recording_and_not_the_run(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(EpisodeWriter, "append", fail)
+    with pytest.warns(RuntimeWarning, match="No space left on device: nothing more is recorded"):
+        trainer, _ = train(tmp_path, all=RecorderCfg(num_envs=4))
+    assert trainer.iteration == 6
+
+
+@pytest.mark.parametrize(
+    ("name", "recorder", "message"),
+    [
+        ("all", RecorderCfg(num_envs=5), "recorders.all.num_envs=5: expected at most num_envs=4"),
+        ("all", RecorderCfg(num_envs=1, keys=("obs/positon",)), "did you mean 'obs/position'"),
+        ("../all", RecorderCfg(num_envs=1), "recorders.../all: expected letters"),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused_by_name(tmp_path, name, recorder, message):
+    with pytest.raises(ValueError, match=message):
+        train(tmp_path, **{name: recorder})
+
+
+def test_a_run_that_goes_on_writes_another_folder(tmp_path):
+    recorder = RecorderCfg(num_envs=1, num_episodes=1)
+    cfg = dataclasses.replace(conf.compose(list(SMALL)), recorders={"all": recorder})
+    for _ in range(2):
+        build(cfg, run_folder=tmp_path).train()
+    names = sorted(path.name for path in (tmp_path / "episodes" / "all").iterdir())
+    assert names == ["from_iteration_000001", "from_iteration_000001_2"]
