@@ -16,16 +16,16 @@ TOLERANCE = 1e-4
 FLOOR = 1e-6
 """Errors below this share of the largest number in the same column, a few units in its last place, are accepted too."""
 ALLOWANCE = 10.0
-"""How many times the change by moves of one unit an error may be: these are few samples."""
-MOVES = (1,) * 8 + (8,) * 4 + (64,) * 8
+"""How many times the change by a move of one unit an error may be; a move of more units counts as so much less."""
+SAME_OUTCOME = 0.25
+"""A move also explains an error if it leaves at most this share of it: it has led to the outcome that was found."""
+MOVES = (1,) * 8 + (4,) * 8 + (8,) * 16 + (32,) * 8
 """Units in the last place of the moves before an error counts as unexplained; most are explained by the first.
 
 The larger ones are for rows with two outcomes, of which rounding chooses one. Of n moves of the error's own size all
 give the other outcome in one row of n + 1, which is too often for tens of thousands of rows that are compared again and
-again; a larger move crosses over every second time.
+again; a larger move crosses over in one of two or three times.
 """
-SAME_OUTCOME = 0.25
-"""A larger move explains an error if it leaves at most this share of it: it has led to the outcome that was found."""
 
 NamedLeaves = Mapping[str, Shaped[Tensor, "*?shape"]]
 
@@ -66,14 +66,12 @@ def differences(
         other = moved(number, units)
         for name in list(open_rows):
             scale = _scale(true[name])
-            if units == 1:
-                # A row is explained once a single move changes it by nearly as much.
-                change = _error(other[name], true[name], scale, num_rows)
-                explained = errors[name] <= ALLOWANCE * change
-            else:
-                left = _error(other[name], found[name], scale, num_rows)
-                # An infinite error is no share of itself.
-                explained = left < SAME_OUTCOME * errors[name]
+            # A row is explained once a single move changes it by nearly as much, or in the same way.
+            change = _error(other[name], true[name], scale, num_rows)
+            left = _error(other[name], found[name], scale, num_rows)
+            explained = errors[name] <= ALLOWANCE / units * change
+            # An infinite error is no share of itself.
+            explained |= left < SAME_OUTCOME * errors[name]
             open_rows[name] &= ~explained
             if not bool(open_rows[name].any()):
                 del open_rows[name]

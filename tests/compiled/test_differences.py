@@ -76,10 +76,10 @@ def test_a_row_that_stands_at_a_border_is_explained():
     small = differences(
         {"x": found}, {"x": true}, num_rows=ROWS, moved=lambda number, _: moved(number, 1)
     )
-    assert small["x"] > ROWS / 20
+    assert small["x"] > 10
 
 
-@pytest.mark.parametrize("wrong", [0.5, float("nan"), 1e30])
+@pytest.mark.parametrize("wrong", [5.0, float("nan"), 1e30])
 def test_a_large_move_explains_no_other_outcome(wrong):
     true = torch.zeros(ROWS, 1)
     crossed = torch.ones(ROWS, 1)
