@@ -25,7 +25,12 @@ Autoreset = Literal["same_step", "next_step", "disabled"]
 AUTORESETS: tuple[Autoreset, ...] = ("same_step", "next_step", "disabled")
 Observations = dict[str, Shaped[Tensor, "E *?leaf"]]
 """Observations by name, each with its own leaf dims (most often one, L)."""
-Shown: TypeAlias = np.ndarray | Tensor | dict[str, np.ndarray] | dict[str, Tensor]
+Shown: TypeAlias = (
+    Shaped[np.ndarray, "*?leaf"]
+    | Shaped[Tensor, "*?leaf"]
+    | dict[str, Shaped[np.ndarray, "*?leaf"]]
+    | dict[str, Shaped[Tensor, "*?leaf"]]
+)
 """One array of observations, or a dict of them by name; NumPy's, or torch's on the env's device."""
 Infos: TypeAlias = dict[str, Shown]
 """Further facts of a step, beside its observations, rewards and ends: each library has its own."""

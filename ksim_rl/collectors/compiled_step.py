@@ -81,7 +81,7 @@ class CompiledStep:
         """
         return self._check.differences(self._run)
 
-    def given(self) -> dict[NestedKey, Tensor]:
+    def given(self) -> dict[NestedKey, Shaped[Tensor, "*?shape"]]:
         """Return a copy of the policy's leaves for the last step."""
         return {key: value.clone() for key, value in self._given.items()}
 

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, TypeAlias
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Shaped
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
@@ -33,7 +33,7 @@ only_compiles = ContextVar("only_compiles", default=False)
 
 
 # An argument of a Triton kernel: an array, a number of the launch, or a constant that it is compiled for.
-Argument: TypeAlias = Tensor | float | str | None
+Argument: TypeAlias = Shaped[Tensor, "*?shape"] | float | str | None
 
 
 @dataclass(frozen=True, kw_only=True)
