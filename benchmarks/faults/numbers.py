@@ -14,6 +14,7 @@ from benchmarks.faults import children
 from benchmarks.faults.row import AT_LEAST, AT_MOST, EXACTLY, Figures, Row
 from benchmarks.faults.saving import same_bits
 from ksim_rl import conf
+from ksim_rl.device.state_tree import number
 from ksim_rl.objectives import NonFiniteStepsError
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.build import build
@@ -173,7 +174,7 @@ def same_seed(folder: Path, *, iterations: int) -> Figures:
 
         children.start(work).wait()
     one, other = (checkpoint.load_latest(run).state for run in runs)
-    return {"iterations": one["iteration"], "differ": same_bits(one, other)}
+    return {"iterations": number(one, "iteration"), "differ": same_bits(one, other)}
 
 
 # Layers and minibatches that torch spreads over threads.

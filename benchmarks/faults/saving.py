@@ -118,7 +118,8 @@ def kill9(folder: Path, *, kills: int, inside: int) -> Figures:
 
 def _whole(path: Path) -> bool:
     try:
-        return checkpoint.load(path).state["iteration"] == int(path.name.partition("_")[0])
+        made = state_tree.number(checkpoint.load(path).state, "iteration")
+        return made == int(path.name.partition("_")[0])
     except CheckpointError:
         return False
 

@@ -17,7 +17,7 @@ from ksim_rl.compiled.watched_graphs import WatchedGraphs
 from ksim_rl.data import DatasetBuffer, DatasetCfg, SequenceSampler
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, branch
 from ksim_rl.envs.signal_keys import STANDARD, SignalKeys
 from ksim_rl.modules import burnt_in, recurrent_modules
 from ksim_rl.objectives import (
@@ -171,12 +171,13 @@ class RolloutUpdate(ABC):
     def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken, at the same addresses; a ValueError names what does not fit."""
         self.load_weights(state)
-        state_tree.copy_into(self.guard.state_dict(), state["guard"], what="guard")
+        state_tree.copy_into(self.guard.state_dict(), branch(state, "guard"), what="guard")
 
     def load_weights(self, state: State) -> None:
         """Take only the networks of a `state_dict`; a ValueError names the tensor that does not fit."""
         for name, network in self.networks.items():
-            state_tree.copy_into(network.state_dict(), state[name], what=name.replace("_", " "))
+            saved = branch(state, name)
+            state_tree.copy_into(network.state_dict(), saved, what=name.replace("_", " "))
 
 
 class DatasetUpdate(RolloutUpdate):
@@ -249,26 +250,30 @@ class DatasetUpdate(RolloutUpdate):
     def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         super().load_state_dict(state)
-        load_optimizer_state(self.optimizer, state["optimizer"], what="optimizer")
-        self.dataset.sampler.load_state_dict(state["sampler"])
-        self.dataset.non_finite_count.copy_(state["non_finite_env_states"])
+        load_optimizer_state(self.optimizer, branch(state, "optimizer"), what="optimizer")
+        self.dataset.sampler.load_state_dict(dict(branch(state, "sampler")))
+        self.dataset.non_finite_count.copy_(state_tree.tensor(state, "non_finite_env_states"))
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> state_tree.State:
     """Return learning rates and moments; a parameter that no loss has reached has an empty entry."""
     group = optimizer.param_groups[0]
-    moments = {
-        index: dict(optimizer.state.get(own, {})) for index, own in enumerate(group["params"])
+    moments: dict[str, State] = {}
+    for index, own in enumerate(group["params"]):
+        moments[str(index)] = dict(optimizer.state.get(own, {}))
+    return {
+        "learning_rate": group["lr"],
+        "initial_learning_rate": group.get("initial_lr"),
+        "moments": moments,
     }
-    rates = {"learning_rate": group["lr"], "initial_learning_rate": group.get("initial_lr")}
-    return rates | {"moments": moments}
 
 
 def load_optimizer_state(optimizer: torch.optim.Optimizer, state: State, *, what: str) -> None:
     """Continue where `optimizer_state` was taken, at the same addresses; a ValueError names what does not fit."""
     group = optimizer.param_groups[0]
     parameters = optimizer.param_groups[0]["params"]
-    moments = {int(index): entry for index, entry in state["moments"].items()}
+    saved = branch(state, "moments")
+    moments = {int(index): state_tree.tensors(branch(saved, index)) for index in saved}
     # All checks before the first copy, so that a refused state leaves the optimizer as it was.
     if set(moments) != set(range(len(parameters))):
         raise ValueError(

@@ -12,6 +12,7 @@ from ksim_rl.cli.errors import say
 from ksim_rl.cli.report import run_and_report, shown_working, verdict
 from ksim_rl.cli.runs import print_table
 from ksim_rl.config.plain_data import check_links
+from ksim_rl.device.state_tree import branch, number
 from ksim_rl.envs.contract import part
 from ksim_rl.objectives import AMPCfg
 from ksim_rl.scene.robots import analyse
@@ -89,7 +90,9 @@ def resume(arguments: list[str]) -> int:
 def _on_these_ranks(cfg: RunCfg, saved: checkpoint.Checkpoint) -> RunCfg:
     """Share the envs out again where a run goes on with another number of ranks: the whole dataset stays as large."""
     # Checkpoints of before there were ranks say nothing of them: they had one.
-    before = saved.state.get(checkpoint.RANKS, {"size": 1})["size"]
+    before = 1
+    if checkpoint.RANKS in saved.state:
+        before = int(number(branch(saved.state, checkpoint.RANKS), "size"))
     now = ranks.size()
     if before == now:
         return cfg

@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers import Writer
 from torchrl.data.replay_buffers.storages import TensorStorage
 
 from ksim_rl import dims
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, tensor
 
 
 class Stateless:
@@ -96,12 +96,12 @@ class DatasetStorage(TensorStorage):
 
     def load_state_dict(self, state_dict: State) -> None:
         """Continue where `state_dict` was taken."""
-        super().load_state_dict(state_dict)
+        super().load_state_dict(dict(state_dict))
         # The counter follows the content, whose device is known now.
         if self.device == "auto" and self.initialized:
             self.device = self._storage.get(MASK_KEY).device
             self.non_finite_count = self.non_finite_count.to(self.device)
-        self.non_finite_count.copy_(state_dict["non_finite_count"])
+        self.non_finite_count.copy_(tensor(state_dict, "non_finite_count"))
 
     def _allocate(self, data: TensorDictBase) -> None:
         if self.device == "auto":

@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl.data.dataset_storage import MASK_KEY
 from ksim_rl.device import random
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, number
 from ksim_rl.files.reading import read_bytes
 from ksim_rl.files.writing import write_whole
 
@@ -157,10 +157,10 @@ class EpochSampler(Sampler):
 
     def load_state_dict(self, state_dict: State) -> None:
         """Continue where `state_dict` was taken."""
-        self.seed = int(state_dict["seed"])
-        self._first_epoch = int(state_dict["epoch"])
-        self._size = int(state_dict["size"])
-        self._position = int(state_dict["position"])
+        self.seed = int(number(state_dict, "seed"))
+        self._first_epoch = int(number(state_dict, "epoch"))
+        self._size = int(number(state_dict, "size"))
+        self._position = int(number(state_dict, "position"))
         self.ran_out = False
         if self._epoch is None:
             device = torch.device("cpu")

@@ -18,7 +18,7 @@ from ksim_rl.checks import check_count, check_in_range, naming
 from ksim_rl.data.dataset_storage import Stateless
 from ksim_rl.data.epoch_sampler import Entries, SampleInfo, stored
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter, SavedByStateDict
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, branch, tensor
 
 
 class ReplaySampler(Stateless, Sampler):
@@ -178,8 +178,8 @@ class PrioritySampler(SavedByStateDict, Sampler):
     @torch.no_grad()
     def load_state_dict(self, state_dict: State) -> None:
         """Continue where `state_dict` was taken; tensors keep their addresses."""
-        self._priority_N.copy_(state_dict["priority"])
-        self._highest.copy_(state_dict["highest"])
+        self._priority_N.copy_(tensor(state_dict, "priority"))
+        self._highest.copy_(tensor(state_dict, "highest"))
 
     def _empty(self) -> None:
         self._priority_N.zero_()
@@ -320,5 +320,5 @@ class ReplayRing(ReplayBuffer):
         if not state_dict:
             self.empty()
             return
-        self._ring.load_state_dict(state_dict["ring"])
-        self.sampler.load_state_dict(state_dict["sampler"])
+        self._ring.load_state_dict(branch(state_dict, "ring"))
+        self.sampler.load_state_dict(dict(branch(state_dict, "sampler")))

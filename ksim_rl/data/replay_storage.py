@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers.storages import Storage
 from ksim_rl import dims
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetWriter
 from ksim_rl.data.epoch_sampler import Entries
-from ksim_rl.device.state_tree import State, copy_into
+from ksim_rl.device.state_tree import State, branch, copy_into, tensor, tensors
 
 REWARD: NestedKey = ("next", "reward")
 DONE: NestedKey = ("next", "done")
@@ -174,8 +174,13 @@ class ReplayStorage(SavedByStateDict, Storage):
 
     def state_dict(self) -> State:
         """Return the ring and where its newest places are."""
+        return {"content": self._leaves(), **self._counters()}
+
+    def _leaves(self) -> dict[str, Tensor]:
+        return {} if self.content is None else self.content.flatten_keys("/").to_dict()
+
+    def _counters(self) -> dict[str, Tensor]:
         return {
-            "content": {} if self.content is None else self.content.flatten_keys("/").to_dict(),
             "available": self.available,
             "head": self.head_E,
             "filled": self.filled_E,
@@ -185,22 +190,23 @@ class ReplayStorage(SavedByStateDict, Storage):
     @torch.no_grad()
     def load_state_dict(self, state_dict: State) -> None:
         """Continue where `state_dict` was taken, with as many envs and places; tensors keep their addresses."""
-        if state_dict["available"].shape != self.available.shape:
+        available = tensor(state_dict, "available")
+        if available.shape != self.available.shape:
             raise ValueError(
-                f"the checkpoint's replay has {state_dict['available'].numel()} places, this run's "
+                f"the checkpoint's replay has {available.numel()} places, this run's "
                 f"{self.max_size}: num_envs and data.capacity must be those of the checkpoint"
             )
         # The ring may not exist yet in this run, or be filled where the checkpoint's is empty.
-        content = {tuple(name.split("/")): leaf for name, leaf in state_dict["content"].items()}
+        content = tensors(branch(state_dict, "content"))
         if not content:
             self._empty()
         elif self.content is None:
-            saved = TensorDict(content, batch_size=[self.max_size])
+            nested = {tuple(name.split("/")): leaf for name, leaf in content.items()}
+            saved = TensorDict(nested, batch_size=[self.max_size])
             self.content = saved.new_zeros(saved.batch_size, device=self.device)
-        own = self.state_dict()
-        leaves = own.pop("content")
+        own = self._counters()
         if content:
-            copy_into(leaves, state_dict["content"], what="the replay's content")
+            copy_into(self._leaves(), content, what="the replay's content")
         copy_into(own, {name: state_dict[name] for name in own}, what="the replay")
 
     @torch.no_grad()
@@ -209,8 +215,8 @@ class ReplayStorage(SavedByStateDict, Storage):
             content: Any = ()
         else:
             content = self.content.values(True, True)
-        for tensor in (self.available, self.head_E, self.filled_E, *content):
-            tensor.zero_()
+        for each in (self.available, self.head_E, self.filled_E, *content):
+            each.zero_()
 
     def _allocate(self, rollout_ET: TensorDictBase) -> None:
         produced = list(rollout_ET.keys(True, True))

@@ -3,21 +3,73 @@
 A path joins the keys with `/`; a key's own `~` and `/` are written `~0` and `~1` (JSON Pointer, RFC 6901).
 """
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
 from torch.utils._pytree import PyTree
 
-State = dict[str, Any]
+Value: TypeAlias = (
+    Mapping[str, "Value"]
+    | Sequence["Value"]
+    | Shaped[Tensor, "*?leaf"]
+    | str
+    | int
+    | float
+    | bool
+    | None
+)
+State: TypeAlias = Mapping[str, Value]
+"""What a part of a run needs to go on: nested, with tensors and plain values as leaves."""
 
 
-def split(state: Mapping[str, Any]) -> tuple[dict[str, Shaped[Tensor, "*?leaf"]], dict[str, Any]]:
+def branch(state: State, name: str) -> State:
+    """Return a nested state; a ValueError where a leaf has its name."""
+    found = state[name]
+    if not isinstance(found, Mapping):
+        raise _other_kind(name, found, "a mapping")
+    return found
+
+
+def tensor(state: State, name: str) -> Shaped[Tensor, "*leaf"]:
+    """Return a tensor of a state; a ValueError where something else has its name."""
+    found = state[name]
+    if not isinstance(found, Tensor):
+        raise _other_kind(name, found, "a tensor")
+    return found
+
+
+def number(state: State, name: str) -> float:
+    """Return a number of a state; a ValueError where something else has its name."""
+    found = state[name]
+    if isinstance(found, bool) or not isinstance(found, (int, float)):
+        raise _other_kind(name, found, "a number")
+    return found
+
+
+def text(state: State, name: str) -> str:
+    """Return a text of a state; a ValueError where something else has its name."""
+    found = state[name]
+    if not isinstance(found, str):
+        raise _other_kind(name, found, "a text")
+    return found
+
+
+def tensors(state: State) -> dict[str, Shaped[Tensor, "*?leaf"]]:
+    """Return a state that has nothing but tensors; a ValueError names another entry."""
+    return {name: tensor(state, name) for name in state}
+
+
+def _other_kind(name: str, found: Value, expected: str) -> ValueError:
+    return ValueError(f"the state's {name!r} is {_describe(found)}: expected {expected}")
+
+
+def split(state: State) -> tuple[dict[str, Shaped[Tensor, "*?leaf"]], dict[str, Value]]:
     """Separate nested state into tensors (detached copies on the host) and JSON values, each by path."""
     tensors: dict[str, Tensor] = {}
-    values: dict[str, Any] = {}
+    values: dict[str, Value] = {}
 
     def visit(path: str, node: PyTree) -> None:
         # Keys may contain the separator.
@@ -43,12 +95,12 @@ def split(state: Mapping[str, Any]) -> tuple[dict[str, Shaped[Tensor, "*?leaf"]]
     return tensors, values
 
 
-def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, Any]) -> State:
+def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, Value]) -> State:
     """Undo `split`."""
     # A state that is itself empty has the empty path.
     if list(values) == [""] and not tensors:
         return {}
-    state: State = {}
+    state: dict[str, Value] = {}
     for path, leaf in [*tensors.items(), *values.items()]:
         keys = path.split("/")[1:]
         *parents, last = [key.replace("~1", "/").replace("~0", "~") for key in keys]
@@ -62,9 +114,7 @@ def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, A
     return state
 
 
-def copy_into(
-    live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: Mapping[str, Any], *, what: str
-) -> None:
+def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: State, *, what: str) -> None:
     """Copy saved tensors into live ones, whose addresses stay for captured graphs; a ValueError names the misfit."""
     # Names are compared in both directions, then shapes, before anything is written.
     for name in live:
@@ -82,7 +132,10 @@ def copy_into(
     # Parameters that require gradients refuse to be written otherwise.
     with torch.no_grad():
         for name, tensor in live.items():
-            tensor.copy_(saved[name])
+            copy = saved[name]
+            # Or else it would have been described in another way.
+            assert isinstance(copy, Tensor)
+            tensor.copy_(copy)
 
 
 def _describe(value: PyTree) -> str:

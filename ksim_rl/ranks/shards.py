@@ -14,7 +14,7 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from ksim_rl.device.group import rank, size
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, branch, number, tensors
 
 Tensors = dict[str, Shaped[Tensor, "*?leaf"]]
 # Below it, `ReplayRing` keeps rows in the order of places and, in each place, of envs.
@@ -77,8 +77,11 @@ def dealt(
     """
     parts = [dict(first)]
     if saved is not None:
-        for index in range(1, int(saved["size"])):
-            parts.append({**first, **saved["parts"].get(str(index), {})})
+        differing = branch(saved, "parts")
+        for index in range(1, int(number(saved, "size"))):
+            # A rank whose tensors are all those of rank 0 has no entry.
+            own = tensors(branch(differing, str(index))) if str(index) in differing else {}
+            parts.append({**first, **own})
     before = len(parts)
     # The same number of ranks: no tensor is cut or merged.
     if before == size():

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from ksim_rl import envs, ranks
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import ReplayCfg
+from ksim_rl.device import state_tree
 from ksim_rl.device.eager import eagerly
 from ksim_rl.device.memory import check_bytes, check_room
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
@@ -73,7 +74,8 @@ def build(
     if simulated is not None:
         cfg = with_engine(cfg, simulated.world.engine)
     with eagerly(cfg.collector.eager):
-        update = make_update(cfg, env, resumed=resume_from.state["update"] if resume_from else None)
+        resumed = state_tree.branch(resume_from.state, "update") if resume_from else None
+        update = make_update(cfg, env, resumed=resumed)
     if cfg.trainer.stop_at and not hooks:  # which may log figures of their own
         check_targets(cfg, update.metrics())
     # It stores only the leaves that the update reads, or a recorder.

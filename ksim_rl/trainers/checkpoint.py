@@ -129,9 +129,9 @@ def own_part(state: State, live: Callable[[], State]) -> State:
     tensors, values = state_tree.split(
         {name: part for name, part in state.items() if name != RANKS}
     )
-    return state_tree.join(
-        ranks.dealt(tensors, state.get(RANKS), state_tree.split(live())[0]), values
-    )
+    of_ranks = state_tree.branch(state, RANKS) if RANKS in state else None
+    here, _ = state_tree.split(live())
+    return state_tree.join(ranks.dealt(tensors, of_ranks, here), values)
 
 
 def load(path: Path) -> Checkpoint:
@@ -239,6 +239,26 @@ def remove_leftovers(folder: Path) -> None:
     for entry in folder.iterdir() if folder.is_dir() else ():
         if entry.name.startswith((WRITING, _DISCARDED)):
             shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+
+
+def columns_of(state: State) -> Columns:
+    """Return the columns of the observations that a checkpoint's networks read: group -> term -> range."""
+    saved = state_tree.branch(state, "observation_columns")
+    columns: dict[str, dict[str, Sequence[int]]] = {}
+    for group in saved:
+        terms = state_tree.branch(saved, group)
+        columns[group] = {name: _range_of(name, found) for name, found in terms.items()}
+    return columns
+
+
+def _range_of(name: str, found: state_tree.Value) -> list[int]:
+    if isinstance(found, Sequence) and len(found) == 2:
+        ends = [end for end in found if isinstance(end, int)]
+        if len(ends) == 2:
+            return ends
+    raise ValueError(
+        f"observation_columns: {name!r} is {found!r}: expected a first and a last column"
+    )
 
 
 def check_columns(saved: Columns, own: Columns) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, branch
 
 FORMAT_VERSION = 2
 Config = dict[str, Any]
@@ -15,10 +15,12 @@ def _from_1(state: State, config: Config) -> tuple[State, Config]:
     Version 1 had neither and sorted the config by name. The inputs of networks stand in the order of the observation
     terms, and that is the order of the columns, which version 1 kept.
     """
-    state = {**state, "hooks": {}, "update": {**state.get("update", {}), "recurrent_state": {}}}
+    update = branch(state, "update") if "update" in state else {}
+    columns = branch(state, "observation_columns") if "observation_columns" in state else {}
+    state = {**state, "hooks": {}, "update": {**update, "recurrent_state": {}}}
     task = config.get("task", {})
     observations = {
-        name: _in_order_of(group, state.get("observation_columns", {}).get(name, {}))
+        name: _in_order_of(group, branch(columns, name) if name in columns else {})
         for name, group in task.get("observations", {}).items()
     }
     if observations:
@@ -26,9 +28,12 @@ def _from_1(state: State, config: Config) -> tuple[State, Config]:
     return state, config
 
 
-def _in_order_of(group: Mapping[str, Any], columns: Mapping[str, Sequence[int]]) -> dict[str, Any]:
+def _in_order_of(group: Mapping[str, Any], columns: State) -> dict[str, Any]:
     # By term its first column, which tells the order that the config of version 1 lost.
-    starts = {column.rpartition("/")[2]: start for column, (start, _) in columns.items()}
+    starts: dict[str, int] = {}
+    for column, span in columns.items():
+        if isinstance(span, Sequence) and span and isinstance(span[0], int):
+            starts[column.rpartition("/")[2]] = span[0]
     terms = group.get("terms", {})
     # Columns of another kind: better the order as it is than a wrong one.
     if not terms.keys() <= starts.keys():

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, branch
 
 H = TypeVar("H")
 
@@ -16,7 +16,7 @@ def paired(
     Hooks that keep nothing, such as a viewer's, may come and go between the sessions of a run; `keeps` knows others.
     """
     # Numbers are texts in a checkpoint: "10" comes after "9".
-    states = [saved[number] for number in sorted(saved, key=int)]
+    states = [branch(saved, number) for number in sorted(saved, key=int)]
     own = list(hooks)
     # Another number of hooks: leave out those that have no state on either side.
     if len(states) != len(own):

@@ -1,13 +1,11 @@
 """Restores parts of a checkpoint, and explains in one line what does not fit."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from torchrl.envs import EnvBase
 
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, tensor
 from ksim_rl.trainers.algorithm import Update
 
 
@@ -46,7 +44,7 @@ def load_networks(update: Update, state: State, path: Path) -> None:
         ) from error
 
 
-def random_state(device: torch.device) -> dict[str, Any]:
+def random_state(device: torch.device) -> State:
     """Return the states of torch's generators that a run on a device draws from."""
     states = {"cpu": torch.get_rng_state()}
     if device.type == "cuda":
@@ -54,9 +52,9 @@ def random_state(device: torch.device) -> dict[str, Any]:
     return states
 
 
-def load_random_state(states: Mapping[str, Any], device: torch.device) -> None:
+def load_random_state(states: State, device: torch.device) -> None:
     """Put the states of torch's generators back."""
-    torch.set_rng_state(states["cpu"])
+    torch.set_rng_state(tensor(states, "cpu"))
     # A run that moves to another kind of device keeps that one's present state.
     if device.type == "cuda" and "cuda" in states:
-        torch.cuda.set_rng_state(states["cuda"], device)
+        torch.cuda.set_rng_state(tensor(states, "cuda"), device)

@@ -182,8 +182,10 @@ def policy_of(
     actor = make_policy(cfg, env)
     with checkpoint.fitting(saved.path):
         # Columns first: equal sizes with other terms would load in silence.
-        checkpoint.check_columns(saved.state["observation_columns"], observation_columns(env))
-        state_tree.copy_into(actor.state_dict(), saved.state["update"]["actor"], what="actor")
+        columns = checkpoint.columns_of(saved.state)
+        checkpoint.check_columns(columns, observation_columns(env))
+        update = state_tree.branch(saved.state, "update")
+        state_tree.copy_into(actor.state_dict(), state_tree.branch(update, "actor"), what="actor")
     env.close(raise_if_closed=False)
     return Policy(cfg=cfg, actor=actor, iteration=saved.iteration)
 

@@ -11,6 +11,7 @@ import torch
 from ksim_rl import ranks
 from ksim_rl.checks import near
 from ksim_rl.collectors import RolloutCollector
+from ksim_rl.device.state_tree import branch, number
 from ksim_rl.diagnosis.probes import probed
 from ksim_rl.envs.contract import EpisodeClock, missing_parts, part
 from ksim_rl.envs.recorded_python import FrozenPythonError
@@ -405,10 +406,9 @@ class Trainer:
     def load_weights(self, path: Path) -> None:
         """Start from the networks and normalizers of a checkpoint of any task, if they fit here; all else stays new."""
         state = checkpoint.load_latest(path).state
-        checkpoint.check_columns(
-            state["observation_columns"], observation_columns(self.collector.env)
-        )
-        load_networks(self.update, state["update"], path)
+        columns = checkpoint.columns_of(state)
+        checkpoint.check_columns(columns, observation_columns(self.collector.env))
+        load_networks(self.update, branch(state, "update"), path)
 
     def state_dict(self) -> State:
         """Return everything that the next iteration depends on: tensors and plain data, nested."""
@@ -425,21 +425,22 @@ class Trainer:
 
     def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; a ValueError where networks, observations or env are others."""
-        checkpoint.check_columns(
-            state["observation_columns"], observation_columns(self.collector.env)
-        )
-        hooks = paired(self._own_hooks, state["hooks"], keeps=_keeps)
+        columns = checkpoint.columns_of(state)
+        checkpoint.check_columns(columns, observation_columns(self.collector.env))
+        hooks = paired(self._own_hooks, branch(state, "hooks"), keeps=_keeps)
         # A first reset allocates the state of collector and transforms, before the saved values go in.
         self.collector.reset()
         state = checkpoint.own_part(state, self.state_dict)  # of this rank
-        self.update.load_state_dict(state["update"])
-        load_env_state(self.collector.env, state["env"])
-        self.collector.load_state_dict(state["collector"])
+        self.update.load_state_dict(branch(state, "update"))
+        load_env_state(self.collector.env, branch(state, "env"))
+        self.collector.load_state_dict(branch(state, "collector"))
         for hook, own in hooks:
             hook.load_state_dict(own)
-        self.iteration = self.saved_at = int(state["iteration"])
-        self.clock.total = float(state["seconds"])
-        load_random_state(state["random"], self.update.device)  # last: the steps above may draw
+        self.iteration = self.saved_at = int(number(state, "iteration"))
+        self.clock.total = float(number(state, "seconds"))
+        load_random_state(
+            branch(state, "random"), self.update.device
+        )  # last: the steps above may draw
 
 
 def _keeps(hook: Hook) -> bool:

@@ -140,7 +140,7 @@ class RowTransform(CheckedKeys, ABC):
         # Buffers that the env has not sized yet take the size of the loaded ones.
         for name, present in self._buffers.items():
             loaded = state_dict.get(prefix + name)
-            if present is None and loaded is not None:
+            if present is None and isinstance(loaded, Tensor):
                 self._buffers[name] = torch.empty_like(loaded)
         super()._load_from_state_dict(state_dict, prefix, *args)
 

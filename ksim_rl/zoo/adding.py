@@ -7,6 +7,7 @@ import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from ksim_rl.device.state_tree import branch, tensors
 from ksim_rl.export import export, sim2sim
 from ksim_rl.files.writing import unfinished_folder
 from ksim_rl.runs import listing, record
@@ -41,7 +42,7 @@ def add(run: Path, name: str, *, folder: Path = FOLDER, episodes: int = 100) -> 
         exported = temporary / "export"
         # The actor is all that playing needs, and matrices in half precision halve its size.
         with checkpoint.fitting(saved.path):
-            actor = dict(saved.state["update"]["actor"])
+            actor = tensors(branch(branch(saved.state, "update"), "actor"))
             actor |= {
                 key: x.half() for key, x in actor.items() if x.is_floating_point() and x.ndim > 1
             }

@@ -56,3 +56,22 @@ def test_what_does_not_fit_is_named_and_nothing_is_copied(saved, message):
     with pytest.raises(ValueError, match=message):
         state_tree.copy_into(live, saved, what="actor")
     assert live["weight"].tolist() == [5.0] * 3
+
+
+@pytest.mark.parametrize(
+    ("read", "expected"),
+    [
+        (state_tree.branch, "a mapping"),
+        (state_tree.tensor, "a tensor"),
+        (state_tree.number, "a number"),
+        (state_tree.text, "a text"),
+    ],
+)
+def test_a_reader_takes_one_kind_and_names_another_one(read, expected):
+    state = {"a mapping": {"x": 1}, "a tensor": torch.ones(2), "a number": 3, "a text": "four"}
+    assert read(state, expected) is state[expected]
+    for other in {*state} - {expected}:
+        with pytest.raises(ValueError, match=f"the state's '{other}' is .*: expected {expected}"):
+            read(state, other)
+    with pytest.raises(ValueError, match="'flag' is bool"):
+        read({"flag": True}, "flag")

@@ -21,7 +21,7 @@ from ksim_rl.algorithms.ppo.update import PPOUpdate
 from ksim_rl.algorithms.ppo.wiring import make_ppo_update
 from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, branch
 from ksim_rl.envs.signal_keys import STANDARD
 from ksim_rl.mdp.motion_observations import observe_motion
 from ksim_rl.modules import Discriminator
@@ -190,7 +190,8 @@ class AMPUpdate(RolloutUpdate):
 
     def state_dict(self) -> state_tree.State:
         """Return PPO's state, and the discriminator with its optimizer and its replay."""
-        return self.ppo.state_dict() | {
+        return {
+            **self.ppo.state_dict(),
             "discriminator": self.discriminator.state_dict(),
             "discriminator_optimizer": optimizer_state(self.optimizer),
             "discriminator_guard": self.guard.state_dict(),
@@ -201,12 +202,11 @@ class AMPUpdate(RolloutUpdate):
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         self.ppo.load_state_dict(state)
         super().load_weights(state)
-        load_optimizer_state(
-            self.optimizer, state["discriminator_optimizer"], what="discriminator's Adam"
-        )
-        guard = state["discriminator_guard"]
+        adam = branch(state, "discriminator_optimizer")
+        load_optimizer_state(self.optimizer, adam, what="discriminator's Adam")
+        guard = branch(state, "discriminator_guard")
         state_tree.copy_into(self.guard.state_dict(), guard, what="guard of the discriminator")
-        self.replay.load_state_dict(state["replay"])
+        self.replay.load_state_dict(branch(state, "replay"))
 
     def load_weights(self, state: State) -> None:
         """Take only the networks of a `state_dict`; from a run of plain PPO, the networks of the policy."""

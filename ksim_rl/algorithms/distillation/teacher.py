@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl.checks import naming
 from ksim_rl.device import state_tree
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, branch, text
 from ksim_rl.modules import recurrent_modules
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.algorithm import make_policy
@@ -34,7 +34,7 @@ class Teacher:
 
     def load_state_dict(self, state: State) -> None:
         """Take the weights of a `state_dict`; tensors keep their addresses."""
-        state_tree.copy_into(self.policy.state_dict(), state["actor"], what="teacher")
+        state_tree.copy_into(self.policy.state_dict(), branch(state, "actor"), what="teacher")
 
 
 def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
@@ -45,7 +45,7 @@ def load_teacher(path: Path, env: EnvBase, *, cfg: RunCfg) -> Teacher:
     with naming(f"objective.teacher={str(path)!r}"):
         saved = checkpoint.load_latest(path)
         state = {
-            "actor": saved.state["update"]["actor"],
+            "actor": branch(branch(saved.state, "update"), "actor"),
             "config": json.dumps(saved.config),
             "columns": json.dumps(saved.state["observation_columns"]),
         }
@@ -56,10 +56,10 @@ def restored_teacher(state: State, env: EnvBase, *, cfg: RunCfg) -> Teacher:
     """Build the teacher of a `Teacher.state_dict`; see `load_teacher`."""
     # Built by the config of its own run, on the device of this one.
     teacher_cfg = RunCfg.from_tree(
-        {**json.loads(state["config"]), "device": str(cfg.resolved_device())}
+        {**json.loads(text(state, "config")), "device": str(cfg.resolved_device())}
     )
     read = teacher_cfg.modules.observation_keys("actor")
-    theirs: Any = json.loads(state["columns"])
+    theirs: Any = json.loads(text(state, "columns"))
     ours: Any = observation_columns(env)
     shown: Composite = env.observation_spec
     # The groups that it reads have to exist here, and to have the same columns.
@@ -83,6 +83,6 @@ def restored_teacher(state: State, env: EnvBase, *, cfg: RunCfg) -> Teacher:
         raise ValueError(
             "the teacher is recurrent, and has to label single env states: take one without"
         )
-    state_tree.copy_into(policy.state_dict(), state["actor"], what="teacher")
-    description = {name: state[name] for name in ("config", "columns")}
+    state_tree.copy_into(policy.state_dict(), branch(state, "actor"), what="teacher")
+    description = {name: text(state, name) for name in ("config", "columns")}
     return Teacher(policy=policy.requires_grad_(False).eval(), description=description)

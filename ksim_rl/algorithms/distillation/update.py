@@ -15,7 +15,7 @@ from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
 from ksim_rl.algorithms.ppo.wiring import make_ppo_policy
 from ksim_rl.data import DatasetCfg
 from ksim_rl.device import state_tree
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, branch
 from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.modules import MixedPolicy, update_normalizers
 from ksim_rl.objectives import (
@@ -46,7 +46,7 @@ def make_distillation_update(
     if resumed is None:
         teacher = load_teacher(Path(objective.teacher), env, cfg=cfg)
     else:
-        teacher = restored_teacher(resumed["teacher"], env, cfg=cfg)
+        teacher = restored_teacher(branch(resumed, "teacher"), env, cfg=cfg)
     return DistillationUpdate(
         objective,
         actor=student,
@@ -129,10 +129,10 @@ class DistillationUpdate(DatasetUpdate):
     def state_dict(self) -> state_tree.State:
         """Return student, teacher, optimizer, sampler and counters."""
         own = {"teacher": self.teacher.state_dict(), "teacher_share": self.teacher_share}
-        return super().state_dict() | own
+        return {**super().state_dict(), **own}
 
     def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         super().load_state_dict(state)
-        self.teacher.load_state_dict(state["teacher"])
-        self.teacher_share.copy_(state["teacher_share"])
+        self.teacher.load_state_dict(branch(state, "teacher"))
+        self.teacher_share.copy_(state_tree.tensor(state, "teacher_share"))

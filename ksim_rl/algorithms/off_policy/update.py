@@ -23,7 +23,7 @@ from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.compiling import compiled
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, branch
 from ksim_rl.modules import ExploringPolicy, update_normalizers
 from ksim_rl.objectives import (
     FlatAdamW,
@@ -234,7 +234,8 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizers, replay, exploration and counters."""
-        state = super().state_dict() | {
+        state = {
+            **super().state_dict(),
             "optimizers": {name: optimizer_state(own) for name, own in self.optimizers.items()},
             "replay": self.replay.state_dict(),
             "exploration": self.behavior.exploration_state(),
@@ -248,14 +249,14 @@ class OffPolicyUpdate(RolloutUpdate):
         """Continue where `state_dict` was taken; where it has no replay, with random actions until there is one."""
         super().load_state_dict(state)
         for name, optimizer in self.optimizers.items():
-            load_optimizer_state(optimizer, state["optimizers"][name], what=f"{name} optimizer")
-        state_tree.copy_into(
-            self.behavior.exploration_state(), state["exploration"], what="exploration"
-        )
-        self.replay.load_state_dict(state["replay"])
+            saved = branch(branch(state, "optimizers"), name)
+            load_optimizer_state(optimizer, saved, what=f"{name} optimizer")
+        exploration = branch(state, "exploration")
+        state_tree.copy_into(self.behavior.exploration_state(), exploration, what="exploration")
+        self.replay.load_state_dict(branch(state, "replay"))
         # Without a replay the run has to collect random actions first, as at its start.
         if state["replay"]:
-            self.steps_made = state["steps_made"]
+            self.steps_made = int(state_tree.number(state, "steps_made"))
         else:
             self.steps_made = 0
         self.behavior.random.fill_(self.steps_made < self.data.learning_starts)
@@ -263,22 +264,21 @@ class OffPolicyUpdate(RolloutUpdate):
     def load_weights(self, state: State) -> None:
         """Take networks and temperature of a `state_dict`; a ValueError names a tensor or action bound that differs."""
         # Before any weight is copied.
-        self._check_action_bounds(state["actor"])
+        self._check_action_bounds(branch(state, "actor"))
         super().load_weights(state)
         if isinstance(self.loss, SACLoss):
             with torch.no_grad():
-                self.loss.log_alpha.copy_(state["log_alpha"])
+                self.loss.log_alpha.copy_(state_tree.tensor(state, "log_alpha"))
 
     def _check_action_bounds(self, saved: State) -> None:
         """Refuse an actor that was trained for other actions: its bounds are not weights, and come from the config."""
         for name, bound in self.actor.state_dict().items():
+            if name not in saved or not name.endswith((".low", ".high")):
+                continue
             own = bound.cpu()
-            if (
-                name.endswith((".low", ".high"))
-                and name in saved
-                and not torch.equal(saved[name].cpu(), own)
-            ):
+            theirs = state_tree.tensor(saved, name).cpu()
+            if not torch.equal(theirs, own):
                 raise ValueError(
-                    f"modules.actor.action_bound: {name!r} is {own.tolist()} in this run and {saved[name].tolist()} in "
-                    "the checkpoint; take that of the checkpoint's run"
+                    f"modules.actor.action_bound: {name!r} is {own.tolist()} in this run and {theirs.tolist()} in the "
+                    "checkpoint; take that of the checkpoint's run"
                 )

@@ -153,9 +153,10 @@ class PPOUpdate(DatasetUpdate):
 
     def state_dict(self) -> state_tree.State:
         """Return networks, optimizer, sampler and counters."""
-        return super().state_dict() | {"recurrent_state": self._carried.state_dict()}
+        return {**super().state_dict(), "recurrent_state": self._carried.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
         """Continue where `state_dict` was taken; see `RolloutUpdate`."""
         super().load_state_dict(state)
-        self._carried.load_state_dict(state["recurrent_state"], device=self.device)
+        carried = state_tree.tensors(state_tree.branch(state, "recurrent_state"))
+        self._carried.load_state_dict(carried, device=self.device)

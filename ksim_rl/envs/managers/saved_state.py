@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from jaxtyping import Shaped
 from torch import Tensor
 
-from ksim_rl.device.state_tree import State
+from ksim_rl.device.state_tree import State, tensors
 from ksim_rl.envs.driver import EnvDriver
 from ksim_rl.envs.managers.outcomes import CurriculumManager, EpisodeLog, RewardManager
 
@@ -35,7 +35,7 @@ def joined(
     of_world: Mapping[str, Shaped[Tensor, "*?shape"]],
 ) -> State:
     """Return the state dict of an env and its worlds; the env's tensors are copied."""
-    state: State = {f"{WORLD}{name}": value for name, value in of_world.items()}
+    state = {f"{WORLD}{name}": value for name, value in of_world.items()}
     for name, tensor in of_env.items():
         state[f"{ENV}{name}"] = tensor.clone()
     return state
@@ -47,7 +47,7 @@ def parts(
     """Return the env's entries of a state dict, and the entries of its worlds; see `joined`."""
     of_env = {}
     of_world = {}
-    for name, value in state.items():
+    for name, value in tensors(state).items():
         if name.startswith(ENV):
             of_env[name.removeprefix(ENV)] = value
         elif name.startswith(WORLD):
