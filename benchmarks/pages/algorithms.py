@@ -5,6 +5,7 @@ import dataclasses
 from benchmarks.pages.table import table
 from ksim_rl.algorithms import registry
 from ksim_rl.modules import ActorCfg
+from ksim_rl.objectives import BCCfg
 from ksim_rl.trainers.algorithm import Algorithm
 
 HEAD = (
@@ -40,6 +41,8 @@ def row(algorithm: Algorithm) -> list[str]:
 
 def actions(algorithm: Algorithm) -> str:
     """Return the kinds of actions that the policies of an algorithm have."""
+    if issubclass(algorithm.cfg, BCCfg):
+        return "continuous"
     if isinstance(algorithm.modules.actor, ActorCfg):
         return "continuous, discrete, or both"
     return "continuous, with bounds"

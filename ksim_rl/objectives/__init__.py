@@ -4,12 +4,14 @@ from ksim_rl.objectives.advantage_estimators import GAE, TDLambda, VTrace
 from ksim_rl.objectives.algorithm_cfg import (
     AlgorithmCfg,
     AMPCfg,
+    BCCfg,
     DistillationCfg,
     OffPolicyCfg,
     PPOCfg,
     SACCfg,
     TD3Cfg,
 )
+from ksim_rl.objectives.bc_loss import BCLoss
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.discriminator_loss import discriminator_loss, style_reward
 from ksim_rl.objectives.distillation_loss import DistillationLoss

@@ -33,6 +33,8 @@ class AlgorithmCfg(Checked):
     """Whether networks may be recurrent."""
     checkpoint_fields: ClassVar[tuple[str, ...]] = ()
     """The fields that name run folders or checkpoints."""
+    episode_fields: ClassVar[tuple[str, ...]] = ()
+    """The fields that name folders of episodes."""
 
     @property
     def observation_groups(self) -> tuple[str, ...]:
@@ -46,7 +48,10 @@ class AlgorithmCfg(Checked):
         """Return the same settings with paths that lead to the same files from any folder."""
         return replace(
             self,
-            **{name: str(Path(getattr(self, name)).resolve()) for name in self.checkpoint_fields},
+            **{
+                name: str(Path(getattr(self, name)).resolve())
+                for name in (*self.checkpoint_fields, *self.episode_fields)
+            },
         )
 
 
@@ -267,6 +272,32 @@ class DistillationCfg(OnPolicyCfg):
     loss: DistillationKind = "kl"
     teacher_share: Share = 1.0
     teacher_share_decay: Share = 0.95
+
+
+@dataclass(frozen=True, kw_only=True)
+class BCCfg(OnPolicyCfg):
+    """A policy learns to act as the `episodes` of a folder do (behavior cloning), in the states that these visit.
+
+    Gradient steps are on env states drawn from the folder, as many as a dataset has; rollouts of the policy only show
+    how well it does meanwhile. The loss "nll" is TorchRL's negative log-likelihood of the recorded action, by which the
+    policy also learns how much actions scatter; "mse" is the squared distance from it of the deterministic action, and
+    leaves the scatter as it is. A share of the episodes is `held_out`: the loss on them is measured, and not learned.
+    """
+
+    learns_on_sequences = False
+    episode_fields = ("episodes",)
+
+    num_epochs: Repeats = 4
+    episodes: Annotated[str, Filled("name a folder of episodes, objective.episodes=FOLDER")] = ""
+    loss: Literal["nll", "mse"] = "nll"
+    held_out: Annotated[float, Within(low=0.0, high=0.5)] = 0.1
+
+    def _check_fields(self) -> None:
+        super()._check_fields()
+        if self.schedule == "adaptive":
+            raise ValueError(
+                "schedule='adaptive' follows the divergence of a policy that collects, and here none does: use 'fixed'"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

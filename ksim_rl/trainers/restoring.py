@@ -8,6 +8,10 @@ from torchrl.envs import EnvBase
 from ksim_rl.device.state_tree import State, tensor
 from ksim_rl.trainers.algorithm import Update
 
+# Networks of an update's state.
+ACTOR = "actor"
+CRITIC = "critic"
+
 
 def load_env_state(env: EnvBase, state: State) -> None:
     """Continue an env where its state was taken.
@@ -26,12 +30,19 @@ def load_env_state(env: EnvBase, state: State) -> None:
         ) from error
 
 
-def load_networks(update: Update, state: State, path: Path) -> None:
+def load_networks(update: Update, state: State, path: Path) -> str:
     """Start from the networks and normalizers of a checkpoint; optimizers and counts stay new.
+
+    A policy that was cloned or distilled has no critic: then this run's begins anew. Returned is a line that says so.
 
     Raises:
         ValueError: if the networks are others, with the path of the checkpoint.
     """
+    note = ""
+    own = update.state_dict()
+    if ACTOR in state and CRITIC in own and CRITIC not in state:
+        state = {**state, CRITIC: own[CRITIC]}
+        note = f"{path} has a policy and no critic: the critic begins anew"
     try:
         update.load_weights(state)
     except KeyError as error:
@@ -42,6 +53,7 @@ def load_networks(update: Update, state: State, path: Path) -> None:
             f"{path}: its networks are others: {error}; choose objective and modules as the "
             "config.yaml of its run has them"
         ) from error
+    return note
 
 
 def random_state(device: torch.device) -> State:

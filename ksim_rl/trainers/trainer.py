@@ -408,7 +408,8 @@ class Trainer:
         state = checkpoint.load_latest(path).state
         columns = checkpoint.columns_of(state)
         checkpoint.check_columns(columns, observation_columns(self.collector.env))
-        load_networks(self.update, branch(state, "update"), path)
+        note = load_networks(self.update, branch(state, "update"), path)
+        self.notes = [*self.notes, *filter(None, [note])]
 
     def state_dict(self) -> State:
         """Return everything that the next iteration depends on: tensors and plain data, nested."""

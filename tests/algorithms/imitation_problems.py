@@ -7,6 +7,8 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 
 from ksim_rl.algorithms.amp.update import AMPUpdate
+from ksim_rl.algorithms.bc.demonstration import Demonstration
+from ksim_rl.algorithms.bc.update import BCUpdate
 from ksim_rl.algorithms.distillation.teacher import Teacher
 from ksim_rl.algorithms.distillation.update import DistillationUpdate
 from ksim_rl.collectors import RolloutCollector
@@ -14,7 +16,7 @@ from ksim_rl.data import DatasetCfg
 from ksim_rl.device import random
 from ksim_rl.envs.masked_reset import MaskedReset
 from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
-from ksim_rl.objectives import AMPCfg, DistillationCfg
+from ksim_rl.objectives import AMPCfg, BCCfg, DistillationCfg
 from ksim_rl.trainers import PPOUpdate, Trainer, TrainerCfg
 
 GAIN, LIMIT = 1.3, 2.0
@@ -170,6 +172,32 @@ def make_distillation(
         ),
         actor=make_actor(actor, obs_dim=len(BINS), action_dim=1),
         teacher=teacher or linear_teacher(),
+        data=data,
+        seed=seed,
+    )
+    return _trainer(env, update, data, folder, iterations)
+
+
+def linear_demonstration(num=4096, *, noise=0.3, held_out=512):
+    """Env states whose actions are (2 x - y + 0.5, y) of what "actor" shows, with noise of this deviation."""
+    generator = torch.Generator().manual_seed(5)
+    obs_N2 = torch.randn(num, 2, generator=generator)
+    mean_N2 = torch.stack((2.0 * obs_N2[:, 0] - obs_N2[:, 1] + 0.5, obs_N2[:, 1]), 1)
+    action_N2 = mean_N2 + noise * torch.randn(num, 2, generator=generator)
+    env_states_N = TensorDict({"actor": obs_N2, "action": action_N2}, [num])
+    return Demonstration(learned_N=env_states_N[held_out:], held_out_N=env_states_N[:held_out])
+
+
+def make_bc(folder=None, *, seed=0, iterations=6, num_envs=64, cfg=None, demonstration=None):
+    torch.manual_seed(seed)
+    env = PlaneEnv(num_envs)
+    env.set_seed(seed)
+    actor = ActorCfg(hidden_dims=(), obs_normalization=False, output_gain=1.0)
+    data = DatasetCfg(num_env_states_per_minibatch=4 * num_envs, num_minibatches=4)
+    update = BCUpdate(
+        BCCfg(**{"episodes": "made_up", "learning_rate": 0.05, **(cfg or {})}),
+        actor=make_actor(actor, obs_dim=2, action_dim=2),
+        demonstration=demonstration or linear_demonstration(),
         data=data,
         seed=seed,
     )

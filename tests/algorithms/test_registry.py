@@ -37,7 +37,7 @@ mine = my_learning.conf
 
 
 def test_ours_are_there_by_name():
-    ours = ["amp", "distillation", "fast_sac", "fast_td3", "ppo", "sac", "td3"]
+    ours = ["amp", "bc", "distillation", "fast_sac", "fast_td3", "ppo", "sac", "td3"]
     assert [name for name in algorithms.names() if name != "mine"] == ours
     assert algorithms.algorithm("amp").cfg is AMPCfg
     with pytest.raises(ValueError, match="fast_sca.*did you mean 'fast_sac'"):

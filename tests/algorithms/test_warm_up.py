@@ -12,6 +12,7 @@ PROBLEMS = {
     "sac": lambda: off_policy_problem.make_trainer("sac"),
     "fast_td3": lambda: off_policy_problem.make_trainer("fast_td3", data={"prioritized": True}),
     "replay_not_saved": lambda: off_policy_problem.make_trainer("td3", data={"save_replay": False}),
+    "bc": imitation_problems.make_bc,
     "amp": imitation_problems.make_amp,
     "distillation": imitation_problems.make_distillation,
 }

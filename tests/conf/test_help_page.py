@@ -73,7 +73,11 @@ def test_the_page_has_values_and_texts_of_the_composed_config():
     assert "\nnum_envs: 16  # parallel envs\n" in page
     assert re.search(r"\n  gamma: [\d.]+  # discount of a step\n", page)
     assert "\ntask:" in page and "walker" in page
-    assert "== Groups" in page and "\nobjective: amp, distillation" in page and "--multirun" in page
+    assert (
+        "== Groups" in page
+        and "\nobjective: amp, bc, distillation" in page
+        and "--multirun" in page
+    )
     with pytest.raises(ValueError, match="did you mean 'num_envs'"):
         conf.help_page(["num_env=17"])
 

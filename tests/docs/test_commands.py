@@ -68,6 +68,7 @@ def test_fields_in_the_text_exist() -> None:
     choices = (
         [],
         ["objective=distillation", "objective.teacher=RUN"],
+        ["objective=bc", "objective.episodes=FOLDER"],
         ["objective=fast_sac"],
         ["task=walker_amp", "objective=amp"],
     )

@@ -1,0 +1,168 @@
+"""Behavior cloning finds the policy that made the actions, reads folders with care, and is a start for PPO."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl import objectives
+from torchrl.data import OneHot
+
+from ksim_rl import conf, data
+from ksim_rl.algorithms.bc.demonstration import read_demonstration
+from ksim_rl.data import EpisodeWriter, Leaf, Origin
+from ksim_rl.data.dataset_storage import MASK_KEY
+from ksim_rl.modules import ActorCfg, make_actor
+from ksim_rl.objectives import BCCfg, BCLoss
+from ksim_rl.testing.counter_env import CounterEnv
+from ksim_rl.trainers import RunProgress, build, run
+from tests.algorithms.imitation_problems import linear_demonstration, make_bc
+
+SMALL = (
+    "device=cpu",
+    "num_envs=4",
+    "task=cartpole_swingup",
+    "task.sim.engine=c",
+    "task.episode_length_s=0.1",
+    "data.num_env_states_per_minibatch=16",
+    "data.num_minibatches=2",
+    "modules.actor.hidden_dims=[8]",
+    "modules.critic.hidden_dims=[8]",
+    "trainer.num_iterations=2",
+    "trainer.eval_episodes=0",
+    "trainer.video=false",
+    "logger=none",
+)
+
+
+@pytest.mark.parametrize(("loss", "std"), [("nll", 0.3), ("mse", 1.0)])
+def test_a_linear_policy_is_found_and_with_nll_its_noise_too(loss, std):
+    trainer = make_bc(
+        iterations=8, cfg={"loss": loss, "num_epochs": 8, "anneal_learning_rate": True}
+    )
+    for _ in range(8):
+        trainer.iterate()
+    trainer.settle()
+    head = trainer.update.actor[0].module.head
+    expected = torch.tensor([[2.0, -1.0], [0.0, 1.0]])
+    torch.testing.assert_close(head.loc.weight.detach(), expected, atol=0.03, rtol=0.0)
+    torch.testing.assert_close(
+        head.loc.bias.detach(), torch.tensor([0.5, 0.0]), atol=0.03, rtol=0.0
+    )
+    shown = TensorDict({"actor": torch.zeros(1, 2)}, [1])
+    scale = trainer.update.actor.get_dist(shown).scale
+    assert scale.flatten().tolist() == pytest.approx([std, std], abs=0.03)
+    # Two numbers with the entropy of a normal distribution each, or the variance of the noise.
+    least = {"nll": 2 * math.log(0.3 * math.sqrt(2 * math.pi * math.e)), "mse": 0.09}[loss]
+    assert trainer.metrics["loss/held_out"] == pytest.approx(least, abs=0.1 * abs(least))
+
+
+def test_the_loss_is_the_stock_one_and_leaves_out_masked_rows():
+    torch.manual_seed(0)
+    actor = make_actor(ActorCfg(hidden_dims=(4,), obs_normalization=False), obs_dim=2, action_dim=2)
+    rows_B = linear_demonstration(64, held_out=8).learned_N.clone()
+    for kind, function in (("nll", None), ("mse", "mse")):
+        loss = BCLoss(actor, loss=kind)(rows_B)["loss_bc"]
+        dist = actor.get_dist(rows_B)
+        if kind == "nll":
+            expected = -dist.log_prob(rows_B["action"]).mean()
+            assert loss == objectives.BCLoss(actor, loss_function=function)(rows_B)["loss_bc"]
+        else:
+            expected = (dist.mean - rows_B["action"]).square().mean()
+        torch.testing.assert_close(loss, expected)
+        # Half of the rows, with actions far off, do not count.
+        spoilt_B = torch.cat([rows_B, rows_B])
+        spoilt_B["action"][len(rows_B) :] = 1e6
+        mask_B1 = torch.arange(len(spoilt_B))[:, None] < len(rows_B)
+        spoilt_B[MASK_KEY] = mask_B1
+        torch.testing.assert_close(BCLoss(actor, loss=kind)(spoilt_B)["loss_bc"], expected)
+
+
+def test_an_update_that_goes_on_from_its_state_is_the_same():
+    first = make_bc(cfg={"num_epochs": 1})
+    first.iterate()
+    state = first.state_dict()
+    again = make_bc(cfg={"num_epochs": 1}, seed=1)
+    again.load_state_dict(state)
+    for trainer in (first, again):
+        torch.manual_seed(3)
+        trainer.iterate()
+    for name, value in first.update.state_dict()["actor"].items():
+        assert torch.equal(value, again.update.state_dict()["actor"][name]), name
+
+
+def write(folder, *, episodes=20, **changed):
+    """Write episodes of a `CounterEnv` of 2 actions, of which leaves may be others."""
+    leaves = {("obs", "vector"): (3,), ("action",): (2,)} | changed.pop("leaves", {})
+    made = [Leaf(key=key, shape=shape) for key, shape in leaves.items() if shape is not None]
+    with EpisodeWriter(folder, made, origin=Origin(**changed)) as writer:
+        for number in range(episodes):
+            rows = {leaf.key: np.full((2, *leaf.shape), number, dtype=np.float32) for leaf in made}
+            writer.append(rows)
+    return folder
+
+
+KEYS = [("obs", "vector"), "action"]
+
+
+def read(folder, held_out=0.1):
+    cpu = torch.device("cpu")
+    return read_demonstration(folder, CounterEnv(), keys=KEYS, held_out=held_out, device=cpu)
+
+
+def test_whole_episodes_are_held_out(tmp_path):
+    found = read(write(tmp_path / "episodes"))
+    assert found.held_out_N["action"][:, 0].tolist() == [9.0, 9.0, 19.0, 19.0]
+    assert len(found.learned_N) == 36
+    assert read(tmp_path / "episodes", held_out=0.0).held_out_N is None
+
+
+@pytest.mark.parametrize(
+    ("leaves", "message"),
+    [
+        ({("action",): None}, "it has no 'action'"),
+        ({("obs", "vector"): (4,)}, r"its 'obs/vector' is float32 \[4\], and the env's"),
+    ],
+)
+def test_leaves_that_do_not_fit_are_refused_by_name(tmp_path, leaves, message):
+    folder = write(tmp_path / "episodes", leaves=leaves)
+    with pytest.raises(ValueError, match=message) as refused:
+        read(folder)
+    assert str(folder) in str(refused.value)
+
+
+def test_actions_that_are_choices_are_refused(tmp_path):
+    env = CounterEnv()
+    env.action_spec = OneHot(2, shape=(3, 2))
+    cpu = torch.device("cpu")
+    with pytest.raises(ValueError, match="are choices, and behavior cloning is for continuous"):
+        read_demonstration(write(tmp_path / "episodes"), env, keys=KEYS, held_out=0.0, device=cpu)
+
+
+def test_a_learning_rate_that_follows_a_divergence_is_refused():
+    with pytest.raises(ValueError, match="use 'fixed'"):
+        BCCfg(episodes="x", schedule="adaptive")
+
+
+def test_a_run_learns_from_a_folder_and_ppo_goes_on_from_it(tmp_path):
+    folder = tmp_path / "episodes"
+    leaves = {("actor",): (5,), ("obs", "vector"): None, ("action",): (1,)}
+    columns = {"actor": {"obs/position": (0, 3), "obs/velocity": (3, 5)}}
+    write(folder, leaves=leaves, columns=columns)
+    cfg = conf.compose([*SMALL, "objective=bc", f"objective.episodes={folder}"])
+    outcome = run(cfg, tmp_path / "cloned", progress=RunProgress(2, enabled=False))
+    assert outcome.iteration == 2
+
+    ppo = build(conf.compose([*SMALL, f"checkpoint={tmp_path / 'cloned'}"]))
+    assert any("the critic begins anew" in note for note in ppo.notes)
+    cloned = build(dataclasses.replace(cfg, checkpoint=str(tmp_path / "cloned")))
+    for name, value in cloned.update.state_dict()["actor"].items():
+        assert torch.equal(value, ppo.update.state_dict()["actor"][name]), name
+
+    other = {"actor": {"obs/velocity": (0, 2), "obs/position": (2, 5)}}
+    write(tmp_path / "other", leaves=leaves, columns=other)
+    with pytest.raises(ValueError, match="objective.episodes=.*other"):
+        build(conf.compose([*SMALL, "objective=bc", f"objective.episodes={tmp_path / 'other'}"]))
+    assert data.read_episodes(folder).contents.num_episodes == 20
