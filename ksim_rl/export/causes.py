@@ -18,6 +18,8 @@ Arrays = Mapping[str, np.ndarray]
 SAME = 2e-3
 LIKE = 2e-2
 """Relative errors: up to SAME two signals count as equal, up to LIKE a reason explains their difference."""
+MOST_OFF = 0.2
+"""Share of pixels in which two renderers may differ: edges, lights and textures are not drawn alike."""
 # Env steps by which a signal may be late or early and still be recognized.
 MOST_SHIFT = 4
 
@@ -53,23 +55,20 @@ def find_causes(meta: Json, trace: Arrays, replay: Arrays) -> list[Cause]:
         )
         found.append(Cause("rate", "env step", evidence + f"{float(trace['trace/dt']):g} s"))
 
+    for camera, share in pictures_off(meta, replay).items():
+        if not share <= MOST_OFF:
+            found.append(
+                Cause("picture", f"camera {camera!r}", f"{share:.0%} of its pixels are others")
+            )
+
     signal = partial(_pairs, trace=trace, replay=replay)
-    # Observations, term by term. Histories are cut to their newest frame, which the replay gives too.
-    frames = _newest(meta, trace["trace/obs"])
-    start = 0
-    obs_differs = False
-    ours, theirs, episode = _pairs("obs", {**trace, "trace/obs": frames}, replay)
-    for term in meta["observations"]:
-        columns = slice(start, start + term["size"])
-        start += term["size"]
-        causes = _of_observation(term["name"], ours[:, columns], theirs[:, columns], episode)
-        obs_differs = obs_differs or bool(causes)
-        # The last action follows from the action chain, which the targets show.
-        found += [] if term["reads"] == ["action"] else causes
+    causes, obs_differs = _of_observations(meta, trace, replay)
+    found += causes
     # The network itself: it was given the recorded observation, so only its file can explain a difference.
     ours, theirs, _ = signal("action")
     # With a history or a recurrent state the runner feeds its own frames, and inherits their errors.
-    remembers = trace["trace/obs"].shape[-1] != start
+    size = sum(term["size"] for term in meta["observations"])
+    remembers = trace["trace/obs"].shape[-1] != size
     if _error(ours, theirs) > SAME and not (remembers and obs_differs):
         # Columns in another order are the most common mistake, and would also look like a wrong normalizer.
         if order := _order(ours, theirs):
@@ -92,6 +91,37 @@ def find_causes(meta: Json, trace: Arrays, replay: Arrays) -> list[Cause]:
         found.append(Cause("joint order", "robot.xml", evidence))
     elif motion := _of_motion(meta, signal, rates=not found or found[0].name != "rate"):
         found.append(motion)
+    return found
+
+
+def _of_observations(meta: Json, trace: Arrays, replay: Arrays) -> tuple[list[Cause], bool]:
+    """Return the causes among the terms of the observation, and whether any term differs."""
+    found: list[Cause] = []
+    # A policy that only sees has no terms.
+    if not meta["observations"]:
+        return found, False
+    # Histories are cut to their newest frame, which the replay gives too.
+    frames = _newest(meta, trace["trace/obs"])
+    ours, theirs, episode = _pairs("obs", {**trace, "trace/obs": frames}, replay)
+    start = 0
+    differs = False
+    for term in meta["observations"]:
+        columns = slice(start, start + term["size"])
+        start += term["size"]
+        causes = _of_observation(term["name"], ours[:, columns], theirs[:, columns], episode)
+        differs = differs or bool(causes)
+        # The last action follows from the action chain, which the targets show.
+        found += [] if term["reads"] == ["action"] else causes
+    return found, differs
+
+
+def pictures_off(meta: Json, replay: Arrays) -> dict[str, float]:
+    """Return the mean share of pixels that are drawn otherwise in the recorded states, by camera."""
+    found = {}
+    for spec in meta.get("pictures", []):
+        ending = f"/off_{spec['group']}"
+        shares = [values for name, values in replay.items() if name.endswith(ending)]
+        found[str(spec["camera"])] = float(np.mean(np.concatenate(shares)))
     return found
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.contract import part
-from ksim_rl.export import controls, policy
+from ksim_rl.export import controls, policy, policy_check
 from ksim_rl.export.described_commands import described_commands
 from ksim_rl.export.exported_transforms import (
     TaskTransforms,
@@ -22,6 +22,7 @@ from ksim_rl.export.exported_transforms import (
 )
 from ksim_rl.export.metadata import metadata
 from ksim_rl.export.onnx_file import attach
+from ksim_rl.export.picture_inputs import describe_sight
 from ksim_rl.export.record import Kept, Recording
 from ksim_rl.export.robot import write_robot
 from ksim_rl.export.standalone.files import Json
@@ -47,6 +48,7 @@ PARTS = (
     "contacts",
     "network",
     "signals",
+    "sight",
     "stages",
     "runner",
     "robot_link",
@@ -113,20 +115,23 @@ README = """# {task}, iteration {iteration}
 
 | file | what is in it |
 |---|---|
-| `policy.onnx` | `obs` [batch, {obs_dim}] to `actions` [batch, {num_actions}], normalization inside{state} |
+| `policy.onnx` | {read} to `actions` [batch, {num_actions}], normalization inside{state} |
 | `policy.pt2` | the same for `torch.export.load` |
-| `obs.onnx` | what a robot measures, one batch row, to `obs` before noise, clip and scale; `obs` in `export.json` |
-| `scores.onnx` | terminations, rewards and metrics, for simulators |
+{observes}| `scores.onnx` | terminations, rewards and metrics, for simulators |
 | `robot.xml` | the robot's model; actuators stand in the order of the actions |
 | `export.json` | names, order, scales, gains, rates, noise, lags; which quantities the ONNX files read |
 | `runner.py` | `python runner.py --episodes 100` runs it on MuJoCo's C engine; needs numpy, onnxruntime, mujoco |
 | `loop.py` | `python loop.py --simulate` runs it as a loop in real time, as a robot's computer does |
 | `episodes.npz`, `trace.npz` | starts, commands and pushes of recorded episodes, and steps to compare with |
 
-The policy's actions equal the trained network's within {difference:.1e} on {checked} observations, and the observations
-equal the observations of training within {obs[difference]:.1e}. One step lasts
-{step_dt:g} s, of {decimation} physics steps. Joints, in the order of actions: {joints}.
+The policy's actions equal the trained network's within {difference:.1e} on {checked} observations{equal}.
+One step lasts {step_dt:g} s, of {decimation} physics steps. Joints, in the order of actions: {joints}.
 """
+
+OBSERVES = (
+    "| `obs.onnx` | what a robot measures, one batch row, to `obs` before noise, clip and scale; `obs` in "
+    "`export.json` |\n"
+)
 
 
 def export(
@@ -219,8 +224,13 @@ def _fill(
     )
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET
-    groups: list[Any] = cfg.modules.observation_keys("actor")
+    sight = describe_sight(cfg.task, cfg.modules.observation_keys("actor"))
+    seen = {picture.group for picture in sight.pictures}
+    groups: list[Any] = [key for key in cfg.modules.observation_keys("actor") if key not in seen]
     transforms = sort_transforms(cfg.task, groups)
+    # One of several groups may be in both.
+    training_only = dict.fromkeys([*transforms.training_only, *sight.training_only])
+    transforms = dataclasses.replace(transforms, training_only=list(training_only))
     for name in transforms.training_only:
         note(f"task.transforms.{name} acts in training only, and is left out")
     kept = {
@@ -246,10 +256,13 @@ def _fill(
     step_count = trained.iteration * cfg.data.rollout_length(cfg.num_envs)
     commands = described_commands(ours, trained.cfg.task.curriculum.values(), step_count)
     meta = metadata(ours, observed, transforms, traced, commands)
-    note("writing obs.onnx")
-    traced.obs.write(folder / "obs.onnx")
-    names = [term["name"] for term in observed]
-    meta["obs"]["difference"] = greatest_difference(traced.obs, ours, folder / "obs.onnx", names)
+    meta["pictures"] = [picture.described() for picture in sight.pictures]
+    if traced.obs:
+        note("writing obs.onnx")
+        traced.obs.write(folder / "obs.onnx")
+        names = [term["name"] for term in observed]
+        path = folder / "obs.onnx"
+        meta["obs"]["difference"] = greatest_difference(traced.obs, ours, path, names)
     if traced.scores:
         traced.scores.write(folder / "scores.onnx")
     columns = {
@@ -265,15 +278,15 @@ def _fill(
         for group in groups
     }
     # In evaluation mode normalizers stop learning; on the CPU as the files are for it.
-    exported = policy.ExportedPolicy(actor.eval(), columns)
+    exported = policy.ExportedPolicy(actor.eval(), columns, sight.pictures)
     note("writing policy.onnx and policy.pt2")
     policy.write(exported, folder)
-    difference = policy.greatest_difference(exported, folder / "policy.onnx")
+    difference = policy_check.greatest_difference(exported, folder / "policy.onnx")
     # Written so that NaN is refused, too.
-    if not difference <= policy.TOLERANCE:
+    if not difference <= policy_check.TOLERANCE:
         raise ValueError(
-            f"policy.onnx differs from the policy by {difference:.2g}: expected at most {policy.TOLERANCE:g}; weights "
-            "or observations that large lose digits in float32"
+            f"policy.onnx differs from the policy by {difference:.2g}: expected at most {policy_check.TOLERANCE:g}; "
+            "weights or observations that large lose digits in float32"
         )
     # Actuators of the model in the order of the policy's actions; those that no action names follow.
     first = [name for law in meta["actuators"] for name in law["actuators"]]
@@ -303,7 +316,13 @@ def _fill(
     if episodes:
         note(f"recording {episodes} episodes for sim2sim")
         params = sorted({name for law in meta["actuators"] for name in law["numbers"]})
-        kept = Kept(groups=groups, joints=meta["joints"]["names"], params=params, order=order)
+        kept = Kept(
+            groups=groups,
+            pictures=sight.pictures,
+            joints=meta["joints"]["names"],
+            params=params,
+            order=order,
+        )
         steps = ours.max_episode_length or UNLIMITED_EPISODE_STEPS
         recorded = Recording(env, ours, actor, kept, steps=steps, seed=seed)
         figures = recorded.figures[:episodes]
@@ -332,12 +351,32 @@ def _fill(
     (folder / "README.md").write_text(
         README.format(
             **{**meta, **own, "joints": ", ".join(meta["joint_names"])},
-            state="; " + ", ".join(exported.input_names[1:]) + " carry its recurrent state"
+            read=_read_by(exported),
+            observes="" if meta["obs"] is None else OBSERVES,
+            equal=_equal(meta),
+            state="; " + ", ".join(state.input for state in exported.states) + " carry its state"
             if states
             else "",
-            checked=policy.CHECKED,
+            checked=policy_check.num_checked(exported),
         )
     )
+
+
+def _read_by(exported: policy.ExportedPolicy) -> str:
+    """Return the observations of a policy, for a reader."""
+    found = []
+    if exported.obs_dim:
+        found.append(f"`obs` [batch, {exported.obs_dim}]")
+    for picture in exported.pictures:
+        found.append(f"`{picture.name}` {['batch', *picture.shape]}".replace("'", ""))
+    return " and ".join(found)
+
+
+def _equal(meta: Json) -> str:
+    if meta["obs"] is None:
+        return ""
+    difference = meta["obs"]["difference"]
+    return f", and the observations\nequal the observations of training within {difference:.1e}"
 
 
 def _traced(

@@ -6,51 +6,49 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import numpy as np
 import torch
-from jaxtyping import Float
-from tensordict import TensorDict
+from jaxtyping import Float, Shaped
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn import functional
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ksim_rl.export.onnx_file import quiet, write_onnx
+from ksim_rl.export.picture_inputs import PictureInput
 from ksim_rl.modules.action_heads import PARAMETERS, MixedHead
-from ksim_rl.modules.network import ObservationNormalizer, side_by_side
-from ksim_rl.modules.recurrent import RESET_KEY, RecurrentModule
-
-# Greatest error of the ONNX file, and over how many observations it is looked for.
-TOLERANCE = 1e-5
-CHECKED = 10_000
-# Observations in one call, as parallel episodes.
-ROWS = 100
+from ksim_rl.modules.network import side_by_side
+from ksim_rl.modules.recurrent import RecurrentModule
 
 
 @dataclass(frozen=True, kw_only=True)
 class StateSpec:
     """A state that the policy carries from step to step: an input [batch, *shape] and the output that feeds it next.
 
-    An episode starts with zeros, or with its first frame, columns [start, stop) of the observation, in all places.
+    An episode starts with zeros, or with its first frame in all places: columns [start, stop) of the input `of`, or all
+    of it.
     """
 
     input: str
     output: str
     shape: tuple[int, ...]
     starts_with: Literal["zeros", "frame"]
+    of: str | None = None
     columns: tuple[int, int] | None = None
+    dtype: str = "float32"
 
 
-def _state(name: str, shape: tuple[int, ...], columns: tuple[int, int] | None = None) -> StateSpec:
-    # A history begins with the first frame in all places, a recurrent state with zeros.
-    starts_with = "frame" if columns else "zeros"
+def _recurrent_state(name: str, shape: tuple[int, ...]) -> StateSpec:
+    return StateSpec(input=f"{name}_in", output=f"{name}_out", shape=shape, starts_with="zeros")
+
+
+def _history(name: str, shape: tuple[int, ...], **frame: Any) -> StateSpec:
+    # It begins with the first frame in all places.
     return StateSpec(
-        input=f"{name}_in",
-        output=f"{name}_out",
+        input=f"history_{name}_in",
+        output=f"history_{name}_out",
         shape=shape,
-        starts_with=starts_with,
-        columns=columns,
+        starts_with="frame",
+        **frame,
     )
 
 
@@ -65,20 +63,25 @@ class Column:
 
 
 class ExportedPolicy(nn.Module):
-    """A policy as a function of tensors: `obs` [batch, L] and its states to the actions [batch, A] and the next states.
+    """A policy as a function of tensors: observations and states to the actions [batch, A] and the next states.
 
-    `obs` is the newest frame of every term, side by side; `groups` are the terms of each observation that the actor
-    reads. Raises ValueError where the actor has a part that has no such form.
+    Observations are `obs` [batch, L], the newest frame of every term, side by side, unless the policy only sees, and
+    the newest picture [batch, *shape] of each camera. `groups` are the terms of each vector that the actor reads.
+    Raises ValueError where the actor has a part that has no such form.
     """
 
     def __init__(
-        self, actor: TensorDictModuleBase, groups: Mapping[NestedKey, Sequence[Column]]
+        self,
+        actor: TensorDictModuleBase,
+        groups: Mapping[NestedKey, Sequence[Column]],
+        pictures: Sequence[PictureInput] = (),
     ) -> None:
         super().__init__()
         self.actor = actor
         # The sequence of modules is run by hand in `forward`: exporters know no TensorDict.
         self.parts = list(_parts(actor))
         self.groups = groups
+        self.pictures = list(pictures)
         # A mixed head has one action per distribution, under keys of its own.
         mixed = _mixed_head(self.parts[-1])
         if mixed:
@@ -92,14 +95,19 @@ class ExportedPolicy(nn.Module):
             if column.length > 1:
                 shape = ((column.length - 1) * column.stride, column.size)
                 columns = (start, start + column.size)
-                self.states.append(_state(f"history_{column.name}", shape, columns))
+                self.states.append(_history(column.name, shape, of="obs", columns=columns))
             # Start of the next term in the frame.
             start += column.size
         self.obs_dim = start
+        for picture in self.pictures:
+            if picture.length > 1:
+                shape = ((picture.length - 1) * picture.stride, *picture.shape)
+                dtype = str(picture.dtype).removeprefix("torch.")
+                self.states.append(_history(picture.name, shape, of=picture.name, dtype=dtype))
         for part in self.parts:
             if isinstance(part, RecurrentModule):
                 shape = (part.cfg.num_layers, part.cfg.hidden_dim)
-                self.states += [_state(key[-1], shape) for key in part.state_keys]
+                self.states += [_recurrent_state(key[-1], shape) for key in part.state_keys]
 
     @property
     def columns(self) -> list[Column]:
@@ -108,38 +116,36 @@ class ExportedPolicy(nn.Module):
 
     @property
     def input_names(self) -> list[str]:
-        """Names of the inputs: "obs", then the states."""
-        return ["obs", *(state.input for state in self.states)]
+        """Names of the inputs: "obs" if there are vectors, pictures, then the states."""
+        return [*self.examples(1)]
+
+    def examples(self, rows: int) -> dict[str, Shaped[Tensor, "*?shape"]]:
+        """Return zeros for each input, by name and in their order."""
+        found = {}
+        if self.obs_dim:
+            found["obs"] = torch.zeros(rows, self.obs_dim)
+        for picture in self.pictures:
+            found[picture.name] = torch.zeros(rows, *picture.shape, dtype=picture.dtype)
+        for state in self.states:
+            dtype = getattr(torch, state.dtype)
+            found[state.input] = torch.zeros(rows, *state.shape, dtype=dtype)
+        return found
 
     @property
     def output_names(self) -> list[str]:
         """Names of the outputs: "actions", then the next states."""
         return ["actions", *(state.output for state in self.states)]
 
-    def forward(
-        self, obs_BL: Float[Tensor, "B L"], *states: Float[Tensor, "B *?S"]
-    ) -> tuple[Float[Tensor, "B *?M"], ...]:
-        """Return the actions and the next states."""
-        # Consumed from the front, in the order of `states`: histories first, then recurrent ones.
-        given = list(states)
-        after = []
-        values: dict[NestedKey, Tensor] = {}
-        start = 0
-        for group, columns in self.groups.items():
-            terms = []
-            for column in columns:
-                frame = obs_BL[:, start : start + column.size]
-                # The frame has terms side by side, in the order of the groups.
-                start += column.size
-                if column.length > 1:
-                    # Oldest first; the oldest frame drops out of the next state.
-                    frames = torch.cat((given.pop(0), frame[:, None]), 1)
-                    after.append(frames[:, 1:])
-                    # Every `stride`-th of (length - 1) * stride + 1 frames: `length` of them, the newest
-                    # among them.
-                    frame = frames[:, :: column.stride].flatten(1)
-                terms.append(frame)
-            values[group] = torch.cat(terms, -1)
+    def forward(self, *inputs: Shaped[Tensor, "B *?S"]) -> tuple[Shaped[Tensor, "B *?M"], ...]:
+        """Return the actions and the next states for inputs in the order of `input_names`."""
+        # Consumed from the front, in their order: histories before recurrent states.
+        given = list(inputs)
+        after: list[Tensor] = []
+        obs_BL = given.pop(0) if self.obs_dim else torch.empty(0)
+        newest = [given.pop(0) for _ in self.pictures]
+        values = self._vectors(obs_BL, given, after)
+        for picture, picture_B in zip(self.pictures, newest, strict=True):
+            values[picture.group] = _frames(picture, picture_B, given, after)
         actions: list[Tensor] = []
         for part in self.parts:
             # By the formula of one step: the module itself reads reset flags, which an export has not.
@@ -160,7 +166,43 @@ class ExportedPolicy(nn.Module):
                     actions = [values["action"]]
                 else:
                     actions = []
-        return torch.cat([_row(action) for action in actions], -1), *after
+        return torch.cat([as_row(action) for action in actions], -1), *after
+
+    def _vectors(
+        self, obs_BL: Tensor, given: list[Tensor], after: list[Tensor]
+    ) -> dict[NestedKey, Tensor]:
+        """Return the vector of each group; histories are taken from `given`, and the next ones put behind `after`."""
+        values: dict[NestedKey, Tensor] = {}
+        start = 0
+        for group, columns in self.groups.items():
+            terms = []
+            for column in columns:
+                frame = obs_BL[:, start : start + column.size]
+                # The frame has terms side by side, in the order of the groups.
+                start += column.size
+                if column.length > 1:
+                    # Oldest first; the oldest frame drops out of the next state.
+                    frames = torch.cat((given.pop(0), frame[:, None]), 1)
+                    after.append(frames[:, 1:])
+                    # Every `stride`-th of (length - 1) * stride + 1 frames: `length` of them, the newest
+                    # among them.
+                    frame = frames[:, :: column.stride].flatten(1)
+                terms.append(frame)
+            values[group] = torch.cat(terms, -1)
+        return values
+
+
+def _frames(
+    picture: PictureInput, picture_B: Tensor, given: list[Tensor], after: list[Tensor]
+) -> Tensor:
+    """Return the frames of a camera as the actor reads them: the newest, or stacked behind older ones."""
+    if not picture.is_stacked:
+        return picture_B
+    frames = picture_B[:, None]
+    if picture.length > 1:
+        frames = torch.cat((given.pop(0), frames), 1)
+        after.append(frames[:, 1:])
+    return frames[:, :: picture.stride]
 
 
 def _parts(module: nn.Module) -> Iterator[Any]:
@@ -206,7 +248,8 @@ def _mixed_head(part: nn.Module) -> MixedHead | None:
     return None
 
 
-def _row(action: Tensor) -> Tensor:
+def as_row(action: Shaped[Tensor, " B *M"]) -> Float[Tensor, "B M"]:
+    """Return actions, or choices [B], as rows of float32."""
     # Choices are whole numbers of shape [B]; files hold one float32 row per action.
     return (action.flatten(1) if action.ndim > 1 else action[:, None]).float()
 
@@ -254,18 +297,13 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
     # Weights are copied into the files; `eval` stops normalizers from learning.
     policy = policy.to("cpu").eval()
     # Two rows: a batch of one would be taken for a constant.
-    example = (
-        torch.zeros(2, policy.obs_dim),
-        *(torch.zeros(2, *state.shape) for state in policy.states),
-    )
+    example = tuple(policy.examples(2).values())
     batch = torch.export.Dim("batch", min=1, max=2**20)
-    # One entry per parameter of `forward`; the states are one parameter, a tuple.
-    shapes: tuple[Any, ...] = ({0: batch}, tuple({0: batch} for _ in policy.states))
+    # One entry per parameter of `forward`, which has one, a tuple.
+    shapes = (tuple({0: batch} for _ in example),)
     # No gradients; warnings of the exporter are not for users.
     with torch.no_grad(), quiet():
-        program = torch.export.export(
-            policy, example, dynamic_shapes=shapes if policy.states else shapes[:1]
-        )
+        program = torch.export.export(policy, example, dynamic_shapes=shapes)
     # They name the folders of this machine, in files that are made to be given away.
     for node in program.graph.nodes:
         node.meta.pop("stack_trace", None)
@@ -280,88 +318,3 @@ def write(policy: ExportedPolicy, folder: Path) -> None:
         inputs=policy.input_names,
         outputs=policy.output_names,
     )
-
-
-def greatest_difference(policy: ExportedPolicy, path: Path) -> float:
-    """Return the greatest difference of an ONNX file's actions from the actor's, over `CHECKED` observations.
-
-    It is relative to actions above 1, which float32 holds no better.
-    They are drawn about the statistics of the policy's normalizer, in episodes of 100 steps that carry the states. The
-    actor itself is asked through TensorDicts, with histories put together here.
-    """
-    import onnxruntime  # an extra
-
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    draws = np.random.default_rng(0)
-    worst = 0.0
-    mean, std = _statistics(policy)
-    carried: dict[NestedKey, Tensor] = {}
-    states: list[np.ndarray] = []
-    frames: list[np.ndarray] = []
-    # Batches of ROWS make CHECKED observations; each batch is one step of all episodes.
-    for step in range(CHECKED // ROWS):
-        frames.append(
-            (mean + std * draws.standard_normal((ROWS, policy.obs_dim))).astype(np.float32)
-        )
-        # States begin with the first frame, as they do on a robot.
-        if not step:
-            states = [_first(state, frames[0]) for state in policy.states]
-        feed = dict(zip(policy.input_names, [frames[-1], *states], strict=True))
-        actions, *states = (np.asarray(value) for value in session.run(policy.output_names, feed))
-        # Recurrent modules clear their state where this is true, at the first step.
-        asked = TensorDict({RESET_KEY: torch.full((ROWS, 1), not step)}, batch_size=[ROWS])
-        start = 0
-        for group, columns in policy.groups.items():
-            # Histories are put together from the kept frames, not taken from the states under test.
-            terms = []
-            for column in columns:
-                back = [column.stride * k for k in reversed(range(column.length))]
-                terms += [frames[max(step - k, 0)][:, start : start + column.size] for k in back]
-                start += column.size
-            asked[group] = torch.from_numpy(np.concatenate(terms, -1))
-        # The recurrent state that the actor gave at the step before, zeros at first.
-        for part in policy.parts:
-            if isinstance(part, RecurrentModule):
-                zeros = torch.zeros(ROWS, part.cfg.num_layers, part.cfg.hidden_dim)
-                for key in part.state_keys:
-                    asked[key] = carried.get(key, zeros)
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            answer = policy.actor(asked)
-        # TorchRL's modules give the state of the next step under "next".
-        carried = {
-            key: answer["next", *key]
-            for part in policy.parts
-            for key in getattr(part, "state_keys", ())
-        }
-        wanted = torch.cat([_row(answer[key]) for key in policy.action_keys], -1).numpy()
-        # Also where one of the two is NaN, which numpy's `max` passes on, and Python's may not.
-        difference = (np.abs(actions - wanted) / np.maximum(np.abs(wanted), 1.0)).max()
-        worst = max(worst, float("inf") if np.isnan(difference) else float(difference))
-    return worst
-
-
-def _statistics(policy: ExportedPolicy) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and std of one frame, [L] each; 0 and 1 without a normalizer that covers it."""
-    mean = np.zeros(policy.obs_dim)
-    std = np.ones(policy.obs_dim)
-    for module in policy.actor.modules():
-        whole = sum(column.size * column.length for column in policy.columns)
-        # The normalizer that covers the whole observation, histories included.
-        if isinstance(module, ObservationNormalizer) and module.dim == whole:
-            newest = []
-            stop = 0
-            for column in policy.columns:
-                stop += column.size * column.length
-                newest += range(stop - column.size, stop)
-            mean_L = module.mean.detach().cpu().double()
-            std_L = module.var.detach().cpu().double().sqrt()
-            mean = mean_L.numpy()[newest]
-            # A column that never moved has no spread; it is drawn a little about its mean.
-            std = std_L.clamp(min=1e-3).numpy()[newest]
-    return mean, std
-
-
-def _first(state: StateSpec, frame: np.ndarray) -> np.ndarray:
-    if state.columns is None:
-        return np.zeros((len(frame), *state.shape), np.float32)
-    return np.repeat(frame[:, None, slice(*state.columns)], state.shape[0], 1)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -13,6 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ksim_rl.envs import ManagerBasedRlEnv
+from ksim_rl.export.picture_inputs import PictureInput
 from ksim_rl.export.robot import activation_order
 from ksim_rl.export.standalone.models import CHOICE, FIELDS
 from ksim_rl.scene.sensors import ContactSensor
@@ -25,13 +27,15 @@ class Kept:
     """What a recording keeps, in the order of the export.
 
     Attributes:
-        groups: of observations, which the policy reads.
+        groups: of observations, which the policy reads as vectors.
+        pictures: that it reads.
         joints: by name.
         params: the numbers of motor models, by name.
         order: of actuators, as places in the env's own order.
     """
 
     groups: Sequence[NestedKey]
+    pictures: Sequence[PictureInput]
     joints: Sequence[str]
     params: Sequence[str]
     order: Sequence[int]
@@ -83,8 +87,9 @@ class Recording:
                 for self._now in range(steps):
                     # State and observation before the step, from which the replay starts this step by itself.
                     if traces:
-                        obs = torch.cat([current[group] for group in kept.groups], -1)
-                        self._keep("trace", {"obs": obs, **self._state(kept.order)})
+                        self._keep("trace", {"obs": _vectors(current, kept.groups)})
+                        self._keep("trace", _pictures(current, kept.pictures))
+                        self._keep("trace", self._state(kept.order))
                     stepped = env.step(actor(current.copy()))
                     # Figures before the reset, which clears the sums of episodes.
                     self._add(stepped["next", "done"][:, 0])
@@ -128,10 +133,11 @@ class Recording:
 
     def _keep(self, kind: str, values: Mapping[str, Tensor]) -> None:
         for name, value in values.items():
+            # Bytes of pictures stay bytes.
+            if value.dtype != torch.uint8:
+                value = value.float()
             # Copied, since the env writes the next step into the same memory.
-            self._seen.setdefault(f"{kind}/{name}", []).append(
-                value.detach().float().cpu().numpy().copy()
-            )
+            self._seen.setdefault(f"{kind}/{name}", []).append(value.detach().cpu().numpy().copy())
 
     def _state(self, order: Sequence[int]) -> dict[str, Tensor]:
         """Return the state that a step begins from, actuators in `order`."""
@@ -212,3 +218,22 @@ class Recording:
             kept_E = self._sums.get(name, value_E)
             self._sums[name] = torch.where(self._running_E, value_E, kept_E).clone()
         self._running_E = self._running_E & ~done_E
+
+
+def _vectors(current: TensorDictBase, groups: Sequence[NestedKey]) -> Tensor:
+    """Return what a policy reads as numbers, side by side [E, L]."""
+    vectors = [current[group] for group in groups]
+    if not vectors:
+        return torch.zeros(*current.batch_size, 0)
+    return torch.cat(vectors, -1)
+
+
+def _pictures(current: TensorDictBase, pictures: Sequence[PictureInput]) -> dict[str, Tensor]:
+    """Return the picture of the moment of each camera, and the one that the policy reads where it is another."""
+    found = {}
+    for picture in pictures:
+        found[f"camera_{picture.group}"] = current["obs", picture.term]
+        read = current[picture.group]
+        if picture.is_late:
+            found[picture.name] = read[:, -1] if picture.is_stacked else read
+    return found

@@ -12,10 +12,11 @@ import numpy as np
 
 from ksim_rl.checks import MISFITS, OneLineParser
 from ksim_rl.config.child_processes import run_python
-from ksim_rl.export.causes import Cause, find_causes
+from ksim_rl.export.causes import Cause, find_causes, pictures_off
 from ksim_rl.export.folder import runner_source
 from ksim_rl.export.standalone.files import Json, check_closed, lacking, read_arrays, read_json
 from ksim_rl.physics import load_spec
+from ksim_rl.scene.rendering.rendering import choose_gl_platform
 from ksim_rl.terminal import printable, show
 from ksim_rl.trainers.other_physics import half_time_step, other_integrator, same_time_step
 
@@ -37,6 +38,7 @@ class Report:
     standard_error: float
     causes: Sequence[Cause]
     left_out: Sequence[str]
+    pictures: Mapping[str, float]  # share of pixels that MuJoCo draws otherwise, by camera
     physics: str = ""  # how it differs from the recorded one, where C made that, too
 
     @property
@@ -72,6 +74,10 @@ class Report:
         lines.append(
             f"return ratio {self.return_ratio:.4f} +- {self.standard_error:.4f} (standard error)"
         )
+        for camera, share in self.pictures.items():
+            lines.append(
+                f"camera {camera}: {share:.1%} of pixels are drawn otherwise in equal states"
+            )
         if self.causes:
             lines.append("likely causes:")
             lines += [f"  {cause}" for cause in self.causes]
@@ -113,7 +119,7 @@ def sim2sim(
         arguments = [str(folder.absolute()), "--episodes", str(episodes), "--seed", str(seed)]
         arguments += ["--output", str(output), "--replay", str(replay), *physics]
         # Isolated: PYTHONPATH adds no modules either, as the runner needs none of this library.
-        done = run_python(["-I", str(program), *arguments])
+        done = run_python(["-I", str(program), *arguments], environment=_drawing(meta))
         if done.returncode:
             # The runner says in one line why it refused; that line becomes ours.
             last = (done.stderr.strip() or "no message").splitlines()[-1]
@@ -122,7 +128,9 @@ def sim2sim(
         found = json.loads(output.read_text())
         # Arrays of wrong shapes fail anywhere in the comparison: it is the files that are wrong.
         try:
-            causes = find_causes(meta, read_arrays(folder / "trace.npz"), read_arrays(replay))
+            replayed = read_arrays(replay)
+            pictures = pictures_off(meta, replayed)
+            causes = find_causes(meta, read_arrays(folder / "trace.npz"), replayed)
         except (*MISFITS, ValueError) as error:
             raise ValueError(f"{folder}: trace.npz does not fit export.json: {error!r}") from error
     # The same episodes on both sides, in pairs, and returns of the same terms.
@@ -142,9 +150,20 @@ def sim2sim(
         theirs={name: float(values.mean()) for name, values in theirs.items()},
         standard_error=ratio_error(own["return"], theirs["return"]),
         causes=causes,
+        pictures=pictures,
         left_out=[str(name) for name in meta.get("left_out", ())],
         physics=words,
     )
+
+
+def _drawing(meta: Json) -> dict[str, str] | None:
+    """Return what a process has to know that draws pictures; a ValueError tells how to get what draws."""
+    if not meta.get("pictures"):
+        return None
+    try:
+        return {"MUJOCO_GL": choose_gl_platform()}
+    except RuntimeError as error:
+        raise ValueError(f"the policy sees, and nothing draws for it here: {error}") from None
 
 
 def _other_physics(meta: Json, option: mujoco.MjOption) -> tuple[list[str], str]:

@@ -27,25 +27,26 @@ class TracedTask:
     """The terms of a task as functions of what a robot can measure.
 
     Attributes:
-        obs: the terms that the policy observes, before noise, clip, scale, delay and history.
+        obs: the terms that the policy observes, before noise, clip, scale, delay and history; None if it only sees.
         scores: terminations, then rewards, then metrics; None for a task without any.
         scored: names of these, by kind, in this order.
         left_out: those that cannot be traced, such as "rewards.riddle".
     """
 
-    obs: Traced
+    obs: Traced | None
     scores: Traced | None
     scored: Mapping[str, Sequence[str]]
     left_out: Sequence[str]
 
     def reads(self, name: str) -> list[str]:
         """Return the inputs of obs.onnx that an observation term reads."""
+        assert self.obs is not None  # it has the term
         return list(self.obs.reads[f"observations/{name}"])
 
     def described(self) -> Json:
         """Return the entries of `export.json`."""
         return {
-            "obs": self.obs.described(),
+            "obs": self.obs.described() if self.obs else None,
             "scores": self.scores.described() if self.scores else None,
         }
 
@@ -53,7 +54,7 @@ class TracedTask:
 def trace_task(
     env: ManagerBasedRlEnv, groups: Sequence[str], note: Callable[[str], None]
 ) -> TracedTask:
-    """Trace the terms of an env; rewards, metrics and terminations that cannot be traced are noted and left out.
+    """Trace the terms of groups that are vectors, and what rates an episode; what cannot be traced of that is left out.
 
     Raises NotDescribedError, naming the term, for one that the policy observes.
     """
@@ -84,7 +85,7 @@ def trace_task(
             scored[kind].append(name)
             scores.append((f"{kind}/{name}", term))
     return TracedTask(
-        obs=trace(env, observed, output="obs"),
+        obs=trace(env, observed, output="obs") if observed else None,
         scores=trace(env, scores, output="scores") if scores else None,
         scored=scored,
         left_out=left_out,

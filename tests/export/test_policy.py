@@ -32,6 +32,7 @@ pytest.importorskip("onnxscript", reason="needs the extra: pip install ksim_rl[e
 
 from ksim_rl.export import policy as policies  # noqa: E402
 from ksim_rl.export.policy import Column, ExportedPolicy  # noqa: E402
+from ksim_rl.export.policy_check import CHECKED, greatest_difference  # noqa: E402
 
 PLAIN = {"actor": [Column(name="joint_pos", size=3), Column(name="gyro", size=2)]}
 BOUNDED = Bounded(torch.tensor([-1.0, -2.0]), torch.tensor([1.0, 3.0]))
@@ -106,8 +107,8 @@ KINDS = {
 def test_onnx_equals_the_actor_on_10_000_observations(kind, tmp_path):
     policy = ExportedPolicy(moved(KINDS[kind]()), PLAIN)
     policies.write(policy, tmp_path)
-    assert policies.CHECKED == 10_000
-    assert policies.greatest_difference(policy, tmp_path / "policy.onnx") < 1e-5
+    assert CHECKED == 10_000
+    assert greatest_difference(policy, tmp_path / "policy.onnx") < 1e-5
 
 
 def test_pt2_and_onnx_carry_histories_and_memory_as_inputs_and_outputs(tmp_path):
@@ -118,7 +119,7 @@ def test_pt2_and_onnx_carry_histories_and_memory_as_inputs_and_outputs(tmp_path)
     actor = moved(make_recurrent_actor(recurrent, ActorCfg(**SMALL), obs_dim=7, action_dim=2))
     policy = ExportedPolicy(actor, columns)
     policies.write(policy, tmp_path)
-    assert policies.greatest_difference(policy, tmp_path / "policy.onnx") < 1e-5
+    assert greatest_difference(policy, tmp_path / "policy.onnx") < 1e-5
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
     named = {value.name: value.shape[1:] for value in session.get_inputs()}
     assert named == {"obs": [3], "history_joint_pos_in": [4, 2], "h_in": [1, 4], "c_in": [1, 4]}
@@ -147,9 +148,7 @@ def test_a_wrong_file_is_seen(tmp_path):
     policies.write(ExportedPolicy(moved(KINDS["gaussian"]()), PLAIN), tmp_path)
     other = moved(KINDS["gaussian"]())
     other.module[0].module.normalizer.mean += 0.01
-    assert (
-        policies.greatest_difference(ExportedPolicy(other, PLAIN), tmp_path / "policy.onnx") > 1e-4
-    )
+    assert greatest_difference(ExportedPolicy(other, PLAIN), tmp_path / "policy.onnx") > 1e-4
 
 
 def test_a_policy_of_other_parts_is_refused_by_name():

@@ -111,7 +111,7 @@ def policy_raises(robot, machine):
 
 
 def policy_gives_nan(robot, machine):
-    machine.control.policy = lambda frame: np.array([0.0, np.nan])
+    machine.control.policy = lambda frame, pictures: np.array([0.0, np.nan])
 
 
 def reads(**fields):

@@ -1,12 +1,14 @@
 """Tasks that are seen: what their policy reads, and that each kind of algorithm trains on it."""
 
 import json
+import re
 
 import pytest
 import torch
 
 from ksim_rl import conf, envs
 from ksim_rl.algorithms.ppo.wiring import build_networks
+from ksim_rl.scene.rendering.rendering import choose_gl_platform
 from ksim_rl.trainers import build
 from tests.cli.test_train import run
 
@@ -103,12 +105,29 @@ def test_it_trains_with_effects_a_slow_camera_and_a_lag(kind):
 
 
 @pytest.mark.full
-def test_a_run_is_evaluated_resumed_and_refused_by_an_export(tmp_path, capsys):
+def test_a_run_is_evaluated_resumed_exported_and_seen_by_mujoco(tmp_path, capsys):
     folder = tmp_path / "run"
     words = [word for word in TINY if "eval" not in word]
     words += [*PPO, "trainer.eval_episodes=2", "task.episode_length_s=0.2"]
     run("train", *words, f"hydra.run.dir={folder}")
     assert json.loads((folder / "evaluation.json").read_text())["episodes"] == 2
     assert run("resume", str(folder), "trainer.num_iterations=3") in (0, 1)
-    assert run("export", str(folder)) == 2
-    assert "CameraImage reads the camera 'side', which an export has not" in capsys.readouterr().err
+    pytest.importorskip("onnxscript", reason="needs the extra: pip install ksim_rl[export]")
+    assert run("export", str(folder), "--episodes", "3", "--output", str(tmp_path / "export")) == 0
+    try:
+        choose_gl_platform()
+    except RuntimeError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    capsys.readouterr()
+    assert run("sim2sim", str(tmp_path / "export"), "--episodes", "3") == 0
+    said = capsys.readouterr().out
+    # Both renderers see the same, edges apart.
+    assert float(re.search(r"camera side: ([0-9.]+)% of pixels", said)[1]) < 2.0
+    assert float(re.search(r"return ratio ([0-9.]+)", said)[1]) == pytest.approx(1.0, abs=0.01)
+    # Another camera than that of the training is named.
+    model = tmp_path / "export" / "robot.xml"
+    moved = re.sub(r'(<camera name="side"[^>]* pos=")[^"]*', r"\g<1>2 -3 1", model.read_text())
+    assert moved != model.read_text()
+    model.write_text(moved)
+    assert run("sim2sim", str(tmp_path / "export"), "--episodes", "3") == 1
+    assert "picture: camera 'side'" in capsys.readouterr().out

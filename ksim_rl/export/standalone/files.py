@@ -115,14 +115,21 @@ def check_closed(path: Path) -> None:
             read(named)
 
 
-def check_count(what: str, value: float) -> int:
-    """Return a whole number of 0 to a million, or refuse it."""
+def check_count(what: str, value: float, most: int = MOST) -> int:
+    """Return a whole number of 0 to a million, or to another limit, or refuse it."""
     # bool is a subclass of int in Python.
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MOST:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
         raise ValueError(
-            f"export.json: {what} is {str(value)[:40]}: expected a whole number of 0 to {MOST}"
+            f"export.json: {what} is {str(value)[:40]}: expected a whole number of 0 to {most}"
         )
     return value
+
+
+def measurements(meta: Json) -> list[Json]:
+    """Return what fills the inputs of `obs.onnx`: nothing of a policy that only sees."""
+    if meta["obs"] is None:
+        return []
+    return meta["obs"]["measurements"]
 
 
 def lacking(meta: Json) -> str:

@@ -1,6 +1,7 @@
 """Runs the ONNX files of an export, with the states that they carry from step to step."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,14 @@ import numpy as np
 from ksim_rl.export.standalone.files import Array, Json, check_count, read
 
 # Types of the inputs that an export writes, by ONNX's names.
-TYPES = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)": np.bool_}
+TYPES = {
+    "tensor(float)": np.float32,
+    "tensor(int64)": np.int64,
+    "tensor(bool)": np.bool_,
+    "tensor(uint8)": np.uint8,
+}
+MOST_NUMBERS = 2**26
+"""Of one input: pictures of a history have the most."""
 
 
 class Network:
@@ -43,7 +51,7 @@ class Network:
         for edge in value.shape:
             # A batch of any size has a name in place of a number.
             shape.append(1 if isinstance(edge, str) else edge)
-        check_count(f"size of {value.name}", math.prod(shape))
+        check_count(f"size of {value.name}", math.prod(shape), MOST_NUMBERS)
         return np.zeros(shape, TYPES[value.type])
 
     def reset(self) -> None:
@@ -51,16 +59,19 @@ class Network:
         self.states: list[Array] = []
         self.next_states: list[Array] = []
 
-    def begin(self, frame: Array) -> list[Array]:
-        """Return the states of a new episode: zeros, or columns of its first frame in all places."""
-        return [
-            np.repeat(
-                frame[:, None, slice(*spec["columns"])], self.inputs[spec["input"]].shape[1], 1
-            )
-            if spec.get("starts_with") == "frame"
-            else self.inputs[spec["input"]]
-            for spec in self.specs
-        ]
+    def begin(self, feed: dict[str, Array]) -> list[Array]:
+        """Return the states of a new episode: zeros, or its first frame in all places, or some columns of it."""
+        states = []
+        for spec in self.specs:
+            example = self.inputs[spec["input"]]
+            if spec.get("starts_with") != "frame":
+                states.append(example)
+                continue
+            frame = feed[spec.get("of") or "obs"][:, None]
+            if spec["columns"] is not None:
+                frame = frame[..., slice(*spec["columns"])]
+            states.append(np.repeat(frame, example.shape[1], 1))
+        return states
 
     def run(self, given: dict[str, Array]) -> Array:
         """Return the first output, of one robot; `advance` makes the states of this run those of the next."""
@@ -69,7 +80,7 @@ class Network:
             example = self.inputs[name]
             feed[name] = np.asarray(value).reshape(example.shape).astype(example.dtype)
         if not self.states:
-            self.states = self.begin(feed.get("obs", np.zeros((1, 0))))
+            self.states = self.begin(feed)
         # `states`, `specs` and the outputs after the first have the same order.
         feed |= {spec["input"]: state for spec, state in zip(self.specs, self.states, strict=True)}
         first, *self.next_states = (
@@ -88,8 +99,12 @@ class Policy(Network):
     def __init__(self, folder: Path, meta: Json) -> None:
         super().__init__(folder / "policy.onnx", meta["policy"]["states"], "actions")
 
-    def __call__(self, obs: Array) -> Array:
-        """Return the action [A] for the newest frame [L]."""
-        action = self.run({"obs": obs})
+    def __call__(self, obs: Array, pictures: Mapping[str, Array]) -> Array:
+        """Return the action [A] for the newest frame [L] and the newest pictures, by input."""
+        given = dict(pictures)
+        # A policy that only sees has no numbers.
+        if "obs" in self.inputs:
+            given["obs"] = obs
+        action = self.run(given)
         self.advance()
         return action

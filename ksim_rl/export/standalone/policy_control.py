@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ksim_rl.export.standalone.commands import command_ranges
-from ksim_rl.export.standalone.files import Array, Json
+from ksim_rl.export.standalone.files import Array, Json, measurements
 from ksim_rl.export.standalone.network import Network, Policy
 from ksim_rl.export.standalone.robot_link import (
     DOWN,
@@ -37,7 +37,11 @@ class PolicyControl:
                 )
         self.meta = meta
         self.joints = DescribedJoints(meta)
-        self.observe = Network(folder / "obs.onnx", meta["obs"]["states"], meta["obs"]["output"])
+        self.observe: Network | None = None
+        if meta["obs"] is not None:
+            obs = meta["obs"]
+            self.observe = Network(folder / "obs.onnx", obs["states"], obs["output"])
+        self.pictures: list[Json] = meta.get("pictures", [])
         self.policy = Policy(folder, meta)
         self.ranges = command_ranges(meta)
         self.command: dict[str, Array] = {}
@@ -46,7 +50,7 @@ class PolicyControl:
         self.estimated: list[str] = []
         self.of_root: set[str] = set()
         self.sources: dict[str, Reading] = {}
-        for node in meta["obs"]["measurements"]:
+        for node in measurements(meta):
             self.sources[node["input"]] = self._source(node)
         self.terms = [clipped_and_scaled(spec) for spec in meta["observations"]]
         self.stops = np.cumsum([spec["size"] for spec in meta["observations"]])
@@ -67,7 +71,8 @@ class PolicyControl:
         self.last_action = self.action
         still = np.zeros(len(self.joints.names))
         self.targets = {"pos": self.joints.default_pos.copy(), "vel": still, "effort": still}
-        self.observe.reset()
+        if self.observe is not None:
+            self.observe.reset()
         self.policy.reset()
         for forget in self.resets:
             forget()
@@ -75,17 +80,14 @@ class PolicyControl:
     def lacking(self, measurement: Measurement) -> list[str]:
         """Return the inputs of `obs.onnx` that a robot's measurements do not give."""
         found = [name for name in self.estimated if name not in measurement.estimates]
+        for spec in self.pictures:
+            if spec["input"] not in measurement.pictures:
+                found.append(spec["input"])
         return found + [name for name in sorted(self.of_root) if getattr(measurement, name) is None]
 
     def __call__(self, measurement: Measurement) -> JointCommand:
         """Run one step of the policy, and return what it asks of the motors."""
-        given = {}
-        for name, source in self.sources.items():
-            given[name] = source(measurement)
-        raw = np.split(self.observe.run(given), self.stops[:-1])
-        self.observe.advance()
-        frame = [term(part) for term, part in zip(self.terms, raw, strict=True)]
-        action = self.policy(np.concatenate(frame))
+        action = self.policy(self._frame(measurement), self._pictures(measurement))
         for change in self.chain:
             action = change(action)
         self.last_action = self.action
@@ -108,6 +110,33 @@ class PolicyControl:
             stiffness=self.joints.stiffness,
             damping=self.joints.damping,
         )
+
+    def _frame(self, measurement: Measurement) -> Array:
+        """Return the numbers that the policy reads."""
+        if self.observe is None:
+            return np.zeros(0)
+        given = {}
+        for name, source in self.sources.items():
+            given[name] = source(measurement)
+        raw = np.split(self.observe.run(given), self.stops[:-1])
+        self.observe.advance()
+        frame = [term(part) for term, part in zip(self.terms, raw, strict=True)]
+        return np.concatenate(frame)
+
+    def _pictures(self, measurement: Measurement) -> dict[str, Array]:
+        """Return the pictures that the policy reads; a ValueError names one that is not as its camera gives it."""
+        found = {}
+        for spec in self.pictures:
+            name = spec["input"]
+            picture = np.asarray(measurement.pictures[name])
+            if list(picture.shape) != spec["shape"] or picture.dtype != spec["dtype"]:
+                raise ValueError(
+                    f"{name} is {picture.dtype} {list(picture.shape)}: expected {spec['dtype']} {spec['shape']}"
+                )
+            if spec["dtype"] == "float32" and not np.isfinite(picture).all():
+                raise ValueError(f"{name} holds numbers that are not finite")
+            found[name] = picture
+        return found
 
     def _source(self, node: Json) -> Reading:
         """Return what fills an input of `obs.onnx`: what is none of the loop's own is an estimate of the robot."""

@@ -24,6 +24,7 @@ class Measurement:
         count: the robot's own number or time of the state that it sent, where it has one: it stands still where its
             firmware sends one state again and again.
         estimates: what else `obs.onnx` reads, by the names of its inputs, such as `sensor_imu_ang_vel`.
+        pictures: the newest of each camera, by the inputs of `policy.onnx`; see `pictures` in export.json.
     """
 
     stamp: float
@@ -34,6 +35,7 @@ class Measurement:
     root_ang_vel: Array | None = None
     count: int | None = None
     estimates: Mapping[str, Array] = field(default_factory=dict)
+    pictures: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

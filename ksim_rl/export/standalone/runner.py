@@ -8,6 +8,7 @@ import numpy as np
 
 from ksim_rl.export.standalone.files import Array, Json
 from ksim_rl.export.standalone.network import Policy
+from ksim_rl.export.standalone.sight import Sight
 from ksim_rl.export.standalone.signals import KINDS, Lag, Noise, Signals, Values
 from ksim_rl.export.standalone.stages import (
     JointAction,
@@ -32,6 +33,7 @@ class Runner(Signals):
         self.noises: list[Noise] = []
         self.readings = Values(self, "obs")
         self.scores = Values(self, "scores")
+        self.sight = Sight(self)
         self.terms = [self._term(spec) for spec in meta["observations"]]
         self.stops = np.cumsum([spec["size"] for spec in meta["observations"]])
         kinds = ("terminations", "rewards", "metrics")
@@ -62,7 +64,10 @@ class Runner(Signals):
         return term
 
     def observe(self, advances: bool = True) -> Array:
-        """Return the newest frame that the policy reads, [L]; call it once per env step."""
+        """Return the newest frame that the policy reads, [L]; call it once per env step, as pictures are drawn then."""
+        self.pictures = self.sight(advances)
+        if not self.terms:
+            return np.zeros(0)
         parts = np.split(self.readings(), self.stops[:-1])
         self.readings.advance()
         frame = [term(part, advances) for term, part in zip(self.terms, parts, strict=True)]
@@ -169,7 +174,8 @@ class Runner(Signals):
             )
         self.drawn.clear()
         networks = (self.policy, self.readings, self.scores)
-        for part in (*networks, *self.lags, *self.noises, *self.contacts.values()):
+        parts = (*networks, *self.lags, *self.noises, *self.contacts.values(), self.sight)
+        for part in parts:
             part.reset()
         for forget in self.resets:
             forget()
@@ -202,7 +208,7 @@ class Runner(Signals):
 
     def act(self) -> Array:
         """Return the policy's action for the newest frame."""
-        return self.policy(self.frame)
+        return self.policy(self.frame, self.pictures)
 
     def step(
         self, action: Array, command: dict[str, Array] | None = None, *, observes: bool = True
@@ -289,6 +295,23 @@ class Runner(Signals):
         for push in pushes[(pushes[:, 0] == number) & (pushes[:, 1] == step)]:
             self.data.qvel[:] += push[2:]
 
+    def _recorded_pictures(self, trace: dict[str, Array], t: int) -> dict[str, Array]:
+        """Return the pictures that the policy read in a recorded step."""
+        found = {}
+        for name, camera in self.sight.cameras.items():
+            # Where nothing is late, they are those of the moment.
+            of_moment = trace[f"camera_{camera.spec['group']}"]
+            found[name] = trace.get(name, of_moment)[t]
+        return found
+
+    def _pixels_off(self, trace: dict[str, Array], t: int) -> Json:
+        """Return the share of pixels in which each camera sees the state of a recorded step otherwise."""
+        found = {}
+        for camera in self.sight.cameras.values():
+            group = camera.spec["group"]
+            found[f"off_{group}"] = camera.share_off(trace[f"camera_{group}"][t])
+        return found
+
     def episode(self, record: dict[str, Array], number: int) -> dict[str, float]:
         """Run a recorded episode once more: its start, commands and pushes, with noise and lags drawn again."""
         self._begin(record, number)
@@ -339,13 +362,15 @@ class Runner(Signals):
                     getattr(self.data, name)[:] = trace[name][t]
             self.refresh()
             frame = self.observe() if t else self.frame
-            action = self.policy(trace["obs"][t] if trace["obs"].shape[1] == len(frame) else frame)
+            recorded = trace["obs"][t] if trace["obs"].shape[1] == len(frame) else frame
+            action = self.policy(recorded, self._recorded_pictures(trace, t))
+            now = self._pixels_off(trace, t)
             self._push(record, number, t)
             self._run_step(
                 trace["action"][t], self._commands(record, number, t + 1), observes=False
             )
             target = [self.targets[kind][name] for kind in KINDS for name in self.joints]
-            now = {
+            now |= {
                 "obs": frame,
                 "action": action,
                 "target": target,

@@ -140,7 +140,7 @@ class Values:
 
     def __init__(self, signals: "Signals", name: str) -> None:
         spec = signals.meta[name]
-        # A task without rewards, metrics and terminations has none.
+        # A task without rewards, metrics and terminations has none, nor has a policy that only sees.
         self.network = None
         self.read = {}
         if spec is not None:
@@ -237,7 +237,14 @@ class Signals:
         model = self.model
         data = self.data
         # Velocities of subtrees, too: sensors of momentum take those of the last substep where nobody computes them.
-        stages = (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel, mujoco.mj_subtreeVel)
+        # Cameras and lights of pictures move with their bodies.
+        stages = (
+            mujoco.mj_kinematics,
+            mujoco.mj_comPos,
+            mujoco.mj_camlight,
+            mujoco.mj_comVel,
+            mujoco.mj_subtreeVel,
+        )
         for compute in stages:
             compute(model, data)
         mujoco.mj_sensorPos(model, data)

@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array
+from ksim_rl.export.standalone.files import Array, measurements
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
 from ksim_rl.export.standalone.runner import Runner
 
@@ -42,7 +42,7 @@ class SimulatedRobot:
         self.hangs_below: Array | None = None
         self.fixed_root = self._fixed_root()
         self.estimates = {}
-        for node in runner.meta["obs"]["measurements"]:
+        for node in measurements(runner.meta):
             if node["input"] in estimated:
                 self.estimates[node["input"]] = runner.quantity(node)
 
@@ -77,7 +77,7 @@ class SimulatedRobot:
 
     def _fixed_root(self) -> int | None:
         """Return the body whose attitude a policy reads, of a robot that is fixed to the world."""
-        for node in self.runner.meta["obs"]["measurements"]:
+        for node in measurements(self.runner.meta):
             if not self.has_root and node["quantity"] in OF_ATTITUDE:
                 return int(self.model.body(node["body"]).id)
         return None
@@ -105,6 +105,7 @@ class SimulatedRobot:
             # Of the simulation's steps: a robot at rest may measure the same to the bit.
             count=round(data.time / self.model.opt.timestep),
             estimates=estimates,
+            pictures=self.runner.sight.drawn(),
         )
 
     def write(self, command: JointCommand) -> None:
