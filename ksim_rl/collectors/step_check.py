@@ -89,7 +89,7 @@ class StepCheck:
             # The reference again, from inputs that are off by some units in the last place: a row that reacts
             # strongly to that is chaotic, and may differ.
             def moved(number: int, units: int) -> NamedLeaves:
-                generator = torch.Generator().manual_seed(number)
+                generator = torch.Generator(self._env.device or "cpu").manual_seed(number)
                 self._return_to(start, partial(_nudged, generator=generator, units=units))
                 with self._draws_forgotten(), Nudging(generator, units=units):
                     env_state_E = self.own_step()

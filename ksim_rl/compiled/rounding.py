@@ -32,11 +32,12 @@ def nudged(
     """Return a tensor, each floating-point number of which has moved by `units` in the last place, up or down."""
     if not value.is_floating_point():
         return value
-    # Drawn where the generator lives, on the CPU: the same directions for every device.
-    is_up = torch.randint(2, value.shape, generator=generator, device=generator.device).to(
-        value.device
+    # Drawn where the generator lives, which is where most of the numbers are: millions of draws take long elsewhere.
+    draws = torch.randint(
+        2, value.shape, generator=generator, device=generator.device, dtype=torch.int8
     )
-    towards = torch.where(is_up.bool(), torch.inf, -torch.inf).to(value.dtype)
+    is_up = draws.to(value.device).bool()
+    towards = torch.where(is_up, torch.inf, -torch.inf).to(value.dtype)
     # A difference of neighbours is exact, and so is its product with a power of two.
     unit = torch.nextafter(value, towards) - value
     return torch.where(value.isfinite(), value + units * unit, value)
