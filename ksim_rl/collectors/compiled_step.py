@@ -29,7 +29,7 @@ class CompiledStep:
     the memory of `root_E`. The policy's leaves may lie elsewhere at each call. The constructor steps the env and then
     restores it. It raises a RuntimeError where the step cannot be recorded, or where the compiled step gives other
     numbers: the tolerance is 1e-4 relative, and more only in rows where the env's own step changes as much when its
-    inputs move by some units in the last place.
+    inputs move by some units in the last place, and in one row of 2,000.
 
     With `nan_ends_rows` a row whose action is NaN ends its episode, so that resets are compared as well. For
     `by_term` see `StepCheck`.

@@ -58,25 +58,45 @@ def test_each_move_is_another_one():
     assert numbers == [0, 1, 2, 3]
 
 
-def test_a_row_that_stands_at_a_border_is_explained():
-    """Contacts that begin, and solvers that stop: two outcomes, and rounding crosses from one to the other."""
-    # The last places of each row's input, as multiples of a unit; the recorded step rounds by one unit more.
-    generator = torch.Generator().manual_seed(0)
-    margin = torch.rand(ROWS, generator=generator)
-    true, found = torch.zeros(ROWS, 1), torch.ones(ROWS, 1)
+def at_borders(num_rows, moves):
+    """Return how many rows at a border stay unexplained, of which the recorded step has the other outcome.
+
+    The border is up to one unit away from the input; a move is of several roundings.
+    """
+    margin = torch.rand(num_rows, generator=torch.Generator().manual_seed(0))
 
     def moved(number, units):
+        moves.append(units)
         draws = torch.Generator().manual_seed(number)
-        # Several roundings of so many units each.
-        shift = units * (torch.rand(ROWS, 4, generator=draws) - 0.5).sum(-1)
+        shift = units * (torch.rand(num_rows, 4, generator=draws) - 0.5).sum(-1)
         return {"x": (shift > margin).float()[:, None]}
 
-    assert differences({"x": found}, {"x": true}, num_rows=ROWS, moved=moved) == {}
-    # Moves of one unit leave many unexplained.
-    small = differences(
-        {"x": found}, {"x": true}, num_rows=ROWS, moved=lambda number, _: moved(number, 1)
-    )
-    assert small["x"] > 10
+    found, true = torch.ones(num_rows, 1), torch.zeros(num_rows, 1)
+    return differences({"x": found}, {"x": true}, num_rows=num_rows, moved=moved).get("x", 0)
+
+
+def test_rows_at_a_border_are_explained_by_larger_moves(monkeypatch):
+    moves = []
+    few = at_borders(1000, moves)
+    assert moves == list(MOVES)
+    monkeypatch.setattr("ksim_rl.compiled.differences.MOVES", (1,) * len(MOVES))
+    assert at_borders(1000, moves) > 3 * few
+
+
+def test_one_row_of_two_thousand_may_stay_at_a_border_and_no_move_is_made_for_it():
+    true = torch.zeros(4000, 1)
+    numbers = []
+
+    def moved(number, units):
+        numbers.append(number)
+        return {"x": true}
+
+    for rows, expected in ((2, {}), (3, {"x": 3})):
+        found = true.clone()
+        found[:rows] = 1.0
+        numbers.clear()
+        assert differences({"x": found}, {"x": true}, num_rows=4000, moved=moved) == expected
+        assert len(numbers) == (1 if rows == 2 else len(MOVES))
 
 
 @pytest.mark.parametrize("wrong", [5.0, float("nan"), 1e30])
