@@ -1,7 +1,7 @@
 """The faults of physics that were mended, and how each is put back; numbers are those of the issue about truth."""
 
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.judge.trial import Kernels
+from ksim_rl.device import headers
 
 PHYSICS = "ksim_rl.physics"
 
@@ -21,7 +22,7 @@ class Fault:
     Args:
         number: of the fault in the issue; empty where another one was found later.
         what: it does.
-        place: the module under `physics` and the name there of what mends it, of a method with its class.
+        place: the module under `physics` and the name there of what mends it, behind the class or module it is of.
         instead: makes what stands there while it is put back, from what mends it.
         needs: the features that a model needs for it, all of them.
         written: a pattern that the model's XML has.
@@ -44,20 +45,19 @@ class Rewrite:
     """Lines of C++ as they were.
 
     Args:
-        folder, part: the file.
-        new, old: what stands there, and what stood there before.
+        lines: what stood in the headers of kernels before, by what stands there.
     """
 
-    folder: str
-    part: str
-    new: str
-    old: str
+    lines: Mapping[str, str]
 
-    def __call__(self, source_of: Callable[[str, tuple[str, ...]], str]) -> Callable[..., str]:
-        """Return what gives the sources with the lines as they were."""
+    def __call__(self, text_of: Callable[..., str]) -> Callable[..., str]:
+        """Return what gives the texts of headers with the lines as they were."""
 
-        def changed(folder: str, parts: tuple[str, ...]) -> str:
-            return source_of(folder, parts).replace(self.new, self.old)
+        def changed(header: str, constants: Mapping[str, headers.Constant] | None = None) -> str:
+            text = text_of(header, constants)
+            for new, old in self.lines.items():
+                text = text.replace(new, old)
+            return text
 
         return changed
 
@@ -174,12 +174,14 @@ FAULTS = {
     "free bodies": Fault(
         number="2",
         what="between substeps a free body turns by a pose that is not written there",
-        place=("native", "source_of"),
+        place=("native", "headers.text_of"),
         instead=Rewrite(
-            folder="smooth",
-            part="free_bodies",
-            new="matrix(unit_quat(q + 3));",
-            old="row_of(problem.xmat)[body];",
+            lines={
+                "    wp::array_t<int> body_freeadr;\n": (
+                    "    wp::array_t<int> body_freeadr;\n    wp::array_t<wp::mat33> xmat;\n"
+                ),
+                "matrix(unit_quat(q + 3));": "world.row_of(a.xmat)[body];",
+            },
         ),
         needs=("tree.free", "integrator.implicitfast"),
         kernels="ours",
@@ -290,9 +292,9 @@ FAULTS = {
     "speed of actuators": Fault(
         number="11",
         what="actuators have a velocity where actuation is disabled",
-        place=("native", "source_of"),
+        place=("native", "headers.text_of"),
         instead=Rewrite(
-            folder="smooth", part="actuation", new="ACTUATORS_ACT ? speed : 0.0f", old="speed"
+            lines={"ACTUATORS_ACT ? speed : 0.0f": "speed"},
         ),
         needs=("disable.actuation", "transmission.joint"),
         kernels="ours",
@@ -323,12 +325,9 @@ FAULTS = {
     "overflow": Fault(
         number="13",
         what="what finds no room is not told of",
-        place=("native", "source_of"),
+        place=("native", "headers.text_of"),
         instead=Rewrite(
-            folder="smooth",
-            part="record",
-            new="problem.overflow.data[world] | lacking",
-            old="0",
+            lines={"a.overflow.data[world] | lacking(world, a)": "0"},
         ),
         needs=("tree.free", "geom.box"),
         kernels="ours",

@@ -6,24 +6,29 @@ of all headers of a kernel, so that its cache has a kernel for each text.
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import PurePosixPath
+from typing import TypeAlias
 
 _INCLUDE = re.compile(r'(?m)^#include "(.*)"\n')
-_ARGUMENTS = re.compile(r"struct Arguments \{\n(.*?)\n\};", re.DOTALL)
+_STRUCT = re.compile(r"(?m)^struct (\w+)(?: : ([\w:, ]+))? \{\n(?:((?:.|\n)*?)\n)?\};")
 _TYPE = r"(?:const )?(?:(?:unsigned|long) )*[\w:]+(?:<[\w:<>, ]+>)?\*?"
 _FIELD = re.compile(rf"^ +({_TYPE}) (\w+);(?: +//.*)?$|^ *//.*$")
 _LEFT = re.compile(r'(?m)^\s*#\s*include\s*".*')
 _GIVEN = re.compile(r"namespace given \{\n(.*?)\n\}", re.DOTALL)
 _OPENED = re.compile(r"(?<!using )\bnamespace given\b")
-_CONSTANT = re.compile(r"(?m)^(constexpr int (\w+) = )(-?\d+);")
-_GIVEN_LINE = re.compile(r"^constexpr int \w+ = -?\d+;(?: *//.*)?$|^(?: *//.*)?$")
+_INT = r"-?\d+"
+_VALUED = rf"constexpr int (\w+)(?: = {_INT}|\[\] = {{{_INT}(?:, {_INT})*}});"
+_CONSTANT = re.compile(rf"(?m)^{_VALUED}")
+_GIVEN_LINE = re.compile(rf"^{_VALUED}(?: *//.*)?$|^(?: *//.*)?$")
+Constant: TypeAlias = int | Sequence[int]
+"""The value of a constant that is given: a number, or the numbers of a table."""
 WARP = "builtin.h"
 """Warp's own header, which stands before all of ours when Warp compiles them."""
 
 
-def text_of(header: str, constants: Mapping[str, int] | None = None) -> str:
+def text_of(header: str, constants: Mapping[str, Constant] | None = None) -> str:
     """Return the text of a header behind the headers that it includes, each once.
 
     Args:
@@ -49,7 +54,7 @@ def _collect(header: str, texts: dict[str, str]) -> None:
     texts[header] = text
 
 
-def _with_constants(header: str, text: str, constants: Mapping[str, int]) -> str:
+def _with_constants(header: str, text: str, constants: Mapping[str, Constant]) -> str:
     # A sample value must never reach a kernel: nothing is passed over.
     bodies = _GIVEN.findall(text)
     assert len(bodies) == len(_OPENED.findall(text)), (
@@ -57,17 +62,18 @@ def _with_constants(header: str, text: str, constants: Mapping[str, int]) -> str
     )
     for line in "\n".join(bodies).splitlines():
         assert _GIVEN_LINE.match(line), (
-            f"{header}: a constant that is given is a line `constexpr int NAME = 1;`, and no {line!r}"
+            f"{header}: a constant that is given is a line `constexpr int NAME = 1;`, or of a table "
+            f"`constexpr int NAME[] = {{1, 2}};`, and no {line!r}"
         )
     declared: set[str] = set()
 
     def valued(constant: re.Match[str]) -> str:
-        begin = constant[1]
-        name = constant[2]
-        value = constants.get(name, 0)
-        assert abs(value) < 1 << 31, f"{header}: {name}={value} is no int of C++"
+        name = constant[1]
         declared.add(name)
-        return f"{begin}{value:d};"
+        # One that is not given is refused below, with all others.
+        if name in constants:
+            return _declaration(header, constant, constants[name])
+        return constant[0]
 
     text = _GIVEN.sub(lambda given: _CONSTANT.sub(valued, given[0]), text)
     assert declared == {*constants}, (
@@ -76,17 +82,49 @@ def _with_constants(header: str, text: str, constants: Mapping[str, int]) -> str
     return text
 
 
+def _declaration(header: str, sample: re.Match[str], value: Constant) -> str:
+    """Return the line of a constant with its value in place of the sample."""
+    name = sample[1]
+    is_table = isinstance(value, Sequence)
+    assert is_table == ("[]" in sample[0]), f"{header}: {name}={value}, and there {sample[0]!r}"
+    numbers = value if isinstance(value, Sequence) else [value]
+    assert numbers, f"{header}: the table {name} is empty"
+    for number in numbers:
+        assert abs(number) < 1 << 31, f"{header}: {name}={number} is no int of C++"
+    written = ", ".join(f"{number:d}" for number in numbers)
+    if is_table:
+        return f"constexpr int {name}[] = {{{written}}};"
+    return f"constexpr int {name} = {written};"
+
+
 def arguments_of(text: str) -> dict[str, str]:
-    """Return the types of the fields of the last struct `Arguments` of a text, by name and in order, as in C++."""
-    bodies = _ARGUMENTS.findall(text)
-    assert bodies, "a header of a kernel has a line `struct Arguments {`, and fields behind it"
+    """Return the types of the fields of the last struct `Arguments` of a text, by name and in order, as in C++.
+
+    The fields of structs that it inherits from, which several kernels may share, come first.
+    """
+    structs = _STRUCT.findall(text)
+    arguments = [struct for struct in structs if struct[0] == "Arguments"]
+    assert arguments, "a header of a kernel has a line `struct Arguments {`, and fields behind it"
     fields: dict[str, str] = {}
-    for line in bodies[-1].splitlines():
+    _add_fields(arguments[-1], structs, fields)
+    return fields
+
+
+def _add_fields(
+    struct: tuple[str, str, str], structs: list[tuple[str, str, str]], fields: dict[str, str]
+) -> None:
+    """Add the fields of a struct: its name, its bases and its lines."""
+    name, bases, lines = struct
+    for base in filter(None, bases.split(", ")):
+        named = [other for other in structs if other[0] == base.rpartition("::")[2]]
+        assert len(named) == 1, f"{name} inherits from {base!r}, which one struct has to be"
+        _add_fields(named[0], structs, fields)
+    for line in lines.splitlines():
         field = _FIELD.match(line)
         assert field is not None, f"a field is a line of its own: {line!r}"
         if field[2]:
+            assert field[2] not in fields, f"{name} has a field twice: {field[2]}"
             fields[field[2]] = field[1]
-    return fields
 
 
 def call_of(header: str, indices: Iterable[str], values: Iterable[str]) -> str:

@@ -83,6 +83,25 @@ CUDA_CALLABLE inline void sync()
 #endif
 }
 
+// Waits for the whole warp, in kernels whose worlds take the same steps.
+CUDA_CALLABLE inline void sync_warp()
+{
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+}
+
+// An item of a table that no kernel writes, so that it may be read ahead of what is written.
+template <class T>
+CUDA_CALLABLE inline T look_up(const wp::array_t<T>& table, int item)
+{
+#if defined(__CUDA_ARCH__)
+    return __ldg(table.data + item);
+#else
+    return table.data[item];
+#endif
+}
+
 // The value that another lane has.
 template <class T>
 CUDA_CALLABLE inline T of_lane(T value, int source)

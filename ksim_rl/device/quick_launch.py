@@ -50,7 +50,9 @@ _KINDS: dict[str, type | str] = {
 }
 
 
-def launch_of(header: str, constants: Mapping[str, int] | None = None) -> "QuickLaunch":
+def launch_of(
+    header: str, constants: Mapping[str, headers.Constant] | None = None
+) -> "QuickLaunch":
     """Return the launch of the kernel of a header; see `headers`.
 
     Its `run` gets the two indices of a thread and the struct `Arguments`, whose fields are the values of a launch in

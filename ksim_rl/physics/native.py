@@ -5,7 +5,7 @@
 
 import functools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,7 +81,7 @@ def launcher(
 
 def launcher_of(
     header: str,
-    constants: Mapping[str, int],
+    constants: Mapping[str, headers.Constant],
     own: Mapping[str, Field],
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
@@ -109,10 +109,13 @@ def launcher_of(
     )
 
 
-def _constants(constants: Mapping[str, int], lanes: int, threads: int) -> dict[str, int]:
-    values = {name.upper(): int(value) for name, value in constants.items()}
-    values["LANES"] = lanes
-    values["THREADS"] = threads
+def _constants(
+    constants: Mapping[str, headers.Constant], lanes: int, threads: int
+) -> dict[str, headers.Constant]:
+    values: dict[str, headers.Constant] = {"LANES": lanes, "THREADS": threads}
+    for name, value in constants.items():
+        # Enums and truths are whole numbers in C++.
+        values[name.upper()] = value if isinstance(value, Sequence) else int(value)
     return values
 
 

@@ -94,6 +94,12 @@ class OverflowReport:
         }
 
 
+def record_arrays(num_envs: int) -> dict[str, wp.array]:
+    """Return arrays of so many worlds in which kernels keep overflow bits and needs."""
+    sizes = {"sticky": num_envs, "most_nefc": num_envs, "most_pool": 2}
+    return {name: wp.zeros(size, dtype=int) for name, size in sizes.items()}
+
+
 class OverflowRecord:
     """Sticky overflow bits and running maxima on the device, which `counts` sums up there.
 
@@ -107,12 +113,11 @@ class OverflowRecord:
             threads = 128
         else:
             threads = 1
-        sizes = {"sticky": warp_data_E.nworld, "most_nefc": warp_data_E.nworld, "most_pool": 2}
-        self.arrays = {name: wp.zeros(size, dtype=int) for name, size in sizes.items()}
+        self.arrays = record_arrays(warp_data_E.nworld)
         self.sticky_E, self.most_nefc_E, self.most_pool = map(wp.to_torch, self.arrays.values())
-        source = native.source_of("smooth", ("record",))
-        self.record = native.launcher(
-            source, OUT_OF, self.arrays, warp_model, warp_data_E, lanes=1, threads=threads
+        header = "ksim_rl/physics/smooth/record.cuh"
+        self.record = native.launcher_of(
+            header, OUT_OF, self.arrays, warp_model, warp_data_E, lanes=1, threads=threads
         )
         if warp_model.opt.integrator == mjw.IntegratorType.RK4:
             # It makes rows four times in a substep, and the last ones alone are there at the end. Callbacks of controls

@@ -12,10 +12,16 @@ from tests import headers as syntax
 from tests.docs.guide import REPOSITORY
 
 CPU = torch.device("cpu")
+CONSTANTS: dict[str, headers.Constant] = {"OFFSET": 7, "SIGNS": [1, 1]}
 SHARED = """// What two share.
 #pragma once
 #include "builtin.h"
 CUDA_CALLABLE inline float scaled(float x) { return 2.0f * x; }
+
+// What several kernels take.
+struct Counted {
+    const long long* count;
+};
 """
 BETWEEN = """#pragma once
 #include "toy/shared.cuh"
@@ -28,19 +34,19 @@ namespace kernel {
 
 namespace given {
 constexpr int OFFSET = 100;  // an example
+constexpr int SIGNS[] = {1, 1};
 }
 
-struct Arguments {
+struct Arguments : Counted {
     float slope;  // of the line
     // Where it goes.
-    const long long* count;
     float* out;
 };
 
 CUDA_CALLABLE inline void run(int row, int, const Arguments& a)
 {
     if (row < *a.count)
-        a.out[row] = scaled(a.slope) * row + given::OFFSET;
+        a.out[row] = given::SIGNS[row] * scaled(a.slope) * row + given::OFFSET;
 }
 
 }
@@ -61,11 +67,11 @@ def toy(tmp_path, monkeypatch):
     return folder
 
 
-def line(offset: int) -> list[float]:
+def line(offset: int, signs: tuple[int, ...] = (1, 1)) -> list[float]:
     out_N = torch.zeros(3)
     count = torch.tensor(2)
-    launch = launch_of("toy/kernel.cuh", {"OFFSET": offset})
-    launch(CPU, (3, 1), 0.5, count.data_ptr(), out_N.data_ptr())
+    launch = launch_of("toy/kernel.cuh", {"OFFSET": offset, "SIGNS": signs})
+    launch(CPU, (3, 1), count.data_ptr(), 0.5, out_N.data_ptr())
     return out_N.tolist()
 
 
@@ -74,21 +80,24 @@ def test_a_header_that_is_edited_makes_another_kernel(toy):
     shared = toy / "shared.cuh"
     shared.write_text(SHARED.replace("2.0f", "6.0f"))
     assert line(7) == [7.0, 10.0, 0.0]
+    assert line(7, signs=(1, -1)) == [7.0, 4.0, 0.0]
 
 
 def test_each_header_comes_once_and_before_those_that_include_it(toy):
-    text = headers.text_of("toy/kernel.cuh", {"OFFSET": 7})
+    text = headers.text_of("toy/kernel.cuh", CONSTANTS)
     assert text.count("float scaled(") == 1
     assert text.index("float scaled(") < text.index("namespace kernel")
     assert "#include" not in text
     assert headers.arguments_of(text) == {
-        "slope": "float",
         "count": "const long long*",
+        "slope": "float",
         "out": "float*",
     }
 
 
-@pytest.mark.parametrize("constants", [{}, {"OFFSET": 1, "LENGTH": 2}, {"OFSET": 1}])
+@pytest.mark.parametrize(
+    "constants", [{}, {"OFFSET": 1}, {**CONSTANTS, "LENGTH": 2}, {"OFSET": 1, "SIGNS": [1]}]
+)
 def test_constants_are_declared_and_given(toy, constants):
     with pytest.raises(AssertionError, match="are declared or given, but not both"):
         headers.text_of("toy/kernel.cuh", constants)
@@ -102,7 +111,9 @@ GIVEN = "constexpr int OFFSET = 100;"
     [
         ("float slope;", "float slope, other;", "a field is a line of its own"),
         ("float slope;", "bool slope;", "slope is of type 'bool': expected a pointer, or"),
-        ("struct Arguments {", "struct Fields {", "has a line `struct Arguments {`"),
+        ("struct Arguments :", "struct Fields :", "has a line `struct Arguments {`"),
+        (": Counted {", ": Numbered {", "inherits from 'Numbered', which one struct has to be"),
+        ("float slope;", "float count;", "Arguments has a field twice: count"),
         ('shared.cuh"', 'shared.cuh"  // both', "an include is a line of its own: '#include"),
         # Samples that nobody gives would reach the kernel.
         ("given {", "given\n{", "`namespace given {` is a line of its own"),
@@ -115,12 +126,22 @@ def test_what_python_would_misread_is_refused(toy, written, instead, message):
     assert KERNEL.count(written) == 1
     (toy / "kernel.cuh").write_text(KERNEL.replace(written, instead))
     with pytest.raises(AssertionError, match=message):
-        launch_of("toy/kernel.cuh", {"OFFSET": 1})
+        launch_of("toy/kernel.cuh", CONSTANTS)
 
 
-def test_a_constant_is_an_int_of_cpp(toy):
-    with pytest.raises(AssertionError, match="OFFSET=5000000000 is no int"):
-        headers.text_of("toy/kernel.cuh", {"OFFSET": 5_000_000_000})
+@pytest.mark.parametrize(
+    ("constants", "message"),
+    [
+        ({"OFFSET": 5_000_000_000}, "OFFSET=5000000000 is no int"),
+        ({"SIGNS": [1, 5_000_000_000]}, "SIGNS=5000000000 is no int"),
+        ({"SIGNS": []}, "the table SIGNS is empty"),
+        ({"SIGNS": 1}, "SIGNS=1, and there 'constexpr int SIGNS"),
+        ({"OFFSET": [1]}, "OFFSET=.*, and there 'constexpr int OFFSET = "),
+    ],
+)
+def test_a_constant_is_an_int_of_cpp_and_a_table_has_several(toy, constants, message):
+    with pytest.raises(AssertionError, match=message):
+        headers.text_of("toy/kernel.cuh", {**CONSTANTS, **constants})
 
 
 def test_headers_compile_alone(toy):

@@ -2,8 +2,8 @@
 
 MuJoCo Warp launches some 35 kernels for the first and some 10 for the second, each of which waits for its slowest
 world; here some lanes of a warp own a world, with its bodies or its inertia matrix in shared memory. They are written
-in C++, as the solver's kernel is; the CPU compiles the same source, for one lane. Read their parts in the order in
-which SMOOTH and INTEGRATION name them.
+in C++, as the solver's kernel is; the CPU compiles the same source, for one lane. Read SMOOTH and
+INTEGRATION.
 
 Source of the algorithms: https://mujoco.readthedocs.io/en/stable/computation/index.html
 """
@@ -20,11 +20,11 @@ import warp as wp
 from ksim_rl.physics import native
 from ksim_rl.physics.actuators.disabled_actuators import SWITCHED_OFF
 from ksim_rl.physics.fixed_geoms import fixed_geoms
-from ksim_rl.physics.overflow import OUT_OF
+from ksim_rl.physics.overflow import OUT_OF, record_arrays
 from ksim_rl.physics.sim_cfg import SimCfg
 
-SMOOTH = ("world", "layout", "kinematics", "inertia", "velocities", "passive", "actuation")
-INTEGRATION = ("world", "derivative", "factorization", "free_bodies", "advance")
+SMOOTH = "ksim_rl/physics/smooth/smooth_dynamics.cuh"
+INTEGRATION = "ksim_rl/physics/smooth/integration.cuh"
 # The shared memory that a block has without asking for more, in floats.
 SHARED_FLOATS = 48 * 1024 // 4
 # Few worlds do not fill a GPU with 8 lanes each. Many have 8 where a block of two warps is small, so that shared memory
@@ -41,11 +41,22 @@ WHOLE = {
     **dict.fromkeys(("places_geoms", "goes_on", "forces_too", "is_read"), True),
     **dict.fromkeys(("sums_momenta", "masked", "empties_pool"), False),
 }
+_TYPES = (
+    "FREE",
+    "BALL",
+    "SLIDE",
+    "HINGE",
+    "JOINT",
+    "JOINTINPARENT",
+    "INTEGRATOR",
+    "FILTER",
+    "FILTEREXACT",
+)
+_NUMBERS = native.names_of(mujoco.mjtJoint, mujoco.mjtTrn, mujoco.mjtDyn)
 _ENUMS = {
-    **native.names_of(mujoco.mjtJoint, mujoco.mjtTrn, mujoco.mjtDyn),
+    **{name: _NUMBERS[name] for name in _TYPES},
     "AFFINE_GAIN": mujoco.mjtGain.mjGAIN_AFFINE,
     "AFFINE_BIAS": mujoco.mjtBias.mjBIAS_AFFINE,
-    **OUT_OF,
     "SWITCHED_OFF": SWITCHED_OFF,
 }
 FORCE_CALLBACKS = ("passive", "control", "act_dyn", "act_gain", "act_bias")
@@ -142,11 +153,13 @@ def integration(
     and implicitfast has the derivatives of what is left), and with controls out of range, whose derivative is taken at
     the clamped ones.
     """
-    return _launcher(INTEGRATION, warp_model, warp_data_E, lanes, record or {})
+    if record is None:
+        record = record_arrays(warp_data_E.nworld)
+    return _launcher(INTEGRATION, warp_model, warp_data_E, lanes, record)
 
 
 def _launcher(
-    parts: tuple[str, ...],
+    header: str,
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
     lanes: int | None,
@@ -161,7 +174,7 @@ def _launcher(
         if lanes:
             block = (lanes, 64)
         else:
-            block = _block(parts, sizes, d.nworld)
+            block = _block(header, sizes, d.nworld)
     else:
         block = (1, 1)
     assert block is not None, "the model is unsuited"
@@ -177,19 +190,19 @@ def _launcher(
     }
     arrays = {name: wp.array(table, dtype=int, device=device) for name, table in tables.items()}
     own = {**WHOLE, **given, **arrays}
-    constants = {**_ENUMS, **sizes, "floats": _floats(parts, sizes, lanes)}
+    floats = _floats(header, sizes, lanes)
+    constants = {
+        **(_ENUMS | sizes),
+        "floats": floats,
+        "parents": m.body_parentid.numpy().tolist(),
+        **(OUT_OF if header == INTEGRATION else {}),
+    }
     # The bound was measured to pay for dynamics in small blocks; see LANES.
-    is_small = (
-        parts == SMOOTH
-        and threads == 64
-        and constants["floats"] * (64 // lanes) <= SMALL_BLOCK_FLOATS
-    )
-    parents = ", ".join(map(str, m.body_parentid.numpy()))
-    # Without a record of overflow, its part is not compiled.
-    parts += ("record",) if "sticky" in given else ()
-    source = f"constexpr int PARENTS[] = {{{parents}}};\n" + native.source_of("smooth", parts)
+    is_small = header == SMOOTH and threads == 64 and floats * (64 // lanes) <= SMALL_BLOCK_FLOATS
     build = native.Build(max_registers=REGISTERS if is_small else None)
-    return native.launcher(source, constants, own, m, d, lanes=lanes, threads=threads, build=build)
+    return native.launcher_of(
+        header, constants, own, m, d, lanes=lanes, threads=threads, build=build
+    )
 
 
 def _sizes(warp_model: mjw.Model) -> dict[str, int]:
@@ -230,10 +243,10 @@ def _sizes(warp_model: mjw.Model) -> dict[str, int]:
     }
 
 
-def _floats(parts: tuple[str, ...], sizes: Mapping[str, int], lanes: int) -> int:
+def _floats(header: str, sizes: Mapping[str, int], lanes: int) -> int:
     """Return how many floats the lanes of a world share."""
     needed = sizes["poses"] + sizes["joints"] + 9 * sizes["num_bodies"] + 6 * sizes["num_dofs"]
-    if parts == INTEGRATION:
+    if header == INTEGRATION:
         needed = sizes["num_entries"] + 2 * sizes["num_dofs"]
     # Worlds of a warp begin in other banks: floats of one world lie side by side for its lanes.
     return needed + (lanes - needed) % 32
@@ -289,17 +302,17 @@ def _has_affine_actuators(warp_model: mjw.Model) -> bool:
     return bool(np.isin(m.jnt_type.numpy()[m.actuator_trnid.numpy()[:, 0]], HINGES).all())
 
 
-def _block(parts: tuple[str, ...], sizes: Mapping[str, int], worlds: int) -> tuple[int, int] | None:
+def _block(header: str, sizes: Mapping[str, int], worlds: int) -> tuple[int, int] | None:
     """Return the fewest lanes that suit so many worlds, and threads of a block, whose worlds fit shared memory."""
     is_few = worlds <= native.FEW_WORLDS
-    least = LANES_OF_FEW[parts] if is_few else 0
+    least = LANES_OF_FEW[header] if is_few else 0
     for threads, lanes in itertools.product((32,) if is_few else (64, 32), LANES):
         if lanes == 8:
             # Eight lanes pay only where shared memory does not limit the blocks; see LANES.
             most = SMALL_BLOCK_FLOATS
         else:
             most = SHARED_FLOATS
-        if lanes >= least and _floats(parts, sizes, lanes) * (threads // lanes) <= most:
+        if lanes >= least and _floats(header, sizes, lanes) * (threads // lanes) <= most:
             return lanes, threads
     return None
 
