@@ -1,7 +1,7 @@
 """Finds the kernels of the package, and has for each the test that compares its bits.
 
-Kernels are Triton functions that are launched, Warp's, and what `QuickLaunch`, `launch_of` and `native.launcher` make
-of C++, by the function that makes them or the name that they get. Their bits are those of equal runs, of other numbers
+Kernels are Triton functions that are launched, Warp's, and what `QuickLaunch`, `launch_of` and `launcher_of` make of
+C++, by the function that makes them or the name that they get. Their bits are those of equal runs, of other numbers
 of lanes, or of what they must come to; tests in tests/gpu run where there is a GPU.
 """
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from tests.docs.guide import REPOSITORY
 
-MAKERS = ("QuickLaunch", "launch_of", "launcher", "launcher_of")
+MAKERS = ("QuickLaunch", "launch_of", "launcher_of")
 EQUAL_WORLDS = "gpu/test_repeatability.py::test_equal_worlds_stay_equal_bit_for_bit"
 CAPTURED_STEPS = "gpu/test_fused_ppo.py::test_captured_steps_are_the_eager_ones_bit_for_bit"
 LAYERS = "gpu/test_off_policy.py::test_layers_in_half_precision_err_as_torch_does"
@@ -104,7 +104,6 @@ TESTS = {
     "physics/nan_guard/guard.py": {"keep_rows": EQUAL_WORLDS, "mark_failed": EQUAL_WORLDS},
     "physics/native.py": {"kernel": EQUAL_WORLDS},
     "physics/newton/kernel.py": {"launcher": EQUAL_WORLDS, "sort_worlds": EQUAL_WORLDS},
-    "physics/newton/solver.py": {"solver": EQUAL_WORLDS},
     "physics/overflow.py": {"__init__": EQUAL_WORLDS},
     "physics/constants/principal_axes.py": {"_diagonalize": EQUAL_WORLDS},
     "physics/resets.py": {"empty_contacts": EQUAL_WORLDS, "fill_rows": EQUAL_WORLDS},

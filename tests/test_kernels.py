@@ -45,7 +45,7 @@ def part(x: float): ...
 def make():
     @wp.kernel(module="unique")
     def turn(x: float): ...
-    return native.launcher("source", lanes=4)
+    return native.launcher_of("source", lanes=4)
 """,
     }
     assert kernels.kernels(sources) == {

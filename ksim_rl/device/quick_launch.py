@@ -7,7 +7,6 @@ issue it again; then only the bytes of its arguments are written, in one go.
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
-from importlib.resources import files
 from inspect import signature
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from weakref import WeakSet
@@ -35,11 +34,6 @@ def arguments_of(*fields: tuple[type | str, str]) -> dict[str, type | str]:
     """
     # The order of the struct's fields is the order of these names.
     return {name: kind for kind, names in fields for name in names.split()}
-
-
-def source_of(package: str, *parts: str) -> str:
-    """Return the C++ of a kernel, whose parts lie in files of a package."""
-    return "".join((files(package) / f"{part}.cpp").read_text() for part in parts)
 
 
 _KINDS: dict[str, type | str] = {

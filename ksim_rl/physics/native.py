@@ -4,7 +4,6 @@
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
 
 import functools
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,18 +11,13 @@ from typing import Any
 import mujoco_warp as mjw
 import warp as wp
 
-from ksim_rl.device import headers, quick_launch
+from ksim_rl.device import headers
 from ksim_rl.device.upstream import with_preamble
 from ksim_rl.physics.structs import Field, filled, values_of
 from ksim_rl.physics.upstream import Struct
 
 FEW_WORLDS = 8192  # more fill a GPU with fewer lanes each
 _ARRAYS = {1: wp.array, 2: wp.array2d, 3: wp.array3d}
-
-
-def source_of(folder: str, parts: tuple[str, ...]) -> str:
-    """Return the C++ of a kernel, whose parts lie in a folder of this room."""
-    return quick_launch.source_of(f"ksim_rl.physics.{folder}", *parts)
 
 
 def names_of(*enums: Any) -> dict[str, int]:
@@ -43,42 +37,6 @@ class Build:
     max_registers: int | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """The C++ of a kernel: the body of its function, and what stands before that function."""
-
-    body: str
-    preamble: str = ""
-
-
-def launcher(
-    source: str,
-    constants: Mapping[str, int],
-    own: Mapping[str, Field],
-    warp_model: mjw.Model,
-    warp_data_E: mjw.Data,
-    *,
-    lanes: int,
-    threads: int,
-    build: Build = Build(),
-) -> Callable[..., None]:
-    """Return a launcher of C++ over (worlds, lanes) in blocks of `threads`, with arrays in their final place.
-
-    The C++ is the body of a function of `world`, `lane` and `problem`; before it stand the constants, by their names in
-    capitals, with LANES and THREADS. Its `problem.x` is x of `own`, or else of the model, its options or its
-    worlds; see `values_of`. A launch may change scalars of `own`, by name.
-    """
-    # The C++ itself says which arrays it reads, so that no list of them can go out of date.
-    names = dict.fromkeys(re.findall(r"\bproblem\.(\w+)", source))
-    # Constants are whole numbers, so that kernels of equal sizes are one in the cache.
-    values = _constants(constants, lanes, threads)
-    named = "".join(f"constexpr int {name} = {value};\n" for name, value in values.items())
-    owners = own, warp_model, warp_model.opt, warp_data_E
-    return _launch_of(
-        Source(body=named + source), tuple(names), owners, lanes=lanes, threads=threads, build=build
-    )
-
-
 def launcher_of(
     header: str,
     constants: Mapping[str, headers.Constant],
@@ -90,49 +48,18 @@ def launcher_of(
     threads: int,
     build: Build = Build(),
 ) -> Callable[..., None]:
-    """Return a launcher of the kernel of a header over (worlds, lanes); see `launcher`, and `headers`.
+    """Return a launcher of the kernel of a header over (worlds, lanes) in blocks of `threads`; see `headers`.
 
-    A field of its `Arguments` is the one of that name of `own`, or else of the model, its options or its worlds.
+    Arrays have to be in their final place. A field of its `Arguments` is the one of that name of `own`, or else of the
+    model, its options or its worlds; see `values_of`. A launch may change scalars of `own`, by name. The constants get
+    their names in capitals, and LANES and THREADS beside them.
     """
     text = headers.text_of(header, _constants(constants, lanes, threads))
-    fields = headers.arguments_of(text)
-    values = [f"problem.{name}" for name in fields]
-    body = headers.call_of(header, ("world", "lane"), values)
     owners = own, warp_model, warp_model.opt, warp_data_E
-    return _launch_of(
-        Source(body=body, preamble=text),
-        tuple(fields),
-        owners,
-        lanes=lanes,
-        threads=threads,
-        build=build,
-    )
-
-
-def _constants(
-    constants: Mapping[str, headers.Constant], lanes: int, threads: int
-) -> dict[str, headers.Constant]:
-    values: dict[str, headers.Constant] = {"LANES": lanes, "THREADS": threads}
-    for name, value in constants.items():
-        # Enums and truths are whole numbers in C++.
-        values[name.upper()] = value if isinstance(value, Sequence) else int(value)
-    return values
-
-
-def _launch_of(
-    source: Source,
-    names: tuple[str, ...],
-    owners: tuple[Mapping[str, Field], mjw.Model, mjw.Option, mjw.Data],
-    *,
-    lanes: int,
-    threads: int,
-    build: Build,
-) -> Callable[..., None]:
-    fields = values_of(names, *owners)
+    fields = values_of(tuple(headers.arguments_of(text)), *owners)
     types = tuple((name, _type_of(value)) for name, value in fields.items())
-    kernel, struct = _kernel(source, types, lanes, threads, build)
+    kernel, struct = _kernel(header, text, types, lanes, threads, build)
     problem = filled(struct, *owners)
-    *_, warp_data_E = owners
     dim = (warp_data_E.nworld, lanes)
     device = warp_data_E.qpos.device
 
@@ -145,6 +72,16 @@ def _launch_of(
     return launch
 
 
+def _constants(
+    constants: Mapping[str, headers.Constant], lanes: int, threads: int
+) -> dict[str, headers.Constant]:
+    values: dict[str, headers.Constant] = {"LANES": lanes, "THREADS": threads}
+    for name, value in constants.items():
+        # Enums and truths are whole numbers in C++.
+        values[name.upper()] = value if isinstance(value, Sequence) else int(value)
+    return values
+
+
 def _type_of(value: Any) -> type:
     if isinstance(value, wp.array):
         return _ARRAYS[value.ndim][value.dtype]
@@ -153,23 +90,26 @@ def _type_of(value: Any) -> type:
 
 @functools.cache
 def _kernel(
-    source: Source,
+    header: str,
+    text: str,
     types: tuple[tuple[str, type], ...],
     lanes: int,
     threads: int,
     build: Build,
 ) -> tuple[wp.Kernel, Struct]:
-    """Return the kernel, and the struct that it takes."""
+    """Return the kernel of a header with this text, and the struct that it takes."""
 
-    # A struct of the arrays that this source reads.
+    # A struct of the arrays that the kernel reads.
     class Problem: ...
 
     Problem.__annotations__ = dict(types)
     struct = wp.struct(Problem)
     # Or else loops over nothing are compiled.
     known = f"__builtin_assume(lane >= 0 && lane < {lanes});\n"
+    values = [f"problem.{name}" for name, _ in types]
+    call = headers.call_of(header, ("world", "lane"), values)
 
-    @wp.func_native(known + source.body)
+    @wp.func_native(known + call)
     def body(world: int, lane: int, problem: struct) -> None: ...
 
     @wp.kernel(
@@ -180,7 +120,7 @@ def _kernel(
         module_options={
             "block_dim": threads,
             "fast_math": build.fast_math,
-            "extra_build_options": with_preamble(source.preamble),
+            "extra_build_options": with_preamble(text),
         },
     )
     def kernel(problem: struct):

@@ -4,7 +4,7 @@ MuJoCo Warp launches about ten kernels per iteration, over all worlds, until the
 world waits for another, and the results of an iteration stay in shared memory. The algorithm is the same, with the same
 tests of convergence, but for a line search that is no more exact than iterations need; costs agree within the
 tolerance. It is written in C++, since its matrix lies in registers, which needs loops that are unrolled, shuffles and
-shared memory; the CPU compiles the same source, for a warp of one lane. Read its `_PARTS` in their order.
+shared memory; the CPU compiles the same source, for a warp of one lane. Read newton.cuh.
 
 Source of the algorithm: https://mujoco.readthedocs.io/en/stable/computation/index.html; of its bounds and
 tests of convergence: mujoco_warp/_src/solver.py.
@@ -26,8 +26,7 @@ from ksim_rl.physics.newton.limbs import Limbs, padded, row_stride
 
 CUDA_LANES = 32
 SORTING_THREADS = 1024
-_PARTS = ("layout", "constraints", "cost", "limbs", "tiles", "hessian", "line_search", "newton")
-_SOURCE = native.source_of("newton", _PARTS)
+_SOLVER = "ksim_rl/physics/newton/newton.cuh"
 
 
 class Invariant(enum.IntFlag):
@@ -146,9 +145,9 @@ def launcher(
         "CHECKED": checked,
         **{str(invariant.name): invariant for invariant in Invariant},
     }
-    given = _SOURCE, constants, own, warp_model, warp_data_E
+    given = _SOLVER, constants, own, warp_model, warp_data_E
     build = native.Build(fast_math=True, max_registers=max_registers)
-    return native.launcher(*given, lanes=lanes, threads=lanes, build=build)
+    return native.launcher_of(*given, lanes=lanes, threads=lanes, build=build)
 
 
 _SORT = "ksim_rl/physics/newton/sort_worlds.cuh"

@@ -2,12 +2,18 @@
 // that at the start, where mujoco_warp's (solver.py, _linesearch_iterative_kernel) goes on to the last bits. Along it a
 // row's residual is r + alpha rate, and the cost a sum of functions of alpha, of each of which its value relative to
 // alpha = 0, its slope and its curvature are needed.
+#pragma once
+#include "ksim_rl/physics/newton/cost.cuh"
+
+namespace newton {
 
 struct Point {
     float cost, slope, curvature;  // the cost is relative to that at the start of the direction
 };
+
 // 1/2 D (r + alpha rate)^2 where that residual is negative.
-auto one_sided = [](float at_start, float rate, float efc_D, float alpha) {
+CUDA_CALLABLE inline Point one_sided(float at_start, float rate, float efc_D, float alpha)
+{
     const float slope = efc_D * rate * at_start, curvature = efc_D * rate * rate;
     const float start = at_start < 0.0f ? 0.5f * efc_D * at_start * at_start : 0.0f;
     if (at_start + alpha * rate >= 0.0f)
@@ -18,9 +24,11 @@ auto one_sided = [](float at_start, float rate, float efc_D, float alpha) {
         slope + alpha * curvature,
         curvature
     };
-};
+}
+
 // Quadratic up to the bound on the force, and linear from there on.
-auto dry_friction = [&](float at_start, float rate, float efc_D, float most, float alpha) {
+CUDA_CALLABLE inline Point dry_friction(float at_start, float rate, float efc_D, float most, float alpha)
+{
     const float reach = ratio(most, efc_D);
     auto cost = [&](float at) {
         return fabsf(at) >= reach ? most * (fabsf(at) - 0.5f * reach) : 0.5f * efc_D * at * at;
@@ -29,31 +37,34 @@ auto dry_friction = [&](float at_start, float rate, float efc_D, float most, flo
     const bool linear = there <= -reach || there >= reach;
     const float slope = there <= -reach ? -most * rate : there >= reach ? most * rate : efc_D * rate * there;
     return Point {cost(there) - cost(at_start), slope, linear ? 0.0f : efc_D * rate * rate};
-};
+}
+
 // A cone along the direction: N + alpha N_rate, and a slip whose part along its own rate is `along` + alpha
 // `speed`, while the square of its part across is `aside2` throughout. So T^2 = (along + alpha speed)^2 + aside2.
 struct alignas(16) Cone {
     float mu, N, N_rate, along, speed, aside2, Dm, cost, slope, half_curvature, T, state;
 };
-auto prepare_cone = [&](int head) {
-    const int size = cone_size(head);
+
+CUDA_CALLABLE inline Cone prepare_cone(const Solve& s, int head)
+{
+    const int size = s.cone_size(head);
     Cone cone {};
-    cone.mu = bound[head];
-    cone.N = residual[head] * cone.mu;
-    cone.N_rate = rate[head] * cone.mu;
-    cone.Dm = cone_Dm(head);
+    cone.mu = s.bound[head];
+    cone.N = s.residual[head] * cone.mu;
+    cone.N_rate = s.rate[head] * cone.mu;
+    cone.Dm = cone_Dm(s, head);
     float slip[MOST_OF_CONE] {}, faster[MOST_OF_CONE] {}, slip_rate = 0.0f, rate_rate = 0.0f;
 UNROLL
     for (int mate = 0; mate < MOST_OF_CONE; ++mate)
         if (mate < size) {
             const int row = head + mate;
-            const float push = efc_D[row] * residual[row];
-            cone.cost += 0.5f * push * residual[row];
-            cone.slope += push * rate[row];
-            cone.half_curvature += 0.5f * efc_D[row] * rate[row] * rate[row];
+            const float push = s.efc_D[row] * s.residual[row];
+            cone.cost += 0.5f * push * s.residual[row];
+            cone.slope += push * s.rate[row];
+            cone.half_curvature += 0.5f * s.efc_D[row] * s.rate[row] * s.rate[row];
             if (mate > 0) {
-                slip[mate] = residual[row] * bound[row];
-                faster[mate] = rate[row] * bound[row];
+                slip[mate] = s.residual[row] * s.bound[row];
+                faster[mate] = s.rate[row] * s.bound[row];
                 slip_rate += slip[mate] * faster[mate];
                 rate_rate += faster[mate] * faster[mate];
             }
@@ -70,8 +81,10 @@ UNROLL
     cone.T = sqrtf(cone.along * cone.along + cone.aside2);
     cone.state = (float)cone_zone(cone.N, cone.T, cone.mu);
     return cone;
-};
-auto cone_point = [&](const Cone& cone, float alpha) {
+}
+
+CUDA_CALLABLE inline Point cone_point(const Cone& cone, float alpha)
+{
     const int state_0 = (int)cone.state;
     const float gap_0 = cone.N - cone.mu * cone.T;
     const float start = state_0 == CURVED ? 0.5f * cone.Dm * gap_0 * gap_0 : state_0 == QUADRATIC ? cone.cost : 0.0f;
@@ -103,58 +116,63 @@ auto cone_point = [&](const Cone& cone, float alpha) {
         change = quadratic - 0.5f * cone.Dm * excess * excess;
     }
     return Point {change, cone.Dm * gap * gap_rate, cone.Dm * (gap_rate * gap_rate - cone.mu * gap * bend)};
-};
+}
+
 // What a unit costs at a point of the search direction.
-auto unit_point = [&](int row, float alpha) {
-    const int kind = kind_of(row);
+CUDA_CALLABLE inline Point unit_point(const Solve& s, int row, float alpha)
+{
+    const int kind = s.kind_of(row);
     if (ELLIPTIC && kind == CONE_HEAD)
-        return cone_point(*(const Cone*)(cones + 4 * row), alpha);
+        return cone_point(*(const Cone*)(s.cones + 4 * row), alpha);
     if (kind == FRICTION)
-        return dry_friction(residual[row], rate[row], efc_D[row], bound[row], alpha);
-    return one_sided(residual[row], rate[row], efc_D[row], alpha);
-};
+        return dry_friction(s.residual[row], s.rate[row], s.efc_D[row], s.bound[row], alpha);
+    return one_sided(s.residual[row], s.rate[row], s.efc_D[row], alpha);
+}
+
 // The step to take, and by how much it lowers the cost. `slope` and `half_curvature` are those of the terms that are
 // quadratic everywhere: the Gauss cost of M and the equalities; `slope_0` is that of all terms at the start.
 struct Step {
     float alpha, improvement;
 };
+
 // The search keeps the points before and beyond the minimum that are flattest. Its trials measure four points each, on
 // CUDA by a team of eight lanes each, and take of those that are flat enough the cheapest. To ask more than ten times
 // ls_tolerance of the slope at the start saves no iteration, and costs trials (Go1: 1.9 an iteration with ls_tolerance
 // itself, 1.5 with ten times that).
-auto search_line = [&](float slope, float half_curvature, float slope_0, float noise) {
+CUDA_CALLABLE inline Step search_line(const Solve& s, float slope, float half_curvature, float slope_0, float noise)
+{
     constexpr int TEAM = LANES > 1 ? 8 : 1, POINTS = 4;
-    Step step {rows == 0 ? 1.0f : 0.0f, 0.0f};
-    require(rows == 0 || slope_0 <= noise, SEARCH_DESCENDS);
-    if (rows == 0 || !(slope_0 < -noise))
+    Step step {s.rows == 0 ? 1.0f : 0.0f, 0.0f};
+    s.require(s.rows == 0 || slope_0 <= noise, SEARCH_DESCENDS);
+    if (s.rows == 0 || !(slope_0 < -noise))
         return step;
     if (ELLIPTIC) {
 #pragma unroll 1
-        for (int unit = lane; unit < num_units; unit += LANES)
-            if (kind_of(units[unit]) == CONE_HEAD)
-                *(Cone*)(cones + 4 * units[unit]) = prepare_cone(units[unit]);
+        for (int unit = s.lane; unit < s.num_units; unit += LANES)
+            if (s.kind_of(s.units[unit]) == CONE_HEAD)
+                *(Cone*)(s.cones + 4 * s.units[unit]) = prepare_cone(s, s.units[unit]);
         sync();
     }
     auto measure = [&](float there) {
         Point sum {0.0f, 0.0f, 0.0f};
 #pragma unroll 1
-        for (int unit = lane % TEAM; unit < num_units; unit += TEAM) {
-            const Point point = unit_point(unit_of(unit), there);
+        for (int unit = s.lane % TEAM; unit < s.num_units; unit += TEAM) {
+            const Point point = unit_point(s, s.unit_of(unit), there);
             sum.cost += point.cost;
             sum.slope += point.slope;
             sum.curvature += point.curvature;
         }
         return sum;
     };
-    const float flat = wp::max(noise, 10.0f * ls_tolerance * -slope_0);
+    const float flat = wp::max(noise, 10.0f * s.ls_tolerance * -slope_0);
     float alphas[POINTS] = {1.0f, 0.5f, 0.25f, 0.1f}, low_alpha = 0.0f, high_alpha = 0.0f;
     Point low {0.0f, slope_0, 0.0f}, high {0.0f, LARGEST, 0.0f};
 #pragma unroll 1
     for (int trial = 0;; ++trial) {
 #if defined(__CUDA_ARCH__)
-        const int team = lane / TEAM;
+        const int team = s.lane / TEAM;
         const Point sum = measure(team == 0 ? alphas[0] : team == 1 ? alphas[1] : team == 2 ? alphas[2] : alphas[3]);
-        const float pool = pooled(sum.cost, sum.slope, sum.curvature, 0.0f, TEAM);
+        const float pool = pooled(s.lane, sum.cost, sum.slope, sum.curvature, 0.0f, TEAM);
 #endif
         bool found = false, moved = false;
 UNROLL
@@ -186,8 +204,8 @@ UNROLL
         if (found)
             return step;
         if (!moved || trial == MOST_TRIALS) {
-            if (moved && lane == 0)
-                wp::atomic_or(problem.overflow.data + world, OUT_OF_LS_ITERATIONS);
+            if (moved && s.lane == 0)
+                wp::atomic_or(s.a.overflow.data + s.world.world, OUT_OF_LS_ITERATIONS);
             const float cost = wp::min(low.cost, high.cost);
             return cost < 0.0f ? Step {low.cost < high.cost ? low_alpha : high_alpha, -cost} : step;
         }
@@ -199,4 +217,6 @@ UNROLL
         alphas[2] = low_alpha + 0.5f * width;
         alphas[3] = low_alpha + width * ratio(low.slope, low.slope - high.slope);
     }
-};
+}
+
+}
