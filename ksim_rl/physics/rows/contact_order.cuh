@@ -24,6 +24,35 @@ constexpr unsigned NOT_EXPLICIT = 1u << 31;
 constexpr int GEOM_BITS = 15;
 constexpr float LEAST_FRICTION = 1e-5f;
 
+// What kernels take that list the contacts of a world in their order.
+struct ListArguments {
+    wp::array_t<wp::vec_t<5, float>> pair_friction;
+    wp::array_t<int> contact_dim;
+    wp::array_t<float> contact_includemargin;
+    wp::array_t<int> pair_dim;
+    wp::array_t<float> contact_adhesion;
+    wp::array_t<float> pair_margin;
+    wp::array_t<wp::vec_t<5, float>> contact_friction;
+    wp::array_t<wp::vec2> contact_solref;
+    wp::array_t<wp::vec2> pair_solref;
+    wp::array_t<wp::vec_t<5, float>> contact_solimp;
+    wp::array_t<wp::vec_t<5, float>> pair_solimp;
+    wp::array_t<wp::vec2> pair_solreffriction;
+    wp::array_t<wp::vec2> contact_solreffriction;
+    wp::array_t<wp::vec2i> contact_geom;
+    wp::array_t<int> pair_geom1;
+    wp::array_t<int> pair_geom2;
+    wp::array_t<int> appended;
+    wp::array_t<int> found;
+    wp::array_t<unsigned long long> keys;
+    wp::array_t<int> ids;
+    wp::array_t<int> geom_bodyid;
+    wp::array_t<float> contact_dist;
+    wp::array_t<wp::vec3> contact_pos;
+    wp::array_t<int> contact_geomcollisionid;
+    wp::array_t<int> count;
+};
+
 template <class One, class Other>
 CUDA_CALLABLE inline bool equals(const One& one, const Other& other, int size)
 {
@@ -34,8 +63,7 @@ CUDA_CALLABLE inline bool equals(const One& one, const Other& other, int size)
 }
 
 // Of explicit pairs of the same geoms, a contact has the law of its own one.
-template <class Arguments>
-CUDA_CALLABLE inline bool has_law_of(const World& world, const Arguments& a, int contact, int pair)
+CUDA_CALLABLE inline bool has_law_of(const World& world, const ListArguments& a, int contact, int pair)
 {
     const auto& friction = world.model_row(a.pair_friction)[pair];
     // Adhesion makes it one of dimension 1 where it is in a gap, and contacts without rows have a margin of their own.
@@ -52,8 +80,7 @@ CUDA_CALLABLE inline bool has_law_of(const World& world, const Arguments& a, int
 }
 
 // The pair of its own law that a contact is of, or -1.
-template <class Arguments>
-CUDA_CALLABLE inline int explicit_pair_of(const World& world, const Arguments& a, int contact)
+CUDA_CALLABLE inline int explicit_pair_of(const World& world, const ListArguments& a, int contact)
 {
     const auto& geoms = a.contact_geom.data[contact];
 #pragma unroll 1
@@ -67,8 +94,7 @@ CUDA_CALLABLE inline int explicit_pair_of(const World& world, const Arguments& a
 }
 
 // Whether a contact comes before another one; keys that are equal leave it open.
-template <class Arguments>
-CUDA_CALLABLE inline bool precedes(const Arguments& a, const mask64* keys, const int* found, int item, int other)
+CUDA_CALLABLE inline bool precedes(const ListArguments& a, const mask64* keys, const int* found, int item, int other)
 {
     if (keys[item] != keys[other])
         return keys[item] < keys[other];
@@ -87,8 +113,7 @@ CUDA_CALLABLE inline bool precedes(const Arguments& a, const mask64* keys, const
 }
 
 // Lists the contacts of a world in that order, and returns how many there are.
-template <class Arguments>
-CUDA_CALLABLE inline int order_contacts(const World& world, const Arguments& a)
+CUDA_CALLABLE inline int order_contacts(const World& world, const ListArguments& a)
 {
     const int contacts = wp::min(a.appended.data[world.world], ROOM);
     const int* const found = world.row_of(a.found);

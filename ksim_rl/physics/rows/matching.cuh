@@ -14,8 +14,13 @@ constexpr int SUBTREE = 2;
 
 using namespace given;
 
-template <class Arguments>
-CUDA_CALLABLE inline bool is_of(const Arguments& a, int geom, int kind, int element)
+// What kernels take that ask for the objects of sensors.
+struct MatchArguments {
+    wp::array_t<int> geom_bodyid;
+    wp::array_t<int> body_subtreenum;
+};
+
+CUDA_CALLABLE inline bool is_of(const MatchArguments& a, int geom, int kind, int element)
 {
     if (kind == NOTHING || kind == GEOM)
         return kind == NOTHING || geom == element;

@@ -13,13 +13,22 @@ using namespace given;
 using namespace lanes;
 using vec3 = wp::vec3;
 
+// What kernels take that ask for the forces of contacts.
+struct WrenchArguments {
+    wp::array_t<int> contact_efc_address;
+    wp::array_t<wp::vec_t<5, float>> contact_friction;
+    wp::array_t<float> efc_force;
+    wp::array_t<int> contact_dim;
+    wp::array_t<float> contact_adhesion;
+    wp::array_t<wp::mat33> contact_frame;
+};
+
 struct Wrench {
     vec3 force, torque;
 };
 
 // What a contact exerts on its second geom, in its own axes: the normal and two tangents ("mj_contactForce").
-template <class Arguments>
-CUDA_CALLABLE inline Wrench wrench_of(const World& world, const Arguments& a, int contact)
+CUDA_CALLABLE inline Wrench wrench_of(const World& world, const WrenchArguments& a, int contact)
 {
     const int* const rows = a.contact_efc_address.data + (size_t)contact * a.contact_efc_address.shape[1];
     const float* const friction = (const float*)(a.contact_friction.data + contact);
@@ -42,16 +51,14 @@ CUDA_CALLABLE inline Wrench wrench_of(const World& world, const Arguments& a, in
     return Wrench {vec3(along[0], along[1], along[2]), vec3(along[3], along[4], along[5])};
 }
 
-template <class Arguments>
-CUDA_CALLABLE inline vec3 axis_of(const Arguments& a, int contact, int axis)
+CUDA_CALLABLE inline vec3 axis_of(const WrenchArguments& a, int contact, int axis)
 {
     const float* const axes = (const float*)(a.contact_frame.data + contact) + 3 * axis;
     return vec3(axes[0], axes[1], axes[2]);
 }
 
 // A vector in the axes of a contact, in the axes of the world.
-template <class Arguments>
-CUDA_CALLABLE inline vec3 in_world(const Arguments& a, int contact, const vec3& v)
+CUDA_CALLABLE inline vec3 in_world(const WrenchArguments& a, int contact, const vec3& v)
 {
     return v[0] * axis_of(a, contact, 0) + v[1] * axis_of(a, contact, 1) + v[2] * axis_of(a, contact, 2);
 }

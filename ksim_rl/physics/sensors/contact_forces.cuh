@@ -11,15 +11,9 @@ constexpr int BODIES = 10;
 using namespace given;
 using namespace contacts;
 
-struct Arguments {
+struct Arguments : WrenchArguments {
     wp::array_t<int> ids;
     wp::array_t<int> count;
-    wp::array_t<int> contact_efc_address;
-    wp::array_t<wp::vec_t<5, float>> contact_friction;
-    wp::array_t<float> efc_force;
-    wp::array_t<int> contact_dim;
-    wp::array_t<float> contact_adhesion;
-    wp::array_t<wp::mat33> contact_frame;
     wp::array_t<wp::vec_t<6, float>> xfrc_applied;
     wp::array_t<wp::vec2i> contact_geom;
     wp::array_t<int> geom_bodyid;

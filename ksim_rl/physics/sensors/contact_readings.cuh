@@ -16,17 +16,9 @@ constexpr int SUM = 3;             // the reduction that sums forces
 using namespace given;
 using namespace contacts;
 
-struct Arguments {
+struct Arguments : WrenchArguments, MatchArguments {
     wp::array_t<int> ids;
     wp::array_t<int> count;
-    wp::array_t<int> contact_efc_address;
-    wp::array_t<wp::vec_t<5, float>> contact_friction;
-    wp::array_t<float> efc_force;
-    wp::array_t<int> contact_dim;
-    wp::array_t<float> contact_adhesion;
-    wp::array_t<wp::mat33> contact_frame;
-    wp::array_t<int> geom_bodyid;
-    wp::array_t<int> body_subtreenum;
     wp::array_t<int> sensors;
     wp::array_t<int> sensor_objtype;
     wp::array_t<int> sensor_objid;
