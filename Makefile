@@ -9,6 +9,8 @@ STAMP := $(VENV)/.installed
 ARGS ?=
 # Whole files go to one worker, since their tests share envs and compiled kernels.
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
+# Pyright takes as long as all other checks. Each writes its lines at its end, where make can do so.
+CHECKS := check docs --no-print-directory -j 2 $(if $(filter output-sync,$(.FEATURES)),--output-sync)
 
 .PHONY: setup train check lint types imports house headers docs test test-full test-oldest test-newest dist figures clean
 
@@ -49,10 +51,12 @@ headers: setup
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
-test: setup check docs
+test: setup
+	$(MAKE) $(CHECKS)
 	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
-test-full: setup check docs
+test-full: setup
+	$(MAKE) $(CHECKS)
 	$(BIN)/python -m pytest $(PARALLEL) -m "full or not full" --cov --cov-report=term $(ARGS)
 
 # The tests with the oldest, or with the newest, versions that pyproject.toml allows, in a venv of their own.

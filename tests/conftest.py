@@ -69,14 +69,6 @@ def _own_plugins():
         yield
 
 
-@pytest.fixture(scope="module")
-def optimized_kernels():
-    """Optimize the kernels that a file's tests compile: their envs take so many steps that this saves time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wp.config, "optimization_level", None)
-        yield
-
-
 def pytest_configure(config):
     """Compile the CPU's kernels without optimization, in half of the time, where the long tests do not run.
 

@@ -19,7 +19,6 @@ from ksim_rl.trainers.run_folder import Policy
 
 KINDS = {"flat": FlatPatch(cell=1.0), "slope_down": PyramidSlope(proportion=5.0, cell=0.5)}
 NUM_ENVS = 14
-pytestmark = pytest.mark.usefixtures("optimized_kernels")
 
 
 @pytest.fixture(scope="module")

@@ -324,6 +324,7 @@ def test_recorded_commands_are_within_the_ranges_of_the_folder(quadruped):
     assert (commands <= np.array(spec["high"]) + 1e-6).all() and np.ptp(commands[:, 0]) > 0.1
 
 
+@pytest.mark.full
 def test_an_unbroken_quadruped_differs_in_nothing(quadruped):
     assert report_of(quadruped).causes == []
 

@@ -13,7 +13,6 @@ from tests.mdp.randomization.randomize_bench import Runners
 
 E = 3
 SUBSTEPS = 60
-pytestmark = pytest.mark.usefixtures("optimized_kernels")
 
 EVENTS = {
     "friction": mdp.RandomizeGeomFriction(
