@@ -12,7 +12,6 @@ from ksim_rl.runs.csv_table import read_table
 from tests.files import bombs
 from tests.files.bombs import BOMBS, read_apart
 
-
 # Of tables, those that take the longest to read; the others are refused alike.
 LONG = ("table_of_30_mb", "table_of_empty_cells")
 NAMES = [pytest.param(name, marks=pytest.mark.full) if name in LONG else name for name in BOMBS]
