@@ -10,7 +10,15 @@ from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.view import EnvView
 from ksim_rl.export.exported_transforms import lag
 from ksim_rl.export.refusal import NotDescribedError
-from ksim_rl.export.standalone.files import Json
+from ksim_rl.export.standalone.description import (
+    ActionSpec,
+    ControlSpec,
+    Edges,
+    JointActionSpec,
+    LawSpec,
+    NoiseSpec,
+    TermSpec,
+)
 from ksim_rl.mdp.actions import per_joint
 from ksim_rl.scene.actuators import (
     Actuator,
@@ -27,15 +35,13 @@ from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, history_cfg
 from ksim_rl.transforms.low_pass import smoothing
 from ksim_rl.transforms.noise.cfg import NoiseCfg, per_dim
 
-Plain = Json
-
 
 def joint_names(view: EnvView, patterns: Patterns | None) -> list[str]:
     """Return the names of the hinges and slides that some patterns match, in the order of the patterns."""
     return list(view.joints(patterns).names)
 
 
-def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
+def noise(cfg: NoiseCfg | None, size: int) -> NoiseSpec | None:
     """Return the description of a noise on `size` numbers; `by_level` counts as full."""
     if cfg is None:
         return None
@@ -47,16 +53,23 @@ def noise(cfg: NoiseCfg | None, size: int) -> Plain | None:
         draw = "uniform"
     else:
         draw = "none"
-    found = {"draw": draw, "offset": offset, "spread": spread, "operation": cfg.operation}
-    # Zeros stand for no walk and no rounding, so the runner needs no special case.
-    walk, grain = (per_dim(name, getattr(cfg, name), size) for name in ("walk_std", "resolution"))
-    errors = {"walk_std": walk, "resolution": grain, "dropout": cfg.dropout, "lost": cfg.lost}
-    return {**found, "bias": noise(cfg.bias, size), **errors}
+    return {
+        "draw": draw,
+        "offset": offset,
+        "spread": spread,
+        "operation": cfg.operation,
+        "bias": noise(cfg.bias, size),
+        # Zeros stand for no walk and no rounding, so the runner needs no special case.
+        "walk_std": per_dim("walk_std", cfg.walk_std, size),
+        "resolution": per_dim("resolution", cfg.resolution, size),
+        "dropout": cfg.dropout,
+        "lost": cfg.lost,
+    }
 
 
-def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[Plain]:
+def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[TermSpec]:
     """Return what becomes of the readings of each term of groups, in the order in which a policy reads them."""
-    found = []
+    found: list[TermSpec] = []
     for group in groups:
         cfg: ObservationGroupCfg = env.cfg.observations[group]
         for name, term in cfg.terms.items():
@@ -82,23 +95,23 @@ def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[Plain]:
     return found
 
 
-def actions(env: ManagerBasedRlEnv) -> list[Plain]:
+def actions(env: ManagerBasedRlEnv) -> list[ActionSpec]:
     """Return the meaning of an action's columns, by name of the joint or actuator.
 
     Raises NotDescribedError, naming the term, for one of a kind that this room does not know.
     """
-    found = []
+    found: list[ActionSpec] = []
     start = 0
     # Terms take their columns of an action in the order of the config.
     for name, term in env.cfg.actions.items():
         stop = start + env.action_manager.sizes[name]
-        found.append({"name": name, "columns": [start, stop], **_action(term, name, env.view)})
+        found.append(_action(term, name, [start, stop], env.view))
         start = stop
     return found
 
 
-def _action(term: Any, name: str, view: EnvView) -> Plain:
-    kinds = {
+def _action(term: Any, name: str, columns: list[int], view: EnvView) -> ActionSpec:
+    kinds: dict[type, TargetKind] = {
         mdp.JointPositionAction: "pos",
         mdp.JointPositionVelocityAction: "pos",
         mdp.RelativeJointPositionAction: "pos",
@@ -109,10 +122,21 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
     if type(term) is mdp.ActuatorAction:
         every = view.resolver.names("actuator")
         names = [every[i] for i in view.resolver.ids("actuator", term.actuators)]
-        limits = view.ctrl_limits_L2[view.resolver.index("actuator", term.actuators)].T.tolist()
+        limits_K2 = view.ctrl_limits_L2[view.resolver.index("actuator", term.actuators)]
+        low, high = limits_K2.T.tolist()
         scale, offset = (_plain(term.numbers(view, field)) for field in ("scale", "offset"))
-        plain = {"clip": None, "tanh": False, "scale": scale, "offset": offset, "alpha": None}
-        return {"kind": "ctrl", "names": names, "limits": limits, **plain}
+        return ControlSpec(
+            name=name,
+            columns=columns,
+            kind="ctrl",
+            names=names,
+            limits=(low, high),
+            clip=None,
+            tanh=False,
+            scale=scale,
+            offset=offset,
+            alpha=None,
+        )
     # Exact types: a subclass may compute something else.
     if type(term) not in kinds:
         raise NotDescribedError(f"task.actions.{name}: {type(term).__name__} has no description")
@@ -123,33 +147,39 @@ def _action(term: Any, name: str, view: EnvView) -> Plain:
         alpha = smoothing(term.cutoff_hz, view.step_dt)
     else:
         alpha = None
-    shared = {"clip": term.clip, "tanh": term.tanh, "alpha": alpha}
     offset = _numbers(view, term, "offset")
     from_default = getattr(term, "use_default_offset", False)
     # The model's own pose: what events draw around it differs from world to world.
     if from_default:
         default = view.default_qpos_L[view.joints(term.joints).qpos].tolist()
         offset = [a + b for a, b in zip(offset, default, strict=True)]
-    # Positions and velocities are not limited here: servos and joints have limits of their own.
+    # Positions and velocities are not limited here: servos and joints have limits of their own. JSON has no infinity.
+    limits: Edges = (-1e30, 1e30)
     if kind == "effort":
         limits_K2 = view.targets.limits("effort", term.joints)
-    else:
-        limits_K2 = None
-    found = {
+        if limits_K2 is not None:
+            low, high = limits_K2.T.tolist()
+            limits = (low, high)
+    found: JointActionSpec = {
+        "name": name,
+        "columns": columns,
         "kind": kind,
         "names": names,
         "relative": isinstance(term, mdp.RelativeJointPositionAction),
         "from_default": from_default,
-        # JSON has no infinity.
-        "limits": [-1e30, 1e30] if limits_K2 is None else limits_K2.T.tolist(),
-        **shared,
+        "limits": limits,
+        "clip": term.clip,
+        "tanh": term.tanh,
+        "alpha": alpha,
         "scale": _numbers(view, term, "scale"),
         "offset": offset,
     }
     if isinstance(term, mdp.JointPositionVelocityAction):
         # The velocity half has no offset: its rest is 0 rad/s.
         found["velocity"] = {
-            **shared,
+            "clip": term.clip,
+            "tanh": term.tanh,
+            "alpha": alpha,
             "scale": _numbers(view, term, "velocity_scale"),
             "offset": 0.0,
         }
@@ -170,9 +200,9 @@ def _numbers(view: EnvView, term: Any, field: str) -> list[float]:
     return value.tolist()
 
 
-def actuators(env: ManagerBasedRlEnv) -> list[Plain]:
+def actuators(env: ManagerBasedRlEnv) -> list[LawSpec]:
     """Return the drives of joints that have targets: laws that run before each substep, or MuJoCo's servos."""
-    found = []
+    found: list[LawSpec] = []
     view = env.view
     # Joints that a law of ours drives; the others are left to MuJoCo's servos.
     explicit: set[str] = set()
@@ -196,12 +226,23 @@ def actuators(env: ManagerBasedRlEnv) -> list[Plain]:
             if n not in explicit
         ]
         if joints:
-            plain = {"kind": "builtin", "takes": [kind], "numbers": {}, "delay": None}
-            found.append({"joints": joints, **plain, **_of_actuators(view, joints, kind)})
+            names, scale, offset = _of_actuators(view, joints, kind)
+            found.append(
+                {
+                    "joints": joints,
+                    "kind": "builtin",
+                    "takes": [kind],
+                    "numbers": {},
+                    "delay": None,
+                    "actuators": names,
+                    "scale": scale,
+                    "offset": offset,
+                }
+            )
     return found
 
 
-def _law(actuator: Actuator, joints: list[str], view: EnvView) -> Plain:
+def _law(actuator: Actuator, joints: list[str], view: EnvView) -> LawSpec:
     delay = None
     # The lag is in substeps, as the law runs before each of them.
     if isinstance(actuator, DelayedActuator):
@@ -219,19 +260,32 @@ def _law(actuator: Actuator, joints: list[str], view: EnvView) -> Plain:
         )
     # JSON has no infinity.
     numbers = {n: [min(value, 1e30)] * len(joints) for n, value in actuator.params.items()}
-    # Sorted, since a set has no order: the runner joins delayed targets in this one.
-    found = {"kind": kind, "joints": joints, "takes": sorted(actuator.takes), "numbers": numbers}
-    return {**found, **_of_actuators(view, joints, None), "delay": delay}
+    names, scale, offset = _of_actuators(view, joints, None)
+    return {
+        "kind": kind,
+        "joints": joints,
+        # Sorted, since a set has no order: the runner joins delayed targets in this one.
+        "takes": sorted(actuator.takes),
+        "numbers": numbers,
+        "actuators": names,
+        "scale": scale,
+        "offset": offset,
+        "delay": delay,
+    }
 
 
-def _of_actuators(view: EnvView, joints: Sequence[str], kind: TargetKind | None) -> Plain:
-    """Return the names of the actuators that take this kind of target, and the lines that make controls of targets.
+def _of_actuators(
+    view: EnvView, joints: Sequence[str], kind: TargetKind | None
+) -> tuple[list[str], list[float], list[float]]:
+    """Return the actuators that take this kind of target, and the scales and offsets that make controls of targets.
 
     Without a kind they are the motors of laws, one of each joint, whose controls are the laws' own.
     """
     every = joint_names(view, None)
     names = view.resolver.names("actuator")
-    found: Plain = {"actuators": [], "scale": [], "offset": []}
+    driven: list[str] = []
+    scales: list[float] = []
+    offsets: list[float] = []
     for joint in joints:
         # `driven` and `motor` take the number of a joint among all of the scene.
         number = every.index(joint)
@@ -243,7 +297,7 @@ def _of_actuators(view: EnvView, joints: Sequence[str], kind: TargetKind | None)
             actuator, control = view.targets.driven(kind, number)
             scale = control.scale
             offset = control.offset
-        found["actuators"].append(names[actuator])
-        found["scale"].append(scale)
-        found["offset"].append(offset)
-    return found
+        driven.append(names[actuator])
+        scales.append(scale)
+        offsets.append(offset)
+    return driven, scales, offsets

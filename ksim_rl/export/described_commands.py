@@ -4,19 +4,19 @@ from collections.abc import Iterable
 
 from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.envs.term import CommandRanges, CommandTerm, CurriculumTerm, hull
-from ksim_rl.export.standalone.files import Json
+from ksim_rl.export.standalone.description import CommandSpec
 
 
 def described_commands(
     ours: ManagerBasedRlEnv, curriculum: Iterable[CurriculumTerm], step_count: int
-) -> Json:
+) -> dict[str, CommandSpec]:
     """Return size, kind and range of each command, by name.
 
     `low` and `high` have a number for each column, and are null where the term does not know its bounds. They hold the
     ranges that a curriculum has given within `step_count` env steps, too.
     """
     terms = list(curriculum)
-    found: Json = {}
+    found: dict[str, CommandSpec] = {}
     for name, value in ours.command_manager.values.items():
         term = ours.cfg.commands[name]
         bounds = term.bounds(ours.view, _seen(name, term, terms, step_count))

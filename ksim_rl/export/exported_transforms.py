@@ -15,7 +15,14 @@ from torchrl.envs.transforms import Transform
 
 from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.export.refusal import NotDescribedError
-from ksim_rl.export.standalone.files import Json
+from ksim_rl.export.standalone.description import (
+    ClipStage,
+    DelayStage,
+    LagSpec,
+    LowPassStage,
+    ScaleStage,
+    StageSpec,
+)
 from ksim_rl.modules.upstream import TensorModule
 from ksim_rl.transforms import (
     ActionClip,
@@ -27,7 +34,6 @@ from ksim_rl.transforms import (
 )
 from ksim_rl.transforms.elementwise import ObservationMap
 
-Plain = Json
 # Steps over which an env is compared with one whose transforms are parts of the policy.
 COMPARED_STEPS = 20
 
@@ -42,7 +48,7 @@ class TaskTransforms:
         training_only: names of those that do nothing in evaluation.
     """
 
-    stages: list[Plain]
+    stages: list[StageSpec]
     in_policy: dict[str, Transform]
     training_only: list[str]
 
@@ -52,17 +58,23 @@ class TaskTransforms:
         return {*self.in_policy, *self.training_only}
 
 
-def lag(cfg: DelayCfg | None, shared: str | None = None) -> Plain | None:
+def lag(cfg: DelayCfg | None, shared: str | None = None) -> LagSpec | None:
     """Return a lag in env steps."""
     if cfg is None:
         return None
     # `initial` None: the first value of an episode fills the lag.
-    draws = {"resample_every": cfg.resample_every, "hold_probability": cfg.hold_probability}
-    return {"min": cfg.min_lag, "max": cfg.max_lag, **draws, "shared": shared, "initial": None}
+    return {
+        "min": cfg.min_lag,
+        "max": cfg.max_lag,
+        "resample_every": cfg.resample_every,
+        "hold_probability": cfg.hold_probability,
+        "shared": shared,
+        "initial": None,
+    }
 
 
 @singledispatch
-def stage(transform: Any) -> Plain:
+def stage(transform: Any) -> StageSpec:
     """Return the description of a transform of actions; `stage.register(Kind)` adds one for transforms of yours.
 
     Kinds are "delay", "low_pass", "clip" and "scale", with the entries that the functions below give. Raises
@@ -77,23 +89,26 @@ def stage(transform: Any) -> Plain:
 
 
 @stage.register
-def _(transform: ActionDelay) -> Plain:
-    return {"kind": "delay", **(lag(transform.delay) or {}), "initial": transform.initial}
+def _(transform: ActionDelay) -> DelayStage:
+    steps = lag(transform.delay)
+    # A transform without a delay would not be there.
+    assert steps is not None
+    return DelayStage(**{**steps, "initial": transform.initial}, kind="delay")
 
 
 @stage.register
-def _(transform: ActionLowPass) -> Plain:
+def _(transform: ActionLowPass) -> LowPassStage:
     return {"kind": "low_pass", "alpha": transform.alpha, "initial": transform.initial}
 
 
 @stage.register
-def _(transform: ActionClip) -> Plain:
+def _(transform: ActionClip) -> ClipStage:
     low, high = transform.ranges[0]
     return {"kind": "clip", "low": low, "high": high}
 
 
 @stage.register
-def _(transform: ActionScale) -> Plain:
+def _(transform: ActionScale) -> ScaleStage:
     # Bounds are known to an env only.
     if transform.scale is None:
         raise NotDescribedError(
@@ -124,7 +139,7 @@ def sort_transforms(cfg: ManagerBasedRlEnvCfg, groups: Sequence[NestedKey]) -> T
     Raises NotDescribedError, naming the transform and the way out, for one that an export can neither leave out, nor
     describe, nor run as a part of the policy.
     """
-    stages: list[Plain] = []
+    stages: list[StageSpec] = []
     in_policy: dict[str, Transform] = {}
     training_only: list[str] = []
     given = {unravel_key(group) for group in groups}

@@ -42,6 +42,7 @@ from ksim_rl.trainers.run_folder import Policy, policy_of
 STANDALONE = Path(__file__).parent / "standalone"
 # Each needs only those before it, since they become one file.
 PARTS = (
+    "description",
     "files",
     "commands",
     "models",
@@ -57,6 +58,7 @@ PARTS = (
 )
 """The modules of `runner.py`, in this order."""
 LOOP_PARTS = (
+    "description",
     "files",
     "commands",
     "network",

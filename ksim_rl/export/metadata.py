@@ -1,7 +1,6 @@
 """The description of an env for whoever runs its policy elsewhere: joints, terms, actions, limits."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -9,6 +8,7 @@ from ksim_rl.envs import ManagerBasedRlEnv
 from ksim_rl.export import controls
 from ksim_rl.export.controls import joint_names
 from ksim_rl.export.exported_transforms import TaskTransforms
+from ksim_rl.export.standalone.description import CommandSpec, LawSpec, TermSpec
 from ksim_rl.export.standalone.files import FORMAT, Json
 from ksim_rl.export.traced_task import TracedTask
 from ksim_rl.scene.names import drives_scalar_joint
@@ -22,10 +22,10 @@ NO_LIMIT = 1e30
 
 def metadata(
     ours: ManagerBasedRlEnv,
-    terms: list[Json],
+    terms: list[TermSpec],
     transforms: TaskTransforms,
     traced: TracedTask,
-    commands: Json,
+    commands: dict[str, CommandSpec],
 ) -> Json:
     """Return the description of the env, whose terms are traced.
 
@@ -117,7 +117,7 @@ def metadata(
 
 
 def _gains(
-    ours: ManagerBasedRlEnv, laws: Sequence[Any], names: Sequence[str]
+    ours: ManagerBasedRlEnv, laws: Sequence[LawSpec], names: Sequence[str]
 ) -> tuple[list[float], list[float]]:
     """Return stiffness and damping by joint: the numbers of laws, and the model's gains for MuJoCo's servos."""
     # Gains of servos are in the model, gains of laws in the numbers that the laws were given.
@@ -146,7 +146,7 @@ def _gains(
 
 
 def _effort_scales(
-    ours: ManagerBasedRlEnv, laws: Sequence[Json], names: Sequence[str]
+    ours: ManagerBasedRlEnv, laws: Sequence[LawSpec], names: Sequence[str]
 ) -> list[float]:
     """Return the effort at the joint that one of a target of effort stands for, by joint: gear times gain of motors."""
     model = ours.world.mj_model
@@ -162,7 +162,7 @@ def _effort_scales(
     return [found[name] for name in names]
 
 
-def _no_load_speeds(laws: Sequence[Json], names: Sequence[str]) -> list[float | None]:
+def _no_load_speeds(laws: Sequence[LawSpec], names: Sequence[str]) -> list[float | None]:
     """Return the speeds at which motors have no torque left, by joint; null where their model has none."""
     found: dict[str, float] = {}
     for law in laws:
@@ -171,7 +171,7 @@ def _no_load_speeds(laws: Sequence[Json], names: Sequence[str]) -> list[float | 
     return [found.get(name) for name in names]
 
 
-def _limits(ours: ManagerBasedRlEnv, laws: Sequence[Json], names: Sequence[str]) -> Json:
+def _limits(ours: ManagerBasedRlEnv, laws: Sequence[LawSpec], names: Sequence[str]) -> Json:
     """Return soft limits of position, and of effort at the joint, behind the gear; null where there is none."""
     model = ours.world.mj_model
     if names:

@@ -11,6 +11,7 @@ from torchrl.envs.transforms import Transform
 from ksim_rl.envs import ManagerBasedRlEnvCfg
 from ksim_rl.export.exported_transforms import lag
 from ksim_rl.export.refusal import NotDescribedError
+from ksim_rl.export.standalone.description import LagSpec
 from ksim_rl.export.standalone.files import Json
 from ksim_rl.mdp import CameraImage
 from ksim_rl.scene.sensors import CameraSensor
@@ -42,7 +43,7 @@ class PictureInput:
     camera: str
     sensor: CameraSensor
     output: str
-    delay: Json | None = None
+    delay: LagSpec | None = None
     every: int = 1
     dropped: float = 0.0
     length: int = 1

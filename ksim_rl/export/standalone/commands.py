@@ -1,7 +1,10 @@
 """The ranges of commands that a policy has seen in its training."""
 
+from typing import Literal
+
 import numpy as np
 
+from ksim_rl.export.standalone.description import CommandSpec
 from ksim_rl.export.standalone.files import Array, Json, check_count
 
 MOST_OFF = 1e-5
@@ -11,17 +14,17 @@ MOST_OFF = 1e-5
 class CommandRange:
     """The numbers of one command, and what each may be."""
 
-    def __init__(self, name: str, spec: Json) -> None:
+    def __init__(self, name: str, spec: CommandSpec) -> None:
         self.name = name
         self.size = check_count(f"commands.{name}.size", spec["size"])
         self.low = self._ends("low", spec, -np.inf)
         self.high = self._ends("high", spec, np.inf)
         if not (self.low <= self.high).all():
             raise ValueError(
-                f"export.json: commands.{name}: low {spec['low']}, high {spec['high']}"
+                f"export.json: commands.{name}: low {self.low.tolist()}, high {self.high.tolist()}"
             )
 
-    def _ends(self, what: str, spec: Json, otherwise: float) -> Array:
+    def _ends(self, what: Literal["low", "high"], spec: CommandSpec, otherwise: float) -> Array:
         values = spec.get(what)
         # A command of which nobody knows what it may be, or a folder of before there were ranges.
         if values is None:

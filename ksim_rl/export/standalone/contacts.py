@@ -3,7 +3,8 @@
 import mujoco
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, Json
+from ksim_rl.export.standalone.description import ContactSpec
+from ksim_rl.export.standalone.files import Array
 
 
 class Contacts:
@@ -12,7 +13,7 @@ class Contacts:
     `substeps` are the physics steps of an env step, and `refine` into how many each of them is divided.
     """
 
-    def __init__(self, spec: Json, mj_model: mujoco.MjModel, substeps: int) -> None:
+    def __init__(self, spec: ContactSpec, mj_model: mujoco.MjModel, substeps: int) -> None:
         self.strongest = spec["strongest"]
         self.every = spec["every_substep"]
         # One MuJoCo sensor reads found, force and position (7 numbers); of the strongest

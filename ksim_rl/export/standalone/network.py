@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ksim_rl.export.standalone.description import StateSpec
 from ksim_rl.export.standalone.files import Array, Json, check_count, read
 
 # Types of the inputs that an export writes, by ONNX's names.
@@ -23,7 +24,7 @@ MOST_NUMBERS = 2**26
 class Network:
     """An ONNX file, with the states that it carries from step to step."""
 
-    def __init__(self, path: Path, states: list[Json], output: str) -> None:
+    def __init__(self, path: Path, states: list[StateSpec], output: str) -> None:
         # Here, so that a program that only reads signals needs no onnxruntime.
         import onnxruntime
 
@@ -68,8 +69,9 @@ class Network:
                 states.append(example)
                 continue
             frame = feed[spec.get("of") or "obs"][:, None]
-            if spec["columns"] is not None:
-                frame = frame[..., slice(*spec["columns"])]
+            columns = spec.get("columns")
+            if columns is not None:
+                frame = frame[..., slice(*columns)]
             states.append(np.repeat(frame, example.shape[1], 1))
         return states
 

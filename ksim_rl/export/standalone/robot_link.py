@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
 from ksim_rl.export.standalone.commands import CommandRange
+from ksim_rl.export.standalone.description import JointsSpec
 from ksim_rl.export.standalone.files import Array, Json
 
 
@@ -72,9 +73,9 @@ class DescribedJoints:
     """The joints of export.json: gains, the pose that a policy stands in, and what they may not pass."""
 
     def __init__(self, meta: Json) -> None:
-        joints = meta["joints"]
+        joints: JointsSpec = meta["joints"]
         limits = joints["limits"]
-        self.names: list[str] = joints["names"]
+        self.names = joints["names"]
         self.default_pos = _finite("default_pos", joints)
         self.stiffness = _finite("stiffness", joints, least=0.0)
         self.damping = _finite("damping", joints, least=0.0)
@@ -111,7 +112,12 @@ class Control(Protocol):
         ...
 
 
-def _finite(what: str, joints: Json, *, least: float = -np.inf) -> Array:
+def _finite(
+    what: Literal["default_pos", "stiffness", "damping", "effort_scale"],
+    joints: JointsSpec,
+    *,
+    least: float = -np.inf,
+) -> Array:
     """Return an entry of export.json with a number for each joint; what no motor may be given is refused."""
     numbers = np.array(joints[what], float)
     for name, number in zip(joints["names"], numbers, strict=True):

@@ -6,6 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from ksim_rl.export.standalone.description import ActionSpec, LawSpec, StageSpec, TermSpec
 from ksim_rl.export.standalone.files import Array, Json
 from ksim_rl.export.standalone.network import Policy
 from ksim_rl.export.standalone.sight import Sight
@@ -45,7 +46,7 @@ class Runner(Signals):
 
     # -- observations --------------------------------------------------------------------------------------------
 
-    def _term(self, spec: Json) -> Callable[[Array, bool], Array]:
+    def _term(self, spec: TermSpec) -> Callable[[Array, bool], Array]:
         shaped = clipped_and_scaled(spec)
         lag = None
         noise = Noise(spec["noise"], self) if spec["noise"] else None
@@ -75,22 +76,23 @@ class Runner(Signals):
 
     # -- actions and actuators -----------------------------------------------------------------------------------
 
-    def _stage(self, spec: Json) -> Callable[[Array], Array]:
+    def _stage(self, spec: StageSpec) -> Callable[[Array], Array]:
         if spec["kind"] == "delay":
             lag = Lag(spec, self)
             self.lags.append(lag)
             return lag
         return stage(spec, self.resets)
 
-    def _action(self, spec: Json) -> Callable[[Array], None]:
+    def _action(self, spec: ActionSpec) -> Callable[[Array], None]:
         # The model's own actuator, driven without a law in between.
         if spec["kind"] == "ctrl":
             columns = slice(*spec["columns"])
             shape = shaping(spec, self.resets)
+            low, high = spec["limits"]
             controls = [self.model.actuator(name).id for name in spec["names"]]
 
             def control(action: Array) -> None:
-                self.data.ctrl[controls] = np.clip(shape(action[columns]), *spec["limits"])
+                self.data.ctrl[controls] = np.clip(shape(action[columns]), low, high)
 
             return control
         asked = JointAction(spec, self.resets)
@@ -106,7 +108,7 @@ class Runner(Signals):
 
         return joints
 
-    def _law(self, spec: Json) -> Callable[[], None]:
+    def _law(self, spec: LawSpec) -> Callable[[], None]:
         """Return a function that sets some actuators' controls from their joints' targets before each substep."""
         names = spec["joints"]
         takes = spec["takes"]

@@ -10,6 +10,7 @@ import numpy as np
 
 from ksim_rl.export.standalone.commands import command_ranges
 from ksim_rl.export.standalone.contacts import Contacts
+from ksim_rl.export.standalone.description import LagSpec, NoiseSpec
 from ksim_rl.export.standalone.files import Array, Json, check_count, read_json
 from ksim_rl.export.standalone.models import read_model
 from ksim_rl.export.standalone.network import Network
@@ -31,7 +32,7 @@ ARRAYS = (
 class Lag:
     """A value as it was some steps ago; before an episode's first value lies that value, or `initial`."""
 
-    def __init__(self, spec: Json, signals: "Signals") -> None:
+    def __init__(self, spec: LagSpec, signals: "Signals") -> None:
         self.spec = spec
         self.signals = signals
         self.most = check_count("steps of a delay", spec["max"])
@@ -75,14 +76,14 @@ class Lag:
 class Noise:
     """A sensor's errors: bias, walk, noise, resolution, dropout, in this order."""
 
-    def __init__(self, spec: Json, signals: "Signals") -> None:
+    def __init__(self, spec: NoiseSpec, signals: "Signals") -> None:
         self.spec = spec
         self.signals = signals
         self.bias = None
         self.walk = 0.0
         self.last = None
 
-    def _sample(self, spec: Json, size: int) -> Array:
+    def _sample(self, spec: NoiseSpec, size: int) -> Array:
         # Uniform draws lie in [0, 1), gaussian ones have std 1; offset and spread map them to the range.
         draws = self.signals.draws
         unit = {"uniform": draws.random, "gaussian": draws.standard_normal, "none": np.zeros}[

@@ -4,12 +4,20 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, Json
+from ksim_rl.export.standalone.description import (
+    ClipStage,
+    JointActionSpec,
+    LowPassStage,
+    ScaleStage,
+    ShapeSpec,
+    TermSpec,
+)
+from ksim_rl.export.standalone.files import Array
 
 Stage = Callable[[Array], Array]
 
 
-def clipped_and_scaled(spec: Json) -> Stage:
+def clipped_and_scaled(spec: TermSpec) -> Stage:
     """Return what happens to the raw values of an observation term, without its noise and delay."""
     low, high = spec["clip"]
     # JSON has no infinity: None is a side without a bound.
@@ -39,7 +47,7 @@ class LowPass:
         return filtered
 
 
-def stage(spec: Json, resets: list[Callable[[], None]]) -> Stage:
+def stage(spec: LowPassStage | ClipStage | ScaleStage, resets: list[Callable[[], None]]) -> Stage:
     """Return a stage of `action_chain` other than a delay; what keeps memory adds its reset to `resets`."""
     if spec["kind"] == "clip":
         return lambda action: np.clip(action, spec["low"], spec["high"])
@@ -50,7 +58,7 @@ def stage(spec: Json, resets: list[Callable[[], None]]) -> Stage:
     return low_pass
 
 
-def shaping(spec: Json, resets: list[Callable[[], None]]) -> Stage:
+def shaping(spec: ShapeSpec, resets: list[Callable[[], None]]) -> Stage:
     """Return what makes targets of an action's columns: clip, tanh, scale, filter and offset, in this order."""
     low, high = spec["clip"] or (-np.inf, np.inf)
     scale = np.asarray(spec["scale"])
@@ -76,15 +84,16 @@ def shaping(spec: Json, resets: list[Callable[[], None]]) -> Stage:
 class JointAction:
     """Columns of an action that are targets of joints, by kind: "pos", "vel" or "effort"."""
 
-    def __init__(self, spec: Json, resets: list[Callable[[], None]]) -> None:
+    def __init__(self, spec: JointActionSpec, resets: list[Callable[[], None]]) -> None:
         self.spec = spec
-        self.names: list[str] = spec["names"]
+        self.names = spec["names"]
         self.columns = slice(*spec["columns"])
         self.shape = shaping(spec, resets)
         # Some actions give a velocity target too: then the first half of the columns is position.
         self.second = None
-        if spec.get("velocity"):
-            self.second = shaping(spec["velocity"], resets)
+        velocity = spec.get("velocity")
+        if velocity:
+            self.second = shaping(velocity, resets)
 
     def __call__(self, action: Array, encoders: Array, shift: Array) -> dict[str, Array]:
         """Return the targets of `names` by kind.
@@ -103,5 +112,6 @@ class JointAction:
         # The offset has the model's own pose in it.
         if spec["from_default"]:
             value = value + shift
-        targets[spec["kind"]] = np.clip(value, *spec["limits"])
+        low, high = spec["limits"]
+        targets[spec["kind"]] = np.clip(value, low, high)
         return targets
