@@ -31,6 +31,7 @@ try:
 except ImportError as error:
     raise ImportError('gymnasium is not installed: pip install "ksim_rl[gymnasium]"') from error
 
+from ksim_rl.adapters.gymnasium_ids import register
 
 MODES: dict[AutoresetMode, Autoreset] = {
     AutoresetMode.SAME_STEP: "same_step",
@@ -299,3 +300,7 @@ def _one_seed(seeds: Sequence[int | None], num_envs: int) -> int | None:
     sequence = np.random.SeedSequence([int(seed or 0) for seed in seeds])
     mixed = sequence.generate_state(1)[0]
     return int(mixed >> 1)
+
+
+# Importing this module is all that `gymnasium.make("ksim_rl.adapters.gymnasium:ksim_rl/walker_walk-v0")` does first.
+register()
