@@ -101,6 +101,7 @@ def trained(work):
         "+experiment=brief",
         *NODES,
         *SMALL,
+        "task.sim.engine=c",
         "trainer.video=false",
         "hydra.run.dir=run",
     ]

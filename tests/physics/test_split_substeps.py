@@ -1,5 +1,7 @@
 """What is read, and how substeps are split into calls, never changes the state that they reach: bit for bit."""
 
+from typing import Literal
+
 import mujoco
 import numpy as np
 import pytest
@@ -50,12 +52,16 @@ SPIN = (10.0, 0.0, 3.0, 5.0, 30.0, 3.0)
 
 
 def run(
-    mj_model: mujoco.MjModel, sim: SimCfg, calls: list[tuple[int, str]], *, reads: bool = False
+    world: World,
+    calls: list[tuple[int, Literal["last", "contacts", "every"]]],
+    *,
+    reads: bool = False,
 ) -> torch.Tensor:
     """The state that 24 substeps reach, in these calls of `step`, with a refresh and views between them or none."""
-    world = World(mj_model, num_envs=2, sim=sim)
+    world.reset(torch.ones(2, dtype=torch.bool))
     generator = np.random.default_rng(5)
-    world.qvel_EL.copy_(torch.from_numpy(generator.uniform(-2.0, 2.0, mj_model.nv)).float())
+    speeds = generator.uniform(-2.0, 2.0, world.mj_model.nv)
+    world.qvel_EL.copy_(torch.from_numpy(speeds).float())
     world.ctrl_EL.fill_(0.1)
     if reads:
         for name in ("M", "qfrc_bias", "cacc", "subtree_linvel"):
@@ -71,13 +77,14 @@ def run(
 @pytest.mark.parametrize("name", MODELS)
 def test_no_substep_depends_on_what_was_read_before_it(name: str, sim: str) -> None:
     mj_model = load_model(MODELS[name])
-    at_once = run(mj_model, SIMS[sim], [(24, "last")])
+    world = World(mj_model, num_envs=2, sim=SIMS[sim])
+    at_once = run(world, [(24, "last")])
     assert torch.isfinite(at_once).all()
-    assert torch.equal(run(mj_model, SIMS[sim], [(4, "last")] * 6), at_once)
-    assert torch.equal(run(mj_model, SIMS[sim], [(1, "last")] * 24), at_once)
-    assert torch.equal(run(mj_model, SIMS[sim], [(8, "every")] * 3), at_once)
-    assert torch.equal(run(mj_model, SIMS[sim], [(8, "contacts")] * 3), at_once)
-    assert torch.equal(run(mj_model, SIMS[sim], [(4, "last")] * 6, reads=True), at_once)
+    assert torch.equal(run(world, [(4, "last")] * 6), at_once)
+    assert torch.equal(run(world, [(1, "last")] * 24), at_once)
+    assert torch.equal(run(world, [(8, "every")] * 3), at_once)
+    assert torch.equal(run(world, [(8, "contacts")] * 3), at_once)
+    assert torch.equal(run(world, [(4, "last")] * 6, reads=True), at_once)
 
 
 @pytest.mark.parametrize("substeps", (1, 4, 10))

@@ -38,6 +38,7 @@ def test_two_iterations_of_training(tmp_path):
     cfg = conf.compose(
         ["task=g1_track_turn", "num_envs=4", "device=cpu", "data.num_env_states_per_minibatch=8"]
         + [
+            "task.sim.engine=c",
             "data.num_minibatches=4",
             "trainer.num_iterations=2",
             "trainer.eval_episodes=0",

@@ -41,7 +41,10 @@ def run_cfg(clip, **limits):
         else term
         for name, term in task.terminations.items()
     }
-    return dataclasses.replace(cfg, task=dataclasses.replace(task, terminations=terminations))
+    # The engine that compiles nothing.
+    sim = dataclasses.replace(task.sim, engine="c")
+    task = dataclasses.replace(task, sim=sim, terminations=terminations)
+    return dataclasses.replace(cfg, task=task)
 
 
 def still():
