@@ -11,7 +11,7 @@ from ksim_rl.objectives.algorithm_cfg import (
     SACCfg,
     TD3Cfg,
 )
-from ksim_rl.objectives.bc_loss import BCLoss
+from ksim_rl.objectives.bc_loss import DEMONSTRATION, VALUE_TARGET, BCAndValueLoss, BCLoss
 from ksim_rl.objectives.clip_ppo_loss import ClipPPOLoss
 from ksim_rl.objectives.discriminator_loss import discriminator_loss, style_reward
 from ksim_rl.objectives.distillation_loss import DistillationLoss

@@ -278,10 +278,13 @@ class DistillationCfg(OnPolicyCfg):
 class BCCfg(OnPolicyCfg):
     """A policy learns to act as the `episodes` of a folder do (behavior cloning), in the states that these visit.
 
-    Gradient steps are on env states drawn from the folder, as many as a dataset has; rollouts of the policy only show
-    how well it does meanwhile. The loss "nll" is TorchRL's negative log-likelihood of the recorded action, by which the
-    policy also learns how much actions scatter; "mse" is the squared distance from it of the deterministic action, and
-    leaves the scatter as it is. A share of the episodes is `held_out`: the loss on them is measured, and not learned.
+    Gradient steps are on env states drawn from the folder, as many as a dataset has. The loss "nll" is TorchRL's
+    negative log-likelihood of the recorded action, by which the policy also learns how much actions scatter; "mse" is
+    the squared distance from it of the deterministic action, and leaves the scatter as it is. A share of the episodes
+    is `held_out`: the loss on them is measured, and not learned.
+
+    The critic learns, in the same steps, what the policy's own rollouts return, by GAE with `gamma` and `lmbda`. The
+    policy learns nothing from them; PPO that goes on from here would spoil it with a critic that knows nothing.
     """
 
     learns_on_sequences = False
@@ -291,6 +294,8 @@ class BCCfg(OnPolicyCfg):
     episodes: Annotated[str, Filled("name a folder of episodes, objective.episodes=FOLDER")] = ""
     loss: Literal["nll", "mse"] = "nll"
     held_out: Annotated[float, Within(low=0.0, high=0.5)] = 0.1
+    gamma: Share = 0.99  # discount of a step, as of the PPO that goes on
+    lmbda: Share = 0.95  # of GAE
 
     def _check_fields(self) -> None:
         super()._check_fields()

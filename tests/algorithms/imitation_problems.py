@@ -197,6 +197,7 @@ def make_bc(folder=None, *, seed=0, iterations=6, num_envs=64, cfg=None, demonst
     update = BCUpdate(
         BCCfg(**{"episodes": "made_up", "learning_rate": 0.05, **(cfg or {})}),
         actor=make_actor(actor, obs_dim=2, action_dim=2),
+        critic=make_critic(CriticCfg(hidden_dims=(32,)), obs_dim=2),
         demonstration=demonstration or linear_demonstration(),
         data=data,
         seed=seed,

@@ -14,11 +14,13 @@ from ksim_rl import conf, data
 from ksim_rl.algorithms.bc.demonstration import read_demonstration
 from ksim_rl.data import EpisodeWriter, Leaf, Origin
 from ksim_rl.data.dataset_storage import MASK_KEY
-from ksim_rl.modules import ActorCfg, make_actor
-from ksim_rl.objectives import BCCfg, BCLoss
+from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
+from ksim_rl.objectives import DEMONSTRATION, VALUE_TARGET, BCAndValueLoss, BCCfg, BCLoss
 from ksim_rl.testing.counter_env import CounterEnv
 from ksim_rl.trainers import RunProgress, build, run
+from ksim_rl.trainers.restoring import load_networks
 from tests.algorithms.imitation_problems import linear_demonstration, make_bc
+from tests.trainers.target_env import make_trainer
 
 SMALL = (
     "device=cpu",
@@ -37,7 +39,9 @@ SMALL = (
 )
 
 
-@pytest.mark.parametrize(("loss", "std"), [("nll", 0.3), ("mse", 1.0)])
+@pytest.mark.parametrize(
+    ("loss", "std"), [("nll", 0.3), pytest.param("mse", 1.0, marks=pytest.mark.full)]
+)
 def test_a_linear_policy_is_found_and_with_nll_its_noise_too(loss, std):
     trainer = make_bc(
         iterations=8, cfg={"loss": loss, "num_epochs": 8, "anneal_learning_rate": True}
@@ -55,8 +59,10 @@ def test_a_linear_policy_is_found_and_with_nll_its_noise_too(loss, std):
     scale = trainer.update.actor.get_dist(shown).scale
     assert scale.flatten().tolist() == pytest.approx([std, std], abs=0.03)
     # Two numbers with the entropy of a normal distribution each, or the variance of the noise.
-    least = {"nll": 2 * math.log(0.3 * math.sqrt(2 * math.pi * math.e)), "mse": 0.09}[loss]
-    assert trainer.metrics["loss/held_out"] == pytest.approx(least, abs=0.1 * abs(least))
+    entropy = 2 * math.log(0.3 * math.sqrt(2 * math.pi * math.e))
+    # The held-out env states are 512 draws.
+    least, width = {"nll": (entropy, 0.15), "mse": (0.09, 0.015)}[loss]
+    assert trainer.metrics["loss/held_out"] == pytest.approx(least, abs=width)
 
 
 def test_the_loss_is_the_stock_one_and_leaves_out_masked_rows():
@@ -78,6 +84,63 @@ def test_the_loss_is_the_stock_one_and_leaves_out_masked_rows():
         mask_B1 = torch.arange(len(spoilt_B))[:, None] < len(rows_B)
         spoilt_B[MASK_KEY] = mask_B1
         torch.testing.assert_close(BCLoss(actor, loss=kind)(spoilt_B)["loss_bc"], expected)
+
+
+def test_rows_that_are_masked_count_for_neither_loss():
+    torch.manual_seed(0)
+    actor = make_actor(ActorCfg(hidden_dims=(4,), obs_normalization=False), obs_dim=2, action_dim=2)
+    critic = make_critic(CriticCfg(hidden_dims=(4,), obs_normalization=False), obs_dim=2)
+    loss = BCAndValueLoss(BCLoss(actor), critic)
+    recorded_B = linear_demonstration(64, held_out=8).learned_N.clone()
+    size = len(recorded_B)
+    rows = {"critic": torch.randn(size, 2), VALUE_TARGET: torch.randn(size, 1)}
+    whole_B = TensorDict({**rows, DEMONSTRATION: recorded_B}, [size])
+    expected = loss(whole_B)
+    value_B1 = critic(whole_B.select("critic"))["state_value"]
+    torch.testing.assert_close(
+        expected["loss_critic"], (value_B1 - whole_B[VALUE_TARGET]).square().mean()
+    )
+    spoilt_B = torch.cat([whole_B, whole_B])
+    spoilt_B[DEMONSTRATION, "action"][size:] = 1e6
+    spoilt_B[VALUE_TARGET][size:] = 1e6
+    spoilt_B[MASK_KEY] = torch.arange(2 * size)[:, None] < size
+    found = loss(spoilt_B)
+    for name in ("loss_bc", "loss_critic"):
+        torch.testing.assert_close(found[name], expected[name])
+
+
+@pytest.mark.full
+def test_the_critic_learns_what_the_rollouts_return():
+    """Each step is made to reward 1."""
+    trainer = make_bc(cfg={"gamma": 0.5, "num_epochs": 4, "learning_rate": 0.02})
+    env = trainer.collector.env
+    step = env._step
+
+    def rewarded(tensordict):
+        following = step(tensordict)
+        following["reward"].fill_(1.0)
+        return following
+
+    env._step = rewarded
+    for _ in range(15):
+        trainer.iterate()
+    shown = TensorDict({"critic": trainer.collector.collect()["critic"].reshape(-1, 2)})
+    values = trainer.update.critic(shown)["state_value"]
+    # 1 + 1/2 + 1/4 + ..., where episodes go on.
+    assert values.median().item() == pytest.approx(2.0, abs=0.1)
+
+
+def test_a_policy_without_a_critic_is_a_start_that_says_so(tmp_path):
+    update = make_trainer().update
+    state = make_trainer().update.state_dict()
+    alone = {name: value for name, value in state.items() if name != "critic"}
+    before = {name: value.clone() for name, value in update.state_dict()["critic"].items()}
+    assert "the critic begins anew" in load_networks(update, alone, tmp_path)
+    assert load_networks(update, state, tmp_path) == ""
+    for name, value in before.items():
+        assert torch.equal(value, update.state_dict()["critic"][name]), name
+    with pytest.raises(ValueError, match="no network 'actor'"):
+        load_networks(update, {"critic": state["critic"]}, tmp_path)
 
 
 def test_an_update_that_goes_on_from_its_state_is_the_same():
@@ -156,10 +219,11 @@ def test_a_run_learns_from_a_folder_and_ppo_goes_on_from_it(tmp_path):
     assert outcome.iteration == 2
 
     ppo = build(conf.compose([*SMALL, f"checkpoint={tmp_path / 'cloned'}"]))
-    assert any("the critic begins anew" in note for note in ppo.notes)
     cloned = build(dataclasses.replace(cfg, checkpoint=str(tmp_path / "cloned")))
-    for name, value in cloned.update.state_dict()["actor"].items():
-        assert torch.equal(value, ppo.update.state_dict()["actor"][name]), name
+    for network in ("actor", "critic"):
+        own = ppo.update.state_dict()[network]
+        for name, value in cloned.update.state_dict()[network].items():
+            assert torch.equal(value, own[name]), name
 
     other = {"actor": {"obs/velocity": (0, 2), "obs/position": (2, 5)}}
     write(tmp_path / "other", leaves=leaves, columns=other)

@@ -5,30 +5,50 @@ from typing import Any
 
 import torch
 from jaxtyping import Num
-from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ksim_rl.algorithms.bc.demonstration import Demonstration, read_demonstration
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
-from ksim_rl.algorithms.ppo.wiring import make_ppo_policy
+from ksim_rl.algorithms.ppo.wiring import build_networks
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.modules import update_normalizers
-from ksim_rl.objectives import BCCfg, BCLoss, observation_keys
+from ksim_rl.objectives import (
+    DEMONSTRATION,
+    GAE,
+    VALUE_TARGET,
+    BCAndValueLoss,
+    BCCfg,
+    BCLoss,
+    observation_keys,
+)
 from ksim_rl.trainers.algorithm import part_of
 from ksim_rl.trainers.run_cfg import RunCfg
 
 # Names of the logged means, by the names that `ppo_step` gives them.
-LOGGED = {"loss_bc": "loss/bc", "grad_norm": "update/grad_norm"}
+LOGGED = {
+    "loss_bc": "loss/bc",
+    "loss_critic": "loss/critic",
+    "grad_norm": "update/grad_norm",
+}
 
 
 def make_bc_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "BCUpdate":
     """Build the behavior cloning of a run, which reads its folder again where it is resumed."""
     objective: Any = cfg.objective
-    actor = make_ppo_policy(cfg, env)
+    if cfg.modules.trunk is not None:
+        raise ValueError(
+            "modules.trunk: behavior cloning trains the policy alone on what was recorded: leave the trunk out"
+        )
+    actor, critic = build_networks(cfg, env)
     device = cfg.resolved_device()
     demonstration = read_demonstration(
         Path(objective.episodes),
@@ -40,6 +60,7 @@ def make_bc_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "BCUpda
     return BCUpdate(
         objective,
         actor=actor,
+        critic=critic,
         demonstration=demonstration,
         data=part_of(cfg, "data", DatasetCfg),
         seed=cfg.seed,
@@ -51,8 +72,8 @@ def make_bc_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "BCUpda
 class BCUpdate(DatasetUpdate):
     """Lets a policy learn the actions of a demonstration, as many env states at a time as a dataset has.
 
-    The policy is any probabilistic module that is not recurrent. What it collects is not learned from. The `shared` are
-    the other arguments of `DatasetUpdate`.
+    The policy is any probabilistic module that is not recurrent. What it collects teaches the critic alone. The
+    `shared` are the other arguments of `DatasetUpdate`.
     """
 
     def __init__(
@@ -60,22 +81,28 @@ class BCUpdate(DatasetUpdate):
         cfg: BCCfg,
         *,
         actor: ProbabilisticTensorDictSequential,
+        critic: TensorDictModule,
         demonstration: Demonstration,
         **shared: Any,
     ) -> None:
         self.actor = actor
+        self.critic = critic
         self.behavior: TensorDictModuleBase = actor
         self.demonstration = demonstration
-        loss = BCLoss(actor, loss=cfg.loss)
-        super().__init__(cfg, loss=loss, networks={"actor": actor}, logged=LOGGED, **shared)
+        self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, critic=critic)
+        loss = BCAndValueLoss(BCLoss(actor, loss=cfg.loss), critic)
+        networks = {"actor": actor, "critic": critic}
+        super().__init__(cfg, loss=loss, networks=networks, logged=LOGGED, **shared)
         self._held_out_loss = torch.zeros((), device=self.device)
-        # All that is ever learned from is known from the start.
+        # All that the policy ever learns from is known from the start.
         update_normalizers(demonstration.learned_N, actor)
 
     @property
     def rollout_keys(self) -> list[NestedKey]:
-        """The leaves of an env state that the metrics of a rollout need."""
-        return list(dict.fromkeys([*observation_keys(self.actor), *self.signals.following]))
+        """The leaves of an env state that an update reads."""
+        valued = self.critic.in_keys
+        following = [*(unravel_key(("next", key)) for key in valued), *self.signals.following]
+        return list(dict.fromkeys([*observation_keys(self.actor), *valued, *following]))
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return the measurements of the last update, each a tensor [] on the device; means are over the steps made.
@@ -88,15 +115,21 @@ class BCUpdate(DatasetUpdate):
         return found
 
     def _update(self) -> None:
+        valued_ET = self.advantage(self.rollout_ET)
+        valued_D = valued_ET.select(*self.critic.in_keys, VALUE_TARGET).reshape(-1)
         steps = []
         for _ in range(self.cfg.num_epochs):
-            self.dataset.extend(self._drawn(self.demonstration.learned_N))
+            drawn_D = self._drawn(self.demonstration.learned_N)
+            # Each row has an env state to act in, and one to value.
+            self.dataset.extend(valued_D.copy().set(DEMONSTRATION, drawn_D))
             steps += self._epoch(self.loss)
         self._measure_(in_columns(steps))
         if self.demonstration.held_out_N is not None:
             with torch.no_grad():
-                measured = self.loss(self._drawn(self.demonstration.held_out_N))
+                measured = self.loss.bc(self._drawn(self.demonstration.held_out_N))
             self._held_out_loss.copy_(measured["loss_bc"])
+        # Only now, so that all gradient steps see the statistics that values were computed with.
+        update_normalizers(self.rollout_ET, self.critic)
 
     def _drawn(self, env_states_N: TensorDictBase) -> TensorDictBase:
         """Draw as many env states as a dataset has, uniformly, with replacement."""
