@@ -126,7 +126,7 @@ def test_a_run_is_evaluated_resumed_exported_and_seen_by_mujoco(tmp_path, capsys
     assert float(re.search(r"return ratio ([0-9.]+)", said)[1]) == pytest.approx(1.0, abs=0.01)
     # Another camera than that of the training is named.
     model = tmp_path / "export" / "robot.xml"
-    moved = re.sub(r'(<camera name="side"[^>]* pos=")[^"]*', r"\g<1>2 -3 1", model.read_text())
+    moved = re.sub(r'(<camera name="side"[^>]* pos=")[^"]*', r"\g<1>0 -3 4", model.read_text())
     assert moved != model.read_text()
     model.write_text(moved)
     assert run("sim2sim", str(tmp_path / "export"), "--episodes", "3") == 1

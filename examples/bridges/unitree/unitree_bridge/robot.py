@@ -38,7 +38,7 @@ class UnitreeRobot:
         self.places = [names.index(name) for name in kind.joints]
         self.motors = [kind.joints.index(name) for name in names]
         self.estimated: dict[str, str] = {}
-        for node in meta["obs"]["measurements"]:
+        for node in (meta["obs"] or {"measurements": ()})["measurements"]:
             if node.get("sensor") in SENSORS:
                 self.estimated[node["input"]] = SENSORS[node["sensor"]]
         of = connection.participant(interface, domain)
