@@ -23,7 +23,8 @@ def hold(bench, **targets):
         bench.world.ctrl_EL[:, bench.view.resolver.index("actuator", f"arm/{name}")] = torch.tensor(
             value
         )[:, None]
-    bench.world.step(100)
+    for _ in range(10):
+        bench.world.step(10)
     bench.world.refresh()
     bench.driver.refreshed()
 
