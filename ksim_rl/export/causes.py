@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ksim_rl.export.standalone.files import Json
+from ksim_rl.export.standalone.description import Export
 
 Arrays = Mapping[str, np.ndarray]
 SAME = 2e-3
@@ -36,7 +36,7 @@ class Cause:
         return f"{self.name}: {self.about}: {self.evidence}"
 
 
-def find_causes(meta: Json, trace: Arrays, replay: Arrays) -> list[Cause]:
+def find_causes(meta: Export, trace: Arrays, replay: Arrays) -> list[Cause]:
     """Return the likely causes of differences, the first in the chain first.
 
     `trace` holds recorded steps, `trace/<signal>` [N, T, ...]; `replay` the same from elsewhere, `<lag>/<n>/<signal>`.
@@ -94,7 +94,7 @@ def find_causes(meta: Json, trace: Arrays, replay: Arrays) -> list[Cause]:
     return found
 
 
-def _of_observations(meta: Json, trace: Arrays, replay: Arrays) -> tuple[list[Cause], bool]:
+def _of_observations(meta: Export, trace: Arrays, replay: Arrays) -> tuple[list[Cause], bool]:
     """Return the causes among the terms of the observation, and whether any term differs."""
     found: list[Cause] = []
     # A policy that only sees has no terms.
@@ -115,7 +115,7 @@ def _of_observations(meta: Json, trace: Arrays, replay: Arrays) -> tuple[list[Ca
     return found, differs
 
 
-def pictures_off(meta: Json, replay: Arrays) -> dict[str, float]:
+def pictures_off(meta: Export, replay: Arrays) -> dict[str, float]:
     """Return the mean share of pixels that are drawn otherwise in the recorded states, by camera."""
     found = {}
     for spec in meta.get("pictures", []):
@@ -125,7 +125,7 @@ def pictures_off(meta: Json, replay: Arrays) -> dict[str, float]:
     return found
 
 
-def _of_motion(meta: Json, signal: Any, *, rates: bool) -> Cause | None:
+def _of_motion(meta: Export, signal: Any, *, rates: bool) -> Cause | None:
     """Return the first difference on the way from the action to the next state."""
     joints = meta["joints"]["names"]
     # Targets come straight from the action: no physics is in them yet.
@@ -267,7 +267,7 @@ def _pairs(name: str, trace: Arrays, replay: Arrays) -> tuple[np.ndarray, np.nda
     return np.concatenate(ours), np.concatenate(theirs), np.concatenate(episode)
 
 
-def _newest(meta: Json, obs: np.ndarray) -> np.ndarray:
+def _newest(meta: Export, obs: np.ndarray) -> np.ndarray:
     """Return the newest frame [..., L] of vectors that hold histories."""
     columns = []
     stop = 0

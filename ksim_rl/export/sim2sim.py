@@ -14,7 +14,8 @@ from ksim_rl.checks import MISFITS, OneLineParser
 from ksim_rl.config.child_processes import run_python
 from ksim_rl.export.causes import Cause, find_causes, pictures_off
 from ksim_rl.export.folder import runner_source
-from ksim_rl.export.standalone.files import Json, check_closed, lacking, read_arrays, read_json
+from ksim_rl.export.standalone.description import Export
+from ksim_rl.export.standalone.files import check_closed, lacking, read_arrays, read_json
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.rendering.rendering import choose_gl_platform
 from ksim_rl.terminal import printable, show
@@ -59,7 +60,7 @@ class Report:
             )
         lines.append(f"{'':<44}{'recorded':>12}{'C engine':>12}{'difference':>12}")
         # A return without some terms is another one than training prints.
-        without = lacking({"left_out": self.left_out})
+        without = lacking(self.left_out)
         for name, value in self.theirs.items():
             if name in self.ours:
                 own = self.ours[name]
@@ -156,7 +157,7 @@ def sim2sim(
     )
 
 
-def _drawing(meta: Json) -> dict[str, str] | None:
+def _drawing(meta: Export) -> dict[str, str] | None:
     """Return what a process has to know that draws pictures; a ValueError tells how to get what draws."""
     if not meta.get("pictures"):
         return None
@@ -166,7 +167,7 @@ def _drawing(meta: Json) -> dict[str, str] | None:
         raise ValueError(f"the policy sees, and nothing draws for it here: {error}") from None
 
 
-def _other_physics(meta: Json, option: mujoco.MjOption) -> tuple[list[str], str]:
+def _other_physics(meta: Export, option: mujoco.MjOption) -> tuple[list[str], str]:
     """Return the runner's arguments by which the C engine judges an export, and the words for them."""
     # Warp is other physics already.
     if meta.get("engine") != "c":
@@ -184,7 +185,7 @@ def _other_physics(meta: Json, option: mujoco.MjOption) -> tuple[list[str], str]
     return arguments, f"{words}, {half_time_step(option.timestep)}"
 
 
-def _recorded(meta: Json, folder: Path) -> dict[str, np.ndarray]:
+def _recorded(meta: Export, folder: Path) -> dict[str, np.ndarray]:
     """Return the figures of the recorded episodes [N] by name; a ValueError names a figure that no export writes."""
     ours = meta.get("ours")
     if not isinstance(ours, dict) or not ours.get("return"):

@@ -4,8 +4,8 @@ from typing import Literal
 
 import numpy as np
 
-from ksim_rl.export.standalone.description import CommandSpec
-from ksim_rl.export.standalone.files import Array, Json, check_count
+from ksim_rl.export.standalone.description import CommandSpec, Export
+from ksim_rl.export.standalone.files import Array, check_count
 
 MOST_OFF = 1e-5
 """By which a command may be beyond its range, of 1 or of the command: float32 holds no more."""
@@ -66,6 +66,6 @@ def as_words(values: Array) -> str:
     return " ".join(f"{value:g}" for value in values)
 
 
-def command_ranges(meta: Json) -> dict[str, CommandRange]:
+def command_ranges(meta: Export) -> dict[str, CommandRange]:
     """Return the range of each command of an export."""
     return {name: CommandRange(name, spec) for name, spec in meta["commands"].items()}

@@ -1,7 +1,7 @@
 """The entries of export.json, as types: what a folder says of its policy and of the env that it was trained in."""
 
 from collections.abc import Sequence
-from typing import Literal, TypeAlias, TypedDict
+from typing import Any, Literal, TypeAlias, TypedDict
 
 
 class LagSpec(TypedDict):
@@ -189,3 +189,68 @@ class JointsSpec(TypedDict):
     damping: list[float]
     effort_scale: list[float]
     limits: LimitsSpec
+
+
+class GraphSpec(TypedDict):
+    """What an ONNX file of terms reads: measurements, each with its input's name, and states."""
+
+    output: str
+    # Each has the entries that its quantity has.
+    measurements: list[dict[str, Any]]
+    states: list[StateSpec]
+
+
+class PolicySpec(TypedDict):
+    """What policy.onnx reads and gives."""
+
+    inputs: list[str]
+    outputs: list[str]
+    states: list[StateSpec]
+    num_actions: int
+    obs_dim: int
+    difference: float  # from the policy in torch
+
+
+class RewardSpec(TypedDict):
+    """A reward that scores.onnx computes."""
+
+    weight: float
+
+
+class EndingSpec(TypedDict):
+    """A termination that scores.onnx computes."""
+
+    time_out: bool
+
+
+class _OfRun(TypedDict, total=False):
+    task: str
+    engine: str
+    noisy: bool
+    left_out: list[str]
+    pictures: list[dict[str, Any]]
+    ours: dict[str, list[float]] | None
+
+
+class Export(_OfRun):
+    """What export.json says."""
+
+    joint_names: list[str]
+    joints: JointsSpec
+    observations: list[ObservationSpec]
+    obs: GraphSpec | None
+    scores: GraphSpec | None
+    policy: PolicySpec
+    actions: list[ActionSpec]
+    action_chain: list[StageSpec]
+    actuators: list[LawSpec]
+    commands: dict[str, CommandSpec]
+    contacts: dict[str, ContactSpec]
+    rewards: dict[str, RewardSpec]
+    terminations: dict[str, EndingSpec]
+    metrics: list[str]
+    scale_rewards_by_dt: bool
+    physics_dt: float
+    decimation: int
+    step_dt: float
+    episode_steps: int  # 0 where episodes have no end

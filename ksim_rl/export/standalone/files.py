@@ -6,10 +6,13 @@ import os
 import re
 import stat
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
+
+from ksim_rl.export.standalone.description import Export
 
 Array = np.ndarray
 # 1 GiB: a file of more, or one that unpacks to more, is refused before it fills the memory.
@@ -40,7 +43,7 @@ def read(path: Path, most: int = MOST_BYTES) -> bytes:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def read_json(path: Path) -> Json:
+def read_json(path: Path) -> Export:
     """Return an export's metadata; a ValueError names the fault of the file."""
     # 64 MiB, far more than the largest description.
     content = read(path, 2**26)
@@ -56,7 +59,8 @@ def read_json(path: Path) -> Json:
             f"{path}: format 1, of before observations were traced: write it once more with `ksim-rl export RUN`; the "
             "folder's own runner.py still runs it"
         )
-    return found
+    # Entries are not looked at here: whoever reads a size or a number checks it.
+    return cast(Export, found)
 
 
 def read_arrays(path: Path) -> dict[str, Array]:
@@ -125,25 +129,25 @@ def check_count(what: str, value: float, most: int = MOST) -> int:
     return value
 
 
-def measurements(meta: Json) -> list[Json]:
+def measurements(meta: Export) -> list[Json]:
     """Return what fills the inputs of `obs.onnx`: nothing of a policy that only sees."""
     if meta["obs"] is None:
         return []
     return meta["obs"]["measurements"]
 
 
-def lacking(meta: Json) -> str:
+def lacking(left_out: Sequence[str]) -> str:
     """Return the end of a return's line, which names the rewards that are not in it; nothing where all are."""
-    names = [str(name) for name in meta.get("left_out", ())]
+    names = [str(name) for name in left_out]
     rewards = [name.removeprefix("rewards.") for name in names if name.startswith("rewards.")]
     return f"  without {', '.join(rewards)}" if rewards else ""
 
 
-def as_text(figures: list[dict[str, float]], meta: Json) -> str:
+def as_text(figures: list[dict[str, float]], meta: Export) -> str:
     """Return mean and spread of the figures of episodes, a line each."""
     lines = []
     for name in figures[0]:
         values = [one[name] for one in figures]
-        note = lacking(meta) if name == "return" else ""
+        note = lacking(meta.get("left_out", ())) if name == "return" else ""
         lines.append(f"{name:<40} {np.mean(values):12.4f} +- {np.std(values):.4f}{note}")
     return "\n".join(lines)

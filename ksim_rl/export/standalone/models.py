@@ -7,7 +7,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, Json, check_closed
+from ksim_rl.export.standalone.description import Export
+from ksim_rl.export.standalone.files import Array, check_closed
 
 # What an export writes of the model's fields where worlds differ: numbers, and none by which C finds other numbers.
 _FIELDS = {
@@ -47,7 +48,7 @@ def read_model(folder: Path) -> mujoco.MjModel:
 
 
 def check_record(
-    path: Path, record: Mapping[str, Array], meta: Json, mj_model: mujoco.MjModel
+    path: Path, record: Mapping[str, Array], meta: Export, mj_model: mujoco.MjModel
 ) -> int:
     """Return how many episodes a record has, or refuse it: everything that it writes into the model has to fit.
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ksim_rl.export.standalone.description import StateSpec
-from ksim_rl.export.standalone.files import Array, Json, check_count, read
+from ksim_rl.export.standalone.description import Export, StateSpec
+from ksim_rl.export.standalone.files import Array, check_count, read
 
 # Types of the inputs that an export writes, by ONNX's names.
 TYPES = {
@@ -98,7 +98,7 @@ class Network:
 class Policy(Network):
     """The policy in `policy.onnx`."""
 
-    def __init__(self, folder: Path, meta: Json) -> None:
+    def __init__(self, folder: Path, meta: Export) -> None:
         super().__init__(folder / "policy.onnx", meta["policy"]["states"], "actions")
 
     def __call__(self, obs: Array, pictures: Mapping[str, Array]) -> Array:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from ksim_rl.export.standalone.commands import CommandRange
-from ksim_rl.export.standalone.files import Array, Json, read
+from ksim_rl.export.standalone.description import Export
+from ksim_rl.export.standalone.files import Array, read
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
 
 TARGETS = {"pos": "target_position", "vel": "target_velocity", "effort": "target_effort"}
@@ -17,7 +18,7 @@ UNEVEN_S = 1e-4
 class PlanControl:
     """Commands of joints from a table, a line for each period; a robot stands up to the first one."""
 
-    def __init__(self, meta: Json, path: Path) -> None:
+    def __init__(self, meta: Export, path: Path) -> None:
         self.joints = DescribedJoints(meta)
         self.command: dict[str, Array] = {}
         self.ranges: dict[str, CommandRange] = {}

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ksim_rl.export.standalone.commands import command_ranges
+from ksim_rl.export.standalone.description import Export, JointActionSpec
 from ksim_rl.export.standalone.files import Array, Json, measurements
 from ksim_rl.export.standalone.network import Network, Policy
 from ksim_rl.export.standalone.robot_link import (
@@ -28,13 +29,15 @@ OF_ROOT = ("root_quat", "projected_gravity", "root_ang_vel")
 class PolicyControl:
     """An exported policy, its observations and its actions, for one robot."""
 
-    def __init__(self, folder: Path, meta: Json) -> None:
+    def __init__(self, folder: Path, meta: Export) -> None:
+        actions: list[JointActionSpec] = []
         for action in meta["actions"]:
             if action["kind"] == "ctrl":
                 raise ValueError(
                     f"export.json: the action {action['name']!r} writes controls of a model's actuators, which a robot "
                     "does not have: train with actions of joints"
                 )
+            actions.append(action)
         self.meta = meta
         self.joints = DescribedJoints(meta)
         self.observe: Network | None = None
@@ -60,7 +63,7 @@ class PolicyControl:
         for spec in meta["action_chain"]:
             if spec["kind"] != "delay":
                 self.chain.append(stage(spec, self.resets))
-        self.actions = [JointAction(spec, self.resets) for spec in meta["actions"]]
+        self.actions = [JointAction(spec, self.resets) for spec in actions]
         self.places = [self.joints.columns(action.names) for action in self.actions]
         self.begin()
 

@@ -7,8 +7,8 @@ from typing import Literal, Protocol
 import numpy as np
 
 from ksim_rl.export.standalone.commands import CommandRange
-from ksim_rl.export.standalone.description import JointsSpec
-from ksim_rl.export.standalone.files import Array, Json
+from ksim_rl.export.standalone.description import Export, JointsSpec
+from ksim_rl.export.standalone.files import Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,7 @@ class Robot(Protocol):
 class DescribedJoints:
     """The joints of export.json: gains, the pose that a policy stands in, and what they may not pass."""
 
-    def __init__(self, meta: Json) -> None:
+    def __init__(self, meta: Export) -> None:
         joints: JointsSpec = meta["joints"]
         limits = joints["limits"]
         self.names = joints["names"]

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -139,7 +139,7 @@ class Noise:
 class Values:
     """What one ONNX file makes of the quantities that it reads."""
 
-    def __init__(self, signals: "Signals", name: str) -> None:
+    def __init__(self, signals: "Signals", name: Literal["obs", "scores"]) -> None:
         spec = signals.meta[name]
         # A task without rewards, metrics and terminations has none, nor has a policy that only sees.
         self.network = None
