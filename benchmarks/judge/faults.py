@@ -258,7 +258,8 @@ FAULTS = {
         place=("sensors.sensor_mending", "contact_sensors_left"),
         instead=gives(none_of_them),
         needs=("reduce.none",),
-        written=r'<contact data="(found dist|force)[^>]*reduce="none"',
+        # One contact alone has no order.
+        written=r'<contact data="(found dist|force)[^>]*reduce="none" num="[2-9]"',
     ),
     "kinetic energy": Fault(
         number="11",
@@ -305,7 +306,8 @@ FAULTS = {
         place=("smooth.stages", "_has_affine_actuators"),
         instead=gives(yes),
         needs=("transmission.joint",),
-        written=r'joint="(ball|free)\d"',
+        # Sensors name joints, too.
+        written=r'<(general|motor|position|velocity|damper|intvelocity)[^>]* joint="(ball|free)\d"',
         kernels="ours",
     ),
     "adhesion of actuators": Fault(
