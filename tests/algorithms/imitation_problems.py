@@ -188,11 +188,20 @@ def linear_demonstration(num=4096, *, noise=0.3, held_out=512):
     return Demonstration(learned_N=env_states_N[held_out:], held_out_N=env_states_N[:held_out])
 
 
-def make_bc(folder=None, *, seed=0, iterations=6, num_envs=64, cfg=None, demonstration=None):
+def make_bc(
+    folder=None,
+    *,
+    seed=0,
+    iterations=6,
+    num_envs=64,
+    cfg=None,
+    demonstration=None,
+    normalizes=False,
+):
     torch.manual_seed(seed)
     env = PlaneEnv(num_envs)
     env.set_seed(seed)
-    actor = ActorCfg(hidden_dims=(), obs_normalization=False, output_gain=1.0)
+    actor = ActorCfg(hidden_dims=(), obs_normalization=normalizes, output_gain=1.0)
     data = DatasetCfg(num_env_states_per_minibatch=4 * num_envs, num_minibatches=4)
     update = BCUpdate(
         BCCfg(**{"episodes": "made_up", "learning_rate": 0.05, **(cfg or {})}),

@@ -86,6 +86,17 @@ def test_the_loss_is_the_stock_one_and_leaves_out_masked_rows():
         torch.testing.assert_close(BCLoss(actor, loss=kind)(spoilt_B)["loss_bc"], expected)
 
 
+def test_statistics_of_a_recording_weigh_as_much_as_was_learned_from_it():
+    trainer = make_bc(iterations=3, normalizes=True)
+    learned_N = trainer.update.demonstration.learned_N["actor"]
+    normalizer = trainer.update.actor[0].module.normalizer
+    for iteration in range(3):
+        assert int(normalizer.count) == (1 + iteration) * len(learned_N)
+        trainer.iterate()
+    torch.testing.assert_close(normalizer.mean, learned_N.mean(0))
+    torch.testing.assert_close(normalizer.var, learned_N.var(0, unbiased=False))
+
+
 def test_rows_that_are_masked_count_for_neither_loss():
     torch.manual_seed(0)
     actor = make_actor(ActorCfg(hidden_dims=(4,), obs_normalization=False), obs_dim=2, action_dim=2)

@@ -130,6 +130,9 @@ class BCUpdate(DatasetUpdate):
             self._held_out_loss.copy_(measured["loss_bc"])
         # Only now, so that all gradient steps see the statistics that values were computed with.
         update_normalizers(self.rollout_ET, self.critic)
+        # The same numbers once more: the statistics stay as they are, and weigh as much as the policy has learned from
+        # them. Those of a short recording would be swept away by the first rollouts of a run that goes on from here.
+        update_normalizers(self.demonstration.learned_N, self.actor)
 
     def _drawn(self, env_states_N: TensorDictBase) -> TensorDictBase:
         """Draw as many env states as a dataset has, uniformly, with replacement."""
