@@ -1,9 +1,7 @@
 """Compiles the step of an env, resets included, whatever terms and transforms it is made of."""
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 
-import torch
 from jaxtyping import Shaped
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -18,8 +16,6 @@ from ksim_rl.device.recording import recorded
 CHECKED_STEPS = 2
 """Steps that are compared before a compiled one is used: state that a step keeps outside of tensors shows in the
 second one."""
-EVERY = 7
-"""One row in so many gets a NaN action, where a NaN action ends the episode."""
 
 
 class CompiledStep:
@@ -45,7 +41,9 @@ class CompiledStep:
         by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
     ) -> None:
         # The check owns the static memory that the policy's leaves are copied to before each step.
-        self._check = StepCheck(env, root_E, tensordict, by_term)
+        self._check = StepCheck(
+            env, root_E, tensordict, nan_ends_rows=nan_ends_rows, by_term=by_term
+        )
         self._given = self._check.given
         with self._check.left_alone():
             # One step in Python gives the list of torch operations and Warp launches.
@@ -58,12 +56,11 @@ class CompiledStep:
         with self._check.left_alone():
             # Compare, then step for real, so that the second comparison starts from another state.
             for _ in range(CHECKED_STEPS):
-                self._refuse(self.differences())
+                self._refuse(self._check.differences(self._run))
                 self._run()
             # The steps above may end no episode, and would leave the reset path unchecked.
             if nan_ends_rows:
-                with self._rows_ending(env.action_key):
-                    self._refuse(self.differences())
+                self._refuse(self.differences())
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Make a step, and reset the rows that are done: return the EnvState's `next`, and write the next root.
@@ -77,13 +74,15 @@ class CompiledStep:
     def differences(self) -> list[str]:
         """Return the differences from the env's own step in the present state, with the last action; see `StepCheck`.
 
-        Env, root and draws are left as they were.
+        Some rows end in this step. Env, root and draws are left as they were.
         """
-        return self._check.differences(self._run)
+        with self._check.rows_ending():
+            return self._check.differences(self._run)
 
     def given(self) -> dict[NestedKey, Shaped[Tensor, "*?shape"]]:
-        """Return a copy of the policy's leaves for the last step."""
-        return {key: value.clone() for key, value in self._given.items()}
+        """Return a copy of the policy's leaves of the step that `differences` compares."""
+        with self._check.rows_ending():
+            return {key: value.clone() for key, value in self._given.items()}
 
     def outcome(self, given: Mapping[NestedKey, Shaped[Tensor, "*?shape"]]) -> NamedLeaves:
         """Return all results of a step from the present state, with these leaves of the policy; nothing is changed."""
@@ -92,19 +91,6 @@ class CompiledStep:
     def _run(self) -> TensorDictBase:
         self._tape()
         return self._next_E
-
-    @contextmanager
-    def _rows_ending(self, action_key: NestedKey) -> Iterator[None]:
-        """Let some rows end their episodes in this block, but never all of them."""
-        action = self._given.get(action_key)
-        if action is None or not action.is_floating_point():
-            yield
-            return
-        # The policy may write into the same memory later, so the action is put back.
-        held = action.clone()
-        action[1::EVERY] = torch.nan
-        yield
-        action.copy_(held)
 
     @staticmethod
     def _refuse(found: list[str]) -> None:

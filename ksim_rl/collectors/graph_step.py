@@ -24,9 +24,13 @@ class GraphStep:
         env: EnvBase,
         root_E: TensorDictBase,
         tensordict: TensorDictBase,
+        *,
+        nan_ends_rows: bool = False,
         by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
     ) -> None:
-        self._check = StepCheck(env, root_E, tensordict, by_term)
+        self._check = StepCheck(
+            env, root_E, tensordict, nan_ends_rows=nan_ends_rows, by_term=by_term
+        )
         self._run = Captured(self._step, device=env.device or torch.device("cpu"))
         # A placeholder until the first call of `_step`.
         self._env_state_E = tensordict
@@ -36,8 +40,9 @@ class GraphStep:
                 self._run()
 
     def differences(self) -> list[str]:
-        """Return the differences from the env's own step in the present state; see `StepCheck`."""
-        return self._check.differences(self._replayed)
+        """Return the differences from the env's own step in the present state, in which some rows end."""
+        with self._check.rows_ending():
+            return self._check.differences(self._replayed)
 
     def _replayed(self) -> TensorDictBase:
         # A replay runs no Python: `_env_state_E` still names the graph's static output, which it fills.

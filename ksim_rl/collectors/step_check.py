@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.utils._pytree import PyTree
 from torchrl.envs import EnvBase
 
+from ksim_rl import ranks
 from ksim_rl.compiled.differences import NamedLeaves, differences
 from ksim_rl.compiled.rounding import Nudging, nudged
 from ksim_rl.device.state_tree import State
@@ -19,6 +20,8 @@ from ksim_rl.device.state_tree import State
 # `last_root` is not state, and a recorded step returns it in other memory. The peak contact counts under `overflow`
 # change with the smallest difference in one world.
 _LEFT_OUT = ("last_root.", "overflow/")
+EVERY = 7
+"""One row in so many gets a NaN action, where a NaN action ends the episode."""
 
 
 def _unchanged(value: PyTree) -> PyTree:
@@ -39,7 +42,8 @@ class StepCheck:
 
     `root_E` is the EnvState before a step; the next root is written into its memory. `tensordict` is the policy's
     output for it; the leaves that the policy added are copied to `given`, where each step reads them. `by_term` returns
-    tensors that each step writes in place, by the name of their term, which is reported where they differ.
+    tensors that each step writes in place, by the name of their term, which is reported where they differ. With
+    `nan_ends_rows` a row whose action is NaN ends its episode, which `rows_ending` makes use of.
     """
 
     def __init__(
@@ -47,9 +51,12 @@ class StepCheck:
         env: EnvBase,
         root_E: TensorDictBase,
         tensordict: TensorDictBase,
+        *,
+        nan_ends_rows: bool = False,
         by_term: Callable[[], Mapping[str, Shaped[Tensor, "*?shape"]]] = dict,
     ) -> None:
         self._env = env
+        self._nan_ends_rows = nan_ends_rows
         self._root_E = root_E
         self._by_term = by_term
         self._root_keys = list(root_E.keys(True, True))
@@ -95,7 +102,13 @@ class StepCheck:
                     env_state_E = self.own_step()
                 return self._results(env_state_E)
 
-            rows = differences(found, true, num_rows=self._env.batch_size[0], moved=moved)
+            rows = differences(
+                found,
+                true,
+                num_rows=self._env.batch_size[0],
+                moved=moved,
+                most_of=ranks.most_of,
+            )
         # Also after an error, so that training can go on.
         finally:
             self._return_to(start)
@@ -114,6 +127,26 @@ class StepCheck:
             for key, value in given.items():
                 self.given[key].copy_(value)
             return self._results(recorded_step())
+
+    @contextmanager
+    def rows_ending(self) -> Iterator[None]:
+        """Let some rows, but never all of them, end their episodes in this block, so that resets are compared as well.
+
+        In most steps no row ends by itself. A row with a NaN action repeats its last one, so nothing else is NaN.
+        """
+        action = None
+        if self._nan_ends_rows:
+            action = self.given.get(self._env.action_key)
+        if action is None or not action.is_floating_point():
+            yield
+            return
+        # Later steps may read the same memory, so the action is put back.
+        held = action.clone()
+        action[1::EVERY] = torch.nan
+        try:
+            yield
+        finally:
+            action.copy_(held)
 
     @contextmanager
     def left_alone(self) -> Iterator[None]:

@@ -8,7 +8,7 @@ rounding may change a row by as much as that does.
 from collections.abc import Callable, Mapping
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 TOLERANCE = 1e-4
@@ -35,18 +35,24 @@ the last row would take forty. A fault of a kernel or a change in Python shows i
 NamedLeaves = Mapping[str, Shaped[Tensor, "*?shape"]]
 
 
+def _own(numbers_N: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+    return numbers_N
+
+
 def differences(
     found: NamedLeaves,
     true: NamedLeaves,
     *,
     num_rows: int,
     moved: Callable[[int, int], NamedLeaves],
+    most_of: Callable[[Int[Tensor, " N"]], Int[Tensor, " N"]] = _own,
 ) -> dict[str, int]:
     """Return the names of the leaves that differ, with the number of rows, in the order of `true`.
 
     `moved(number, units)` gives the outcome of the true step when each number that it reads or rounds moves by so many
     units in its last place, up or down, in another way for each `number`. Tensors whose first dim is not `num_rows` are
-    one row.
+    one row. With several ranks `most_of` returns the largest of their numbers: all ranks make the same moves, since a
+    step may wait for the other ranks, and return the same.
     """
     too_far: dict[str, Tensor] = {}
     # First pass on the device: rows [rows] of each leaf that exceed the plain tolerance.
@@ -56,10 +62,8 @@ def differences(
     if not too_far:
         return {}
     # One look at the device for all of them: most often there is nothing to see.
-    is_open = torch.stack([rows.any() for rows in too_far.values()]).tolist()
-    open_rows = {
-        name: rows for (name, rows), is_one in zip(too_far.items(), is_open, strict=True) if is_one
-    }
+    counts = _counts(too_far, most_of)
+    open_rows = {name: rows for name, rows in too_far.items() if counts[name]}
     # Second pass, only for leaves that failed: can rounding explain the error?
     errors = {}
     for name in open_rows:
@@ -69,7 +73,7 @@ def differences(
             break
         # Moves cost a step each, so they stop as soon as every row is explained.
         other = moved(number, units)
-        for name in list(open_rows):
+        for name, rows in open_rows.items():
             scale = _scale(true[name])
             # A row is explained once a single move changes it by nearly as much, or in the same way.
             change = _error(other[name], true[name], scale, num_rows)
@@ -77,10 +81,23 @@ def differences(
             explained = errors[name] <= ALLOWANCE / units * change
             # An infinite error is no share of itself.
             explained |= left < SAME_OUTCOME * errors[name]
-            open_rows[name] &= ~explained
-            if int(open_rows[name].sum()) <= num_rows // ROWS_PER_BORDER:
-                del open_rows[name]
-    return {name: int(rows.sum()) for name, rows in open_rows.items()}
+            rows.logical_and_(~explained)
+        counts = _counts(open_rows, most_of)
+        open_rows = {
+            name: rows
+            for name, rows in open_rows.items()
+            if counts[name] > num_rows // ROWS_PER_BORDER
+        }
+    return {name: counts[name] for name in open_rows}
+
+
+def _counts(
+    rows: Mapping[str, Bool[Tensor, " ?rows"]],
+    most_of: Callable[[Int[Tensor, " N"]], Int[Tensor, " N"]],
+) -> dict[str, int]:
+    """Return how many rows of each leaf are marked, on the rank where most are."""
+    counts_N = torch.stack([marked.sum() for marked in rows.values()])
+    return dict(zip(rows, most_of(counts_N).tolist(), strict=True))
 
 
 def equal(found: NamedLeaves, true: NamedLeaves) -> bool:

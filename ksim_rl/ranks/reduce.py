@@ -80,11 +80,11 @@ def any_of(mask: Bool[Tensor, "*rows"]) -> Bool[Tensor, ""]:
     return count > 0
 
 
-def most_of(number: Num[Tensor, ""]) -> Num[Tensor, ""]:
-    """Return the largest of all ranks' numbers."""
+def most_of(numbers: Num[Tensor, "*shape"]) -> Num[Tensor, "*shape"]:
+    """Return the largest of all ranks' numbers, for each place."""
     if size() == 1:
-        return number
-    return torch.stack(gather(number)).amax()
+        return numbers
+    return torch.stack(gather(numbers)).amax(0)
 
 
 def combined(
