@@ -133,6 +133,24 @@ def of_one_body(mj_model: mujoco.MjModel) -> bool:
     return any({int(first[pair]), int(second[pair])} in contacts for pair in rigid)
 
 
+def several_in_a_sensor(mj_model: mujoco.MjModel) -> bool:
+    """Say whether a contact sensor that lists contacts one by one comes to read two of them."""
+    mj_data = mujoco.MjData(mj_model)
+    listing = (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT) & (
+        mj_model.sensor_intprm[:, 1] == 0
+    )
+    for _ in range(150):
+        mujoco.mj_step(mj_model, mj_data)
+        for sensor in np.flatnonzero(listing):
+            start = mj_model.sensor_adr[sensor]
+            slots = mj_model.sensor_intprm[sensor, 2]
+            values = mj_data.sensordata[start : start + mj_model.sensor_dim[sensor]]
+            read = values.reshape(slots, -1).any(axis=1)
+            if read.sum() > 1:
+                return True
+    return False
+
+
 def without_priority(corrections: dict[Any, Any]) -> dict[Any, Any]:
     """Leave out what gives contacts the law of the geom with priority."""
     return {
@@ -258,8 +276,9 @@ FAULTS = {
         place=("sensors.sensor_mending", "contact_sensors_left"),
         instead=gives(none_of_them),
         needs=("reduce.none",),
-        # One contact alone has no order.
         written=r'<contact data="(found dist|force)[^>]*reduce="none" num="[2-9]"',
+        # One contact alone has no order.
+        suits=several_in_a_sensor,
     ),
     "kinetic energy": Fault(
         number="11",
