@@ -2,8 +2,8 @@
 
 from ksim_rl.data.dataset_buffer import DatasetBuffer, DatasetCfg, rollout_length
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetStorage, DatasetWriter
-from ksim_rl.data.episode_folder import Leaf, Origin, mend
-from ksim_rl.data.episode_reader import Episodes, load, read_episodes
+from ksim_rl.data.episode_folder import Leaf, Origin
+from ksim_rl.data.episode_reader import Episodes, load, mend, read_episodes
 from ksim_rl.data.episode_recorder import EpisodeRecorder, leaves_of
 from ksim_rl.data.episode_writer import EpisodeWriter
 from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SequenceSampler, sequence_length

@@ -11,12 +11,11 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
-from ksim_rl.checked import Checked, NonNegative, WholeNumber
-from ksim_rl.config.plain_data import check_links
+from ksim_rl.checked import Checked, NonNegative, WholeNumber, Within
 from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
 from ksim_rl.files.writing import write_whole
 from ksim_rl.terminal import printable
@@ -75,6 +74,9 @@ class Leaf(Checked):
             raise ValueError(
                 f"shape={self.shape} of {'/'.join(self.key)}: more than {MOST_DIMS} dims"
             )
+        # TensorDict maps no file without bytes.
+        if 0 in self.shape:
+            raise ValueError(f"shape={self.shape} of {'/'.join(self.key)}: no number in it")
 
     @property
     def torch_dtype(self) -> torch.dtype:
@@ -102,6 +104,9 @@ class Leaf(Checked):
         """Return the file of its numbers in a folder of episodes."""
         above = folder.joinpath(ENV_STATES, *self.key[:-1])
         return above / f"{self.key[-1]}{MAP_SUFFIX}"
+
+
+EPISODE = Leaf(key=EPISODE_KEY, dtype="int64")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,17 +138,32 @@ class Contents(Checked):
     origin: Origin
     asked: WholeNumber = 0
     num_episodes: WholeNumber = 0
-    num_env_states: WholeNumber = 0
+    # A fast env takes 32 bits of steps within an hour.
+    num_env_states: Annotated[int, Within(low=0, high=2**62)] = 0
 
     def _check_fields(self) -> None:
         super()._check_fields()
         keys = {leaf.key for leaf in self.leaves}
-        if len(keys) != len(self.leaves) or EPISODE_KEY not in keys:
-            raise ValueError("leaves: expected each key once, and 'episode' among them")
+        if len(keys) != len(self.leaves) or EPISODE not in self.leaves:
+            raise ValueError("leaves: expected each key once, and 'episode' among them, one int64")
         for key in keys:
             for length in range(1, len(key)):
                 if key[:length] in keys:
                     raise ValueError(f"leaves: {'/'.join(key[:length])} is a leaf and has leaves")
+        for leaf in self.leaves:
+            self._check_columns(leaf)
+
+    def _check_columns(self, leaf: Leaf) -> None:
+        """Refuse terms in columns that a group has not."""
+        group = "/".join(leaf.key)
+        if len(leaf.shape) != 1:
+            return
+        width = leaf.shape[0]
+        for term, (start, stop) in self.origin.columns.get(group, {}).items():
+            if not 0 <= start <= stop <= width:
+                raise ValueError(
+                    f"columns of {group}: {term!r} is in {start} to {stop}, and there are {width}"
+                )
 
 
 def write_contents(folder: Path, contents: Contents) -> None:
@@ -156,17 +176,6 @@ def write_contents(folder: Path, contents: Contents) -> None:
         entry["dims"] = leaf.dims
     text = json.dumps({"format": FORMAT, **tree}, indent=1)
     write_whole(folder / CONTENTS, f"{text}\n")
-
-
-def mend(folder: Path | str) -> None:
-    """Renew the sizes that TensorDict reads from what `episodes.json` says.
-
-    Where a process was killed within a commit, some of them are of the commit before: then `load_memmap` raises a
-    RuntimeError, while `read_episodes` and `load` of this library go by `episodes.json` and need none of this.
-    """
-    folder = Path(folder)
-    check_links(folder, below=(ENV_STATES,))
-    write_contents(folder, read_contents(folder))
 
 
 def _write_sizes(folder: Path, leaves: Sequence[Leaf], num_rows: int) -> None:
@@ -218,4 +227,6 @@ def read_contents(folder: Path) -> Contents:
 
 
 def _leaf(entry: Mapping[str, Any]) -> Leaf:
+    if not isinstance(entry["key"], list):
+        raise ValueError(f"key={entry['key']!r}: expected a list of names")
     return Leaf(key=tuple(entry["key"]), shape=tuple(entry["shape"]), dtype=entry["dtype"])

@@ -5,18 +5,28 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Shaped
+from jaxtyping import Int64, Shaped
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers import Sampler
 
 from ksim_rl import dims
-from ksim_rl.data.episode_folder import EPISODE_KEY, Contents, Leaf, read_contents
+from ksim_rl.config.plain_data import check_links
+from ksim_rl.data.episode_folder import (
+    ENV_STATES,
+    EPISODE_KEY,
+    Contents,
+    Leaf,
+    read_contents,
+    write_contents,
+)
 from ksim_rl.files.reading import open_regular
 
 # Of one leaf: it is mapped, and no memory is taken for it.
 MOST_LEAF_BYTES = 2**42
+# Env states whose numbers of episodes are read at once.
+MOST_CHECKED = 2**22
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,14 +49,26 @@ def read_episodes(folder: Path | str) -> Episodes:
         raise ValueError(f"{folder}: no whole episode in it")
     size = contents.num_env_states
     leaves = {leaf.key: _mapped(leaf, folder, size) for leaf in contents.leaves}
-    episode_D = leaves[EPISODE_KEY]
-    last = contents.num_episodes - 1
-    if episode_D.shape != (size,) or episode_D[0] != 0 or episode_D[-1] != last:
-        raise ValueError(f"{folder}: damaged: its env states are not of episodes 0 to {last}")
+    _check_order(leaves[EPISODE_KEY], folder, contents.num_episodes)
     env_states_D = TensorDict(batch_size=[size])
     for key, leaf_D in leaves.items():
         env_states_D.set(key, leaf_D)
     return Episodes(contents=contents, env_states_D=dims.name(env_states_D, dims.D))
+
+
+def mend(folder: Path | str) -> None:
+    """Renew the sizes that TensorDict reads from what `episodes.json` says.
+
+    Where a process was killed within a commit, some of them are of the commit before: then `load_memmap` raises a
+    RuntimeError, while `read_episodes` and `load` of this library go by `episodes.json` and need none of this. A
+    ValueError names what is damaged, as in `read_episodes`: no size is written that a file does not have.
+    """
+    folder = Path(folder)
+    check_links(folder, below=(ENV_STATES,))
+    contents = read_contents(folder)
+    if contents.num_env_states:
+        read_episodes(folder)
+    write_contents(folder, contents)
 
 
 def load(
@@ -74,6 +96,23 @@ def load(
         sampler=sampler,
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
+    )
+
+
+def _check_order(episode_D: Int64[Tensor, " D"], folder: Path, num_episodes: int) -> None:
+    """Refuse env states that are not of episode 0, then of episode 1, and so on."""
+    before = torch.zeros(1, dtype=torch.int64)
+    # In pieces, since a folder may be larger than memory.
+    for piece_D in episode_D.split(MOST_CHECKED):
+        step_D = torch.diff(piece_D, prepend=before)
+        before = piece_D[-1:]
+        if ((step_D != 0) & (step_D != 1)).any():
+            break
+    else:
+        if episode_D[0] == 0 and before == num_episodes - 1:
+            return
+    raise ValueError(
+        f"{folder}: damaged: its env states are not of episodes 0 to {num_episodes - 1}, one after the other"
     )
 
 

@@ -1,6 +1,7 @@
 """Writes whole episodes into a new folder, which holds whole ones whenever its process ends."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -10,7 +11,15 @@ import numpy as np
 from jaxtyping import Shaped
 
 from ksim_rl.checks import check_count
-from ksim_rl.data.episode_folder import EPISODE_KEY, Contents, Key, Leaf, Origin, write_contents
+from ksim_rl.data.episode_folder import (
+    EPISODE,
+    EPISODE_KEY,
+    Contents,
+    Key,
+    Leaf,
+    Origin,
+    write_contents,
+)
 from ksim_rl.files.writing import check_folder, make_folder, named, open_new
 
 
@@ -29,8 +38,7 @@ class EpisodeWriter:
         self, folder: Path, leaves: Sequence[Leaf], *, origin: Origin, asked: int = 0
     ) -> None:
         check_count("asked", asked, low=0)
-        number = Leaf(key=EPISODE_KEY, dtype="int64")
-        ordered = sorted([*leaves, number], key=lambda leaf: leaf.key)
+        ordered = sorted([*leaves, EPISODE], key=lambda leaf: leaf.key)
         self.contents = Contents(leaves=tuple(ordered), origin=origin, asked=asked)
         self._written = self.contents
         self._folder = folder
@@ -76,8 +84,10 @@ class EpisodeWriter:
         try:
             self.commit()
         finally:
-            for file in self._files.values():
-                file.close()
+            # Each is closed, also after one that a full disk fails at.
+            with named(self._folder), ExitStack() as files:
+                for file in self._files.values():
+                    files.callback(file.close)
 
     def __enter__(self) -> "EpisodeWriter":
         return self

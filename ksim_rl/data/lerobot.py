@@ -21,6 +21,7 @@ from ksim_rl.data.lerobot_meta import write_meta
 from ksim_rl.files.writing import whole_folder
 
 # Key frames stand close, as LeRobot reads single frames.
+MOST_FPS = 1e6
 H264 = ["-crf", "18", "-g", "2"]
 ENCODER = "libx264"
 
@@ -60,12 +61,17 @@ def write_lerobot(folder: Path | str, output: Path | str) -> Path:
 
 def _fps(contents: Contents) -> int:
     step_dt = contents.origin.step_dt
-    if step_dt <= 0.0 or abs(1.0 / step_dt - round(1.0 / step_dt)) > 1e-6:
+    if step_dt > 0.0:
+        rate = 1.0 / step_dt
+    else:
+        rate = 0.0
+    # A rate that rounds to 0 is below one frame per second, and one that is infinite has no whole number.
+    if not 0.5 < rate < MOST_FPS or abs(rate - round(rate)) > 1e-6:
         raise ValueError(
             f"step_dt={step_dt:g} s is no whole number of frames per second, and LeRobot knows no other: choose "
             "task.decimation and the time step so that it is"
         )
-    return round(1.0 / step_dt)
+    return round(rate)
 
 
 def _write_numbers(

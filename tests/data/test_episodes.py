@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import resource
 import shutil
 import signal
 import time
@@ -19,7 +20,7 @@ from torchrl.data.replay_buffers import (
 )
 
 from ksim_rl import data, dims
-from ksim_rl.data.episode_folder import Leaf, Origin
+from ksim_rl.data.episode_folder import Contents, Leaf, Origin
 from ksim_rl.data.episode_recorder import EpisodeRecorder, leaves_of
 from ksim_rl.data.episode_writer import EpisodeWriter
 from ksim_rl.files import writing
@@ -246,6 +247,20 @@ def lead_out(folder):
     damaged(folder, leaves=leaves)
 
 
+def changed_leaf(folder, name, **changes):
+    leaves = json.loads((folder / "episodes.json").read_text())["leaves"]
+    for leaf in leaves:
+        if leaf["key"] == [name]:
+            leaf.update(changes)
+    damaged(folder, leaves=leaves)
+
+
+def misplaced(folder, start, stop):
+    origin = json.loads((folder / "episodes.json").read_text())["origin"]
+    origin["columns"] = {"action": {"torque": [start, stop]}}
+    damaged(folder, origin=origin)
+
+
 def link(folder):
     path = folder / "env_states" / "action.memmap"
     shutil.move(path, folder / "elsewhere")
@@ -262,6 +277,14 @@ def renumber(folder):
     np.full(17, 7, dtype=np.int64).tofile(path)
 
 
+def reorder(folder):
+    """The first and the last are as they were."""
+    path = folder / "env_states" / "episode.memmap"
+    number_D = np.fromfile(path, dtype=np.int64)
+    number_D[5] = 2**62
+    number_D.tofile(path)
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -270,6 +293,12 @@ def renumber(folder):
         (link, "action.memmap: cannot be read"),
         (pipe, "action.memmap: cannot be read: it is no regular file"),
         (renumber, "not of episodes 0 to 5"),
+        (reorder, "not of episodes 0 to 5, one after the other"),
+        (lambda folder: changed_leaf(folder, "episode", dtype="float64"), "one int64"),
+        (lambda folder: changed_leaf(folder, "action", shape=[0]), "no number in it"),
+        (lambda folder: changed_leaf(folder, "action", key="action"), "a list of names"),
+        (lambda folder: misplaced(folder, 0, 10**12), "in 0 to 1000000000000, and there are 1"),
+        (lambda folder: misplaced(folder, -1, 1), "in -1 to 1, and there are 1"),
         (lambda folder: damaged(folder, format=2), "format 2, and this version reads 1"),
         (lambda folder: damaged(folder, num_env_states=-1), "num_env_states=-1"),
         (lambda folder: damaged(folder, num_env_states=2**40), "damaged"),
@@ -283,6 +312,8 @@ def test_what_is_damaged_or_leads_out_is_refused_by_name(folder, damage, message
     with pytest.raises(ValueError, match=message) as refused:
         data.load(folder)
     assert str(folder) in str(refused.value)
+    with pytest.raises(ValueError, match=str(folder)):
+        data.mend(folder)
 
 
 def test_a_foreign_truth_is_zero_or_one(folder):
@@ -306,12 +337,34 @@ def test_an_error_of_the_disk_reaches_the_caller(tmp_path, monkeypatch):
         record(tmp_path / "episodes", rollout_of(2, 12), (4, 2), pieces=4)
 
 
+def test_a_file_that_cannot_grow_is_an_error_that_names_the_folder(tmp_path):
+    folder = tmp_path / "episodes"
+    writer = EpisodeWriter(folder, [Leaf(key=("x",)), Leaf(key=("y",))], origin=Origin())
+    rows = np.zeros(1000, dtype=np.float32)
+    writer.append({("x",): rows, ("y",): rows})
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(OSError, match=str(folder)):
+            writer.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with pytest.raises(ValueError, match="no whole episode"):
+        data.read_episodes(folder)
+
+
 @pytest.mark.parametrize(
     ("key", "message"), [((), "at least one"), (("a/b",), "a/b"), (("..",), "'..'"), (("",), "''")]
 )
 def test_names_that_are_no_names_of_files_are_refused(key, message):
     with pytest.raises(ValueError, match=message):
         Leaf(key=key)
+
+
+def test_more_env_states_than_32_bits_count():
+    # So many are an hour of a fast env.
+    made = [Leaf(key=("episode",), dtype="int64")]
+    assert Contents(leaves=tuple(made), origin=Origin(), num_env_states=2**40).num_env_states
 
 
 def test_types_that_other_programs_do_not_know_are_refused():

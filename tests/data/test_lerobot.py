@@ -139,6 +139,8 @@ def one_step(folder, value, **origin):
     [
         (0.0, 0.0, "step_dt=0 s is no whole number of frames"),
         (0.0, 0.03, "step_dt=0.03 s is no whole number of frames"),
+        (0.0, 1e300, r"step_dt=1e\+300 s is no whole number of frames"),
+        (0.0, 5e-324, "step_dt=4.94066e-324 s is no whole number of frames"),
         (np.nan, 0.02, "numbers that are not finite in action"),
     ],
 )
