@@ -163,6 +163,7 @@ def stamped(read, clock):
     ("text", "said"),
     [
         ("time,right.target_position\n0,1\n1,1\n", "no column left.target_position, though"),
+        ("time,x\n0,1\n20,1\n", "'time' is 20.0: expected more than 0 and at most 10 s"),
         ("time,x\n0,1\n1,1\n3,1\n", "'time': expected at least two lines at an even rate"),
         ("time,x\n0,1\n1,nan\n", "expected 2 finite numbers in each line"),
         ("time,x\n0,a\n", "no table of numbers"),

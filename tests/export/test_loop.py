@@ -205,6 +205,13 @@ def test_nothing_beyond_the_ranges_of_the_training_reaches_a_policy(folder, cont
         runner.step(runner.act(), {"speed": np.array([9.0, 0.5])})
 
 
+def test_a_runner_begins_with_a_command_that_the_policy_has_seen(folder, tmp_path):
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "export.json"
+    path.write_text(path.read_text().replace('"low": [-1.0', '"low": [0.4'))
+    assert Runner(tmp_path).command["twist"].tolist() == [0.4, 0.0]
+
+
 def test_an_operator_changes_the_command(control):
     _, _, machine, lines = set_up(control)
     assert sort_words(["0.5 -0.25", "stop"], machine, 0.0) == ["stop"]

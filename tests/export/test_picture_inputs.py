@@ -168,6 +168,12 @@ WEIGHTS = np.random.default_rng(4).normal(0.0, 1e-3, (12 * 16 * 3, 2)).astype(np
 @pytest.fixture
 def seeing(folder, tmp_path):
     """The toy, whose policy sees by a camera in front of it, and reads nothing else."""
+    return see(folder, tmp_path, SPEC, WEIGHTS)
+
+
+def see(folder, tmp_path, spec, weights):
+    """Write the toy with a policy of one picture, and return its folder and metadata."""
+    kind = TensorProto.UINT8 if spec["dtype"] == "uint8" else TensorProto.FLOAT
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     robot = tmp_path / "robot.xml"
     robot.write_text(robot.read_text().replace('<site name="imu"', f'{CAMERA}<site name="imu"'))
@@ -177,17 +183,17 @@ def seeing(folder, tmp_path):
         helper.make_node("Flatten", ["light"], ["row"]),
         helper.make_node("MatMul", ["row", "weights"], ["actions"]),
     ]
-    seen = helper.make_tensor_value_info("picture_eye", TensorProto.UINT8, [1, 12, 16, 3])
+    seen = helper.make_tensor_value_info("picture_eye", kind, [1, *spec["shape"]])
     actions = helper.make_tensor_value_info("actions", TensorProto.FLOAT, [1, 2])
     graph = helper.make_graph(
-        nodes, "eye", [seen], [actions], [numpy_helper.from_array(WEIGHTS, "weights")]
+        nodes, "eye", [seen], [actions], [numpy_helper.from_array(weights, "weights")]
     )
     opset = [helper.make_opsetid("", 18)]
     onnx.save(
         helper.make_model(graph, opset_imports=opset, ir_version=10), tmp_path / "policy.onnx"
     )
     meta = json.loads((tmp_path / "export.json").read_text())
-    meta |= {"obs": None, "observations": [], "pictures": [SPEC]}
+    meta |= {"obs": None, "observations": [], "pictures": [spec]}
     (tmp_path / "export.json").write_text(json.dumps(meta))
     return tmp_path, meta
 
@@ -205,6 +211,38 @@ def test_a_loop_gives_its_policy_the_pictures_of_a_robot(seeing):
     for wrong in (eye[:, ::-1][:6], eye.astype(np.float32)):
         with pytest.raises(ValueError, match=r"picture_eye is .*: expected uint8 \[12, 16, 3\]"):
             control(dataclasses.replace(blind, pictures={"picture_eye": wrong}))
+
+
+def test_what_is_farther_than_in_training_is_read_as_the_farthest(folder, tmp_path):
+    spec = {**SPEC, "output": "depth", "shape": [12, 16], "dtype": "float32", "max_depth": 4.0}
+    weights = WEIGHTS[: 12 * 16]
+    control = PolicyControl(*see(folder, tmp_path, spec, weights))
+    depth = np.random.default_rng(2).uniform(0.1, 60.0, (12, 16)).astype(np.float32)
+    blind = Bench(Clock()).read()
+    control(dataclasses.replace(blind, pictures={"picture_eye": depth}))
+    expected = np.minimum(depth, 4.0).ravel() @ weights
+    assert control.action == pytest.approx(expected, abs=1e-4)
+    depth[3, 4] = np.inf
+    with pytest.raises(ValueError, match="picture_eye holds numbers that are not finite"):
+        control(dataclasses.replace(blind, pictures={"picture_eye": depth}))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"shape": [16, 12, 3]},
+            r"picture_eye is uint8 \[12, 16, 3\]: export.json has uint8 \[16,",
+        ),
+        ({"dtype": "float32"}, "picture_eye is uint8 .*: export.json has float32"),
+        ({"input": "picture_ear"}, "no input 'picture_ear'"),
+    ],
+)
+def test_pictures_that_the_network_does_not_read_are_refused(seeing, change, said):
+    folder, meta = seeing
+    meta["pictures"] = [{**SPEC, **change}]
+    with pytest.raises(ValueError, match=said):
+        PolicyControl(folder, meta)
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import shutil
 import sys
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 pytest.importorskip("onnxruntime", reason="needs the extra: pip install ksim_rl[export]")
 pytest.importorskip("onnx", reason="needs the extra: pip install ksim_rl[export]")
 
+from ksim_rl.export.standalone import loop_command
 from ksim_rl.export.standalone.loop_command import drive, loop_parser
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand
 from ksim_rl.export.standalone.safety import EffortLimit, Limits, unguarded
@@ -110,6 +112,10 @@ def policy_raises(robot, machine):
     machine.control.observe.run = fail
 
 
+def policy_exits(robot, machine):
+    machine.control.observe.run = lambda given: sys.exit("no license")
+
+
 def policy_gives_nan(robot, machine):
     machine.control.policy = lambda frame, pictures: np.array([0.0, np.nan])
 
@@ -145,6 +151,10 @@ FAULTS = {
         "left moves with 21.0 per s: expected at most 20.0",
     ),
     "tilted": (reads(root_quat=turned(75)), "tilted by 75 degrees: expected at most 57"),
+    "attitude lost": (
+        reads(root_quat=None),
+        "no root_quat in a message: the ones before had it",
+    ),
     "short attitude": (
         reads(root_quat=UPRIGHT[:3]),
         "root_quat has the shape (3,): expected (4,)",
@@ -165,6 +175,7 @@ FAULTS = {
     "loop waits": (loop_waits, "the loop ran 0.200 s late: is the computer busy?"),
 }
 OF_THE_POLICY = {
+    "policy exits": (policy_exits, "SystemExit: no license"),
     "policy raises": (policy_raises, "RuntimeError: no such node"),
     "period is long": (period_is_long, "a period took 0.200 s: is the computer busy?"),
     "policy gives nan": (policy_gives_nan, "the policy's target of left (pos) is not finite"),
@@ -211,6 +222,18 @@ def test_a_message_that_is_late_once_is_no_fault(control):
     robot.harm = changed(stamp=stamp)
     assert machine.tick(0.0, robot.read(), []).damping.tolist() == [2.0, 2.0]
     assert not machine.fault
+
+
+def test_readings_whose_efforts_have_no_sum_are_a_fault(control):
+    _, robot, machine, _ = set_up(control)
+    robot.pos = np.array([-1e308, 0.0])
+    robot.vel = np.array([1.7e308, 0.0])
+    machine.state = State.STOP
+    machine.first_share = 0.5
+    with np.errstate(all="ignore"):
+        command = machine.tick(0.0, robot.read(), [])
+    assert machine.fault == "the policy's target of right (effort) is not finite"
+    assert command.stiffness.tolist() == [0.0, 0.0] and command.damping.tolist() == [2.0, 2.0]
 
 
 # -- efforts -----------------------------------------------------------------------------------------------------
@@ -288,6 +311,57 @@ def test_gains_that_no_motor_may_be_given_are_refused(control, value, said):
     joints = {**control.meta["joints"], "damping": [1.0, value]}
     with pytest.raises(ValueError, match=f"joints.damping of 'left' is {said}: expected 0 to inf"):
         DescribedJoints({**control.meta, "joints": joints})
+
+
+@pytest.mark.parametrize(
+    ("what", "value", "said"),
+    [
+        ("effort", [18.0, -1.0], "effort of 'left' is -1: expected 0 or more"),
+        ("velocity", [-2.0, None], "velocity of 'right' is -2: expected 0 or more"),
+        ("position", [[1.0, 0.5], [None, 1.0]], "position of 'right' is 0.5: expected 1 or more"),
+        ("effort", [18.0], "effort: expected an entry for each of 2 joints"),
+        ("velocity", 3.0, "velocity: expected an entry for each of 2 joints"),
+    ],
+)
+def test_limits_that_would_drive_a_joint_are_refused(control, what, value, said):
+    limits = {**control.meta["joints"]["limits"], what: value}
+    joints = {**control.meta["joints"], "limits": limits}
+    with pytest.raises(ValueError, match=f"export.json: joints.limits.{said}"):
+        DescribedJoints({**control.meta, "joints": joints})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"effort": [18.0', '"effort": [NaN', "NaN: expected finite numbers"),
+        ('"effort": [18.0', '"effort": [1e999', "1e999: expected finite numbers"),
+        (
+            '"step_dt": 0.02',
+            '"step_dt": 0.0',
+            "step_dt is 0.0: expected more than 0 and at most 10",
+        ),
+        ('"step_dt": 0.02', '"step_dt": "fast"', "step_dt is fast: expected more than 0"),
+        ('"joints"', '"limbs"', "KeyError: 'joints'"),
+        ('"size": 2', '"size": []', "sequence"),
+        # What only the simulated robot reads.
+        ('"decimation"', '"substeps"', "KeyError: 'decimation'"),
+    ],
+)
+def test_a_strange_folder_is_refused_in_one_line(
+    folder, tmp_path, monkeypatch, capsys, old, new, said
+):
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "export.json"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["loop.py", str(tmp_path), "--simulate", "--seconds", "1"])
+    with pytest.raises(SystemExit) as ended:
+        loop_command.main()
+    found = capsys.readouterr().err
+    assert ended.value.code == 2 and found.startswith("loop.py: error: ") and said in found
+    assert str(tmp_path) in found and found.count("\n") == 1
 
 
 def test_what_nothing_limits_holds_or_brakes_is_named(control):

@@ -6,7 +6,8 @@ import os
 import re
 import stat
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
@@ -21,6 +22,8 @@ MOST_BYTES = 2**30
 FORMAT = 2
 # Far more than an export has of anything that is counted, such as actions or steps of a delay.
 MOST = 1_000_000
+# Of a period: nobody could stop a robot that listens less often.
+MOST_SECONDS = 10.0
 # Tags by which MuJoCo would load other files or code, and "<!", which begins an XML entity.
 LEAVES_THE_FOLDER = re.compile(rb"<!|<\s*(include|extension|plugin|attach|model)\b", re.IGNORECASE)
 # Attributes of MJCF that name a file or a folder.
@@ -49,7 +52,7 @@ def read_json(path: Path) -> Export:
     content = read(path, 2**26)
     try:
         # Deep nesting raises RecursionError in the parser.
-        found = json.loads(content)
+        found = json.loads(content, parse_float=_number, parse_constant=_number)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from None
     if not isinstance(found, dict) or found.get("format") not in (1, FORMAT):
@@ -61,6 +64,14 @@ def read_json(path: Path) -> Export:
         )
     # Entries are not looked at here: whoever reads a size or a number checks it.
     return cast(Export, found)
+
+
+def _number(text: str) -> float:
+    """Return a number of a JSON file; NaN and Infinity, which no export writes, would be limits without effect."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:40]}: expected finite numbers")
+    return value
 
 
 def read_arrays(path: Path) -> dict[str, Array]:
@@ -127,6 +138,30 @@ def check_count(what: str, value: float, most: int = MOST) -> int:
             f"export.json: {what} is {str(value)[:40]}: expected a whole number of 0 to {most}"
         )
     return value
+
+
+@contextmanager
+def refusing(folder: Path) -> Iterator[None]:
+    """Make a ValueError, which names the folder, of whatever a stranger's file makes a library raise."""
+    try:
+        yield
+    except Exception as error:
+        why = str(error)
+        if isinstance(error, ValueError) and str(folder) in why:
+            raise
+        if not isinstance(error, ValueError):
+            why = f"{type(error).__name__}: {why}"
+        raise ValueError(f"{folder}: {why}") from error
+
+
+def check_seconds(what: str, value: float) -> float:
+    """Return a duration of at most `MOST_SECONDS`, or refuse it."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not 0.0 < value <= MOST_SECONDS:
+        raise ValueError(
+            f"{what} is {str(value)[:40]}: expected more than 0 and at most {MOST_SECONDS:g} s"
+        )
+    return float(value)
 
 
 def measurements(meta: Export) -> list[Json]:

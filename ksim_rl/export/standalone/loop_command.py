@@ -24,7 +24,7 @@ import numpy as np
 from ksim_rl.export.standalone.commands import as_words
 from ksim_rl.export.standalone.deadlines import MonotonicClock
 from ksim_rl.export.standalone.dry_run import DryRun, HeardRobot
-from ksim_rl.export.standalone.files import Json, read_json
+from ksim_rl.export.standalone.files import Json, read_json, refusing
 from ksim_rl.export.standalone.journal import Journal
 from ksim_rl.export.standalone.loop import (
     ask_for_real_time,
@@ -92,7 +92,7 @@ def loop_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="end behind the first dry run; a robot is sent nothing, and may stand under another controller meanwhile",
     )
-    parser.add_argument("--command", type=float, nargs="*", help="the policy's first command")
+    parser.add_argument("--command", type=float, nargs="+", help="the policy's first command")
     parser.add_argument("--log", type=Path, help="a new CSV file; default: named by the time")
     parser.add_argument(
         "--real-time",
@@ -121,11 +121,10 @@ def drive(
     before anything moves.
     """
     _check_options(options, has_robot=robot is not None)
-    step_dt = float(control.meta["step_dt"])
     plan = None
     if options.plan is not None:
         plan = PlanControl(control.meta, options.plan)
-    period = step_dt if plan is None else plan.period
+    period = control.step_dt if plan is None else plan.period
     driver = plan or control
     chosen = vars(options)
     limits = Limits(**{field.name: chosen[field.name] for field in dataclasses.fields(Limits)})
@@ -159,7 +158,7 @@ def drive(
     only = None if plan is None else State.POLICY
     journal = Journal(path, driver.joints, _say, only=only, dry=dry is not None)
     machine = StateMachine(
-        driver, period=step_dt, limits=limits, times=times, note=journal.event, dry=dry
+        driver, period=control.step_dt, limits=limits, times=times, note=journal.event, dry=dry
     )
     heard = _operators(options, plan, operators)
     calm_python()
@@ -240,7 +239,8 @@ def _simulated(
         from ksim_rl.export.standalone.simulated_robot import SimulatedRobot
     except ImportError as error:
         raise ValueError(f"--simulate: {error}: install mujoco, and keep runner.py here") from None
-    robot = SimulatedRobot(options.folder, control.estimated)
+    with refusing(options.folder):
+        robot = SimulatedRobot(options.folder, control.estimated)
     robot.change_period(period)
     if options.plan is not None:
         # The base of a robot that is identified is held, and nothing touches.
@@ -252,7 +252,7 @@ def _simulated(
 
 
 def _set_command(control: PolicyControl, values: Sequence[float] | None) -> None:
-    if not values:
+    if values is None:
         return
     if not np.isfinite(values).all():
         raise ValueError(f"--command {' '.join(map(str, values))}: expected finite numbers")

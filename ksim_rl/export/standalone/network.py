@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ksim_rl.export.standalone.description import Export, StateSpec
-from ksim_rl.export.standalone.files import Array, check_count, read
+from ksim_rl.export.standalone.files import Array, Json, check_count, read
 
 # Types of the inputs that an export writes, by ONNX's names.
 TYPES = {
@@ -100,6 +100,20 @@ class Policy(Network):
 
     def __init__(self, folder: Path, meta: Export) -> None:
         super().__init__(folder / "policy.onnx", meta["policy"]["states"], "actions")
+        for spec in meta.get("pictures", []):
+            self._check_picture(spec)
+
+    def _check_picture(self, spec: Json) -> None:
+        """Refuse a description of pictures by which `run` would fold, or cast, them to others."""
+        name = spec["input"]
+        if name not in self.inputs:
+            raise ValueError(f"{self.path}: no input {name!r}: export.json has such pictures")
+        example = self.inputs[name]
+        shape = list(example.shape[1:])
+        if spec["shape"] != shape or spec["dtype"] != example.dtype.name:
+            raise ValueError(
+                f"{self.path}: {name} is {example.dtype} {shape}: export.json has {spec['dtype']} {spec['shape']}"
+            )
 
     def __call__(self, obs: Array, pictures: Mapping[str, Array]) -> Array:
         """Return the action [A] for the newest frame [L] and the newest pictures, by input."""

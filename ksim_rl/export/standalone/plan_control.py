@@ -7,7 +7,7 @@ import numpy as np
 
 from ksim_rl.export.standalone.commands import CommandRange
 from ksim_rl.export.standalone.description import Export
-from ksim_rl.export.standalone.files import Array, read
+from ksim_rl.export.standalone.files import Array, check_seconds, read
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
 
 TARGETS = {"pos": "target_position", "vel": "target_velocity", "effort": "target_effort"}
@@ -27,7 +27,7 @@ class PlanControl:
         steps = np.diff(time)
         if len(time) < 2 or not steps.min() > 0.0 or np.ptp(steps) > UNEVEN_S:
             raise ValueError(f"{path}: column 'time': expected at least two lines at an even rate")
-        self.period = float(np.median(steps))
+        self.period = check_seconds(f"{path}: a step of 'time'", float(np.median(steps)))
         still = np.zeros(len(self.joints.names))
         # What has no target of its position holds the pose of standing.
         absent = {"pos": self.joints.default_pos, "vel": still, "effort": still}

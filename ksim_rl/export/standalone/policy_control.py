@@ -7,7 +7,13 @@ import numpy as np
 
 from ksim_rl.export.standalone.commands import command_ranges
 from ksim_rl.export.standalone.description import Export, JointActionSpec
-from ksim_rl.export.standalone.files import Array, Json, measurements
+from ksim_rl.export.standalone.files import (
+    Array,
+    Json,
+    check_seconds,
+    measurements,
+    refusing,
+)
 from ksim_rl.export.standalone.network import Network, Policy
 from ksim_rl.export.standalone.robot_link import (
     DOWN,
@@ -30,6 +36,11 @@ class PolicyControl:
     """An exported policy, its observations and its actions, for one robot."""
 
     def __init__(self, folder: Path, meta: Export) -> None:
+        with refusing(folder):
+            self._read(folder, meta)
+        self.begin()
+
+    def _read(self, folder: Path, meta: Export) -> None:
         actions: list[JointActionSpec] = []
         for action in meta["actions"]:
             if action["kind"] == "ctrl":
@@ -39,6 +50,7 @@ class PolicyControl:
                 )
             actions.append(action)
         self.meta = meta
+        self.step_dt = check_seconds("export.json: step_dt", meta["step_dt"])
         self.joints = DescribedJoints(meta)
         self.observe: Network | None = None
         if meta["obs"] is not None:
@@ -65,7 +77,6 @@ class PolicyControl:
                 self.chain.append(stage(spec, self.resets))
         self.actions = [JointAction(spec, self.resets) for spec in actions]
         self.places = [self.joints.columns(action.names) for action in self.actions]
-        self.begin()
 
     def begin(self) -> None:
         """Begin an episode: forget states, actions and time; commands stay."""
@@ -136,8 +147,11 @@ class PolicyControl:
                 raise ValueError(
                     f"{name} is {picture.dtype} {list(picture.shape)}: expected {spec['dtype']} {spec['shape']}"
                 )
-            if spec["dtype"] == "float32" and not np.isfinite(picture).all():
-                raise ValueError(f"{name} holds numbers that are not finite")
+            if spec["dtype"] == "float32":
+                if not np.isfinite(picture).all():
+                    raise ValueError(f"{name} holds numbers that are not finite")
+                # As in training, where nothing is farther.
+                picture = np.minimum(picture, np.float32(spec["max_depth"]))
             found[name] = picture
         return found
 
@@ -163,14 +177,13 @@ class PolicyControl:
             # Readings of a robot have it in them.
             zeros = np.zeros(len(node["joints"]))
             return lambda _: zeros
-        step_dt = float(self.meta["step_dt"])
         of_the_loop: dict[str, Reading] = {
             "action": lambda _: self.action,
             "last_action": lambda _: self.last_action,
             "terminated": lambda _: np.array([False]),
             "step": lambda _: np.array([self.steps]),
             "time_out_offset": lambda _: np.zeros(1),
-            "time": lambda _: np.array([self.steps * step_dt]),
+            "time": lambda _: np.array([self.steps * self.step_dt]),
         }
         if quantity in of_the_loop:
             return of_the_loop[quantity]

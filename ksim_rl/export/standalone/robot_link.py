@@ -84,9 +84,28 @@ class DescribedJoints:
         self.highest = _or([high for _, high in limits["position"]], np.inf)
         self.most_effort = _or(limits["effort"], np.inf)
         self.most_speed = _or(limits["velocity"], np.inf)
+        self._check_limits()
         asked = set(meta["joint_names"])
         driven = [name in asked for name in self.names]
         self.driven = np.array(driven, bool) | (self.stiffness > 0.0) | (self.damping > 0.0)
+
+    def _check_limits(self) -> None:
+        """Refuse limits between which nothing is: clipped to them, a command would push or drive a joint."""
+        still = np.zeros(len(self.names))
+        for what, low, high in (
+            ("position", self.lowest, self.highest),
+            ("effort", still, self.most_effort),
+            ("velocity", still, self.most_speed),
+        ):
+            if low.shape != still.shape or high.shape != still.shape:
+                raise ValueError(
+                    f"export.json: joints.limits.{what}: expected an entry for each of {len(still)} joints"
+                )
+            for place in np.flatnonzero(low > high):
+                raise ValueError(
+                    f"export.json: joints.limits.{what} of {self.names[place]!r} is {high[place]:g}: expected "
+                    f"{low[place]:g} or more"
+                )
 
     def columns(self, names: list[str]) -> Array:
         """Return the places of some joints."""

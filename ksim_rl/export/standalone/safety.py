@@ -70,6 +70,7 @@ class Watch:
         # What the last message said, and since when.
         self.count: int | None = None
         self.counted_at = 0.0
+        self.given: set[str] = set()
         self.readings: list[Array] = []
         self.changed_at = 0.0
 
@@ -127,6 +128,12 @@ class Watch:
     def _numbers(self, measurement: Measurement) -> None:
         names = self.joints.names
         of_joints = ("joint_pos", "joint_vel", "joint_effort")
+        for what in ("root_quat", "root_ang_vel", "count"):
+            if getattr(measurement, what) is not None:
+                self.given.add(what)
+            # What watches it would see nothing any more.
+            elif what in self.given:
+                raise Fault(f"no {what} in a message: the ones before had it")
         sizes: dict[str, int] = dict.fromkeys(of_joints, len(names))
         if measurement.root_quat is not None:
             sizes["root_quat"] = 4

@@ -199,11 +199,11 @@ class Signals:
         self.default = dict(self.own_default)
         # Errors of joint encoders, rad, which a recorded start may set.
         self.bias = dict.fromkeys(names, 0.0)
-        # Commands are zero until the caller gives one.
+        # Until the caller gives one: zero, or what is nearest to it among what the policy has seen.
         self.ranges = command_ranges(meta)
         self.command: dict[str, Array] = {}
         for name, allowed in self.ranges.items():
-            self.command[name] = np.zeros(allowed.size)
+            self.command[name] = allowed.clip(np.zeros(allowed.size))
         self.contacts = {
             name: Contacts(spec, model, self.decimation) for name, spec in meta["contacts"].items()
         }

@@ -137,11 +137,14 @@ class StateMachine:
                 command = self._command(now, measured)
                 check_finite(command, self.joints.names)
                 command = self.effort_limit(command, measured)
+                # Once more, as readings of 1e300 may meet there.
+                check_finite(command, self.joints.names)
                 self.pose = command.pos
                 return command
             except Fault as fault:
                 self.fail(now, str(fault))
-            except Exception as error:  # whatever a policy's files make a library raise
+            # Whatever a policy's files make a library raise, an exit too: motors would stay as they are.
+            except BaseException as error:
                 self.fail(now, in_one_line(error))
         return self._damped(self.pose)
 
