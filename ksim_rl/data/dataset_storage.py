@@ -77,7 +77,7 @@ class DatasetStorage(TensorStorage):
         for key, leaf_D in stored.items():
             leaf_D.unflatten(0, data.batch_size).copy_(leaves[key])
 
-        finite_D1 = _finite_rows(stored.values())
+        finite_D1 = finite_rows(stored.values())
         mask_D1: Tensor = self._storage.get(MASK_KEY)
         # A row takes part if it is finite, and if the data does not mask it.
         mask_D1.copy_(finite_D1)
@@ -158,7 +158,7 @@ class DatasetWriter(Stateless, Writer):
         return self._storage.write(data)
 
 
-def _finite_rows(leaves_D: Iterable[Tensor]) -> Tensor:
+def finite_rows(leaves_D: Iterable[Tensor]) -> Tensor:
     """Return bool [D, 1]: whether each element of a row is finite in all leaves."""
     finite_D1: Tensor | None = None
     for leaf_D in leaves_D:

@@ -193,6 +193,21 @@ def test_whole_episodes_are_held_out(tmp_path):
     assert read(tmp_path / "episodes", held_out=0.0).held_out_N is None
 
 
+def test_held_out_rows_that_are_not_finite_count_for_no_loss(tmp_path):
+    folder = write(tmp_path / "episodes")
+    path = folder / "env_states" / "obs" / "vector.memmap"
+    vector_D3 = np.fromfile(path, dtype=np.float32).reshape(-1, 3)
+    vector_D3[18, 1] = np.nan  # the first of the held-out rows
+    vector_D3.tofile(path)
+    held_out_N = read(folder).held_out_N
+    assert held_out_N[MASK_KEY].flatten().tolist() == [False, True, True, True]
+    held_out_N["actor"] = held_out_N["obs", "vector"]
+    cfg = ActorCfg(hidden_dims=(4,), obs_normalization=False)
+    loss = BCLoss(make_actor(cfg, obs_dim=3, action_dim=2))
+    expected = loss(held_out_N[1:].exclude(MASK_KEY))["loss_bc"]
+    torch.testing.assert_close(loss(held_out_N)["loss_bc"], expected)
+
+
 @pytest.mark.parametrize(
     ("leaves", "message"),
     [

@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl.checks import naming
 from ksim_rl.data import Episodes, read_episodes
+from ksim_rl.data.dataset_storage import MASK_KEY, finite_rows
 from ksim_rl.data.episode_folder import EPISODE_KEY
 from ksim_rl.trainers import checkpoint
 from ksim_rl.transforms import observation_columns
@@ -21,7 +22,10 @@ from ksim_rl.transforms.specs import spell
 
 @dataclass(frozen=True, kw_only=True)
 class Demonstration:
-    """Env states to learn from, `["N"]`, and those of other episodes to measure on, None without."""
+    """Env states to learn from, `["N"]`, and those of other episodes to measure on, None without.
+
+    Held-out rows with a non-finite number are masked: `("collector", "mask")` is False there.
+    """
 
     learned_N: TensorDictBase
     held_out_N: TensorDictBase | None
@@ -43,9 +47,10 @@ def read_demonstration(
     learned_N = _taken(env_states_D, ~is_held_out_D, device)
     if not is_held_out_D.any():
         return Demonstration(learned_N=learned_N, held_out_N=None)
-    return Demonstration(
-        learned_N=learned_N, held_out_N=_taken(env_states_D, is_held_out_D, device)
-    )
+    held_out_N = _taken(env_states_D, is_held_out_D, device)
+    # What is learned goes through a dataset, which masks such rows itself.
+    held_out_N[MASK_KEY] = finite_rows(list(held_out_N.values(True, True)))
+    return Demonstration(learned_N=learned_N, held_out_N=held_out_N)
 
 
 def _check(found: Episodes, env: EnvBase, keys: list[NestedKey]) -> None:
