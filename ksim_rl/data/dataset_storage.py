@@ -5,7 +5,7 @@ from os import PathLike
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64, Shaped
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -158,7 +158,7 @@ class DatasetWriter(Stateless, Writer):
         return self._storage.write(data)
 
 
-def finite_rows(leaves_D: Iterable[Tensor]) -> Tensor:
+def finite_rows(leaves_D: Iterable[Shaped[Tensor, "D *?leaf"]]) -> Bool[Tensor, "D 1"]:
     """Return bool [D, 1]: whether each element of a row is finite in all leaves."""
     finite_D1: Tensor | None = None
     for leaf_D in leaves_D:
