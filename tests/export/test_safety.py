@@ -12,6 +12,7 @@ pytest.importorskip("onnxruntime", reason="needs the extra: pip install ksim_rl[
 pytest.importorskip("onnx", reason="needs the extra: pip install ksim_rl[export]")
 
 from ksim_rl.export.standalone import loop_command
+from ksim_rl.export.standalone.command import main as run_episodes
 from ksim_rl.export.standalone.loop_command import drive, loop_parser
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand
 from ksim_rl.export.standalone.safety import EffortLimit, Limits, unguarded
@@ -296,6 +297,7 @@ def test_wrong_options_are_refused(make, said):
         (["--plan", "p.csv", "--seconds", "3"], "--seconds: a plan says itself"),
         (["--plan", "p.csv", "--dry-run"], "--dry-run: a plan has no policy"),
         (["--dry-run", "--seconds", "3"], "--seconds: a dry run has --dry-seconds"),
+        (["--report", "nowhere/a.json"], "--report nowhere/a.json: there is no folder nowhere"),
     ],
 )
 def test_a_robot_is_not_driven_with_options_that_do_not_fit(control, arguments, said):
@@ -362,6 +364,25 @@ def test_a_strange_folder_is_refused_in_one_line(
     found = capsys.readouterr().err
     assert ended.value.code == 2 and found.startswith("loop.py: error: ") and said in found
     assert str(tmp_path) in found and found.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--episodes", "0", "--episodes 0: expected at least 1"),
+        ("--refine", "0", "--refine 0: expected at least 1"),
+        ("--seed", "-1", "--seed -1: expected at least 0"),
+        ("--output", "nowhere/a.json", "--output nowhere/a.json: there is no folder nowhere"),
+    ],
+)
+def test_a_runner_refuses_its_options_before_it_runs(
+    folder, monkeypatch, capsys, option, value, said
+):
+    monkeypatch.setattr(sys, "argv", ["runner.py", str(folder), option, value])
+    with pytest.raises(SystemExit) as ended:
+        run_episodes()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == f"runner.py: error: {said}\n"
 
 
 def test_what_nothing_limits_holds_or_brakes_is_named(control):

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ksim_rl.export.standalone.files import Array, as_text, read_arrays, read_json
+from ksim_rl.export.standalone.files import Array, as_text, check_parent, read_arrays, read_json
 from ksim_rl.export.standalone.models import check_record
 from ksim_rl.export.standalone.runner import Runner
 from ksim_rl.export.standalone.signals import INTEGRATORS
@@ -93,7 +93,20 @@ def main() -> None:
     print(as_text(found, read_json(Path(options.folder) / "export.json")))
 
 
+def _check_options(options: argparse.Namespace) -> None:
+    """Refuse what would be found out in another process, or behind the last episode."""
+    for name, least in (("episodes", 1), ("refine", 1), ("seed", 0)):
+        value = getattr(options, name)
+        if value < least:
+            raise ValueError(f"--{name} {value}: expected at least {least}")
+    for name in ("output", "replay"):
+        path = getattr(options, name)
+        if path:
+            check_parent(f"--{name}", Path(path))
+
+
 def _run_all(options: argparse.Namespace) -> list[dict[str, float]]:
+    _check_options(options)
     # What is wrong is said here: a process that fails as it begins has nobody to tell.
     runner = Runner(options.folder, options.seed)
     _record(runner)

@@ -164,6 +164,12 @@ def check_seconds(what: str, value: float) -> float:
     return float(value)
 
 
+def check_parent(option: str, path: Path) -> None:
+    """Refuse a file that cannot be written since its folder is not there."""
+    if not path.parent.is_dir():
+        raise ValueError(f"{option} {path}: there is no folder {path.parent}")
+
+
 def measurements(meta: Export) -> list[Json]:
     """Return what fills the inputs of `obs.onnx`: nothing of a policy that only sees."""
     if meta["obs"] is None:

@@ -24,7 +24,7 @@ import numpy as np
 from ksim_rl.export.standalone.commands import as_words
 from ksim_rl.export.standalone.deadlines import MonotonicClock
 from ksim_rl.export.standalone.dry_run import DryRun, HeardRobot
-from ksim_rl.export.standalone.files import Json, read_json, refusing
+from ksim_rl.export.standalone.files import Json, check_parent, read_json, refusing
 from ksim_rl.export.standalone.journal import Journal
 from ksim_rl.export.standalone.loop import (
     ask_for_real_time,
@@ -200,6 +200,8 @@ def _check_options(options: argparse.Namespace, *, has_robot: bool) -> None:
     if options.plan is not None and options.seconds:
         raise ValueError("--seconds: a plan says itself how long it is: leave out one of the two")
 
+    if options.report is not None:
+        check_parent("--report", options.report)
     if options.dry_run and options.plan is not None:
         raise ValueError("--dry-run: a plan has no policy that could run: leave out one of the two")
     if options.dry_run and options.seconds:
