@@ -343,6 +343,7 @@ def test_limits_that_would_drive_a_joint_are_refused(control, what, value, said)
             "step_dt is 0.0: expected more than 0 and at most 10",
         ),
         ('"step_dt": 0.02', '"step_dt": "fast"', "step_dt is fast: expected more than 0"),
+        ('"num_actions": 2', '"num_actions": 1e12', "policy.num_actions is 1000000000000.0: exp"),
         ('"joints"', '"limbs"', "KeyError: 'joints'"),
         ('"size": 2', '"size": []', "sequence"),
         # What only the simulated robot reads.

@@ -10,6 +10,7 @@ from ksim_rl.export.standalone.description import Export, JointActionSpec
 from ksim_rl.export.standalone.files import (
     Array,
     Json,
+    check_count,
     check_seconds,
     measurements,
     refusing,
@@ -38,7 +39,7 @@ class PolicyControl:
     def __init__(self, folder: Path, meta: Export) -> None:
         with refusing(folder):
             self._read(folder, meta)
-        self.begin()
+            self.begin()
 
     def _read(self, folder: Path, meta: Export) -> None:
         actions: list[JointActionSpec] = []
@@ -51,6 +52,7 @@ class PolicyControl:
             actions.append(action)
         self.meta = meta
         self.step_dt = check_seconds("export.json: step_dt", meta["step_dt"])
+        self.num_actions = check_count("policy.num_actions", meta["policy"]["num_actions"])
         self.joints = DescribedJoints(meta)
         self.observe: Network | None = None
         if meta["obs"] is not None:
@@ -81,7 +83,7 @@ class PolicyControl:
     def begin(self) -> None:
         """Begin an episode: forget states, actions and time; commands stay."""
         self.steps = 0
-        self.action = np.zeros(self.meta["policy"]["num_actions"])
+        self.action = np.zeros(self.num_actions)
         self.last_action = self.action
         still = np.zeros(len(self.joints.names))
         self.targets = {"pos": self.joints.default_pos.copy(), "vel": still, "effort": still}
