@@ -16,7 +16,7 @@ CUDA_CALLABLE inline float activation_rate(const World& world, const Arguments& 
     return 0.0f;
 }
 
-CUDA_CALLABLE inline void drive(const World& world, const Arguments& a, const Chip& chip)
+CUDA_CALLABLE inline void drive(const World& world, const Arguments& a, const SharedMemory& shared)
 {
     const float* const qpos = world.row_of(a.qpos);
     const float* const qvel = world.row_of(a.qvel);
@@ -34,14 +34,14 @@ CUDA_CALLABLE inline void drive(const World& world, const Arguments& a, const Ch
             world.row_of(a.actuator_moment)[actuator] = gear;
         }
         float rate = 0.0f, found = 0.0f;
-        const int address = activation_of(world, a, actuator);
+        const int address = activation_of(a, actuator);
         if (address >= 0) {
             if (ACTUATORS_ACT)
                 rate = activation_rate(world, a, actuator, ctrl_of(world, a, actuator), world.row_of(a.act)[address]);
             world.row_of(a.act_dot)[address] = rate;
         }
         const float input = input_of(world, a, actuator, rate);
-        if (ACTUATORS_ACT && !is_switched_off(world, a, actuator)) {
+        if (ACTUATORS_ACT && !is_switched_off(a, actuator)) {
             auto affine = [&](const auto& factors) {
                 return factors[0] + factors[1] * length + factors[2] * speed;
             };
@@ -55,7 +55,7 @@ CUDA_CALLABLE inline void drive(const World& world, const Arguments& a, const Ch
             const wp::vec2 range = world.model_row(a.actuator_forcerange)[actuator];
             found = wp::clamp(found, range[0], range[1]);
         }
-        world.row_of(a.actuator_force)[actuator] = chip.actuator_forces[actuator] = found;
+        world.row_of(a.actuator_force)[actuator] = shared.actuator_forces[actuator] = found;
     });
 }
 
@@ -74,45 +74,46 @@ CUDA_CALLABLE inline bool is_pushed(const World& world, const Arguments& a)
 #endif
 }
 
-CUDA_CALLABLE inline void sum_smooth_forces(const World& world, const Arguments& a, const Chip& chip)
+CUDA_CALLABLE inline void sum_smooth_forces(const World& world, const Arguments& a, const SharedMemory& shared)
 {
     const float* const mass = world.model_row(a.body_mass);
     const bool pushed = is_pushed(world, a);
     world.each(NUM_DOFS, [&](int dof) {
         const int joint = look_up(a.dof_jntid, dof), body = look_up(a.dof_bodyid, dof);
-        const float bias = wp::dot(chip.motion(dof), chip.force(body));
+        const float bias = wp::dot(shared.motion(dof), shared.force(body));
         float driven = 0.0f;
 #pragma unroll 1
         for (int i = look_up(a.first_driver, dof); i < look_up(a.first_driver, dof + 1); ++i) {
             const int actuator = look_up(a.drivers, i);
-            driven += world.model_row(a.actuator_gear)[actuator][0] * chip.actuator_forces[actuator];
+            driven += world.model_row(a.actuator_gear)[actuator][0] * shared.actuator_forces[actuator];
         }
         if (LIFTS) {
-            // Weights that are compensated (mj_gravcomp), by what is chip.passive or by actuators.
-            const vec3 spin = rotation_of(chip.motion(dof)), origin = chip.com(look_up(a.body_rootid, body));
+            // Weights that are compensated (mj_gravcomp), as passive forces or by actuators.
+            const vec3 spin = rotation_of(shared.motion(dof)), origin = shared.com(look_up(a.body_rootid, body));
             float lifted = 0.0f;
 #pragma unroll 1
             for (int of = body; of < body + look_up(a.body_subtreenum, body); ++of) {
-                const vec3 moved = translation_of(chip.motion(dof)) + wp::cross(spin, world.row_of(a.xipos)[of] - origin);
+                const vec3 moved
+                    = translation_of(shared.motion(dof)) + wp::cross(spin, world.row_of(a.xipos)[of] - origin);
                 lifted -= wp::dot(moved, world.of_world(a.gravity)) * mass[of] * world.model_row(a.body_gravcomp)[of];
             }
             world.row_of(a.qfrc_gravcomp)[dof] = lifted;
             const bool is_driven = a.jnt_actgravcomp.data[joint];
             driven += is_driven && ACTUATORS_ACT ? lifted : 0.0f;
-            world.row_of(a.qfrc_passive)[dof] = chip.passive[dof] += is_driven ? 0.0f : lifted;
+            world.row_of(a.qfrc_passive)[dof] = shared.passive[dof] += is_driven ? 0.0f : lifted;
         }
         if (ACTUATORS_ACT && a.jnt_actfrclimited.data[joint]) {
             const wp::vec2 range = world.model_row(a.jnt_actfrcrange)[joint];
             driven = wp::clamp(driven, range[0], range[1]);
         }
-        float sum = chip.passive[dof] - bias + driven + world.row_of(a.qfrc_applied)[dof];
+        float sum = shared.passive[dof] - bias + driven + world.row_of(a.qfrc_applied)[dof];
         if (pushed) {
-            const vec3 spin = rotation_of(chip.motion(dof)), origin = chip.com(look_up(a.body_rootid, body));
+            const vec3 spin = rotation_of(shared.motion(dof)), origin = shared.com(look_up(a.body_rootid, body));
 #pragma unroll 1
             for (int of = body; of < body + look_up(a.body_subtreenum, body); ++of) {
                 const spatial push = world.row_of(a.xfrc_applied)[of];  // its translation comes first
                 const vec3 arm = world.row_of(a.xipos)[of] - origin;
-                sum += wp::dot(translation_of(chip.motion(dof)) + wp::cross(spin, arm), rotation_of(push));
+                sum += wp::dot(translation_of(shared.motion(dof)) + wp::cross(spin, arm), rotation_of(push));
                 sum += wp::dot(spin, translation_of(push));
             }
         }

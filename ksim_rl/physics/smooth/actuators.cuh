@@ -33,7 +33,7 @@ struct ActuatorArguments {
 
 // Calls body(actuator) for the actuators that add armature or damping to a joint: none, one, or (below -1) several.
 template <class Body>
-CUDA_CALLABLE inline void each_actuator_of(const World&, const ActuatorArguments& a, int joint, Body body)
+CUDA_CALLABLE inline void each_actuator_of(const ActuatorArguments& a, int joint, Body body)
 {
     const int only = look_up(a.jnt_actuatorid, joint);
     if (only >= 0)
@@ -60,7 +60,7 @@ struct Damping {
 CUDA_CALLABLE inline Damping damping_of(const World& world, const ActuatorArguments& a, int joint, int dof)
 {
     Damping found;
-    each_actuator_of(world, a, joint, [&](int actuator) {
+    each_actuator_of(a, joint, [&](int actuator) {
         const float gear = world.model_row(a.actuator_gear)[actuator][0];
         found.linear += world.model_row(a.actuator_damping)[actuator] * gear * gear;
         found.more = found.more + world.model_row(a.actuator_dampingpoly)[actuator] * gear * gear;
@@ -71,7 +71,7 @@ CUDA_CALLABLE inline Damping damping_of(const World& world, const ActuatorArgume
 }
 
 // Whether the option actuatorgroupdisable disables it (disabled_actuators.py).
-CUDA_CALLABLE inline bool is_switched_off(const World& world, const ActuatorArguments& a, int actuator)
+CUDA_CALLABLE inline bool is_switched_off(const ActuatorArguments& a, int actuator)
 {
     return SOME_SWITCHED_OFF && look_up(a.actuator_gaintype, actuator) == SWITCHED_OFF;
 }
@@ -91,7 +91,7 @@ CUDA_CALLABLE inline float next_activation(const World& world, const ActuatorArg
 }
 
 // Where its activation is, or -1.
-CUDA_CALLABLE inline int activation_of(const World& world, const ActuatorArguments& a, int actuator)
+CUDA_CALLABLE inline int activation_of(const ActuatorArguments& a, int actuator)
 {
     const int first = HAS_ACTIVATION ? look_up(a.actuator_actadr, actuator) : -1;
     return first < 0 ? -1 : first + look_up(a.actuator_actnum, actuator) - 1;
@@ -110,7 +110,7 @@ CUDA_CALLABLE inline float ctrl_of(const World& world, const ActuatorArguments& 
 // What its gain multiplies: its activation, which changes at a rate, or its control where it has none.
 CUDA_CALLABLE inline float input_of(const World& world, const ActuatorArguments& a, int actuator, float rate)
 {
-    const int address = activation_of(world, a, actuator);
+    const int address = activation_of(a, actuator);
     if (address < 0)
         return ctrl_of(world, a, actuator);
     return a.actuator_actearly.data[actuator] ? next_activation(world, a, actuator, address, rate)

@@ -4,17 +4,17 @@
 
 namespace integration {
 
-CUDA_CALLABLE inline void advance(const World& world, const Arguments& a, const Memory& m)
+CUDA_CALLABLE inline void advance(const World& world, const Arguments& a, const SharedMemory& shared)
 {
     const float timestep = world.of_world(a.timestep);
     world.each(NUM_DOFS, [&](int dof) {
-        world.row_of(a.qvel)[dof] = m.right[dof] = world.row_of(a.qvel)[dof] + timestep * m.qacc[dof];
+        world.row_of(a.qvel)[dof] = shared.right[dof] = world.row_of(a.qvel)[dof] + timestep * shared.qacc[dof];
         world.row_of(a.qacc_warmstart)[dof] = world.row_of(a.qacc)[dof];
     });
     if (ACTUATORS_ACT)
         world.each(NUM_ACTUATORS, [&](int actuator) {
-            const int address = activation_of(world, a, actuator);
-            if (address < 0 || is_switched_off(world, a, actuator))
+            const int address = activation_of(a, actuator);
+            if (address < 0 || is_switched_off(a, actuator))
                 return;
             const float rate = world.row_of(a.act_dot)[address];
             world.row_of(a.act)[address] = next_activation(world, a, actuator, address, rate);
@@ -22,7 +22,7 @@ CUDA_CALLABLE inline void advance(const World& world, const Arguments& a, const 
     sync_warp();
     world.each(NUM_JOINTS, [&](int joint) {
         const int type = look_up(a.jnt_type, joint);
-        const float* v = m.right + look_up(a.jnt_dofadr, joint);
+        const float* v = shared.right + look_up(a.jnt_dofadr, joint);
         float* q = world.row_of(a.qpos) + look_up(a.jnt_qposadr, joint);
         if (type == HINGE || type == SLIDE) {
             q[0] += timestep * v[0];

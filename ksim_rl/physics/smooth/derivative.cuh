@@ -56,12 +56,12 @@ struct Arguments : ActuatorArguments, NeedsArguments {
 };
 
 // What the lanes of a world share.
-struct Memory {
+struct SharedMemory {
     float* system;
     float* right;  // M qacc, then D L qacc', and the new velocities
     float* qacc;   // qacc'
 
-    CUDA_CALLABLE explicit Memory(float* begin)
+    CUDA_CALLABLE explicit SharedMemory(float* begin)
         : system(begin)
         , right(system + NUM_ENTRIES)
         , qacc(right + NUM_DOFS)
@@ -86,7 +86,7 @@ CUDA_CALLABLE inline bool is_clamped(float force, const wp::vec2& range)
 
 CUDA_CALLABLE inline float present_input(const World& world, const Arguments& a, int actuator)
 {
-    const int address = activation_of(world, a, actuator);
+    const int address = activation_of(a, actuator);
     return input_of(world, a, actuator, address < 0 ? 0.0f : world.row_of(a.act_dot)[address]);
 }
 
@@ -101,7 +101,7 @@ CUDA_CALLABLE inline float drive_rate(const World& world, const Arguments& a, in
 #pragma unroll 1
     for (int i = look_up(a.first_driver, dof); i < look_up(a.first_driver, dof + 1); ++i) {
         const int actuator = look_up(a.drivers, i);
-        if (is_switched_off(world, a, actuator))
+        if (is_switched_off(a, actuator))
             continue;
         if (a.actuator_forcelimited.data[actuator]
             && is_clamped(world.row_of(a.actuator_force)[actuator], world.model_row(a.actuator_forcerange)[actuator]))
@@ -117,12 +117,12 @@ CUDA_CALLABLE inline float drive_rate(const World& world, const Arguments& a, in
     return sum;
 }
 
-CUDA_CALLABLE inline void fill_system(const World& world, const Arguments& a, const Memory& m)
+CUDA_CALLABLE inline void fill_system(const World& world, const Arguments& a, const SharedMemory& shared)
 {
     const float timestep = world.of_world(a.timestep);
 #pragma unroll 4
     for (int entry = world.lane; entry < NUM_ENTRIES; entry += LANES)
-        m.system[entry] = world.row_of(a.M)[entry];
+        shared.system[entry] = world.row_of(a.M)[entry];
     sync_warp();
     world.each(NUM_DOFS, [&](int dof) {
         float rate = 0.0f;
@@ -133,8 +133,8 @@ CUDA_CALLABLE inline void fill_system(const World& world, const Arguments& a, co
         }
         if (IMPLICIT_FAST)
             rate -= drive_rate(world, a, dof);
-        m.system[row_start(a, dof) + num_ancestors(a, dof)] += timestep * rate;
-        m.right[dof] = world.row_of(a.efc_Ma)[dof];
+        shared.system[row_start(a, dof) + num_ancestors(a, dof)] += timestep * rate;
+        shared.right[dof] = world.row_of(a.efc_Ma)[dof];
     });
     sync_warp();
 }

@@ -8,18 +8,18 @@
 
 namespace integration {
 
-CUDA_CALLABLE inline void solve(const World& world, const Arguments& a, const Memory& m)
+CUDA_CALLABLE inline void solve(const World& world, const Arguments& a, const SharedMemory& shared)
 {
 #pragma unroll 1
     for (int i = 0; i < a.eliminated.shape[0]; ++i) {
         const int dof = look_up(a.eliminated, i), ancestors = num_ancestors(a, dof);
-        const float* const row = m.system + row_start(a, dof);
+        const float* const row = shared.system + row_start(a, dof);
         const float inverse = 1.0f / row[ancestors];
 #pragma unroll 2
         for (int item = look_up(a.first_change, i) + world.lane; item < look_up(a.first_change, i + 1); item += LANES) {
             const int change = look_up(a.changes, item), other = change & 127;
             const float factor = row[change >> 7 & 127] * inverse;
-            m.system[change >> 14] -= factor * (other < ancestors ? row[other] : m.right[dof]);
+            shared.system[change >> 14] -= factor * (other < ancestors ? row[other] : shared.right[dof]);
         }
         sync_warp();
     }
@@ -29,21 +29,21 @@ CUDA_CALLABLE inline void solve(const World& world, const Arguments& a, const Me
 #pragma unroll 1
         for (int place = 0; place <= num_ancestors(a, last); ++place) {
             const int dof = look_up(a.M_colind, chain + place);
-            const float* const row = m.system + row_start(a, dof);
-            float sum = m.right[dof];
+            const float* const row = shared.system + row_start(a, dof);
+            float sum = shared.right[dof];
 #pragma unroll 4
             for (int before = 0; before < place; ++before)
-                sum -= row[before] * m.qacc[look_up(a.M_colind, chain + before)];
-            m.qacc[dof] = sum / row[place];
+                sum -= row[before] * shared.qacc[look_up(a.M_colind, chain + before)];
+            shared.qacc[dof] = sum / row[place];
         }
     });
     sync_warp();
 }
 
 // The accelerations of the solver, where nothing changes them.
-CUDA_CALLABLE inline void keep_accelerations(const World& world, const Arguments& a, const Memory& m)
+CUDA_CALLABLE inline void keep_accelerations(const World& world, const Arguments& a, const SharedMemory& shared)
 {
-    world.each(NUM_DOFS, [&](int dof) { m.qacc[dof] = world.row_of(a.qacc)[dof]; });
+    world.each(NUM_DOFS, [&](int dof) { shared.qacc[dof] = world.row_of(a.qacc)[dof]; });
     sync_warp();
 }
 

@@ -10,7 +10,7 @@
 
 namespace integration {
 
-CUDA_CALLABLE inline void solve_free_bodies(const World& world, const Arguments& a, const Memory& m)
+CUDA_CALLABLE inline void solve_free_bodies(const World& world, const Arguments& a, const SharedMemory& shared)
 {
     const float timestep = world.of_world(a.timestep);
     world.each(NUM_FREE_BODIES, [&](int free) {
@@ -36,9 +36,9 @@ CUDA_CALLABLE inline void solve_free_bodies(const World& world, const Arguments&
             const int start = row_start(a, first + i), ancestors = num_ancestors(a, first + i);
             for (int place = 0; place <= ancestors; ++place) {
                 const int j = look_up(a.M_colind, start + place) - first;
-                block[i][j] = block[j][i] = m.system[start + place];
+                block[i][j] = block[j][i] = shared.system[start + place];
             }
-            block[i][6] = m.right[first + i];
+            block[i][6] = shared.right[first + i];
         }
         for (int i = 0; i < 6; ++i)
             for (int j = 0; j < 3; ++j)
@@ -62,8 +62,8 @@ CUDA_CALLABLE inline void solve_free_bodies(const World& world, const Arguments&
         for (int i = 5; i >= 0; --i) {
             float sum = block[i][6];
             for (int j = i + 1; j < 6; ++j)
-                sum -= block[i][j] * m.qacc[first + j];
-            m.qacc[first + i] = sum / block[i][i];
+                sum -= block[i][j] * shared.qacc[first + j];
+            shared.qacc[first + i] = sum / block[i][i];
         }
     });
     sync_warp();

@@ -9,8 +9,8 @@ struct Column {
     int stride;
 };
 
-// Adds to each body's parent, from the last body to the first, what lies on the chip; a lane has a column of it. The
-// parents are constants, so that sums stay in registers.
+// Adds to each body's parent, from the last body to the first, what lies in shared memory; a lane has a column of it.
+// The parents are constants, so that sums stay in registers.
 template <class ColumnOf>
 CUDA_CALLABLE inline void sum_subtrees(const World& world, int columns, ColumnOf column_of)
 {
@@ -23,50 +23,50 @@ CUDA_CALLABLE inline void sum_subtrees(const World& world, int columns, ColumnOf
     sync_warp();
 }
 
-CUDA_CALLABLE inline void place_dofs(const World& world, const Arguments& a, const Chip& chip)
+CUDA_CALLABLE inline void place_dofs(const World& world, const Arguments& a, const SharedMemory& shared)
 {
     const float* const mass = world.model_row(a.body_mass);
-    world.each(NUM_BODIES, [&](int body) { chip.com(body) = mass[body] * chip.center(body); });
+    world.each(NUM_BODIES, [&](int body) { shared.com(body) = mass[body] * shared.center(body); });
     sync_warp();
-    sum_subtrees(world, 3, [&](int index) { return Column {chip.coms + index, 3}; });
+    sum_subtrees(world, 3, [&](int index) { return Column {shared.coms + index, 3}; });
     world.each(NUM_BODIES, [&](int body) {
         const float total = world.model_row(a.body_subtreemass)[body];
-        chip.com(body) = total < TINY ? chip.center(body) : chip.com(body) / total;
+        shared.com(body) = total < TINY ? shared.center(body) : shared.com(body) / total;
     });
     sync_warp();
-    write(world, a.subtree_com, NUM_BODIES, chip.coms, 3);
+    write(world, a.subtree_com, NUM_BODIES, shared.coms, 3);
 
     world.each(NUM_JOINTS, [&](int joint) {
         const int body = look_up(a.jnt_bodyid, joint), type = look_up(a.jnt_type, joint);
         int dof = look_up(a.jnt_dofadr, joint);
-        const vec3 offset = chip.com(look_up(a.body_rootid, body)) - chip.anchor(joint);
+        const vec3 offset = shared.com(look_up(a.body_rootid, body)) - shared.anchor(joint);
         if (type == SLIDE)
-            chip.motion(dof) = spatial_of(vec3(), chip.axis(joint));
+            shared.motion(dof) = spatial_of(vec3(), shared.axis(joint));
         else if (type == HINGE)
-            chip.motion(dof) = spatial_of(chip.axis(joint), wp::cross(chip.axis(joint), offset));
+            shared.motion(dof) = spatial_of(shared.axis(joint), wp::cross(shared.axis(joint), offset));
         else {
-            const mat33 frame = matrix(chip.turn(body));
+            const mat33 frame = matrix(shared.turn(body));
             for (int i = 0; i < (type == FREE ? 3 : 0); ++i, ++dof) {
                 const vec3 along(i == 0 ? 1.0f : 0.0f, i == 1 ? 1.0f : 0.0f, i == 2 ? 1.0f : 0.0f);
-                chip.motion(dof) = spatial_of(vec3(), along);
+                shared.motion(dof) = spatial_of(vec3(), along);
             }
             for (int i = 0; i < 3; ++i, ++dof) {
                 const vec3 column(frame.data[0][i], frame.data[1][i], frame.data[2][i]);
-                chip.motion(dof) = spatial_of(column, wp::cross(column, offset));
+                shared.motion(dof) = spatial_of(column, wp::cross(column, offset));
             }
         }
     });
     sync_warp();
-    write(world, a.cdof, NUM_DOFS, chip.motions, 6);
+    write(world, a.cdof, NUM_DOFS, shared.motions, 6);
 }
 
-CUDA_CALLABLE inline void find_inertias(const World& world, const Arguments& a, const Chip& chip)
+CUDA_CALLABLE inline void find_inertias(const World& world, const Arguments& a, const SharedMemory& shared)
 {
     const float* const mass = world.model_row(a.body_mass);
     world.each(NUM_BODIES, [&](int body) {
-        const mat33 frame = inertial_frame(world, a, chip, body);
+        const mat33 frame = inertial_frame(world, a, shared, body);
         const vec3 moments = world.model_row(a.body_inertia)[body];
-        const vec3 offset = chip.center(body) - chip.com(look_up(a.body_rootid, body));
+        const vec3 offset = shared.center(body) - shared.com(look_up(a.body_rootid, body));
         auto turned = [&](int i, int j) {
             float sum = 0.0f;
             for (int k = 0; k < 3; ++k)
@@ -84,11 +84,11 @@ CUDA_CALLABLE inline void find_inertias(const World& world, const Arguments& a, 
         for (int i = 0; i < 3; ++i)
             found[6 + i] = moment[i];
         found[9] = mass[body];
-        chip.inertia(body) = found;
+        shared.inertia(body) = found;
     });
     sync_warp();
     if (a.is_read)
-        write(world, a.cinert, NUM_BODIES, chip.inertias, POSE);
+        write(world, a.cinert, NUM_BODIES, shared.inertias, POSE);
 }
 
 }

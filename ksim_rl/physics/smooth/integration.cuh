@@ -9,19 +9,19 @@ CUDA_CALLABLE inline void run(int index, int lane, const Arguments& a)
 {
 #if defined(__CUDA_ARCH__)
     __shared__ __align__(16) float memory[FLOATS * (THREADS / LANES)];
-    const Memory m(memory + (threadIdx.x / LANES) * FLOATS);
+    const SharedMemory shared(memory + (threadIdx.x / LANES) * FLOATS);
 #else
     static float memory[FLOATS];
-    const Memory m(memory);
+    const SharedMemory shared(memory);
 #endif
     const World world = world_of(index, lane);
     if (SOLVES) {
-        fill_system(world, a, m);
-        solve(world, a, m);
-        solve_free_bodies(world, a, m);
+        fill_system(world, a, shared);
+        solve(world, a, shared);
+        solve_free_bodies(world, a, shared);
     } else
-        keep_accelerations(world, a, m);
-    advance(world, a, m);
+        keep_accelerations(world, a, shared);
+    advance(world, a, shared);
     if (lane == 0) {
         a.time.data[index] += world.of_world(a.timestep);
         note_overflow(world, a);

@@ -4,7 +4,7 @@
 
 namespace smooth_dynamics {
 
-CUDA_CALLABLE inline void find_passive_forces(const World& world, const Arguments& a, const Chip& chip)
+CUDA_CALLABLE inline void find_passive_forces(const World& world, const Arguments& a, const SharedMemory& shared)
 {
     const float* const qpos = world.row_of(a.qpos);
     const float* const qvel = world.row_of(a.qvel);
@@ -38,12 +38,12 @@ CUDA_CALLABLE inline void find_passive_forces(const World& world, const Argument
             const bool damps = damping.linear != 0.0f || damping.more[0] != 0.0f || damping.more[1] != 0.0f;
             const float speed = qvel[dof + i];
             const float damper = damps ? -speed * rate_at(damping.linear, damping.more, wp::abs(speed)) : 0.0f;
-            chip.passive[dof + i] = spring[i] + damper;
+            shared.passive[dof + i] = spring[i] + damper;
             if (!a.is_read)
                 continue;
             world.row_of(a.qfrc_spring)[dof + i] = spring[i];
             world.row_of(a.qfrc_damper)[dof + i] = damper;
-            world.row_of(a.qfrc_passive)[dof + i] = chip.passive[dof + i];
+            world.row_of(a.qfrc_passive)[dof + i] = shared.passive[dof + i];
         }
     });
 }

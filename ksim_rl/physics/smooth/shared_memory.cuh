@@ -1,5 +1,5 @@
-// Where the numbers of a world lie in shared memory, from where they go to global memory in whole rows: lanes that write
-// the fields of a body each on their own would touch every sector of memory once per number.
+// Where the numbers of a world lie in shared memory, from where they go to global memory in whole rows: lanes that
+// write the fields of a body each on their own would touch every sector of memory once per number.
 #pragma once
 #include "ksim_rl/physics/smooth/dynamics_arguments.cuh"
 
@@ -9,7 +9,7 @@ constexpr int UNROLLED_BODIES = NUM_BODIES <= 64 ? NUM_BODIES : 4;
 constexpr int POSE = 10;  // floats of a body: position, quaternion and centre of mass, then its inertia
 constexpr int STAGED = 6 * (NUM_DOFS + NUM_BODIES);
 
-struct Chip {
+struct SharedMemory {
     float* poses;
     float* inertias;         // once the poses are written
     float* actuator_forces;  // once the inertias are summed
@@ -22,7 +22,7 @@ struct Chip {
     float* forces;           // accelerations of the bodies under their velocities, then forces
     float* staged;           // until the motions are known, what waits to be written
 
-    CUDA_CALLABLE explicit Chip(float* begin)
+    CUDA_CALLABLE explicit SharedMemory(float* begin)
         : poses(begin)
         , inertias(poses)
         , actuator_forces(poses)
@@ -113,7 +113,12 @@ CUDA_CALLABLE inline void write(const World& world, const wp::array_t<T>& array,
 // Writes compute(item) at place_of(item) of a row, for all items.
 template <class T, class PlaceOf, class Compute>
 CUDA_CALLABLE inline void compute_row(
-    const World& world, const Chip& chip, const wp::array_t<T>& array, int count, PlaceOf place_of, Compute compute
+    const World& world,
+    const SharedMemory& shared,
+    const wp::array_t<T>& array,
+    int count,
+    PlaceOf place_of,
+    Compute compute
 )
 {
     using Value = decltype(compute(0));
@@ -122,11 +127,11 @@ CUDA_CALLABLE inline void compute_row(
 #pragma unroll 1
     for (int first = 0; first < count; first += ROOM) {
         const int items = wp::min(ROOM, count - first);
-        world.each(items, [&](int item) { ((Value*)chip.staged)[item] = compute(first + item); });
+        world.each(items, [&](int item) { ((Value*)shared.staged)[item] = compute(first + item); });
         sync_warp();
 #pragma unroll 4
         for (int place = world.lane; place < items * WIDTH; place += LANES)
-            to[place_of(first + place / WIDTH) * WIDTH + place % WIDTH] = chip.staged[place];
+            to[place_of(first + place / WIDTH) * WIDTH + place % WIDTH] = shared.staged[place];
         sync_warp();
     }
 }
