@@ -12,7 +12,6 @@ from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers import Sampler
 
 from ksim_rl import dims
-from ksim_rl.config.plain_data import check_links
 from ksim_rl.data.episode_folder import (
     ENV_STATES,
     EPISODE_KEY,
@@ -64,6 +63,9 @@ def mend(folder: Path | str) -> None:
     ValueError names what is damaged, as in `read_episodes`: no size is written that a file does not have.
     """
     folder = Path(folder)
+    # Its module needs PyYAML, which a user of samplers alone need not have.
+    from ksim_rl.config.plain_data import check_links
+
     check_links(folder, below=(ENV_STATES,))
     contents = read_contents(folder)
     if contents.num_env_states:

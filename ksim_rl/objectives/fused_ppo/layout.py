@@ -331,7 +331,7 @@ def why_not_fused(
 def launch(
     kernel: Any,
     grid: tuple[int, ...],
-    arguments: Mapping[str, Argument],
+    arguments: Mapping[str, Any],
     *,
     num_warps: int = 4,
     **changes: Argument,
