@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import imageio.v2 as imageio
 import numpy as np
 
 from ksim_rl.data.episode_folder import EPISODE_KEY, Contents
@@ -126,6 +125,9 @@ def _write_video(
         "output_params": H264,
     }
     try:
+        # Only pictures need it.
+        import imageio.v2 as imageio
+
         writer: Any = imageio.get_writer(path, **options)
         with writer:
             for picture_HWC in episodes.env_states_D.get(feature.leaf.key)[file.frames]:
