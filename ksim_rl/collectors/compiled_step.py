@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ksim_rl.collectors.step_check import StepCheck
+from ksim_rl.collectors.step_check import StepCheck, shortened
 from ksim_rl.compiled.differences import NamedLeaves
 from ksim_rl.compiled.tape import Tape
 from ksim_rl.device.copying import copy_rows
@@ -95,9 +95,4 @@ class CompiledStep:
     @staticmethod
     def _refuse(found: list[str]) -> None:
         if found:
-            names = ", ".join(found[:3])
-            if len(found) > 3:
-                more = f" and {len(found) - 3} more"
-            else:
-                more = ""
-            raise RuntimeError(f"the compiled step gives another {names}{more} than the env")
+            raise RuntimeError(f"the compiled step gives another {shortened(found)} than the env")

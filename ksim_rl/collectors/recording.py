@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 from ksim_rl import ranks
 from ksim_rl.collectors.compiled_step import CompiledStep
 from ksim_rl.collectors.graph_step import GraphStep
-from ksim_rl.collectors.step_check import StepCheck
+from ksim_rl.collectors.step_check import StepCheck, shortened
 from ksim_rl.compiled.differences import equal
 from ksim_rl.compiled.python_watch import Change, listed
 from ksim_rl.device.capture import Captured
@@ -181,23 +181,19 @@ class Recording:
             return
         # It is not known in which of these rollouts the change happened.
         suspects = self.unchecked_rollouts
-        names = ", ".join(found[:3])
-        if len(found) > 3:
-            more = f" and {len(found) - 3} more"
-        else:
-            more = ""
+        names = shortened(found)
         if self.compiled_step is not None and self._kernels_are_wrong(root_E, act):
             self._compiles = False
             self._drop()
             warnings.warn(
                 f"THE ENV'S STEP IS NOT COMPILED any more, and slower: in this state its kernels give another "
-                f"{names}{more} than the env; they have made the last {suspects} rollouts",
+                f"{names} than the env; they have made the last {suspects} rollouts",
                 RuntimeWarning,
                 stacklevel=4,
             )
             return
         raise FrozenPythonError(
-            f"the env's own step gives another {names}{more} than what was recorded of it {self._rollouts} rollouts "
+            f"the env's own step gives another {names} than what was recorded of it {self._rollouts} rollouts "
             f"ago, though no Python value has changed that can be seen (it may be in a file or a library): the last "
             f"{suspects} rollouts may be of what it was then. {KEEP}; {EAGER}",
             rollouts=suspects,

@@ -193,6 +193,14 @@ class StepCheck:
         return results
 
 
+def shortened(found: list[str]) -> str:
+    """Return the first few names of values that differ, and how many more there are."""
+    names = ", ".join(found[:3])
+    if len(found) > 3:
+        names += f" and {len(found) - 3} more"
+    return names
+
+
 def _nudged(value: PyTree, generator: torch.Generator, units: int) -> PyTree:
     if isinstance(value, Tensor):
         return nudged(value, generator, units=units)
