@@ -91,7 +91,7 @@ class Checked:
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return how many numbers of four bytes must lie in memory at least, by the names of the fields that say so.
 
-        Numbers of configs in its fields are left out. `ksim_rl.device.memory.check_room` compares them with a machine.
+        Numbers of configs in its fields are left out. `ksim_rl.device.room.check_room` compares them with a machine.
         """
         return {}
 

@@ -58,7 +58,7 @@ ROWS = {
         measure=huge_numbers,
         amounts={"commands": 10},
         short={"commands": 1},
-        files=("ksim_rl/checked.py", "ksim_rl/device/memory.py", "tests/cli/wrong_sizes.py"),
+        files=("ksim_rl/checked.py", "ksim_rl/device/room.py", "tests/cli/wrong_sizes.py"),
     ),
     "crafted_manifests": Row(
         fault="manifests with a right hash in which parts of the state are gone, or of another kind",

@@ -11,9 +11,9 @@ from ksim_rl.checks import OneLineParser, check_count
 from ksim_rl.cli.errors import say
 from ksim_rl.cli.report import run_and_report, shown_working, verdict
 from ksim_rl.cli.runs import print_table
-from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.state_tree import branch, number
 from ksim_rl.envs.contract import part
+from ksim_rl.files.writing import check_links
 from ksim_rl.objectives import AMPCfg
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S

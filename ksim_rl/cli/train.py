@@ -21,7 +21,7 @@ from ksim_rl.cli.errors import report, say
 from ksim_rl.cli.report import run_and_report
 from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
-from ksim_rl.config.plain_data import check_links
+from ksim_rl.files.writing import check_links
 from ksim_rl.runs.run_lock import is_locked
 from ksim_rl.terminal import show
 from ksim_rl.trainers import RunCfg

@@ -1,8 +1,7 @@
 """Reads files that a stranger may have written as plain data: nothing in them executes or leads on."""
 
-import os
 import re
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ from ksim_rl.checks import naming
 from ksim_rl.config.trees import Plain, Tree
 from ksim_rl.config.upstream import yaml_resolvers
 from ksim_rl.files.reading import MOST_CONFIG_BYTES, read_bytes
-from ksim_rl.files.writing import check_name, check_own
 
 # Deeper trees would exhaust Python's stack.
 MOST_DEPTH = 50
@@ -138,28 +136,3 @@ def flat(tree: Mapping[str, Plain], path: str = "") -> Iterator[tuple[str, Plain
             yield from flat(value, f"{path}{key}.")
         else:
             yield f"{path}{key}", value
-
-
-def check_links(folder: Path, *, below: Sequence[str]) -> None:
-    """Refuse a folder in which something, at its top or in the folders `below`, leads out: a run writes there.
-
-    These are links to other folders, files with other names (hard links), pipes and devices.
-    """
-    check_name(folder)
-    inside = folder.resolve()
-    # Only folders that a run writes into; others, such as a user's data, may hold anything.
-    walked = (
-        os.path.join(root, name)
-        for own in below
-        for root, *names in os.walk(folder / own)
-        for name in sum(names, [])
-    )
-    for path in map(Path, (*folder.iterdir(), *walked)):
-        # Links inside of the folder are harmless. By os: a link to itself is an error of another kind for `resolve`.
-        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(inside):
-            raise ValueError(
-                f"{path}: a link that leads out of the run folder, and a run writes only into its own"
-            )
-        # Hard links, pipes and devices in the place of files.
-        if not path.is_symlink() and not path.is_dir():
-            check_own(path)

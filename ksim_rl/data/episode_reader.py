@@ -21,6 +21,7 @@ from ksim_rl.data.episode_folder import (
     write_contents,
 )
 from ksim_rl.files.reading import open_regular
+from ksim_rl.files.writing import check_links
 
 # Of one leaf: it is mapped, and no memory is taken for it.
 MOST_LEAF_BYTES = 2**42
@@ -63,9 +64,6 @@ def mend(folder: Path | str) -> None:
     ValueError names what is damaged, as in `read_episodes`: no size is written that a file does not have.
     """
     folder = Path(folder)
-    # Its module needs PyYAML, which a user of samplers alone need not have.
-    from ksim_rl.config.plain_data import check_links
-
     check_links(folder, below=(ENV_STATES,))
     contents = read_contents(folder)
     if contents.num_env_states:

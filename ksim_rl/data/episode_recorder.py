@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from ksim_rl.checks import check_count
 from ksim_rl.data.episode_folder import Key, Leaf
 from ksim_rl.data.episode_writer import EpisodeWriter
+from ksim_rl.device.room import check_bytes
 
 # While one is written to the disk, the device fills the other.
 NUM_BUFFERS = 2
@@ -156,9 +157,6 @@ class _RunningEpisodes:
         leaves = [leaf for leaf in writer.contents.leaves if leaf.key != ("episode",)]
         self.keys = [leaf.key for leaf in leaves]
         needed = num_envs * max_length * sum(leaf.num_bytes for leaf in leaves)
-        # Its module loads Warp, which a user of samplers alone need not have.
-        from ksim_rl.device.memory import check_bytes
-
         check_bytes(
             f"recorded episodes of up to {max_length} env states",
             needed,

@@ -1,23 +1,18 @@
-"""Refuses configs that no memory holds, and explains a failed allocation by the number of envs that fit."""
+"""Explains a failed allocation by the number of envs that fit."""
 
 import gc
-import os
 import re
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
 
 import torch
 
-from ksim_rl.checked import Checked
 from ksim_rl.device.upstream import ALLOCATION_REFUSALS
 
 # A rollout is read in so many parts: intermediate results of a part take several times its memory.
 ROLLOUT_PARTS = 4
 _UNITS = {None: 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
-# Of a number in memory: float32 nearly everywhere.
-_NUMBER_BYTES = 4
 
 
 class TooManyEnvsError(ValueError):
@@ -26,44 +21,6 @@ class TooManyEnvsError(ValueError):
     def __init__(self, text: str, *, per_env: int) -> None:
         super().__init__(text)
         self.per_env = per_env
-
-
-def check_room(cfg: Checked, *, num_envs: int, device: torch.device, path: str = "") -> None:
-    """Refuse a config of which one part alone takes more memory than a device has in all.
-
-    `Checked.least_numbers` gives the sizes, so that nothing has to be allocated to know them. What passes may
-    still be too much: a failed allocation tells. The ValueError names the fields, which stand at `path`.
-    """
-    for where, part in _parts(cfg, path):
-        for names, numbers in part.least_numbers(num_envs).items():
-            given = ", ".join(
-                f"{where}.{name}={getattr(part, name)!r}".removeprefix(".") for name in names
-            )
-            check_bytes(given, _NUMBER_BYTES * numbers, num_envs=num_envs, device=device)
-
-
-def check_bytes(given: str, needed: float, *, num_envs: int, device: torch.device) -> None:
-    """Refuse what takes more memory than a device has in all; `given` are the fields and values that ask for it."""
-    total = total_bytes(device)
-    if needed > total:
-        raise ValueError(
-            f"{given}: takes at least {needed / 1e9:,.0f} GB of memory with num_envs={num_envs}, and {device} has "
-            f"{total / 1e9:.1f} GB: lower it"
-        )
-
-
-def _parts(value: object, path: str) -> Iterator[tuple[str, Checked]]:
-    """Yield the configs in a config, itself first, each with its dotted path."""
-    if isinstance(value, Mapping):
-        for name, entry in value.items():
-            yield from _parts(entry, f"{path}.{name}".removeprefix("."))
-    elif isinstance(value, tuple | list):
-        for index, entry in enumerate(value):
-            yield from _parts(entry, f"{path}[{index}]")
-    elif isinstance(value, Checked) and is_dataclass(value):
-        yield path, value
-        for field in fields(value):
-            yield from _parts(getattr(value, field.name), f"{path}.{field.name}".removeprefix("."))
 
 
 @contextmanager
@@ -145,10 +102,3 @@ def free_bytes(device: torch.device) -> int | None:
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     return None
-
-
-def total_bytes(device: torch.device) -> int:
-    """Return how much memory a GPU has, or the machine for its CPU."""
-    if device.type == "cuda":
-        return torch.cuda.mem_get_info(device)[1]
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

@@ -15,7 +15,7 @@ from ksim_rl.checks import check_known, naming, near
 from ksim_rl.config import plugins
 from ksim_rl.config.config_tree import from_tree, to_tree
 from ksim_rl.config.trees import Tree
-from ksim_rl.device.memory import check_room
+from ksim_rl.device.room import check_room
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv

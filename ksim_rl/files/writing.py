@@ -11,7 +11,7 @@ import secrets
 import shutil
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
@@ -51,6 +51,31 @@ def check_name(path: Path) -> None:
         raise ValueError(
             f"{path.absolute()}: bytes that are no UTF-8, with which nothing is written: rename the folder"
         )
+
+
+def check_links(folder: Path, *, below: Sequence[str]) -> None:
+    """Refuse a folder in which something, at its top or in the folders `below`, leads out: a run writes there.
+
+    These are links to other folders, files with other names (hard links), pipes and devices.
+    """
+    check_name(folder)
+    inside = folder.resolve()
+    # Only folders that a run writes into; others, such as a user's data, may hold anything.
+    walked = (
+        os.path.join(root, name)
+        for own in below
+        for root, *names in os.walk(folder / own)
+        for name in sum(names, [])
+    )
+    for path in map(Path, (*folder.iterdir(), *walked)):
+        # Links inside of the folder are harmless. By os: a link to itself is an error of another kind for `resolve`.
+        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(inside):
+            raise ValueError(
+                f"{path}: a link that leads out of the run folder, and a run writes only into its own"
+            )
+        # Hard links, pipes and devices in the place of files.
+        if not path.is_symlink() and not path.is_dir():
+            check_own(path)
 
 
 def check_folder(folder: Path, *, below: Path) -> None:

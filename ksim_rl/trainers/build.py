@@ -17,7 +17,7 @@ from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import ReplayCfg
 from ksim_rl.device import state_tree
 from ksim_rl.device.eager import eagerly
-from ksim_rl.device.memory import check_bytes, check_room
+from ksim_rl.device.room import check_bytes, check_room
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
 from ksim_rl.trainers.algorithm import HasWarmUp, make_update

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ksim_rl.config.plain_data import check_links
 from ksim_rl.config.trees import Plain
 from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
-from ksim_rl.files.writing import whole_folder, write_whole
+from ksim_rl.files.writing import check_links, whole_folder, write_whole
 from ksim_rl.physics.model_files.packing import ModelFiles, files_of_model
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot, ModelRobot
 from ksim_rl.scene.scene import MjcfRobot

@@ -15,7 +15,8 @@ from ksim_rl import ranks
 from ksim_rl.config.class_paths import loading_notes
 from ksim_rl.config.plugins import load as load_plugins
 from ksim_rl.device import state_tree
-from ksim_rl.device.memory import check_room, memory_for
+from ksim_rl.device.memory import memory_for
+from ksim_rl.device.room import check_room
 from ksim_rl.envs.contract import EpisodeClock, part
 from ksim_rl.files.writing import whole_file, write_whole
 from ksim_rl.runs.listing import CONFIG, METRICS

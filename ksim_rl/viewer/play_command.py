@@ -13,8 +13,8 @@ from urllib.parse import urlsplit
 from torchrl.envs import EnvBase
 
 from ksim_rl.checks import OneLineParser, check_count, check_in_range
-from ksim_rl.config.plain_data import check_links
 from ksim_rl.device.kernel_loading import compile_notice
+from ksim_rl.files.writing import check_links
 from ksim_rl.trainers import RunProgress, record_video
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.video import FPS

@@ -5,9 +5,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from ksim_rl.config import plain_data
 from ksim_rl.export import export
-from ksim_rl.files.writing import make_folder
+from ksim_rl.files.writing import check_links, make_folder
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.loggers import LoggerCfg, WandbCfg, check_installed, kept_id
 
@@ -83,8 +82,8 @@ def download(address: str, folder: Path, *, note: Callable[[str], None]) -> Path
     target = folder / address.replace("/", "_")
     make_folder(target, below=folder)
     # Before, so that nothing is written through a link, and after, for links that came along.
-    plain_data.check_links(target, below=("checkpoint",))
+    check_links(target, below=("checkpoint",))
     found[-1].download(root=str(target))
-    plain_data.check_links(target, below=("checkpoint",))
+    check_links(target, below=("checkpoint",))
     note(f"wandb:{address}: copied to {target}")
     return target

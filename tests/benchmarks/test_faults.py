@@ -21,7 +21,7 @@ from ksim_rl import terminal
 from ksim_rl.algorithms.gradient_steps import RolloutUpdate
 from ksim_rl.cli import errors
 from ksim_rl.config import plain_data
-from ksim_rl.device import memory
+from ksim_rl.device import room
 from ksim_rl.envs.managers.action_manager import ActionManager
 from ksim_rl.envs.non_finite import NonFiniteTerms
 from ksim_rl.export.folder import runner_source
@@ -271,7 +271,7 @@ def states_as_they_come(patch):
 
 @sabotage("huge_numbers")
 def nobody_looks_at_sizes(patch):
-    patch.setattr(memory, "check_room", lambda *_, **__: None)
+    patch.setattr(room, "check_room", lambda *_, **__: None)
 
 
 @sabotage("wrong_inputs")

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from ksim_rl.config import class_paths
-from ksim_rl.config.plain_data import check_links, read_yaml
+from ksim_rl.config.plain_data import read_yaml
 from ksim_rl.files import arrays, reading
+from ksim_rl.files.writing import check_links
 from ksim_rl.scene.actuators import nets
 from ksim_rl.scene.motions import motion
 from ksim_rl.trainers import loggers, run_folder

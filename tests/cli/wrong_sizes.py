@@ -11,7 +11,7 @@ import pytest
 from benchmarks.faults import children
 from ksim_rl import conf
 from ksim_rl.checked import Annotation
-from ksim_rl.device import memory
+from ksim_rl.device import room
 from ksim_rl.trainers import RunCfg
 from tests.cli import wrong_inputs
 
@@ -91,7 +91,7 @@ def refusal(cfg: RunCfg, path: str, value: int | list[int]) -> str:
     part[name] = value
     try:
         changed = RunCfg.from_tree(tree)
-        memory.check_room(changed, num_envs=changed.num_envs, device=changed.resolved_device())
+        room.check_room(changed, num_envs=changed.num_envs, device=changed.resolved_device())
     except ValueError as refused:
         return str(refused)
     return ""
@@ -102,7 +102,7 @@ def figures(folder: Path, *, commands: int) -> dict[str, float]:
     found = dict.fromkeys(("fields", "not_refused", "not_named", "commands", "neither"), 0)
     words: list[tuple[Sequence[str], str]] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(memory, "total_bytes", lambda device: LITTLE_BYTES)
+        patch.setattr(room, "total_bytes", lambda device: LITTLE_BYTES)
         for cfg, brought, numbers in configs():
             for path, is_list in numbers:
                 found["fields"] += 1
@@ -127,7 +127,7 @@ def figures(folder: Path, *, commands: int) -> dict[str, float]:
 
 def _train(words: Sequence[str], folder: Path) -> int:
     # In a forked process: what is taken by mistake fills no more of this machine.
-    memory.total_bytes = lambda device: LITTLE_BYTES
+    room.total_bytes = lambda device: LITTLE_BYTES
     return wrong_inputs.train(words, folder)
 
 

@@ -15,26 +15,11 @@ from ksim_rl.algorithms.off_policy.update import OffPolicyUpdate
 from ksim_rl.device import memory
 from ksim_rl.device.memory import TooManyEnvsError, memory_for, refused_bytes
 from ksim_rl.trainers import RunProgress, run_folder, trial
-from tests.cli import wrong_sizes
 from tests.cli.payloads import SMALL
 from tests.device.small_machine import hold_at_most
 from tests.physics.models import standing_quadrupeds
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda:0")
-
-
-def test_whole_numbers_that_no_memory_holds_are_refused_before_anything_is_allocated(monkeypatch):
-    monkeypatch.setattr(memory, "total_bytes", lambda device: wrong_sizes.LITTLE_BYTES)
-    taken = set()
-    for cfg, _, numbers in wrong_sizes.configs():
-        for path, is_list in numbers:
-            value = wrong_sizes.HUGE[1]
-            said = wrong_sizes.refusal(cfg, path, [value, value] if is_list else value)
-            if not said:
-                taken.add(path)
-            else:
-                assert path.rpartition(".")[2] in said
-    assert taken == wrong_sizes.FREE
 
 
 def test_refusals_are_told_from_other_errors():
