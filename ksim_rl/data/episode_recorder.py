@@ -4,7 +4,6 @@ import queue
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from jaxtyping import Bool, Int64
 from tensordict import TensorDictBase
 
 from ksim_rl.checks import check_count
-from ksim_rl.data.episode_folder import Key, Leaf
+from ksim_rl.data.episode_folder import EPISODE_KEY, Key, Leaf
 from ksim_rl.data.episode_writer import EpisodeWriter
 from ksim_rl.device.room import check_bytes
 
@@ -130,12 +129,7 @@ class EpisodeRecorder:
     def __enter__(self) -> "EpisodeRecorder":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -154,7 +148,7 @@ class _RunningEpisodes:
         self._left_E = episodes_E
         self._max_length = max_length
         num_envs = len(episodes_E)
-        leaves = [leaf for leaf in writer.contents.leaves if leaf.key != ("episode",)]
+        leaves = [leaf for leaf in writer.contents.leaves if leaf.key != EPISODE_KEY]
         self.keys = [leaf.key for leaf in leaves]
         needed = num_envs * max_length * sum(leaf.num_bytes for leaf in leaves)
         check_bytes(
