@@ -30,7 +30,7 @@ class _HostBuffer:
 
 
 class EpisodeRecorder:
-    """Takes rollouts `["E","T"]` one after the other, and writes those of their episodes that are whole.
+    """Takes rollouts `["E","T"]` one after the other, and writes their whole episodes.
 
     A call starts a copy to pinned memory and returns; a thread waits for it, and writes. So the device never waits for
     the disk, until both buffers are full. Env e gives its first `episodes_E[e]` episodes, whatever their lengths: among

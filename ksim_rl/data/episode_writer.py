@@ -25,7 +25,7 @@ from ksim_rl.files.writing import check_folder, make_folder, named, open_new
 class EpisodeWriter:
     """Appends episodes to a folder of its own; `commit` makes them count.
 
-    `leaves` are those of an env state, without the number of its episode, which the writer adds. A ValueError refuses a
+    `leaves` make up an env state, without the number of its episode, which the writer adds. A ValueError refuses a
     folder in which something lies. Rows are written plainly, since a full disk ends a process that writes through a
     memory map.
 

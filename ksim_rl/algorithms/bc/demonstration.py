@@ -22,7 +22,7 @@ from ksim_rl.transforms.specs import spell
 
 @dataclass(frozen=True, kw_only=True)
 class Demonstration:
-    """Env states to learn from, `["N"]`, and those of other episodes to measure on, None without.
+    """Env states to learn from, `["N"]`, and env states of other episodes to measure on, None without.
 
     Held-out rows with a non-finite number are masked: `("collector", "mask")` is False there.
     """
