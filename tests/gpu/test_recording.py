@@ -100,7 +100,8 @@ def test_what_nothing_shows_is_found_by_comparison(compile):
     collector = collector_of(term, compile=compile)
     rewards_of(collector, 5)
     term.ask.box.value = 2
-    with pytest.raises(FrozenPythonError, match=r"another rewards\.term in 64 rows"):
+    # Of 64 rows every seventh ends by a NaN action in a comparison, and rows that end so are paid nothing.
+    with pytest.raises(FrozenPythonError, match=r"another rewards\.term in 55 rows"):
         rewards_of(collector, 12)
 
 
