@@ -5,9 +5,9 @@
 
 Without names all rows of this machine are measured; those of a GPU are left out where there is none, and are never
 counted as passed then. With `jobs` so many rows run side by side, each in a process of its own, the soak first; rows of
-a GPU have it for themselves, last. The short form, which CI runs, prints what it found and writes nothing. With
-BENCHMARK_RESULTS=FOLDER results are written there and the page is left alone; `merge` takes them from there. Exit code
-1: a limit is broken.
+a GPU have it for themselves, last. A row that is named alone spreads its cases over so many processes, if it can.
+The short form, which CI runs, prints what it found and writes nothing. With BENCHMARK_RESULTS=FOLDER results are
+written there and the page is left alone; `merge` takes them from there. Exit code 1: a limit is broken.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ def main() -> int:
             print(f"{name}: not measured: no CUDA device", flush=True)
         else:
             here.append(name)
-    if jobs == 1:
-        held = [_measure(name, short=short) for name in here]
+    if jobs == 1 or len(here) == 1:
+        held = [_measure(name, short=short, jobs=jobs) for name in here]
     else:
         held = [ended == 0 for ended in _apart(here, form=options["form"], jobs=jobs)]
     return 0 if all(held) else 1
 
 
-def _measure(name: str, *, short: bool) -> bool:
+def _measure(name: str, *, short: bool, jobs: int) -> bool:
     """Measure a row, print it, write its long form; return whether it holds."""
     began, used = time.monotonic(), sum(os.times()[:4])
     with tempfile.TemporaryDirectory() as folder:
         try:
-            figures, broken = ROWS[name].run(Path(folder), short=short)
+            figures, broken = ROWS[name].run(Path(folder), short=short, jobs=jobs)
         except Exception as error:  # a row that cannot be measured is a row that fails
             traceback.print_exc()
             figures, broken = {}, [f"{type(error).__name__}: {error}"]

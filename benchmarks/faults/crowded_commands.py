@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.faults import children, killed_commands
+from benchmarks.faults import children, killed_commands, spread
 from benchmarks.faults.file_operations import limit_files, no_space, on_each
 from benchmarks.faults.killed_commands import COMMANDS, Command
 from benchmarks.faults.row import AT_LEAST, EXACTLY, Figures, Row
@@ -44,30 +45,29 @@ def _full_from(place: Path, at: int) -> None:
     on_each(place, act)
 
 
-def full_disk_of_commands(folder: Path, *, points: int, sizes: int, commands: int) -> Figures:
+def full_disk_of_commands(
+    folder: Path, *, points: int, sizes: int, commands: int, jobs: int = 1
+) -> Figures:
     """Let the disk become full at operations of each command, and then be empty again."""
     trained = killed_commands.train_once(folder)
-    found = {"cases": 0, "ended_badly": 0, "half_files": 0, "raw_tracebacks": 0, "do_not_go_on": 0}
+    cases = []
     for name in WRITERS[:commands]:
-        place = folder / name
-        shutil.copytree(trained, place)
-        many = _operations(COMMANDS[name], place)
-        harms: list[tuple[str, Callable[[], None]]] = []
+        counted = folder / name
+        shutil.copytree(trained, counted)
+        many = _operations(COMMANDS[name], counted)
         for at in range(0, many, max(1, many // points)):
-            harms.append(
-                (f"full at {at} of {many}", lambda at=at, place=place: _full_from(place, at))
-            )
+            place = folder / f"{name} full at {at} of {many}"
+            full = functools.partial(_full_from, place, at)
+            cases.append(functools.partial(_fill, name, trained, place, full))
         for size in SIZES[:sizes]:
-            harms.append((f"files of {size} bytes", lambda size=size: limit_files(size)))
-        for harm, before in harms:
-            shutil.rmtree(place)
-            shutil.copytree(trained, place)
-            for figure, value in _fill(name, place, harm, before).items():
-                found[figure] += value
-    return found
+            place = folder / f"{name} with files of {size} bytes"
+            limited = functools.partial(limit_files, size)
+            cases.append(functools.partial(_fill, name, trained, place, limited))
+    return spread.summed(cases, folder, jobs=jobs)
 
 
-def _fill(name: str, place: Path, harm: str, before: Callable[[], None]) -> dict[str, int]:
+def _fill(name: str, trained: Path, place: Path, before: Callable[[], None]) -> dict[str, int]:
+    shutil.copytree(trained, place)
     command = COMMANDS[name]
     words = command.words(place)
     ended = killed_commands.start(words, before=before).wait()
@@ -77,8 +77,9 @@ def _fill(name: str, place: Path, harm: str, before: Callable[[], None]) -> dict
     after = killed_commands.start(command.again(place)).wait()
     goes_on = after.code in (0, 1)
     if not clear or half or not goes_on or ended.raw_traceback:
-        print(f"{name}, {harm}: exit code {ended.code}: {ended.text[-600:]}", flush=True)
+        print(f"{place.name}: exit code {ended.code}: {ended.text[-600:]}", flush=True)
         print(f"    then exit code {after.code}: {after.text[-600:]}", flush=True)
+    shutil.rmtree(place)
     return {
         "cases": 1,
         "ended_badly": int(not clear),
@@ -129,6 +130,7 @@ ROWS = {
         measure=lambda folder, *, least, **amounts: full_disk_of_commands(folder, **amounts),
         amounts={"points": 8, "sizes": 4, "commands": 3, "least": 30},
         short={"points": 1, "sizes": 1, "commands": 1, "least": 2},
+        splits=True,
         files=(
             "ksim_rl/files/writing.py",
             "ksim_rl/export",

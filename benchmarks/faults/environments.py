@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import resource
@@ -11,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.faults import children
+from benchmarks.faults import children, spread
 from benchmarks.faults.hostile_folder import PROGRAM
 from benchmarks.faults.row import AT_LEAST, EXACTLY, Figures, Row
 
@@ -145,20 +146,28 @@ def wrong(case: Case, ended: subprocess.CompletedProcess[str]) -> str:
     return ""
 
 
-def environments(folder: Path, *, cases: int, note: Callable[[str], None] = print) -> Figures:
+def environments(
+    folder: Path, *, cases: int, jobs: int = 1, note: Callable[[str], None] = print
+) -> Figures:
     """Train the smallest task in each environment; count those that work, are refused in one line, or neither."""
-    found = {"cases": 0, "work": 0, "one_line": 0, "neither": 0}
-    for number, (name, case) in enumerate(list(CASES.items())[:cases]):
-        place = folder / str(number)
-        ended = start(case, [*TRAIN, f"hydra.run.dir={place / 'run'}"], place)
-        fault = wrong(case, ended)
-        found["cases"] += 1
-        found["work"] += not fault and ended.returncode in (0, 1)
-        found["one_line"] += not fault and ended.returncode not in (0, 1)
-        found["neither"] += bool(fault)
-        if fault:
-            note(f"{name}: {fault}: exit code {ended.returncode}: {ended.stderr[-500:]}")
-    return found
+    chosen = []
+    for number, name in enumerate(list(CASES)[:cases]):
+        chosen.append(functools.partial(_train_in, name, folder / str(number), note))
+    return spread.summed(chosen, folder, jobs=jobs)
+
+
+def _train_in(name: str, place: Path, note: Callable[[str], None]) -> dict[str, int]:
+    ended = start(CASES[name], [*TRAIN, f"hydra.run.dir={place / 'run'}"], place)
+    fault = wrong(CASES[name], ended)
+    if fault:
+        note(f"{name}: {fault}: exit code {ended.returncode}: {ended.stderr[-500:]}")
+    works = ended.returncode in (0, 1)
+    return {
+        "cases": 1,
+        "work": int(works and not fault),
+        "one_line": int(not works and not fault),
+        "neither": int(bool(fault)),
+    }
 
 
 ROWS = {
@@ -170,6 +179,7 @@ ROWS = {
         measure=environments,
         amounts={"cases": 50},
         short={"cases": 2},
+        splits=True,
         files=("ksim_rl/cli/errors.py", "ksim_rl/cli/main.py", "ksim_rl/cli/process.py"),
     ),
 }

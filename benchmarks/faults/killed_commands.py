@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import random
 import shutil
@@ -10,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.faults import children
+from benchmarks.faults import children, spread
 from benchmarks.faults.row import AT_LEAST, EXACTLY, Figures, Row
 from ksim_rl.cli.main import main
 from ksim_rl.files.writing import WRITING
@@ -177,27 +178,29 @@ def train_once(folder: Path) -> Path:
     return trained
 
 
-def killed_commands(folder: Path, *, kills: int, commands: int) -> Figures:
+def killed_commands(folder: Path, *, kills: int, commands: int, jobs: int = 1) -> Figures:
     """Kill commands at random moments, begin each again, and count what is half, and what does not end well."""
     trained = train_once(folder)
-    choose = random.Random(kills)
-    found = {"kills": 0, "corrupt": 0, "do_not_go_on": 0, "stray": 0, "raw_tracebacks": 0}
     names = list(COMMANDS)[:commands]
-    for number, name in enumerate(names):
-        share = kills // len(names) + (number < kills % len(names))
-        for figure, value in _kill(
-            name, trained, folder / name, kills=share, choose=choose
-        ).items():
-            found[figure] += value
-        found[f"kills_of_{name.replace(' ', '_')}"] = share
-    return found
+    cases = []
+    # The parts of a command stand apart, so that no process has two of the command that takes longest.
+    for part in range(max(1, jobs // len(names))):
+        for number, name in enumerate(names):
+            share = _share(kills, among=len(names), number=number)
+            here = _share(share, among=max(1, jobs // len(names)), number=part)
+            place = folder / f"{name} {part}"
+            cases.append(functools.partial(_kill, name, trained, place, kills=here))
+    return spread.summed(cases, folder, jobs=jobs)
 
 
-def _kill(
-    name: str, trained: Path, folder: Path, *, kills: int, choose: random.Random
-) -> dict[str, int]:
+def _share(whole: int, *, among: int, number: int) -> int:
+    return whole // among + (number < whole % among)
+
+
+def _kill(name: str, trained: Path, folder: Path, *, kills: int) -> dict[str, int]:
     """Kill one command so often, each time in a copy of a folder with a trained run, or for `train` without it."""
     command = COMMANDS[name]
+    choose = random.Random(f"{folder.name} {kills}")
     found = {"kills": 0, "corrupt": 0, "do_not_go_on": 0, "stray": 0, "raw_tracebacks": 0}
     _copy(trained, folder, of=name)
     began = time.monotonic()
@@ -207,8 +210,11 @@ def _kill(
     while found["kills"] < kills and tries < MOST_TRIES * kills:
         tries += 1
         _copy(trained, folder, of=name)
-        ended = _run(command.words(folder), kill_after=choose.uniform(0.0, whole_s))
+        moment = choose.uniform(0.0, whole_s)
+        ended = _run(command.words(folder), kill_after=moment)
         if ended.code >= 0:
+            # It took less than when its time was taken, with caches that were cold.
+            whole_s = moment
             continue
         found["kills"] += 1
         found["corrupt"] += command.halves(folder)
@@ -223,7 +229,7 @@ def _kill(
         for path in left:
             print(f"{name}: left after a kill: {path.relative_to(folder)}", flush=True)
     shutil.rmtree(folder)
-    return found
+    return {**found, f"kills_of_{name.replace(' ', '_')}": found["kills"]}
 
 
 def _stray(folder: Path) -> list[Path]:
@@ -257,6 +263,7 @@ ROWS = {
         measure=killed_commands,
         amounts={"kills": 102, "commands": 6},
         short={"kills": 3, "commands": 1},
+        splits=True,
         files=(
             "ksim_rl/files/writing.py",
             "ksim_rl/runs/run_lock.py",

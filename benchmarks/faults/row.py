@@ -26,6 +26,7 @@ class Row:
         measure: provokes it in an empty folder, as often as the amounts say, and returns the figures.
         amounts: of the long form, which counts; `short` replaces some of them for CI.
         device: "cpu" or "cuda".
+        splits: whether `measure` takes `jobs`, the number of processes over which it spreads its cases.
         files: those whose change makes the figures old, beside the benchmark itself.
     """
 
@@ -36,12 +37,14 @@ class Row:
     amounts: Mapping[str, int] = field(default_factory=dict)
     short: Mapping[str, int] = field(default_factory=dict)
     device: str = "cpu"
+    splits: bool = False
     files: tuple[str, ...] = ()
 
-    def run(self, folder: Path, *, short: bool) -> tuple[Figures, list[str]]:
-        """Measure; return the figures, and one line for each that breaks its limit."""
+    def run(self, folder: Path, *, short: bool, jobs: int = 1) -> tuple[Figures, list[str]]:
+        """Measure, in `jobs` processes if it splits; return the figures, and a line for each that breaks its limit."""
         amounts = {**self.amounts, **(self.short if short else {})}
-        figures = self.measure(folder, **amounts)
+        processes = {"jobs": jobs} if self.splits else {}
+        figures = self.measure(folder, **amounts, **processes)
         return figures, self.broken(figures, amounts)
 
     def broken(

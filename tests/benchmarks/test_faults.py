@@ -14,7 +14,15 @@ import torch
 
 from benchmarks import report
 from benchmarks.faults import __main__ as command
-from benchmarks.faults import children, damaged_caches, environments, hostile_folder, machine, page
+from benchmarks.faults import (
+    children,
+    damaged_caches,
+    environments,
+    hostile_folder,
+    machine,
+    page,
+    spread,
+)
 from benchmarks.faults.row import Row
 from benchmarks.faults.rows import ROWS
 from ksim_rl import terminal
@@ -429,3 +437,13 @@ def test_rows_side_by_side_are_merged_and_the_page_waits_for_those_that_are_comm
     assert command.main() == 0
     assert json.loads((committed / "faults.json").read_text())["passed"] == saved["passed"]
     assert "| `latest` |" in page.PAGE.read_text()
+
+
+def test_cases_spread_over_processes_are_summed(tmp_path, monkeypatch):
+    monkeypatch.setattr(children, "warm", lambda: None)
+    cases = [lambda case=case: {"cases": 1, "sum": case, f"of_{case % 2}": 1} for case in range(5)]
+    alone = spread.summed(cases, tmp_path, jobs=1)
+    assert alone == {"cases": 5, "sum": 10, "of_0": 3, "of_1": 2}
+    assert spread.summed(cases, tmp_path, jobs=2) == alone
+    with pytest.raises(RuntimeError, match="no such figure"):
+        spread.summed([*cases[:1], lambda: {}["no such figure"]], tmp_path, jobs=2)
