@@ -330,9 +330,9 @@ class Tape:
             return None
         # Decide what each lane does, and whether the arrays of the block's rows fit in shared memory.
         kinds = schedule(works, own)
-        on_chip = sum(one.size * one.bytes for one in own if kinds[one.name] == SHARED)
+        in_shared = sum(one.size * one.bytes for one in own if kinds[one.name] == SHARED)
         lanes = LANES[self._device.type]
-        if not (lanes and BLOCK // lanes * on_chip <= MOST_BYTES):
+        if not (lanes and BLOCK // lanes * in_shared <= MOST_BYTES):
             lanes = 0
         # Only pointers that no operation writes may be `const`, and be loaded ahead.
         read = {name: ctype for name, ctype in pointed.items() if name not in changed}

@@ -12,7 +12,7 @@ from ksim_rl.physics.newton import solver as newton
 from tests.physics.rows_of_all_kinds import CONES, ROWS_OF_ALL_KINDS
 
 NUM_ENVS = 300
-ROWS_ON_CHIP = (64, 8, 0)
+ROWS_IN_SHARED = (64, 8, 0)
 
 
 # Joints of the spine and of each limb: lanes sum tiles of a quadruped's Hessian, and rows of a humanoid's.
@@ -73,7 +73,7 @@ def worlds(cone: str) -> World:
 
 
 def check_solutions(world: World) -> None:
-    """Solve with rows on the chip and beyond, each twice: as MuJoCo Warp's solver does, and with the same bits."""
+    """Solve with rows in shared memory and beyond: as MuJoCo Warp's solver does, and twice with the same bits."""
     model, data = world.warp_model, world.warp_data_E
     found = []
     with wp.ScopedDevice("cuda"):
@@ -83,7 +83,7 @@ def check_solutions(world: World) -> None:
         mjw.fwd_acceleration(model, data, factorize=True)
         for solve in (
             partial(mjw.solve, model, data),
-            *(newton.solver(model, data, rows_on_chip=rows) for rows in ROWS_ON_CHIP),
+            *(newton.solver(model, data, rows_in_shared=rows) for rows in ROWS_IN_SHARED),
         ):
             twice = []
             for _ in range(2):  # the second is ordered by the first

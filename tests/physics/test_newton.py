@@ -102,14 +102,14 @@ def test_iterations_and_overflow_are_those_of_mujoco_warp(cone, iterations):
 
 
 @pytest.mark.parametrize("cone", ONE_OF_CONES)
-def test_rows_that_find_no_room_on_chip_solve_alike(cone):
+def test_rows_that_find_no_room_in_shared_memory_solve_alike(cone):
     world = worlds(cone)
     rows_of(world)
     found = []
     with wp.ScopedDevice("cpu"):
-        for rows_on_chip in (world.njmax, 10, 0):
+        for rows_in_shared in (world.njmax, 10, 0):
             world.qacc_EL.zero_()
-            newton.solver(world.warp_model, world.warp_data_E, rows_on_chip=rows_on_chip)()
+            newton.solver(world.warp_model, world.warp_data_E, rows_in_shared=rows_in_shared)()
             found.append(world.qacc_EL.clone())
     assert found[0].any()
     for other in found[1:]:
@@ -170,10 +170,10 @@ def test_limbs_with_and_without_contacts_between_them_move_as_in_the_c_engine(co
     world.qvel_EL.copy_(0.7 * torch.randn(world.qvel_EL.shape, generator=generator))
     rows_of(world)
     touched = []
-    for rows_on_chip in (world.njmax, 3):
+    for rows_in_shared in (world.njmax, 3):
         world.qacc_EL.zero_()
         with wp.ScopedDevice("cpu"):
-            newton.solver(world.warp_model, world.warp_data_E, rows_on_chip=rows_on_chip)()
+            newton.solver(world.warp_model, world.warp_data_E, rows_in_shared=rows_in_shared)()
         for row in range(NUM_ENVS):
             mj_data = mujoco.MjData(model)
             mj_data.qpos[:], mj_data.qvel[:] = world.qpos_EL[row], world.qvel_EL[row]

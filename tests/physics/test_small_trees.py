@@ -107,5 +107,5 @@ def test_a_small_tree_moves_as_in_the_c_engine(xml: str) -> None:
 def test_rows_of_every_small_tree_find_room(nv: int) -> None:
     for parents, njmax in itertools.product(_trees(nv), (1, 4, 7)):
         limbs = limbs_of(parents)
-        sizes = layout(nv, njmax, limbs, ntendon=0, elliptic=False, rows_on_chip=njmax)
+        sizes = layout(nv, njmax, limbs, ntendon=0, elliptic=False, rows_in_shared=njmax)
         assert sizes["NARROW"] <= sizes["STRIDE"], (parents, njmax)

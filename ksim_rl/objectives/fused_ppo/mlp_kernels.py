@@ -260,8 +260,8 @@ def lower_gradients(
 ):  # fmt: skip
     """Sum the gradients of both layers around the first hidden one, which is computed here again.
 
-    Program (i, s, n) has LOWER of its elements, whose weights stay on the chip, over the ROWS of split s, in network n;
-    neither they nor the gradients at them are ever in memory. It writes to the places of its split, as
+    Program (i, s, n) has LOWER of its elements, whose weights stay in shared memory, over the ROWS of split s, in
+    network n; neither they nor the gradients at them are ever in memory. It writes to the places of its split, as
     `weight_gradients` does, all but the biases of the second layer. All is transposed: the result here is the
     first factor of the next product, as which it stays in registers. Observations are HEAD columns and REST more, both
     powers of two, which are fewer than OBS.

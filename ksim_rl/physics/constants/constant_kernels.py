@@ -255,17 +255,17 @@ def floats_per_world(nv: int, nbody: int) -> int:
 
 
 @functools.cache
-def constants_kernel(nv: int, nbody: int, lanes: int, on_chip: bool) -> wp.Kernel:
+def constants_kernel(nv: int, nbody: int, lanes: int, in_shared: bool) -> wp.Kernel:
     """Return the kernel that recomputes constants; launch it over (worlds, lanes), in blocks of as many lanes.
 
-    Its arrays are on the chip (in shared memory), or else in the scratch memory of its `Constants`.
+    Its arrays are in shared memory, or else in the scratch memory of its `Constants`.
     """
     # Sizes are compile-time constants, so that arrays in shared memory have them; the cache keeps one kernel for each.
     sizes = {
         "NV": nv,
         "NB": nbody,
         "FLOATS": floats_per_world(nv, nbody),
-        "ON_CHIP": int(on_chip),
+        "IN_SHARED": int(in_shared),
         "LANES": lanes,
         "THREADS": lanes,
     }

@@ -15,7 +15,7 @@ namespace given {
 constexpr int NV = 14;          // degrees of freedom
 constexpr int NB = 10;          // bodies
 constexpr int FLOATS = 788;     // of a world, see `Memory`
-constexpr int ON_CHIP = 1;      // whether these are in shared memory, or else in the scratch
+constexpr int IN_SHARED = 1;      // whether these are in shared memory, or else in the scratch
 }
 
 using namespace given;
@@ -258,8 +258,8 @@ CUDA_CALLABLE inline void run(int index, int lane, const Arguments& a)
 {
     float* begin = a.scratch.data + (size_t)index * FLOATS;
 #if defined(__CUDA_ARCH__)
-    __shared__ float on_chip[ON_CHIP ? FLOATS : 1];
-    begin = ON_CHIP ? on_chip : begin;
+    __shared__ float in_shared[IN_SHARED ? FLOATS : 1];
+    begin = IN_SHARED ? in_shared : begin;
 #endif
     const World world {index, lane};
     const Memory m(begin);

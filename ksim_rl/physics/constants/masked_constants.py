@@ -24,7 +24,7 @@ _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPA
 SLIDES_ALONE = 2
 LANES = 128  # threads that share the work of one world on a GPU: a block
 # Of the 48 KiB of shared memory that any block has, some is Warp's.
-_MOST_FLOATS_ON_CHIP = 40 * 1024 // 4
+_MOST_FLOATS_IN_SHARED = 40 * 1024 // 4
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -60,8 +60,8 @@ class MaskedConstants:
         starts, sizes = _joint_groups(mj_model)
         self._lanes = LANES if mask.device.is_cuda else 1
         floats = kernels.floats_per_world(nv, nbody)
-        on_chip = mask.device.is_cuda and floats <= _MOST_FLOATS_ON_CHIP
-        self._kernel = kernels.constants_kernel(nv, nbody, self._lanes, on_chip)
+        in_shared = mask.device.is_cuda and floats <= _MOST_FLOATS_IN_SHARED
+        self._kernel = kernels.constants_kernel(nv, nbody, self._lanes, in_shared)
         # Frames at qpos0 are shared unless a field that moves them differs between worlds.
         num_frames = num_envs if self._moves else 1
         self._mask = mask
@@ -86,7 +86,7 @@ class MaskedConstants:
             "xipos": wp.zeros((num_envs, nbody), dtype=wp.vec3),
             "inertia": wp.zeros((num_envs, nbody), dtype=wp.mat33),
             # One row where shared memory holds it, since a kernel takes an array in any case.
-            "scratch": wp.zeros((1 if on_chip else num_envs, floats), dtype=float),
+            "scratch": wp.zeros((1 if in_shared else num_envs, floats), dtype=float),
         }
         self._constants = filled(kernels.Constants, own, warp_model)
 

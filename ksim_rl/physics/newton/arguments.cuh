@@ -17,7 +17,7 @@ constexpr int SPREAD = 22;
 constexpr int WORKSPACE = 176;
 constexpr int COLUMN = 16;
 constexpr int BOUNDS = 64;
-constexpr int ROWS_ON_CHIP = 32;
+constexpr int ROWS_IN_SHARED = 32;
 constexpr int TILE = 8;  // lanes that sum the tile of a limb, or 0
 constexpr int ELLIPTIC = 1;
 constexpr int FLOATS = 1500;
@@ -78,7 +78,7 @@ struct Arguments {
     wp::array_t<float> efc_J;
     wp::array_t<int> efc_type;
     wp::array_t<int> efc_id;
-    wp::array_t<float> scratch;  // rows that find no room on the chip
+    wp::array_t<float> scratch;  // rows that find no room in shared memory
     wp::array_t<float> qacc_warmstart;
     wp::array_t<float> qfrc_smooth;
     wp::array_t<int> M_hinit_i;

@@ -117,7 +117,7 @@ UNROLL
             }
         }
     };
-    add_rows(0, s.near_rows, s.chip);
+    add_rows(0, s.near_rows, s.near);
     if (HAS_FAR_ROWS)
         add_rows(s.near_rows, s.rows, s.far);
     if (ELLIPTIC)

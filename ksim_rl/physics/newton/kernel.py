@@ -47,7 +47,7 @@ class Invariant(enum.IntFlag):
 
 
 def layout(
-    nv: int, njmax: int, limbs: Limbs, *, ntendon: int, elliptic: bool, rows_on_chip: int
+    nv: int, njmax: int, limbs: Limbs, *, ntendon: int, elliptic: bool, rows_in_shared: int
 ) -> dict[str, int]:
     """Return the sizes of the arrays that a world's lanes share, by names of the C++, and their sum in `FLOATS`."""
     # Arms couple a limb to each degree of freedom of the trunk; one more has the gradient.
@@ -85,7 +85,7 @@ def layout(
     # The inertia matrix and one vector, rows of the Jacobian, workspace, a vector by limbs, bounds, numbers per row.
     floats = (
         (nv + 1) * stride
-        + rows_on_chip * narrow
+        + rows_in_shared * narrow
         + workspace
         + spread
         + bounds
@@ -104,7 +104,7 @@ def layout(
         "WORKSPACE": workspace,
         "COLUMN": column,
         "BOUNDS": bounds,
-        "ROWS_ON_CHIP": rows_on_chip,
+        "ROWS_IN_SHARED": rows_in_shared,
         "TILE": tile,
         "ELLIPTIC": elliptic,
         "FLOATS": floats + (4 * rows + rows // 2 if elliptic else 0) + (rows // 2 if tile else 0),

@@ -11,7 +11,7 @@
 //
 // The lanes of a world share out its degrees of freedom: lane l has l, l + LANES, ..., each of them a `block`. Of
 // each it has the row of the Hessian from the block's first column on: on CUDA these rows lie in registers, and
-// with one lane, on the CPU, they are the upper triangle. J and M lie on the chip as whole rows, zeros included:
+// with one lane, on the CPU, they are the upper triangle. J and M lie in shared memory as whole rows, zeros included:
 // then sums over them have no index to look up, and the lanes read one address or adjacent ones.
 //
 // Here the degrees of freedom are in the order of their slots: the trunk of the kinematic tree, then its limbs (see
@@ -22,7 +22,7 @@
 namespace newton {
 
 constexpr int BLOCKS = (NV + LANES - 1) / LANES;
-constexpr bool HAS_FAR_ROWS = ROWS_ON_CHIP * NARROW < NJ * STRIDE;  // some may find no room on the chip
+constexpr bool HAS_FAR_ROWS = ROWS_IN_SHARED * NARROW < NJ * STRIDE;  // some may find no room in shared memory
 constexpr int LIMB_BEGIN = (TRUNK + 3) / 4 * 4, LIMB_STRIDE = (LIMB + 3) / 4 * 4, PADDED_ROWS = (NJ + 3) / 4 * 4;
 constexpr int ARMS = TRUNK + 1;  // columns of what couples a limb to the trunk, of which the last is the gradient's
 constexpr int ENTRIES = ARMS * (ARMS + 1) / 2;
@@ -31,9 +31,9 @@ constexpr int EQUALITY = 0, FRICTION = 1, ONE_SIDED = 2, CONE_HEAD = 3, CONE_TAN
 constexpr int MOST_OF_CONE = 6;
 
 // Shared memory of a world.
-struct Chip {
+struct SharedMemory {
     float* const mass;       // M
-    float* const chip;       // J of the rows that find room
+    float* const near;       // J of the rows that find room
     float* const columns;    // two, or what part 4 has of the Hessian
     float* const spread;     // `shared` with LIMB_STRIDE entries of each limb
     float* const shared;     // a vector of the degrees of freedom, for all lanes to read
@@ -54,10 +54,10 @@ struct Chip {
     float* const limb_arms;    // A_k', then Z_k', by columns
     float* const trunk;        // T by rows, up to the diagonal
 
-    CUDA_CALLABLE explicit Chip(float* memory)
+    CUDA_CALLABLE explicit SharedMemory(float* memory)
         : mass(memory)
-        , chip(mass + NV * STRIDE)
-        , columns(chip + ROWS_ON_CHIP * NARROW)
+        , near(mass + NV * STRIDE)
+        , columns(near + ROWS_IN_SHARED * NARROW)
         , spread(columns + WORKSPACE)
         , shared(spread + SPREAD)
         , residual(shared + STRIDE)
@@ -98,7 +98,7 @@ struct Registers {
 };
 
 // The constraints of a world while they are solved, as one of its lanes sees them.
-struct Solve : Chip, Registers {
+struct Solve : SharedMemory, Registers {
     const Arguments& a;
     const World world;
     const int lane, rows, equalities, frictions;
@@ -106,7 +106,7 @@ struct Solve : Chip, Registers {
     int num_units;
     const float impratio, tolerance, ls_tolerance;
     int* const states;
-    // Whether no row touches two limbs; how wide rows are, how many lie on the chip, and where the others are.
+    // Whether no row touches two limbs; how wide rows are, how many lie in shared memory, and where the others are.
     bool by_limbs = false;
     int width = STRIDE, near_rows = 0;
     float* far = nullptr;
@@ -114,7 +114,7 @@ struct Solve : Chip, Registers {
     int tile_slot = 0, tile_length = 0;  // the slots of its limb
 
     CUDA_CALLABLE Solve(const Arguments& a, const World& world, float* memory, const Registers& registers)
-        : Chip(memory)
+        : SharedMemory(memory)
         , Registers(registers)
         , a(a)
         , world(world)
@@ -204,17 +204,17 @@ struct Solve : Chip, Registers {
 
     CUDA_CALLABLE float* jacobian_of(int row) const
     {
-        return (row < near_rows ? chip : far) + row * width;
+        return (row < near_rows ? near : far) + row * width;
     }
 
-    // Calls body(row, its J) for the rows first, first + stride, ...: those on chip, so many in one go, then those that
-    // found no room there.
+    // Calls body(row, its J) for the rows first, first + stride, ...: those in shared memory, so many in one go, then
+    // those that found no room there.
     template <int AT_ONCE, class Body>
     CUDA_CALLABLE void each_row(int first, int stride, Body body) const
     {
 #pragma unroll AT_ONCE
         for (int row = first; row < near_rows; row += stride)
-            body(row, chip + row * width);
+            body(row, near + row * width);
         if (HAS_FAR_ROWS)
 #pragma unroll 1
             for (int row = near_rows + first; row < rows; row += stride)
@@ -243,7 +243,7 @@ CUDA_CALLABLE inline void measure_rows(Solve& s)
     }
     s.by_limbs = LIMBS > 0 && lanes_where(couples) == 0;
     s.width = s.by_limbs ? NARROW : STRIDE;
-    s.near_rows = wp::min(s.rows, ROWS_ON_CHIP * NARROW / s.width);
+    s.near_rows = wp::min(s.rows, ROWS_IN_SHARED * NARROW / s.width);
     s.far = s.row_of(a.scratch) - s.near_rows * s.width;
 }
 

@@ -44,9 +44,9 @@ def unsuited(mj_model: mujoco.MjModel, *, njmax: int) -> str | None:
     nv = mj_model.nv
     elliptic = bool(opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
     limbs = limbs_of(mj_model.dof_parentid.tolist())
-    floats = layout(nv, njmax, limbs, ntendon=mj_model.ntendon, elliptic=elliptic, rows_on_chip=0)[
-        "FLOATS"
-    ]
+    floats = layout(
+        nv, njmax, limbs, ntendon=mj_model.ntendon, elliptic=elliptic, rows_in_shared=0
+    )["FLOATS"]
     reasons = {
         "the solver is not Newton's": opt.solver != mujoco.mjtSolver.mjSOL_NEWTON,
         f"the integrator is {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator
@@ -92,7 +92,7 @@ def solver(
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
     *,
-    rows_on_chip: int | None = None,
+    rows_in_shared: int | None = None,
     broken: wp.array | None = None,
 ) -> Callable[..., None]:
     """Return a launcher of the solver: accelerations and forces from the constraint rows, which must be sparse.
@@ -101,7 +101,7 @@ def solver(
 
     Args:
         warp_model, warp_data_E: a model that is not `unsuited`, and its worlds, with arrays in their final place.
-        rows_on_chip: None takes the measured best: half of the rows, which few worlds exceed, where they fit.
+        rows_in_shared: None takes the measured best: half of the rows, which few worlds exceed, where they fit.
         broken: int32 [E], makes a debug build, which adds to each world's number the `Invariant`s that do not hold.
     """
     m = warp_model
@@ -113,10 +113,10 @@ def solver(
     limbs = limbs_of(m.dof_parentid.numpy().tolist())
     sizes_with = partial(layout, m.nv, d.njmax, limbs, ntendon=m.ntendon, elliptic=elliptic)
     # Shared memory without any row of the Jacobian; the rest is filled with rows.
-    sizes = sizes_with(rows_on_chip=0)
+    sizes = sizes_with(rows_in_shared=0)
     stride = sizes["STRIDE"]
     narrow = sizes["NARROW"]
-    if rows_on_chip is None:
+    if rows_in_shared is None:
         # Of many worlds, eleven run at the same time if an eighth of the rows finds room; see FLOATS_OF_MANY.
         is_tight = (
             d.nworld > FEW_WORLDS and sizes["FLOATS"] + d.njmax // 8 * narrow <= FLOATS_OF_MANY
@@ -124,12 +124,12 @@ def solver(
         room = (FLOATS_OF_MANY if is_tight else FLOATS_PER_WORLD) - sizes["FLOATS"]
         if on_cuda:
             # Half of the rows suffice: few worlds have more.
-            rows_on_chip = min(-(-d.njmax // 2), max(0, room // narrow))
+            rows_in_shared = min(-(-d.njmax // 2), max(0, room // narrow))
         else:
-            rows_on_chip = d.njmax
-    sizes = sizes_with(rows_on_chip=rows_on_chip)
+            rows_in_shared = d.njmax
+    sizes = sizes_with(rows_in_shared=rows_in_shared)
     # Rows beyond are in global memory, in rows of full width.
-    far_floats = (d.njmax - rows_on_chip * narrow // stride) * stride
+    far_floats = (d.njmax - rows_in_shared * narrow // stride) * stride
     own = {
         "efc_J_colind": efc.J_colind.reshape((d.nworld, -1)),
         "efc_J": efc.J.reshape((d.nworld, -1)),

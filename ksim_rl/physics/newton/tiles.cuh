@@ -105,8 +105,8 @@ UNROLL
     int index = s.tile_begin;
 #pragma unroll 1
     for (int row; index < s.tile_end && (row = s.listed[index]) < s.near_rows; ++index)
-        add_row(row, [&](int near) { return s.chip + near * NARROW; });
-    if (ROWS_ON_CHIP < NJ)
+        add_row(row, [&](int near) { return s.near + near * NARROW; });
+    if (ROWS_IN_SHARED < NJ)
 #pragma unroll 1
         for (; index < s.tile_end; ++index)
             add_row(s.listed[index], [&](int other) { return s.jacobian_of(other); });
