@@ -71,7 +71,7 @@ def resume(arguments: list[str]) -> int:
         check_run_tree(saved.config, saved.path, given=fields)
     tree = {**saved.config, "device": options.device}
     if overrides:
-        cfg = conf.changed(tree, saved.path, overrides)
+        cfg = conf.changed(tree, saved.path, overrides, learns=True)
     else:
         cfg = RunCfg.from_tree(tree)
     # The device of this machine, not of the machine where the run began.

@@ -19,6 +19,7 @@ from ksim_rl.conf import spelling
 from ksim_rl.conf.registration import CHOSEN_BY_TASK, MODULE, NAME, RUN_AGAIN, register, store_run
 from ksim_rl.config.overrides import check_parsed, quoting
 from ksim_rl.config.trees import Tree
+from ksim_rl.envs.replaced_fields import check_not_replaced
 from ksim_rl.trainers import RunCfg
 
 # A sweep over more combinations than this is checked in part here; each job checks its own config again.
@@ -33,20 +34,26 @@ def compose(overrides: Sequence[str] = ()) -> RunCfg:
     return check_command_line(overrides, name=NAME, multirun=False, values=True)[0]
 
 
-def changed(tree: Tree, path: Path, overrides: Sequence[str]) -> RunCfg:
-    """Return a run's config, the `tree` of its file at `path`, with overrides; a ValueError names a bad one."""
+def changed(tree: Tree, path: Path, overrides: Sequence[str], *, learns: bool = False) -> RunCfg:
+    """Return a run's config, the `tree` of its file at `path`, with overrides; a ValueError names a bad one.
+
+    With `learns` curricula run, and the fields that they replace cannot be overridden alone.
+    """
     register()
     store_run(tree, path)
-    return check_command_line(overrides, name=RUN_AGAIN, multirun=False, values=True)[0]
+    return check_command_line(
+        overrides, name=RUN_AGAIN, multirun=False, values=True, learns=learns
+    )[0]
 
 
 def check_command_line(
-    texts: Sequence[str], *, name: str, multirun: bool, values: bool
+    texts: Sequence[str], *, name: str, multirun: bool, values: bool, learns: bool = True
 ) -> list[RunCfg]:
     """Refuse overrides that name an unknown group, choice or field, or (with `values`) give a field a bad value.
 
     The primary config is `name`; sweeps such as `seed=1,2` need `multirun`. With `values` it returns the config, of
-    each job of a sweep. The ValueError is one line that names the fault, and the near names or the valid values.
+    each job of a sweep. With `learns` overrides of what a curriculum replaces are refused. The ValueError is one line
+    that names the fault, and the near names or the valid values.
     """
     # Hydra keeps one global state: an earlier call in this process would be found in the way.
     GlobalHydra.instance().clear()
@@ -67,7 +74,7 @@ def check_command_line(
             _check_names(overrides, loader, name)
             # Many jobs are checked in part; each of them checks itself when it starts.
             jobs = itertools.islice(_jobs(overrides), MAX_CHECKED_JOBS if values else 0)
-            return [_compose(job, name) for job in jobs]
+            return [_compose(job, name, learns=learns) for job in jobs]
     except (HydraException, OmegaConfBaseException) as error:
         raise ValueError(f"the overrides do not compose: {' '.join(str(error).split())}") from error
 
@@ -84,7 +91,7 @@ def without_sweeps(texts: Sequence[str]) -> list[str]:
     return [override.get_key_element() for override in parsed if not override.is_sweep_override()]
 
 
-def _compose(overrides: list[str], name: str) -> RunCfg:
+def _compose(overrides: list[str], name: str, *, learns: bool) -> RunCfg:
     # Interpolations are resolved here, as the run's config holds values only.
     plain = OmegaConf.to_container(hydra.compose(name, overrides=overrides), resolve=True)
     assert isinstance(plain, dict)
@@ -96,6 +103,8 @@ def _compose(overrides: list[str], name: str) -> RunCfg:
                 f"override {override!r}: collector.rollout_length={cfg.collector.rollout_length} sets it; leave one of "
                 "the two out, or set collector.rollout_length=null"
             )
+    if learns:
+        check_not_replaced(cfg.task, overrides)
     return cfg
 
 

@@ -2,7 +2,7 @@
 
 import copy
 import string
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -28,6 +28,30 @@ def check_overrides(tree: Tree, overrides: Sequence[str]) -> None:
             reason = str(error).splitlines()[0]
             raise ValueError(f"override {text!r} does not parse: {reason}{quoting(text)}") from None
     check_parsed(tree, parsed)
+
+
+def given_fields(overrides: Iterable[str]) -> list[str]:
+    """Return the fields that overrides give values, down into mappings: "a.b" and "a.c" of "a={b: 1, c: 2}"."""
+    parser = OverridesParser.create()
+    found: list[str] = []
+    for text in overrides:
+        override = parser.parse_override(text)
+        # A deleted field gets no value; several values of a sweep are of the field itself.
+        if override.is_delete():
+            continue
+        if override.is_sweep_override():
+            found.append(override.key_or_group)
+        else:
+            found.extend(_leaves(override.key_or_group, _plain(override)))
+    return found
+
+
+def _leaves(path: str, value: Plain) -> Iterator[str]:
+    if isinstance(value, dict) and value:
+        for name, inside in value.items():
+            yield from _leaves(f"{path}.{name}", inside)
+    else:
+        yield path
 
 
 def quoting(text: str) -> str:

@@ -49,6 +49,14 @@ class StartInMotion(ResetToMotion):
     joint_range: NonNegative = 0.0
     part_s: Positive | None = None
 
+    def _check_fields(self) -> None:
+        super()._check_fields()
+        if self.part_s is not None and self.start_range != (0.0, 1.0):
+            raise ValueError(
+                f"start_range={self.start_range} with part_s={self.part_s:g}: starts follow the curriculum's weights "
+                "of parts, and not the range: set part_s=null, and leave the curriculum out"
+            )
+
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         super().__call__(view, mask_E)
         robot = view.robot

@@ -103,3 +103,8 @@ def test_who_has_not_failed_counts_for_nothing():
 def test_ranges_are_checked():
     with pytest.raises(ValueError, match="joint_range"):
         StartInMotion(file=CLIP, joint_range=-0.1)
+
+
+def test_a_range_of_starts_that_the_curriculum_would_replace_is_refused():
+    with pytest.raises(ValueError, match=r"start_range=\(0.0, 0.5\) with part_s=1: .*part_s=null"):
+        StartInMotion(file="x.npz", start_range=(0.0, 0.5), part_s=1.0)

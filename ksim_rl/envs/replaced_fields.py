@@ -1,0 +1,54 @@
+"""Finds overrides of fields that a curriculum replaces while an env runs, which would hold for a while only."""
+
+import sys
+from collections.abc import Iterator, Sequence
+
+from ksim_rl.config.overrides import given_fields
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.term import CurriculumTerm
+
+PATH = "task"
+
+
+def check_not_replaced(cfg: ManagerBasedRlEnvCfg, overrides: Sequence[str]) -> None:
+    """Refuse overrides of fields whose values a curriculum replaces, unless they are of the curriculum as well.
+
+    Args:
+        cfg: the env's config, with the overrides.
+        overrides: Hydra's, such as "task.commands.twist.lin_vel_x=[0,1]".
+
+    Raises:
+        ValueError: naming the field, the curriculum, and how to go without it.
+    """
+    given = given_fields(overrides)
+    for name, term in cfg.curriculum.items():
+        curriculum = f"{PATH}.curriculum.{name}"
+        # Whoever says what the curriculum does knows of it.
+        if any(_is_in(field, curriculum) for field in given):
+            continue
+        for replaced in _replaced(term):
+            for field in given:
+                if _is_in(field, f"{PATH}.{replaced}"):
+                    raise ValueError(
+                        f"{field}: the curriculum {name!r} replaces {PATH}.{replaced} in training: leave it out, "
+                        f"~{curriculum}, or override its values too"
+                    )
+
+
+def _replaced(term: CurriculumTerm) -> Iterator[str]:
+    """Yield the fields that a curriculum writes, such as "commands.twist.lin_vel_x"."""
+    for reward in term.adapted_rewards:
+        yield f"rewards.{reward}.weight"
+    for scope, stages in term.adapted_fields.items():
+        for fields in stages:
+            for field in fields:
+                yield f"{scope.replace('/', '.')}.{field}"
+    # Of all stages, however late they begin.
+    for command, stages in term.command_ranges(sys.maxsize).items():
+        for ranges in stages:
+            for field in ranges:
+                yield f"commands.{command}.{field}"
+
+
+def _is_in(field: str, path: str) -> bool:
+    return field == path or field.startswith(f"{path}.")

@@ -1,0 +1,87 @@
+"""A field that a curriculum replaces cannot be overridden in silence."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from ksim_rl import conf, envs
+from ksim_rl.config.overrides import given_fields
+from ksim_rl.envs import mdp
+from ksim_rl.envs.replaced_fields import check_not_replaced
+
+TASK = "go1_velocity_flat"
+RANGE = "task.commands.twist.lin_vel_x=[0.0,0.5]"
+STAGE = "task.curriculum.command_ranges.stages.120000.lin_vel_x=[0.0,0.6]"
+CURRICULA = {
+    "ranges": mdp.CommandRangesByStage(command="twist", stages={9: {"lin_vel_x": (0.0, 1.0)}}),
+    "level": mdp.CommandRangesByLevel(
+        command="gait", start={"height": (0.0, 0.1)}, end={"height": (0.0, 0.2)}
+    ),
+    "weight": mdp.RewardWeightByStage(reward="upright", stages={9: 2.0}),
+    "slope": mdp.RewardWeightByLevel(reward="still", start=0.0, end=1.0),
+    "width": mdp.RewardFieldsByStage(reward="upright", stages={9: {"std": 0.1}}),
+    "limit": mdp.TerminationFieldsByStage(termination="fell", stages={9: {"limit_angle": 1.0}}),
+}
+
+
+def with_curricula(*names):
+    return dataclasses.replace(
+        envs.make_cfg("cartpole_balance"), curriculum={name: CURRICULA[name] for name in names}
+    )
+
+
+@pytest.mark.parametrize(
+    ("override", "curriculum"),
+    [
+        ("task.commands.twist.lin_vel_x=[0,1]", "ranges"),
+        ("task.commands.twist={lin_vel_x: [0, 1], lin_vel_y: [0, 1]}", "ranges"),
+        ("task.commands.twist.lin_vel_x.1=0.5", "ranges"),
+        ("task.commands.gait.height=[0,1]", "level"),
+        ("task.rewards.upright.weight=1.0", "weight"),
+        ("task.rewards.still.weight=1.0", "slope"),
+        ("task.rewards.upright.std=0.5", "width"),
+        ("task.terminations.fell.limit_angle=0.5", "limit"),
+    ],
+)
+def test_each_curriculum_names_what_it_replaces(override, curriculum):
+    cfg = with_curricula(*CURRICULA)
+    field = override.partition("=")[0]
+    with pytest.raises(
+        ValueError, match=rf"{field}.*'{curriculum}'.*~task.curriculum.{curriculum},"
+    ):
+        check_not_replaced(cfg, [override])
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["task.commands.twist={lin_vel_y: [0, 1]}", "task.commands.twist.heading=null"],
+        ["task.rewards.upright.offset=1.0", "~task.rewards.still"],
+        ["task.rewards.upright.weight=1.0", "task.curriculum.weight.stages={9: 1.0}"],
+    ],
+)
+def test_other_fields_and_those_whose_curriculum_is_overridden_too_are_free(overrides):
+    check_not_replaced(with_curricula("ranges", "weight", "width"), overrides)
+
+
+def test_fields_are_given_down_into_mappings():
+    texts = ["a.b=1", "+c={d: 1, e: {f: 2, g: {}}}", "~h", "i=1,2"]
+    assert given_fields(texts) == ["a.b", "c.d", "c.e.f", "c.e.g", "i"]
+
+
+@pytest.mark.full
+def test_a_training_is_refused_and_an_evaluation_is_not():
+    with pytest.raises(ValueError, match="lin_vel_x: the curriculum 'command_ranges' replaces"):
+        envs.make_cfg(TASK, [RANGE])
+    cfg = envs.make_cfg(TASK, [RANGE, "~task.curriculum.command_ranges"])
+    assert cfg.commands["twist"].ranges["lin_vel_x"] == (0.0, 0.5) and not cfg.curriculum
+    with pytest.raises(ValueError, match="'command_ranges' replaces"):
+        conf.compose([f"task={TASK}", RANGE])
+    whole = conf.compose([f"task={TASK}", RANGE, STAGE])
+    assert whole.task.commands["twist"].ranges["lin_vel_x"] == (0.0, 0.5)
+    tree = whole.to_tree()
+    # Evaluations leave curricula out.
+    assert conf.changed(tree, Path("config.yaml"), [RANGE]).task == whole.task
+    with pytest.raises(ValueError, match="'command_ranges' replaces"):
+        conf.changed(tree, Path("config.yaml"), [RANGE], learns=True)
