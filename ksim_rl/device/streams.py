@@ -134,20 +134,23 @@ def waiting_allowed(device: torch.device) -> Iterator[None]:
 
 
 @contextmanager
-def beside(aside: wp.Stream | None, *launches: Callable[[], None]) -> Iterator[None]:
+def beside(side_stream: wp.Stream | None, *launches: Callable[[], None]) -> Iterator[None]:
     """Run `launches` in parallel with the work of this block on a side stream; without a stream, after it.
 
     Both follow the work before the block and precede the work after it, in a graph too. Neither may write memory that
     the other reads or writes, or free memory that the other allocates: memory is given back in the order of one stream.
     """
-    if aside is not None:
+    if side_stream is not None:
         # The side stream starts after the work that precedes the block.
-        aside.wait_stream(aside.device.stream)
-        with wp.ScopedStream(aside, sync_enter=False), torch.cuda.stream(wp.stream_to_torch(aside)):
+        side_stream.wait_stream(side_stream.device.stream)
+        with (
+            wp.ScopedStream(side_stream, sync_enter=False),
+            torch.cuda.stream(wp.stream_to_torch(side_stream)),
+        ):
             for launch in launches:
                 launch()
         yield
-        aside.device.stream.wait_stream(aside)
+        side_stream.device.stream.wait_stream(side_stream)
     else:
         yield
         for launch in launches:

@@ -27,7 +27,7 @@ class Stages:
         contacts: reads contact sensors and accelerometers from lists of contacts; None for MuJoCo Warp's kernels.
         limits: reads the sensors of limits.
         mend: mends MuJoCo Warp's constraint rows and transmissions, where these are wrong.
-        aside: a side stream for work that can run in parallel with the rest.
+        side_stream: a side stream for work that can run in parallel with the rest.
     """
 
     solve: Callable[..., None]
@@ -38,7 +38,7 @@ class Stages:
     contacts: ContactReadings | None = None
     limits: LimitSensors | None = None
     mend: Callable[[], None] | None = None
-    aside: wp.Stream | None = None
+    side_stream: wp.Stream | None = None
 
 
 def run(
@@ -57,16 +57,16 @@ def run(
     """
     m = warp_model
     d = warp_data_E
-    aside = stages.aside
+    side_stream = stages.side_stream
     # Stages of MuJoCo Warp, and callbacks, may touch any array, so that nothing runs in parallel with them.
     if stages.dynamics is None or m.callback.sensor:
-        aside = None
+        side_stream = None
     if stages.dynamics is None:
         _launch_their_dynamics(stages, m, d)
     else:
-        _launch_our_dynamics(stages, stages.dynamics, m, d, aside)
+        _launch_our_dynamics(stages, stages.dynamics, m, d, side_stream)
     # Sensors of positions and velocities do not read the solution, so that both run in parallel.
-    with beside(aside if sensors else None, partial(_act_and_solve, stages, m, d)):
+    with beside(side_stream if sensors else None, partial(_act_and_solve, stages, m, d)):
         if sensors:
             _read_state(stages, m, d)
     _read_forces(stages, m, d, sensors=sensors, accelerometers=accelerometers)
@@ -93,18 +93,18 @@ def _launch_our_dynamics(
     dynamics: Callable[..., None],
     warp_model: mjw.Model,
     warp_data_E: mjw.Data,
-    aside: wp.Stream | None,
+    side_stream: wp.Stream | None,
 ) -> None:
     # Where dynamics alone fill a GPU, placing bodies twice, for collisions first, takes longer than it saves.
-    at_once = aside is not None and warp_data_E.nworld <= FEW_WORLDS
+    in_parallel = side_stream is not None and warp_data_E.nworld <= FEW_WORLDS
     # While collisions run, the rest of the dynamics goes on without placing geoms a second time.
-    if at_once:
+    if in_parallel:
         rest = [partial(dynamics, places_geoms=False)]
     else:
         rest = []
     # The worlds are ordered while collisions run, since their order follows from the last substep.
-    with beside(aside, partial(stages.solve, solves=False), *rest):
-        dynamics(goes_on=not at_once)
+    with beside(side_stream, partial(stages.solve, solves=False), *rest):
+        dynamics(goes_on=not in_parallel)
         if warp_model.opt.run_collision_detection:
             if stages.collide is not None:
                 stages.collide()

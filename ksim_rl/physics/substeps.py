@@ -40,7 +40,7 @@ class Substeps:
     The variants share all arrays with `warp_model`. Build them once its arrays are in their final place. The `plan`
     says which stages are ours. Our rows come with `contact_lists`, from which contact sensors are read; our
     integration keeps a `record` of overflow. Work that can run in parallel with the rest of a substep does so on the
-    stream `aside`.
+    stream `side_stream`.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Substeps:
         warp_data_E: mjw.Data,
         *,
         plan: SubstepPlan,
-        aside: wp.Stream | None = None,
+        side_stream: wp.Stream | None = None,
         mask: wp.array | None = None,
         record: Mapping[str, wp.array] | None = None,
         expanded: Collection[str] = (),
@@ -127,7 +127,7 @@ class Substeps:
             contacts=contacts,
             limits=limits,
             mend=mend,
-            aside=aside,
+            side_stream=side_stream,
         )
 
     @property

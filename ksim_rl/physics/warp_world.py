@@ -102,14 +102,14 @@ class WarpWorld(World):
             self.one_kernel_collisions_unavailable = plan.collisions
             self.one_kernel_integration_unavailable = plan.integration
             # One of torch's, since Warp's own wait for the default stream, which no capture allows.
-            aside = (
+            side_stream = (
                 None if self.device.type == "cpu" else warp_stream(torch.cuda.Stream(self.device))
             )
             with as_if_drawn(m, expanded):
                 self._substeps = Substeps(
                     *(self.mj_model, m, d),
                     plan=plan,
-                    aside=aside,
+                    side_stream=side_stream,
                     mask=self._reset_mask,
                     record=self._overflow.arrays,
                     expanded=expanded,

@@ -43,7 +43,7 @@ def test_captured_physics_and_torch_equal_eager_ones():
 def test_what_runs_beside_the_rest_of_a_substep_changes_no_bit():
     both, alone = (standing_quadrupeds(512, device="cuda") for _ in range(2))
     assert both.one_kernel_rows_unavailable is None
-    alone._substeps.stages = dataclasses.replace(alone._substeps.stages, aside=None)
+    alone._substeps.stages = dataclasses.replace(alone._substeps.stages, side_stream=None)
     graphs = []
     for world in (both, alone):
         world.qvel_EL[:, 6:].add_(torch.linspace(-2.0, 2.0, 512, device="cuda")[:, None])

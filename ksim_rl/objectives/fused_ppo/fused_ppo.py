@@ -246,12 +246,12 @@ class FusedPPO:
         self,
         rollout_ET: TensorDictBase,
         orders_KD: Int64[Tensor, "K D"],
-        *aside: Callable[[], None],
+        *meanwhile: Callable[[], None],
     ) -> tuple[dict[str, Float[Tensor, ""]], Int64[Tensor, ""], Int32[Tensor, ""]]:
         """Make all gradient steps of an update.
 
         `rollout_ET`, `["E","T"]`, may be time-major in memory, as a collector's. `orders_KD` has for each epoch the
-        env states in the order of the minibatches, counted env by env; a GPU calls `aside` during the steps.
+        env states in the order of the minibatches, counted env by env; a GPU calls `meanwhile` during the steps.
         Returned are means over the steps that were made, by the names of `SUMMARY`, how many in a row were not at most,
         both in the same memory each time, and how many env states took no part as an element was not finite.
         """
@@ -270,7 +270,7 @@ class FusedPPO:
             indices = self._rows[orders_KD.flatten()].split(self.batch)
             self.parameters.load()
             left_out = self.dataset.read(rollout_ET, evaluate=self._evaluate)
-            with beside(self._side, *aside):
+            with beside(self._side, *meanwhile):
                 for step, index_B in enumerate(indices):
                     if len(self.dataset.records) > self.dataset.size:
                         index_B = torch.cat([index_B, index_B + self.dataset.size])
