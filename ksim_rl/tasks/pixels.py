@@ -1,18 +1,77 @@
 """Tasks whose policy sees pictures alone."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from ksim_rl import mdp
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
+from ksim_rl.envs.view import EnvView
 from ksim_rl.modules import FEATURES, ActorCfg, CriticCfg, EncoderCfg, SharedTrunkCfg
 from ksim_rl.objectives import PPOCfg
+from ksim_rl.scene.robots.control_models import Reacher
 from ksim_rl.scene.sensors import CameraSensor
-from ksim_rl.tasks.control_suite import cartpole_balance
+from ksim_rl.tasks.control_suite import (
+    TARGET_RADIUS,
+    ReacherTarget,
+    cartpole_balance,
+    cartpole_swingup,
+    reacher,
+)
 from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.transforms.history import HistoryCfg
+
+CAMERA = "side"
+# Right and up of a picture, in the frame of the world.
+FROM_THE_SIDE = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+FROM_ABOVE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+def _seen(cfg: ManagerBasedRlEnvCfg, camera: CameraSensor) -> ManagerBasedRlEnvCfg:
+    """Return a task whose "actor" has the last three pictures, uint8 [E, 3, H, W, 3], and nothing else."""
+    frames = ObservationGroupCfg(
+        terms={"rgb": ObservationTermCfg(term=mdp.CameraImage(sensor=CAMERA))},
+        # Speeds can be seen in three pictures, and not in one.
+        history=HistoryCfg(length=3, flat=False),
+    )
+    return replace(
+        cfg,
+        scene=replace(cfg.scene, sensors={CAMERA: camera}),
+        observations={**cfg.observations, "actor": frames},
+    )
+
+
+def _training(
+    *,
+    num_envs: int,
+    data: DatasetCfg,
+    num_iterations: int,
+    eval_interval: int,
+    **objective: Any,
+) -> TrainingCfg:
+    """Return PPO with one encoder for actor and critic, as encoding is most of the work."""
+    return TrainingCfg(
+        num_envs=num_envs,
+        # Values reach 100 here: clipping their change to 0.2 would stop the critic from learning.
+        objective=PPOCfg(clip_value=False, schedule="fixed", num_epochs=4, **objective),
+        data=data,
+        modules=ModulesCfg(
+            trunk=SharedTrunkCfg(encoders={"actor": EncoderCfg()}, hidden_dims=(256,)),
+            actor=ActorCfg(in_keys=(FEATURES,), hidden_dims=(64,), obs_normalization=False),
+            critic=CriticCfg(in_keys=(FEATURES,), hidden_dims=(64,), obs_normalization=False),
+        ),
+        trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=eval_interval),
+    )
+
+
+# -- a pole on a cart --------------------------------------------------------------------------------------------
 
 
 def cartpole_balance_pixels() -> ManagerBasedRlEnvCfg:
@@ -21,44 +80,115 @@ def cartpole_balance_pixels() -> ManagerBasedRlEnvCfg:
     "actor" has the last three pictures, uint8 [E, 3, 64, 64, 3], in which speeds can be seen; "critic" has the state,
     which nothing reads unless `modules.critic.in_keys` says so.
     """
-    cfg = cartpole_balance()
     # 2.5 m of the rail are seen, from 3 m away.
-    camera = CameraSensor(
-        pos=(0.0, -3.0, 1.0), xyaxes=(1.0, 0.0, 0.0, 0.0, 0.0, 1.0), width=64, height=64
-    )
-    frames = ObservationGroupCfg(
-        terms={"rgb": ObservationTermCfg(term=mdp.CameraImage(sensor="side"))},
-        history=HistoryCfg(length=3, flat=False),
-    )
-    return replace(
-        cfg,
-        scene=replace(cfg.scene, sensors={"side": camera}),
-        observations={**cfg.observations, "actor": frames},
-    )
+    camera = CameraSensor(pos=(0.0, -3.0, 1.0), xyaxes=FROM_THE_SIDE, width=64, height=64)
+    return _seen(cartpole_balance(), camera)
+
+
+def cartpole_swingup_pixels() -> ManagerBasedRlEnvCfg:
+    """Return the config of `cartpole_swingup` seen as in `cartpole_balance_pixels`, from farther away."""
+    # 3.3 of 3.6 m of the rail: the cart goes farther here than for a pole that is up.
+    camera = CameraSensor(pos=(0.0, -4.0, 1.0), xyaxes=FROM_THE_SIDE, width=64, height=64)
+    return _seen(cartpole_swingup(), camera)
 
 
 CARTPOLE_BALANCE_PIXELS = Task(
     name="cartpole_balance_pixels",
     description="keep a pole upright on a cart, by pictures of 64 x 64 pixels alone",
     cfg=cartpole_balance_pixels,
-    training=TrainingCfg(
+    training=_training(
         num_envs=512,
-        # Values reach 100 here: clipping their change to 0.2 would stop the critic from learning.
-        objective=PPOCfg(
-            clip_value=False,
-            schedule="fixed",
-            learning_rate=5e-4,
-            num_epochs=4,
-            entropy_coeff=0.0,
-        ),
         data=DatasetCfg(num_env_states_per_minibatch=2048, num_minibatches=8),
-        # One encoder for actor and critic, as encoding is most of the work.
-        modules=ModulesCfg(
-            trunk=SharedTrunkCfg(encoders={"actor": EncoderCfg()}, hidden_dims=(256,)),
-            actor=ActorCfg(in_keys=(FEATURES,), hidden_dims=(64,), obs_normalization=False),
-            critic=CriticCfg(in_keys=(FEATURES,), hidden_dims=(64,), obs_normalization=False),
-        ),
-        trainer=TrainerCfg(num_iterations=120, eval_interval=10),
+        num_iterations=120,
+        eval_interval=10,
+        learning_rate=5e-4,
+        entropy_coeff=0.0,
     ),
     solved_at=900.0,
+)
+CARTPOLE_SWINGUP_PIXELS = Task(
+    name="cartpole_swingup_pixels",
+    description="swing a hanging pole up, by pictures of 64 x 64 pixels alone",
+    cfg=cartpole_swingup_pixels,
+    training=_training(
+        num_envs=1024,
+        data=DatasetCfg(num_env_states_per_minibatch=4096, num_minibatches=8),
+        num_iterations=400,
+        eval_interval=20,
+        learning_rate=5e-4,
+        gamma=0.995,
+        entropy_coeff=0.003,
+    ),
+    # As of `cartpole_swingup`.
+    solved_at=800.0,
+)
+
+
+# -- an arm with two joints --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReacherBesideTarget(Reacher):
+    """The reacher, and a ball that shows its target: the mocap body "target", which touches nothing."""
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a new spec of the model."""
+        spec = super().spec()
+        target = spec.worldbody.add_body(
+            name="target", mocap=True, pos=[0.2, 0.0, self.plane_height]
+        )
+        target.add_geom(
+            name="target",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[TARGET_RADIUS, 0.0, 0.0],
+            rgba=[0.1, 0.7, 0.2, 1.0],
+            contype=0,
+            conaffinity=0,
+        )
+        return spec
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenReacherTarget(ReacherTarget):
+    """A `ReacherTarget` at which the mocap body "target" stands, so that pictures show it."""
+
+    def resample(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
+        super().resample(view, mask_E)
+        mocap = int(view.world.mj_model.body_mocapid[view.resolver.one("body", "target")])
+        shown_E2 = view.world.view("mocap_pos")[:, mocap, :2]
+        # In place, and in the drawn rows only: nothing else moves it but resets, which draw too.
+        shown_E2.copy_(torch.where(mask_E[:, None], self.held(view), shown_E2))
+
+
+def reacher_pixels() -> ManagerBasedRlEnvCfg:
+    """Return the config of `reacher` seen from above, with a green ball as target.
+
+    "actor" has the last three pictures, uint8 [E, 3, 64, 64, 3]; "critic" has the state, which nothing reads unless
+    `modules.critic.in_keys` says so.
+    """
+    cfg = reacher()
+    # 0.52 m of the finger's plane, which is all that the arm reaches: 8 mm per pixel.
+    camera = CameraSensor(pos=(0.0, 0.0, 0.65), xyaxes=FROM_ABOVE, width=64, height=64)
+    cfg = replace(
+        cfg,
+        scene=replace(cfg.scene, robots={"reacher": ReacherBesideTarget()}),
+        commands={"target": SeenReacherTarget(resampling_time_range_s=(20.0, 20.0))},
+    )
+    return _seen(cfg, camera)
+
+
+REACHER_PIXELS = Task(
+    name="reacher_pixels",
+    description="a planar arm reaches a ball, by pictures of 64 x 64 pixels alone",
+    cfg=reacher_pixels,
+    training=_training(
+        num_envs=1024,
+        data=DatasetCfg(num_env_states_per_minibatch=4096, num_minibatches=8),
+        num_iterations=400,
+        eval_interval=20,
+        learning_rate=5e-4,
+        entropy_coeff=0.0,
+    ),
+    # As of `reacher`.
+    solved_at=930.0,
 )

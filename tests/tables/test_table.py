@@ -103,7 +103,7 @@ def test_the_other_algorithm_stays_within_its_env_states():
     [
         "velocity:fast_sac/go1",
         "humanoids:g1_flat",
-        "pixels:cartpole_balance_pixels",
+        *(f"pixels:{row}" for row in load("pixels").rows),
         "manipulation:panda_pick_cube",
         "manipulation:leap_cube_reorient",
         *(f"tracking:{clip}" for clip in ("walk", "squat", "turn", "kick")),

@@ -1,6 +1,7 @@
 """Tasks that are seen: what their policy reads, and that each kind of algorithm trains on it."""
 
 import json
+import math
 import re
 
 import pytest
@@ -9,7 +10,10 @@ import torch
 from ksim_rl import conf, envs
 from ksim_rl.algorithms.ppo.wiring import build_networks
 from ksim_rl.scene.rendering.rendering import choose_gl_platform
+from ksim_rl.tables.measure import run_cfg
+from ksim_rl.tables.table import load
 from ksim_rl.trainers import build
+from ksim_rl.trainers.build import build_env
 from tests.cli.test_train import run
 
 TINY = [
@@ -54,6 +58,48 @@ def test_its_policy_reads_the_last_three_pictures_and_nothing_else():
     # 10 N on 1.1 kg for 0.15 s are 0.1 m, of 2.5 m in 64 columns.
     moved_E = cart_column(root["actor"][:, -1]) - first
     assert bool(((moved_E > 1.5) & (moved_E < 4.0)).all())
+
+
+@pytest.mark.full
+def test_the_reachers_policy_sees_its_target_and_finger_where_they_are():
+    env = envs.make("reacher_pixels", num_envs=8, seed=0)
+    root = env.reset()
+    for steps in (0, 3):
+        # The second time around envs 0 to 3 have new targets, the others those that they had.
+        if steps:
+            is_reset = torch.arange(8)[:, None] < 4
+            root = env.reset(root.clone().set("_reset", is_reset))
+        rgb_EHWC = root["actor"][:, -1].int()
+        red, green, blue = rgb_EHWC.unbind(-1)
+        finger_E2 = env.base_env.view.site("finger").pos_EL[:, :2]
+        target_E2 = env.base_env.view.command("target")
+        assert pixels_apart((green > 90) & (red < 60), target_E2).max() < 0.8
+        # An arm may lie above its ball, and a ball above the finger.
+        apart_E = torch.linalg.vector_norm(finger_E2 - target_E2, dim=-1)
+        seen_E = pixels_apart((red > 90) & (blue < 80) & (green < 190), finger_E2)
+        assert seen_E[apart_E > 0.04].max() < 0.8
+
+
+def pixels_apart(is_seen_EHW, place_E2):
+    """How far the middle of some pixels is from a place in the plane of the finger, pixels."""
+    count_E = is_seen_EHW.sum((1, 2))
+    assert bool((count_E > 2).all())
+    place_P = torch.arange(64.0)
+    column_E = (is_seen_EHW.sum(1) * place_P).sum(-1) / count_E
+    row_E = (is_seen_EHW.sum(2) * place_P).sum(-1) / count_E
+    # 0.63 m below the lens, of 45 degrees in 64 pixels; rows run downwards.
+    pixels_per_m = 32.0 / (0.63 * math.tan(math.radians(22.5)))
+    x_E, y_E = place_E2.unbind(-1)
+    return torch.hypot(column_E - 31.5 - pixels_per_m * x_E, row_E - 31.5 + pixels_per_m * y_E)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", load("pixels").groups()["blind"])
+def test_the_blind_see_black(name):
+    cfg = run_cfg(load("pixels").rows[name], 1, device="cpu", smoke=True)
+    env = build_env(cfg, num_envs=2, seed=1)
+    root = env.reset()
+    assert root["actor"].shape == (2, 3, 64, 64, 3) and not root["actor"].any()
 
 
 def test_a_policy_without_an_encoder_and_a_replay_without_memory_are_refused():

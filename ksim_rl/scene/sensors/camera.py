@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import mujoco
+import numpy as np
 import torch
 from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
@@ -71,6 +72,13 @@ class CameraSensor(Sensor):
         )
 
     def track(self, name: str, view: WorldView) -> "CameraTracker":
+        groups = view.world.mj_model.geom_group
+        # The renderer would end the process.
+        if not np.isin(groups, self.geom_groups).any():
+            raise ValueError(
+                f"scene.sensors.{name}.geom_groups={self.geom_groups}: no geom of the model is in one of them, but in "
+                f"{sorted(set(groups.tolist()))}"
+            )
         return CameraTracker(name, self, view)
 
 

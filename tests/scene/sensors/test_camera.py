@@ -250,3 +250,8 @@ def test_cameras_out_of_range_are_refused(fields, message):
 def test_unknown_cameras_and_bodies_are_refused(sensor, message):
     with pytest.raises(ValueError, match=message):
         sensor.add_to(mujoco.MjSpec.from_string(SCENE), "eye")
+
+
+def test_a_camera_that_may_see_none_of_the_models_geoms_is_refused():
+    with pytest.raises(ValueError, match=r"eye\.geom_groups=\(5,\): no geom .*in \[0, 4\]"):
+        SensorBench(SCENE, 1, {"eye": CameraSensor(camera="front", geom_groups=(5,))})
