@@ -19,7 +19,7 @@ from ksim_rl.conf import spelling
 from ksim_rl.conf.registration import CHOSEN_BY_TASK, MODULE, NAME, RUN_AGAIN, register, store_run
 from ksim_rl.config.overrides import check_parsed, quoting
 from ksim_rl.config.trees import Tree
-from ksim_rl.envs.replaced_fields import check_not_replaced
+from ksim_rl.envs.managers.replaced_fields import check_not_replaced
 from ksim_rl.trainers import RunCfg
 
 # A sweep over more combinations than this is checked in part here; each job checks its own config again.
@@ -104,7 +104,7 @@ def _compose(overrides: list[str], name: str, *, learns: bool) -> RunCfg:
                 "the two out, or set collector.rollout_length=null"
             )
     if learns:
-        check_not_replaced(cfg.task, overrides)
+        check_not_replaced(cfg.task.curriculum, overrides)
     return cfg
 
 

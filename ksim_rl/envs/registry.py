@@ -18,8 +18,8 @@ from ksim_rl.config.trees import Tree
 from ksim_rl.device.room import check_room
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
+from ksim_rl.envs.managers.replaced_fields import check_not_replaced
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
-from ksim_rl.envs.replaced_fields import check_not_replaced
 from ksim_rl.envs.specs import misfit
 from ksim_rl.envs.task import Task
 from ksim_rl.transforms.groups.group_cfg import compile_groups
@@ -99,7 +99,7 @@ def make_cfg(name: str, overrides: Sequence[str] = ()) -> ManagerBasedRlEnvCfg:
     register_configs()
     tree = composed.with_overrides(name, _tree, overrides)
     cfg = from_tree(ManagerBasedRlEnvCfg, tree, "task")
-    check_not_replaced(cfg, overrides)
+    check_not_replaced(cfg.curriculum, overrides)
     return cfg
 
 

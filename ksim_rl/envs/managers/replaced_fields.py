@@ -1,27 +1,26 @@
 """Finds overrides of fields that a curriculum replaces while an env runs, which would hold for a while only."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from ksim_rl.config.overrides import given_fields
-from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import CurriculumTerm
 
 PATH = "task"
 
 
-def check_not_replaced(cfg: ManagerBasedRlEnvCfg, overrides: Sequence[str]) -> None:
+def check_not_replaced(curricula: Mapping[str, CurriculumTerm], overrides: Sequence[str]) -> None:
     """Refuse overrides of fields whose values a curriculum replaces, unless they are of the curriculum as well.
 
     Args:
-        cfg: the env's config, with the overrides.
+        curricula: the task's, with the overrides.
         overrides: Hydra's, such as "task.commands.twist.lin_vel_x=[0,1]".
 
     Raises:
         ValueError: naming the field, the curriculum, and how to go without it.
     """
     given = given_fields(overrides)
-    for name, term in cfg.curriculum.items():
+    for name, term in curricula.items():
         curriculum = f"{PATH}.curriculum.{name}"
         # Whoever says what the curriculum does knows of it.
         if any(_is_in(field, curriculum) for field in given):
