@@ -84,7 +84,13 @@ def with_keyframe(tmp_path_factory):
     return exported(tmp_path_factory.mktemp("arm") / "export", KEYFRAME)
 
 
-@pytest.mark.parametrize("keyframe", ["", KEYFRAME], ids=["no keyframe", "keyframe"])
+@pytest.mark.parametrize(
+    "keyframe",
+    [
+        pytest.param("", id="no keyframe", marks=pytest.mark.full),
+        pytest.param(KEYFRAME, id="keyframe"),
+    ],
+)
 def test_an_export_acts_in_the_c_engine_as_here(tmp_path, with_keyframe, keyframe):
     folder = with_keyframe if keyframe else exported(tmp_path / "export", keyframe)
     runner = Runner(folder)

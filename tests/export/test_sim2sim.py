@@ -95,8 +95,16 @@ def test_cartpole_earns_the_same_from_the_folder_alone(cartpole):
 
 
 def test_what_the_c_engine_trained_is_judged_in_other_physics(tmp_path):
+    """A reward that is drawn counts on neither side."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Riddle(RewardTerm):
+        def __call__(self, view: EnvView) -> torch.Tensor:
+            return 1.0 + 0.0 * view.uniform(1)[:, 0]
+
     def change(cfg):
-        return dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, engine="c"))
+        sim = dataclasses.replace(cfg.sim, engine="c")
+        return dataclasses.replace(cfg, sim=sim, rewards={**cfg.rewards, "riddle": Riddle()})
 
     folder = exported("cartpole_balance", tmp_path / "export", change=change)
     assert json.loads((folder / "export.json").read_text())["engine"] == "c"
@@ -107,6 +115,9 @@ def test_what_the_c_engine_trained_is_judged_in_other_physics(tmp_path):
     assert report.causes == []
     assert report.return_ratio == pytest.approx(1.0, abs=0.02)
     assert report.return_ratio != pytest.approx(1.0, abs=1e-9)
+    assert report.left_out == ["rewards.riddle"] and report.ours["reward/riddle"] > 0
+    (line,) = [line for line in report.table().splitlines() if line.startswith("return  ")]
+    assert line.endswith("  without riddle")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -190,9 +201,10 @@ def test_all_quantities_are_read_as_here_also_where_default_poses_differ(tmp_pat
         assert (np.abs(seen - ours) / size).max() < 1e-3
 
 
-# `test_tracing` compares the terms of more tasks without an export of each.
-FULL = (
+# `test_tracing` compares the terms of tasks without an export of each, and cartpole's are compared above.
+LONG = (
     "arm_push",
+    "arm_reach",
     "cheetah_run",
     "hopper_stand",
     "pendulum_swingup",
@@ -201,9 +213,8 @@ FULL = (
 )
 
 
-@pytest.mark.parametrize(
-    "task", ["arm_reach", *(pytest.param(name, marks=pytest.mark.full) for name in FULL)]
-)
+@pytest.mark.full
+@pytest.mark.parametrize("task", LONG)
 def test_the_terms_of_a_task_give_the_same_in_the_c_engine(task, tmp_path):
     report = report_of(exported(task, tmp_path / "export"), episodes=4)
     # The cube rests on the table without a sensor that would tell so; the solvers leave it 1e-5 m/s apart.
@@ -212,22 +223,6 @@ def test_the_terms_of_a_task_give_the_same_in_the_c_engine(task, tmp_path):
     assert len(compared) == len(report.ours.keys() & set(compared)) > 0
     for name in compared:
         assert report.theirs[name] == pytest.approx(report.ours[name], rel=0.02, abs=2e-3), name
-
-
-def test_a_reward_that_is_drawn_counts_on_neither_side(tmp_path):
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Riddle(RewardTerm):
-        def __call__(self, view: EnvView) -> torch.Tensor:
-            return 1.0 + 0.0 * view.uniform(1)[:, 0]
-
-    def change(cfg):
-        return dataclasses.replace(cfg, rewards={**cfg.rewards, "riddle": Riddle()})
-
-    report = report_of(exported("cartpole_balance", tmp_path / "export", change=change), episodes=4)
-    assert report.left_out == ["rewards.riddle"] and report.ours["reward/riddle"] > 0
-    (line,) = [line for line in report.table().splitlines() if line.startswith("return  ")]
-    assert line.endswith("  without riddle")
-    assert report.return_ratio == pytest.approx(1.0, abs=1e-3)
 
 
 def test_the_ratio_has_the_error_of_pairs():

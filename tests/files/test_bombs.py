@@ -12,8 +12,8 @@ from ksim_rl.runs.csv_table import read_table
 from tests.files import bombs
 from tests.files.bombs import BOMBS, read_apart
 
-# Of tables, those that take the longest to read; the others are refused alike.
-LONG = ("table_of_30_mb", "table_of_empty_cells")
+# Those that take the longest to write or read; other tables and recordings are refused alike.
+LONG = ("table_of_30_mb", "table_of_empty_cells", "recording_that_unpacks_to_gigabytes")
 NAMES = [pytest.param(name, marks=pytest.mark.full) if name in LONG else name for name in BOMBS]
 
 

@@ -39,7 +39,10 @@ print(*(name for name in NOT_LOADED if name in sys.modules))
 
 WORLDS = """
 import runpy
+import warp
 
+# Kernels compile in half of the time, and run for an instant.
+warp.config.optimization_level = 0
 example = runpy.run_path("examples/worlds.py", run_name="example")
 for engine in ("warp", "c"):
     mass_E, sag_E = example["reach"](engine=engine, num_worlds=4)

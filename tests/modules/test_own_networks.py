@@ -75,6 +75,7 @@ def test_it_trains_evaluates_and_exports(my_nets, tmp_path, monkeypatch):
         "--plugin",
         "my_nets",
         "task=cartpole_balance",
+        "task.sim.engine=c",
         *small,
         *NAMED,
         "trainer.num_iterations=1",

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
+import pytest
 import torch
 
 from ksim_rl.physics import SimCfg, World
@@ -17,6 +18,10 @@ KERNELS = {
     "our solver": SimCfg(one_kernel_dynamics=False, tolerance=1e-8, iterations=50),
     "theirs": SimCfg(one_kernel_solver=False, tolerance=1e-8, iterations=50),
 }
+# MuJoCo Warp's solver compiles kernels of its own for each model. Where the same is asked of ours, it is a long test;
+# test_idle_ties, test_asleep, test_split_substeps and test_every_field ask it always.
+THEIRS = pytest.param("theirs", marks=pytest.mark.full)
+ALL_KERNELS = ("ours", "our solver", THEIRS)
 
 
 def started(

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from tests.physics.beside_c import KERNELS, check, started
+from tests.physics.beside_c import KERNELS, THEIRS, check, started
 
 CHAIN = """
 <mujoco>
@@ -25,7 +25,7 @@ CONSTANTS = ("dof_invweight0", "body_invweight0", "actuator_acc0")
 
 @pytest.mark.parametrize("has_tendon", (False, True), ids=("joints", "and a tendon"))
 @pytest.mark.parametrize("integrator", ("Euler", "implicitfast"))
-@pytest.mark.parametrize("kernels", ("ours", "theirs"))
+@pytest.mark.parametrize("kernels", ("ours", THEIRS))
 def test_each_world_has_what_its_actuators_add(
     kernels: str, integrator: str, has_tendon: bool
 ) -> None:

@@ -6,7 +6,14 @@ import mujoco
 import pytest
 import torch
 
-from tests.physics.beside_c import KERNELS, check_sensors, started, step_and_check
+from tests.physics.beside_c import (
+    ALL_KERNELS,
+    KERNELS,
+    THEIRS,
+    check_sensors,
+    started,
+    step_and_check,
+)
 
 STUCK = """
 <mujoco>
@@ -32,7 +39,7 @@ STUCK = """
 CALM: dict[str, Any] = {"spread": 0.0003, "speed": 0.02}
 
 
-@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize("kernels", ("our solver", THEIRS))
 @pytest.mark.parametrize("integrator", ("implicitfast", "RK4"))
 def test_pairs_that_a_sensor_measures_are_no_contacts(integrator: str, kernels: str) -> None:
     step_and_check(STUCK.format(integrator=integrator, more=""), KERNELS[kernels], **CALM)
@@ -52,7 +59,7 @@ FLAT = """
 """
 
 
-@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize("kernels", ("our solver", THEIRS))
 @pytest.mark.parametrize("integrator", ("implicitfast", "RK4"))
 def test_upper_corners_of_boxes_do_not_stick(integrator: str, kernels: str) -> None:
     names = ("qpos", "qvel", "qacc", "qfrc_passive", "actuator_velocity")
@@ -63,7 +70,7 @@ def test_upper_corners_of_boxes_do_not_stick(integrator: str, kernels: str) -> N
         step_and_check(xml, KERNELS[kernels], names=names, **CALM)
 
 
-@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("kernels", ALL_KERNELS)
 def test_a_pair_of_one_rigid_body_does_not_stick(kernels: str) -> None:
     xml = """
 <mujoco>
@@ -79,7 +86,7 @@ def test_a_pair_of_one_rigid_body_does_not_stick(kernels: str) -> None:
     step_and_check(xml, KERNELS[kernels], names=("qpos", "qvel", "qacc", "qfrc_passive"), **CALM)
 
 
-@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("kernels", ALL_KERNELS)
 @pytest.mark.parametrize("other", ("beside", "welded"))
 def test_an_actuator_does_not_adhere_by_a_pair_of_one_rigid_body(other: str, kernels: str) -> None:
     xml = f"""
@@ -112,7 +119,7 @@ def test_a_reset_of_one_world_leaves_the_adhesion_of_another(more: str) -> None:
     check_sensors(world, mj_data, of_forces=False)
 
 
-@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize("kernels", ("our solver", THEIRS))
 def test_geoms_do_not_stick_where_a_sensor_alone_reaches_them(kernels: str) -> None:
     xml = """
 <mujoco>

@@ -99,7 +99,7 @@ def check(world: World, **kwargs: int) -> None:
         torch.testing.assert_close(own, expected[key], msg=str(key))
 
 
-@pytest.mark.parametrize("make", [pile, standing_quadrupeds])
+@pytest.mark.parametrize("make", [pytest.param(pile, marks=pytest.mark.full), standing_quadrupeds])
 def test_it_finds_the_contacts_of_mujoco_warp(make):
     check(make())
 

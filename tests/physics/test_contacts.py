@@ -9,7 +9,7 @@ import torch
 
 from ksim_rl.physics import SimCfg, World, load_model
 from ksim_rl.physics.warp_world import WarpWorld
-from tests.physics.beside_c import KERNELS, step_and_check
+from tests.physics.beside_c import ALL_KERNELS, KERNELS, step_and_check
 
 NUM_ENVS = 64
 # The plane is the last geom: contacts order geoms by their type, pairs by their number.
@@ -106,7 +106,7 @@ def test_an_upright_rod_has_the_frame_of_the_c_engine(one_kernel: bool):
     assert len(expected) == 1
 
 
-@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("kernels", ALL_KERNELS)
 @pytest.mark.parametrize("cone", ("pyramidal", "elliptic"))
 def test_a_belt_carries_a_steep_rod_as_in_the_c_engine(cone: str, kernels: str):
     xml = f"""

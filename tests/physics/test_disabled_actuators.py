@@ -3,7 +3,7 @@
 import mujoco
 import pytest
 
-from tests.physics.beside_c import KERNELS, started, step_and_check
+from tests.physics.beside_c import ALL_KERNELS, KERNELS, started, step_and_check
 
 ARM = """
 <mujoco>
@@ -34,7 +34,7 @@ INTEGRATORS = ("Euler", "implicitfast", "implicit", "RK4")
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("kernels", ALL_KERNELS)
 def test_disabled_actuators_make_no_force_and_keep_their_activations(
     kernels: str, integrator: str
 ) -> None:

@@ -3,7 +3,7 @@
 import mujoco
 import pytest
 
-from tests.physics.beside_c import KERNELS, check, started, step_and_check
+from tests.physics.beside_c import KERNELS, THEIRS, check, started, step_and_check
 
 IMPLICIT = ("implicit", "implicitfast")
 DAMPED = """
@@ -90,7 +90,7 @@ def test_such_a_gain_beside_a_motor_of_several_controls_is_refused() -> None:
     step_and_check(xml.replace("implicitfast", "Euler"), KERNELS["our solver"])
 
 
-@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize("kernels", ("our solver", THEIRS))
 @pytest.mark.parametrize("integrator", IMPLICIT)
 @pytest.mark.parametrize("acts", ACTS_ON_BODIES)
 @pytest.mark.parametrize("joints", JOINTS_OF_SIMPLE_BODIES)
@@ -140,7 +140,7 @@ READ_BY_STAGES = {
 }
 
 
-@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize("kernels", ("our solver", THEIRS))
 @pytest.mark.parametrize(
     "flag",
     ("", '<flag sleep="enable"/>', '<flag sleep="enable" spring="disable" damper="disable"/>'),

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ksim_rl.physics import SimCfg, World
-from tests.physics.beside_c import KERNELS, step_and_check
+from tests.physics.beside_c import ALL_KERNELS, KERNELS, THEIRS, step_and_check
 
 # Joint 0 and tendon 0 are both limited, and so are both sides of a slide with a wide margin.
 LIMITED = """
@@ -43,12 +43,12 @@ OF_TENDON = (
 )
 
 
-@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("kernels", ALL_KERNELS)
 def test_limits_of_joints_read_as_in_c(kernels: str) -> None:
     step_and_check(LIMITED.format(flags="", tendon="", sensors=""), KERNELS[kernels])
 
 
-@pytest.mark.parametrize("kernels", ("our solver", "theirs"))
+@pytest.mark.parametrize("kernels", ("our solver", THEIRS))
 def test_a_tendon_is_not_taken_for_the_joint_of_its_number(kernels: str) -> None:
     step_and_check(LIMITED.format(flags="", tendon=TENDON, sensors=OF_TENDON), KERNELS[kernels])
 

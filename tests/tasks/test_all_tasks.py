@@ -16,9 +16,9 @@ def test_its_config_survives_yaml(name):
     assert from_tree(ManagerBasedRlEnvCfg, yaml.safe_load(text)) == cfg
 
 
-# With those that tests/integration/test_stock_torchrl.py checks, one of each kind of robot, ground and suite. The
-# others, which compile kernels of their own, run in full tests.
-QUICK = ("cartpole_swingup", "dm_control_cartpole_balance", "humanoid_get_up")
+# What others check is tested where their parts are: a quadruped in tests/integration/test_stock_torchrl.py, a humanoid
+# in tests/tracking, a suite in tests/suites. All run in full tests, since they compile kernels of their own.
+QUICK = ("cartpole_swingup",)
 NAMES = [
     name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in envs.names()
 ]
