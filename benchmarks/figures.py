@@ -54,6 +54,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "learning": (*STEP, *LEARN, *TASK),
     "manipulation": (*STEP, *LEARN, "ksim_rl/suites"),
     "loop": ("ksim_rl/export/standalone",),
+    "motions": (*STEP, *LEARN, "ksim_rl/tracking"),
     "nan_names": ("ksim_rl/envs/non_finite.py", "ksim_rl/device/quick_launch.py"),
     "narrow_phase": ("ksim_rl/physics",),
     "num_envs": (*STEP, *LEARN),

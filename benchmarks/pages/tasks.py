@@ -19,7 +19,7 @@ from ksim_rl.tables.table import Row, load
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 TABLES = {
     name: report.RESULTS / "tables" / f"{name}.json"
-    for name in ("tasks", "velocity", "humanoids", "tracking", "pixels")
+    for name in ("tasks", "velocity", "humanoids", "tracking", "motions", "pixels")
 }
 NUM_ENVS = 4096
 COLUMNS = (
@@ -66,8 +66,8 @@ OLDER = (
 )
 LEARNED = """## What was learned
 
-By `ksim-rl reproduce tasks`, for Go1, G1 and `g1_track_*` `ksim-rl reproduce velocity`, `humanoids` and `tracking`,
-and for pictures `pixels`, with [one protocol](tables.md#the-protocol).
+By `ksim-rl reproduce tasks`, for Go1, G1, `g1_track_*` and `g1_track` `ksim-rl reproduce velocity`, `humanoids`,
+`tracking` and `motions`, and for pictures `pixels`, with [one protocol](tables.md#the-protocol).
 
 * **env states**, **seconds**: of a run's training, its first iteration included. Runs of G1 and Go1 on flat ground had
   a GPU of their own, the others shared one with up to ten; a run that is alone takes less time. On a CPU a run had one

@@ -39,6 +39,7 @@ def train(arguments: list[str]) -> int:
     """
     # Groups and classes go into Hydra's store before it composes anything.
     conf.register()
+    arguments = [conf.spelling.in_full(word) for word in arguments]
     flags, unknown = parse_flags(arguments)
     if unknown:
         raise conf.spelling.of_flag(unknown[0], arguments)

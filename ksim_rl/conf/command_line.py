@@ -61,7 +61,7 @@ def check_command_line(
         with hydra.initialize_config_module(MODULE, version_base="1.3"):
             loader = GlobalHydra.instance().config_loader()
             # Parsed before anything is composed, for errors that name one override.
-            overrides = [_parse(text, loader) for text in texts]
+            overrides = [_parse(spelling.in_full(text), loader) for text in texts]
             sweeps = [
                 str(override.input_line) for override in overrides if override.is_sweep_override()
             ]

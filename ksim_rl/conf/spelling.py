@@ -11,6 +11,19 @@ from ksim_rl.config.trees import Plain
 
 GROUPS = ("task", "objective", "data", "modules", "collector", "trainer", "logger")
 
+MOTIONS = "task.scene.motions.clips.sources"
+"""The field that `motions=FOLDER` stands for."""
+
+
+def in_full(word: str) -> str:
+    """Return `motions=FOLDER` as the field that it means, and any other argument as it is."""
+    name, equals, value = word.partition("=")
+    if name != "motions" or not equals:
+        return word
+    # Several folders and files are given as a list.
+    listed = value if value.startswith("[") else f"[{value}]"
+    return f"{MOTIONS}={listed}"
+
 
 def of_flag(flag: str, arguments: Sequence[str] = ()) -> ValueError:
     """Build the error for a flag that does not exist, such as `--num_envs=4`, or `--task x` in `arguments`."""

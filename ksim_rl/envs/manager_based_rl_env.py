@@ -110,6 +110,7 @@ class ManagerBasedRlEnv(
             max_episode_length=self.max_episode_length,
             soft_joint_pos_limit_factor=cfg.scene.soft_joint_pos_limit_factor,
             entities=tuple(cfg.scene.entities),
+            motions=cfg.scene.motions,
         )
         self.world.refresh()  # managers read derived quantities
         self._events_cfg: Mapping[str, Any] = events

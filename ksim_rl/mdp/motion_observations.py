@@ -13,7 +13,7 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.registry import build
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.motion_tracking import OfMotion
+from ksim_rl.mdp.motion_tracking import OfMotion, one_motion
 from ksim_rl.scene.motions.motion import load_motion
 from ksim_rl.scene.state.motion_clock import motion_start_time
 from ksim_rl.scene.terrains import PlaneTerrain
@@ -28,7 +28,7 @@ class PlayMotion(OfMotion, EventTerm):
         # Env e starts at frame e: the envs together are the whole motion.
         frame_s_E = torch.arange(view.num_envs, device=view.device) * view.step_dt
         start_E.copy_(torch.where(mask_E, frame_s_E, start_E))
-        qpos_EL, qvel_EL = view.motion(self.file).sample(start_E)
+        qpos_EL, qvel_EL = one_motion(view, self.file).sample(start_E)
         view.write_qpos(mask_E, qpos_EL)
         view.write_qvel(mask_E, qvel_EL)
 

@@ -9,17 +9,21 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from ksim_rl.checked import Positive, Within
 from ksim_rl.envs.term import EventTerm, ObservationTerm, Term, TerminationTerm
 from ksim_rl.envs.view import EnvView
+from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import GaussianReward, OfJoints
 from ksim_rl.scene import quaternion
+from ksim_rl.scene.motions.motion import ReferenceMotion
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.state.motion_clock import (
     motion_bodies,
+    motion_clip,
+    motion_end,
     motion_joints,
     motion_shift,
     motion_start_time,
@@ -55,25 +59,34 @@ class MotionPhase(OfMotion, ObservationTerm):
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         # A whole motion as the cycle: its phase tells where in it the env is.
-        cycle_s = self.cycle_s or view.motion(self.file).duration_s
+        cycle_s = self.cycle_s or motion_end(view, self.file)
         angle_E = motion_time(view, self.file) * (2.0 * math.pi / cycle_s)
         return torch.stack((torch.sin(angle_E), torch.cos(angle_E)), dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionJoints(OfMotion, OfJoints, ObservationTerm):
-    """Positions (rad or m), then velocities (per s), that joints have in the motion `ahead_s` from now, [E, 2L]."""
+    """Positions (rad or m), then velocities (per s), that joints have in the motion `ahead_s` from now, [E, 2L].
 
-    ahead_s: float = 0.0
+    Of several moments one is behind the other, [E, 2LN].
+    """
+
+    ahead_s: float | tuple[float, ...] = 0.0
 
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
-        if self.ahead_s == 0.0:
-            # The present frame is sampled once per step for all terms.
-            return torch.cat(motion_joints(view, self.file, self.joints), dim=-1)
-        time_E = motion_time(view, self.file) + self.ahead_s
-        motion = view.motion(self.file)
-        # Positions, then velocities, both of the later moment.
-        return torch.cat(motion.sample_joints(time_E, view.joints(self.joints).index), dim=-1)
+        moments = self.ahead_s if isinstance(self.ahead_s, tuple) else (self.ahead_s,)
+        index = view.joints(self.joints).index
+        clip_E = motion_clip(view, self.file)
+        seen: list[Tensor] = []
+        for ahead_s in moments:
+            if ahead_s == 0.0:
+                # The present frame is sampled once per step for all terms.
+                seen += motion_joints(view, self.file, self.joints)
+                continue
+            time_E = motion_time(view, self.file) + ahead_s
+            # Positions, then velocities, both of the later moment.
+            seen += view.motion(self.file).sample_joints(time_E, index, clip_E)
+        return torch.cat(seen, dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +156,7 @@ class MotionFinished(OfMotion, TerminationTerm):
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
         # Half a step early: sums of float32 steps may fall short of the end by some rounding.
-        return motion_time(view, self.file) > view.motion(self.file).duration_s - 0.5 * view.step_dt
+        return motion_time(view, self.file) > motion_end(view, self.file) - 0.5 * view.step_dt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,16 +174,43 @@ class ResetToMotion(OfMotion, EventTerm):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         motion = view.motion(self.file)
         start_E = motion_start_time(view, self.file)
-        # Rows that are not reset keep their start: their clock goes on from it.
-        start_E.copy_(torch.where(mask_E, self.draw_share(view) * motion.duration_s, start_E))
-        qpos_EL, qvel_EL = motion.sample(start_E)
+        clip_E = motion_clip(view, self.file)
+        drawn_E, share_E = self.draw_start(view)
+        # Rows that are not reset keep their clip and their start: their clock goes on from it.
+        if clip_E is not None and drawn_E is not None:
+            clip_E.copy_(torch.where(mask_E, drawn_E, clip_E))
+        begin_E = share_E * motion.duration_of(drawn_E)
+        start_E.copy_(torch.where(mask_E, begin_E, start_E))
+        qpos_EL, qvel_EL = motion.sample(start_E, clip_E)
         # Motions are recorded around the world's origin; on a terrain each env has its own origin.
         view.write_qpos(mask_E, qpos_EL if motion_shift(view) is None else view.at_origins(qpos_EL))
         view.write_qvel(mask_E, qvel_EL)
 
-    def draw_share(self, view: EnvView) -> Float[Tensor, " E"]:
-        """Draw where in the motion each env would begin, as a share of its duration."""
-        return view.uniform(1, *self.start_range)[:, 0]
+    def draw_start(self, view: EnvView) -> tuple[Int64[Tensor, " E"] | None, Float[Tensor, " E"]]:
+        """Draw which clip each env would follow, None of a single one, and where it begins, a share of its duration."""
+        share_E = view.uniform(1, *self.start_range)[:, 0]
+        return self.draw_clip(view), share_E
+
+    def draw_clip(self, view: EnvView) -> Int64[Tensor, " E"] | None:
+        """Draw a clip that is not held out for each env, all alike; None where the motion is a single one."""
+        held_out = view.motion(self.file).held_out
+        if len(held_out) == 1:
+            return None
+        trained = [float(clip) for clip, is_held_out in enumerate(held_out) if not is_held_out]
+        trained_C = constant(trained, view.device).long()
+        place_E = (view.uniform(1)[:, 0] * len(trained)).long()
+        # A draw close to 1 may be rounded up to the end.
+        return trained_C[place_E.clamp(max=len(trained) - 1)]
+
+
+def one_motion(view: EnvView, file: str) -> ReferenceMotion:
+    """Return a motion for a term that shows it from its start to its end; a ValueError if it has several clips."""
+    motion = view.motion(file)
+    if len(motion.names) > 1:
+        raise ValueError(
+            f"file={file!r}: a set of {len(motion.names)} motions, of which one can be shown: name its file"
+        )
+    return motion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +221,7 @@ class ShowMotion(OfMotion, EventTerm):
     """
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        motion = view.motion(self.file)
+        motion = one_motion(view, self.file)
         passed = torch.remainder(view.step_count * view.step_dt, motion.duration_s)
         qpos_EL, qvel_EL = motion.sample(passed.to(torch.float32).expand(view.num_envs))
         view.write_qpos(mask_E, qpos_EL if motion_shift(view) is None else view.at_origins(qpos_EL))

@@ -13,6 +13,7 @@ from ksim_rl.physics import SimCfg, load_model, load_spec, prepare_spec
 from ksim_rl.scene.actuators import Actuator, set_actuators
 from ksim_rl.scene.joining import joined
 from ksim_rl.scene.keyframes import complete_keyframes, move_keyframe
+from ksim_rl.scene.motions.motion_set import MotionSet
 from ksim_rl.scene.sensors import Sensor
 from ksim_rl.scene.terrains import Terrain
 
@@ -105,6 +106,7 @@ class SceneCfg(Checked):
     placements: Mapping[str, Placement] = field(default_factory=dict)  # by entity
     terrain: Terrain | None = None  # None: the robot's own model has its ground
     sensors: Mapping[str, Sensor] = field(default_factory=dict)  # of contacts, rays, cameras, IMUs
+    motions: Mapping[str, MotionSet] = field(default_factory=dict)  # by the `file` of terms
     num_envs: Count = 1  # a run's own number takes its place
     spacing: NonNegative = 2.0  # m between neighbouring envs when several are drawn in one picture
     soft_joint_pos_limit_factor: Share = 1.0  # of each joint's range, about its middle

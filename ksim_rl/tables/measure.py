@@ -33,6 +33,8 @@ from ksim_rl.trainers.run_cfg import reaching_outside
 KEPT_POINTS = 60
 # One evaluation, at the end, of the final policy.
 FIXED = "trainer.eval_interval=0 trainer.checkpoint_interval=0 trainer.stop_when_solved=false logger=local"
+# The level of a row whose task holds clips out: the mean share of their trials that succeed.
+HELD_OUT = "evaluation/held_out_success"
 # Two iterations and a few short episodes say whether all parts of a row work, and nothing about how well it learns.
 SMOKE = "num_envs=8 data.num_env_states_per_minibatch=32 data.num_minibatches=2 task.episode_length_s=0.4"
 # Fields that came after the first tables, with values that change nothing, as a fingerprint's text has them.
@@ -44,6 +46,7 @@ LATER = re.compile(
     r'|"offset": 0.0, (?="scale": [^,{}]*\})'
     # Of the networks of off-policy methods, which read one group before they could choose.
     r'|"encoders": \{\}, |"in_keys": \["(actor|critic)"\], (?="layer_norm")'
+    r'|"motions": \{\}, '
     r'|"recorders": \{\}, '
     r'|"free_root": false, |"root_turn": \[1.0, 0.0, 0.0, 0.0\], '
 )
@@ -133,7 +136,10 @@ class _Judge(Hook):
         # Trials are run by the trained policy, in envs of their own.
         if self._trials:
             how = {"trials": self._trials, "note": trainer.progress.note}
-            self.found["trials"] = asdict(run_trials(self._cfg, trainer.update.actor, **how))
+            trials = run_trials(self._cfg, trainer.update.actor, **how)
+            self.found["trials"] = asdict(trials)
+            if trials.held_out is not None:
+                self.found["means"][HELD_OUT] = trials.held_out
 
 
 def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) -> Result:

@@ -18,7 +18,7 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.motion_tracking import OfMotion, OfMotionBodies
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
-from ksim_rl.scene.state.motion_clock import motion_bodies, motion_time
+from ksim_rl.scene.state.motion_clock import motion_bodies, motion_clip, motion_time
 
 
 class Poses(NamedTuple):
@@ -85,11 +85,8 @@ def motion_velocities(
     if key not in view.cache:
         motion = view.motion(file)
         table_FN6 = _velocity_table(view, file, bodies)
-        # The last pair of frames is interpolated up to its end.
-        last = table_FN6.shape[0] - 1
-        frame_E = (motion_time(view, file) * motion.fps).clamp(0.0, float(last))
-        low_E = frame_E.floor().long().clamp(max=last - 1)
-        share_E11 = (frame_E - low_E)[:, None, None]
+        low_E, share_E1 = motion.between(motion_time(view, file), motion_clip(view, file))
+        share_E11 = share_E1[:, None]
         view.cache[key] = torch.lerp(table_FN6[low_E], table_FN6[low_E + 1], share_E11)
     return view.cache[key][..., :3], view.cache[key][..., 3:]
 

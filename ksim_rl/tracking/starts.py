@@ -2,9 +2,10 @@
 
 import math
 from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from ksim_rl import ranks
@@ -14,21 +15,70 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.events import Ranges, draw_by_axis
 from ksim_rl.mdp.motion_tracking import OfMotion, ResetToMotion
 from ksim_rl.scene import quaternion
-from ksim_rl.scene.state.motion_clock import motion_time
+from ksim_rl.scene.state.motion_clock import motion_clip, motion_end, motion_time
 
 
-def part_weights(view: EnvView, file: str, parts: int) -> Float[Tensor, "E B"]:
-    """Return the buffer of how much likelier than others each part of a motion is as a start; `FailedParts` writes it.
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """The B parts of the clips of a motion that training sees: of equal length within a clip, one clip after the other.
 
-    Parts are of equal length. Zeros stand for parts that are all alike.
+    Attributes:
+        clip_B: the clip of each part.
+        place_B: the number of each part within its clip.
+        first_C, count_C: the first part of each clip, and how many it has; none of held-out clips.
     """
-    return view.buffers.get(f"motion/{file}.part_weights_EB", parts, keep=True)
+
+    clip_B: Int64[Tensor, " B"]
+    place_B: Float[Tensor, " B"]
+    first_C: Int64[Tensor, " C"]
+    count_C: Float[Tensor, " C"]
+
+    def __len__(self) -> int:
+        return len(self.clip_B)
 
 
-def parts_of(view: EnvView, file: str, part_s: float) -> int:
-    """Return how many parts of about `part_s` seconds a motion has."""
-    # Rounded up: all parts are equally long, and none is longer than asked for.
-    return max(1, math.ceil(view.motion(file).duration_s / part_s - 1e-6))
+# Per view, by motion and length of a part; made while the env is constructed.
+_PARTS: WeakKeyDictionary[EnvView, dict[tuple[str, float], Parts]] = WeakKeyDictionary()
+
+
+def parts_of(view: EnvView, file: str, part_s: float) -> Parts:
+    """Return the parts of about `part_s` seconds of a motion."""
+    found = _PARTS.setdefault(view, {})
+    if (file, part_s) in found:
+        return found[file, part_s]
+    motion = view.motion(file)
+    counts = []
+    for last, held_out in zip(motion.last_C.tolist(), motion.held_out, strict=True):
+        # Rounded up: all parts are equally long, and none is longer than asked for.
+        parts = max(1, math.ceil(last / motion.fps / part_s - 1e-6))
+        counts.append(0 if held_out else parts)
+    # Outside of inference mode: the tables outlive the mode of the call that happens to come first.
+    with torch.inference_mode(False):
+        count_C = torch.tensor(counts, device=view.device)
+        first_C = torch.cumsum(count_C, dim=0) - count_C
+        clip_B = torch.arange(len(counts), device=view.device).repeat_interleave(count_C)
+        place_B = torch.arange(sum(counts), device=view.device) - first_C[clip_B]
+        found[file, part_s] = Parts(
+            clip_B=clip_B,
+            place_B=place_B.to(torch.float32),
+            first_C=first_C,
+            count_C=count_C.to(torch.float32),
+        )
+    return found[file, part_s]
+
+
+def part_weights(view: EnvView, file: str, parts: Parts) -> Float[Tensor, " B"]:
+    """Return how much likelier than others each part of a motion is as a start; `FailedParts` writes it.
+
+    Zeros stand for parts that are all alike.
+    """
+    zeros = [0.0] * len(parts)
+    return view.shared(f"motion/{file}.part_weights_B", zeros, of_curriculum=True)
+
+
+def trial_clip(view: EnvView, file: str) -> Int64[Tensor, " E"]:
+    """Return the buffer of the clip that each env tries; who runs trials writes it before they begin."""
+    return view.buffers.get(f"motion/{file}.trial_clip_E", dtype=torch.int64, keep=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,29 +131,47 @@ class StartInMotion(ResetToMotion):
         # Within the soft limits, where the action can reach.
         joints.write_pos(mask_E, torch.clamp(joints.pos_EL + off_EL, low_L, high_L))
 
-    def draw_share(self, view: EnvView) -> Float[Tensor, " E"]:
+    def draw_start(self, view: EnvView) -> tuple[Int64[Tensor, " E"] | None, Float[Tensor, " E"]]:
         """Draw it from the curriculum's weights where there are some, else from the range."""
         # Two draws: one chooses the part, one the place in it.
         drawn_E2 = view.uniform(2)
         low, high = self.start_range
         plain_E = low + (high - low) * drawn_E2[:, 0]
+        plain_clip_E = self.draw_clip(view)
         if self.part_s is None:
-            return plain_E
+            return plain_clip_E, plain_E
         parts = parts_of(view, self.file, self.part_s)
-        reach_EB = torch.cumsum(part_weights(view, self.file, parts), dim=-1)
+        reach_B = torch.cumsum(part_weights(view, self.file, parts), dim=-1)
         # Not a probability yet: weights need not add up to 1.
-        whole_E = reach_EB[:, -1]
+        whole = reach_B[-1]
         # The first part whose cumulated weight exceeds the draw.
-        is_past_EB = drawn_E2[:, :1] * whole_E[:, None] >= reach_EB
-        part_E = is_past_EB.sum(-1).clamp(max=parts - 1)
+        part_E = torch.searchsorted(reach_B, drawn_E2[:, 0] * whole, right=True)
+        part_E = part_E.clamp(max=len(parts) - 1)
+        clip_E = parts.clip_B[part_E]
+        share_E = (parts.place_B[part_E] + drawn_E2[:, 1]) / parts.count_C[clip_E]
         # Zeros, before the curriculum has run, mean a start from the plain range.
-        return torch.where(whole_E > 0.0, (part_E + drawn_E2[:, 1]) / parts, plain_E)
+        has_run = whole > 0.0
+        if plain_clip_E is not None:
+            plain_clip_E = torch.where(has_run, clip_E, plain_clip_E)
+        return plain_clip_E, torch.where(has_run, share_E, plain_E)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartOfTrial(StartInMotion):
+    """Begin each episode at the start of the clip that `trial_clip` says, with the errors of `StartInMotion`."""
+
+    def draw_clip(self, view: EnvView) -> Int64[Tensor, " E"] | None:
+        """Return the clip of each env's trial; None where the motion is a single one."""
+        if motion_clip(view, self.file) is None:
+            return None
+        return trial_clip(view, self.file)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FailedParts(OfMotion, CurriculumTerm):
-    """Lets episodes begin more often in the parts of a motion where failures end them; `StartInMotion` reads it.
+    """Lets episodes begin more often in the clips, and the parts of clips, where failures end them.
 
+    `StartInMotion` reads it. Held-out clips have no parts.
     Reports the share of starts in the part that has most.
 
     Attributes:
@@ -119,17 +187,20 @@ class FailedParts(OfMotion, CurriculumTerm):
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
         parts = parts_of(view, self.file, self.part_s)
         # Shared by all envs: one count for each part, 1 at first.
-        failed_B = view.shared("failed_B", [1.0] * parts)
-        weights_EB = part_weights(view, self.file, parts)
+        failed_B = view.shared("failed_B", [1.0] * len(parts))
+        weights_B = part_weights(view, self.file, parts)
         # The very first resets end no episode.
         lived_E = mask_E & (view.episode_step_E > 0)
-        share_E = motion_time(view, self.file) / view.motion(self.file).duration_s
+        share_E = motion_time(view, self.file) / motion_end(view, self.file)
+        clip_E = motion_clip(view, self.file)
+        clip = 0 if clip_E is None else clip_E
         # Where the episode was when it ended: the clock is still the old one here.
-        part_E = (share_E * parts).long().clamp(0, parts - 1)
-        is_here_EB = part_E[:, None] == torch.arange(parts, device=view.device)
+        last_E = parts.count_C[clip] - 1.0
+        place_E = torch.minimum((share_E * parts.count_C[clip]).floor().clamp(min=0.0), last_E)
+        part_E = parts.first_C[clip] + place_E.long()
         # Only failures count; motions that were finished say nothing about where it is hard.
-        failed_E = lived_E & view.terminated_E
-        counts_B = (is_here_EB & failed_E[:, None]).sum(0).to(torch.float32)
+        failed_E = (lived_E & view.terminated_E).to(torch.float32)
+        counts_B = torch.zeros_like(failed_B).index_add(0, part_E, failed_E)
         # All ranks learn from all failures.
         ranks.sum_(counts_B)
         # An exponential mean over resets; nothing is read back from the device.
@@ -137,6 +208,6 @@ class FailedParts(OfMotion, CurriculumTerm):
         failed_B.copy_(torch.where(ranks.any_of(lived_E), mixed_B, failed_B))
         # A share is even over all parts, so that none is forgotten.
         share_of_failures_B = failed_B / failed_B.sum().clamp(min=1e-9)
-        chance_B = self.uniform / parts + (1.0 - self.uniform) * share_of_failures_B
-        weights_EB.copy_(torch.where(mask_E[:, None], chance_B, weights_EB))
+        chance_B = self.uniform / len(parts) + (1.0 - self.uniform) * share_of_failures_B
+        weights_B.copy_(torch.where(mask_E.any(), chance_B, weights_B))
         return chance_B.max() / chance_B.sum()

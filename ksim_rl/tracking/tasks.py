@@ -17,6 +17,7 @@ from ksim_rl.envs.task import Task
 from ksim_rl.envs.term import EventTerm, RewardTerm
 from ksim_rl.modules import ActorCfg
 from ksim_rl.objectives import PPOCfg
+from ksim_rl.scene.motions.motion_set import MotionSet
 from ksim_rl.scene.robots.unitree_g1 import SIDES, UnitreeG1
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity, velocity_training
@@ -52,16 +53,26 @@ KICK: mdp.Ranges = {
 }
 """m/s and rad/s, of pushes and of the errors that episodes begin with."""
 PART_S = 1.0
+SET = "clips"
+"""The name of the set of motions in the config of `g1_track`: `task.scene.motions.clips`."""
+AHEAD_S = (0.0, 0.1, 0.3)
+"""s from now, of the motion's joints that a policy of many motions sees."""
 ENV_STATES_PER_ITERATION = 24 * 4096
 # 160 million env states, after which G1 followed each of the four motions in all of 1024 trials.
 ITERATIONS = 1_627
 
 
-def observations(file: str) -> dict[str, ObservationGroupCfg]:
-    """Return the groups: a noisy "actor", and a clean "critic" that also sees where the bodies are."""
+def observations(
+    file: str, *, ahead_s: float | tuple[float, ...] = 0.0
+) -> dict[str, ObservationGroupCfg]:
+    """Return the groups: a noisy "actor", and a clean "critic" that also sees where the bodies are.
+
+    `ahead_s` are the moments of the motion that both see, s from now.
+    """
     # Order of the robot, which observations and actions share.
     joints = ROBOT.joint_names
-    reference = {"reference": ObservationTermCfg(term=mdp.MotionJoints(file=file, joints=joints))}
+    motion = mdp.MotionJoints(file=file, joints=joints, ahead_s=ahead_s)
+    reference = {"reference": ObservationTermCfg(term=motion)}
     last = {"actions": ObservationTermCfg(term=mdp.LastAction())}
     # Term and reach of its uniform noise, in the term's units, about as good as the robot's sensors.
     reaches = {
@@ -167,6 +178,29 @@ def track_cfg(file: str) -> ManagerBasedRlEnvCfg:
     )
 
 
+def track_set_cfg() -> ManagerBasedRlEnvCfg:
+    """Return the config of following many motions of G1 with one policy; those of the package, unless others are given.
+
+    The policy sees the motion's joints now and at two later moments, since it has to tell the motions apart.
+    """
+    cfg = track_cfg(SET)
+    names = tuple(f"g1_{clip}" for clip in ("walk", "squat", "turn", "kick"))
+    return dataclasses.replace(
+        cfg,
+        scene=dataclasses.replace(cfg.scene, motions={SET: MotionSet(sources=names)}),
+        observations=observations(SET, ahead_s=AHEAD_S),
+        # The names that the field has for these errors.
+        metrics={
+            "mpkpe": terms.BodyDrift(file=SET, bodies=BODIES),
+            "r_mpkpe": terms.BodyPosError(file=SET, anchor=ANCHOR, bodies=BODIES),
+            "joint_pos_error": terms.MotionJointError(file=SET, joints=ROBOT.joint_names),
+            "ee_pos_error": terms.BodyPosError(file=SET, anchor=ANCHOR, bodies=ENDS),
+        },
+        # Recordings last longer than our own motions; each ends with its clip.
+        episode_length_s=60.0,
+    )
+
+
 def training() -> TrainingCfg:
     """Return the training settings: mjlab's, but that the first policy keeps to the motion, with half the noise."""
     return TrainingCfg(
@@ -192,6 +226,12 @@ def _task(clip: str, what: str) -> Task:
 
 
 TASKS = (
+    Task(
+        name="g1_track",
+        description="Unitree G1 follows many motions, a folder of them, with its whole body",
+        cfg=track_set_cfg,
+        training=training(),
+    ),
     _task("walk", "a walk"),
     _task("squat", "squats"),
     _task("turn", "a turn on the spot"),

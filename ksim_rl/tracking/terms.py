@@ -16,11 +16,16 @@ from ksim_rl.envs.term import MetricTerm, ObservationTerm, TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.actions import JointAction
 from ksim_rl.mdp.constants import constant
-from ksim_rl.mdp.fields import GaussianReward
+from ksim_rl.mdp.fields import GaussianReward, OfJoints
 from ksim_rl.mdp.motion_tracking import OfMotion, OfMotionBodies
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
-from ksim_rl.scene.state.motion_clock import motion_bodies, motion_time
+from ksim_rl.scene.state.motion_clock import (
+    motion_bodies,
+    motion_clip,
+    motion_joints,
+    motion_time,
+)
 from ksim_rl.tracking.reference import OfAlignedBodies, OfAnchor, motion_velocities
 
 
@@ -91,7 +96,8 @@ class JointPositionAroundMotion(OfMotion, JointAction):
         joints = view.joints(self.joints)
         # At the end of the step, when the target should be reached.
         time_E = motion_time(view, self.file) + view.step_dt
-        pos_EK, _ = view.motion(self.file).sample_joints(time_E, joints.index)
+        clip_E = motion_clip(view, self.file)
+        pos_EK, _ = view.motion(self.file).sample_joints(time_E, joints.index, clip_E)
         # The error that this world's joints read with.
         wrong_EK = joints.default_pos_EL - view.default_qpos_L[joints.qpos]
         view.write_joint_pos_target(self.joints, pos_EK + wrong_EK + self.shaped(view, action_EK))
@@ -213,3 +219,12 @@ class BodyDrift(OfMotionBodies, MetricTerm):
         pos_EN3, _ = motion_bodies(view, self.file, self.bodies)
         away_EN3 = view.bodies(self.bodies).pos_EN3 - pos_EN3
         return torch.linalg.vector_norm(away_EN3, dim=-1).mean(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionJointError(OfMotion, OfJoints, MetricTerm):
+    """Mean absolute difference of joint positions from the motion's, rad or m, [E]; position stage."""
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        pos_EL, _ = motion_joints(view, self.file, self.joints)
+        return (view.joints(self.joints).pos_EL - pos_EL).abs().mean(-1)

@@ -8,7 +8,8 @@ in the height of the anchor and of feet and hands, 0.8 in how upright the anchor
 
 import dataclasses
 import math
-from collections.abc import Callable
+import statistics
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -21,24 +22,66 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.room import with_room
 from ksim_rl.mdp.events import PushByVelocity
-from ksim_rl.tracking.starts import StartInMotion
+from ksim_rl.tracking.starts import StartInMotion, StartOfTrial, trial_clip
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, build_env
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.metrics import losses_of
 
+MOST_ENVS = 8192
+"""That trials of many clips run in at a time: more of them take more memory, and are no faster."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipTrials:
+    """The results of the trials of one clip: the share of successes, and errors by metric, means over all steps."""
+
+    clip: str
+    held_out: bool
+    success: float
+    errors: dict[str, float]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Trials:
-    """The results of trials: the share of successes, and errors by metric, means over all steps of all trials."""
+    """The results of trials of a motion.
+
+    Attributes:
+        trials: of each clip.
+        success: the share of successes; of many clips the least of those that were trained on.
+        errors: by metric, means over all steps of all trials; of many clips over those that were trained on.
+        clips: the results by clip, where the motion has several.
+    """
 
     trials: int
     success: float
     errors: dict[str, float]
+    clips: tuple[ClipTrials, ...] = ()
+
+    @property
+    def held_out(self) -> float | None:
+        """The mean share of successes over the clips that were held out; None where there are none."""
+        shares = [clip.success for clip in self.clips if clip.held_out]
+        return statistics.fmean(shares) if shares else None
 
     def __str__(self) -> str:
-        errors = ", ".join(f"{name} {value:.3f}" for name, value in self.errors.items())
-        return f"{self.success:.1%} of {self.trials} trials succeed; {errors}"
+        if not self.clips:
+            return f"{self.success:.1%} of {self.trials} trials succeed; {_listed(self.errors)}"
+        trained = [clip.success for clip in self.clips if not clip.held_out]
+        lines = [
+            f"{self.trials} trials of each of {len(self.clips)} clips; trained on {len(trained)}: "
+            f"{statistics.fmean(trained):.1%} succeed, at least {self.success:.1%}; {_listed(self.errors)}"
+        ]
+        if self.held_out is not None:
+            lines[0] += f"; held out {len(self.clips) - len(trained)}: {self.held_out:.1%} succeed"
+        for clip in self.clips:
+            mark = " (held out)" if clip.held_out else ""
+            lines.append(f"  {clip.clip}{mark}: {clip.success:.1%}; {_listed(clip.errors)}")
+        return "\n".join(lines)
+
+
+def _listed(errors: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.3f}" for name, value in errors.items())
 
 
 class TrialRunner(Evaluator):
@@ -87,8 +130,10 @@ def trial_cfg(cfg: ManagerBasedRlEnvCfg, *, pushes: bool = False) -> ManagerBase
             "as g1_track_walk"
         )
     for name in starts:
+        start = events[name]
         # From the first frame, and not from the parts of the curriculum.
-        events[name] = dataclasses.replace(events[name], start_range=(0.0, 0.0), part_s=None)
+        fields = {field.name: getattr(start, field.name) for field in dataclasses.fields(start)}
+        events[name] = StartOfTrial(**{**fields, "start_range": (0.0, 0.0), "part_s": None})
     if not pushes:
         events = {
             name: event for name, event in events.items() if not isinstance(event, PushByVelocity)
@@ -105,37 +150,69 @@ def run_trials(
     pushes: bool = False,
     note: Callable[[str], None],
 ) -> Trials:
-    """Run trials of a policy of a tracking task, by its deterministic actions.
+    """Run trials of each clip of a tracking task by the deterministic actions of its policy.
 
     `note` is told of room that worlds get, and of contacts and constraints that they lose.
     """
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET
     of_trials = dataclasses.replace(cfg, task=trial_cfg(cfg.task, pushes=pushes))
-    env = with_room(partial(build_env, of_trials, num_envs=trials, seed=seed), note=note)
+    (file,) = {
+        event.file
+        for event in (of_trials.task.events or {}).values()
+        if isinstance(event, StartOfTrial)
+    }
+    chosen = cfg.task.scene.motions.get(file)
+    clips = len(chosen.files()) if chosen is not None else 1
+    # As many clips at a time as fit into one env.
+    at_once = min(clips, max(1, MOST_ENVS // trials))
+    env = with_room(partial(build_env, of_trials, num_envs=trials * at_once, seed=seed), note=note)
     base = part(env, ManagerBasedRlEnv)
     assert base is not None
-    files = {
-        event.file for event in (base.cfg.events or {}).values() if isinstance(event, StartInMotion)
-    }
-    # The longest motion that any start may choose.
-    duration_s = max(base.view.motion(file).duration_s for file in files)
-    # Rounded up, but not for a rounding error of the division.
-    runner = TrialRunner(
-        base,
-        env=env,
-        policy=actor,
-        max_steps=math.ceil(duration_s / base.step_dt - 1e-6),
-        seed=seed,
-    )
-    runner()
+    motion = base.view.motion(file)
+    runner = TrialRunner(base, env=env, policy=actor, max_steps=1, seed=seed)
+    steps_C = []
+    errors_CM = []
+    success_C = []
+    row_E = torch.arange(trials * at_once, device=base.device) // trials
+    for first in range(0, clips, at_once):
+        # Rows beyond the last clip try it once more, and are not counted.
+        count = min(at_once, clips - first)
+        if clips > 1:
+            trial_clip(base.view, file).copy_((first + row_E).clamp(max=clips - 1))
+        duration_s = float(motion.duration_C[first : first + count].max())
+        # Rounded up, but not for a rounding error of the division.
+        runner.max_steps = math.ceil(duration_s / base.step_dt - 1e-6)
+        runner()
+        rows = slice(0, count * trials)
+        steps_C += runner.length_E[rows].view(count, trials).sum(1).tolist()
+        errors_CM += runner.errors_EM[rows].view(count, trials, -1).sum(1).tolist()
+        success_C += runner.ended_well_E[rows].double().view(count, trials).mean(1).tolist()
     for text in losses_of(env):
         note(f"warning: {text}")
-    # Per step of all trials, so that a long trial counts more than a short one.
-    steps = runner.length_E.sum()
-    errors = (runner.errors_EM.sum(0) / steps).tolist()
-    success = float(runner.ended_well_E.double().mean())
     env.close(raise_if_closed=False)
+    names = list(base.cfg.metrics)
+    trained = [place for place, held_out in enumerate(motion.held_out) if not held_out]
     return Trials(
-        trials=trials, success=success, errors=dict(zip(base.cfg.metrics, errors, strict=True))
+        trials=trials,
+        success=min(success_C[place] for place in trained),
+        errors=_means(names, [steps_C[c] for c in trained], [errors_CM[c] for c in trained]),
+        clips=tuple(
+            ClipTrials(
+                clip=name,
+                held_out=motion.held_out[place],
+                success=success_C[place],
+                errors=_means(names, [steps_C[place]], [errors_CM[place]]),
+            )
+            for place, name in enumerate(motion.names if clips > 1 else ())
+        ),
     )
+
+
+def _means(
+    names: Sequence[str], steps_C: Sequence[float], errors_CM: Sequence[Sequence[float]]
+) -> dict[str, float]:
+    """Return the errors of some clips per step of their trials, so that a long trial counts more than a short one."""
+    steps = sum(steps_C)
+    sums = [sum(column) for column in zip(*errors_CM, strict=True)]
+    return {name: total / steps for name, total in zip(names, sums, strict=True)}

@@ -70,6 +70,7 @@ def test_the_shipped_tables_name_tasks_that_exist():
         "dm_control",
         "humanoids",
         "manipulation",
+        "motions",
         "pixels",
         "tasks",
         "tracking",
@@ -106,6 +107,7 @@ def test_the_other_algorithm_stays_within_its_env_states():
         *(f"pixels:{row}" for row in load("pixels").rows),
         "manipulation:panda_pick_cube",
         "manipulation:leap_cube_reorient",
+        "motions:g1_track",
         *(f"tracking:{clip}" for clip in ("walk", "squat", "turn", "kick")),
         *(f"tasks:{row}" for row in load("tasks").rows),
         *(
@@ -128,7 +130,7 @@ def test_the_tables_have_every_task_and_that_of_tasks_asks_of_each_what_the_task
     rows = load("tasks").rows
     elsewhere = {
         row.task
-        for name in ("velocity", "humanoids", "tracking", "pixels")
+        for name in ("velocity", "humanoids", "tracking", "motions", "pixels")
         for row in load(name).rows.values()
     }
     own = [name for name in envs.names() if not envs.task(name).suite]

@@ -9,7 +9,7 @@ import torch
 
 from ksim_rl import envs
 from ksim_rl.scene.state.motion_clock import motion_start_time
-from ksim_rl.tracking.starts import FailedParts, StartInMotion, part_weights
+from ksim_rl.tracking.starts import FailedParts, StartInMotion, part_weights, parts_of
 from ksim_rl.tracking.tasks import track_cfg
 from tests.tracking.g1 import g1_model
 
@@ -25,6 +25,10 @@ def built(num_envs, *, curriculum=True, **changes):
     if not curriculum:
         cfg = dataclasses.replace(cfg, curriculum={})
     return envs.build(cfg).base_env
+
+
+def weights_of(view):
+    return part_weights(view, CLIP, parts_of(view, CLIP, 1.0))
 
 
 def test_errors_of_the_start_keep_their_ranges():
@@ -71,17 +75,18 @@ def test_failures_in_one_part_bring_more_starts_there():
         motion_start_time(view, CLIP).fill_(4.2)
         view.episode_step_E.fill_(20)  # ended at 4.6 s
         view.terminated_E.fill_(True)
-        before_EB = part_weights(view, CLIP, 9).clone()
+        before_B = weights_of(view).clone()
         term(view, torch.zeros(256, dtype=torch.bool))
-        assert torch.equal(part_weights(view, CLIP, 9), before_EB), "nobody ended"
+        assert torch.equal(weights_of(view), before_B), "nobody ended"
         for _ in range(30):
             level = term(view, everyone_E)
-    weights_B = part_weights(view, CLIP, 9)[0]
+    weights_B = weights_of(view)
     part = int(4.6 / motion.duration_s * 9)
     assert weights_B.sum().item() == pytest.approx(1.0)
     assert weights_B.argmax() == part and level.item() == pytest.approx(0.5 + 0.5 / 9, abs=0.02)
     with env.driver.scope("events/start", view.reset_count_E):
-        share_E = env.cfg.events["start"].draw_share(view)
+        clip_E, share_E = env.cfg.events["start"].draw_start(view)
+    assert clip_E is None, "there is one clip"
     begins = np.histogram(share_E.numpy(), bins=9, range=(0.0, 1.0))[0] / 256
     assert begins[part] == pytest.approx(weights_B[part].item(), abs=0.1)
     assert (begins > 0.01).all(), "half of the starts are spread evenly"
@@ -96,7 +101,7 @@ def test_who_has_not_failed_counts_for_nothing():
         view.terminated_E.fill_(False)
         for _ in range(5):
             term(view, torch.ones(8, dtype=torch.bool))
-    weights_B = part_weights(view, CLIP, 9)[0]
+    weights_B = weights_of(view)
     assert weights_B == pytest.approx(torch.full((9,), 1.0 / 9))
 
 

@@ -1,6 +1,6 @@
 """Reads reference motions: recorded states of a scene, at any time between their frames."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,10 +25,17 @@ FASTEST = 1e5
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceMotion(NearNames):
-    """F frames of generalized positions and velocities in MuJoCo's layout.
+    """F frames of generalized positions and velocities in MuJoCo's layout: of C clips, one after the other.
+
+    Methods take the clip that each env follows; without one it is the first, as of a motion that is a single file.
 
     Attributes:
-        fps: frames per second.
+        fps: frames per second, of all clips.
+        names: of the clips.
+        held_out: of the clips, whether training must not see it.
+        first_C: the clips' first frames among the F.
+        last_C: the number of each clip's last frame, counted from its own first.
+        duration_C: seconds from the first frame of each clip to its last.
         qpos_FL, qvel_FL: positions and velocities in MuJoCo's layout.
         quats: the columns of qpos at which unit quaternions (w, x, y, z) begin.
         joint_pos_FL: positions of hinges and slides, rad or m.
@@ -38,6 +45,11 @@ class ReferenceMotion(NearNames):
     """
 
     fps: float
+    names: tuple[str, ...]
+    held_out: tuple[bool, ...]
+    first_C: Int64[Tensor, " C"]
+    last_C: Float[Tensor, " C"]
+    duration_C: Float[Tensor, " C"]
     qpos_FL: Float[Tensor, "F ?L"]
     qvel_FL: Float[Tensor, "F ?L"]
     quats: tuple[int, ...]
@@ -48,18 +60,22 @@ class ReferenceMotion(NearNames):
 
     @property
     def duration_s(self) -> float:
-        """Seconds from the first frame to the last."""
-        return (self.qpos_FL.shape[0] - 1) / self.fps
+        """Seconds from the first frame to the last, of the longest clip."""
+        return float(self.last_C.max()) / self.fps
+
+    def duration_of(self, clip_E: Int64[Tensor, " E"] | None) -> Float[Tensor, "*E"]:
+        """Return the duration of each env's clip, s."""
+        return self.duration_C[0 if clip_E is None else clip_E]
 
     def sample(
-        self, time_E: Float[Tensor, " E"]
+        self, time_E: Float[Tensor, " E"], clip_E: Int64[Tensor, " E"] | None = None
     ) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E M"]]:
-        """Return qpos and qvel at times, s; before the first and after the last frame those stay.
+        """Return qpos and qvel at times, s; before the first and after the last frame of a clip those stay.
 
         Between frames both are interpolated linearly, quaternions along the shorter arc and normalized.
         """
         # Frame and share once, for all tables.
-        low_E, share_E1 = self._between(time_E)
+        low_E, share_E1 = self.between(time_E, clip_E)
         before_EL = self.qpos_FL[low_E]
         after_EL = self.qpos_FL[low_E + 1]
         qpos_EL = torch.lerp(before_EL, after_EL, share_E1)
@@ -70,10 +86,13 @@ class ReferenceMotion(NearNames):
         return qpos_EL, torch.lerp(self.qvel_FL[low_E], self.qvel_FL[low_E + 1], share_E1)
 
     def sample_joints(
-        self, time_E: Float[Tensor, " E"], joints: Index
+        self,
+        time_E: Float[Tensor, " E"],
+        joints: Index,
+        clip_E: Int64[Tensor, " E"] | None = None,
     ) -> tuple[Float[Tensor, "E N"], Float[Tensor, "E N"]]:
         """Return positions and velocities of hinges and slides at times, s."""
-        low_E, share_E1 = self._between(time_E)
+        low_E, share_E1 = self.between(time_E, clip_E)
         pos_EL, vel_EL = (
             torch.lerp(
                 _entries(table_FL, low_E, joints), _entries(table_FL, low_E + 1, joints), share_E1
@@ -83,10 +102,13 @@ class ReferenceMotion(NearNames):
         return pos_EL, vel_EL
 
     def sample_bodies(
-        self, time_E: Float[Tensor, " E"], bodies: Index
+        self,
+        time_E: Float[Tensor, " E"],
+        bodies: Index,
+        clip_E: Int64[Tensor, " E"] | None = None,
     ) -> tuple[Float[Tensor, "E N 3"], Float[Tensor, "E N 4"]]:
         """Return the poses of bodies at times, s; between frames as in `sample`."""
-        low_E, share_E1 = self._between(time_E)
+        low_E, share_E1 = self.between(time_E, clip_E)
         (pos_EN3, next_pos_EN3), (quat_EN4, next_quat_EN4) = (
             (_entries(table, low_E, bodies), _entries(table, low_E + 1, bodies))
             for table in (self.body_pos_FN3, self.body_quat_FN4)
@@ -97,13 +119,16 @@ class ReferenceMotion(NearNames):
             quat_EN4, next_quat_EN4, share_E11
         )
 
-    def _between(self, time_E: Float[Tensor, " E"]) -> tuple[Tensor, Tensor]:
-        """Return the frame before each time, [E], and the part of the way to the next one, [E, 1]."""
-        last = self.qpos_FL.shape[0] - 1
-        frame_E = (time_E * self.fps).clamp(0.0, float(last))
-        # The last frame has no next one: the share is 1 there instead.
-        low_E = frame_E.floor().long().clamp(max=last - 1)
-        return low_E, (frame_E - low_E)[:, None]
+    def between(
+        self, time_E: Float[Tensor, " E"], clip_E: Int64[Tensor, " E"] | None = None
+    ) -> tuple[Int64[Tensor, " E"], Float[Tensor, "E 1"]]:
+        """Return the frame before each time, s, among the F, and the part of the way to the next one."""
+        clip = 0 if clip_E is None else clip_E
+        last_E = self.last_C[clip]
+        frame_E = torch.minimum((time_E * self.fps).clamp(min=0.0), last_E)
+        # The last frame has no next one: the share is 1 there instead. So no clip reads the next one's frames.
+        low_E = torch.minimum(frame_E.floor(), last_E - 1.0)
+        return self.first_C[clip] + low_E.long(), (frame_E - low_E)[:, None]
 
 
 def motion_path(file: str) -> Path:
@@ -122,7 +147,66 @@ def load_motion(
 
     The file may be the name of a motion that comes with the package (`ksim_rl.scene.motions`).
     """
-    arrays = _read(motion_path(str(file)))
+    return load_clips({Path(str(file)).stem: str(file)}, mj_model, device)
+
+
+def load_clips(
+    files: Mapping[str, str],
+    mj_model: mujoco.MjModel,
+    device: torch.device,
+    *,
+    held_out: Collection[str] = (),
+) -> ReferenceMotion:
+    """Read motions by name, as `load_motion` does each, into one table; those of `held_out` are marked as such."""
+    clips = [_checked_arrays(file, mj_model) for file in files.values()]
+    rates = [float(arrays["fps"].item()) for arrays in clips]
+    for file, fps in zip(files.values(), rates, strict=True):
+        # One table has one rate: a clip of another one is resampled when it is made.
+        if fps != rates[0]:
+            first = next(iter(files.values()))
+            raise ValueError(
+                f"motion {file}: fps={fps:g}, and {first} has {rates[0]:g}: motions of one folder have one rate; make "
+                f"it with --fps {rates[0]:g}"
+            )
+    counts = [len(arrays["qpos"]) for arrays in clips]
+    qpos_FL = np.concatenate([arrays["qpos"] for arrays in clips])
+    qvel_FM = np.concatenate([arrays["qvel"] for arrays in clips])
+    # Bodies follow from qpos by kinematics, once on the host.
+    body_pos_FN3, body_quat_FN4 = _body_poses(mj_model, qpos_FL)
+    joints = scalar_joint_ids(mj_model)
+
+    def on_device(array: np.ndarray | list[float]) -> Tensor:
+        return torch.tensor(array, dtype=torch.float32, device=device)
+
+    firsts = np.cumsum([0, *counts[:-1]])
+    return ReferenceMotion(
+        fps=rates[0],
+        names=tuple(files),
+        held_out=tuple(name in held_out for name in files),
+        first_C=torch.tensor(firsts, dtype=torch.int64, device=device),
+        last_C=on_device([count - 1.0 for count in counts]),
+        duration_C=on_device([(count - 1) / rates[0] for count in counts]),
+        qpos_FL=on_device(qpos_FL),
+        qvel_FL=on_device(qvel_FM),
+        quats=_quaternion_columns(mj_model),
+        joint_pos_FL=on_device(qpos_FL[:, mj_model.jnt_qposadr[joints]]),
+        joint_vel_FL=on_device(qvel_FM[:, mj_model.jnt_dofadr[joints]]),
+        body_pos_FN3=on_device(body_pos_FN3),
+        body_quat_FN4=on_device(body_quat_FN4),
+    )
+
+
+def _quaternion_columns(mj_model: mujoco.MjModel) -> tuple[int, ...]:
+    """Return the columns of qpos at which quaternions begin."""
+    # Where a joint's quaternion starts in its part of qpos; a free joint has its position before it.
+    starts = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
+    places = zip(mj_model.jnt_type.tolist(), mj_model.jnt_qposadr.tolist(), strict=True)
+    return tuple(address + starts[kind] for kind, address in places if kind in starts)
+
+
+def _checked_arrays(file: str, mj_model: mujoco.MjModel) -> Mapping[str, np.ndarray]:
+    """Return the arrays of a file that fits the model; a ValueError names what does not."""
+    arrays = _read(motion_path(file))
     # One number, also as an array.
     fps = arrays["fps"]
     if fps.size != 1 or not SLOWEST <= fps.item() <= FASTEST:
@@ -153,11 +237,7 @@ def load_motion(
         raise ValueError(
             f"motion {file}: joint_names={names.tolist()}: expected the model's joints in their order, {own}"
         )
-    # Where a joint's quaternion starts in its part of qpos; a free joint has its position before it.
-    starts = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
-    places = zip(mj_model.jnt_type.tolist(), mj_model.jnt_qposadr.tolist(), strict=True)
-    quats = tuple(address + starts[kind] for kind, address in places if kind in starts)
-    for start in quats:
+    for start in _quaternion_columns(mj_model):
         # Float32 files round; a thousandth is far beyond that.
         norms = np.linalg.norm(arrays["qpos"][:, start : start + 4], axis=-1)
         if np.abs(norms - 1.0).max() > 1e-3:
@@ -165,23 +245,7 @@ def load_motion(
                 f"motion {file}: qpos[:, {start}:{start + 4}] holds quaternions of lengths {norms.min():g} to "
                 f"{norms.max():g}: expected unit quaternions (w, x, y, z)"
             )
-    # Bodies follow from qpos by kinematics, once on the host.
-    body_pos_FN3, body_quat_FN4 = _body_poses(mj_model, arrays["qpos"])
-    joints = scalar_joint_ids(mj_model)
-
-    def on_device(array: np.ndarray) -> Tensor:
-        return torch.tensor(array, dtype=torch.float32, device=device)
-
-    return ReferenceMotion(
-        fps=float(fps.item()),
-        qpos_FL=on_device(arrays["qpos"]),
-        qvel_FL=on_device(arrays["qvel"]),
-        quats=quats,
-        joint_pos_FL=on_device(arrays["qpos"][:, mj_model.jnt_qposadr[joints]]),
-        joint_vel_FL=on_device(arrays["qvel"][:, mj_model.jnt_dofadr[joints]]),
-        body_pos_FN3=on_device(body_pos_FN3),
-        body_quat_FN4=on_device(body_quat_FN4),
-    )
+    return arrays
 
 
 def _read(path: Path) -> Mapping[str, np.ndarray]:

@@ -1,6 +1,7 @@
 """Follows a reference motion through an episode: when in the motion each env is, and the motion's pose then."""
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from ksim_rl.scene.names import Patterns
@@ -19,6 +20,19 @@ def motion_time(view: WorldView, file: str) -> Float[Tensor, " E"]:
     return motion_start_time(view, file) + view.episode_time_E
 
 
+def motion_clip(view: WorldView, file: str) -> Int64[Tensor, " E"] | None:
+    """Return the buffer of the clip that each episode follows; `ResetToMotion` writes it. None: there is one clip."""
+    # A motion that is a single file needs no buffer, and is sampled without look-ups.
+    if len(view.motion(file).names) == 1:
+        return None
+    return view.buffers.get(f"motion/{file}.clip_E", dtype=torch.int64)
+
+
+def motion_end(view: WorldView, file: str) -> Float[Tensor, "*E"]:
+    """Return how long the motion is that each episode follows, s."""
+    return view.motion(file).duration_of(motion_clip(view, file))
+
+
 def motion_joints(
     view: WorldView, file: str, joints: Patterns
 ) -> tuple[Float[Tensor, "E L"], Float[Tensor, "E L"]]:
@@ -27,7 +41,9 @@ def motion_joints(
     key = f"motion/{file}.joints {joints}"
     if key not in view.cache:
         index = view.joints(joints).index
-        view.cache[key] = view.motion(file).sample_joints(motion_time(view, file), index)
+        view.cache[key] = view.motion(file).sample_joints(
+            motion_time(view, file), index, motion_clip(view, file)
+        )
     return view.cache[key]
 
 
@@ -40,7 +56,9 @@ def motion_bodies(
         index = view.bodies(bodies).index
         shift_E3 = motion_shift(view)
         # Orientations are not shifted: origins differ in position only.
-        pos_EN3, quat_EN4 = view.motion(file).sample_bodies(motion_time(view, file), index)
+        pos_EN3, quat_EN4 = view.motion(file).sample_bodies(
+            motion_time(view, file), index, motion_clip(view, file)
+        )
         view.cache[key] = (pos_EN3 if shift_E3 is None else pos_EN3 + shift_E3[:, None]), quat_EN4
     return view.cache[key]
 

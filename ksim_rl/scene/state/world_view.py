@@ -1,6 +1,6 @@
 """The view that parts of a scene and terms of an env read: named quantities of the current state."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,7 +11,8 @@ from torch import Tensor
 from ksim_rl.checks import near
 from ksim_rl.device import random
 from ksim_rl.physics import World
-from ksim_rl.scene.motions.motion import ReferenceMotion, load_motion
+from ksim_rl.scene.motions.motion import ReferenceMotion
+from ksim_rl.scene.motions.motion_set import MotionSet, load_set
 from ksim_rl.scene.names import NameResolver, Patterns, as_index, as_patterns, scalar_joint_ids
 from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.state.buffers import ActuatorParams
@@ -73,6 +74,7 @@ class WorldView(NearNames):
         *,
         soft_joint_pos_limit_factor: float = 1.0,
         entities: Sequence[str] = (),
+        motions: Mapping[str, MotionSet] | None = None,
     ) -> None:
         self._simulation = simulation
         self.world = simulation.world
@@ -93,6 +95,7 @@ class WorldView(NearNames):
         # Look-ups by patterns are remembered, since terms repeat them in each step.
         self._named: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._motions: dict[str, ReferenceMotion] = {}
+        self._motion_sets = motions or {}
 
         # MuJoCo keeps all sensors in one array; names give their slices.
         model = self.world.mj_model
@@ -277,10 +280,14 @@ class WorldView(NearNames):
         return self._simulation.derived()
 
     def motion(self, file: str) -> ReferenceMotion:
-        """Return the reference motion of an .npz file; it is read once, while the env is constructed."""
+        """Return the reference motion of an .npz file, or of the name of a set of motions in the scene's config.
+
+        It is read once, while the env is constructed.
+        """
         # Reading a file belongs to construction: a captured step could not do it.
         if file not in self._motions:
-            self._motions[file] = load_motion(file, self.world.mj_model, self.device)
+            chosen = self._motion_sets.get(file, MotionSet(sources=(file,)))
+            self._motions[file] = load_set(chosen, self.world.mj_model, self.device)
         return self._motions[file]
 
     @quantity
@@ -315,9 +322,18 @@ class WorldView(NearNames):
         return self.buffers.get(full_name, *shape, dtype=dtype, keep=keep, owner=owner)
 
     def shared(
-        self, name: str, initial: float | Sequence[float] | Sequence[Sequence[float]]
+        self,
+        name: str,
+        initial: float | Sequence[float] | Sequence[Sequence[float]],
+        *,
+        of_curriculum: bool = False,
     ) -> Float[Tensor, "*shape"]:
-        """Return a float32 tensor of the calling term that all envs share; it starts at `initial` and is saved."""
+        """Return a float32 tensor of the calling term that all envs share; it starts at `initial` and is saved.
+
+        With `of_curriculum` all terms read the same one by this name, and a curriculum writes it.
+        """
+        if of_curriculum:
+            return self._simulation.shared_values.get(name, initial)
         full_name = self._simulation.scoped(name)
         owner = self._simulation.reader
         return self._simulation.shared_values.get(full_name, initial, owner=owner)
