@@ -100,6 +100,10 @@ def test_no_episode_of_training_begins_in_a_held_out_clip(env):
     clip_E = motion_clip(env.view, SET)
     found = np.bincount(clip_E.numpy(), minlength=4)
     assert found[1] == 0 and (found[[0, 2, 3]] > 8).all()
+    # Nor where no curriculum runs.
+    with env.driver.scope("events/start", env.view.reset_count_E):
+        drawn = np.bincount(env.cfg.events["start"].draw_clip(env.view).numpy(), minlength=4)
+    assert drawn[1] == 0 and (drawn[[0, 2, 3]] > 8).all()
     start_E = motion_start_time(env.view, SET)
     ends = torch.tensor([(count - 1) / 50.0 for count in FRAMES.values()])
     assert (start_E <= ends[clip_E]).all() and (start_E > 0.6 * ends[clip_E]).any()
