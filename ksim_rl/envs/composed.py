@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any
 
-from hydra import compose, initialize
+from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
@@ -14,6 +14,7 @@ from ksim_rl.config.overrides import check_overrides
 from ksim_rl.config.trees import Tree
 
 _CONFIG = "ksim_rl_env"
+_MODULE = "ksim_rl.envs"
 
 MakeTree = Callable[[str], Tree]
 
@@ -30,7 +31,8 @@ def with_overrides(name: str, make_tree: MakeTree, overrides: Sequence[str]) -> 
     """Return the tree of a registered task with overrides applied; a ValueError names the one that is not valid."""
     # Our own check first: it names near fields, which Hydra's errors do not.
     check_overrides({"task": make_tree(name)}, overrides)
-    with initialize(version_base="1.3", config_path=None):
+    # Its sibling `initialize` reads the source around each frame of the stack to find out who calls.
+    with initialize_config_module(_MODULE, version_base="1.3"):
         try:
             composed = compose(config_name=_CONFIG, overrides=[f"task={name}", *overrides])
         except ConfigCompositionException as error:

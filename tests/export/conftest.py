@@ -1,8 +1,25 @@
 """A toy policy that is exported once for a file of tests, and what runs it in a loop."""
 
+import functools
+from importlib.util import find_spec
+
 import pytest
 
 # Their modules need onnx and onnxruntime, which an extra brings: files of tests without them are skipped before.
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_registry():
+    """Let torch's exporter read the signatures of its five hundred functions once, not for each file that it writes."""
+    if find_spec("onnxscript") is None:
+        yield
+        return
+    from torch.onnx._internal.exporter._registration import ONNXRegistry
+
+    with pytest.MonkeyPatch.context() as patch:
+        once = functools.cache(ONNXRegistry.from_torchlib)
+        patch.setattr(ONNXRegistry, "from_torchlib", staticmethod(once))
+        yield
 
 
 @pytest.fixture(scope="module")

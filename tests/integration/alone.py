@@ -12,6 +12,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
 OURS = "ksim_rl"
+_BETWEEN = "-- the next program --"
 
 # Lets Python's finders find nothing of these names: then it is as if they were not installed.
 REFUSAL = """
@@ -51,6 +52,18 @@ def run_with(packages: Sequence[str], program: str, *, without: Sequence[str] = 
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+def run_each_with(
+    packages: Sequence[str], programs: Sequence[str], *, without: Sequence[str] = ()
+) -> list[str]:
+    """Return what each program prints; they run as with `run_with`, one after the other in one process.
+
+    A process imports for as long as most programs run: what has been loaded is asked by the first.
+    """
+    between = f"\nprint({_BETWEEN!r})\n"
+    printed = run_with(packages, between.join(programs), without=without)
+    return printed.split(f"{_BETWEEN}\n")
 
 
 def _with_requirements(packages: Sequence[str]) -> set[str]:

@@ -5,7 +5,7 @@ import inspect
 import pytest
 
 from ksim_rl import physics
-from tests.integration.alone import run_with
+from tests.integration.alone import run_each_with
 
 PACKAGES = ("torch", "numpy", "jaxtyping", "mujoco", "mujoco-warp", "warp-lang")
 # What programs beyond the engine's need; a name that is wrongly spelled here would be absent for another reason.
@@ -60,8 +60,16 @@ except ValueError as error:
 """
 
 
-def test_its_modules_load_no_other_room_and_no_other_package():
-    rooms, others = run_with(PACKAGES, ROOMS).splitlines()
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory):
+    """What the programs print, by name."""
+    folder = str(tmp_path_factory.mktemp("guard"))
+    programs = {"rooms": ROOMS, "guard": GUARD.replace("FOLDER", repr(folder)), "worlds": WORLDS}
+    return dict(zip(programs, run_each_with(PACKAGES, [*programs.values()]), strict=True))
+
+
+def test_its_modules_load_no_other_room_and_no_other_package(printed):
+    rooms, others = printed["rooms"].splitlines()
     assert rooms.split() == [
         "checked",
         "checks",
@@ -74,8 +82,8 @@ def test_its_modules_load_no_other_room_and_no_other_package():
     assert others == ""
 
 
-def test_both_engines_step_worlds():
-    warp, c = (list(map(float, line.split())) for line in run_with(PACKAGES, WORLDS).splitlines())
+def test_both_engines_step_worlds(printed):
+    warp, c = (list(map(float, line.split())) for line in printed["worlds"].splitlines())
     masses, sags = warp[:4], warp[4:]
     assert masses == pytest.approx([0.5, 1.0, 1.5, 2.0])
     # What holds the arm: stiffness times sag is gravity's torque at the angle that is reached.
@@ -83,10 +91,8 @@ def test_both_engines_step_worlds():
     assert warp == pytest.approx(c, abs=1e-4)
 
 
-def test_who_asks_for_files_of_the_nan_guard_learns_what_they_need(tmp_path):
-    assert "need the package safetensors" in run_with(
-        PACKAGES, GUARD.replace("FOLDER", repr(str(tmp_path)))
-    )
+def test_who_asks_for_files_of_the_nan_guard_learns_what_they_need(printed):
+    assert "need the package safetensors" in printed["guard"]
 
 
 def test_its_face_is_a_few_names_that_explain_themselves():

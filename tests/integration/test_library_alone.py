@@ -1,6 +1,8 @@
 """Transforms, losses, networks and data serve any env of TorchRL, beside torch and TorchRL alone."""
 
-from tests.integration.alone import run_with
+import pytest
+
+from tests.integration.alone import run_each_with
 
 PACKAGES = ("torch", "torchrl", "tensordict", "jaxtyping", "gymnasium")
 # Some of them come with torch or TorchRL on some machines.
@@ -71,19 +73,27 @@ for _ in range(20):
 """
 
 
-def test_its_rooms_load_nothing_of_the_engine():
-    rooms = set(run_with(PACKAGES, IMPORTS, without=ABSENT).split())
+@pytest.fixture(scope="module")
+def printed():
+    """What the programs print, by name."""
+    programs = {"imports": IMPORTS, "transforms": TRANSFORMS, "learning": LEARNING}
+    found = run_each_with(PACKAGES, [*programs.values()], without=ABSENT)
+    return dict(zip(programs, found, strict=True))
+
+
+def test_its_rooms_load_nothing_of_the_engine(printed):
+    rooms = set(printed["imports"].split())
     assert {"data", "modules", "objectives", "transforms"} <= rooms
     assert not {"physics", "compiled", "scene", "envs", "conf", "cli"} & rooms
 
 
-def test_each_transform_serves_an_env_of_gymnasium():
+def test_each_transform_serves_an_env_of_gymnasium(printed):
     from tests.transforms.portable import exported_transforms
 
-    names = run_with(PACKAGES, TRANSFORMS, without=ABSENT).split()
+    names = printed["transforms"].split()
     assert exported_transforms() <= set(names)
 
 
-def test_a_policy_learns_from_a_batch():
-    losses = [float(line) for line in run_with(PACKAGES, LEARNING, without=ABSENT).split()]
+def test_a_policy_learns_from_a_batch(printed):
+    losses = [float(line) for line in printed["learning"].split()]
     assert losses[-1] < 0.5 * losses[0]

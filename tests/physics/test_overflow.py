@@ -20,7 +20,7 @@ from tests.physics.overflowing_models import (
 )
 
 # Their ground and their cones are in the others, too.
-LONG_SCENES = SCENES[4:8]
+LONG_SCENES = SCENES[1:3] + SCENES[4:8]
 
 
 def scenes():

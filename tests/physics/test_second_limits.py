@@ -68,7 +68,12 @@ def thrown(
 @pytest.mark.parametrize("more", ["", TENDON, SENSORS], ids=("joints", "tendon", "sensors"))
 @pytest.mark.parametrize(
     ("sim", "jacobian"),
-    [(OURS, "sparse"), (THEIRS, "sparse"), (DENSE, "sparse"), (DENSE, "dense")],
+    [
+        (OURS, "sparse"),
+        (THEIRS, "sparse"),
+        pytest.param(DENSE, "sparse", marks=pytest.mark.full),
+        (DENSE, "dense"),
+    ],
     ids=("ours", "theirs", "their solver", "dense"),
 )
 def test_both_limits_hold(sim, jacobian, more):

@@ -64,7 +64,11 @@ def compare(xml: str, sim: SimCfg) -> None:
     np.testing.assert_allclose(world.qvel_EL[1], mj_data.qvel, rtol=2e-4, atol=2e-4)
 
 
-@pytest.mark.parametrize("sim", [OURS, THEIRS, NO_KERNEL], ids=("ours", "theirs", "their solver"))
+@pytest.mark.parametrize(
+    "sim",
+    [OURS, THEIRS, pytest.param(NO_KERNEL, marks=pytest.mark.full)],
+    ids=("ours", "theirs", "their solver"),
+)
 @pytest.mark.parametrize("ties", TIES.values(), ids=TIES)
 def test_tied_bodies_without_joints_weigh_as_in_the_c_engine(ties, sim):
     compare(ARMS.format(ties=ties, flag="", jacobian="sparse"), sim)

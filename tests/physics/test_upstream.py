@@ -196,8 +196,24 @@ def test_versions_are_bounded_above(package: str) -> None:
     )
 
 
-@pytest.mark.parametrize("integrator", ["euler", "implicit", "implicitfast", "discrete"])
-@pytest.mark.parametrize("sleeps", [False, True])
+@pytest.mark.parametrize(
+    ("integrator", "sleeps"),
+    [
+        ("euler", True),
+        ("implicit", False),
+        ("implicitfast", False),
+        ("discrete", False),
+        *(
+            pytest.param(*pair, marks=pytest.mark.full)
+            for pair in (
+                ("euler", False),
+                ("implicit", True),
+                ("implicitfast", True),
+                ("discrete", True),
+            )
+        ),
+    ],
+)
 def test_a_step_does_without_the_arrays_that_are_dropped(integrator: str, sleeps: bool) -> None:
     mj_model = mujoco.MjModel.from_xml_string(MODEL.replace('pos="0 0 1"', 'pos="0 0 0.09"'))
     mj_model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
