@@ -156,6 +156,8 @@ def _per_row(mask: Tensor, num_rows: int) -> Tensor:
 class KeyedTransform(RowTransform):
     """Base of transforms with random draws from a named `stream`; a config names it, else class and keys do.
 
+    Of several transforms in an env with the same class and keys, those behind the first have streams by their number.
+
     Draws in a step are keyed by `step_count`, which counts env steps; draws at a reset by `reset_count_E`, which counts
     each row's own resets. So a reset of one row never changes another row's numbers, and TorchRL's reset of the rows
     that are done equals a masked reset at every step. `seed` holds until `seed_` or the env's `set_seed` gives another;
@@ -179,6 +181,7 @@ class KeyedTransform(RowTransform):
         super().__init__(*keys, **others)  # pyright: ignore[reportArgumentType]
         self._register_rows("reset_count_E")
         every = (self.in_keys, self.out_keys, self.in_keys_inv, self.out_keys_inv)
+        self._is_named = stream is not None
         if stream is None:
             self.stream = type(self).__name__ + "".join(map(str, every))
         else:
@@ -190,7 +193,11 @@ class KeyedTransform(RowTransform):
 
     def _name_streams(self, purposes: Iterable[str]) -> None:
         """Name the streams of draws: with names, one more transform in a chain changes no draws of the others."""
-        self._stream_ids = {name: random.stream_id(f"{self.stream}/{name}") for name in purposes}
+        self._streams = tuple(purposes)
+        self._make_stream_ids(self.stream)
+
+    def _make_stream_ids(self, stream: str) -> None:
+        self._stream_ids = {name: random.stream_id(f"{stream}/{name}") for name in self._streams}
 
     def seed_(self, seed: int) -> Self:
         """Set the seed and start the counters again, in place."""
@@ -225,6 +232,9 @@ class KeyedTransform(RowTransform):
     def _size_rows(self, specs: Composite) -> None:
         super()._size_rows(specs)
         self._size_buffer("reset_count_E", torch.int64)
+        # The chain is whole here, and comes here again when it changes. Who gave a name twice may mean the same draws.
+        alike = 0 if self._is_named else _count_alike(self)
+        self._make_stream_ids(f"{self.stream}#{alike + 1}" if alike else self.stream)
 
     def _rows_that_reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -243,6 +253,21 @@ class KeyedTransform(RowTransform):
         return random.row_keys(
             self.seed_value, self._stream_ids[purpose], self.reset_count_E, self.num_rows
         )
+
+
+def _count_alike(transform: KeyedTransform) -> int:
+    """Count the transforms of an env that stand before this one, inside or in its own chain, with its stream."""
+    env = upstream.env_of(transform)
+    if not isinstance(env, TransformedEnv):
+        return 0
+    before: list[KeyedTransform] = []
+    for module in env.transform.modules():
+        if module is transform:
+            break
+        if isinstance(module, KeyedTransform):
+            before.append(module)
+    inside = held_transforms(env.base_env, KeyedTransform)
+    return sum(other.stream == transform.stream for other in (*before, *inside))
 
 
 def held_transforms(env: EnvBase, kind: type[Held]) -> Iterator[Held]:

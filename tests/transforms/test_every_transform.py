@@ -309,3 +309,24 @@ def test_two_transforms_of_one_kind_draw_apart(seed):
     rollout_ET = fixed_rollout(env, 10)
     assert not (rollout_ET["a"] == rollout_ET["b"]).any()
     assert torch.equal(rollout_ET["c"], rollout_ET["d"])
+
+
+def test_two_of_one_kind_and_key_draw_apart_however_the_chain_came_about():
+    def drawn_ET(num_transforms, *, appended=0, in_front=0):
+        noises = [ObservationNoise("count", noise=UNIFORM) for _ in range(num_transforms)]
+        env = MaskedTransformedEnv(
+            CounterEnv((3, 5, 4)), noises[in_front : num_transforms - appended]
+        )
+        for noise in noises[num_transforms - appended :]:
+            assert env.output_spec is not None
+            env.append_transform(noise)
+        for noise in noises[:in_front]:
+            assert env.output_spec is not None
+            env.insert_transform(0, noise)
+        seed_all(env, 3)
+        return fixed_rollout(env, 10)["count"] - fixed_rollout(CounterEnv((3, 5, 4)), 10)["count"]
+
+    first_ET, both_ET = drawn_ET(1), drawn_ET(2)
+    assert not torch.isclose(both_ET, 2.0 * first_ET).any()
+    torch.testing.assert_close(drawn_ET(2, appended=1), both_ET)
+    torch.testing.assert_close(drawn_ET(2, in_front=1), both_ET)
