@@ -161,6 +161,8 @@ class Tape:
         # All sources first, so that they are compiled together.
         modules = [self._compiled(part) for part in self.parts if isinstance(part, Kernel)]
         kernel_loading.load([module for module in modules if module], self._device)
+        # Kernels have what they need; a reference here would keep memory that none of them reads.
+        self._memory.made.clear()
 
     def __call__(self) -> None:
         """Run all parts in order."""
@@ -359,7 +361,7 @@ class Tape:
             tensor
             for one, _ in kernel.operations
             for tensor in one.read()
-            if _storage(tensor) in given
+            if self._memory.place(tensor) in given
         ]
         # The launch has all that it needs, so the recorded operations and their tensors are dropped.
         kernel.operations.clear()

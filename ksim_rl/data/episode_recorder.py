@@ -38,7 +38,8 @@ class EpisodeRecorder:
     episodes, which are left out.
 
     `writer` is closed at the end; episodes that run then are not in it. `max_length` is the longest that an episode can
-    be, in env states. An error of the thread, such as of a full disk, is raised by the next call.
+    be, in env states. An error of the thread, such as of a full disk, is raised by the next call. A recorder that is
+    closed takes nothing more.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class EpisodeRecorder:
             self._free.put(None)
         self._is_done = threading.Event()
         self._failed: list[BaseException] = []
+        self._is_closed = False
         self._thread = threading.Thread(target=self._write, name="episodes", daemon=True)
         self._thread.start()
 
@@ -72,10 +74,16 @@ class EpisodeRecorder:
         """Take a rollout, whose memory may be overwritten by what the same stream does next.
 
         Where all envs have `restarted` before it, the episodes that ran until then never end, and are left out.
+
+        Raises:
+            ValueError: if the recorder is closed.
         """
+        if self._is_closed:
+            raise ValueError("the recorder is closed, and its folder is whole: make another one")
         buffer = self._free.get()
         self._raise_failure()
-        if buffer is None:
+        # Rollouts may differ in length; a copy would repeat a step to fill a longer buffer.
+        if buffer is None or not self._fits(buffer, rollout_ET):
             buffer = self._allocate(rollout_ET)
         for key, host_TE in buffer.leaves.items():
             # As the collector stores it, [T, E], each leaf is one piece.
@@ -88,10 +96,15 @@ class EpisodeRecorder:
 
     def close(self) -> None:
         """Write what has been taken, and close the folder."""
+        self._is_closed = True
         self._full.put(None)
         self._thread.join()
         self._writer.close()
         self._raise_failure()
+
+    def _fits(self, buffer: _HostBuffer, rollout_ET: TensorDictBase) -> bool:
+        num_envs, num_steps = rollout_ET.batch_size
+        return buffer.leaves[DONE_KEY].shape[:2] == (num_steps, num_envs)
 
     def _allocate(self, rollout_ET: TensorDictBase) -> _HostBuffer:
         pinned = rollout_ET.device is not None and rollout_ET.device.type == "cuda"

@@ -16,7 +16,7 @@ from ksim_rl.scene.actuators.actuator import ExplicitActuator
 from ksim_rl.scene.actuators.joint_drives import driven_joints
 from ksim_rl.scene.names import actuators_of_joint, scalar_joint_ids
 from ksim_rl.scene.robots.edit import drop_bodies
-from ksim_rl.scene.state.joint_control import TargetKind, force_limit, joint_control
+from ksim_rl.scene.state.joint_control import TargetKind, effort_limit, joint_control
 
 TIME_STEP = 0.002
 """Of the simulation, s: with the Runge-Kutta integrator its error is far below what encoders resolve."""
@@ -218,11 +218,7 @@ def _builtin(robot: str, name: str, mj_model: mujoco.MjModel, actuator: int) -> 
     control = joint_control(mj_model, actuator)
     if control.refusal:
         raise ValueError(f"--robot {robot}: the actuator of joint {name!r}: {control.refusal}")
-    limit = force_limit(mj_model, actuator)
-    if limit is None and control.kind == "effort" and mj_model.actuator_ctrllimited[actuator]:
-        # A motor's control is its effort, before gear and gain.
-        per_control = mj_model.actuator_gear[actuator, 0] * mj_model.actuator_gainprm[actuator, 0]
-        limit = float(np.abs(mj_model.actuator_ctrlrange[actuator] * per_control).min())
+    limit = effort_limit(mj_model, actuator)
     return _Motor(
         stiffness=control.stiffness,
         damping=control.damping,

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Shaped
@@ -138,7 +139,8 @@ class _ToChannels(nn.Module):
 class Encoder(nn.Module):
     """Maps pictures [*batch, *shape] to features [*batch, F], by what a config builds for one batch dim.
 
-    `spec` is the spec of one picture. A ValueError tells where the config's module does not fit, or pictures differ.
+    `spec` is the spec of one picture. A ValueError tells where the config's module does not fit, or pictures differ,
+    also those that a loaded state was learned on: weights of convolutions fit pictures of any size.
     """
 
     def __init__(self, cfg: EncoderCfg, spec: TensorSpec, *, device: Device = None) -> None:
@@ -177,3 +179,20 @@ class Encoder(nn.Module):
             )
         features = self.layers(pictures.reshape(-1, *self.shape))
         return features.reshape(*pictures.shape[:start], self.num_features)
+
+    def get_extra_state(self) -> Tensor:
+        """Return the shape of one picture, which goes into a state beside the weights."""
+        return torch.tensor(self.shape)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Refuse a state that was learned on pictures of another shape."""
+        if state.tolist() != list(self.shape):
+            raise ValueError(
+                f"the encoder was built for pictures {list(self.shape)}, and what is loaded has learned on "
+                f"{state.tolist()}: take the same size, or train anew"
+            )
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        # States of before shapes were in them say nothing of theirs.
+        state_dict.setdefault(f"{prefix}_extra_state", self.get_extra_state())
+        super()._load_from_state_dict(state_dict, prefix, *args)

@@ -1,6 +1,8 @@
 """A recorded function gives what it gave, in few kernels: operation by operation, and where rows could meet."""
 
+import gc
 import math
+import weakref
 
 import pytest
 import torch
@@ -359,3 +361,27 @@ def taped_once(function):
 )
 def test_numbers_of_python_in_cpp(value, ctype, written):
     assert cells.literal(value, ctype) == written
+
+
+def test_memory_that_only_a_kernel_uses_is_given_back_and_other_memory_kept():
+    held = []
+
+    def function(x):
+        # The kernel of the case "most".
+        ends = (x.amax(-1), x.amin(-1))
+        result = ends[0] - ends[1]
+        held.extend(weakref.ref(one.untyped_storage()) for one in (*ends, result, x))
+        return result
+
+    x = floats(4)
+    # Behind the beginning of its storage, which nobody else keeps.
+    inputs = [torch.cat((x, x))[E:]]
+    with recording.recorded() as recorder:
+        returned = function(inputs.pop())
+    tape = Tape(recorder, num_rows=E, returned=(returned,))
+    del recorder
+    gc.collect()
+    assert [one() is None for one in held] == [True, True, False, False]
+    returned.zero_()
+    tape()
+    torch.testing.assert_close(returned, x.amax(-1) - x.amin(-1))

@@ -146,6 +146,20 @@ def test_episodes_before_a_restart_of_all_envs_are_left_out(tmp_path):
     assert found["obs", "step"].flatten().tolist() == [0, 1, 2, 6, 7, 8]
 
 
+def test_a_rollout_of_one_step_after_longer_ones_is_one_step(tmp_path):
+    rollout_ET = rollout_of(1, 12)
+    writer = EpisodeWriter(tmp_path / "episodes", leaves_of(rollout_ET), origin=Origin())
+    recorder = EpisodeRecorder(writer, episodes_E=(4,), max_length=5)
+    for first, last in ((0, 4), (4, 7), (7, 8), (8, 9), (9, 12)):
+        recorder.record(rollout_ET[:, first:last])
+    recorder.close()
+    found = data.read_episodes(tmp_path / "episodes").env_states_D
+    assert found["obs", "step"].flatten().tolist() == list(range(12))
+    for _ in range(3):
+        with pytest.raises(ValueError, match="closed"):
+            recorder.record(rollout_ET)
+
+
 def test_the_recorder_says_when_all_episodes_are_written(tmp_path):
     assert record(tmp_path / "a", rollout_of(2, 6), (2, 1)).is_done
     assert not record(tmp_path / "b", rollout_of(2, 6), (2, 2)).is_done

@@ -115,6 +115,20 @@ def test_spatial_softmax_is_where_a_channel_is_brightest():
     assert encoder.num_features == 14
 
 
+def test_a_state_of_pictures_of_another_size_is_refused():
+    cfg = EncoderCfg(channels=(7,), kernel_sizes=(3,), strides=(1,), spatial_softmax=True)
+    learned = Encoder(cfg, picture_spec(H, W, 3)).state_dict()
+    same = Encoder(cfg, picture_spec(H, W, 3))
+    same.load_state_dict(learned)
+    assert torch.equal(same.state_dict()["_extra_state"], torch.tensor([H, W, 3]))
+    larger = Encoder(cfg, picture_spec(2 * H, W, 3))
+    with pytest.raises(ValueError, match=rf"pictures \[{2 * H}, {W}, 3\].*\[{H}, {W}, 3\]"):
+        larger.load_state_dict(learned)
+    # States of before shapes were in them.
+    del learned["_extra_state"]
+    larger.load_state_dict(learned)
+
+
 class Brightness(EncoderCfg):
     """A user's own: the mean of each channel."""
 

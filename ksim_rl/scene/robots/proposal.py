@@ -3,7 +3,6 @@
 import dataclasses
 
 import mujoco
-import numpy as np
 
 from ksim_rl.scene.actuators import PositionActuator
 from ksim_rl.scene.names import actuators_of_joint, scalar_joint_ids
@@ -11,7 +10,7 @@ from ksim_rl.scene.robots.anatomy import Anatomy, posed, rounded
 from ksim_rl.scene.robots.edit import Site
 from ksim_rl.scene.robots.legged_robot import ModelRobot
 from ksim_rl.scene.robots.strangers_model import StrangersModel
-from ksim_rl.scene.state.joint_control import joint_control
+from ksim_rl.scene.state.joint_control import both_ways, effort_limit, joint_control
 
 LEAST_SCALE = 0.15
 MOST_SCALE = 0.5
@@ -105,22 +104,15 @@ def drive_of(
 
 
 def effort_limit_of(mj_model: mujoco.MjModel, joint: int, *, most: float) -> float | None:
-    """Return the least of all limits of a joint's effort, N m or N; None where there is none below `most`."""
+    """Return the least limit of a joint's effort both ways, N m or N; None where there is none below `most`."""
     limits = []
     if mj_model.jnt_actfrclimited[joint]:
-        limits.append(np.abs(mj_model.jnt_actfrcrange[joint]).max())
+        limits.append(both_ways(mj_model.jnt_actfrcrange[joint]))
     for a in actuators_of_joint(mj_model, joint):
-        gear = abs(mj_model.actuator_gear[a, 0])
-        is_motor = joint_control(mj_model, a).kind == "effort"
-        if mj_model.actuator_forcelimited[a]:
-            limits.append(gear * np.abs(mj_model.actuator_forcerange[a]).max())
-        # A motor's control range limits its force where no force range does.
-        elif mj_model.actuator_ctrllimited[a] and is_motor:
-            control_limit = np.abs(
-                mj_model.actuator_gainprm[a, 0] * mj_model.actuator_ctrlrange[a]
-            ).max()
-            limits.append(gear * control_limit)
-    limits = [float(limit) for limit in limits if 0.0 < limit < most]
+        limit = effort_limit(mj_model, a)
+        if limit is not None:
+            limits.append(limit)
+    limits = [limit for limit in limits if 0.0 < limit < most]
     return min(limits, default=None)
 
 

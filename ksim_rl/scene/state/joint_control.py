@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 TargetKind = Literal["pos", "vel", "effort"]
 SMOOTHED = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
@@ -54,12 +55,30 @@ def joint_control(mj_model: mujoco.MjModel, actuator: int) -> JointControl:
 
 
 def force_limit(mj_model: mujoco.MjModel, actuator: int) -> float | None:
-    """Return the least effort at the joint that an actuator's force range allows both ways, N m or N; None without."""
+    """Return the effort at the joint that an actuator's force range allows both ways, N m or N; None without one."""
     if not mj_model.actuator_forcelimited[actuator]:
         return None
     # The force goes through the gear.
-    range_2 = mj_model.actuator_forcerange[actuator] * mj_model.actuator_gear[actuator, 0]
-    return float(np.abs(range_2).min())
+    return both_ways(mj_model.actuator_forcerange[actuator] * mj_model.actuator_gear[actuator, 0])
+
+
+def effort_limit(mj_model: mujoco.MjModel, actuator: int) -> float | None:
+    """Return the effort at the joint that an actuator can exert both ways, N m or N; None without a limit.
+
+    A motor's control range limits its effort where no force range does.
+    """
+    limit = force_limit(mj_model, actuator)
+    is_motor = joint_control(mj_model, actuator).kind == "effort"
+    if limit is not None or not is_motor or not mj_model.actuator_ctrllimited[actuator]:
+        return limit
+    per_control = mj_model.actuator_gear[actuator, 0] * mj_model.actuator_gainprm[actuator, 0]
+    return both_ways(mj_model.actuator_ctrlrange[actuator] * per_control)
+
+
+def both_ways(range_2: Float[np.ndarray, " 2"]) -> float:
+    """Return how far a range reaches both ways; where a drive acts one way only, how far it reaches that way."""
+    less, more = sorted(abs(float(end)) for end in range_2)
+    return less if less > 0.0 else more
 
 
 def control_of_spec(actuator: mujoco.MjsActuator) -> JointControl:

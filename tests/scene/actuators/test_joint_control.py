@@ -7,7 +7,8 @@ import pytest
 from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, MjcfRobot, SceneCfg
 from ksim_rl.mdp import JointEffortAction, JointPositionAction, JointVelocityAction
 from ksim_rl.physics import SimCfg
-from ksim_rl.scene.state.joint_control import joint_control
+from ksim_rl.scene.robots.proposal import effort_limit_of
+from ksim_rl.scene.state.joint_control import effort_limit, force_limit, joint_control
 
 HINGE = """
 <mujoco>
@@ -135,3 +136,30 @@ def test_a_target_is_the_inverse_of_its_control():
     for text in (*POSITION.values(), *VELOCITY.values()):
         control = joint_control(mujoco.MjModel.from_xml_string(hinge(text)), 0)
         np.testing.assert_allclose(control.target(control.of(0.7)), 0.7, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<motor name="a" joint="hinge" forcerange="-3 5" gear="2"/>',
+        '<position name="a" joint="hinge" kp="50" forcerange="-7 4" gear="-3"/>',
+        '<general name="a" joint="hinge" gainprm="4" ctrlrange="-0.5 2" ctrllimited="true" gear="3"/>',
+        '<motor name="a" joint="hinge" ctrlrange="0 2" ctrllimited="true" gear="5"/>',
+    ],
+)
+def test_limits_of_effort_are_those_that_mujoco_keeps_both_ways(actuator):
+    mj_model = mujoco.MjModel.from_xml_string(hinge(actuator))
+    mj_data = mujoco.MjData(mj_model)
+    efforts = []
+    for control in (-1e9, 1e9):
+        mj_data.ctrl[0] = control
+        mujoco.mj_forward(mj_model, mj_data)
+        efforts.append(abs(mj_data.qfrc_actuator[0]))
+    # A drive that acts one way only is limited by that way.
+    least = min(effort for effort in efforts if effort > 0.0)
+    assert effort_limit(mj_model, 0) == pytest.approx(least)
+    assert effort_limit_of(mj_model, 0, most=1e6) == pytest.approx(least)
+    if mj_model.actuator_forcelimited[0]:
+        assert force_limit(mj_model, 0) == pytest.approx(least)
+    else:
+        assert force_limit(mj_model, 0) is None
