@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int64, Shaped
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.modules import ConvNet
@@ -180,16 +180,16 @@ class Encoder(nn.Module):
         features = self.layers(pictures.reshape(-1, *self.shape))
         return features.reshape(*pictures.shape[:start], self.num_features)
 
-    def get_extra_state(self) -> Tensor:
+    def get_extra_state(self) -> Int64[Tensor, " N"]:
         """Return the shape of one picture, which goes into a state beside the weights."""
         return torch.tensor(self.shape)
 
-    def set_extra_state(self, state: Tensor) -> None:
+    def set_extra_state(self, shape_N: Int64[Tensor, " N"]) -> None:
         """Refuse a state that was learned on pictures of another shape."""
-        if state.tolist() != list(self.shape):
+        if shape_N.tolist() != list(self.shape):
             raise ValueError(
                 f"the encoder was built for pictures {list(self.shape)}, and what is loaded has learned on "
-                f"{state.tolist()}: take the same size, or train anew"
+                f"{shape_N.tolist()}: take the same size, or train anew"
             )
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:

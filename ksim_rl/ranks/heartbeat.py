@@ -13,10 +13,11 @@ from typing import Protocol
 from ksim_rl.device import group
 from ksim_rl.terminal import show
 
-# Between beats; a rank whose thread is silent for so long is dead or stopped, and one that says to be in the same
-# place for `KSIM_RL_RANK_TIMEOUT_S` hangs: compiling kernels and evaluating take less.
+# Between beats; a rank whose thread is silent for so long is dead or stopped, and the others end within 35 s, two beats
+# later at most. One that says to be in the same place for `KSIM_RL_RANK_TIMEOUT_S` hangs: compiling kernels and
+# evaluating take less.
 BEAT_S = 2.0
-SILENT_S = 40.0
+SILENT_S = 30.0
 HUNG_S = 600.0
 FAILED = 3
 

@@ -46,6 +46,25 @@ ALGORITHMS = {
     **{name: [f"objective={name}", *REPLAY] for name in ("sac", "td3", "fast_sac", "fast_td3")},
 }
 
+# What a policy sees and follows: pictures by a trunk's encoder, and a motion whose failed parts all ranks count.
+TASKS = {
+    "pictures": [
+        "task=cartpole_balance_pixels",
+        "task.scene.sensors.side.width=36",
+        "task.scene.sensors.side.height=36",
+        "data.num_minibatches=2",
+    ],
+    "tracking": [
+        *NETWORKS,
+        "task=g1_track_walk",
+        "task.sim.engine=c",
+        "data.num_minibatches=2",
+        # Later, statistics of inputs that hardly move make steps of Adam out of differences of rounding.
+        "trainer.num_iterations=1",
+    ],
+}
+ALGORITHMS = {**ALGORITHMS, **TASKS}
+
 
 def trained(overrides, num_envs, minibatch, shards):
     """Return the tensors of an update, and where the envs stand, after two iterations."""

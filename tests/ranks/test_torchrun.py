@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -87,8 +88,8 @@ def test_two_nodes_of_two_ranks_are_one_run(tmp_path):
     assert sum("on each of 4 ranks, 32 envs and 512 in all" in text for text in texts) == 1
 
 
-def kill_rank_1(process, at):
-    """Kill it when the run says `at`, and return what was said until then."""
+def kill_rank_1(process, at, how=signal.SIGKILL):
+    """Kill or stop it when the run says `at`; return what was said until then, and the process of each rank."""
     lines = []
     while not lines or at not in lines[-1]:
         lines.append(process.stdout.readline())
@@ -96,15 +97,22 @@ def kill_rank_1(process, at):
     ranks = subprocess.run(
         ["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True
     )
-    os.kill(int(ranks.stdout.split()[1]), signal.SIGKILL)
-    return "".join(lines)
+    processes = [int(number) for number in ranks.stdout.split()]
+    os.kill(processes[1], how)
+    return "".join(lines), processes
+
+
+def is_running(number):
+    """Whether a process is there, and not as one that has ended and waits for its parent."""
+    status = Path(f"/proc/{number}/stat")
+    return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 def test_a_killed_rank_is_started_again_and_the_run_goes_on_from_its_newest_checkpoint(tmp_path):
     options = ("--nproc-per-node=2", "--max-restarts=1")
     run = [*RUN, "trainer.checkpoint_interval=4", "trainer.num_iterations=30"]
     process = torchrun("train", *run, folder=tmp_path, options=options)
-    text = kill_rank_1(process, "iteration 6/") + finished(process)
+    text = kill_rank_1(process, "iteration 6/")[0] + finished(process)
     numbers = [int(found) for found in re.findall(r"iteration (\d+)/30:.*slowest rank", text)]
     again = next(i for i, (a, b) in enumerate(pairwise(numbers), 1) if b < a + 1)
     print(f"killed after iteration {numbers[again - 1]}, went on with {numbers[again]}")
@@ -113,6 +121,25 @@ def test_a_killed_rank_is_started_again_and_the_run_goes_on_from_its_newest_chec
     (run,) = (tmp_path / "runs" / "cartpole_balance").iterdir()
     rows = (run / "metrics.csv").read_text().splitlines()
     assert [int(row.split(",")[0]) for row in rows[1:]] == list(range(256, 31 * 256, 256))
+
+
+def test_a_stopped_rank_ends_the_others_within_35_s(tmp_path):
+    options = ("--nproc-per-node=4",)
+    process = torchrun(
+        "train", *RUN, "trainer.num_iterations=100000", folder=tmp_path, options=options
+    )
+    _, processes = kill_rank_1(process, "iteration 2/", signal.SIGSTOP)
+    began = time.monotonic()
+    stopped = processes.pop(1)
+    while any(is_running(number) for number in processes) and time.monotonic() < began + 60:
+        time.sleep(0.1)
+    seconds = time.monotonic() - began
+    # Else torchrun waits for it.
+    os.kill(stopped, signal.SIGKILL)
+    text, _ = process.communicate(timeout=60)
+    print(f"three ranks had ended {seconds:.1f} s after the fourth was stopped")
+    assert seconds < 35 and process.returncode != 0
+    assert "error: rank 1 is silent since 30 s (" in text
 
 
 def test_a_killed_rank_ends_the_others_with_its_cause(tmp_path):
