@@ -59,6 +59,8 @@ TASKS: dict[str, tuple[str, ...]] = {
     # has 1.7, humanoid_velocity_flat 1.3). None has 20, but with six more cubes about the arm.
     "arm_push": ("task=arm_push",),
     "arm_clutter": ("task=arm_push", *CLUTTER),
+    # Pictures too: the renderer's bounding volumes are built in parallel.
+    "cartpole_balance_pixels": ("task=cartpole_balance_pixels",),
 }
 QUIET = (
     "logger=none",

@@ -41,6 +41,7 @@ IDENTIFY = (
 MEASURED: dict[str, tuple[str, ...]] = {
     "agreement": STEP[:1],
     "before_and_now": (*STEP, *LEARN),
+    "cameras": (*STEP, *LEARN, "ksim_rl/transforms"),
     "cards": ("ksim_rl/transfer", "ksim_rl/zoo", *STEP),
     "collector": (*STEP, "ksim_rl/collectors"),
     "dm_control": (*STEP, *LEARN, "ksim_rl/suites"),
@@ -58,6 +59,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "nan_names": ("ksim_rl/envs/non_finite.py", "ksim_rl/device/quick_launch.py"),
     "narrow_phase": ("ksim_rl/physics",),
     "num_envs": (*STEP, *LEARN),
+    "pixels": (*STEP, *LEARN, *TASK),
     "off_policy_update": (*LEARN, "ksim_rl/device"),
     "peer_settings": (*STEP, *LEARN, *TASK),
     "peer_terms": (*STEP, *TASK),

@@ -77,25 +77,34 @@ def physics_ms(
 ) -> float:
     """Time MuJoCo Warp's substeps of one env step, as one graph with all sensors in each, over the recorded steps."""
     stock = stock_world(world)
-    device, warp_device = stock.device, wp.get_device(str(stock.device))
 
     def substeps() -> None:
         for _ in range(decimation):
             mjw.step(stock.warp_model, stock.warp_data_E)
 
+    found = _mean_ms(stock, as_graph(substeps, stock.device), steps, repeats=repeats)
+    stock.close()
+    return found
+
+
+def as_graph(launches: Callable[[], object], device: torch.device) -> Callable[[], None]:
+    """Return a replay of some launches of Warp, which have run twice, as one graph."""
+    warp_device = wp.get_device(str(device))
     with warp_scope(device):
-        substeps()
+        launches()
     _synchronize(device)
     with (
         no_collection(),
         wp.ScopedDevice(warp_device),
         wp.ScopedCapture(device=warp_device) as capture,
     ):
-        substeps()
-    _launch(capture.graph, device)
-    found = _mean_ms(stock, lambda: _launch(capture.graph, device), steps, repeats=repeats)
-    stock.close()
-    return found
+        launches()
+
+    def replay() -> None:
+        _launch(capture.graph, device)
+
+    replay()
+    return replay
 
 
 def own_physics_ms(

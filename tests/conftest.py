@@ -43,6 +43,7 @@ def _fresh_torch():
         torch.set_num_threads(_THREADS)
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("highest")
+    torch.backends.cudnn.allow_tf32 = False
     torch.compiler.reset()
 
 

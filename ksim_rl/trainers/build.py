@@ -47,7 +47,7 @@ def build(
     """Build everything that a run needs, with all its memory allocated.
 
     With `collector.eager` nothing is recorded: the Python of rollouts, evaluations and updates runs each time.
-    Torch's global seed, matmul precision and number of CPU threads are set from the config. Without a `run_folder`
+    Torch's global seed, precision of products and number of CPU threads are set from the config. Without a `run_folder`
     nothing is written; without `resume_from` a new run starts, with the weights of `cfg.checkpoint` if it has one.
     Raises ValueError where a logger's package is missing, or a checkpoint is of another network or env.
     """
@@ -57,6 +57,9 @@ def build(
     # Before any network is made, as the weights are drawn from it.
     torch.manual_seed(cfg.seed)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
+    # The same for convolutions, which have switches of their own; some of cuDNN's add up in no order.
+    torch.backends.cudnn.allow_tf32 = cfg.trainer.matmul_precision != "highest"
+    torch.backends.cudnn.deterministic = True
     torch.set_num_threads(cfg.trainer.num_threads or default_threads(cfg.resolved_device()))
 
     said: list[str] = []

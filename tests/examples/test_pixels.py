@@ -21,6 +21,6 @@ def example():
 def test_it_learns_what_only_pictures_show(example, capsys):
     assert example.train(num_iterations=40) > 0.87
     assert "iteration 40: reward per step" in capsys.readouterr().out
-    # Nothing is drawn of a group that no geom is in: the middle of the rail is the best guess, 0.5 m away in the mean.
-    example.CAMERA = replace(example.CAMERA, geom_groups=(5,))
+    # A camera that looks up at nothing: the middle of the rail is the best guess, 0.5 m away in the mean.
+    example.CAMERA = replace(example.CAMERA, xyaxes=(1.0, 0.0, 0.0, 0.0, -1.0, 0.0))
     assert example.train(num_iterations=40) < 0.6
