@@ -18,7 +18,9 @@ NUM_ENVS, LENGTHS = 3, (3, 5, 4)
 
 @pytest.fixture(scope="module")
 def cartpole() -> Iterator[GymnasiumVectorEnv]:
-    env = GymnasiumVectorEnv(envs.make("cartpole_balance", num_envs=NUM_ENVS, seed=0))
+    env = GymnasiumVectorEnv(
+        envs.make("cartpole_balance", num_envs=NUM_ENVS, seed=0, overrides=["task.sim.engine=c"])
+    )
     yield env
     env.close()
 

@@ -166,6 +166,7 @@ def test_a_motion_whose_features_are_not_finite_is_refused():
 
 SMALL = [
     "task=walker_amp",
+    "task.sim.engine=c",
     "objective=amp",
     "device=cpu",
     "logger=none",

@@ -165,7 +165,7 @@ def test_updates_of_squashed_policies_equal_those_of_torch(
 
 
 @needs_interpreter
-@pytest.mark.parametrize("desired_kl", [1e3, 1e-12])
+@pytest.mark.parametrize("desired_kl", [1e3, full(1e-12)])
 def test_an_annealed_rate_is_that_of_torch(fused_ppo, desired_kl):
     limits = {"learning_rate": 3e-3, "learning_rate_min": 2e-3, "learning_rate_max": 4e-3}
     cfg = PPOCfg(num_epochs=1, desired_kl=desired_kl, anneal_learning_rate=True, **limits)
@@ -299,7 +299,7 @@ def test_a_symmetry_without_a_mirror_is_refused(fused_ppo):
 
 
 @needs_interpreter
-@pytest.mark.parametrize("hidden", [HIDDEN, (48, 16)])
+@pytest.mark.parametrize("hidden", [HIDDEN, full((48, 16))])
 def test_what_tensor_cores_would_cut_off_is_rounded(fused_ppo, hidden):
     torch.set_float32_matmul_precision("high")
     actor, critic = networks(hidden=hidden)

@@ -27,7 +27,10 @@ def by_hand(network, obs, rounded):
 
 
 @needs_interpreter
-@pytest.mark.parametrize(("precision", "normalized"), [("high", True), ("highest", False)])
+@pytest.mark.parametrize(
+    ("precision", "normalized"),
+    [("high", True), pytest.param("highest", False, marks=pytest.mark.full)],
+)
 def test_who_collects_is_the_policy_of_the_first_gradient_step(fused_ppo, precision, normalized):
     torch.set_float32_matmul_precision(precision)
     rounded = to_eleven_bits if precision == "high" else torch.clone

@@ -11,6 +11,7 @@ from ksim_rl.cli import main, train
 from ksim_rl.trainers import checkpoint
 
 SMALL = (
+    "task.sim.engine=c",
     "num_envs=16",
     "data.num_env_states_per_minibatch=32",
     "modules.actor.hidden_dims=[16]",

@@ -27,6 +27,7 @@ from ksim_rl.mdp import (
     LastAction,
     TimeOut,
 )
+from ksim_rl.physics import SimCfg
 
 SUBSTEP_S = 0.005
 DECIMATION = 4
@@ -160,6 +161,11 @@ def puck_cfg(
 def puck_env(**fields: object) -> ManagerBasedRlEnv:
     """Build the bare puck env on the CPU."""
     return ManagerBasedRlEnv(puck_cfg(**fields))  # pyright: ignore[reportArgumentType]
+
+
+def puck_env_in_c(**fields: object) -> ManagerBasedRlEnv:
+    """Build it on MuJoCo's C engine, which compiles and records nothing, where physics is no matter."""
+    return puck_env(sim=SimCfg(engine="c"), **fields)
 
 
 def push(env: ManagerBasedRlEnv, root_E: object, force: float = 0.0) -> object:

@@ -24,12 +24,13 @@ from ksim_rl import envs
 from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, MaskedTransformedEnv
 from ksim_rl.testing import CounterEnv
 from ksim_rl.transforms import ObservationNoise, UniformNoise
-from tests.envs.probe_env import puck_cfg, puck_env
+from tests.envs.probe_env import puck_cfg, puck_env_in_c
 
 
 def pucks():
     return MaskedTransformedEnv(
-        puck_env(), ObservationNoise(("obs", "position"), noise=UniformNoise(low=-0.1, high=0.1))
+        puck_env_in_c(),
+        ObservationNoise(("obs", "position"), noise=UniformNoise(low=-0.1, high=0.1)),
     )
 
 
@@ -40,7 +41,7 @@ def counters():
 # -- makers and collectors --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [puck_env, pucks, counters])
+@pytest.mark.parametrize("make", [puck_env_in_c, pucks, counters])
 @pytest.mark.parametrize("share_memory", [True, False])
 def test_env_creators_make_envs(make, share_memory):
     env = EnvCreator(make, share_memory=share_memory)()
@@ -84,7 +85,7 @@ def test_several_collectors_stack_envs_with_labels():
 
 
 def bounded_puck():
-    env = puck_env()
+    env = puck_env_in_c()
     env.full_action_spec = Composite(action=Bounded(-1.0, 1.0, shape=(3, 1)), shape=(3,))
     return env
 
@@ -146,7 +147,7 @@ def test_an_env_with_random_actions_of_its_own_keeps_them():
 # -- copies -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [puck_env, pucks])
+@pytest.mark.parametrize("make", [puck_env_in_c, pucks])
 @pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, pickle.dumps])
 def test_a_copy_says_how_to_make_a_second_env(make, how):
     with pytest.raises(
@@ -228,7 +229,7 @@ def test_a_step_of_a_closed_env_says_so(closed):
 
 def test_the_class_has_the_metadata():
     assert ManagerBasedRlEnv.metadata["render_modes"] == [None, "rgb_array"]
-    assert ManagerBasedRlEnv.metadata is puck_env().metadata
+    assert ManagerBasedRlEnv.metadata is puck_env_in_c().metadata
 
 
 def test_seed_on_the_class_seeds_the_process():
