@@ -177,6 +177,25 @@ class RunningMoments(nn.Module):
         if len(values_NL):
             _count_rows(values_NL.to(torch.float32).contiguous(), valid_N, *exact, until)
 
+    @torch.no_grad()
+    def count_again(self, other: "RunningMoments") -> None:
+        """Count the rows that another one has counted, without reading them; `mean` and `var` stay as they are.
+
+        As with rows, nothing is counted from `until` on.
+        """
+        weight = other.count.double()
+        if self.until is not None:
+            weight = torch.where(self.count * group.size() < self.until, weight, 0.0)
+        total = self.count + weight
+        share = weight / total.clamp_min(1.0)
+        delta_L = other.exact_mean - self.exact_mean
+        # As in `_count_in_torch`.
+        between_L = delta_L.square() * share * self.count
+        added_L = torch.where(weight > 0.0, other.exact_sum_of_squares, 0.0)
+        self.exact_sum_of_squares += added_L + between_L
+        self.exact_mean += delta_L * share
+        self.count.copy_(total)
+
 
 @torch.no_grad()
 def publish(every: Sequence[RunningMoments]) -> None:

@@ -25,6 +25,25 @@ def test_rows_that_are_not_finite_do_not_count():
     assert (int(moments.count), moments.mean.item(), moments.var.item()) == (2, 2.0, 1.0)
 
 
+@pytest.mark.parametrize("until", [None, 40])
+def test_rows_of_another_one_count_as_if_they_were_read(until):
+    first, second = torch.randn(30, 2) + 5.0, 3.0 * torch.randn(12, 2)
+    seen, other, read = RunningMoments(2, until=until), RunningMoments(2), RunningMoments(2)
+    other.count_rows(second)
+    for moments in (seen, read):
+        moments.count_rows(first)
+    for _ in range(3):
+        seen.count_again(other)
+    # A limit that is reached by the first time ends the others.
+    for _ in range(3 if until is None else 1):
+        read.count_rows(second)
+    assert int(seen.count) == int(read.count)
+    torch.testing.assert_close(seen.exact_mean, read.exact_mean, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        seen.exact_sum_of_squares, read.exact_sum_of_squares, rtol=1e-12, atol=1e-12
+    )
+
+
 def test_counted_rows_show_once_they_are_published():
     moments = RunningMoments(1)
     moments.count_rows(torch.tensor([[1.0], [3.0]]))

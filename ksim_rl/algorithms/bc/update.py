@@ -1,5 +1,6 @@
 """An iteration of behavior cloning draws recorded env states, and makes gradient steps on them."""
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from ksim_rl.algorithms.ppo.wiring import build_networks
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.signal_keys import signal_keys
 from ksim_rl.modules import update_normalizers
+from ksim_rl.modules.network import ObservationNormalizer
 from ksim_rl.objectives import (
     DEMONSTRATION,
     GAE,
@@ -30,6 +32,7 @@ from ksim_rl.objectives import (
     BCLoss,
     observation_keys,
 )
+from ksim_rl.ranks.running_moments import RunningMoments, publish
 from ksim_rl.trainers.algorithm import part_of
 from ksim_rl.trainers.run_cfg import RunCfg
 
@@ -94,8 +97,14 @@ class BCUpdate(DatasetUpdate):
         networks = {"actor": actor, "critic": critic}
         super().__init__(cfg, loss=loss, networks=networks, logged=LOGGED, **shared)
         self._held_out_loss = torch.zeros((), device=self.device)
-        # All that the policy ever learns from is known from the start.
-        update_normalizers(demonstration.learned_N, actor)
+        # All that the policy ever learns from is known from the start, and read once.
+        self._normalizers = _normalizers(actor)
+        recorded = copy.deepcopy(actor)
+        for fresh in _normalizers(recorded):
+            fresh.load_state_dict(RunningMoments(fresh.dim).state_dict())
+        update_normalizers(demonstration.learned_N, recorded)
+        self._recorded = _normalizers(recorded)
+        self._weigh_recording_()
 
     @property
     def rollout_keys(self) -> list[NestedKey]:
@@ -130,11 +139,21 @@ class BCUpdate(DatasetUpdate):
             self._held_out_loss.copy_(measured["loss_bc"])
         # Only now, so that all gradient steps see the statistics that values were computed with.
         update_normalizers(self.rollout_ET, self.critic)
-        # The same numbers once more: the statistics stay as they are, and weigh as much as the policy has learned from
-        # them. Those of a short recording would be swept away by the first rollouts of a run that goes on from here.
-        update_normalizers(self.demonstration.learned_N, self.actor)
+        # Once more: the statistics stay as they are, and weigh as much as the policy has learned from the recording.
+        # Those of a short one would be swept away by the first rollouts of a run that goes on from here.
+        self._weigh_recording_()
+
+    def _weigh_recording_(self) -> None:
+        """Let the recording count once more in the statistics of the policy's observations."""
+        for normalizer, recorded in zip(self._normalizers, self._recorded, strict=True):
+            normalizer.count_again(recorded)
+        publish(self._normalizers)
 
     def _drawn(self, env_states_N: TensorDictBase) -> TensorDictBase:
         """Draw as many env states as a dataset has, uniformly, with replacement."""
         index_D = torch.randint(len(env_states_N), (self.num_env_states,), device=self.device)
         return env_states_N[index_D]
+
+
+def _normalizers(actor: TensorDictModuleBase) -> list[ObservationNormalizer]:
+    return [module for module in actor.modules() if isinstance(module, ObservationNormalizer)]
