@@ -78,7 +78,7 @@ COMMANDS = {
     "envs": "ksim_rl.cli.run_commands:list_envs",
     "robot": "ksim_rl.cli.run_commands:robot",
     "new": "ksim_rl.cli.new:new",
-    "motion": "ksim_rl.clips.command:motion",
+    "motion": "ksim_rl.tracking.motion_command:motion",
     "completion": "ksim_rl.cli.completion:completion",
     "reproduce": "ksim_rl.tables.reproduce:reproduce",
 }

@@ -66,6 +66,20 @@ def between(count: int, fps: float, wanted_fps: float) -> tuple[Array, Float[Arr
     return low_F, np.clip(times_F * fps - low_F, 0.0, 1.0)
 
 
+def resampled_qpos(
+    qpos_FL: Float[Array, "F L"], fps: float, wanted_fps: float
+) -> Float[Array, "G L"]:
+    """Return the states of a robot with a free root at another rate, as `Recording.resampled` does points."""
+    low_F, share_F = between(len(qpos_FL), fps, wanted_fps)
+    share_F1 = share_F[:, None]
+    before_FL = qpos_FL[low_F]
+    after_FL = qpos_FL[low_F + 1]
+    # Linear between frames, and the root's orientation along the arc.
+    found_FL = (1.0 - share_F1) * before_FL + share_F1 * after_FL
+    found_FL[:, 3:7] = slerp(before_FL[:, 3:7], after_FL[:, 3:7], share_F1)
+    return found_FL
+
+
 def slerp(
     first: Float[Array, "*batch 4"],
     second: Float[Array, "*batch 4"],

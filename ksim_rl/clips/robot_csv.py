@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ksim_rl.checks import near
-from ksim_rl.clips.recording import between, refused, slerp
+from ksim_rl.clips.recording import refused, resampled_qpos
 from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
 from ksim_rl.scene.names import scalar_joint_ids
 
@@ -66,14 +66,7 @@ def read_csv(
     qpos_FL[:, 3:7] = quat_F4[:, [3, 0, 1, 2]]
     places = [int(mj_model.joint(joint).qposadr[0]) for joint in joints]
     qpos_FL[:, places] = table_FC[:, 7:]
-    low_F, share_F = between(len(qpos_FL), fps, wanted_fps)
-    share_F1 = share_F[:, None]
-    before_FL = qpos_FL[low_F]
-    after_FL = qpos_FL[low_F + 1]
-    # Linear between frames, and the root's orientation along the arc.
-    found_FL = (1.0 - share_F1) * before_FL + share_F1 * after_FL
-    found_FL[:, 3:7] = slerp(before_FL[:, 3:7], after_FL[:, 3:7], share_F1)
-    return found_FL
+    return resampled_qpos(qpos_FL, fps, wanted_fps)
 
 
 def _table(path: Path, columns: int) -> Array:

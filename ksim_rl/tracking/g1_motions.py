@@ -18,12 +18,12 @@ ROBOT = UnitreeG1()
 FPS = 50.0
 STAND = 0.76
 """m: the root's height in the default pose."""
-_WIDTH = 0.1185
+FEET_APART = 0.1185
 """m: each foot's distance from the middle."""
-_MIDDLE = 0.0388
+MIDDLE = 0.0388
 """m: the middle of the soles is ahead of the root."""
-FEET = ((_MIDDLE, _WIDTH, 0.0), (_MIDDLE, -_WIDTH, 0.0))
-_NARROW = ((_MIDDLE, 0.095, 0.0), (_MIDDLE, -0.095, 0.0))
+FEET = ((MIDDLE, FEET_APART, 0.0), (MIDDLE, -FEET_APART, 0.0))
+NARROW = ((MIDDLE, 0.095, 0.0), (MIDDLE, -0.095, 0.0))
 """Feet near enough to each other to stand on one without leaning far."""
 # Arms and waist keep their posture: else the search would balance with them.
 _ARMS = {name: 0.5 for name in JOINTS if "shoulder" in name or "elbow" in name or "wrist" in name}
@@ -90,7 +90,7 @@ def walk() -> Choreography:
     stride = 0.24
     count = 12
     moves = []
-    at = [_MIDDLE, _MIDDLE]
+    at = [MIDDLE, MIDDLE]
     for number in range(count):
         foot = number % 2
         last = number == count - 1
@@ -108,7 +108,7 @@ def walk() -> Choreography:
                 begin_s=start,
                 end_s=start + swing_s,
                 # Foot 0 is the left one, whose side is positive y.
-                to=(at[foot], (1 - 2 * foot) * _WIDTH, 0.0),
+                to=(at[foot], (1 - 2 * foot) * FEET_APART, 0.0),
                 lift=((0.5 * swing_s, 0.08),),
                 pitch=((0.4 * swing_s, 0.45),),
             )
@@ -170,10 +170,10 @@ def turn() -> Choreography:
         # The left foot leads; the right foot comes to its heading.
         headings[foot] = other + turn_by if foot == 0 else other
         heading = headings[foot]
-        side = (1 - 2 * foot) * _WIDTH
+        side = (1 - 2 * foot) * FEET_APART
         # The feet move on circles about the root.
-        x = _MIDDLE * math.cos(heading) - side * math.sin(heading)
-        y = _MIDDLE * math.sin(heading) + side * math.cos(heading)
+        x = MIDDLE * math.cos(heading) - side * math.sin(heading)
+        y = MIDDLE * math.sin(heading) + side * math.cos(heading)
         start = begin_s + number * step_s
         swing_s = step_s - both_s
         moves.append(
@@ -229,7 +229,7 @@ def kick() -> Choreography:
                 foot=foot,
                 begin_s=begin_s,
                 end_s=begin_s + alone_s,
-                to=_NARROW[foot],
+                to=NARROW[foot],
                 lift=lift,
                 forward=forward,
                 pitch=pitch,
@@ -248,7 +248,7 @@ def kick() -> Choreography:
         joints[f"{side}_elbow_joint"] = [(time, -0.6 * value) for time, value in arms[side]]
     return Choreography(
         duration_s=begin_s + 0.2,
-        feet=_NARROW,
+        feet=NARROW,
         moves=moves,
         root_height=((0.3, STAND), (1.0, 0.73), (begin_s - 1.0, 0.73), (begin_s - 0.3, STAND)),
         joints=joints,

@@ -1,4 +1,4 @@
-"""`ksim-rl motion` turns recordings into motion files of a robot: from CSV, BVH or AMASS-like archives."""
+"""`ksim-rl motion` makes motion files of a robot: of CSV, BVH, AMASS-like and tracking files, and of its own plans."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,14 +8,23 @@ import mujoco
 from ksim_rl.checks import OneLineParser, naming, near
 from ksim_rl.clips.amass import HEIGHT, read_amass
 from ksim_rl.clips.bvh import read_bvh
+from ksim_rl.clips.mirrored import mirrored
 from ksim_rl.clips.motion_file import write_motion
 from ksim_rl.clips.retarget import read_retarget, retargeted
 from ksim_rl.clips.robot_csv import read_csv
+from ksim_rl.clips.tracking_file import read_tracking
 from ksim_rl.physics import load_spec
+from ksim_rl.scene.motions.motion_set import MIRRORED
+from ksim_rl.scene.names import match_names
 from ksim_rl.scene.robots.booster_t1 import BoosterT1
 from ksim_rl.scene.robots.own_robots import Humanoid
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
 from ksim_rl.terminal import show
+from ksim_rl.tracking.feasibility import feasibility
+from ksim_rl.tracking.g1_motions import FIGURE, FPS
+from ksim_rl.tracking.g1_motions import model as g1
+from ksim_rl.tracking.g1_repertoire import REPERTOIRE
+from ksim_rl.tracking.keyframes import perform
 
 ROBOTS = {"g1": UnitreeG1, "t1": BoosterT1, "humanoid": Humanoid}
 
@@ -32,8 +41,10 @@ def model_of(robot: str) -> mujoco.MjModel:
 
 
 def motion(arguments: Sequence[str]) -> int:
-    """Convert one file; a ValueError names its fault."""
+    """Convert one file, or write a folder of our own motions; a ValueError names a fault."""
     options = _parser().parse_args(arguments)
+    if options.kind == "generate":
+        return _generate(options.folder, options.only)
     model = model_of(options.robot)
     # A CSV holds the robot's own joints, so nothing has to be retargeted.
     if options.kind == "csv":
@@ -44,6 +55,8 @@ def motion(arguments: Sequence[str]) -> int:
         qpos_FL = read_csv(
             options.source, model, fps=options.source_fps, wanted_fps=options.fps, joints=joints
         )
+    elif options.kind == "tracking":
+        qpos_FL = read_tracking(options.source, model, wanted_fps=options.fps)
     else:
         # Both become recordings of points, which are then retargeted.
         if options.kind == "bvh":
@@ -55,7 +68,34 @@ def motion(arguments: Sequence[str]) -> int:
             qpos_FL = retargeted(recording, model, pairs, fps=options.fps)
     write_motion(options.motion, model, qpos_FL, options.fps)
     show(f"{options.motion}: {len(qpos_FL)} frames, {(len(qpos_FL) - 1) / options.fps:.2f} s")
+    # Of G1 the soles are known, and with them what the ground has to give.
+    if options.kind == "tracking" and options.robot == "g1":
+        for fault in feasibility(model, qpos_FL, options.fps, figure=FIGURE).faults():
+            show(f"  not feasible as it is: {fault}")
     return 0
+
+
+def _generate(folder: Path, only: str) -> int:
+    """Write the motions of `REPERTOIRE` whose names match a regular expression, and their mirror images."""
+    names = [list(REPERTOIRE)[place] for place in match_names("motion", (only,), list(REPERTOIRE))]
+    model = g1()
+    folder.mkdir(parents=True, exist_ok=True)
+    infeasible = 0
+    for name in names:
+        clip = REPERTOIRE[name]
+        qpos_FL, _, planted_FN = perform(model, FIGURE, clip.plan(), fps=FPS, shift_s=clip.shift_s)
+        faults = feasibility(model, qpos_FL, FPS, figure=FIGURE, planted_FN=planted_FN).faults()
+        # What the robot cannot do would only teach a policy to fall.
+        if faults:
+            infeasible += 1
+            show(f"{name}: not written: {'; '.join(faults)}")
+            continue
+        write_motion(folder / f"{name}.npz", model, qpos_FL, FPS)
+        write_motion(folder / f"{name}{MIRRORED}.npz", model, mirrored(model, qpos_FL), FPS)
+        show(
+            f"{name}: {len(qpos_FL)} frames, {(len(qpos_FL) - 1) / FPS:.2f} s, and its mirror image"
+        )
+    return min(infeasible, 1)
 
 
 def _parser() -> OneLineParser:
@@ -65,6 +105,10 @@ def _parser() -> OneLineParser:
         ("csv", "root position, quaternion (x, y, z, w) and joints of the robot itself"),
         ("bvh", "a skeleton's motion"),
         ("amass", "an .npz with poses, trans and mocap_framerate"),
+        (
+            "tracking",
+            "an .npz of mjlab's or BeyondMimic's tracking tasks, with names of joints and bodies",
+        ),
     ):
         one = kinds.add_parser(kind, help=said)
         one.add_argument("source", type=Path)
@@ -79,6 +123,8 @@ def _parser() -> OneLineParser:
                 "--joints", default="", help="of the file's columns, if not the model's order"
             )
             continue
+        if kind == "tracking":
+            continue
         one.add_argument(
             "--pairs", type=Path, required=True, help="a YAML file: see docs/motions.md"
         )
@@ -87,4 +133,11 @@ def _parser() -> OneLineParser:
             one.add_argument("--z-up", action="store_true")
         else:
             one.add_argument("--height", type=float, default=HEIGHT, help="of the person, m")
+    own = kinds.add_parser(
+        "generate", help="the package's plans of Unitree G1, sixty motions of twelve kinds"
+    )
+    own.add_argument(
+        "folder", type=Path, help="where to write, an .npz file for each, and its mirror image"
+    )
+    own.add_argument("--only", default=".*", help="names to make, a regular expression: walk_.*")
     return parser
