@@ -92,10 +92,11 @@ def feasibility(
     """
     soles_FN3, heading_FN = _soles(mj_model, qpos_FL, figure)
     speed_FN = np.linalg.norm(np.gradient(soles_FN3, 1.0 / fps, axis=0), axis=-1)
-    if planted_FN is None:
-        is_low_FN = soles_FN3[..., 2] < figure.sole_z + STANDING_HEIGHT
-        planted_FN = is_low_FN & (speed_FN < STANDING_SPEED)
-    asked = demand(mj_model, qpos_FL, fps, feet=figure.feet, planted_FN=planted_FN)
+    is_low_FN = soles_FN3[..., 2] < figure.sole_z + STANDING_HEIGHT
+    standing_FN = is_low_FN & (speed_FN < STANDING_SPEED)
+    if planted_FN is not None:
+        standing_FN = planted_FN
+    asked = demand(mj_model, qpos_FL, fps, feet=figure.feet, planted_FN=standing_FN)
     weight = float(mj_model.body_subtreemass[1]) * GRAVITY
     push_F = asked.force_F3[:, 2]
     aside_F = np.linalg.norm(asked.force_F3[:, :2], axis=-1)
@@ -104,11 +105,11 @@ def feasibility(
     low_L, high_L = mj_model.jnt_range[1:].T
     room_FL = np.minimum(qpos_FL[:, 7:] - low_L, high_L - qpos_FL[:, 7:])
     # Between two frames in which it stands, as a foot comes to rest in the first of them.
-    still_FN = planted_FN[:-1] & planted_FN[1:]
+    still_FN = standing_FN[:-1] & standing_FN[1:]
     slip_FN = np.linalg.norm(np.diff(soles_FN3, axis=0), axis=-1) * fps
     return Feasibility(
-        off_sole=_off_sole(asked, soles_FN3, heading_FN, planted_FN),
-        unsupported=float((~planted_FN.any(1)).mean()),
+        off_sole=_off_sole(asked, soles_FN3, heading_FN, standing_FN),
+        unsupported=float((~standing_FN.any(1)).mean()),
         least_push=float(push_F.min() / weight),
         most_push=float(push_F.max() / weight),
         friction=float((aside_F / np.maximum(push_F, 1e-9)).max()),
