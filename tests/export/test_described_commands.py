@@ -6,7 +6,7 @@ import pytest
 from ksim_rl import mdp
 from ksim_rl.export.described_commands import described_commands
 from ksim_rl.export.standalone.commands import CommandRange
-from tests.envs.probe_env import puck_env
+from tests.envs.probe_env import puck_env_in_c
 
 AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 
@@ -14,7 +14,7 @@ AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 @pytest.fixture(scope="module")
 def env():
     start, end = ({"height": pair} for pair in ((0.3, 0.3), (0.1, 0.5)))
-    return puck_env(
+    return puck_env_in_c(
         limit=None,
         commands={
             "twist": mdp.UniformVelocityCommand(

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from tests.envs.probe_env import DT, Launch, Position, puck_env
+from tests.envs.probe_env import DT, Launch, Position, puck_env_in_c
 
 
 def run(env, steps):
@@ -18,7 +18,9 @@ def run(env, steps):
 
 def leveled(term, *, steps=2, **fields):
     """Pucks whose episodes last `steps` steps."""
-    return puck_env(limit=None, episode_length_s=steps * DT, curriculum={"level": term}, **fields)
+    return puck_env_in_c(
+        limit=None, episode_length_s=steps * DT, curriculum={"level": term}, **fields
+    )
 
 
 def test_linear_rises_between_two_counts_of_steps_when_envs_reset():
@@ -50,7 +52,7 @@ def test_long_episodes_raise_the_level_and_short_ones_lower_it():
     term = mdp.EpisodeLengthLevel(raise_above=0.9, lower_below=0.6, num_levels=4, initial_level=0.5)
     survivors = leveled(term, steps=4)
     assert run(survivors, 8) == [0.5] * 3 + [0.75] * 4 + [1.0]
-    fallers = puck_env(limit=0.05, episode_length_s=4 * DT, curriculum={"level": term})
+    fallers = puck_env_in_c(limit=0.05, episode_length_s=4 * DT, curriculum={"level": term})
     # Three episodes have ended after step 2, with 1, 1 and 2 steps; three more after step 3 already count anew.
     assert run(fallers, 2) == [0.5, 0.25]
 
@@ -137,11 +139,11 @@ def test_the_level_and_what_it_waits_for_are_part_of_the_state():
             "unknown reward 'positon'",
         ),
         (
-            lambda: puck_env(limit=None, curriculum={"level": mdp.EpisodeLengthLevel()}),
+            lambda: puck_env_in_c(limit=None, curriculum={"level": mdp.EpisodeLengthLevel()}),
             "EpisodeLengthLevel with episode_length_s=0",
         ),
         (
-            lambda: puck_env(
+            lambda: puck_env_in_c(
                 curriculum={"one": mdp.LinearLevel(end_step=5), "two": mdp.LinearLevel(end_step=5)}
             ),
             "one and two all drive the one level",

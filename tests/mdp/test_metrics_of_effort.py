@@ -5,7 +5,7 @@ import torch
 
 from ksim_rl import mdp
 from ksim_rl.envs import MjcfRobot, SceneCfg
-from tests.envs.probe_env import DT, PUCK_XML, Launch, puck_env
+from tests.envs.probe_env import DT, PUCK_XML, Launch, puck_env_in_c
 from tests.mdp.bench import FREE_BODY, Bench
 
 CART = PUCK_XML.replace('gravity="0 0 0"', 'gravity="0 0 -5"').replace(
@@ -50,7 +50,7 @@ def test_cost_of_transport_is_energy_per_weight_and_way(cart):
 
 
 def test_standing_still_has_a_finite_cost_and_a_reset_starts_anew():
-    env = puck_env(
+    env = puck_env_in_c(
         limit=None,
         events={"launch": Launch(speed=0.0)},
         episode_length_s=3 * DT,

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from tests.envs.probe_env import DT, Beyond, puck_env
+from tests.envs.probe_env import DT, Beyond, puck_env_in_c
 
 
 def finished(env, steps):
@@ -14,7 +14,7 @@ def finished(env, steps):
 
 def racing(*terminations, **fields):
     """Pucks of 1, 2 and 3 m/s; the goal is 0.11 m away, and the episode ends after five steps."""
-    return puck_env(
+    return puck_env_in_c(
         terminations={
             "goal": Beyond(limit=0.11),
             "time_out": mdp.TimeOut(),
@@ -39,7 +39,7 @@ def test_success_is_an_end_by_the_named_terminations_and_by_no_other():
 
 
 def test_an_end_for_two_reasons_is_none():
-    env = puck_env(
+    env = puck_env_in_c(
         terminations={"goal": Beyond(limit=0.05), "far": Beyond(limit=0.05)},
         metrics={"success": mdp.Success(terminations=("goal",))},
     )

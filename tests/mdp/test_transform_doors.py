@@ -24,7 +24,7 @@ from ksim_rl.transforms import (
     TimeAwareObservation,
 )
 from ksim_rl.transforms.low_pass import smoothing
-from tests.envs.probe_env import DT, Position, puck_env
+from tests.envs.probe_env import DT, Position, puck_env_in_c
 from tests.mdp.bench import TWO_WHEELS
 
 CUTOFF_HZ = 3.0
@@ -76,7 +76,7 @@ def test_time_left_successes_and_lengths_are_counted_alike():
         "ever": mdp.Success(terminations=("time_out",), reduce="max"),
         "length": Ones(),
     }
-    puck = puck_env(
+    puck = puck_env_in_c(
         limit=0.11, episode_length_s=5 * DT, observations={"actor": left}, metrics=metrics
     )
     trackers = [
@@ -105,7 +105,7 @@ def test_time_left_successes_and_lengths_are_counted_alike():
 def test_ranges_weights_and_levels_move_alike():
     """A curriculum and a transform that follow one level, after episodes that all last long."""
     start, end, score = (0.2, 0.4), (-1.0, 2.0), 2.0
-    puck = puck_env(
+    puck = puck_env_in_c(
         num_envs=2,
         limit=None,
         episode_length_s=2 * DT,

@@ -6,7 +6,7 @@ import torch
 from ksim_rl import mdp
 from ksim_rl.runs.csv_table import CsvTable, read_table
 from ksim_rl.trainers.metrics import episode_means, read_episode_sums, start_copy
-from tests.envs.probe_env import DT, Position, puck_env
+from tests.envs.probe_env import DT, Position, puck_env_in_c
 
 SUMS = {
     "sum/episodes": 4.0,
@@ -52,7 +52,7 @@ def test_an_env_without_episode_log_gives_what_it_has():
 
 def test_rewards_ends_and_the_levels_of_curricula_and_commands_reach_the_table(tmp_path):
     ranges = {"start": {"height": (0.5, 0.5)}, "end": {"height": (0.0, 1.0)}}
-    env = puck_env(
+    env = puck_env_in_c(
         limit=0.1,
         episode_length_s=4 * DT,
         rewards={"position": Position(), "still": Position(weight=-0.5)},
@@ -83,7 +83,7 @@ def test_rewards_ends_and_the_levels_of_curricula_and_commands_reach_the_table(t
 
 
 def test_without_a_curriculum_there_are_no_levels_to_report():
-    env = puck_env(
+    env = puck_env_in_c(
         commands={"height": mdp.BaseHeightCommand(resampling_time_range_s=None, height=(0.2, 0.4))}
     )
     assert env.command_levels() == {} and env.curriculum_levels() == {}

@@ -9,7 +9,7 @@ from torch import Tensor
 from ksim_rl.envs import EnvView, ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.term import CommandTerm, RewardTerm
 from ksim_rl.mdp import Command
-from tests.envs.probe_env import DT, Target, puck_env, push
+from tests.envs.probe_env import DT, Target, puck_env_in_c, push
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class CommandItself(RewardTerm):
 
 def commanded(low, high=None, **fields):
     command = Target(resampling_time_range_s=(low, low if high is None else high))
-    return puck_env(limit=None, commands={"target": command}, **fields)
+    return puck_env_in_c(limit=None, commands={"target": command}, **fields)
 
 
 def targets(env, steps):
@@ -105,7 +105,7 @@ def test_a_command_is_a_vector_per_env():
     with pytest.raises(
         ValueError, match=r"command term 'flat' returns shape \(3,\): expected \[3, K\]"
     ):
-        puck_env(commands={"flat": Flat(resampling_time_range_s=(1.0, 1.0))})
+        puck_env_in_c(commands={"flat": Flat(resampling_time_range_s=(1.0, 1.0))})
 
 
 def test_an_unordered_range_is_refused():

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ksim_rl.envs import EnvView
 from ksim_rl.envs.term import MetricTerm
-from tests.envs.probe_env import DT, Launch, Speed, puck_env
+from tests.envs.probe_env import DT, Launch, Speed, puck_env_in_c
 
 REDUCTIONS = ("mean", "last", "max", "sum")
 
@@ -42,7 +42,7 @@ def finished(env, steps):
     ("reduce", "value"), [("mean", -2.5), ("last", -3.0), ("max", -1.0), ("sum", -10.0)]
 )
 def test_each_reduction_over_whole_episodes(reduce, value):
-    env = puck_env(limit=None, episode_length_s=4 * DT, metrics={"wave": Wave(reduce=reduce)})
+    env = puck_env_in_c(limit=None, episode_length_s=4 * DT, metrics={"wave": Wave(reduce=reduce)})
     # Two episodes of four steps in each of three envs, and three steps that are not over.
     log = finished(env, 11)
     torch.testing.assert_close(log["metric/wave"], torch.tensor(2 * value * (1 + 2 + 3)))
@@ -52,12 +52,12 @@ def test_each_reduction_over_whole_episodes(reduce, value):
 def test_reductions_stand_side_by_side_and_episodes_of_other_lengths_do_not_mix():
     # Env e moves 0.02 (e + 1) m a step, and its episode ends beyond 0.05 m: after 3, 2 and 1 steps.
     metrics = {reduce: Wave(reduce=reduce) for reduce in REDUCTIONS}
-    env = puck_env(limit=0.05, metrics=metrics)
+    env = puck_env_in_c(limit=0.05, metrics=metrics)
     log = finished(env, 1)
     assert {name: float(log[f"metric/{name}"]) for name in REDUCTIONS} == {
         "mean": -3.0, "last": -3.0, "max": -3.0, "sum": -3.0,
     }  # fmt: skip
-    log = finished(puck_env(limit=0.05, metrics=metrics), 3)
+    log = finished(puck_env_in_c(limit=0.05, metrics=metrics), 3)
     # Env 2 has ended three times with -3; env 1 once with -2, -8; env 0 once with -1, -4, -2.
     expected = {
         "mean": -9.0 - 5.0 - 7.0 / 3.0,
@@ -70,7 +70,7 @@ def test_reductions_stand_side_by_side_and_episodes_of_other_lengths_do_not_mix(
 
 
 def test_a_failed_world_adds_nothing():
-    env = puck_env(
+    env = puck_env_in_c(
         num_envs=1, limit=None, events={"launch": Launch()}, metrics={"speed": Speed(reduce="sum")}
     )
     root_E = env.reset()
@@ -85,7 +85,7 @@ def test_a_failed_world_adds_nothing():
 
 
 def test_the_log_sums_over_rows_that_end_together_and_apart():
-    env = puck_env(limit=0.11, episode_length_s=5 * DT)
+    env = puck_env_in_c(limit=0.11, episode_length_s=5 * DT)
     log = finished(env, 5)
     # 0.02 m a step: time-out in step 5; 0.04: beyond in step 3; 0.06: beyond in steps 2 and 4.
     assert (log["termination/time_out"], log["termination/beyond"]) == (1, 3)
@@ -97,7 +97,7 @@ def test_a_shape_other_than_one_per_env_is_refused_at_construction():
         ValueError,
         match=r"'column' returns torch\.float32 \(3, 1\): expected any real dtype \(3,\), one value",
     ):
-        puck_env(metrics={"column": Column()})
+        puck_env_in_c(metrics={"column": Column()})
 
 
 def test_an_unknown_reduction_is_refused():
@@ -127,7 +127,7 @@ def test_a_metric_of_substeps_is_their_mean():
         "substep": SquaredPlace(reduce="last", per_substep=True),
         "peak": SquaredPlace(reduce="max", per_substep=True),
     }
-    env = puck_env(limit=None, episode_length_s=2 * DT, metrics=metrics)
+    env = puck_env_in_c(limit=None, episode_length_s=2 * DT, metrics=metrics)
     log = finished(env, 2)
     # Env e is at 0.005 (e + 1) k m after k substeps; the second step has the substeps 5 to 8.
     factor = 0.005**2 * (1 + 4 + 9)
@@ -144,4 +144,4 @@ def test_a_metric_of_substeps_is_their_mean():
 
 def test_a_metric_of_substeps_cannot_read_what_has_to_be_derived():
     with pytest.raises(RuntimeError, match=r"metrics/body.*derived quantity"):
-        puck_env(limit=None, metrics={"body": BodyPlace(per_substep=True)})
+        puck_env_in_c(limit=None, metrics={"body": BodyPlace(per_substep=True)})

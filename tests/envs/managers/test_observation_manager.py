@@ -10,7 +10,7 @@ from torch import Tensor
 from ksim_rl.envs import EnvView, ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.term import ObservationTerm
 from ksim_rl.mdp import JointPos, RandomizeBodyMass
-from tests.envs.probe_env import puck_cfg, puck_env, push
+from tests.envs.probe_env import puck_cfg, puck_env_in_c, push
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,11 +65,11 @@ def observing(**groups):
 )
 def test_a_wrong_shape_or_dtype_is_refused_at_construction(term, message):
     with pytest.raises(ValueError, match="observation term 'odd' returns .*" + message):
-        puck_env(**observing(actor={"odd": term}))
+        puck_env_in_c(**observing(actor={"odd": term}))
 
 
 def test_groups_share_a_term_that_is_read_once_a_step():
-    env = puck_env(**observing(actor={"shared": Counted()}, critic={"shared": Counted()}))
+    env = puck_env_in_c(**observing(actor={"shared": Counted()}, critic={"shared": Counted()}))
     root_E = env.reset()
     Counted.calls.clear()
     push(env, root_E)
@@ -78,7 +78,7 @@ def test_groups_share_a_term_that_is_read_once_a_step():
 
 
 def test_a_reading_is_no_window_onto_the_physics():
-    env = puck_env(limit=None, **observing(actor={"raw": Raw(), "position": JointPos()}))
+    env = puck_env_in_c(limit=None, **observing(actor={"raw": Raw(), "position": JointPos()}))
     next_E = push(env, env.reset())["next"]
     kept = {name: next_E["obs", name].clone() for name in ("raw", "position")}
     push(env, next_E.clone())
@@ -110,7 +110,7 @@ def test_what_is_done_to_a_reading_in_place_reaches_nobody_else(onto, others):
     """A transform of a user's may well work in place."""
     terms = {"window": Window(onto=onto)} | ({"position": JointPos()} if others else {})
     heavier = {"mass": RandomizeBodyMass(bodies="puck", ranges=(1.0, 1.0), mode="reset")}
-    env = puck_env(events=heavier, **observing(actor=terms))
+    env = puck_env_in_c(events=heavier, **observing(actor=terms))
     next_E = push(env, env.reset())["next"]
     check_nobody_else_sees(env, next_E, has_others=bool(others))
     root_E = env.maybe_reset(next_E.exclude("reward"))
@@ -136,6 +136,6 @@ def test_one_name_cannot_mean_two_terms():
 
 
 def test_specs_have_the_terms_shapes():
-    env = puck_env(**observing(actor={"two": Counted()}, critic={"one": JointPos()}))
+    env = puck_env_in_c(**observing(actor={"two": Counted()}, critic={"one": JointPos()}))
     assert env.observation_spec["obs", "two"].shape == (3, 2)
     assert env.observation_spec["obs", "one"].shape == (3, 1)

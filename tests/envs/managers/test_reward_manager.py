@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ksim_rl.envs import EnvView
 from ksim_rl.envs.term import RewardTerm
-from tests.envs.probe_env import DT, Position, puck_env, push
+from tests.envs.probe_env import DT, Position, puck_env_in_c, push
 
 SPEED_E = torch.tensor([1.0, 2.0, 3.0])
 
@@ -35,20 +35,20 @@ class Column(RewardTerm):
 
 def test_terms_are_weighted_scaled_and_summed():
     rewards = {"once": Position(), "minus_twice": Position(weight=-2.0), "one": Counted(weight=0.5)}
-    env = puck_env(limit=None, rewards=rewards)
+    env = puck_env_in_c(limit=None, rewards=rewards)
     next_E = push(env, env.reset())["next"]
     torch.testing.assert_close(next_E["reward"][:, 0], (-SPEED_E * DT + 0.5) * DT)
 
 
 def test_a_term_of_weight_zero_is_not_computed():
     Counted.calls.clear()
-    env = puck_env(limit=None, rewards={"off": Counted(weight=0.0), "position": Position()})
+    env = puck_env_in_c(limit=None, rewards={"off": Counted(weight=0.0), "position": Position()})
     push(env, env.reset())
     assert not Counted.calls and "reward/off" not in env.episode_log()
 
 
 def test_without_rewards_the_reward_is_zero():
-    env = puck_env(limit=None, rewards={})
+    env = puck_env_in_c(limit=None, rewards={})
     next_E = push(env, env.reset())["next"]
     assert next_E["reward"].shape == (3, 1) and next_E["reward"].eq(0.0).all()
 
@@ -58,7 +58,7 @@ def test_a_shape_other_than_one_per_env_is_refused_at_construction():
         ValueError,
         match=r"'column' returns torch\.float32 \(3, 1\): expected any real dtype \(3,\), one value",
     ):
-        puck_env(rewards={"column": Column()})
+        puck_env_in_c(rewards={"column": Column()})
 
 
 @pytest.mark.parametrize("weight", [float("nan"), float("inf"), True, "1"])

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ksim_rl.envs import EnvView
 from ksim_rl.envs.term import TerminationTerm
-from tests.envs.probe_env import puck_cfg, puck_env, push
+from tests.envs.probe_env import puck_cfg, puck_env_in_c, push
 
 FAILED, LATE = (True, False, True, False), (False, True, True, False)
 
@@ -26,7 +26,7 @@ class Returns(TerminationTerm):
 
 def ending(*terms, **fields):
     terminations = {f"term_{i}": term for i, term in enumerate(terms)}
-    return puck_env(num_envs=4, terminations=terminations, episode_length_s=10.0, **fields)
+    return puck_env_in_c(num_envs=4, terminations=terminations, episode_length_s=10.0, **fields)
 
 
 def flags_of(env):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from tests.envs.probe_env import DT, puck_env, push
+from tests.envs.probe_env import DT, puck_env_in_c, push
 from tests.mdp.recorder import Recorder
 
 TROT = (0.0, 0.5, 0.5, 0.0)
@@ -27,7 +27,7 @@ def turned(cycles):
 
 
 def gait_env(**fields):
-    return puck_env(
+    return puck_env_in_c(
         limit=None,
         commands={"gait": mdp.SinusoidalGaitCommand(offsets=TROT, **fields)},
         episode_length_s=4.0,
@@ -69,7 +69,7 @@ def test_a_reset_begins_the_rhythm_anew_in_its_rows_only():
 
 
 def test_a_reset_without_events_begins_the_rhythm_anew():
-    env = puck_env(
+    env = puck_env_in_c(
         limit=None,
         events={},
         commands={"gait": mdp.SinusoidalGaitCommand(offsets=TROT, frequency=(1.5, 1.5))},

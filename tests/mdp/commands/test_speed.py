@@ -8,7 +8,7 @@ from torch import Tensor
 from ksim_rl.envs import EnvView, ObservationGroupCfg, ObservationTermCfg
 from ksim_rl.envs.term import CommandTerm, ObservationTerm, RewardTerm
 from ksim_rl.mdp.fields import commanded_speed, is_commanded
-from tests.envs.probe_env import DT, puck_env, push
+from tests.envs.probe_env import DT, puck_env_in_c, push
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class SpeedPaid(RewardTerm):
 
 def test_rewards_see_the_old_command_and_observations_the_new_one():
     group = ObservationGroupCfg(terms={"speed": ObservationTermCfg(term=SpeedSeen())})
-    env = puck_env(
+    env = puck_env_in_c(
         limit=None,
         commands={"twist": Faster(resampling_time_range_s=(DT, DT))},
         observations={"actor": group, "critic": group},

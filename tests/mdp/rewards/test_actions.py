@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from ksim_rl import mdp
-from tests.envs.probe_env import puck_env
+from tests.envs.probe_env import puck_env_in_c
 
 
 def test_action_rate_is_the_squared_change(free_body):
@@ -48,7 +48,7 @@ def test_alive_is_one(free_body):
 @pytest.mark.parametrize("is_finite_horizon", [False, True])
 def test_terminated_marks_failures_and_no_time_outs(is_finite_horizon):
     # Env e starts at e + 1 m/s and fails beyond 0.1 m: in steps 6, 3 and 2 of 20 ms. Time is out after 3 steps.
-    env = puck_env(
+    env = puck_env_in_c(
         rewards={"failed": mdp.Terminated(weight=-2.0)},
         scale_rewards_by_dt=False,
         episode_length_s=0.06,
