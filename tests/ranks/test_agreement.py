@@ -10,6 +10,7 @@ from tests.ranks.gloo import results
 
 SMALL = [
     "task=cartpole_balance",
+    "task.sim.engine=c",
     "device=cpu",
     "logger=none",
     "task.episode_length_s=0.1",
