@@ -355,7 +355,7 @@ KINDS: Mapping[str, Mapping[str, Plan]] = {
         "twist": partial(dance, 0.7, dip=0.04, swing=0.5, twist=0.3),
         "slow": partial(dance, 1.0, dip=0.08, swing=0.7, twist=0.4),
         "aside": partial(dance, 0.6, dip=0.0, swing=0.5, step=0.05),
-        "aside_twist": partial(dance, 0.66, dip=0.0, swing=0.5, twist=0.1, step=0.05),
+        "aside_twist": partial(dance, 0.66, dip=0.0, swing=0.5, twist=0.08, step=0.04),
     },
 }
 """The plans by kind and variant."""

@@ -195,11 +195,12 @@ class FailedParts(OfMotion, CurriculumTerm):
         clip_E = motion_clip(view, self.file)
         clip = 0 if clip_E is None else clip_E
         # Where the episode was when it ended: the clock is still the old one here.
-        last_E = parts.count_C[clip] - 1.0
-        place_E = torch.minimum((share_E * parts.count_C[clip]).floor().clamp(min=0.0), last_E)
-        part_E = parts.first_C[clip] + place_E.long()
+        count_E = parts.count_C[clip]
+        place_E = torch.minimum((share_E * count_E).floor(), count_E - 1.0).clamp(min=0.0)
+        part_E = (parts.first_C[clip] + place_E.long()).clamp(max=len(parts) - 1)
         # Only failures count; motions that were finished say nothing about where it is hard.
-        failed_E = (lived_E & view.terminated_E).to(torch.float32)
+        # Held-out clips have no parts, and an env follows one only before its first reset.
+        failed_E = (lived_E & view.terminated_E & (count_E > 0.0)).to(torch.float32)
         counts_B = torch.zeros_like(failed_B).index_add(0, part_E, failed_E)
         # All ranks learn from all failures.
         ranks.sum_(counts_B)
