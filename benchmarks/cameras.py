@@ -52,15 +52,17 @@ Output = Literal["rgb", "depth"]
 OUTPUTS: tuple[Output, ...] = ("rgb", "depth")
 # Forward and 30 degrees down, right and up in the frame of a body whose x points forward.
 AHEAD = (0.0, -1.0, 0.0, 0.5, 0.0, 0.866)
+# The same, 75 degrees down.
+AT_THE_FEET = (0.0, -1.0, 0.0, 0.966, 0.0, 0.259)
 CAMERAS = {
     "cartpole_balance": CameraSensor(pos=(0.0, -3.0, 1.0), xyaxes=(1.0, 0.0, 0.0, 0.0, 0.0, 1.0)),
     # The floor, and the primitives with which this robot collides.
     "go1_velocity_flat": CameraSensor(
         body="trunk", pos=(0.3, 0.0, 0.05), xyaxes=AHEAD, geom_groups=(0, 3)
     ),
-    # The floor, and the meshes of the robot.
+    # The floor, and the capsules of arms and legs: models for training have no meshes that only show.
     "g1_velocity_flat": CameraSensor(
-        body="torso_link", pos=(0.08, 0.0, 0.43), xyaxes=AHEAD, geom_groups=(0, 2)
+        body="torso_link", pos=(0.2, 0.0, 0.4), xyaxes=AT_THE_FEET, fovy=90.0, geom_groups=(0, 3)
     ),
     # In front of the table, as high as the arm.
     "panda_pick_cube": CameraSensor(pos=(1.8, 0.0, 0.8), xyaxes=(0.0, 1.0, 0.0, -0.3, 0.0, 0.954)),
