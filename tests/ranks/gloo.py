@@ -1,5 +1,6 @@
 """Tests of several ranks run here as forked processes of one machine, joined by gloo."""
 
+import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch.multiprocessing as mp
 def _run_one(
     rank: int, size: int, folder: str, function: Callable[..., Any], arguments: tuple
 ) -> None:
+    gc.freeze()
     torch.set_num_threads(1)
     torch.distributed.init_process_group(
         "gloo", f"file://{folder}/store", rank=rank, world_size=size
@@ -36,6 +38,8 @@ def as_ranks_compute(dtype: torch.dtype = torch.float32) -> Iterator[None]:
 def results(function: Callable[..., Any], *arguments: Any, size: int, folder: Path) -> list[Any]:
     """Call `function` on each of `size` ranks, and return what it returned there."""
     folder.mkdir(exist_ok=True)
+    # A fork has no threads of its parent, and would wait for those of MuJoCo's pools that it throws away.
+    gc.collect()
     mp.start_processes(
         _run_one, (size, str(folder), function, arguments), nprocs=size, start_method="fork"
     )
