@@ -71,7 +71,7 @@ def build_networks(
         layers = next(own for own in trunk.modules() if isinstance(own, LayeredNetwork))
         # Both networks read its features as one more observation.
         spec = spec.clone()
-        spec[FEATURES] = Unbounded(torch.Size([*spec.shape, layers.output_dim]))
+        spec[FEATURES] = Unbounded(torch.Size([*spec.shape, layers.output_dim]), device=spec.device)
 
     # Behind a recurrent module, where there is one.
     if m := modules.recurrent_actor:
