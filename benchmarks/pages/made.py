@@ -6,6 +6,7 @@ from pathlib import Path
 from benchmarks import report
 from benchmarks.pages import (
     algorithms,
+    cameras,
     engines,
     judge,
     learned,
@@ -49,6 +50,7 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "larger steps": speed.larger_steps,
         "engines": engines.engines,
     },
+    "vision.md": {"cameras": cameras.cameras},
 }
 NAMES = sorted({*WHOLE, *PARTS})
 
