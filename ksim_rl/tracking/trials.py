@@ -120,7 +120,7 @@ class TrialRunner(Evaluator):
 def trial_cfg(cfg: ManagerBasedRlEnvCfg, *, pushes: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the config of trials of a tracking task: all begin with the motion, and nothing adapts.
 
-    A ValueError if the task has no start in a motion.
+    A ValueError if the task has no start in a motion, or starts in several.
     """
     events: dict[str, Any] = dict(cfg.events or {})
     starts = [name for name, event in events.items() if isinstance(event, StartInMotion)]
@@ -128,6 +128,12 @@ def trial_cfg(cfg: ManagerBasedRlEnvCfg, *, pushes: bool = False) -> ManagerBase
         raise ValueError(
             f"events {sorted(events)}: none is a StartInMotion, so that there is no motion to follow: take a task such "
             "as g1_track_walk"
+        )
+    motions = sorted({str(events[name].file) for name in starts})
+    if len(motions) > 1:
+        raise ValueError(
+            f"events {starts} start in several motions ({', '.join(motions)}), and trials follow one: start in one, or "
+            "put the files into one set of motions, as task.scene.motions of g1_track has them"
         )
     for name in starts:
         start = events[name]

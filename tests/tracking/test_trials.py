@@ -100,6 +100,14 @@ def test_a_task_without_a_motion_is_refused():
         trial_cfg(cfg)
 
 
+def test_trials_follow_one_motion():
+    cfg = track_cfg("g1_walk")
+    another = dataclasses.replace(cfg.events["start"], file="g1_kick")
+    cfg = dataclasses.replace(cfg, events={**cfg.events, "another": another})
+    with pytest.raises(ValueError, match="'start', 'another'.*g1_kick, g1_walk.*follow one"):
+        trial_cfg(cfg)
+
+
 def test_the_tasks_have_the_limits_of_the_peer():
     # mjlab, src/mjlab/tasks/tracking/tracking_env_cfg.py at 0eda4e7: anchor_pos, anchor_ori, ee_body_pos.
     assert (HEIGHT_LIMIT, UPRIGHT_LIMIT) == (0.25, 0.8)
