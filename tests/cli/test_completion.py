@@ -50,7 +50,7 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
         ("ksim-rl train task=go1_velocity_", ["go1_velocity_flat", "go1_velocity_rough"]),
         ("ksim-rl train objective.clip_e", ["objective.clip_epsilon="]),
         ("ksim-rl train seed=1 modules=g", ["gru"]),
-        ("ksim-rl envs cartpole_s", ["cartpole_swingup"]),
+        ("ksim-rl envs cartpole_s", ["cartpole_swingup", "cartpole_swingup_pixels"]),
         ("ksim-rl eval ru", []),
     ],
 )

@@ -240,6 +240,7 @@ def test_a_state_dict_of_another_kind_is_refused():
         fresh().load_state_dict({"what": torch.ones(1)})
 
 
+@pytest.mark.full
 @pytest.mark.skipif(
     TorchVersion(torch.__version__) < "2.13",
     reason="Dynamo of torch 2.10 cannot trace TorchRL's cache of specs",

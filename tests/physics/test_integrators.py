@@ -103,7 +103,9 @@ def test_what_acts_on_a_body_as_a_whole_is_implicit(
     step_and_check(xml, KERNELS[kernels], speed=3.0)
 
 
-@pytest.mark.parametrize("flag", ("", '<flag sleep="enable"/>'))
+@pytest.mark.parametrize(
+    "flag", ("", pytest.param('<flag sleep="enable"/>', marks=pytest.mark.full))
+)
 @pytest.mark.parametrize("kind", ("filter", "filterexact"))
 def test_runge_kutta_leaves_the_rates_of_its_last_stage(kind: str, flag: str) -> None:
     xml = (

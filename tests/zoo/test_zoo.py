@@ -182,6 +182,7 @@ def test_a_run_of_code_that_no_commit_has_is_refused_in_one_line(
     assert not (tmp_path / "zoo").exists()
 
 
+@pytest.mark.full
 def test_an_entry_names_the_commit_of_its_run(run, tmp_path):
     pytest.importorskip("onnxruntime")
     card = add(
