@@ -233,6 +233,7 @@ def test_clips_are_held_out_by_name_and_by_share():
         ({"held_out": ("kik.*",)}, "no clip matches 'kik"),
         ({"held_out": (".*",)}, "none of the 7 clips is left"),
         ({"held_out_share": 1.0}, "none of the 7 clips is left"),
+        ({"held_out_share": 0.05}, "held_out_share=0.05: of 5 clips that is none"),
     ):
         with pytest.raises(ValueError, match=message):
             MotionSet(sources=("x",), **fields).held_out_of(names)
@@ -242,6 +243,7 @@ def test_what_is_no_set_is_refused(folder, tmp_path):
     for sources, message in (
         ((), "sources"),
         ((str(tmp_path),), "has no .npz file"),
+        (("",), "one of them is empty"),
         ((str(folder), str(folder / "g1_walk.npz")), "same name 'g1_walk'"),
     ):
         with pytest.raises(ValueError, match=message):

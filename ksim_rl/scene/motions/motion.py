@@ -219,14 +219,21 @@ def _checked_arrays(file: str, mj_model: mujoco.MjModel) -> Mapping[str, np.ndar
             raise ValueError(
                 f"motion {file}: {key} has shape {array.shape}: expected [F, {width}] ({kind} of the model), F >= 2"
             )
-        if not np.isfinite(array).all():
-            raise ValueError(f"motion {file}: {key} holds a number that is not finite")
+        # As float32, in which they are kept: a larger number becomes infinite there.
+        with np.errstate(over="ignore"):
+            is_finite = np.isfinite(array.astype(np.float32)).all()
+        if not is_finite:
+            raise ValueError(f"motion {file}: {key} holds a number that is not finite in float32")
     if arrays["qpos"].shape[0] != arrays["qvel"].shape[0]:
         raise ValueError(
             f"motion {file}: qpos has {arrays['qpos'].shape[0]} frames and qvel {arrays['qvel'].shape[0]}"
         )
     # Optional: a guard against a file for another robot or another order.
     names = arrays.get("joint_names")
+    if names is not None and names.ndim != 1:
+        raise ValueError(
+            f"motion {file}: joint_names has shape {names.shape}: expected one name for each joint"
+        )
     own = [mj_model.joint(i).name for i in range(mj_model.njnt)]
     for name in () if names is None else names:
         if name not in own:
@@ -266,8 +273,11 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
             raise ValueError(
                 f"motion {path}: no array {key!r}: it has {', '.join(sorted(arrays)) or 'none'}"
             )
-        if arrays[key].dtype.kind not in "fiu":
-            raise ValueError(f"motion {path}: {key} is {arrays[key].dtype}: expected numbers")
+        # Torch has no numbers of more than 64 bits.
+        if arrays[key].dtype.kind not in "fiu" or arrays[key].dtype.itemsize > 8:
+            raise ValueError(
+                f"motion {path}: {key} is {arrays[key].dtype}: expected numbers of at most 64 bits"
+            )
     unknown = sorted(arrays.keys() - {*KEYS, *_OPTIONAL})
     if unknown:
         raise ValueError(

@@ -55,6 +55,10 @@ class MotionSet(Checked):
         # Twins are one motion: they are drawn together.
         others = sorted({name.removesuffix(MIRRORED) for name in names} - twins)
         count = round(self.held_out_share * len(others))
+        if self.held_out_share > 0.0 and count == 0:
+            raise ValueError(
+                f"held_out_share={self.held_out_share:g}: of {len(others)} clips that is none: raise it, or set it to 0"
+            )
         order = np.random.default_rng(self.seed).permutation(len(others))
         twins |= {others[place] for place in order[:count]}
         held_out = tuple(name for name in names if name.removesuffix(MIRRORED) in twins)
@@ -74,6 +78,9 @@ def load_set(chosen: MotionSet, mj_model: mujoco.MjModel, device: torch.device) 
 
 
 def _files_of(source: str) -> list[str]:
+    # An empty path would be the working directory.
+    if not source:
+        raise ValueError("sources: one of them is empty: name a folder of motions, or a file")
     path = motion_path(source)
     if not path.is_dir():
         return [source]
