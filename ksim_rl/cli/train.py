@@ -182,13 +182,15 @@ def _train_one(
             f"folder may not: set {path} on the command line"
         )
     cfg = RunCfg.from_tree(plain)
+    launched = HydraConfig.get()
+    # Only here for a config of the user's own, and for the last jobs of a long sweep.
+    conf.check_composed(cfg, launched.overrides.task)
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     # The run's own config must find its files from anywhere.
     if cfg.checkpoint is not None:
         cfg = dataclasses.replace(cfg, checkpoint=str(Path(cfg.checkpoint).resolve()))
     cfg = dataclasses.replace(cfg, objective=cfg.objective.with_absolute_paths())
     cfg = _with_models_of(began, cfg, note=say)
-    launched = HydraConfig.get()
     folder = Path(launched.runtime.output_dir)
     # Where the user named the folder of a run that is under way, that run's lock says so.
     named = any(

@@ -4,6 +4,7 @@ from ksim_rl.conf import spelling
 from ksim_rl.conf.command_line import (
     changed,
     check_command_line,
+    check_composed,
     compose,
     fields_of,
     without_sweeps,

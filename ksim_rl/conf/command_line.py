@@ -96,6 +96,12 @@ def _compose(overrides: list[str], name: str, *, learns: bool) -> RunCfg:
     plain = OmegaConf.to_container(hydra.compose(name, overrides=overrides), resolve=True)
     assert isinstance(plain, dict)
     cfg = RunCfg.from_tree({str(key): value for key, value in plain.items()})
+    check_composed(cfg, overrides, learns=learns)
+    return cfg
+
+
+def check_composed(cfg: RunCfg, overrides: Sequence[str], *, learns: bool = True) -> None:
+    """Refuse overrides of one job whose values the composed config would not keep, of data sizes or by a curriculum."""
     # Data sizes follow from the rollout length, so only one of the two may be given.
     for override in overrides:
         if override.partition("=")[0] in SIZES and cfg.collector.rollout_length is not None:
@@ -105,7 +111,6 @@ def _compose(overrides: list[str], name: str, *, learns: bool) -> RunCfg:
             )
     if learns:
         check_not_replaced(cfg.task.curriculum, overrides)
-    return cfg
 
 
 def _parse(text: str, loader: ConfigLoader) -> Override:

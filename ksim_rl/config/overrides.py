@@ -74,28 +74,43 @@ def check_parsed(tree: Tree, overrides: Iterable[Override]) -> None:
     tree = copy.deepcopy(dict(tree))
     for override in overrides:
         key = override.key_or_group
-        # "+" makes a field, so that it may be set below.
-        if override.is_add() or override.is_force_add():
-            above = _node(tree, key.split(".")[:-1], make=True)
-            if override.is_sweep_override():
-                above[key.split(".")[-1]] = None
-            else:
-                above[key.split(".")[-1]] = _plain(override)
-            continue
+        *parents, name = key.split(".")
+        makes = override.is_add() or override.is_force_add()
         # "~" and plain overrides need a field that is there.
-        check_key(tree, key)
+        if not makes:
+            check_key(tree, key)
         if override.is_delete():
-            above = _node(tree, key.split(".")[:-1])
-            above.pop(key.split(".")[-1], None)
-        # A mapping adds its entries, as Hydra merges.
-        elif not override.is_sweep_override() and isinstance(value := _plain(override), dict):
-            _node(tree, key.split("."), make=True).update(value)
+            _node(tree, parents).pop(name, None)
+        elif not override.is_sweep_override():
+            value = _plain(override)
+            # "+" makes a field, so that it may be set below; a mapping adds its entries, as Hydra merges.
+            if makes or isinstance(value, dict):
+                _merge(_node(tree, parents, make=True), {name: value}, parents)
+        elif makes:
+            _node(tree, parents, make=True)[name] = None
 
 
 def _plain(override: Override) -> Plain:
     # Through OmegaConf, which reads the value as it will later.
     tree: Any = OmegaConf.to_container(OmegaConf.create({"value": override.value()}))
     return tree["value"]
+
+
+def _merge(tree: Tree, given: Tree, path: Sequence[str]) -> None:
+    """Put values into the mapping at a path of a tree, as Hydra does; refuse empty ones, which change nothing."""
+    for name, value in given.items():
+        present = tree.get(name)
+        if not (isinstance(present, dict) and isinstance(value, dict)):
+            tree[name] = value
+            continue
+        inside = [*path, name]
+        if present and not value:
+            field = ".".join(inside)
+            raise ValueError(
+                f"{field}={{}}: a mapping adds its entries to those that are there, and an empty one changes nothing: "
+                f"drop each that is too much with ~{field}.NAME: {', '.join(map(str, present))}"
+            )
+        _merge(present, value, inside)
 
 
 def _node(tree: Tree, path: Sequence[str], *, make: bool = False) -> Tree:

@@ -7,6 +7,8 @@ from hydra import compose, initialize
 from omegaconf import OmegaConf
 
 from ksim_rl import envs
+from ksim_rl.config.overrides import check_overrides
+from ksim_rl.config.trees import Tree
 from ksim_rl.envs import ManagerBasedRlEnvCfg, from_tree, registry, to_tree
 
 # What Hydra's grammar wants escaped in a key of a mapping.
@@ -129,3 +131,12 @@ def test_every_field_of_the_config_is_a_key_of_the_tree():
 def test_what_is_wrong_is_named_with_its_place(overrides, message):
     with pytest.raises(ValueError, match=message):
         envs.make("cartpole_balance", num_envs=2, overrides=overrides, render_mode="rgb_array")
+
+
+def test_mappings_add_their_entries_and_an_empty_one_is_refused():
+    tree: Tree = {"task": {"events": {"reset": {"mode": "reset", "range": [0, 1]}}, "rewards": {}}}
+    inside = ["task.events={reset: {range: [0, 2]}}", "task.events.reset.mode=startup"]
+    check_overrides(tree, [*inside, "task.rewards={}", "+task.new={}", "task.events=null"])
+    for nothing in ("task.events={}", "++task.events={}", "task={events: {}}"):
+        with pytest.raises(ValueError, match=r"^task\.events=\{\}: .* changes nothing: .*reset.*"):
+            check_overrides(tree, [nothing])

@@ -1,7 +1,7 @@
 """Finds overrides of fields that a curriculum replaces while an env runs, which would hold for a while only."""
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from ksim_rl.config.overrides import given_fields
 from ksim_rl.envs.term import CurriculumTerm
@@ -22,10 +22,12 @@ def check_not_replaced(curricula: Mapping[str, CurriculumTerm], overrides: Seque
     given = given_fields(overrides)
     for name, term in curricula.items():
         curriculum = f"{PATH}.curriculum.{name}"
-        # Whoever says what the curriculum does knows of it.
-        if any(_is_in(field, curriculum) for field in given):
-            continue
-        for replaced in _replaced(term):
+        every = set(_replaced(term))
+        of_curriculum = [field for field in given if _is_in(field, curriculum)]
+        for replaced in sorted(every):
+            # Whoever says what the curriculum does with the field knows of it.
+            if any(not _is_of_others(field, replaced, every) for field in of_curriculum):
+                continue
             for field in given:
                 if _is_in(field, f"{PATH}.{replaced}"):
                     raise ValueError(
@@ -47,6 +49,13 @@ def _replaced(term: CurriculumTerm) -> Iterator[str]:
         for ranges in stages:
             for field in ranges:
                 yield f"commands.{command}.{field}"
+
+
+def _is_of_others(field: str, replaced: str, every: Collection[str]) -> bool:
+    """Tell whether a field of a curriculum, such as "stages.9.ang_vel_z", names other replaced fields than this one."""
+    parts = set(field.split("."))
+    names = {one.rpartition(".")[2] for one in every} & parts
+    return bool(names) and replaced.rpartition(".")[2] not in names
 
 
 def _is_in(field: str, path: str) -> bool:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from ksim_rl import conf, envs
+from ksim_rl.cli.main import main
 from ksim_rl.config.overrides import given_fields
 from ksim_rl.envs import mdp
 from ksim_rl.envs.managers.replaced_fields import check_not_replaced
@@ -58,6 +59,15 @@ def test_other_fields_and_those_whose_curriculum_is_overridden_too_are_free(over
     check_not_replaced(curricula, overrides)
 
 
+def test_who_overrides_another_field_of_a_curriculum_does_not_know_of_this_one():
+    stages = {9: {"lin_vel_x": (0.0, 1.0), "ang_vel_z": (0.0, 1.0)}}
+    curricula = {"ranges": mdp.CommandRangesByStage(command="twist", stages=stages)}
+    of_z = "task.curriculum.ranges.stages.9.ang_vel_z=[0,2]"
+    check_not_replaced(curricula, ["task.commands.twist.ang_vel_z=[0,1]", of_z])
+    with pytest.raises(ValueError, match="lin_vel_x: the curriculum 'ranges' replaces"):
+        check_not_replaced(curricula, ["task.commands.twist.lin_vel_x=[0,1]", of_z])
+
+
 def test_fields_are_given_down_into_mappings():
     texts = ["a.b=1", "+c={d: 1, e: {f: 2, g: {}}}", "~h", "i=1,2"]
     assert given_fields(texts) == ["a.b", "c.d", "c.e.f", "c.e.g", "i"]
@@ -78,3 +88,18 @@ def test_a_training_is_refused_and_an_evaluation_is_not():
     assert conf.changed(tree, Path("config.yaml"), [RANGE]).task == whole.task
     with pytest.raises(ValueError, match="'command_ranges' replaces"):
         conf.changed(tree, Path("config.yaml"), [RANGE], learns=True)
+
+
+@pytest.mark.full
+def test_overrides_of_a_config_of_the_users_own_are_refused_too(tmp_path, capsys):
+    stages = "{_target_: ksim_rl.mdp.RewardWeightByStage, reward: balance, stages: {9: 2.0}}"
+    (tmp_path / "mine.yaml").write_text(
+        "defaults: [train, {override task: cartpole_balance}, _self_]\n"
+        f"task: {{curriculum: {{weight: {stages}}}}}\n"
+    )
+    own = ("--config-dir", str(tmp_path), "--config-name", "mine")
+    folder = f"hydra.run.dir={tmp_path / 'run'}"
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", *own, folder, "task.rewards.balance.weight=3.0"])
+    assert "balance.weight: the curriculum 'weight' replaces" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
