@@ -1,7 +1,8 @@
 """Keeps the model files of a run with their hashes, and tells a resumed run where a file has changed since.
 
 `models.json` of a run folder says of each robot and object whose model is a file: its path, the hash of all its files,
-and where in the folder `models` a copy lies. Models of the menagerie, and models that are too large, have only a hash.
+and where in the folder `models` a copy lies. Models of the menagerie, and models that are too large, have only a hash,
+and so do sets of motions.
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ from ksim_rl.config.trees import Plain
 from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
 from ksim_rl.files.writing import check_links, whole_folder, write_whole
 from ksim_rl.physics.model_files.packing import ModelFiles, files_of_model
+from ksim_rl.scene.motions.motion_set import MotionSet
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot, ModelRobot
 from ksim_rl.scene.scene import MjcfRobot
 from ksim_rl.terminal import printable
@@ -43,7 +45,10 @@ class KeptModel:
 
 
 def keep_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None]) -> None:
-    """Write the models of a config's robots and objects into a run folder, but for those that are there already."""
+    """Write the models of a config's robots and objects into a run folder, but for those that are there already.
+
+    Of sets of motions their hashes are written.
+    """
     earlier = read_record(run_folder)
     record: dict[str, KeptModel] = {}
     for name, source in _sources(cfg):
@@ -56,6 +61,12 @@ def keep_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None]) -
         # A model that is built in code has no files.
         if files is not None:
             record[name] = _keep(name, source, files, run_folder, note)
+    for name, source, motions in _motions(cfg):
+        known = earlier.get(name)
+        if known is not None and source == known.source:
+            record[name] = known
+        else:
+            record[name] = KeptModel(source=source, sha256=motions.sha256())
     # An unchanged record is not written again.
     if record != earlier:
         plain = {name: dataclasses.asdict(kept) for name, kept in record.items()}
@@ -68,7 +79,7 @@ def with_kept_models(
     """Return a run's config with the models that it began with.
 
     Where a model's file is not there any more, or has changed, the run's own copy takes its place, and `note` (by
-    default a warning) says so. Where there is no copy, a changed file is warned of by name.
+    default a warning) says so. Where there is no copy, a changed file is warned of by name, as are changed motions.
     """
     note = note or _warn
     # By "robots/NAME" or "objects/NAME".
@@ -99,6 +110,15 @@ def with_kept_models(
         copy = _checked_copy(name, kept, run_folder)
         note(f"task.scene.{kind}.{entity}: {why}: the run's own copy is used, {copy}")
         changed[kind][entity] = _with_source(changed[kind][entity], str(copy))
+    for name, source, motions in _motions(cfg):
+        kept = record.get(name)
+        # Of other sources the user knows.
+        if kept is None or source != kept.source or motions.sha256() == kept.sha256:
+            continue
+        note(
+            f"task.scene.{name.replace('/', '.')}: the motions of {source} have changed since the run began: other "
+            "clips may be held out than in its training"
+        )
     scene = dataclasses.replace(scene, **changed)
     return dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, scene=scene))
 
@@ -197,6 +217,12 @@ def _sources(cfg: RunCfg) -> Iterator[tuple[str, str]]:
                 yield f"{kind}/{name}", entity.source
             elif isinstance(entity, MenagerieRobot):
                 yield f"{kind}/{name}", entity.model
+
+
+def _motions(cfg: RunCfg) -> Iterator[tuple[str, str, MotionSet]]:
+    """Yield the sets of motions of a config: "motions/NAME", its sources, and the set."""
+    for name, motions in cfg.task.scene.motions.items():
+        yield f"motions/{name}", ", ".join(motions.sources), motions
 
 
 def _with_source(entity: MjcfRobot | MenagerieRobot, source: str) -> MjcfRobot | ModelRobot:

@@ -10,6 +10,7 @@ import pytest
 from ksim_rl import conf
 from ksim_rl.physics import load_model
 from ksim_rl.physics.model_files.packing import files_of_model
+from ksim_rl.scene.motions import MotionSet
 from ksim_rl.scene.scene import MjcfRobot
 from ksim_rl.trainers import RunCfg, kept_models
 from ksim_rl.trainers.kept_models import keep_models, read_record, with_kept_models
@@ -232,3 +233,37 @@ def test_models_of_no_file_and_of_the_menagerie_are_not_copied(run, tmp_path, mo
     (tmp_path / "toy" / "scene.xml").write_text("<mujoco />")
     with_kept_models(cfg, run, note=said.append)
     assert "toy has changed since the run began" in said[0]
+
+
+def test_motions_that_have_changed_are_told(run, tmp_path):
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    for clip in ("bow", "kick"):
+        (folder / f"{clip}.npz").write_bytes(clip.encode())
+    cfg = conf.compose(["task=cartpole_swingup"])
+
+    def with_motions(source: Path) -> RunCfg:
+        chosen = MotionSet(sources=(str(source),), held_out_share=0.5)
+        scene = dataclasses.replace(cfg.task.scene, motions={"clips": chosen})
+        return dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, scene=scene))
+
+    said: list[str] = []
+    keep_models(with_motions(folder), run, note=said.append)
+    with_kept_models(with_motions(folder), run, note=said.append)
+    assert said == []
+    # One clip more, which changes who is held out; then other contents.
+    (folder / "reach.npz").write_bytes(b"reach")
+    with_kept_models(with_motions(folder), run, note=said.append)
+    (folder / "reach.npz").unlink()
+    (folder / "kick.npz").write_bytes(b"another")
+    with_kept_models(with_motions(folder), run, note=said.append)
+    assert len(said) == 2 and set(said) == {
+        f"task.scene.motions.clips: the motions of {folder} have changed since the run began: other clips may be held "
+        "out than in its training"
+    }
+    # A resumed run keeps what it began with; other motions were asked for.
+    keep_models(with_motions(folder), run, note=said.append)
+    with_kept_models(with_motions(folder), run, note=said.append)
+    assert len(said) == 3
+    with_kept_models(with_motions(folder / "bow.npz"), run, note=said.append)
+    assert len(said) == 3

@@ -1,5 +1,7 @@
 """Chooses the clips of a reference motion that is a folder, and those of them that training does not see."""
 
+import hashlib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +12,7 @@ import numpy as np
 import torch
 
 from ksim_rl.checked import Checked, Filled, Seed, Share
+from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 from ksim_rl.scene.motions.motion import ReferenceMotion, load_clips, motion_path
 from ksim_rl.scene.names import match_names
 
@@ -47,6 +50,16 @@ class MotionSet(Checked):
                     )
                 found[name] = file
         return found
+
+    def sha256(self) -> str:
+        """Return the hash of the clips' names and contents, wherever they lie."""
+        total = hashlib.sha256()
+        for name, file in self.files().items():
+            content = read_bytes(motion_path(file), limit=MOST_DATA_BYTES, follows_links=True)
+            of_file = hashlib.sha256(content).hexdigest()
+            # Names of files may be no text.
+            total.update(os.fsencode(f"{name}\n{of_file}\n"))
+        return total.hexdigest()
 
     def held_out_of(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return which clips are held out, in their order; a ValueError if none is left to train on."""
