@@ -25,6 +25,10 @@ State: TypeAlias = Mapping[str, Value]
 """What a part of a run needs to go on: nested, with tensors and plain values as leaves."""
 
 
+DESCRIPTION = "_extra_state"
+"""The end of the names by which modules of torch describe themselves in a state, such as the pictures of an encoder."""
+
+
 def branch(state: State, name: str) -> State:
     """Return a nested state; a ValueError where a leaf has its name."""
     found = state[name]
@@ -115,8 +119,17 @@ def join(tensors: Mapping[str, Shaped[Tensor, "*?leaf"]], values: Mapping[str, V
 
 
 def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: State, *, what: str) -> None:
-    """Copy saved tensors into live ones, whose addresses stay for captured graphs; a ValueError names the misfit."""
+    """Copy saved tensors into live ones, whose addresses stay for captured graphs; a ValueError names the misfit.
+
+    What describes a module has to be equal. States of before there was such a description have none, and are taken.
+    """
     # Names are compared in both directions, then shapes, before anything is written.
+    described = [name for name in live if name.endswith(DESCRIPTION)]
+    for name in described:
+        _check_description(live[name], saved.get(name), what=f"{what}: {name!r}")
+    # No memory of a module: it would be written for nothing.
+    live = {name: tensor for name, tensor in live.items() if name not in described}
+    saved = {name: value for name, value in saved.items() if name not in described}
     for name in live:
         if name not in saved:
             raise ValueError(f"{what}: the checkpoint has no {name!r}")
@@ -136,6 +149,15 @@ def copy_into(live: Mapping[str, Shaped[Tensor, "*?leaf"]], saved: State, *, wha
             # Or else it would have been described in another way.
             assert isinstance(copy, Tensor)
             tensor.copy_(copy)
+
+
+def _check_description(live: Tensor, saved: Value, *, what: str) -> None:
+    if saved is None:
+        return
+    have = saved.tolist() if isinstance(saved, Tensor) else saved
+    want = live.tolist()
+    if have != want:
+        raise ValueError(f"{what} is {have} in the checkpoint and {want} in this run")
 
 
 def _describe(value: PyTree) -> str:

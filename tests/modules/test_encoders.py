@@ -8,6 +8,7 @@ from torch.nn import functional
 from torchrl.data import Composite, Unbounded
 from torchrl.modules import set_recurrent_mode
 
+from ksim_rl.device.state_tree import copy_into
 from ksim_rl.modules import (
     ActorCfg,
     CriticCfg,
@@ -124,9 +125,15 @@ def test_a_state_of_pictures_of_another_size_is_refused():
     larger = Encoder(cfg, picture_spec(2 * H, W, 3))
     with pytest.raises(ValueError, match=rf"pictures \[{2 * H}, {W}, 3\].*\[{H}, {W}, 3\]"):
         larger.load_state_dict(learned)
+    # As checkpoints are read.
+    copy_into(same.state_dict(), learned, what="actor")
+    sizes = rf"actor: '_extra_state' is \[{H}, {W}, 3\] in the checkpoint and \[{2 * H}, {W}, 3\]"
+    with pytest.raises(ValueError, match=sizes):
+        copy_into(larger.state_dict(), learned, what="actor")
     # States of before shapes were in them.
     del learned["_extra_state"]
     larger.load_state_dict(learned)
+    copy_into(same.state_dict(), learned, what="actor")
 
 
 class Brightness(EncoderCfg):
