@@ -73,6 +73,11 @@ class MotionJoints(OfMotion, OfJoints, ObservationTerm):
 
     ahead_s: float | tuple[float, ...] = 0.0
 
+    def _check_fields(self) -> None:
+        super()._check_fields()
+        if self.ahead_s == ():
+            raise ValueError("ahead_s=(): name one moment or more, 0.0 for the present one")
+
     def __call__(self, view: EnvView) -> Float[Tensor, "E L"]:
         moments = self.ahead_s if isinstance(self.ahead_s, tuple) else (self.ahead_s,)
         index = view.joints(self.joints).index

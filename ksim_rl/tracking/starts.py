@@ -26,26 +26,34 @@ class Parts:
         clip_B: the clip of each part.
         place_B: the number of each part within its clip.
         first_C, count_C: the first part of each clip, and how many it has; none of held-out clips.
+        part_s: the length that was asked for, s.
     """
 
     clip_B: Int64[Tensor, " B"]
     place_B: Float[Tensor, " B"]
     first_C: Int64[Tensor, " C"]
     count_C: Float[Tensor, " C"]
+    part_s: float
 
     def __len__(self) -> int:
         return len(self.clip_B)
 
 
-# Per view, by motion and length of a part; made while the env is constructed.
-_PARTS: WeakKeyDictionary[EnvView, dict[tuple[str, float], Parts]] = WeakKeyDictionary()
+# Per view, by motion; made while the env is constructed.
+_PARTS: WeakKeyDictionary[EnvView, dict[str, Parts]] = WeakKeyDictionary()
 
 
 def parts_of(view: EnvView, file: str, part_s: float) -> Parts:
-    """Return the parts of about `part_s` seconds of a motion."""
+    """Return the parts of about `part_s` seconds of a motion; a ValueError if others of another length are in use."""
     found = _PARTS.setdefault(view, {})
-    if (file, part_s) in found:
-        return found[file, part_s]
+    if file in found:
+        # Starts would read the weights of other parts than those where episodes have failed.
+        if found[file].part_s != part_s:
+            raise ValueError(
+                f"part_s={part_s:g} of motion {file}, and {found[file].part_s:g} elsewhere: give StartInMotion and "
+                "FailedParts the same one"
+            )
+        return found[file]
     motion = view.motion(file)
     counts = []
     for last, held_out in zip(motion.last_C.tolist(), motion.held_out, strict=True):
@@ -58,13 +66,14 @@ def parts_of(view: EnvView, file: str, part_s: float) -> Parts:
         first_C = torch.cumsum(count_C, dim=0) - count_C
         clip_B = torch.arange(len(counts), device=view.device).repeat_interleave(count_C)
         place_B = torch.arange(sum(counts), device=view.device) - first_C[clip_B]
-        found[file, part_s] = Parts(
+        found[file] = Parts(
             clip_B=clip_B,
             place_B=place_B.to(torch.float32),
             first_C=first_C,
             count_C=count_C.to(torch.float32),
+            part_s=part_s,
         )
-    return found[file, part_s]
+    return found[file]
 
 
 def part_weights(view: EnvView, file: str, parts: Parts) -> Float[Tensor, " B"]:

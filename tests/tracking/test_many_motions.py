@@ -127,6 +127,8 @@ def test_starts_follow_failures_by_clip_and_by_second(env):
     counts = [int(np.ceil(length / PART_S - 1e-6)) for length in lengths]
     counts[0] = 0
     assert len(parts) == sum(counts)
+    with pytest.raises(ValueError, match="part_s=0.3 of motion clips, and 0.2 elsewhere"):
+        parts_of(view, SET, 0.3)
     term = env.cfg.curriculum["failed_parts"]
     view.episode_step_E.fill_(2)
     view.terminated_E.copy_(torch.arange(E) % 3 == 0)
@@ -175,6 +177,8 @@ def test_a_policy_sees_the_motion_ahead(env):
     for ahead_s in (0.0, 0.1, 0.3):
         wanted += motion.sample_joints(start_E + ahead_s, joints, motion_clip(env.view, SET))
     assert torch.equal(seen_EL, torch.cat(wanted, -1))
+    with pytest.raises(ValueError, match="ahead_s=.*: name one moment or more"):
+        dataclasses.replace(term, ahead_s=())
 
 
 def still():
