@@ -66,5 +66,13 @@ def motion_bytes(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: fl
 def write_motion(
     path: Path, mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float
 ) -> None:
-    """Write a motion of the model, whose scene may hold other things without joints, at `fps` frames per second."""
+    """Write a motion of the model, whose scene may hold other things without joints, at `fps` frames per second.
+
+    A ValueError refuses fewer than two frames, of which no motion can be read.
+    """
+    if len(qpos_FL) < 2:
+        raise ValueError(
+            f"{path}: a motion of {len(qpos_FL)} frames at {fps:g} per second: expected two or more: raise the rate, "
+            "or give a longer recording"
+        )
     write_whole(path, motion_bytes(mj_model, qpos_FL, fps))

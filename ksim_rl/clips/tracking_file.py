@@ -102,6 +102,11 @@ def _checked_arrays(path: Path) -> Mapping[str, Array]:
                 f"{name} has shape {array.shape}",
                 "expected one rate, and two frames or more, as many in each array",
             )
+    for name in NAMES:
+        if arrays[name].ndim != 1:
+            raise refused(
+                path, f"{name} has shape {arrays[name].shape}", "expected a list of names"
+            )
     bodies = len(arrays["body_names"])
     for name, width in (("body_pos_w", 3), ("body_quat_w", 4)):
         if arrays[name].shape[1:] != (bodies, width):
@@ -117,6 +122,14 @@ def _check_bodies(
     """Refuse joints that put bodies elsewhere than the file has them: wrong units, order or robot."""
     own = {mj_model.body(i).name: i for i in range(1, mj_model.nbody)}
     shared = [name for name in bodies if name in own]
+    # The root is where the file has it, whatever the joints are.
+    root = mj_model.body(int(mj_model.jnt_bodyid[0])).name
+    if set(shared) <= {root}:
+        raise refused(
+            path,
+            f"of its body_names the model has {root!r} alone",
+            "name bodies that the joints move, feet and hands among them",
+        )
     data = mujoco.MjData(mj_model)
     for frame in range(0, len(qpos_FL), max(1, len(qpos_FL) // 20)):
         data.qpos[:] = qpos_FL[frame]

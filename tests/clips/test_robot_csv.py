@@ -59,6 +59,9 @@ def test_a_file_comes_back_at_the_control_rate_with_its_velocities(model, tmp_pa
     motion = load_motion(tmp_path / "a.npz", model, torch.device("cpu"))
     assert motion.duration_s == pytest.approx(SECONDS) and motion.fps == 50.0
     assert motion.qpos_FL.numpy() == pytest.approx(found_FL, abs=1e-6)
+    with pytest.raises(ValueError, match="a motion of 1 frames at 50 per second: expected two"):
+        write_motion(tmp_path / "b.npz", model, found_FL[:1], 50.0)
+    assert not (tmp_path / "b.npz").exists()
 
 
 def test_angular_velocity_is_in_the_body_frame_as_the_engine_integrates_it(model):

@@ -76,6 +76,17 @@ def test_the_joints_come_in_the_models_order_at_the_wanted_rate(tmp_path):
         (lambda a: {"fps": np.array([50, 50])}, "fps has shape"),
         (lambda a: {"body_pos_w": a["body_pos_w"] * np.nan}, "no finite number"),
         (lambda a: {"body_names": None}, "no array 'body_names'"),
+        (lambda a: {"joint_names": np.array("x")}, r"joint_names has shape \(\)"),
+        (
+            # Degrees, and no body that tells.
+            lambda a: {
+                "joint_pos": np.rad2deg(a["joint_pos"]),
+                "body_names": a["body_names"][1:2],
+                "body_pos_w": a["body_pos_w"][:, 1:2],
+                "body_quat_w": a["body_quat_w"][:, 1:2],
+            },
+            "the model has 'pelvis' alone",
+        ),
     ],
 )
 def test_another_order_unit_or_robot_is_refused(tmp_path, changes, message):
