@@ -28,10 +28,13 @@ MAX_CHECKED_JOBS = 50
 SIZES = ("data.num_env_states_per_minibatch", "data.num_steps")
 
 
-def compose(overrides: Sequence[str] = ()) -> RunCfg:
-    """Compose a run's config, as `ksim-rl train <overrides>` does; a ValueError lists the near names."""
+def compose(overrides: Sequence[str] = (), *, learns: bool = True) -> RunCfg:
+    """Compose a run's config, as `ksim-rl train <overrides>` does; a ValueError lists the near names.
+
+    Without `learns` no curriculum runs, and the fields that it replaces can be overridden.
+    """
     register()
-    return check_command_line(overrides, name=NAME, multirun=False, values=True)[0]
+    return check_command_line(overrides, name=NAME, multirun=False, values=True, learns=learns)[0]
 
 
 def changed(tree: Tree, path: Path, overrides: Sequence[str], *, learns: bool = False) -> RunCfg:

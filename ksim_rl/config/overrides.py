@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
@@ -88,12 +88,23 @@ def check_parsed(tree: Tree, overrides: Iterable[Override]) -> None:
                 _merge(_node(tree, parents, make=True), {name: value}, parents)
         elif makes:
             _node(tree, parents, make=True)[name] = None
+        else:
+            for value in _mappings(override):
+                _merge(copy.deepcopy(_node(tree, parents)), {name: value}, parents)
 
 
 def _plain(override: Override) -> Plain:
     # Through OmegaConf, which reads the value as it will later.
     tree: Any = OmegaConf.to_container(OmegaConf.create({"value": override.value()}))
     return tree["value"]
+
+
+def _mappings(override: Override) -> list[dict[str, Any]]:
+    """Return the mappings among the values of a sweep."""
+    sweep = override.value()
+    if not isinstance(sweep, ChoiceSweep):
+        return []
+    return [value for value in sweep.list if isinstance(value, dict)]
 
 
 def _merge(tree: Tree, given: Tree, path: Sequence[str]) -> None:

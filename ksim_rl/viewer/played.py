@@ -51,7 +51,7 @@ def find(
             raise ValueError(
                 f"{first!r}: expected a run folder, or task=NAME with --agent zero or random, as it has no policy"
             )
-        return _without_policy(conf.compose([*what, f"device={device}"]), agent)
+        return _without_policy(conf.compose([*what, f"device={device}"], learns=False), agent)
     changed = None
     physics = ""
     # `locate` also takes names of the zoo.
@@ -80,7 +80,7 @@ def _motion(what: Sequence[str], motion: str, *, agent: str | None, device: str)
         raise ValueError(f"--motion {motion}: name a task with the motion's robot: task=NAME")
     if agent is not None:
         raise ValueError(f"--motion {motion} with --agent {agent}: nothing acts in a motion")
-    cfg = conf.compose([*what, f"device={device}"])
+    cfg = conf.compose([*what, f"device={device}"], learns=False)
     shown = dataclasses.replace(cfg, task=showing_motion(cfg.task, motion))
     played = _without_policy(shown, "zero")
     return dataclasses.replace(played, title=f"{cfg.task_name}, motion {motion}")

@@ -137,6 +137,11 @@ def test_mappings_add_their_entries_and_an_empty_one_is_refused():
     tree: Tree = {"task": {"events": {"reset": {"mode": "reset", "range": [0, 1]}}, "rewards": {}}}
     inside = ["task.events={reset: {range: [0, 2]}}", "task.events.reset.mode=startup"]
     check_overrides(tree, [*inside, "task.rewards={}", "+task.new={}", "task.events=null"])
-    for nothing in ("task.events={}", "++task.events={}", "task={events: {}}"):
+    for nothing in (
+        "task.events={}",
+        "++task.events={}",
+        "task={events: {}}",
+        "task.events={},null",
+    ):
         with pytest.raises(ValueError, match=r"^task\.events=\{\}: .* changes nothing: .*reset.*"):
             check_overrides(tree, [nothing])

@@ -9,6 +9,7 @@ from ksim_rl.cli.main import main
 from ksim_rl.config.overrides import given_fields
 from ksim_rl.envs import mdp
 from ksim_rl.envs.managers.replaced_fields import check_not_replaced
+from ksim_rl.viewer.played import find
 
 TASK = "go1_velocity_flat"
 RANGE = "task.commands.twist.lin_vel_x=[0.0,0.5]"
@@ -81,6 +82,11 @@ def test_a_training_is_refused_and_an_evaluation_is_not():
     assert cfg.commands["twist"].ranges["lin_vel_x"] == (0.0, 0.5) and not cfg.curriculum
     with pytest.raises(ValueError, match="'command_ranges' replaces"):
         conf.compose([f"task={TASK}", RANGE])
+    # Agents that do not learn.
+    shown = conf.compose([f"task={TASK}", RANGE], learns=False)
+    assert shown.task.commands["twist"].ranges["lin_vel_x"] == (0.0, 0.5)
+    found = find([f"task={TASK}", RANGE], agent="zero", device="cpu")
+    assert found.cfg.task == shown.task
     whole = conf.compose([f"task={TASK}", RANGE, STAGE])
     assert whole.task.commands["twist"].ranges["lin_vel_x"] == (0.0, 0.5)
     tree = whole.to_tree()
