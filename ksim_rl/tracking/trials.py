@@ -22,6 +22,8 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.room import with_room
 from ksim_rl.mdp.events import PushByVelocity
+from ksim_rl.mdp.motion_tracking import MotionFinished
+from ksim_rl.mdp.terminations import TimeOut
 from ksim_rl.tracking.starts import StartInMotion, StartOfTrial, trial_clip
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, build_env
@@ -144,7 +146,13 @@ def trial_cfg(cfg: ManagerBasedRlEnvCfg, *, pushes: bool = False) -> ManagerBase
         events = {
             name: event for name, event in events.items() if not isinstance(event, PushByVelocity)
         }
-    return dataclasses.replace(cfg, events=events, curriculum={})
+    terminations = dict(cfg.terminations)
+    # A time limit before the motion's end would be taken for a trial that followed it so far.
+    if any(isinstance(term, MotionFinished) for term in terminations.values()):
+        terminations = {
+            name: term for name, term in terminations.items() if not isinstance(term, TimeOut)
+        }
+    return dataclasses.replace(cfg, events=events, terminations=terminations, curriculum={})
 
 
 def run_trials(

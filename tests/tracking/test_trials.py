@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from ksim_rl import conf
+from ksim_rl import conf, mdp
 from ksim_rl.cli import run_commands
 from ksim_rl.scene.motions.motion import motion_path
 from ksim_rl.tracking.starts import StartInMotion
@@ -92,6 +92,12 @@ def test_trials_begin_with_the_motion_and_are_not_pushed():
     )
     assert cfg.curriculum == {}
     assert "push_robot" in trial_cfg(track_cfg("g1_walk"), pushes=True).events
+    # Nor do they end by time, which is no success: a trial ends with its motion.
+    whole = track_cfg("g1_walk")
+    timed = {**whole.terminations, "time": mdp.TimeOut()}
+    assert trial_cfg(dataclasses.replace(whole, terminations=timed)).terminations == dict(
+        whole.terminations
+    )
 
 
 def test_a_task_without_a_motion_is_refused():
