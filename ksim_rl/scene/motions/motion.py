@@ -36,6 +36,7 @@ class ReferenceMotion(NearNames):
         first_C: the clips' first frames among the F.
         last_C: the number of each clip's last frame, counted from its own first.
         duration_C: seconds from the first frame of each clip to its last.
+        duration_s: the longest of them, on the host, where terms read it in each step.
         qpos_FL, qvel_FL: positions and velocities in MuJoCo's layout.
         quats: the columns of qpos at which unit quaternions (w, x, y, z) begin.
         joint_pos_FL: positions of hinges and slides, rad or m.
@@ -50,6 +51,7 @@ class ReferenceMotion(NearNames):
     first_C: Int64[Tensor, " C"]
     last_C: Float[Tensor, " C"]
     duration_C: Float[Tensor, " C"]
+    duration_s: float
     qpos_FL: Float[Tensor, "F ?L"]
     qvel_FL: Float[Tensor, "F ?L"]
     quats: tuple[int, ...]
@@ -57,11 +59,6 @@ class ReferenceMotion(NearNames):
     joint_vel_FL: Float[Tensor, "F ?L"]
     body_pos_FN3: Float[Tensor, "F N 3"]
     body_quat_FN4: Float[Tensor, "F N 4"]
-
-    @property
-    def duration_s(self) -> float:
-        """Seconds from the first frame to the last, of the longest clip."""
-        return float(self.last_C.max()) / self.fps
 
     def duration_of(self, clip_E: Int64[Tensor, " E"] | None) -> Float[Tensor, "*E"]:
         """Return the duration of each env's clip, s."""
@@ -186,6 +183,7 @@ def load_clips(
         first_C=torch.tensor(firsts, dtype=torch.int64, device=device),
         last_C=on_device([count - 1.0 for count in counts]),
         duration_C=on_device([(count - 1) / rates[0] for count in counts]),
+        duration_s=(max(counts) - 1) / rates[0],
         qpos_FL=on_device(qpos_FL),
         qvel_FL=on_device(qvel_FM),
         quats=_quaternion_columns(mj_model),
