@@ -40,7 +40,7 @@ from ksim_rl.checks import check_choice
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.streams import warp_scope
 from ksim_rl.modules import EncoderCfg
-from ksim_rl.physics.ray_casting import BatchCamera, Picture
+from ksim_rl.physics.ray_casting import BatchCamera
 from ksim_rl.physics.warp_world import WarpWorld
 from ksim_rl.scene.sensors import CameraSensor
 from ksim_rl.trainers import RunCfg, Trainer, build
@@ -142,7 +142,7 @@ def measure(cfg: RunCfg, *, output: Output) -> dict[str, float]:
 @torch.no_grad()
 def _drawn_ms(world: WarpWorld, sensor: CameraSensor, *, output: Output, repeats: int) -> float:
     """Time what a term's reading takes: drawing all worlds, and a copy of the pictures."""
-    camera = BatchCamera(world, CAMERA, _picture(sensor))
+    camera = BatchCamera(world, CAMERA, sensor.picture())
     world.refresh()
 
     def pictures() -> torch.Tensor:
@@ -187,18 +187,6 @@ def _renderer_ms(world: WarpWorld, sensor: CameraSensor, *, repeats: int) -> tup
         if isinstance(value, wp.array):
             held += value.capacity
     return milliseconds(replay, device=world.device, repeats=4 * repeats), held
-
-
-def _picture(sensor: CameraSensor) -> Picture:
-    return Picture(
-        width=sensor.width,
-        height=sensor.height,
-        rgb=sensor.rgb,
-        depth=sensor.depth,
-        geom_groups=sensor.geom_groups,
-        textures=sensor.textures,
-        shadows=sensor.shadows,
-    )
 
 
 def _rollout_bytes(trainer: Trainer) -> int:

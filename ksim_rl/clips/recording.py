@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from ksim_rl.checked import Checked, Positive
 from ksim_rl.checks import check_in_range
+from ksim_rl.scene.motions.frames import in_each_frame
 from ksim_rl.scene.motions.motion import FASTEST, SLOWEST
 
 Array = np.ndarray
@@ -155,12 +156,9 @@ def chain(
 
 def of_robot(mj_model: mujoco.MjModel, qpos_FL: Float[Array, "F L"], fps: float) -> Recording:
     """Return where the bodies of a robot are in a motion of it, by the C engine."""
-    data = mujoco.MjData(mj_model)
     pos = []
     quat = []
-    for qpos in qpos_FL:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(mj_model, data)
+    for data in in_each_frame(mj_model, qpos_FL):
         # Body 0 is the world.
         pos.append(data.xpos[1:].copy())
         quat.append(data.xquat[1:].copy())

@@ -14,6 +14,7 @@ from ksim_rl.clips.inverse_kinematics import InverseKinematics, PoseGoal
 from ksim_rl.clips.recording import Array, Recording, multiply
 from ksim_rl.config.config_tree import from_tree
 from ksim_rl.config.plain_data import read_yaml
+from ksim_rl.scene.motions.frames import in_each_frame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,12 +169,9 @@ def _between(mj_model: mujoco.MjModel, from_L: Array, to_L: Array, share_M: Arra
 
 
 def _low_height(mj_model: mujoco.MjModel, qpos_FL: Array, soles: Sequence[str]) -> float:
-    data = mujoco.MjData(mj_model)
     lowest = []
     sites = {mj_model.site(i).name for i in range(mj_model.nsite)}
-    for qpos in qpos_FL:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(mj_model, data)
+    for data in in_each_frame(mj_model, qpos_FL):
         heights = []
         for name in soles:
             if name in sites:

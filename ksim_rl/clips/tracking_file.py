@@ -15,6 +15,7 @@ from jaxtyping import Float
 from ksim_rl.checks import near
 from ksim_rl.clips.recording import refused, resampled_qpos
 from ksim_rl.files.arrays import read_arrays
+from ksim_rl.scene.motions.frames import in_each_frame
 from ksim_rl.scene.names import scalar_joint_ids
 
 Array = np.ndarray
@@ -130,10 +131,8 @@ def _check_bodies(
             f"of its body_names the model has {root!r} alone",
             "name bodies that the joints move, feet and hands among them",
         )
-    data = mujoco.MjData(mj_model)
-    for frame in range(0, len(qpos_FL), max(1, len(qpos_FL) // 20)):
-        data.qpos[:] = qpos_FL[frame]
-        mujoco.mj_kinematics(mj_model, data)
+    frames = range(0, len(qpos_FL), max(1, len(qpos_FL) // 20))
+    for frame, data in zip(frames, in_each_frame(mj_model, qpos_FL[frames]), strict=True):
         for name in shared:
             away = np.linalg.norm(data.xpos[own[name]] - body_pos_FN3[frame, bodies.index(name)])
             if away > MOST_OFF:

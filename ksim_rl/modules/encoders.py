@@ -12,6 +12,7 @@ from torchrl.modules import ConvNet
 
 from ksim_rl.checked import NUMBERS_PER_WEIGHT, Checked, Count, Range
 from ksim_rl.checks import check_choice
+from ksim_rl.device.state_tree import DESCRIPTION
 from ksim_rl.modules.mlp import ACTIVATIONS, Device
 from ksim_rl.transforms.pictures.layout import Layout, check_layout, framed
 
@@ -189,10 +190,10 @@ class Encoder(nn.Module):
         if shape_N.tolist() != list(self.shape):
             raise ValueError(
                 f"the encoder was built for pictures {list(self.shape)}, and what is loaded has learned on "
-                f"{shape_N.tolist()}: take the same size, or train anew"
+                f"{shape_N.tolist()}: take the same size, or train from the start"
             )
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         # States of before shapes were in them say nothing of theirs.
-        state_dict.setdefault(f"{prefix}_extra_state", self.get_extra_state())
+        state_dict.setdefault(f"{prefix}{DESCRIPTION}", self.get_extra_state())
         super()._load_from_state_dict(state_dict, prefix, *args)

@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ksim_rl.scene.motions.frames import in_each_frame
 from ksim_rl.tracking.dynamics import GRAVITY, Demand, demand, self_contacts
 from ksim_rl.tracking.keyframes import Figure
 
 Array = np.ndarray
-# m: half of a sole's length and width, less than those of G1's contact capsules.
+# m: half of a sole's length and width, less than the contact capsules of G1 have.
 SOLE = (0.09, 0.025)
 # Of the robot's weight: outside of them it jumps or lands hard.
 LEAST_PUSH = 0.7
@@ -122,12 +123,9 @@ def feasibility(
 
 def _soles(mj_model: mujoco.MjModel, qpos_FL: Array, figure: Figure) -> tuple[Array, Array]:
     """Return where the middles of the soles are, m, and the headings of the feet, rad, in each frame."""
-    data = mujoco.MjData(mj_model)
     places = []
     headings = []
-    for qpos in qpos_FL:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(mj_model, data)
+    for data in in_each_frame(mj_model, qpos_FL):
         sites = [data.site(foot) for foot in figure.feet]
         places.append([site.xpos.copy() for site in sites])
         # Of the x axis, the first column of the site's rotation.

@@ -33,7 +33,7 @@ def beats(begin_s: float, beat_s: float, count: int, by: float) -> Keys:
 
 
 def both_arms(joint: str, keys: Keys, *, mirrored: bool = False) -> dict[str, Keys]:
-    """Return the keys of a joint of both arms; those of the right one are negated for rolls and yaws (`mirrored`)."""
+    """Return the keys of a joint of both arms; the right one's are negated for rolls and yaws (`mirrored`)."""
     sign = -1.0 if mirrored else 1.0
     right = [(time, sign * value) for time, value in keys]
     return {f"left_{joint}_joint": keys, f"right_{joint}_joint": right}

@@ -179,7 +179,7 @@ def track_cfg(file: str) -> ManagerBasedRlEnvCfg:
 
 
 def track_set_cfg() -> ManagerBasedRlEnvCfg:
-    """Return the config of following many motions of G1 with one policy; those of the package, unless others are given.
+    """Return the config of following many motions of G1 with one policy: the package's, unless others are given.
 
     The policy sees the motion's joints now and at two later moments, since it has to tell the motions apart.
     """

@@ -12,6 +12,7 @@ from ksim_rl.envs import Task
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.trainers import TrainerCfg, TrainingCfg
 from ksim_rl.trainers.loggers import LoggerCfg, MLflowCfg, WandbCfg
+from tests.task_names import NAMES
 
 
 def test_without_a_task_of_its_own_settings_a_run_has_the_dataclasses_defaults(monkeypatch):
@@ -41,16 +42,6 @@ def test_the_defaults_are_those_of_the_dataclasses():
 )
 def test_a_logger_is_chosen_by_name(name, cfg):
     assert conf.compose([f"logger={name}"]).logger == cfg
-
-
-# The tasks of a suite share their settings but for a few numbers: two of them, and all in full runs.
-QUICK = ("dm_control_ball_in_cup_catch", "playground_humanoid_walk")
-NAMES = [
-    pytest.param(name, marks=pytest.mark.full)
-    if envs.task(name).suite and name not in QUICK
-    else name
-    for name in envs.names()
-]
 
 
 @pytest.mark.parametrize("name", NAMES)

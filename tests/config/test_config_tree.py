@@ -5,15 +5,7 @@ from omegaconf import OmegaConf
 
 from ksim_rl import envs
 from ksim_rl.envs import ManagerBasedRlEnvCfg, from_tree, to_tree
-
-# Tasks of suites differ in numbers from each other: one of each kind here, and YAML takes all in tests/tasks.
-QUICK = ("dm_control_ball_in_cup_catch", "playground_humanoid_walk")
-NAMES = [
-    pytest.param(name, marks=pytest.mark.full)
-    if envs.task(name).suite and name not in QUICK
-    else name
-    for name in envs.names()
-]
+from tests.task_names import NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)

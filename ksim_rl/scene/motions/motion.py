@@ -13,6 +13,7 @@ from torch import Tensor
 from ksim_rl.checks import near
 from ksim_rl.files.arrays import read_arrays
 from ksim_rl.files.reading import MOST_DATA_BYTES
+from ksim_rl.scene.motions.frames import in_each_frame
 from ksim_rl.scene.names import Index, scalar_joint_ids
 from ksim_rl.scene.near_names import NearNames
 
@@ -154,7 +155,7 @@ def load_clips(
     *,
     held_out: Collection[str] = (),
 ) -> ReferenceMotion:
-    """Read motions by name, as `load_motion` does each, into one table; those of `held_out` are marked as such."""
+    """Read motions by name, as `load_motion` does each, into one table; the clips of `held_out` are marked as such."""
     clips = [_checked_arrays(file, mj_model) for file in files.values()]
     rates = [float(arrays["fps"].item()) for arrays in clips]
     for file, fps in zip(files.values(), rates, strict=True):
@@ -302,13 +303,9 @@ def _blend(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
 
 def _body_poses(mj_model: mujoco.MjModel, qpos_FL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where the bodies are in each frame, [F, N, 3] and [F, N, 4]."""
-    data = mujoco.MjData(mj_model)
     pos_FN3 = []
     quat_FN4 = []
-    for qpos in qpos_FL:
-        data.qpos[:] = qpos
-        # Kinematics alone: no forces are needed for poses.
-        mujoco.mj_kinematics(mj_model, data)
+    for data in in_each_frame(mj_model, qpos_FL):
         pos_FN3.append(data.xpos.copy())
         quat_FN4.append(data.xquat.copy())
     return np.stack(pos_FN3), np.stack(quat_FN4)

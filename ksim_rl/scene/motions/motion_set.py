@@ -1,4 +1,4 @@
-"""Chooses the clips of a reference motion that is a folder, and those of them that training does not see."""
+"""Chooses the clips of a reference motion that is a folder, and which of the clips training does not see."""
 
 import hashlib
 import os

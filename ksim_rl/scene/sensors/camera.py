@@ -71,6 +71,19 @@ class CameraSensor(Sensor):
             name=name, pos=list(self.pos), xyaxes=list(self.xyaxes), fovy=self.fovy
         )
 
+    def picture(self) -> Picture:
+        """Return what the renderer draws."""
+        return Picture(
+            width=self.width,
+            height=self.height,
+            rgb=self.rgb,
+            depth=self.depth,
+            segmentation=self.segmentation,
+            geom_groups=self.geom_groups,
+            textures=self.textures,
+            shadows=self.shadows,
+        )
+
     def track(self, name: str, view: WorldView) -> "CameraTracker":
         groups = view.world.mj_model.geom_group
         # The renderer would end the process.
@@ -89,19 +102,7 @@ class CameraTracker(SensorTracker):
         self._name = name
         self._sensor = sensor
         self._view = view
-        # The sensor's fields by the renderer's names.
-        drawn = (
-            "width",
-            "height",
-            "rgb",
-            "depth",
-            "segmentation",
-            "geom_groups",
-            "textures",
-            "shadows",
-        )
-        settings = {field: getattr(sensor, field) for field in drawn}
-        self._camera = BatchCamera(view.world, sensor.camera or name, Picture(**settings))
+        self._camera = BatchCamera(view.world, sensor.camera or name, sensor.picture())
 
     @property
     def rgb_EHW3(self) -> UInt8[Tensor, "E H W 3"]:
