@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from ksim_rl.checked import Checked, NonNegative, Repeats, Within
+from ksim_rl.envs.managers.replaced_fields import check_one_writer
 from ksim_rl.envs.term import (
     ActionTerm,
     CommandTerm,
@@ -63,6 +64,7 @@ class ManagerBasedRlEnvCfg(Checked):
                 f"episode_length_s=0.0 with the time-out termination {timed[0]!r}: give a positive length, or remove "
                 "the termination"
             )
+        check_one_writer(self.curriculum)
         shared: dict[str, object] = {}
         for group_name, group in self.observations.items():
             for term_name, term_cfg in group.terms.items():

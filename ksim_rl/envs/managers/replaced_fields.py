@@ -1,4 +1,4 @@
-"""Finds overrides of fields that a curriculum replaces while an env runs, which would hold for a while only."""
+"""Finds fields that a curriculum replaces while an env runs, and what else would write them."""
 
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -34,6 +34,26 @@ def check_not_replaced(curricula: Mapping[str, CurriculumTerm], overrides: Seque
                         f"{field}: the curriculum {name!r} replaces {PATH}.{replaced} in training: leave it out, "
                         f"~{curriculum}, or override its values too"
                     )
+
+
+def check_one_writer(curricula: Mapping[str, CurriculumTerm]) -> None:
+    """Refuse two curricula that write one field, of which the later one would hide the earlier one.
+
+    Raises:
+        ValueError: naming the field and both curricula.
+    """
+    writers: dict[str, str] = {}
+    for name, term in curricula.items():
+        # Stages of a reward or termination are whole terms, so that two sets of stages cannot be joined.
+        staged = {scope.replace("/", ".") for scope in term.adapted_fields}
+        fields = {*_replaced(term), *staged}
+        for field in sorted(fields):
+            if field in writers:
+                raise ValueError(
+                    f"curriculum: {writers[field]!r} and {name!r} both write {field}: join them into one, or leave one "
+                    "of them out"
+                )
+            writers[field] = name
 
 
 def _replaced(term: CurriculumTerm) -> Iterator[str]:

@@ -8,8 +8,9 @@ from ksim_rl import conf, envs
 from ksim_rl.cli.main import main
 from ksim_rl.config.overrides import given_fields
 from ksim_rl.envs import mdp
-from ksim_rl.envs.managers.replaced_fields import check_not_replaced
+from ksim_rl.envs.managers.replaced_fields import check_not_replaced, check_one_writer
 from ksim_rl.viewer.played import find
+from tests.envs.probe_env import puck_cfg
 
 TASK = "go1_velocity_flat"
 RANGE = "task.commands.twist.lin_vel_x=[0.0,0.5]"
@@ -67,6 +68,27 @@ def test_who_overrides_another_field_of_a_curriculum_does_not_know_of_this_one()
     check_not_replaced(curricula, ["task.commands.twist.ang_vel_z=[0,1]", of_z])
     with pytest.raises(ValueError, match="lin_vel_x: the curriculum 'ranges' replaces"):
         check_not_replaced(curricula, ["task.commands.twist.lin_vel_x=[0,1]", of_z])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "field"),
+    [
+        ("weight", mdp.RewardWeightByLevel(reward="upright", start=0.0, end=1.0), "upright.weight"),
+        ("ranges", mdp.CommandRangesByLevel(
+            command="twist", start={"lin_vel_x": (0.0, 0.1)}, end={"lin_vel_x": (0.0, 0.2)}
+        ), "twist.lin_vel_x"),
+        # Other fields, but of one reward, whose stages are whole terms.
+        ("width", mdp.RewardFieldsByStage(reward="upright", stages={7: {"offset": 1.0}}), "rewards.upright"),
+    ],
+)  # fmt: skip
+def test_two_curricula_that_write_one_field_are_refused(first, second, field):
+    curricula = {first: CURRICULA[first], "another": second}
+    with pytest.raises(ValueError, match=f"'{first}' and 'another' both write .*{field}: join"):
+        puck_cfg(curriculum=curricula)
+
+
+def test_a_weight_and_the_stages_of_other_fields_go_together():
+    check_one_writer(CURRICULA)
 
 
 def test_fields_are_given_down_into_mappings():
