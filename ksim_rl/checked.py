@@ -7,8 +7,8 @@ Whole numbers without an upper one end at 32 bits. Only rules that relate severa
 
 import types
 import typing
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from itertools import pairwise
 from typing import Annotated, Any, Literal, TypeAlias
@@ -94,6 +94,27 @@ class Checked:
         Numbers of configs in its fields are left out. `ksim_rl.device.room.check_room` compares them with a machine.
         """
         return {}
+
+    def data_files(self) -> Sequence[str]:
+        """Return the files of data that the config names, as it names them: motions and networks of motors.
+
+        Those of configs in its fields are left out. A run keeps their hashes (`ksim_rl.trainers.kept_models`).
+        """
+        return ()
+
+
+def parts(value: object, path: str = "") -> Iterator[tuple[str, Checked]]:
+    """Yield the configs in a config, itself first, each with its dotted path."""
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            yield from parts(entry, f"{path}.{name}".removeprefix("."))
+    elif isinstance(value, tuple | list):
+        for index, entry in enumerate(value):
+            yield from parts(entry, f"{path}[{index}]")
+    elif isinstance(value, Checked) and is_dataclass(value):
+        yield path, value
+        for field in fields(value):
+            yield from parts(getattr(value, field.name), f"{path}.{field.name}".removeprefix("."))
 
 
 def numbers_of_layers(widths: Sequence[int]) -> float:

@@ -1,12 +1,10 @@
 """Refuses configs and sizes that no memory holds, before anything is allocated."""
 
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass
 
 import torch
 
-from ksim_rl.checked import Checked
+from ksim_rl.checked import Checked, parts
 
 # Of a number in memory: float32 nearly everywhere.
 _NUMBER_BYTES = 4
@@ -18,7 +16,7 @@ def check_room(cfg: Checked, *, num_envs: int, device: torch.device, path: str =
     `Checked.least_numbers` gives the sizes, so that nothing has to be allocated to know them. What passes may
     still be too much: a failed allocation tells. The ValueError names the fields, which stand at `path`.
     """
-    for where, part in _parts(cfg, path):
+    for where, part in parts(cfg, path):
         for names, numbers in part.least_numbers(num_envs).items():
             given = ", ".join(
                 f"{where}.{name}={getattr(part, name)!r}".removeprefix(".") for name in names
@@ -34,20 +32,6 @@ def check_bytes(given: str, needed: float, *, num_envs: int, device: torch.devic
             f"{given}: takes at least {needed / 1e9:,.0f} GB of memory with num_envs={num_envs}, and {device} has "
             f"{total / 1e9:.1f} GB: lower it"
         )
-
-
-def _parts(value: object, path: str) -> Iterator[tuple[str, Checked]]:
-    """Yield the configs in a config, itself first, each with its dotted path."""
-    if isinstance(value, Mapping):
-        for name, entry in value.items():
-            yield from _parts(entry, f"{path}.{name}".removeprefix("."))
-    elif isinstance(value, tuple | list):
-        for index, entry in enumerate(value):
-            yield from _parts(entry, f"{path}[{index}]")
-    elif isinstance(value, Checked) and is_dataclass(value):
-        yield path, value
-        for field in fields(value):
-            yield from _parts(getattr(value, field.name), f"{path}.{field.name}".removeprefix("."))
 
 
 def total_bytes(device: torch.device) -> int:

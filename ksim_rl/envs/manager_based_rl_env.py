@@ -116,6 +116,7 @@ class ManagerBasedRlEnv(
         self._events_cfg: Mapping[str, Any] = events
         self.view = self.driver.view
         self.load_managers()
+        self.view.check_motions()
         self.driver.freeze()  # no buffer may be made in a captured step
         observed = self.observation_manager.examples
         readings = {"obs": observed, "command": self.command_manager.values}

@@ -22,9 +22,13 @@ def read_arrays(
     are refused.
     """
     # Read as a whole: the file cannot change between header and data.
-    data = io.BytesIO(read_bytes(path, limit=limit, follows_links=follows_links))
+    return arrays_of(read_bytes(path, limit=limit, follows_links=follows_links), limit=limit)
+
+
+def arrays_of(content: bytes, *, limit: int = MOST_DATA_BYTES) -> dict[str, np.ndarray]:
+    """Return the arrays of the contents of an archive; see `read_arrays`."""
     try:
-        with zipfile.ZipFile(data) as archive:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = archive.infolist()
             if len(entries) > MOST_ARRAYS:
                 raise ValueError(f"it has {len(entries)} arrays, more than {MOST_ARRAYS}")

@@ -13,7 +13,7 @@ from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.registry import build
 from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
-from ksim_rl.mdp.motion_tracking import OfMotion, one_motion
+from ksim_rl.mdp.motion_tracking import OfMotion, one_motion, with_motions_in_use
 from ksim_rl.scene.motions.motion import load_motion
 from ksim_rl.scene.state.motion_clock import motion_start_time
 from ksim_rl.scene.terrains import PlaneTerrain
@@ -79,7 +79,7 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> Float[Tensor, "F L
         # A fixed seed; noise is off in evaluation mode.
         seed=0,
     )
-    player = build(played, device=device)
+    player = build(with_motions_in_use(played), device=device)
     # Noise of observations is for training only.
     player.eval()
     # A clone outlives the env that is closed next.

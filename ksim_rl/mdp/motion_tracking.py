@@ -4,7 +4,9 @@
 std = 1 / sqrt(k): joint positions 2, joint velocities 0.1, ends of limbs 40, root or centre of mass 10.
 """
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -12,7 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from ksim_rl.checked import Positive, Within
+from ksim_rl.checked import Positive, Within, parts
+from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm, ObservationTerm, Term, TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
@@ -36,6 +39,10 @@ class OfMotion(Term):
     """A term of a reference motion."""
 
     file: str
+
+    def data_files(self) -> Sequence[str]:
+        """Return the name of the motion, of its file or of a set."""
+        return (self.file,)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,6 +213,13 @@ class ResetToMotion(OfMotion, EventTerm):
         place_E = (view.uniform(1)[:, 0] * len(trained)).long()
         # A draw close to 1 may be rounded up to the end.
         return trained_C[place_E.clamp(max=len(trained) - 1)]
+
+
+def with_motions_in_use(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
+    """Return a config some of whose terms were taken away, without the sets of motions that no other one names."""
+    named = {file for _, part in parts(cfg) for file in part.data_files()}
+    motions = {name: chosen for name, chosen in cfg.scene.motions.items() if name in named}
+    return dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, motions=motions))
 
 
 def one_motion(view: EnvView, file: str) -> ReferenceMotion:

@@ -1,6 +1,6 @@
 """The settings of all algorithms: of gradient steps, of PPO, AMP and distillation, of SAC and TD3."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
@@ -244,6 +244,10 @@ class AMPCfg(PPOCfg):
             ("num_transitions_per_step",): 2 * self.num_transitions_per_step,
             ("replay_rollouts",): num_envs * self.replay_rollouts,
         }
+
+    def data_files(self) -> Sequence[str]:
+        """Return the names of the motions."""
+        return self.motions
 
     def _check_fields(self) -> None:
         super()._check_fields()

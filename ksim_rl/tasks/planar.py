@@ -283,10 +283,9 @@ class WalkAt(RewardTerm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseDistance(MetricTerm):
+class PoseDistance(mdp.OfMotion, MetricTerm):
     """The root mean square of the joint angles' distance to the nearest pose of a motion, rad, [E]; position stage."""
 
-    file: str
     joints: Patterns
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:

@@ -76,6 +76,17 @@ def parts_of(view: EnvView, file: str, part_s: float) -> Parts:
     return found[file]
 
 
+def drawn_parts(view: EnvView, file: str, part_s: float) -> Parts:
+    """Return the parts that starts of a motion are drawn from; a ValueError if none are, as `parts_of`."""
+    # Starts are rehearsed before curricula are built.
+    if file not in _PARTS.get(view, {}):
+        raise ValueError(
+            f"FailedParts of motion {file}: no StartInMotion of it draws parts, so that the curriculum would change "
+            f"nothing: give one part_s={part_s:g}, or leave the curriculum out"
+        )
+    return parts_of(view, file, part_s)
+
+
 def part_weights(view: EnvView, file: str, parts: Parts) -> Float[Tensor, " B"]:
     """Return how much likelier than others each part of a motion is as a start; `FailedParts` writes it.
 
@@ -194,7 +205,7 @@ class FailedParts(OfMotion, CurriculumTerm):
     memory: Positive = 500.0
 
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> Float[Tensor, ""]:
-        parts = parts_of(view, self.file, self.part_s)
+        parts = drawn_parts(view, self.file, self.part_s)
         # Shared by all envs: one count for each part, 1 at first.
         failed_B = view.shared("failed_B", [1.0] * len(parts))
         weights_B = part_weights(view, self.file, parts)

@@ -119,24 +119,35 @@ class TrialRunner(Evaluator):
         self.errors_EM.add_(torch.where(self._running_E[:, None], errors_EM, 0.0))
 
 
+def followed_motion(cfg: ManagerBasedRlEnvCfg) -> str:
+    """Return the motion that trials of a tracking task follow; a ValueError if it starts in none, or in several."""
+    events = cfg.events or {}
+    motions = {
+        name: event.file for name, event in events.items() if isinstance(event, StartInMotion)
+    }
+    if not motions:
+        raise ValueError(
+            f"events {sorted(events)}: none is a StartInMotion, so that there is no motion to follow: take a task such "
+            "as g1_track_walk"
+        )
+    files = sorted(set(motions.values()))
+    if len(files) > 1:
+        raise ValueError(
+            f"events {list(motions)} start in several motions ({', '.join(files)}), and trials follow one: start in "
+            "one, or put the files into one set of motions, as task.scene.motions of g1_track has them"
+        )
+    return files[0]
+
+
 def trial_cfg(cfg: ManagerBasedRlEnvCfg, *, pushes: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the config of trials of a tracking task: all begin with the motion, and nothing adapts.
 
     A ValueError if the task has no start in a motion, or starts in several.
     """
+    # Refuses a task without a motion, or with several.
+    followed_motion(cfg)
     events: dict[str, Any] = dict(cfg.events or {})
     starts = [name for name, event in events.items() if isinstance(event, StartInMotion)]
-    if not starts:
-        raise ValueError(
-            f"events {sorted(events)}: none is a StartInMotion, so that there is no motion to follow: take a task such "
-            "as g1_track_walk"
-        )
-    motions = sorted({str(events[name].file) for name in starts})
-    if len(motions) > 1:
-        raise ValueError(
-            f"events {starts} start in several motions ({', '.join(motions)}), and trials follow one: start in one, or "
-            "put the files into one set of motions, as task.scene.motions of g1_track has them"
-        )
     for name in starts:
         start = events[name]
         # From the first frame, and not from the parts of the curriculum.
@@ -171,11 +182,7 @@ def run_trials(
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET
     of_trials = dataclasses.replace(cfg, task=trial_cfg(cfg.task, pushes=pushes))
-    (file,) = {
-        event.file
-        for event in (of_trials.task.events or {}).values()
-        if isinstance(event, StartOfTrial)
-    }
+    file = followed_motion(cfg.task)
     chosen = cfg.task.scene.motions.get(file)
     clips = len(chosen.files()) if chosen is not None else 1
     # As many clips at a time as fit into one env.

@@ -2,7 +2,7 @@
 
 `models.json` of a run folder says of each robot and object whose model is a file: its path, the hash of all its files,
 and where in the folder `models` a copy lies. Models of the menagerie, and models that are too large, have only a hash,
-and so do sets of motions.
+and so do files of data: motions, sets of them, and networks of motors.
 """
 
 import dataclasses
@@ -11,14 +11,17 @@ import os
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ksim_rl.checked import parts
 from ksim_rl.config.trees import Plain
 from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
 from ksim_rl.files.writing import check_links, whole_folder, write_whole
 from ksim_rl.physics.model_files.packing import ModelFiles, files_of_model
-from ksim_rl.scene.motions.motion_set import MotionSet
+from ksim_rl.scene.motions.contents import sha256_of
+from ksim_rl.scene.motions.motion import motion_path
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot, ModelRobot
 from ksim_rl.scene.scene import MjcfRobot
 from ksim_rl.terminal import printable
@@ -47,7 +50,7 @@ class KeptModel:
 def keep_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None]) -> None:
     """Write the models of a config's robots and objects into a run folder, but for those that are there already.
 
-    Of sets of motions their hashes are written.
+    Of files of data their hashes are written.
     """
     earlier = read_record(run_folder)
     record: dict[str, KeptModel] = {}
@@ -61,12 +64,12 @@ def keep_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None]) -
         # A model that is built in code has no files.
         if files is not None:
             record[name] = _keep(name, source, files, run_folder, note)
-    for name, source, motions in _motions(cfg):
-        known = earlier.get(name)
-        if known is not None and source == known.source:
-            record[name] = known
+    for data in _data(cfg):
+        known = earlier.get(data.name)
+        if known is not None and data.source == known.source:
+            record[data.name] = known
         else:
-            record[name] = KeptModel(source=source, sha256=motions.sha256())
+            record[data.name] = KeptModel(source=data.source, sha256=data.sha256())
     # An unchanged record is not written again.
     if record != earlier:
         plain = {name: dataclasses.asdict(kept) for name, kept in record.items()}
@@ -79,7 +82,7 @@ def with_kept_models(
     """Return a run's config with the models that it began with.
 
     Where a model's file is not there any more, or has changed, the run's own copy takes its place, and `note` (by
-    default a warning) says so. Where there is no copy, a changed file is warned of by name, as are changed motions.
+    default a warning) says so. Where there is no copy, a changed file is warned of by name, as is changed data.
     """
     note = note or _warn
     # By "robots/NAME" or "objects/NAME".
@@ -110,15 +113,12 @@ def with_kept_models(
         copy = _checked_copy(name, kept, run_folder)
         note(f"task.scene.{kind}.{entity}: {why}: the run's own copy is used, {copy}")
         changed[kind][entity] = _with_source(changed[kind][entity], str(copy))
-    for name, source, motions in _motions(cfg):
-        kept = record.get(name)
+    for data in _data(cfg):
+        kept = record.get(data.name)
         # Of other sources the user knows.
-        if kept is None or source != kept.source or motions.sha256() == kept.sha256:
+        if kept is None or data.source != kept.source or data.sha256() == kept.sha256:
             continue
-        note(
-            f"task.scene.{name.replace('/', '.')}: the motions of {source} have changed since the run began: other "
-            "clips may be held out than in its training"
-        )
+        note(f"{data.where}: {data.change}")
     scene = dataclasses.replace(scene, **changed)
     return dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, scene=scene))
 
@@ -219,10 +219,45 @@ def _sources(cfg: RunCfg) -> Iterator[tuple[str, str]]:
                 yield f"{kind}/{name}", entity.model
 
 
-def _motions(cfg: RunCfg) -> Iterator[tuple[str, str, MotionSet]]:
-    """Yield the sets of motions of a config: "motions/NAME", its sources, and the set."""
-    for name, motions in cfg.task.scene.motions.items():
-        yield f"motions/{name}", ", ".join(motions.sources), motions
+@dataclass(frozen=True, kw_only=True)
+class _Data:
+    """Data that a config names: its place in the record and in the config, and how a change of it is told."""
+
+    name: str
+    where: str
+    source: str
+    change: str
+    sha256: Callable[[], str]
+
+
+def _data(cfg: RunCfg) -> Iterator[_Data]:
+    """Yield the sets of motions of a config, "motions/NAME", then its other files of data, "files/SOURCE"."""
+    sets = cfg.task.scene.motions
+    for name, motions in sets.items():
+        source = ", ".join(motions.sources)
+        yield _Data(
+            name=f"motions/{name}",
+            where=f"task.scene.motions.{name}",
+            source=source,
+            change=f"the motions of {source} have changed since the run began: other clips may be held out than in "
+            "its training",
+            sha256=motions.sha256,
+        )
+    told: set[str] = set()
+    for where, part in parts(cfg):
+        for source in part.data_files():
+            path = motion_path(source)
+            # A file that is not there is refused by who reads it.
+            if source in sets or source in told or not path.is_file():
+                continue
+            told.add(source)
+            yield _Data(
+                name=f"files/{source}",
+                where=where,
+                source=source,
+                change=f"{source} has changed since the run began: its policy may not fit any more",
+                sha256=partial(sha256_of, path),
+            )
 
 
 def _with_source(entity: MjcfRobot | MenagerieRobot, source: str) -> MjcfRobot | ModelRobot:

@@ -19,6 +19,7 @@ from ksim_rl import mdp
 from ksim_rl.checks import check_in_range
 from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from ksim_rl.envs.contract import part
+from ksim_rl.mdp.motion_tracking import with_motions_in_use
 from ksim_rl.transforms import ActionDelay, ObservationDelay, ObservationNoise
 
 AGENTS = ("zero", "random")
@@ -79,7 +80,7 @@ def showing_motion(cfg: ManagerBasedRlEnvCfg, file: str) -> ManagerBasedRlEnvCfg
 
     Each root is the motion's exact state; physics runs in between, and its states are thrown away.
     """
-    return dataclasses.replace(
+    shown = dataclasses.replace(
         cfg,
         events={"motion": mdp.ShowMotion(file=file)},
         terminations={"next_frame": mdp.TimeOut()},
@@ -89,6 +90,7 @@ def showing_motion(cfg: ManagerBasedRlEnvCfg, file: str) -> ManagerBasedRlEnvCfg
         metrics={},
         curriculum={},
     )
+    return with_motions_in_use(shown)
 
 
 class UntrainedAgent(TensorDictModuleBase):

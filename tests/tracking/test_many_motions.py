@@ -1,6 +1,7 @@
 """One policy for many motions: what is read of each clip, where episodes begin, who is held out, and trials by clip."""
 
 import dataclasses
+import shutil
 
 import mujoco
 import numpy as np
@@ -9,7 +10,8 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from ksim_rl import conf, envs
-from ksim_rl.scene.motions import MotionSet, load_motion, motion_path
+from ksim_rl.scene.motions import MotionSet, contents, load_motion, motion_path
+from ksim_rl.scene.motions.motion_set import load_set
 from ksim_rl.scene.state.motion_clock import motion_clip, motion_start_time
 from ksim_rl.tracking.starts import FailedParts, part_weights, parts_of
 from ksim_rl.tracking.tasks import SET, track_cfg, track_set_cfg
@@ -163,6 +165,45 @@ def test_starts_follow_failures_by_clip_and_by_second(env):
     # The second part of the third clip.
     assert (drawn_E == 2).all()
     assert ((share_E >= 1 / counts[2]) & (share_E <= 2 / counts[2])).all()
+
+
+def test_parts_that_no_start_draws_are_refused(env):
+    term = FailedParts(file="g1_walk")
+    with (
+        env.driver.scope("curriculum/other"),
+        pytest.raises(ValueError, match="FailedParts of motion g1_walk: no StartInMotion of it"),
+    ):
+        term(env.view, torch.ones(E, dtype=torch.bool))
+
+
+def test_a_set_that_no_term_reads_is_refused():
+    cfg = envs.make_cfg("cartpole_balance")
+    motions = {"clips": MotionSet(sources=("walker_walk",))}
+    scene = dataclasses.replace(cfg.scene, motions=motions, num_envs=1)
+    sim = dataclasses.replace(cfg.sim, engine="c")
+    with pytest.raises(ValueError, match="scene.motions.clips: no term reads this set"):
+        envs.build(dataclasses.replace(cfg, scene=scene, sim=sim))
+
+
+def test_a_file_is_read_once_for_its_hash_and_its_frames(folder, env, monkeypatch):
+    motions = MotionSet(sources=(str(folder),))
+    read = []
+    whole = contents.read_bytes
+    monkeypatch.setattr(
+        contents, "read_bytes", lambda path, **how: read.append(path.stem) or whole(path, **how)
+    )
+    # The env has read all four; that they are hashed now reads nothing.
+    motions.sha256()
+    assert read == []
+    copy = folder.parent / "copied"
+    shutil.copytree(folder, copy)
+    again = MotionSet(sources=(str(copy),))
+    assert again.sha256() == motions.sha256()
+    load_set(again, env.world.mj_model, torch.device("cpu"))
+    assert read == list(FRAMES)
+    # Frames are not kept: who asks for them again reads them again.
+    load_set(again, env.world.mj_model, torch.device("cpu"))
+    assert read == 2 * list(FRAMES)
 
 
 def test_a_policy_sees_the_motion_ahead(env):

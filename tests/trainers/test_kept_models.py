@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 
 from ksim_rl import conf
+from ksim_rl.mdp import ResetToMotion
+from ksim_rl.objectives import AMPCfg
 from ksim_rl.physics import load_model
 from ksim_rl.physics.model_files.packing import files_of_model
+from ksim_rl.scene.actuators import MLPActuator
 from ksim_rl.scene.motions import MotionSet
 from ksim_rl.scene.scene import MjcfRobot
 from ksim_rl.trainers import RunCfg, kept_models
@@ -267,3 +270,33 @@ def test_motions_that_have_changed_are_told(run, tmp_path):
     assert len(said) == 3
     with_kept_models(with_motions(folder / "bow.npz"), run, note=said.append)
     assert len(said) == 3
+
+
+@pytest.mark.parametrize("kind", ["motion of a term", "motions of an objective", "motor"])
+def test_files_of_data_that_have_changed_are_told(kind, run, tmp_path):
+    file = tmp_path / "data.npz"
+    file.write_bytes(b"one")
+    cfg = conf.compose(["task=cartpole_swingup"])
+    if kind == "motion of a term":
+        events = {"start": ResetToMotion(file=str(file))}
+        cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, events=events))
+        where = "task.events.start"
+    elif kind == "motions of an objective":
+        objective = AMPCfg(motions=("walker_walk", str(file)), style_group="actor")
+        cfg = dataclasses.replace(cfg, objective=objective)
+        where = "objective"
+    else:
+        motor = MLPActuator(joints=("slide",), file=str(file), effort_limit=1.0)
+        robot = MjcfRobot(source=ROBOT, actuators=(motor,))
+        scene = dataclasses.replace(cfg.task.scene, robots={"cart": robot})
+        cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, scene=scene))
+        where = "task.scene.robots.cart.actuators[0]"
+    said: list[str] = []
+    keep_models(cfg, run, note=said.append)
+    with_kept_models(cfg, run, note=said.append)
+    assert said == []
+    file.write_bytes(b"another")
+    assert with_kept_models(cfg, run, note=said.append) == cfg
+    assert said == [
+        f"{where}: {file} has changed since the run began: its policy may not fit any more"
+    ]

@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -113,6 +113,10 @@ class NetActuator(ExplicitActuator):
     position_scale: float | None = None
     velocity_scale: float | None = None
     effort_scale: float | None = None
+
+    def data_files(self) -> Sequence[str]:
+        """Return the file of the weights."""
+        return (self.file,)
 
     @abstractmethod
     def load(self, net: NetFile, drive: Drive) -> Predictor:

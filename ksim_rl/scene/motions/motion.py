@@ -11,8 +11,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from ksim_rl.checks import near
-from ksim_rl.files.arrays import read_arrays
-from ksim_rl.files.reading import MOST_DATA_BYTES
+from ksim_rl.scene.motions.contents import motion_arrays
 from ksim_rl.scene.motions.frames import in_each_frame
 from ksim_rl.scene.names import Index, scalar_joint_ids
 from ksim_rl.scene.near_names import NearNames
@@ -262,7 +261,7 @@ def _read(path: Path) -> Mapping[str, np.ndarray]:
         )
     try:
         # Without pickles, since these run code when they are read.
-        arrays = read_arrays(path, limit=MOST_DATA_BYTES)
+        arrays = motion_arrays(path)
     except ValueError as error:
         raise ValueError(
             f"motion {path}: cannot be read as .npz without pickles: {error}"

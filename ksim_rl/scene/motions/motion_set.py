@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ksim_rl.checked import Checked, Filled, Seed, Share
-from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
+from ksim_rl.scene.motions.contents import sha256_of
 from ksim_rl.scene.motions.motion import ReferenceMotion, load_clips, motion_path
 from ksim_rl.scene.names import match_names
 
@@ -55,10 +55,8 @@ class MotionSet(Checked):
         """Return the hash of the clips' names and contents, wherever they lie."""
         total = hashlib.sha256()
         for name, file in self.files().items():
-            content = read_bytes(motion_path(file), limit=MOST_DATA_BYTES, follows_links=True)
-            of_file = hashlib.sha256(content).hexdigest()
             # Names of files may be no text.
-            total.update(os.fsencode(f"{name}\n{of_file}\n"))
+            total.update(os.fsencode(f"{name}\n{sha256_of(motion_path(file))}\n"))
         return total.hexdigest()
 
     def held_out_of(self, names: Sequence[str]) -> tuple[str, ...]:

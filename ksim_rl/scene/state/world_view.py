@@ -290,6 +290,15 @@ class WorldView(NearNames):
             self._motions[file] = load_set(chosen, self.world.mj_model, self.device)
         return self._motions[file]
 
+    def check_motions(self) -> None:
+        """Refuse, by a ValueError, sets of motions that nothing has read while the env was constructed."""
+        for name in self._motion_sets:
+            if name not in self._motions:
+                raise ValueError(
+                    f"scene.motions.{name}: no term reads this set of motions: name it as the `file` of the terms that "
+                    "follow it, or leave it out"
+                )
+
     @quantity
     def episode_time_E(self) -> Float[Tensor, " E"]:
         """Time since the episode's start, s."""
