@@ -3,21 +3,27 @@
     python -m benchmarks.cards
     python -m benchmarks.cards --policies cartpole,go1 --episodes 32
 
-Figures go to benchmarks/results/cards.json: `zoo/<name>/weakest`, the least share over the list, with the name of that
-condition and all shares beside it. A policy that fails somewhere says so.
+The page and the picture of each go to docs/cards/<name>, its numbers to ksim_rl/zoo/transfer, where `ksim-rl zoo` finds
+them. Figures go to benchmarks/results/cards.json: `zoo/<name>/weakest`, the least share over the list, with the name of
+that condition and all shares beside it. A policy that fails somewhere says so.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from benchmarks import command_line, report
 from ksim_rl.checks import OneLineParser, check_count, check_known
+from ksim_rl.files.writing import whole_folder, write_whole
+from ksim_rl.transfer.card import TransferCard
 from ksim_rl.transfer.command import EPISODES, judge_all
 from ksim_rl.transfer.judge import MOST_SECONDS
-from ksim_rl.zoo.cards import FOLDER, cards
+from ksim_rl.zoo.cards import FOLDER, TRANSFER, cards
+
+PAGES = Path(__file__).parents[1] / "docs" / "cards"
 
 
 def main() -> int:
@@ -34,6 +40,7 @@ def main() -> int:
         how = {"episodes": options.episodes, "seconds": options.seconds, "note": print}
         found = judge_all(FOLDER / name, name=f"zoo:{name}", **how)
         print(found.verdict())
+        ship(found, name)
         report.write(
             "cards",
             figures={f"zoo/{name}/weakest": found.share(found.weakest)},
@@ -46,6 +53,17 @@ def main() -> int:
             seconds={name: options.seconds},
         )
     return 0
+
+
+def ship(found: TransferCard, name: str) -> None:
+    """Write a card where a user of the zoo sees it: its page and picture in docs, its numbers in the package."""
+    page = PAGES / name
+    with whole_folder(page, below=PAGES.parent) as unfinished:
+        found.write(unfinished)
+        # Once in the repository: in the package, which has no pages.
+        numbers = (unfinished / "card.json").read_text()
+        (unfinished / "card.json").unlink()
+    write_whole(TRANSFER / f"{name}.json", numbers)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "agreement": STEP[:1],
     "before_and_now": (*STEP, *LEARN),
     "cameras": (*STEP, *LEARN, "ksim_rl/transforms"),
-    "cards": ("ksim_rl/transfer", "ksim_rl/zoo", *STEP),
+    "cards": ("ksim_rl/transfer", "ksim_rl/zoo/policies", *STEP),
     "collector": (*STEP, "ksim_rl/collectors"),
     "dm_control": (*STEP, *LEARN, "ksim_rl/suites"),
     "determinism": (*STEP, *LEARN, *TASK),

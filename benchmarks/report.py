@@ -16,7 +16,7 @@ import torch
 
 # The variable is for benchmarks that run others and take their figures.
 RESULTS = Path(os.environ.get("BENCHMARK_RESULTS") or Path(__file__).parent / "results")
-WRITTEN = ("benchmarks/results", "docs")
+WRITTEN = ("benchmarks/results", "docs", "ksim_rl/zoo/transfer")
 PACKAGES = (
     "ksim_rl",
     "torch",
@@ -60,7 +60,7 @@ def versions() -> dict[str, str]:
 def commit() -> str:
     """Return the commit that ran, with "-dirty" if files differ from it; outside a repository GIT_COMMIT names it.
 
-    Results and pages do not count: a benchmark of several parts writes them between these.
+    Results, pages and cards do not count: a benchmark of several parts writes them between these.
     """
 
     def git(*words: str) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ksim_rl.files.writing import write_whole
 from ksim_rl.runs.plotting import Figure, FigureCanvasAgg, plain_style
 from ksim_rl.terminal import printable
 from ksim_rl.transfer.conditions import CONDITIONS
@@ -36,6 +37,8 @@ class TransferCard:
         policy: as it was named.
         task: its name.
         episodes: of each condition.
+        seconds: of each episode, at most.
+        trained: what the policy has met in its training, by the part of the task.
         judged: by the names of `CONDITIONS`.
         refused: why a condition cannot apply to the task, by its name.
     """
@@ -43,6 +46,8 @@ class TransferCard:
     policy: str
     task: str
     episodes: int
+    seconds: float
+    trained: Mapping[str, str]
     judged: Mapping[str, Judged]
     refused: Mapping[str, str]
 
@@ -95,9 +100,9 @@ class TransferCard:
         head = [*_HEAD, *errors]
         lines = [f"# Transfer card of {self.policy}", "", self.verdict(), ""]
         lines += [
-            f"{self.task}, {self.episodes} episodes of each condition in MuJoCo's C engine, with the same starts and "
-            "commands. Efforts (of the limit), joint speeds and impacts are 99th percentiles, jerk is a root mean "
-            "square, power a mean.",
+            f"{self.task}, {self.episodes} episodes of each condition in MuJoCo's C engine, of {self.seconds:g} s at "
+            "most, with the same starts and commands. Efforts (of the limit), joint speeds and impacts are 99th "
+            "percentiles, jerk is a root mean square, power a mean.",
             "",
             "![shares of return and of upright episodes under each condition](card.png)",
             "",
@@ -122,6 +127,8 @@ class TransferCard:
             cells += [_short(value) for value in felt]
             cells += [_short(found.errors[error]) for error in errors]
             lines.append(f"| {' | '.join(cells)} |")
+        lines += ["", "What it has met in training:", "", "| part | of the task |", "|---|---|"]
+        lines += [f"| {part} | `{text}` |" for part, text in self.trained.items()]
         return "\n".join(map(printable, lines)) + "\n"
 
     def numbers(self) -> str:
@@ -131,12 +138,21 @@ class TransferCard:
             "policy": self.policy,
             "task": self.task,
             "episodes": self.episodes,
+            "seconds": self.seconds,
+            "verdict": self.verdict(),
+            "trained": dict(self.trained),
             "weakest": {"condition": self.weakest, "share": self.share(self.weakest)},
             "shares": {name: self.share(name) for name in self.judged},
             "judged": judged,
             "refused": dict(self.refused),
         }
         return json.dumps(tree, indent=1) + "\n"
+
+    def write(self, folder: Path) -> None:
+        """Write page, picture and numbers into a folder that is there: card.md, card.png and card.json."""
+        write_whole(folder / "card.md", self.page())
+        write_whole(folder / "card.json", self.numbers())
+        self.draw(folder / "card.png")
 
     @plain_style()
     def draw(self, picture: Path) -> None:

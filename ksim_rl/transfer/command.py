@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ksim_rl.checks import OneLineParser, check_count, check_in_range
-from ksim_rl.files.writing import whole_folder, write_whole
+from ksim_rl.files.writing import whole_folder
 from ksim_rl.terminal import show
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.run_cfg import check_run_tree
@@ -13,6 +13,7 @@ from ksim_rl.trainers.run_folder import policy_of
 from ksim_rl.transfer.card import GOOD, TransferCard
 from ksim_rl.transfer.conditions import CONDITIONS
 from ksim_rl.transfer.judge import MOST_SECONDS, Judged, judge
+from ksim_rl.transfer.training_conditions import training_conditions
 from ksim_rl.zoo import locate
 
 EPISODES = 32
@@ -47,9 +48,7 @@ def card(arguments: Sequence[str]) -> int:
     found = judge_all(run, name=str(options.run), **how)
     folder = options.output or run / "card"
     with whole_folder(folder, below=folder.parent) as unfinished:
-        write_whole(unfinished / "card.md", found.page())
-        write_whole(unfinished / "card.json", found.numbers())
-        found.draw(unfinished / "card.png")
+        found.write(unfinished)
     show(found.verdict())
     show(f"{folder / 'card.md'}: the page, with card.png and card.json")
     return int(found.share(found.weakest) < GOOD)
@@ -86,5 +85,11 @@ def judge_all(
             f"{number}/{len(CONDITIONS)} {condition.name}: return {found.return_mean:.4g}, {found.upright:.0%} upright"
         )
     return TransferCard(
-        policy=name, task=policy.cfg.task_name, episodes=episodes, judged=judged, refused=refused
+        policy=name,
+        task=policy.cfg.task_name,
+        episodes=episodes,
+        seconds=seconds,
+        trained=training_conditions(policy.cfg.task),
+        judged=judged,
+        refused=refused,
     )

@@ -17,6 +17,8 @@ from ksim_rl.files.reading import read_bytes
 from ksim_rl.terminal import printable
 
 FOLDER = Path(__file__).parent / "policies"
+TRANSFER = Path(__file__).parent / "transfer"
+"""The numbers of the transfer cards of the package's policies, `<name>.json`, by `python -m benchmarks.cards`."""
 CARD = "card.json"
 ONNX = "policy.onnx"
 CHECKPOINT = "checkpoint"
@@ -73,6 +75,14 @@ def read_card(name: str, folder: Path = FOLDER) -> Card:
             f"{path.parent}: its files are not those of its card: install the package once more"
         )
     return card
+
+
+def read_transfer(name: str, folder: Path = TRANSFER) -> dict[str, Any] | None:
+    """Return the numbers of a policy's transfer card, or None of one that was not judged."""
+    path = folder / f"{name}.json"
+    if not path.exists():
+        return None
+    return json.loads(read_bytes(path, limit=MOST_BYTES))
 
 
 def hashes(entry: Path) -> dict[str, str]:

@@ -20,7 +20,8 @@ def judged(return_mean=10.0, upright=1.0):
 def card(refused=(), **changed):
     found = {name: judged() for name in NAMES if name not in refused} | changed
     reasons = dict.fromkeys(refused, "its ground is no plane")
-    return TransferCard(policy="zoo:x", task="a_task", episodes=4, judged=found, refused=reasons)
+    how = {"episodes": 4, "seconds": 2.0, "trained": {"event push": "PushByVelocity()"}}
+    return TransferCard(policy="zoo:x", task="a_task", judged=found, refused=reasons, **how)
 
 
 def test_the_weakest_condition_is_named_with_its_share():
@@ -40,13 +41,17 @@ def test_the_weakest_condition_is_named_with_its_share():
 def test_no_condition_may_be_left_out():
     found = {name: judged() for name in NAMES[:-1]}
     with pytest.raises(ValueError, match=f"{NAMES[-1]}.*expected figures, or the reason"):
-        TransferCard(policy="x", task="y", episodes=1, judged=found, refused={})
+        TransferCard(
+            policy="x", task="y", episodes=1, seconds=1.0, trained={}, judged=found, refused={}
+        )
 
 
 def test_the_page_and_the_numbers_have_every_condition(tmp_path):
     found = card(refused=("a slope of 5 degrees",))
     page = found.page()
-    rows = [line for line in page.splitlines() if line.startswith("| ")]
+    table, _, training = page.partition("What it has met in training:")
+    assert "| event push | `PushByVelocity()` |" in training and "of 2 s at most" in table
+    rows = [line for line in table.splitlines() if line.startswith("| ")]
     assert [row.split(" | ")[0].removeprefix("| ") for row in rows[1:]] == NAMES
     assert "cannot apply: its ground is no plane" in page and "1 cannot apply to a_task" in page
     assert len({row.count("|") for row in rows}) == 1
