@@ -80,7 +80,7 @@ def new_robot(arguments: list[str]) -> int:
         default=[],
         help="leave a body out, such as a prop; repeatable",
     )
-    parser.add_argument("--name", help="of the package; default: that of the model")
+    parser.add_argument("--name", help="of the package; default: the model's name")
     parser.add_argument(
         "--output", type=Path, help="the new folder; default: the package's name, here"
     )

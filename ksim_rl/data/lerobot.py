@@ -1,8 +1,8 @@
 """Writes a folder of episodes as a dataset of LeRobot, version 3.0: Parquet for numbers, videos for pictures.
 
-The layout is that of `lerobot` 0.4 (https://huggingface.co/docs/lerobot/lerobot-dataset-v3): each file of `data` and
+The layout is `lerobot` 0.4's (https://huggingface.co/docs/lerobot/lerobot-dataset-v3): each file of `data` and
 `videos` has many episodes, and `meta/episodes` says where each of them lies. Frames are env states: observations, the
-action taken, and under `next.` the reward and how the episode stands. Observations that follow are those of the next
+action taken, and under `next.` the reward and how the episode stands. Observations that follow stand in the next
 frame, so the last of each episode is in no dataset of this kind.
 """
 

@@ -194,7 +194,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         if available.shape != self.available.shape:
             raise ValueError(
                 f"the checkpoint's replay has {available.numel()} places, this run's "
-                f"{self.max_size}: num_envs and data.capacity must be those of the checkpoint"
+                f"{self.max_size}: num_envs and data.capacity must be the checkpoint's"
             )
         # The ring may not exist yet in this run, or be filled where the checkpoint's is empty.
         content = tensors(branch(state_dict, "content"))

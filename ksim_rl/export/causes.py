@@ -140,7 +140,7 @@ def _of_motion(meta: Export, signal: Any, *, rates: bool) -> Cause | None:
     if _error(ours, theirs) > LIKE:
         # Looser than elsewhere: efforts also change with the state.
         if shift := _shift(ours, theirs, episode, tolerance=0.2):
-            return Cause("delay", "actuators", f"efforts are those of {shift} steps ago")
+            return Cause("delay", "actuators", f"efforts are {shift} steps old")
         # The joint whose gain is furthest from ours, up or down; the small number keeps the logarithm finite.
         ratios = _ratios(ours, theirs)
         worst = int(np.abs(np.log(np.abs(ratios) + 1e-9)).argmax())
@@ -187,7 +187,7 @@ def _of_observation(
     about = f"observation {name!r}"
     # From the most particular reason to the most general: a factor would fit many others badly, too.
     if shift := _shift(ours, theirs, episode):
-        return [Cause("stale sensor", about, f"it is that of {shift} steps ago")]
+        return [Cause("stale sensor", about, f"it is {shift} steps old")]
     if order := _order(ours, theirs):
         return [Cause("joint order", about, f"its columns match ours in the order {order}")]
     ratios = _ratios(ours, theirs)
@@ -223,9 +223,11 @@ def _of_targets(
     # Columns are position, velocity and effort of all joints, hence the remainder.
     if order := _order(ours, theirs):
         moved = [joints[a % len(joints)] for a, b in enumerate(order) if a != b]
-        return Cause("joint order", "targets", f"{', '.join(moved)} get those of other joints")
+        return Cause(
+            "joint order", "targets", f"{', '.join(moved)} get the targets of other joints"
+        )
     if shift := _shift(ours, theirs, episode):
-        return Cause("delay", "targets", f"they are those of {shift} steps ago")
+        return Cause("delay", "targets", f"they are {shift} steps old")
     # A factor or shift by column explains it; about the mean, the two are told apart.
     if _unlike(ours, theirs) <= LIKE:
         ratios = _ratios(ours - ours.mean(0), theirs - theirs.mean(0))

@@ -234,7 +234,7 @@ def check_equal(
                     f"{names}: observation {group!r} differs at step {step} from what `_apply_transform` makes of a "
                     "single observation: an export takes transforms that keep nothing from step to step"
                 )
-        # The same actions; that of the last step is of no use.
+        # The same actions; the last step's is of no use.
         action = whole.rand_action(one.clone())
         one = whole.step_and_maybe_reset(action)[1]
         for key in whole.action_keys:

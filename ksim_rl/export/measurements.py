@@ -61,7 +61,7 @@ _OF_ROOT: dict[str, dict[str, str]] = {
     "root_ang_vel_b_EL": {"quantity": "root_ang_vel", "frame": "root"},
     "root_ang_vel_w_EL": {"quantity": "root_ang_vel", "frame": "world"},
 }
-# Arrays with an entry per actuator, whose order in the exported model is that of the actions.
+# Arrays with an entry per actuator, which the exported model has in the order of the actions.
 OF_ACTUATORS = ("actuator_force", "ctrl")
 
 

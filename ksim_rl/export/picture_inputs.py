@@ -72,7 +72,7 @@ class PictureInput:
 
     @property
     def is_late(self) -> bool:
-        """Whether the policy reads other pictures than that of the moment."""
+        """Whether the policy reads other pictures than the moment's."""
         return self.delay is not None or self.every > 1 or self.dropped > 0.0
 
     def described(self) -> Json:

@@ -150,7 +150,7 @@ def _read(path: Path, robot: HeldRobot) -> JointLog:
 
 
 def _kinds(text: str | None, robot: HeldRobot) -> list[TargetKind]:
-    """Return the kinds of commands to propose: those of the option, else those that the robot's motors take."""
+    """Return the kinds of commands to propose: the option's, else all that the robot's motors take."""
     if text is None:
         taken = set.intersection(*(set(joint.takes) for joint in robot.joints))
         if not taken:

@@ -1,8 +1,9 @@
 """Fits the numbers of joints to a log: simulated positions are brought to those that the encoders read.
 
 MuJoCo's toolbox for system identification searches (Gauss-Newton with bounds) and gives the intervals. These assume
-that what is left is noise, which it is not where a model lacks something. So they are at least as wide as those of
-seconds of the log as independent pieces (White, "Maximum likelihood estimation of misspecified models", 1982).
+that what is left is noise, which it is not where a model lacks something. So they are at least as wide as intervals
+that take seconds of the log as independent pieces (White, "Maximum likelihood estimation of misspecified models",
+1982).
 """
 
 import io

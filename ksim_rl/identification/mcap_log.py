@@ -139,9 +139,9 @@ def _check_names(path: Path, time: str, topics: Sequence[Topic]) -> None:
         for name in topic.names:
             if name in owners:
                 raise ValueError(
-                    f"{path}: {topic.name} has a column {name!r}, which is that of {owners[name]}: expected one"
+                    f"{path}: {topic.name} has a column {name!r}, which is the name of {owners[name]}: expected one"
                 )
-            owners[name] = topic.name
+            owners[name] = f"a column of {topic.name}"
 
 
 def _topics(path: Path, data: bytes, most_cells: int) -> list[Topic]:

@@ -42,7 +42,7 @@ def overrides(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> list[str]:
     if actuators and findings.delay_s.is_told:
         late = _late(actuators, findings.delay_s, time_step(cfg))
         found.append(_driven_by(key, late))
-    # Of several robots each has its name before those of its joints.
+    # Where robots are several, each has its name before its joints' names.
     prefix = "" if len(cfg.scene.robots) == 1 else f"{key}/"
     for name, event in _events(findings, prefix).items():
         found.append(f"+task.events.identified_{name}={_value(to_tree(event, EventTerm))}")

@@ -71,7 +71,7 @@ class EncoderCfg(Checked):
         """
         if spec.dtype not in (torch.uint8, torch.float32):
             raise ValueError(
-                f"it reads pictures of {spec.dtype}, and those of uint8 or float32 are amounts of light or distances: "
+                f"it reads pictures of {spec.dtype}, and only uint8 or float32 is an amount of light or a distance: "
                 "map ids to colours first, or name an encoder of your own by _target_"
             )
         check_layout(spec.shape, self.layout)

@@ -18,7 +18,7 @@ from ksim_rl.objectives.policy_kl import observation_keys
 from ksim_rl.transforms.specs import path_of
 
 DEMONSTRATION = "demonstration"
-"""Under this key a dataset holds recorded env states, beside those of a rollout that the critic learns from."""
+"""Under this key a dataset holds recorded env states, beside the rollout that the critic learns from."""
 VALUE_TARGET = "value_target"
 
 

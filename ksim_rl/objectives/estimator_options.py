@@ -18,7 +18,7 @@ REFUSED: dict[str, tuple[tuple[Any, ...], str]] = {
     "average_rewards": ((False, None), "scale rewards in the env, or by its transforms"),
     "auto_reset_env": (
         (False, None),
-        "the value after a step is that of its true next observation",
+        "the value after a step is computed from its true next observation",
     ),
     "group_key": ((None,), "advantages are standardized over all env states"),
     "deactivate_vmap": ((False, True, None), ""),

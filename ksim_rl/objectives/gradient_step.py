@@ -20,7 +20,7 @@ class NonFiniteStepsError(RuntimeError):
     def __init__(self, in_a_row: int, *, limit: int, skipped: int) -> None:
         super().__init__(
             f"{in_a_row} gradient steps in a row had a loss or gradient that is not finite (limit {limit}, "
-            f"{skipped} since the start); the parameters are those of the last good step. "
+            f"{skipped} since the start); the parameters are as after the last good step. "
             "Lower the learning rate or max_grad_norm, or look for extreme rewards and observations"
         )
 

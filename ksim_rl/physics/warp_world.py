@@ -161,12 +161,14 @@ class WarpWorld(World):
     ) -> None:
         """Advance all worlds by `n` substeps under the present `ctrl`.
 
-        Sensors are computed on the last one, but for those that `refresh` computes, which read zero until then; with
-        those of contacts on every one, which until the last computes nothing else; or all on every one. Hooks are
-        called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when `refresh`
-        has not run: `qpos` and `qvel` are of the state reached, poses and sensors as the substep computed them
-        on its way. With hooks the substeps are launches of their own, with the hooks' torch work in between; without,
-        all of them are one. Inside an outer capture both become part of its graph.
+        `sensors` says on which substeps sensors are computed: all on the last one; with "contacts", contact sensors on
+        every one as well, and no others before the last; with "every", all on every one. What `refresh` computes is
+        left to it, and reads zero until then.
+
+        Hooks are called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when
+        `refresh` has not run: `qpos` and `qvel` are of the state reached, poses and sensors as the substep computed
+        them on its way. With hooks the substeps are launches of their own, with the hooks' torch work in between;
+        without, all of them are one. Inside an outer capture both become part of its graph.
         """
         check_count("n", n)
         check_choice("sensors", sensors, ("last", "contacts", "every"))

@@ -143,10 +143,12 @@ class World(views.DataViews):
     ) -> None:
         """Advance all worlds by `n` substeps under the present `ctrl`.
 
-        Sensors are computed on the last one, but for those that `refresh` computes; with those of contacts on every
-        one; or all on every one. Hooks are called, in order, before each substep (such as a motor model that writes
-        `ctrl`) and after it, when `refresh` has not run: `qpos` and `qvel` are of the state reached, poses and sensors
-        as the substep computed them on its way.
+        `sensors` says on which substeps sensors are computed: all on the last one; with "contacts", contact sensors on
+        every one as well; with "every", all on every one. What `refresh` computes is left to it.
+
+        Hooks are called, in order, before each substep (such as a motor model that writes `ctrl`) and after it, when
+        `refresh` has not run: `qpos` and `qvel` are of the state reached, poses and sensors as the substep computed
+        them on its way.
         """
 
     @abstractmethod

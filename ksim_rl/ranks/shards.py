@@ -79,7 +79,7 @@ def dealt(
     if saved is not None:
         differing = branch(saved, "parts")
         for index in range(1, int(number(saved, "size"))):
-            # A rank whose tensors are all those of rank 0 has no entry.
+            # A rank whose tensors all equal rank 0's has no entry.
             own = tensors(branch(differing, str(index))) if str(index) in differing else {}
             parts.append({**first, **own})
     before = len(parts)

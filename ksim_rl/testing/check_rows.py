@@ -107,7 +107,7 @@ def _check_end(next_E: TensorDictBase, root: TensorDictBase, keys: list[NestedKe
     for row in ended:
         if keys and len(differing(next_obs, root_obs, [row])) == 0:
             raise AssertionError(
-                f"row {row} ended, and its `next` observation is that of the new episode. `_step` must return the "
+                f"row {row} ended, and its `next` observation is of the new episode. `_step` must return the "
                 "observation of the state reached; leave resets to `_reset`, which `maybe_reset` calls with `done`"
             )
     if ended and bool(root.get("done")[ended].any()):

@@ -68,7 +68,7 @@ class TransferCard:
     def share(self, name: str) -> float:
         """Return the lesser of the shares of return and of upright episodes that a condition leaves; at least 0.
 
-        Where the return as trained is not positive, it has no shares, and that of the episodes counts.
+        Where the return as trained is not positive, it has no shares, and the share of episodes counts.
         """
         found = self.judged[name]
         shares = []

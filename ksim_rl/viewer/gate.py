@@ -69,7 +69,7 @@ class Gate:
             return _forbidden("expected one Host and one Origin")
         # Other names are refused: by such a name a page of another site would reach this machine.
         if not self._is_own(host):
-            return _forbidden("the address has another name than that of the machine")
+            return _forbidden("the address does not name this machine")
         # Browsers send the origin with each WebSocket: pages of other sites are refused.
         if origin is not None and origin != f"http://{host}":
             return _forbidden("only its own page may connect")

@@ -72,7 +72,7 @@ def read_card(name: str, folder: Path = FOLDER) -> Card:
     # A changed or missing file would be another policy under the same name.
     if card.name != name or hashes(path.parent) != dict(card.files):
         raise ValueError(
-            f"{path.parent}: its files are not those of its card: install the package once more"
+            f"{path.parent}: its files differ from what its card says: install the package once more"
         )
     return card
 

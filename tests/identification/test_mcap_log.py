@@ -136,11 +136,11 @@ FAULTS = {
     ),
     "two commands": (
         lambda: in_json(both(_more=(stamps(), rows(WAVE_TN, "target_position")))),
-        "/more has a column 'hip.target_position', which is that of /sent",
+        "/more has a column 'hip.target_position', which is the name of a column of /sent",
     ),
     "a time of its own": (
         readings(rows=[{"time": 0.0, **row} for row in rows(WAVE_TN, "position")]),
-        "/read has a column 'time', which is that of the times",
+        "/read has a column 'time', which is the name of the times",
     ),
 }
 

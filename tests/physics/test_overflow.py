@@ -163,7 +163,7 @@ def check_overflows(
         report = report_with(njmax, 200)
         assert report.worlds["NEFC"], (njmax, report)
         if counts_all:
-            assert report.nefc == roomy.nefc, "the need is that of the world with the most rows"
+            assert report.nefc == roomy.nefc, "the need is the largest of any world"
     # Contacts that found no place have no rows, so that here those may suffice.
     for njmax, nconmax in ((400, places - 1), (400, 1), (12, 1)):
         report = report_with(njmax, nconmax)

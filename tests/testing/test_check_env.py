@@ -135,7 +135,7 @@ def test_a_good_env_passes():
         (ResetsEverybody, r"\[partial_reset\] 'episode_E' of the state.*Write through the mask"),
         (
             ObservesTheNextEpisode,
-            r"\[episode_end\] row 0 ended, and its `next` observation is that of the new episode",
+            r"\[episode_end\] row 0 ended, and its `next` observation is of the new episode",
         ),
         (AdvancesTwice, r"\[episode_end\] 'row' differ between `next` and the next root"),
         (Waits, r"\[syncs\] .*make the host wait"),

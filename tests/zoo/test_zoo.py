@@ -100,7 +100,7 @@ def test_changed_files_are_refused(zoo):
     read_card(NAMES[0], zoo)
     with open(zoo / NAMES[0] / "policy.onnx", "ab") as file:
         file.write(b"more")
-    with pytest.raises(ValueError, match="are not those of its card"):
+    with pytest.raises(ValueError, match="its files differ from what its card says"):
         read_card(NAMES[0], zoo)
 
 

@@ -280,5 +280,5 @@ class OffPolicyUpdate(RolloutUpdate):
             if not torch.equal(theirs, own):
                 raise ValueError(
                     f"modules.actor.action_bound: {name!r} is {own.tolist()} in this run and {theirs.tolist()} in the "
-                    "checkpoint; take that of the checkpoint's run"
+                    "checkpoint; take the bound of the checkpoint's run"
                 )

@@ -116,7 +116,7 @@ def fused_networks(
     value = getattr(critic, "module", None)
     # Exact types: a subclass may compute something else.
     if type(policy) is not PolicyNetwork or type(value) is not ValueNetwork:
-        return NotFused("the networks are not those of make_actor and make_critic")
+        return NotFused("the networks were not made by make_actor and make_critic")
     if type(policy.trunk) is not nn.Sequential or type(value.layers) is not nn.Sequential:
         return NotFused("the networks are of layers of their own")
     head: Any = policy.head

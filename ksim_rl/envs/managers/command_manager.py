@@ -41,7 +41,7 @@ class CommandManager:
             value_EK = self._computed(name)
             with self._driver.scope(f"commands/{name}"):
                 if term.ranges:
-                    # Columns beyond those of `ranges` are the term's own.
+                    # Columns beyond `ranges` are the term's own.
                     columns = term.shared_ranges(view).unbind(-1)
                     driver.readings.command_ranges[name] = dict(
                         zip(term.ranges, columns, strict=False)

@@ -5,7 +5,7 @@ from typing import Any, Literal, TypeAlias, TypedDict
 
 
 class LagSpec(TypedDict):
-    """By how many steps a value comes late; those of one `shared` name draw the same lag."""
+    """By how many steps a value comes late; values with one `shared` name draw the same lag."""
 
     min: int
     max: int

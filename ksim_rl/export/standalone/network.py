@@ -76,7 +76,7 @@ class Network:
         return states
 
     def run(self, given: dict[str, Array]) -> Array:
-        """Return the first output, of one robot; `advance` makes the states of this run those of the next."""
+        """Return the first output, of one robot; after `advance` the next run reads the states that this one leaves."""
         feed = {}
         for name, value in given.items():
             example = self.inputs[name]

@@ -301,7 +301,7 @@ class Runner(Signals):
         """Return the pictures that the policy read in a recorded step."""
         found = {}
         for name, camera in self.sight.cameras.items():
-            # Where nothing is late, they are those of the moment.
+            # Where nothing is late, these are the moment's.
             of_moment = trace[f"camera_{camera.spec['group']}"]
             found[name] = trace.get(name, of_moment)[t]
         return found

@@ -237,7 +237,7 @@ class Signals:
         """Recompute all that follows from position and velocity; contacts and forces stay from the last substep."""
         model = self.model
         data = self.data
-        # Velocities of subtrees, too: sensors of momentum take those of the last substep where nobody computes them.
+        # Velocities of subtrees, too: sensors of momentum read the last substep's where nobody computes them.
         # Cameras and lights of pictures move with their bodies.
         stages = (
             mujoco.mj_kinematics,

@@ -221,7 +221,7 @@ class RandomizeActuator(OfJoints, Randomize):
             # The worst joint is named; `own` may have a low and a high end per joint.
             row = int(low.reshape(len(names), -1).min(-1).argmin())
             raise ValueError(
-                f"{type(self).__name__}.{field}={pair!r}: that of joint {names[row]!r} would reach {low.min():g}; "
+                f"{type(self).__name__}.{field}={pair!r}: joint {names[row]!r} would reach {low.min():g}; "
                 "expected at least 0"
             )
 

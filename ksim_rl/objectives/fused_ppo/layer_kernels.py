@@ -114,10 +114,10 @@ def output_gradients(
 ):  # fmt: skip
     """Run BLOCK rows through the last layer and the loss: program (i, n) is of network n (0: actor, 1: critic).
 
-    Gradients at the outputs go to `slopes` [2, num_rows, GRADIENTS] from `slope_at` on, that of the std and statistics
-    to `block_partials`, as in `minibatch_gradients`. Weights and biases are the last layer's, NUM_PADDED apart. With
-    MIRROR the second half of the rows, images of the first half, has the mirror loss only; `image_of` [OUT] has the
-    source of each mirrored action, counted from 1, times its sign.
+    Gradients at the outputs go to `slopes` [2, num_rows, GRADIENTS] from `slope_at` on, the gradient of the std and
+    statistics to `block_partials`, as in `minibatch_gradients`. Weights and biases are the last layer's, NUM_PADDED
+    apart. With MIRROR the second half of the rows, images of the first half, has the mirror loss only; `image_of` [OUT]
+    has the source of each mirrored action, counted from 1, times its sign.
     """
     block = tl.program_id(0)
     network = tl.program_id(1)

@@ -123,7 +123,7 @@ CUDA_CALLABLE inline void write_contact(const Geoms& geoms, const Found& found, 
     a.contact_type.data[place] = HAS_ROWS;
     a.contact_geomcollisionid.data[place] = found.which;
     a.contact_adhesion.data[place] = law.adhesion;
-    // The kernel of the rows writes those of contacts that are listed.
+    // The kernel of the rows writes the addresses of contacts that are listed.
     const int most = is_listed ? 0 : a.contact_efc_address.shape[1];
     for (int row = 0; row < most; ++row)
         a.contact_efc_address.data[place * most + row] = -1;

@@ -20,8 +20,9 @@ from ksim_rl.physics.collision.candidate_pairs import CandidatePairs
 
 # Below this, in 1/kg, an inverse weight is rounding error.
 ROUNDING = 1e-12
-# The least inverse weight of such a body, in that of the mass that it carries: its contacts are still harder than those
-# of other bodies, and forces across the joint so small that float32's rounding of them does little work along it.
+# The least inverse weight of such a body, as a share of 1 / the mass that it carries: its contacts are still harder
+# than contacts of other bodies, and forces across the joint so small that float32's rounding of them does little work
+# along it.
 SHARE = 1e-2
 
 

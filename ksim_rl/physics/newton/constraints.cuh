@@ -1,7 +1,7 @@
 // Part 2: the constraint model. Reads M, and of each row J, D, aref, its kind and its bound.
 //
-// The rows of a contact with an elliptic cone stand one after another: that of the normal, here the head of the
-// cone, and those of its tangents.
+// The rows of a contact with an elliptic cone stand one after another: the normal's, here the head of the
+// cone, and its tangents'.
 #pragma once
 #include "ksim_rl/physics/newton/layout.cuh"
 

@@ -1,5 +1,5 @@
 // Part 6: the gradient M qacc - qfrc_smooth - J' force, the Hessian H = M + J' d2s/dr2 J, and the search direction
-// -H^-1 gradient by a Cholesky factorization (computation chapter, "Algorithms", Newton): that of part 4, or here for
+// -H^-1 gradient by a Cholesky factorization (computation chapter, "Algorithms", Newton): part 4's, or computed here for
 // rows that touch any degrees of freedom.
 #pragma once
 #include "ksim_rl/physics/newton/tiles.cuh"
@@ -134,7 +134,7 @@ CUDA_CALLABLE inline void eliminate(const Solve& s, Block own_block)
     const int own = own_block.INDEX;
     const int begin = own * LANES, size = wp::min(LANES, NV - begin), end = begin + size;
     const int passes = size == 32 ? 4 : 1, pass_width = size / passes;
-    // Where a shared column has the entries beyond the block; before them are those of the block, in passes
+    // Where a shared column has the entries beyond the block; before them are the block's entries, in passes
     // twice.
     const int beyond = passes > 1 ? size - begin : -begin;
 #pragma unroll 1

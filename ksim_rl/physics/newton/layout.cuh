@@ -15,7 +15,7 @@
 // then sums over them have no index to look up, and the lanes read one address or adjacent ones.
 //
 // Here the degrees of freedom are in the order of their slots: the trunk of the kinematic tree, then its limbs (see
-// limbs.py). Where no row of J touches two limbs, rows are narrow: the trunk's entries, then those of one limb.
+// limbs.py). Where no row of J touches two limbs, rows are narrow: the trunk's entries, then one limb's.
 #pragma once
 #include "ksim_rl/physics/newton/exchange.cuh"
 

@@ -2,7 +2,7 @@
 // two limbs: eliminated from the limbs to the trunk, as mj_factorI goes from the leaves to the root, it has no fill-in
 // (computation chapter, "Inverse inertia"; engine_core_smooth.c).
 //
-// With the gradient as one more row below those of the trunk, the Cholesky factor of limb k and its neighbours is
+// With the gradient as one more row below the trunk's, the Cholesky factor of limb k and its neighbours is
 //
 //     [ H_k   A_k' ]   [ L_k    ] [ L_k'  Z_k' ]
 //     [ A_k   T    ] = [ Z_k  I ] [     rest   ],   Z_k' = L_k^-1 A_k',   rest = T - sum of all Z_k Z_k',
@@ -198,7 +198,7 @@ UNROLL
     return -s.rest[ENTRIES - 1];
 }
 
-// The search direction, from the trunk to the limbs: L_k' search = -(L_k^-1 gradient + Z_k' times that of the trunk).
+// The search direction, from the trunk to the limbs: L_k' search = -(L_k^-1 gradient + Z_k' times the trunk's search).
 CUDA_CALLABLE inline void search_along_limbs(const Solve& s)
 {
     float of_trunk[ARMS];

@@ -93,7 +93,7 @@ CUDA_CALLABLE inline Point cone_point(const Cone& cone, float alpha)
     const int state = cone_zone(N, T, cone.mu);
     if (state == SATISFIED)
         return Point {-start, 0.0f, 0.0f};
-    // The quadratic cost of all rows exceeds that of the cone at the same point by Dm / 2 (mu N + T)^2.
+    // The quadratic cost of all rows exceeds the cone's cost at the same point by Dm / 2 (mu N + T)^2.
     const float half = alpha * cone.half_curvature, quadratic = alpha * (half + cone.slope);
     if (state == QUADRATIC) {
         const float excess = cone.mu * cone.N + cone.T;
@@ -129,8 +129,8 @@ CUDA_CALLABLE inline Point unit_point(const Solve& s, int row, float alpha)
     return one_sided(s.residual[row], s.rate[row], s.efc_D[row], alpha);
 }
 
-// The step to take, and by how much it lowers the cost. `slope` and `half_curvature` are those of the terms that are
-// quadratic everywhere: the Gauss cost of M and the equalities; `slope_0` is that of all terms at the start.
+// The step to take, and by how much it lowers the cost. `slope` and `half_curvature` belong to the terms that are
+// quadratic everywhere: the Gauss cost of M and the equalities; `slope_0` is the slope of all terms at the start.
 struct Step {
     float alpha, improvement;
 };

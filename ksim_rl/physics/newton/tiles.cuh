@@ -7,7 +7,7 @@
 namespace newton {
 
 constexpr int TILE_LANES = TILED ? TILE : LANES, TILE_ROWS = TRUNK + LIMB, LAST = TILE_ROWS - 1;
-constexpr bool HAS_LAST = TILE_ROWS > TILE_LANES;  // the last row has no lane: those of the others sum its entries
+constexpr bool HAS_LAST = TILE_ROWS > TILE_LANES;  // the last row has no lane: the other rows' lanes sum its entries
 
 CUDA_CALLABLE inline void list_rows(Solve& s)
 {

@@ -1,7 +1,7 @@
 """Counts the rows of ties no further than there is room for them, where worlds have too little.
 
 MuJoCo Warp counts what ties need. The line search of its solver goes through so many rows, and beyond the last one it
-reads those of the next world, or whatever memory lies behind the last: a NaN there, and the world is not accelerated.
+reads the next world's rows, or whatever memory lies behind the last: a NaN there, and the world is not accelerated.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.

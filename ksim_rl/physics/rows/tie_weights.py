@@ -23,7 +23,7 @@ ROWS = {mujoco.mjtEq.mjEQ_CONNECT: 3, mujoco.mjtEq.mjEQ_WELD: 6}
 
 
 def rows_of_equalities(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return how many constraint rows each equality constraint has, int [neq]; 1 of those of flexes, which vary."""
+    """Return how many constraint rows each equality constraint has, int [neq]; 1 for flexes, whose count varies."""
     rows = [ROWS.get(mujoco.mjtEq(kind), 1) for kind in mj_model.eq_type]
     return np.array(rows, dtype=np.int64)
 

@@ -1,4 +1,4 @@
-// Part 5: what actuators do (mj_transmission, mj_fwdActuation), and the sum of all forces but those of constraints
+// Part 5: what actuators do (mj_transmission, mj_fwdActuation), and the sum of all forces but the constraints'
 // (mj_fwdAcceleration). An actuator drives a hinge or a slide, and has a gain, a bias and an activation that are
 // affine.
 #pragma once

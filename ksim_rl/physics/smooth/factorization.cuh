@@ -1,8 +1,9 @@
 // Part 2 of the integration: its solution by L' D L = M - h dF/dv (computation chapter, "Inertia factorization"), whose
 // L has entries where M has some. Degrees of freedom are eliminated from the last to the first: each takes from the
-// rows of its ancestors, among which that of the n-th has the columns of the first n. In each of these turns another lane
-// has each entry that changes, so that an entry is summed in the order of elimination. A table says which entry of the
-// system, in its upper bits, takes the product of which two of the row; the right side stands in it as one more row.
+// rows of its ancestors, among which the n-th ancestor's row has the columns of the first n. In each of these turns
+// another lane has each entry that changes, so that an entry is summed in the order of elimination. A table says which
+// entry of the system, in its upper bits, takes the product of which two of the row; the right side stands in it as one
+// more row.
 #pragma once
 #include "ksim_rl/physics/smooth/derivative.cuh"
 

@@ -1,4 +1,4 @@
-// The overflow bits of each world and the most that it needed in this period; the first world has those of the pool.
+// The overflow bits of each world and the most that it needed in this period; the first world has the pool's.
 //
 // Bits are set from the counts here too: the integration sets them at the end of a substep, and one that evaluates the
 // forces several times on its way has made rows that it does not count.

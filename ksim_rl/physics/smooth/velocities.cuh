@@ -23,7 +23,7 @@ CUDA_CALLABLE inline void find_velocities(const World& world, const Arguments& a
 #pragma unroll 1
             for (int joint = first; joint < first + look_up(a.body_jntnum, body); ++joint) {
                 const int type = look_up(a.jnt_type, joint);
-                // A free joint's first three axes are those of the world, which nothing turns.
+                // A free joint's first three axes are the world's, which nothing turns.
                 if (type == FREE)
                     for (const int end = dof + 3; dof < end; ++dof) {
                         if (a.is_read)

@@ -17,7 +17,7 @@ LEVELLING_STEP = 2
 LIMB = 0.15
 """Share of the robot's height from which on a limb is worth a hull."""
 NO_FREE_JOINT = (
-    "the model has 0 free joints: expected one, that of the robot's root body; where the file fixes a robot that walks "
+    "the model has 0 free joints: expected one, of the robot's root body; where the file fixes a robot that walks "
     "to the world, add <freejoint/> to its root body"
 )
 REACHES_GROUND = 0.08
@@ -174,7 +174,7 @@ def _root_of(mj_model: mujoco.MjModel) -> int:
     props = [name for name in bodies if name != robot]
     flags = " ".join(f"--drop {name}" for name in props)
     raise ValueError(
-        f"the model has {len(bodies)} free joints, of the bodies {', '.join(bodies)}: expected one, that of the "
+        f"the model has {len(bodies)} free joints, of the bodies {', '.join(bodies)}: expected one, of the "
         f"robot's root body; leave the others out by {flags} (in Python: analyse(..., drop={props!r}))"
     )
 

@@ -293,6 +293,6 @@ class ActuatorParams:
         for joint in joints:
             if joint not in self._owners[name]:
                 raise ValueError(
-                    f"the actuator of joint {self._joint_names[joint]!r} has no parameter {name!r}: those of built-in "
-                    "actuators are the model fields actuator_gainprm, actuator_biasprm and actuator_forcerange"
+                    f"the actuator of joint {self._joint_names[joint]!r} has no parameter {name!r}: built-in "
+                    "actuators have the model fields actuator_gainprm, actuator_biasprm and actuator_forcerange"
                 )

@@ -375,7 +375,7 @@ class WorldView(NearNames):
         self.default_state.restore(mask_E)
         # On flat ground all origins are zero.
         if not self.terrain.is_flat:
-            # All free roots move, also those of objects.
+            # All free roots move, of objects as well.
             self.write_qpos(mask_E, self.at_origins(self.default_qpos_L.expand(self.num_envs, -1)))
 
     def write_qpos(self, mask_E: Bool[Tensor, " E"], qpos_EL: Float[Tensor, "E L"]) -> None:

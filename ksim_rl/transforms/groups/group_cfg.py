@@ -55,7 +55,7 @@ class ObservationTermCfg(Checked):
         # Stacked frames are no columns of a vector.
         if frames is not None and not frames.flat:
             raise ValueError(
-                "history.flat=False: frames in a vector are flat; stack those of the whole group"
+                "history.flat=False: frames in a vector are flat; stack frames of the whole group"
             )
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:

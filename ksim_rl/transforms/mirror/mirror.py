@@ -144,9 +144,7 @@ class Mirror(KeyedTransform):
         keys = self.in_keys
         keys_inv = self.in_keys_inv
         if set(maps) != {*keys, *keys_inv}:
-            raise ValueError(
-                f"maps has the keys {list(maps)}: expected those of {keys} and {keys_inv}"
-            )
+            raise ValueError(f"maps has the keys {list(maps)}: expected {keys} and {keys_inv}")
         checks.check_in_range("probability", probability, low=0.0, high=1.0)
         self._register_rows("mirrored_E")
         self.maps = dict(maps)
