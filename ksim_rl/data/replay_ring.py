@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from ksim_rl import dims, ranks
-from ksim_rl.checked import Checked, Count, NonNegative, Repeats, Share
+from ksim_rl.checked import Checked, Count, NonNegative, Repeats, Share, WholeNumber
 from ksim_rl.checks import check_count, check_in_range, naming
 from ksim_rl.data.dataset_storage import Stateless
 from ksim_rl.data.epoch_sampler import Entries, SampleInfo, stored
@@ -199,6 +199,9 @@ class ReplayCfg(Checked):
     T steps and then T * u gradient steps is the same but for actions that are up to T - 1 steps older than the newest
     policy, and each iteration is only two graphs, whatever T is.
 
+    From `learning_starts` until each env has made `policy_starts` steps only the critics learn: critics that know
+    nothing would spoil a good policy that a run goes on from (PIRLNav, Ramrakhya et al., arXiv 2301.07302).
+
     Without `save_replay` checkpoints are small, and a resumed run begins with an empty replay and random actions until
     `learning_starts`, so that it is not the same run any more.
     """
@@ -209,6 +212,9 @@ class ReplayCfg(Checked):
     capacity: Count = 1024  # env states per env; the end of an episode takes one more
     n_step: Repeats = 1  # rewards that a target sums before it bootstraps
     learning_starts: Count = 10  # steps of each env with random actions before any update
+    policy_starts: WholeNumber = (
+        0  # steps of each env before the policy learns; 0 is with the critics
+    )
     prioritized: bool = False  # by the last TD error (Schaul et al., arXiv 1511.05952)
     priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
     priority_beta: Share = 0.4  # how far the weights of the losses undo that; 1 is wholly
@@ -224,6 +230,11 @@ class ReplayCfg(Checked):
             raise ValueError(
                 f"capacity={self.capacity} is less than 2 * num_steps + n_step = {least}: "
                 "one rollout would overwrite itself; raise capacity"
+            )
+        if 0 < self.policy_starts <= self.learning_starts:
+            raise ValueError(
+                f"policy_starts={self.policy_starts} is not beyond learning_starts={self.learning_starts}: the critics "
+                "learn alone in between; raise it, or leave it at 0"
             )
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:

@@ -11,6 +11,8 @@ from ksim_rl.trainers.algorithm import Update
 # Networks of an update's state.
 ACTOR = "actor"
 CRITIC = "critic"
+# What belongs to a critic, and begins anew with it: its slow copy, and the temperature of SAC.
+WITH_CRITIC = (CRITIC, "target_critic", "log_alpha")
 
 
 def load_env_state(env: EnvBase, state: State) -> None:
@@ -41,8 +43,11 @@ def load_networks(update: Update, state: State, path: Path) -> str:
     note = ""
     own = update.state_dict()
     if ACTOR in state and CRITIC in own and CRITIC not in state:
-        state = {**state, CRITIC: own[CRITIC]}
+        anew = {name: own[name] for name in WITH_CRITIC if name in own}
+        state = {**state, **anew}
         note = f"{path} has a policy and no critic: the critic begins anew"
+        if "target_critic" in own:
+            note += "; with data.policy_starts it learns for a while before the policy does"
     try:
         update.load_weights(state)
     except KeyError as error:

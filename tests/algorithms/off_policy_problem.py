@@ -3,9 +3,12 @@
 from dataclasses import replace
 
 import torch
+from tensordict import TensorDict
 
+from ksim_rl.algorithms.bc.demonstration import Demonstration
+from ksim_rl.algorithms.bc.update import BCUpdate
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.data import ReplayCfg
+from ksim_rl.data import DatasetCfg, ReplayCfg
 from ksim_rl.envs.signal_keys import STANDARD
 from ksim_rl.modules import (
     DeterministicActorCfg,
@@ -18,7 +21,7 @@ from ksim_rl.modules import (
     make_q_network,
     make_squashed_actor,
 )
-from ksim_rl.objectives import SACCfg, SACLoss, TD3Cfg, TD3Loss
+from ksim_rl.objectives import BCCfg, SACCfg, SACLoss, TD3Cfg, TD3Loss
 from ksim_rl.trainers import Evaluator, OffPolicyUpdate, Trainer, TrainerCfg
 from tests.trainers.target_env import LENGTH, make_env
 
@@ -140,3 +143,24 @@ def make_trainer(
         evaluator=Evaluator(evaluation_env, update.actor, max_steps=LENGTH, seed=7),
         folder=folder,
     )
+
+
+def clone_for(name, *, noise=0.1, num_updates=20):
+    """Return the state of a policy of `make_trainer(name)` that was cloned from near-best actions."""
+    generator = torch.Generator().manual_seed(3)
+    shown_N1 = 2.0 * torch.rand(4096, 1, generator=generator) - 1.0
+    action_N1 = shown_N1 + noise * torch.randn(4096, 1, generator=generator)
+    recorded_N = TensorDict({"actor": shown_N1, "action": action_N1}, [4096])
+    torch.manual_seed(1)
+    env = make_env(32)
+    update = BCUpdate(
+        BCCfg(episodes="made_up", learning_rate=0.01, num_epochs=8),
+        actor=make_update(name, env).actor,
+        critic=None,
+        demonstration=Demonstration(learned_N=recorded_N, held_out_N=None),
+        data=DatasetCfg(num_env_states_per_minibatch=128, num_minibatches=4),
+    )
+    collector = RolloutCollector(env, update.actor, rollout_length=16, keys=update.rollout_keys)
+    for _ in range(num_updates):
+        update(collector.collect())
+    return update.state_dict()

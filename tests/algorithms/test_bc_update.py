@@ -18,6 +18,7 @@ from ksim_rl.modules import ActorCfg, CriticCfg, make_actor, make_critic
 from ksim_rl.objectives import DEMONSTRATION, VALUE_TARGET, BCAndValueLoss, BCCfg, BCLoss
 from ksim_rl.testing.counter_env import CounterEnv
 from ksim_rl.trainers import RunProgress, build, run
+from ksim_rl.trainers.checkpoint import load_latest
 from ksim_rl.trainers.restoring import load_networks
 from tests.algorithms.imitation_problems import linear_demonstration, make_bc
 from tests.trainers.target_env import make_trainer
@@ -258,3 +259,29 @@ def test_a_run_learns_from_a_folder_and_ppo_goes_on_from_it(tmp_path):
     with pytest.raises(ValueError, match="objective.episodes=.*other"):
         build(conf.compose([*SMALL, "objective=bc", f"objective.episodes={tmp_path / 'other'}"]))
     assert data.read_episodes(folder).contents.num_episodes == 20
+
+
+@pytest.mark.full
+def test_fast_sac_goes_on_from_a_clone_of_its_kind(tmp_path):
+    """Such a clone has no critic, and actions within its bounds only."""
+    leaves = {("actor",): (5,), ("obs", "vector"): None, ("action",): (1,)}
+    columns = {"actor": {"obs/position": (0, 3), "obs/velocity": (3, 5)}}
+    # Actions are the numbers of the episodes.
+    for episodes in (2, 3):
+        write(tmp_path / str(episodes), episodes=episodes, leaves=leaves, columns=columns)
+    cloning = [*SMALL, "objective=bc", "modules=fast_sac", "trainer.num_iterations=1"]
+    with pytest.raises(ValueError, match=r"actions reach 2, and the policy stays within \[-1.0\]"):
+        build(conf.compose([*cloning, f"objective.episodes={tmp_path / '3'}"]))
+    cfg = conf.compose([*cloning, f"objective.episodes={tmp_path / '2'}"])
+    cloned = run(cfg, tmp_path / "cloned", progress=RunProgress(1, enabled=False))
+    assert cloned.iteration == 1
+
+    start = f"checkpoint={tmp_path / 'cloned'}"
+    replaying = [*SMALL, "objective=fast_sac", "data.num_minibatches=4", "data.capacity=20", start]
+    trainer = build(conf.compose(replaying))
+    assert any("data.policy_starts" in note for note in trainer.notes)
+    saved = load_latest(tmp_path / "cloned").state["update"]["actor"]
+    for name, value in trainer.update.actor.state_dict().items():
+        assert torch.equal(value, saved[name]), name
+    with pytest.raises(ValueError, match="its networks are others"):
+        build(conf.compose([*SMALL, start]))

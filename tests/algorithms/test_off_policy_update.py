@@ -1,11 +1,15 @@
 """The update of off-policy learning: what it learns on probes with known values, and what it refuses."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 import torch
 
 from ksim_rl.objectives import NonFiniteStepsError, SACCfg
 from ksim_rl.testing import count_syncs
-from tests.algorithms.off_policy_problem import GAMMA, OBJECTIVES, make_trainer
+from ksim_rl.trainers.restoring import load_networks
+from tests.algorithms.off_policy_problem import GAMMA, OBJECTIVES, clone_for, make_trainer
 from tests.trainers.target_env import BEST_RETURN, make_env
 
 NAMES = list(OBJECTIVES)
@@ -55,6 +59,56 @@ def test_random_actions_until_learning_starts(name):
         )
         assert same == (number == 0)
     assert update.metrics()["replay/env_states"] == 3 * 4 * 32
+
+
+def test_a_loaded_policy_acts_from_the_first_step_and_waits_for_its_critics(tmp_path):
+    """The critics begin anew at step 8, and the policy at step 16."""
+    trainer = make_trainer("fast_sac", data={"policy_starts": 16})
+    update = trainer.update
+    said = load_networks(update, clone_for("fast_sac", num_updates=1), tmp_path)
+    assert "the critic begins anew; with data.policy_starts" in said
+    networks = (update.actor, update.critic)
+    first = [[own.clone() for own in network.parameters()] for network in networks]
+    found = []
+    for _ in range(4):
+        rollout = trainer.collector.collect()
+        # Uniform actions have a std of 1.15.
+        assert rollout["action"].std() < 1.0
+        update(rollout)
+        changed = []
+        for before, network in zip(first, networks, strict=True):
+            pairs = zip(before, network.parameters(), strict=True)
+            changed.append(any(not torch.equal(a, b) for a, b in pairs))
+        found.append(changed)
+    # Of the policy, and of its critics.
+    assert found == [[False, False], [False, True], [False, True], [True, True]]
+
+
+@pytest.mark.full
+def test_the_return_of_a_cloned_policy_is_kept():
+    """Critics that know nothing take a part of the return, and little where they learn first."""
+    clone = clone_for("fast_sac", noise=0.4)
+    slow = replace(OBJECTIVES["fast_sac"], actor_learning_rate=3e-4)
+    lowest = {}
+    for starts in (0, 200):
+        trainer = make_trainer(
+            "fast_sac", objective=slow, data={"policy_starts": starts}, iterations=100
+        )
+        load_networks(trainer.update, clone, Path("clone"))
+        assert trainer.evaluator().return_mean > 0.998 * BEST_RETURN
+        returns = []
+        for number in range(100):
+            trainer.iterate()
+            if number % 3 == 0:
+                returns.append(trainer.evaluator().return_mean)
+        lowest[starts] = min(returns)
+    print(f"lowest return by policy_starts: {lowest}")
+    assert lowest[0] < 0.995 * BEST_RETURN < lowest[200]
+
+
+def test_a_policy_that_starts_before_its_critics_is_refused():
+    with pytest.raises(ValueError, match="policy_starts=8 is not beyond learning_starts=8"):
+        make_trainer("fast_sac", data={"policy_starts": 8})
 
 
 def test_weights_for_actions_of_another_range_are_refused():

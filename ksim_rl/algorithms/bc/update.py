@@ -18,10 +18,12 @@ from torchrl.envs import EnvBase
 
 from ksim_rl.algorithms.bc.demonstration import Demonstration, read_demonstration
 from ksim_rl.algorithms.gradient_steps import DatasetUpdate, in_columns
-from ksim_rl.algorithms.ppo.wiring import build_networks
+from ksim_rl.algorithms.off_policy.wiring import make_squashed_policy
+from ksim_rl.algorithms.ppo.wiring import build_networks, make_ppo_policy
 from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.signal_keys import signal_keys
-from ksim_rl.modules import update_normalizers
+from ksim_rl.modules import SquashedActorCfg, update_normalizers
+from ksim_rl.modules.bounded_actors import BoundedActor
 from ksim_rl.modules.network import ObservationNormalizer
 from ksim_rl.objectives import (
     DEMONSTRATION,
@@ -51,7 +53,12 @@ def make_bc_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "BCUpda
         raise ValueError(
             "modules.trunk: behavior cloning trains the policy alone on what was recorded: leave the trunk out"
         )
-    actor, critic = build_networks(cfg, env)
+    actor: Any
+    critic = None
+    if isinstance(cfg.modules.actor, SquashedActorCfg):
+        actor = make_squashed_policy(cfg, env)
+    else:
+        actor, critic = build_networks(cfg, env)
     device = cfg.resolved_device()
     demonstration = read_demonstration(
         Path(objective.episodes),
@@ -60,6 +67,7 @@ def make_bc_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "BCUpda
         held_out=objective.held_out,
         device=device,
     )
+    _check_within_bounds(actor, demonstration)
     return BCUpdate(
         objective,
         actor=actor,
@@ -72,11 +80,34 @@ def make_bc_update(cfg: RunCfg, env: EnvBase, resumed: object = None) -> "BCUpda
     )
 
 
+def make_bc_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
+    """Build the policy of a run: PPO's, or SAC's where `modules.actor` is of that kind."""
+    if isinstance(cfg.modules.actor, SquashedActorCfg):
+        return make_squashed_policy(cfg, env)
+    return make_ppo_policy(cfg, env)
+
+
+def _check_within_bounds(actor: TensorDictModuleBase, demonstration: Demonstration) -> None:
+    """Refuse actions that a policy with bounds can never take, which would be learned as others."""
+    for module in actor.modules():
+        if not isinstance(module, BoundedActor):
+            continue
+        action_NL = demonstration.learned_N.get("action")
+        # What is not finite is left out by the loss.
+        outside_NL = (action_NL < module.low) | (action_NL > module.high)
+        if outside_NL.any():
+            farthest = action_NL[outside_NL].abs().max().item()
+            raise ValueError(
+                f"objective.episodes: actions reach {farthest:.3g}, and the policy stays within {module.low.tolist()} "
+                f"and {module.high.tolist()}: record a policy with these bounds, or raise modules.actor.action_bound"
+            )
+
+
 class BCUpdate(DatasetUpdate):
     """Lets a policy learn the actions of a demonstration, as many env states at a time as a dataset has.
 
-    The policy is any probabilistic module that is not recurrent. What it collects teaches the critic alone. The
-    `shared` are the other arguments of `DatasetUpdate`.
+    The policy is any probabilistic module that is not recurrent. What it collects teaches the critic alone; without
+    one it is only measured. The `shared` are the other arguments of `DatasetUpdate`.
     """
 
     def __init__(
@@ -84,7 +115,7 @@ class BCUpdate(DatasetUpdate):
         cfg: BCCfg,
         *,
         actor: ProbabilisticTensorDictSequential,
-        critic: TensorDictModule,
+        critic: TensorDictModule | None,
         demonstration: Demonstration,
         **shared: Any,
     ) -> None:
@@ -92,9 +123,13 @@ class BCUpdate(DatasetUpdate):
         self.critic = critic
         self.behavior: TensorDictModuleBase = actor
         self.demonstration = demonstration
-        self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, critic=critic)
-        loss = BCAndValueLoss(BCLoss(actor, loss=cfg.loss), critic)
-        networks = {"actor": actor, "critic": critic}
+        self.bc = BCLoss(actor, loss=cfg.loss)
+        networks: dict[str, TensorDictModuleBase] = {"actor": actor}
+        loss: BCLoss | BCAndValueLoss = self.bc
+        if critic is not None:
+            self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, critic=critic)
+            networks["critic"] = critic
+            loss = BCAndValueLoss(self.bc, critic)
         super().__init__(cfg, loss=loss, networks=networks, logged=LOGGED, **shared)
         self._held_out_loss = torch.zeros((), device=self.device)
         # All that the policy ever learns from is known from the start, and read once.
@@ -109,7 +144,9 @@ class BCUpdate(DatasetUpdate):
     @property
     def rollout_keys(self) -> list[NestedKey]:
         """The leaves of an env state that an update reads."""
-        valued = self.critic.in_keys
+        valued: list[NestedKey] = []
+        if self.critic is not None:
+            valued = self.critic.in_keys
         following = [*(unravel_key(("next", key)) for key in valued), *self.signals.following]
         return list(dict.fromkeys([*observation_keys(self.actor), *valued, *following]))
 
@@ -124,21 +161,26 @@ class BCUpdate(DatasetUpdate):
         return found
 
     def _update(self) -> None:
-        valued_ET = self.advantage(self.rollout_ET)
-        valued_D = valued_ET.select(*self.critic.in_keys, VALUE_TARGET).reshape(-1)
+        valued_D = None
+        if self.critic is not None:
+            valued_ET = self.advantage(self.rollout_ET)
+            valued_D = valued_ET.select(*self.critic.in_keys, VALUE_TARGET).reshape(-1)
         steps = []
         for _ in range(self.cfg.num_epochs):
-            drawn_D = self._drawn(self.demonstration.learned_N)
-            # Each row has an env state to act in, and one to value.
-            self.dataset.extend(valued_D.copy().set(DEMONSTRATION, drawn_D))
+            rows_D = self._drawn(self.demonstration.learned_N)
+            if valued_D is not None:
+                # Each row has an env state to act in, and one to value.
+                rows_D = valued_D.copy().set(DEMONSTRATION, rows_D)
+            self.dataset.extend(rows_D)
             steps += self._epoch(self.loss)
         self._measure_(in_columns(steps))
         if self.demonstration.held_out_N is not None:
             with torch.no_grad():
-                measured = self.loss.bc(self._drawn(self.demonstration.held_out_N))
+                measured = self.bc(self._drawn(self.demonstration.held_out_N))
             self._held_out_loss.copy_(measured["loss_bc"])
         # Only now, so that all gradient steps see the statistics that values were computed with.
-        update_normalizers(self.rollout_ET, self.critic)
+        if self.critic is not None:
+            update_normalizers(self.rollout_ET, self.critic)
         # Once more: the statistics stay as they are, and weigh as much as the policy has learned from the recording.
         # Those of a short one would be swept away by the first rollouts of a run that goes on from here.
         self._weigh_recording_()

@@ -1,6 +1,6 @@
 """An off-policy iteration puts a rollout into the replay and makes gradient steps; it is one CUDA graph on CUDA."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -52,10 +52,11 @@ OF_TEMPERATURE = {"entropy": "loss/entropy", "alpha": "update/alpha"}
 class OffPolicyUpdate(RolloutUpdate):
     """Adds a rollout to the replay and improves actor and critics with minibatches of it, without a host sync.
 
-    Until each env has made `learning_starts` steps, rollouts have random actions and there are no gradient steps. From
-    then on an update is `num_minibatches` gradient steps of the critics, each followed by one of the target networks,
-    and by one of the actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`,
-    `mirror` has mirror images of the networks' inputs and of the action; `shared`, `RolloutUpdate`'s other arguments.
+    Until each env has made `learning_starts` steps, rollouts have random actions, or those of the policy whose weights
+    were loaded, and there are no gradient steps. Until `policy_starts` the critics learn alone. From then on an update
+    is `num_minibatches` gradient steps of the critics, each followed by one of the target networks, and by one of the
+    actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`, `mirror` has mirror
+    images of the networks' inputs and of the action; `shared`, `RolloutUpdate`'s other arguments.
     """
 
     def __init__(
@@ -123,8 +124,11 @@ class OffPolicyUpdate(RolloutUpdate):
         # Zero until learning starts.
         for name in logged.values():
             self._means[name] = torch.zeros((), device=self.device)
-        # Two graphs: one for rollouts that are only stored, and one that learns as well.
+        # Graphs of their own: for rollouts that are only stored, and for those that only the critics learn from.
         self._store_only = Captured(self._store, device=self.device)
+        self._critics_only = Captured(self._improve_critics, device=self.device)
+        if data.policy_starts:
+            self._work.insert(0, self._critics_only)
         self._work.insert(0, self._store_only)
 
     @property
@@ -139,9 +143,16 @@ class OffPolicyUpdate(RolloutUpdate):
         self.steps_made += self.data.num_steps
         # Counted on the host, which knows it without asking the device.
         learns = self.steps_made >= self.data.learning_starts
+        if not learns:
+            work = self._store_only
+        elif self.steps_made < self.data.policy_starts:
+            work = self._critics_only
+        else:
+            work = self._run
         with self._watched.watched():
-            (self._run if learns else self._store_only)()
-        self.behavior.random.fill_(not learns)
+            work()
+        if learns:
+            self.behavior.random.fill_(False)
 
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return the measurements of the last update; see `RolloutUpdate`."""
@@ -158,13 +169,25 @@ class OffPolicyUpdate(RolloutUpdate):
         # An env that ended an episode anywhere in the rollout explores with another scale of noise from now on.
         self.behavior.end_episodes_(rollout_ET.get(("next", "done")).squeeze(-1).any(1))
 
+    def _improve_critics(self) -> None:
+        """Store a rollout, and let the critics learn while the policy stays as it is."""
+        self._store()
+        steps = []
+        for minibatch_B in self._minibatches():
+            steps.append(self._improve_critic(minibatch_B))
+        columns = in_columns(steps)
+        longest = self._count_(columns["skipped"])
+        self._measure_(columns | {"skipped_in_a_row": longest.expand_as(columns["skipped"])})
+
+    def _minibatches(self) -> Iterator[TensorDictBase]:
+        return self.replay.minibatches(self.data.num_minibatches, read=self._read)
+
     def _update(self) -> None:
         self._store()
-        minibatches = self.replay.minibatches(self.data.num_minibatches, read=self._read)
         of_critic = []
         of_actor = []
         # The actor learns on every `policy_delay`-th minibatch, after the critics have.
-        for step, minibatch_B in enumerate(minibatches, start=1):
+        for step, minibatch_B in enumerate(self._minibatches(), start=1):
             of_critic.append(self._improve_critic(minibatch_B))
             if step % self.cfg.policy_delay == 0:
                 of_actor.append(self._improve_actor(minibatch_B))
@@ -174,12 +197,12 @@ class OffPolicyUpdate(RolloutUpdate):
         self._measure_(columns[0] | {"skipped_in_a_row": longest.expand_as(columns[0]["skipped"])})
         self._means.take_(columns[1])
 
-    def _counted_(self, of_critic_S: Tensor, of_actor: Tensor) -> Tensor:
+    def _counted_(self, of_critic_S: Tensor, of_actor: Tensor | None = None) -> Tensor:
         """Count S gradient steps, skipped if one of their parts was; return how many in a row were at most."""
         longest = torch.zeros_like(self.guard.skipped)
         delay = self.cfg.policy_delay
         for step, skipped in enumerate(of_critic_S.unbind(), start=1):
-            if step % delay == 0:
+            if of_actor is not None and step % delay == 0:
                 skipped = torch.maximum(skipped, of_actor[step // delay - 1])
             self.guard.count_(skipped)
             longest = torch.maximum(longest, self.guard.skipped_in_a_row)
@@ -259,16 +282,23 @@ class OffPolicyUpdate(RolloutUpdate):
             self.steps_made = int(state_tree.number(state, "steps_made"))
         else:
             self.steps_made = 0
-        self.behavior.random.fill_(self.steps_made < self.data.learning_starts)
+            self.behavior.random.fill_(True)
+        if self.steps_made >= self.data.learning_starts:
+            self.behavior.random.fill_(False)
 
     def load_weights(self, state: State) -> None:
-        """Take networks and temperature of a `state_dict`; a ValueError names a tensor or action bound that differs."""
+        """Take networks and temperature of a `state_dict`; a ValueError names a tensor or action bound that differs.
+
+        The loaded policy also makes the first rollouts, before learning starts: random ones would tell the critics
+        nothing about it (WSRL, Zhou et al., arXiv 2412.07762).
+        """
         # Before any weight is copied.
         self._check_action_bounds(branch(state, "actor"))
         super().load_weights(state)
         if isinstance(self.loss, SACLoss):
             with torch.no_grad():
                 self.loss.log_alpha.copy_(state_tree.tensor(state, "log_alpha"))
+        self.behavior.random.fill_(False)
 
     def _check_action_bounds(self, saved: State) -> None:
         """Refuse an actor that was trained for other actions: its bounds are not weights, and come from the config."""

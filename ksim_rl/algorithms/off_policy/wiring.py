@@ -1,5 +1,6 @@
 """Builds SAC, TD3 and their fast variants for a run: networks, loss, exploration and update."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -23,7 +24,7 @@ from ksim_rl.modules import (
     make_q_network,
     make_squashed_actor,
 )
-from ksim_rl.modules.bounded_actors import BoundedActor
+from ksim_rl.modules.bounded_actors import BoundedActor, BoundedActorCfg
 from ksim_rl.objectives import OffPolicyLoss, SACCfg, SACLoss, TD3Loss
 from ksim_rl.trainers.algorithm import Algorithm, part_of
 from ksim_rl.trainers.run_cfg import RunCfg
@@ -86,15 +87,26 @@ def make_off_policy_update(
 def make_off_policy_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
     """Build the policy of a run: with SAC's settings one that draws its actions, with TD3's one that does not."""
     # The settings of the algorithm decide the kind of policy, which the config of the networks has to match.
-    draws = isinstance(cfg.objective, SACCfg)
-    if draws:
-        make: Any = make_squashed_actor
-    else:
-        make = make_deterministic_actor
+    if isinstance(cfg.objective, SACCfg):
+        return make_squashed_policy(cfg, env)
+    return _bounded_policy(cfg, env, make_deterministic_actor, DeterministicActorCfg)
+
+
+def make_squashed_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
+    """Build the policy of a run as SAC has it, whatever its objective is."""
+    return _bounded_policy(cfg, env, make_squashed_actor, SquashedActorCfg)
+
+
+def _bounded_policy(
+    cfg: RunCfg,
+    env: EnvBase,
+    make: Callable[..., TensorDictModuleBase],
+    kind: type[BoundedActorCfg],
+) -> TensorDictModuleBase:
     with naming("modules.actor"):
         return make_for_spec(
             make,
-            part_of(cfg, "modules.actor", SquashedActorCfg if draws else DeterministicActorCfg),
+            part_of(cfg, "modules.actor", kind),
             env.observation_spec,
             action_spec=env.action_spec,
             device=cfg.resolved_device(),
