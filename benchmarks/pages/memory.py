@@ -8,12 +8,13 @@ ROBOTS = {
     "Go1 on flat ground, 12 joints": "h200/go1_velocity_flat/4096",
     "G1 on flat ground, 29 joints": "h200/g1_velocity_flat/4096",
 }
-# Bytes in an env: colours take one each, distances four.
+# Bytes in a frame, of which colours take one each and distances four, and the frames of an observation.
 PICTURES = {
-    "64 x 64 RGB": 64 * 64 * 3,
-    "64 x 64 RGB, 3 frames": 3 * 64 * 64 * 3,
-    "64 x 64 depth": 64 * 64 * 4,
-    "128 x 128 RGB": 128 * 128 * 3,
+    "64 x 64 RGB": (64 * 64 * 3, 1),
+    "64 x 64 RGB, 3 frames": (64 * 64 * 3, 3),
+    "64 x 64 depth": (64 * 64 * 4, 1),
+    "64 x 64 depth, 3 frames": (64 * 64 * 4, 3),
+    "128 x 128 RGB": (128 * 128 * 3, 1),
 }
 ENVS = 4096
 STEPS = 24
@@ -52,10 +53,12 @@ def of_many() -> str:
 def pictures() -> str:
     """Return the table of what pictures take, computed from their sizes."""
     rows = []
-    for name, size in PICTURES.items():
+    for name, (frame, num_frames) in PICTURES.items():
+        size = frame * num_frames
         # A rollout, and the dataset that is a copy of it; a critic that sees reads the state that follows, too.
         rollout = 2 * STEPS * ENVS * size
-        gigabytes = [rollout, 2 * rollout, REPLAYED * ENVS * size]
+        # A replay holds each frame once, though it is in several stacks.
+        gigabytes = [rollout, 2 * rollout, REPLAYED * ENVS * frame]
         cells = [f"{number / 1e9:.1f}" for number in gigabytes]
         rows.append([name, f"{size / 1000:.1f}", *cells])
     columns = ("kB per env state", "policy sees", "critic too", "replay")

@@ -1,5 +1,6 @@
 """Keeps the last env states of each env in a ring, which stores each observation once."""
 
+from collections.abc import Mapping
 from os import PathLike
 from typing import Any
 
@@ -13,6 +14,7 @@ from torchrl.data.replay_buffers.storages import Storage
 from ksim_rl import dims
 from ksim_rl.data.dataset_storage import MASK_KEY, DatasetWriter
 from ksim_rl.data.epoch_sampler import Entries
+from ksim_rl.data.frame_stacks import FrameStacks
 from ksim_rl.device.state_tree import State, branch, copy_into, tensor, tensors
 
 REWARD: NestedKey = ("next", "reward")
@@ -61,10 +63,13 @@ class ReplayStorage(SavedByStateDict, Storage):
         observations: list[NestedKey],
         n_step: int = 1,
         gamma: float = 0.99,
+        stacks: Mapping[NestedKey, int] | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
+        self.capacity = capacity
+        self.stacks = FrameStacks(stacks or {}, num_envs=num_envs)
         # One more, for the newest observation, whose env state is not complete yet.
-        self.places = capacity + 1
+        self.places = capacity + 1 + self.stacks.reach
         super().__init__(self.places * num_envs)
         self.num_envs = num_envs
         self.n_step = n_step
@@ -78,6 +83,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         self.filled_E = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.non_finite_count = torch.zeros((), dtype=torch.int64, device=self.device)
         self._env_E = torch.arange(num_envs, device=self.device)
+        self.stacks.size_(self.max_size, self.device)
 
     def index(
         self, env: Int64[Tensor, "*batch"], age: Int64[Tensor, "*batch"]
@@ -93,9 +99,9 @@ class ReplayStorage(SavedByStateDict, Storage):
                 f"the rollout has batch_size {tuple(rollout_ET.batch_size)}: expected [{self.num_envs}, T]"
             )
         length = rollout_ET.shape[1]
-        if self.places < 2 * length + self.n_step:
+        if self.capacity + 1 < 2 * length + self.n_step:
             raise ValueError(
-                f"a rollout of {length} steps can overwrite itself in a ring of {self.places - 1} env states per env: "
+                f"a rollout of {length} steps can overwrite itself in a ring of {self.capacity} env states per env: "
                 f"capacity must be at least {2 * length + self.n_step - 1}"
             )
         if self.content is None:
@@ -107,32 +113,40 @@ class ReplayStorage(SavedByStateDict, Storage):
         places_ET = 1 + done_ET.to(torch.int64)
         # Places taken by the rollout before each step, so that all of it is written in one go.
         before_ET = places_ET.cumsum(1) - places_ET
-        place_ET = self.head_E[:, None] + before_ET
+        self._cut_where_not_continued(rollout_ET)
+        depth_E, skipped_E = self._begin_stacks(rollout_ET)
+        place_ET = (self.head_E + skipped_E)[:, None] + before_ET
         # A place of an env is a row of the storage at place * num_envs + env.
         index_N = (place_ET % self.places * self.num_envs + self._env_E[:, None]).flatten()
         following_N = (
             (place_ET + 1) % self.places * self.num_envs + self._env_E[:, None]
         ).flatten()
 
-        self._cut_where_not_continued(rollout_ET)
+        if self.stacks.reach:
+            depth_N = self.stacks.depths(depth_E, done_ET).flatten()
+            # Successors first, as for the env states below.
+            self.stacks.depth[following_N] = (depth_N + 1).clamp_max(self.stacks.reach)
+            self.stacks.depth[index_N] = depth_N
         # One element that is not finite makes its env state invalid, whichever leaf it is in.
         finite_N = torch.ones(self.num_envs * length, dtype=torch.bool, device=self.device)
         for key, leaf in self.content.items(True, True):
             if key in self.observations:
                 # The successor of a rollout's last env state is the newest observation, until the next rollout
                 # brings it as its first.
-                finite_N &= self._put(leaf, following_N, rollout_ET.get(_next(key)))
-            finite_N &= self._put(leaf, index_N, rollout_ET.get(key))
+                finite_N &= self._put(key, leaf, following_N, rollout_ET.get(_next(key)))
+            finite_N &= self._put(key, leaf, index_N, rollout_ET.get(key))
         # First all successors, of which many are env states of this rollout and become available next.
-        self.available.index_fill_(0, following_N, False)
+        self._make_unavailable(following_N)
         self.available.index_copy_(0, index_N, finite_N)
         self.non_finite_count.add_((~finite_N).sum())
         # In place: a captured write finds the next places where this one has left them.
-        taken_E = places_ET.sum(1)
+        taken_E = places_ET.sum(1) + skipped_E
         self.head_E.add_(taken_E).remainder_(self.places)
-        self.filled_E.add_(taken_E).clamp_max_(self.places - 1)
+        # Places before the first env state of all are never drawn.
+        taken_E = torch.where(self.filled_E > 0, taken_E, taken_E - skipped_E)
+        self.filled_E.add_(taken_E).clamp_max_(self.capacity)
         # After the end of an episode the newest observation's place still has its env state of a round ago.
-        self.available.index_fill_(0, self._head_index(), False)
+        self._make_unavailable(self._head_index())
         return index_N
 
     @torch.no_grad()
@@ -148,9 +162,9 @@ class ReplayStorage(SavedByStateDict, Storage):
         for key, leaf in self.content.items(True, True):
             # Rewards and flags cover all steps up to the successor, and are set below.
             if key not in _LEAVES:
-                sample.set(key, leaf[index_B])
+                sample.set(key, self.stacks.read(key, leaf, index_B))
             if key in self.observations:
-                sample.set(_next(key), leaf[following_B])
+                sample.set(_next(key), self.stacks.read(key, leaf, following_B))
         sample.set(REWARD, reward_B[:, None])
         sample.set(DONE, done_B[:, None])
         sample.set(TERMINATED, terminated_B[:, None])
@@ -180,12 +194,15 @@ class ReplayStorage(SavedByStateDict, Storage):
         return {} if self.content is None else self.content.flatten_keys("/").to_dict()
 
     def _counters(self) -> dict[str, Tensor]:
-        return {
+        counters = {
             "available": self.available,
             "head": self.head_E,
             "filled": self.filled_E,
             "non_finite_count": self.non_finite_count,
         }
+        if self.stacks.reach:
+            counters["depth"] = self.stacks.depth
+        return counters
 
     @torch.no_grad()
     def load_state_dict(self, state_dict: State) -> None:
@@ -194,7 +211,8 @@ class ReplayStorage(SavedByStateDict, Storage):
         if available.shape != self.available.shape:
             raise ValueError(
                 f"the checkpoint's replay has {available.numel()} places, this run's "
-                f"{self.max_size}: num_envs and data.capacity must be the checkpoint's"
+                f"{self.max_size}: num_envs, data.capacity and stacked frames must be the checkpoint's; before 0.2 "
+                "replays held whole stacks"
             )
         # The ring may not exist yet in this run, or be filled where the checkpoint's is empty.
         content = tensors(branch(state_dict, "content"))
@@ -228,6 +246,8 @@ class ReplayStorage(SavedByStateDict, Storage):
         kept_ET = rollout_ET.select(
             *(key for key in produced if key[0] != "next" or key in _LEAVES)
         )
+        for key in self.stacks.num_frames:
+            kept_ET.set(key, self.stacks.newest(key, kept_ET.get(key)))
         # Asked for as a whole first: a refusal then names the size of all of it, and not of its first leaf.
         row = sum(leaf[0, 0].nbytes for leaf in kept_ET.values(True, True))
         torch.empty(self.max_size * row, dtype=torch.uint8, device=self.device)
@@ -242,23 +262,51 @@ class ReplayStorage(SavedByStateDict, Storage):
         assert self.content is not None
         head_E = self._head_index()
         # The env was not reset in between if its newest observation is the first one of this rollout.
-        newest_E = self.index(self._env_E, torch.ones_like(self._env_E))
-        continued_E = self.available[newest_E]
+        last_E = self.index(self._env_E, torch.ones_like(self._env_E))
+        continued_E = self.available[last_E]
         for key in self.observations:
-            same = self.content.get(key)[head_E] == rollout_ET.get(key)[:, 0]
+            newest_E = self.stacks.read(key, self.content.get(key), head_E)
+            same = newest_E == rollout_ET.get(key)[:, 0]
             continued_E = continued_E & same.reshape(self.num_envs, -1).all(1)
         # After the end of an episode the newest env state lies one place further back, with all that follows it.
-        self.available.index_copy_(0, newest_E, continued_E)
+        self.available.index_copy_(0, last_E, continued_E)
 
-    @staticmethod
-    def _put(leaf: Tensor, index_N: Tensor, values_ET: Tensor) -> Tensor:
+    def _begin_stacks(self, rollout_ET: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return the depth of each env's first stacks, and how many places their older frames have taken, each [E]."""
+        assert self.content is not None
+        depth_E = torch.zeros_like(self.head_E)
+        if not self.stacks.reach:
+            return depth_E, depth_E
+        first = {key: _finite(rollout_ET.get(key)[:, 0]) for key in self.stacks.num_frames}
+        content: Any = {key: self.content.get(key) for key in first}
+        depth_E, lacks_E = self.stacks.begun(first, content, self._head_index())
+        skipped_E = lacks_E * self.stacks.reach
+        for steps_ago in range(self.stacks.reach + 1):
+            place_E = (self.head_E + skipped_E - steps_ago) % self.places
+            row_E = place_E * self.num_envs + self._env_E
+            self.stacks.put_older_(content, first, row_E, steps_ago=steps_ago, where_E=lacks_E)
+            # Frames alone are no env state, and take the place of one; rows of other envs stay as they are.
+            for taken_E in (row_E, self._beyond(row_E)):
+                self.available[taken_E] = self.available[taken_E] & ~lacks_E
+        return depth_E, skipped_E
+
+    def _put(self, key: NestedKey, leaf: Tensor, index_N: Tensor, values_ET: Tensor) -> Tensor:
         """Write rows, and return which were finite, bool [N]; other elements become zero."""
-        values_N = values_ET.flatten(0, 1).to(leaf.dtype)
+        leaf[index_N] = _finite(self.stacks.newest(key, values_ET).flatten(0, 1).to(leaf.dtype))
         if not leaf.is_floating_point():
-            leaf[index_N] = values_N
             return torch.ones_like(index_N, dtype=torch.bool)
-        leaf[index_N] = values_N.nan_to_num(0.0, 0.0, 0.0)
-        return values_N.isfinite().reshape(index_N.numel(), -1).all(1)
+        # All frames of a stack, of which the older ones have been refused with their own env states.
+        return values_ET.isfinite().reshape(index_N.numel(), -1).all(1)
+
+    def _make_unavailable(self, row_N: Tensor) -> None:
+        """Mark rows that hold no env state yet, and those of env states whose place they take."""
+        self.available.index_fill_(0, row_N, False)
+        if self.stacks.reach:
+            self.available.index_fill_(0, self._beyond(row_N), False)
+
+    def _beyond(self, row_N: Tensor) -> Tensor:
+        """Return the rows of the env states that no longer count: only their frames do, for those that follow."""
+        return (row_N + self.stacks.reach * self.num_envs) % self.max_size
 
     def _return(self, start_B: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the sum of rewards, done, terminated and the number of steps to the successor, each [B]."""
@@ -280,6 +328,13 @@ class ReplayStorage(SavedByStateDict, Storage):
             steps_B = steps_B + going_B
             going_B = going_B & ~dones[index_B]
         return reward_B, done_B, terminated_B, steps_B
+
+
+def _finite(leaf: Tensor) -> Tensor:
+    """Return a leaf with zeros where it is not finite."""
+    if leaf.is_floating_point():
+        return leaf.nan_to_num(0.0, 0.0, 0.0)
+    return leaf
 
 
 class ReplayWriter(DatasetWriter):

@@ -113,7 +113,7 @@ def _dealt_one(name: str, parts: list[Tensors], live: Tensor | None) -> Tensor:
         return total
     # A replay keeps [places * E, ...]: envs are joined and cut within each place.
     update, found, leaf = name.partition(_RING)
-    if found and leaf.startswith(("available", "content/")):
+    if found and leaf.startswith(("available", "depth", "content/")):
         num_envs = len(parts[0][f"{update}{_RING}head"])
         rings_PE = torch.cat([rows.unflatten(0, (-1, num_envs)) for rows in tensors], 1)
         return rings_PE.chunk(size(), 1)[rank()].flatten(0, 1)

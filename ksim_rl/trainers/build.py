@@ -28,6 +28,7 @@ from ksim_rl.trainers.recorders import make_recorders, recorded_keys
 from ksim_rl.trainers.run_cfg import RunCfg, with_engine
 from ksim_rl.trainers.sources import check_targets
 from ksim_rl.trainers.trainer import Hook, Trainer
+from ksim_rl.transforms import stacked_frames
 
 # Evaluations see other initial states than training does.
 EVALUATION_SEED_OFFSET = 1_000_003
@@ -126,19 +127,21 @@ def build(
 
 def _check_rollout(cfg: RunCfg, env: EnvBase, keys: Sequence[NestedKey]) -> None:
     """Refuse rollouts, and a replay, whose observations alone no memory holds, before the first of their steps."""
-    now = following = 0
+    now = following = kept = 0
+    stacks = stacked_frames(env)
     for key, leaf in env.observation_spec.items(include_nested=True, leaves_only=True):
         # Of one env state.
         size = leaf.shape.numel() * leaf.dtype.itemsize // cfg.num_envs
         if key in keys:
             now += size
+            kept += size // stacks.get(key, 1)
         if unravel_key(("next", key)) in keys:
             following += size
     length = cfg.data.rollout_length(cfg.num_envs)
     needed = length * cfg.num_envs * (now + following)
-    # A replay keeps each observation once; the dataset of an update that copies none is the rollout.
+    # A replay keeps each observation once, and of stacked ones each frame; an update that copies none has the rollout.
     if isinstance(cfg.data, ReplayCfg):
-        needed += cfg.data.capacity * cfg.num_envs * now
+        needed += cfg.data.capacity * cfg.num_envs * kept
     check_bytes(
         f"rollouts of {length} steps, by {cfg.data}, with {now + following:,} bytes of observations in each env state",
         needed,

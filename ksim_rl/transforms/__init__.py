@@ -25,7 +25,7 @@ from ksim_rl.transforms.groups.groups import (
     group_specs,
     observation_columns,
 )
-from ksim_rl.transforms.history import HistoryCfg, ObservationHistory
+from ksim_rl.transforms.history import HistoryCfg, ObservationHistory, stacked_frames
 from ksim_rl.transforms.hold import ObservationHold
 from ksim_rl.transforms.low_pass import ActionLowPass
 from ksim_rl.transforms.mirror.mirror import (

@@ -6,8 +6,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Transform
 
 from ksim_rl.checked import Checked, Count
 from ksim_rl.transforms import ring
@@ -202,3 +205,37 @@ class ObservationHistory(RingTransform):
         if self.flat:
             return stacked.flatten(inner)
         return stacked
+
+
+def stacked_frames(env: EnvBase) -> dict[NestedKey, int]:
+    """Return how many frames each observation [E, N, ...] stacks of which every one is the newest of an earlier step.
+
+    Those are the results of an `ObservationHistory` with `flat=False` and a stride of 1 that nothing changes after it.
+    A transform of a user's own behind it may change anything, so nothing is said then.
+    """
+    assert env.output_spec is not None  # making the specs is what counts the dims
+    found: dict[NestedKey, int] = {}
+    for transform in _from_inside(env):
+        # Only of these the out keys are known to be all that they write.
+        if type(transform).__module__.partition(".")[0] not in ("ksim_rl", "torchrl"):
+            found.clear()
+        for key in transform.out_keys or ():
+            found.pop(unravel_key(key), None)
+        if not isinstance(transform, ObservationHistory) or transform.flat or transform.stride > 1:
+            continue
+        for key, batch_dims in zip(transform.out_keys, transform.batch_dims, strict=True):
+            # The frames of several agents stand behind the dim of agents.
+            if batch_dims == 1:
+                found[unravel_key(key)] = transform.length
+    return found
+
+
+def _from_inside(env: EnvBase) -> list[Transform]:
+    """Return the transforms of an env in the order in which they are applied."""
+    transforms: list[Transform] = []
+    inner: Any = env
+    while isinstance(inner, TransformedEnv):
+        own = [module for module in inner.transform.modules() if isinstance(module, Transform)]
+        transforms = [*own, *transforms]
+        inner = inner.base_env
+    return transforms

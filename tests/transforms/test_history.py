@@ -1,11 +1,17 @@
 import pytest
 import torch
 from torchrl.data import Unbounded
-from torchrl.envs.transforms import CatFrames, Compose
+from torchrl.envs.transforms import CatFrames, Compose, Transform
 
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.testing import CounterEnv
-from ksim_rl.transforms import DelayCfg, ObservationDelay, ObservationHistory
+from ksim_rl.transforms import (
+    DelayCfg,
+    ObservationDelay,
+    ObservationHistory,
+    ObservationScale,
+    stacked_frames,
+)
 from tests.transforms.chains import VECTOR, counter, fixed_rollout
 
 
@@ -126,3 +132,37 @@ def test_wrong_lengths_are_refused(length):
         ObservationHistory("count", length=length)
     with pytest.raises(ValueError, match="stride="):
         ObservationHistory("count", length=2, stride=length)
+
+
+class _Own(Transform):
+    """A user's transform, which may write whatever it likes."""
+
+    def _call(self, next_tensordict):
+        return next_tensordict
+
+
+@pytest.mark.parametrize(
+    ("chain", "found"),
+    [
+        ([ObservationHistory("count", length=3, flat=False)], {"count": 3}),
+        ([_Own(), ObservationHistory([VECTOR], ["a"], length=2, flat=False)], {"a": 2}),
+        ([ObservationHistory("count", length=3)], {}),
+        # The frames between those of a larger stride are in no stack.
+        ([ObservationHistory("count", length=3, stride=2, flat=False)], {}),
+        # The newest frames of late or changed stacks are not those of the steps before.
+        *(
+            ([ObservationHistory(["count", "drawn"], length=2, flat=False), behind], {"drawn": 2})
+            for behind in (
+                ObservationDelay("count", delay=DelayCfg(max_lag=1)),
+                ObservationScale("count", scale=2.0),
+            )
+        ),
+        ([ObservationHistory("count", length=3, flat=False), _Own()], {}),
+    ],
+)
+def test_only_stacks_that_nothing_changes_are_known_as_such(chain, found):
+    env = counter(*(transform.clone() for transform in chain))
+    assert stacked_frames(env) == found
+    # Further inside of stock envs as well.
+    outer = MaskedTransformedEnv(env, [ObservationScale("episode", scale=2.0)])
+    assert stacked_frames(outer) == found

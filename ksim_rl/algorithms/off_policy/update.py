@@ -56,7 +56,8 @@ class OffPolicyUpdate(RolloutUpdate):
     were loaded, and there are no gradient steps. Until `policy_starts` the critics learn alone. From then on an update
     is `num_minibatches` gradient steps of the critics, each followed by one of the target networks, and by one of the
     actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`, `mirror` has mirror
-    images of the networks' inputs and of the action; `shared`, `RolloutUpdate`'s other arguments.
+    images of the networks' inputs and of the action. Of observations that `stacks` knows to be so many frames (see
+    `stacked_frames`), the replay holds each frame once. `shared`: `RolloutUpdate`'s other arguments.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class OffPolicyUpdate(RolloutUpdate):
         data: ReplayCfg,
         num_envs: int,
         mirror: Mapping[NestedKey, MirrorMap] | None = None,
+        stacks: Mapping[NestedKey, int] | None = None,
         **shared: Any,
     ) -> None:
         if data.num_minibatches % cfg.policy_delay:
@@ -106,6 +108,9 @@ class OffPolicyUpdate(RolloutUpdate):
             num_envs=num_envs,
             observations=self._observations,
             gamma=cfg.gamma,
+            stacks={
+                key: number for key, number in (stacks or {}).items() if key in self._observations
+            },
             device=self.device,
         )
         # The optimizer of the critics moves the targets in the same step.

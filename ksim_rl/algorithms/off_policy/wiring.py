@@ -28,6 +28,7 @@ from ksim_rl.modules.bounded_actors import BoundedActor, BoundedActorCfg
 from ksim_rl.objectives import OffPolicyLoss, SACCfg, SACLoss, TD3Loss
 from ksim_rl.trainers.algorithm import Algorithm, part_of
 from ksim_rl.trainers.run_cfg import RunCfg
+from ksim_rl.transforms import stacked_frames
 
 
 def make_off_policy_update(
@@ -81,6 +82,7 @@ def make_off_policy_update(
         device=cfg.resolved_device(),
         mirror=mirror_maps(env, loss.observation_keys) if objective.symmetry != "none" else None,
         signals=signal_keys(env),
+        stacks=stacked_frames(env),
     )
 
 
