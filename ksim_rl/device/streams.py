@@ -17,7 +17,11 @@ import torch
 import warp as wp
 
 from ksim_rl.device.kernel_cache import mend_damages
-from ksim_rl.device.upstream import ABSENT_DRIVER, current_stream_handle
+from ksim_rl.device.upstream import (
+    ABSENT_DRIVER,
+    current_stream_handle,
+    keep_templates_in_header,
+)
 
 CPU_LOCK = threading.RLock()
 
@@ -31,6 +35,8 @@ def start_warp() -> None:
     A run on the CPU is no fault, and who asks for CUDA there is refused by name. The complaint is written by native
     code, so it can be told from other messages only on the file descriptor.
     """
+    # Before Warp starts, as it forgets then which flags modules had so far.
+    keep_templates_in_header()
     # Python's own buffer goes out first, so that it is not caught.
     sys.stderr.flush()
     stderr = os.dup(2)

@@ -31,6 +31,8 @@ ABSENT_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 # Warp 1.19 raises a bare exception with these words where the file of a compiled module is none.
 UNLOADABLE = "Failed to load "
+# Clang's, which Warp 1.19 carries.
+TEMPLATES_IN_HEADER = "-fpch-instantiate-templates"
 
 
 def current_stream_handle(device: torch.device) -> int:
@@ -92,6 +94,20 @@ def with_preamble(text: str) -> wp.ModuleBuildOptions:
     Warp calls them experimental. Checked with Warp 1.19.
     """
     return wp.ModuleBuildOptions(extra_cpu_preamble=text, extra_cuda_preamble=text)
+
+
+def keep_templates_in_header() -> None:
+    """Let Warp's precompiled header hold what its templates come to.
+
+    Without the flag each module for the CPU works them out again, in 0.09 s of the 0.1 to 0.2 s that one takes. The
+    machine code is the same, byte for byte. Checked with Warp 1.19.
+    """
+    # Warp's meaning of None.
+    flags = wp.config.cpu_compiler_flags
+    if flags is None:
+        flags = "-march=native"
+    if TEMPLATES_IN_HEADER not in flags.split():
+        wp.config.cpu_compiler_flags = f"{flags} {TEMPLATES_IN_HEADER}".lstrip()
 
 
 def watch_loads(mend: Callable[[Path, Exception, int], None]) -> None:

@@ -2,12 +2,16 @@
 
 import inspect
 import re
+import time
+from pathlib import Path
 
 import pytest
 import torch
 import warp as wp
+from warp._src.build import build_cpu
 
 from ksim_rl.device import upstream
+from ksim_rl.device.streams import start_warp
 
 
 @wp.struct
@@ -65,6 +69,60 @@ def test_modules_load_by_device_and_block_from_a_folder_of_the_cache() -> None:
     )
     folder = take_pair.module.get_module_identifier(1)
     assert folder.startswith("wp_"), "warp.Module.get_module_identifier names something else"
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (None, "-march=native -fpch-instantiate-templates"),
+        ("", "-fpch-instantiate-templates"),
+        (
+            "-march=native -fno-vectorize",
+            "-march=native -fno-vectorize -fpch-instantiate-templates",
+        ),
+    ],
+)
+def test_flags_of_the_user_stay_beside_that_of_templates(
+    before: str | None, after: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wp.config, "cpu_compiler_flags", before)
+    # A second call adds nothing.
+    for _ in range(2):
+        upstream.keep_templates_in_header()
+        assert wp.config.cpu_compiler_flags == after
+
+
+def test_what_is_compiled_after_the_start_keeps_templates_in_the_header() -> None:
+    start_warp()
+    assert upstream.TEMPLATES_IN_HEADER in wp.config.cpu_compiler_flags.split()
+    options = take_pair.module.resolve_options(wp.config)
+    assert upstream.TEMPLATES_IN_HEADER in options["cpu_compiler_flags"], (
+        "warp.config.cpu_compiler_flags no longer reaches modules"
+    )
+
+
+@pytest.mark.full
+def test_templates_in_the_header_are_not_worked_out_for_each_module(tmp_path: Path) -> None:
+    start_warp()
+    source = tmp_path / "empty.cpp"
+    source.write_text("int nothing() { return 0; }")
+    seconds = {}
+    for flags in ("-march=native", f"-march=native {upstream.TEMPLATES_IN_HEADER}"):
+        # The first one writes the header.
+        for _ in range(3):
+            start = time.thread_time()
+            build_cpu(
+                str(tmp_path / "empty.o"),
+                str(source),
+                optimization_level=0,
+                use_precompiled_headers=True,
+                pch_dir=str(tmp_path),
+                block_dim=1,
+                extra_flags=flags,
+            )
+            seconds[flags] = time.thread_time() - start
+    without, with_templates = seconds.values()
+    assert with_templates < without / 3, "Clang's -fpch-instantiate-templates does nothing any more"
 
 
 def test_diversion_ends_with_its_block() -> None:
