@@ -15,13 +15,13 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from ksim_rl.checked import Positive, Within, parts
+from ksim_rl.checks import near
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm, ObservationTerm, Term, TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import GaussianReward, OfJoints
 from ksim_rl.scene import quaternion
-from ksim_rl.scene.motions.motion import ReferenceMotion
 from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.state.motion_clock import (
     motion_bodies,
@@ -215,33 +215,85 @@ class ResetToMotion(OfMotion, EventTerm):
         return trained_C[place_E.clamp(max=len(trained) - 1)]
 
 
+@dataclass(frozen=True, kw_only=True)
+class ResetByChoice(ResetToMotion):
+    """Begin each episode in the clip, and at the time, that are chosen for its env.
+
+    Whoever chooses writes both buffers, or calls `choose`.
+
+    Attributes:
+        clip: of a set of motions, the one that is chosen at first; empty: the first.
+    """
+
+    clip: str = ""
+
+    def _check_fields(self) -> None:
+        super()._check_fields()
+        if self.start_range != (0.0, 1.0):
+            raise ValueError(
+                f"start_range={self.start_range}: a {type(self).__name__} begins where it is told, and draws nothing: "
+                "leave it out"
+            )
+
+    def chosen_clip(self, view: EnvView) -> Int64[Tensor, " E"]:
+        """Return the buffer of the clip that is chosen for each env."""
+        names = view.motion(self.file).names
+        place = 0
+        if self.clip:
+            if self.clip not in names:
+                raise ValueError(
+                    f"motion {self.file}: no clip {self.clip!r}: {near(self.clip, names)}"
+                )
+            place = names.index(self.clip)
+        return view.buffers.get(
+            f"motion/{self.file}.chosen_clip_E",
+            dtype=torch.int64,
+            keep=True,
+            initial=constant((float(place),), view.device).long(),
+        )
+
+    def chosen_time(self, view: EnvView) -> Float[Tensor, " E"]:
+        """Return the buffer of when in its clip each env is to begin, s."""
+        return view.buffers.get(f"motion/{self.file}.chosen_time_E", keep=True)
+
+    def choose(self, view: EnvView, clip: int, time_s: float) -> None:
+        """Let all envs begin at this time of this clip when they are reset next."""
+        self.chosen_clip(view).fill_(clip)
+        self.chosen_time(view).fill_(time_s)
+
+    def begin_time(self, view: EnvView, duration_E: Float[Tensor, "*E"]) -> Float[Tensor, " E"]:
+        """Return when in its clip each env begins now, s; the clips last `duration_E`."""
+        return torch.minimum(self.chosen_time(view).clamp(min=0.0), duration_E)
+
+    def draw_start(self, view: EnvView) -> tuple[Int64[Tensor, " E"] | None, Float[Tensor, " E"]]:
+        """Return what was chosen."""
+        motion = view.motion(self.file)
+        clip_E = self.chosen_clip(view)
+        duration_E = motion.duration_of(clip_E)
+        share_E = self.begin_time(view, duration_E) / duration_E
+        return (clip_E if len(motion.names) > 1 else None), share_E
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowMotion(ResetByChoice):
+    """Put the whole scene into the state that the chosen clip has at this env step; from its end it begins again.
+
+    In an env whose episodes last one step it plays the motion exactly: `showing_motion` makes one of any config.
+    """
+
+    def choose(self, view: EnvView, clip: int, time_s: float) -> None:
+        """Let all envs be at this time of this clip now, and go on from there."""
+        super().choose(view, clip, time_s)
+        self.chosen_time(view).sub_(view.step_count * view.step_dt)
+
+    def begin_time(self, view: EnvView, duration_E: Float[Tensor, "*E"]) -> Float[Tensor, " E"]:
+        """Return how far the env steps have come since the time that was chosen, s."""
+        passed_E = self.chosen_time(view) + view.step_count * view.step_dt
+        return torch.remainder(passed_E, duration_E)
+
+
 def with_motions_in_use(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
     """Return a config some of whose terms were taken away, without the sets of motions that no other one names."""
     named = {file for _, part in parts(cfg) for file in part.data_files()}
     motions = {name: chosen for name, chosen in cfg.scene.motions.items() if name in named}
     return dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, motions=motions))
-
-
-def one_motion(view: EnvView, file: str) -> ReferenceMotion:
-    """Return a motion for a term that shows it from its start to its end; a ValueError if it has several clips."""
-    motion = view.motion(file)
-    if len(motion.names) > 1:
-        raise ValueError(
-            f"file={file!r}: a set of {len(motion.names)} motions, of which one can be shown: name its file"
-        )
-    return motion
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShowMotion(OfMotion, EventTerm):
-    """Put the whole scene into the state that a reference motion has at this env step; from its end it begins again.
-
-    In an env whose episodes last one step it plays the motion exactly: `showing_motion` makes one of any config.
-    """
-
-    def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
-        motion = one_motion(view, self.file)
-        passed = torch.remainder(view.step_count * view.step_dt, motion.duration_s)
-        qpos_EL, qvel_EL = motion.sample(passed.to(torch.float32).expand(view.num_envs))
-        view.write_qpos(mask_E, qpos_EL if motion_shift(view) is None else view.at_origins(qpos_EL))
-        view.write_qvel(mask_E, qvel_EL)

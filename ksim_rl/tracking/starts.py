@@ -13,7 +13,7 @@ from ksim_rl.checked import NonNegative, Positive, Share
 from ksim_rl.envs.term import CurriculumTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.events import Ranges, draw_by_axis
-from ksim_rl.mdp.motion_tracking import OfMotion, ResetToMotion
+from ksim_rl.mdp.motion_tracking import OfMotion, ResetByChoice, ResetToMotion
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.state.motion_clock import motion_clip, motion_end, motion_time
 
@@ -96,11 +96,6 @@ def part_weights(view: EnvView, file: str, parts: Parts) -> Float[Tensor, " B"]:
     return view.shared(f"motion/{file}.part_weights_B", zeros, of_curriculum=True)
 
 
-def trial_clip(view: EnvView, file: str) -> Int64[Tensor, " E"]:
-    """Return the buffer of the clip that each env tries; who runs trials writes it before they begin."""
-    return view.buffers.get(f"motion/{file}.trial_clip_E", dtype=torch.int64, keep=True)
-
-
 @dataclass(frozen=True, kw_only=True)
 class StartInMotion(ResetToMotion):
     """Put the first robot into a state of the motion, plus drawn errors of the root and of each joint.
@@ -177,14 +172,21 @@ class StartInMotion(ResetToMotion):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StartOfTrial(StartInMotion):
-    """Begin each episode at the start of the clip that `trial_clip` says, with the errors of `StartInMotion`."""
+class StartOfTrial(ResetByChoice, StartInMotion):
+    """Begin each episode in the chosen clip, at its start or a chosen time, with the errors of `StartInMotion`."""
 
-    def draw_clip(self, view: EnvView) -> Int64[Tensor, " E"] | None:
-        """Return the clip of each env's trial; None where the motion is a single one."""
-        if motion_clip(view, self.file) is None:
-            return None
-        return trial_clip(view, self.file)
+    def _check_fields(self) -> None:
+        super()._check_fields()
+        if self.part_s is not None:
+            raise ValueError(
+                f"part_s={self.part_s:g}: a StartOfTrial begins where it is told, and draws no part: set it to null"
+            )
+
+    def draw_start(self, view: EnvView) -> tuple[Int64[Tensor, " E"] | None, Float[Tensor, " E"]]:
+        """Return what was chosen."""
+        # Drawn and not used: the errors that are drawn next are those of `StartInMotion` at the same seed.
+        view.uniform(2)
+        return super().draw_start(view)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from ksim_rl.envs.room import with_room
 from ksim_rl.mdp.events import PushByVelocity
 from ksim_rl.mdp.motion_tracking import MotionFinished
 from ksim_rl.mdp.terminations import TimeOut
-from ksim_rl.tracking.starts import StartInMotion, StartOfTrial, trial_clip
+from ksim_rl.tracking.starts import StartInMotion, StartOfTrial
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, build_env
 from ksim_rl.trainers.evaluation import Evaluator
@@ -139,20 +139,29 @@ def followed_motion(cfg: ManagerBasedRlEnvCfg) -> str:
     return files[0]
 
 
+def starting_by_choice(cfg: ManagerBasedRlEnvCfg, *, clip: str = "") -> ManagerBasedRlEnvCfg:
+    """Return the config of a tracking task whose episodes begin with the clip that is chosen, `clip` at first.
+
+    It has no curriculum. A ValueError if the task has no start in a motion, or starts in several.
+    """
+    followed_motion(cfg)
+    events: dict[str, Any] = dict(cfg.events or {})
+    for name, event in events.items():
+        if isinstance(event, StartInMotion):
+            fields = {field.name: getattr(event, field.name) for field in dataclasses.fields(event)}
+            # From the first frame, and not from the parts of the curriculum.
+            chosen = {"start_range": (0.0, 1.0), "part_s": None, "clip": clip}
+            events[name] = StartOfTrial(**{**fields, **chosen})
+    return dataclasses.replace(cfg, events=events, curriculum={})
+
+
 def trial_cfg(cfg: ManagerBasedRlEnvCfg, *, pushes: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the config of trials of a tracking task: all begin with the motion, and nothing adapts.
 
     A ValueError if the task has no start in a motion, or starts in several.
     """
-    # Refuses a task without a motion, or with several.
-    followed_motion(cfg)
+    cfg = starting_by_choice(cfg)
     events: dict[str, Any] = dict(cfg.events or {})
-    starts = [name for name, event in events.items() if isinstance(event, StartInMotion)]
-    for name in starts:
-        start = events[name]
-        # From the first frame, and not from the parts of the curriculum.
-        fields = {field.name: getattr(start, field.name) for field in dataclasses.fields(start)}
-        events[name] = StartOfTrial(**{**fields, "start_range": (0.0, 0.0), "part_s": None})
     if not pushes:
         events = {
             name: event for name, event in events.items() if not isinstance(event, PushByVelocity)
@@ -163,7 +172,7 @@ def trial_cfg(cfg: ManagerBasedRlEnvCfg, *, pushes: bool = False) -> ManagerBase
         terminations = {
             name: term for name, term in terminations.items() if not isinstance(term, TimeOut)
         }
-    return dataclasses.replace(cfg, events=events, terminations=terminations, curriculum={})
+    return dataclasses.replace(cfg, events=events, terminations=terminations)
 
 
 def run_trials(
@@ -190,6 +199,7 @@ def run_trials(
     env = with_room(partial(build_env, of_trials, num_envs=trials * at_once, seed=seed), note=note)
     base = part(env, ManagerBasedRlEnv)
     assert base is not None
+    start = StartOfTrial(file=file)
     motion = base.view.motion(file)
     runner = TrialRunner(base, env=env, policy=actor, max_steps=1, seed=seed)
     steps_C = []
@@ -199,8 +209,7 @@ def run_trials(
     for first in range(0, clips, at_once):
         # Rows beyond the last clip try it once more, and are not counted.
         count = min(at_once, clips - first)
-        if clips > 1:
-            trial_clip(base.view, file).copy_((first + row_E).clamp(max=clips - 1))
+        start.chosen_clip(base.view).copy_((first + row_E).clamp(max=clips - 1))
         duration_s = float(motion.duration_C[first : first + count].max())
         # Rounded up, but not for a rounding error of the division.
         runner.max_steps = math.ceil(duration_s / base.step_dt - 1e-6)

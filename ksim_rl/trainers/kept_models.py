@@ -22,6 +22,7 @@ from ksim_rl.files.writing import check_links, whole_folder, write_whole
 from ksim_rl.physics.model_files.packing import ModelFiles, files_of_model
 from ksim_rl.scene.motions.contents import sha256_of
 from ksim_rl.scene.motions.motion import motion_path
+from ksim_rl.scene.motions.motion_set import MotionSet
 from ksim_rl.scene.robots.legged_robot import MenagerieRobot, ModelRobot
 from ksim_rl.scene.scene import MjcfRobot
 from ksim_rl.terminal import printable
@@ -248,15 +249,19 @@ def _data(cfg: RunCfg) -> Iterator[_Data]:
         for source in part.data_files():
             path = motion_path(source)
             # A file that is not there is refused by who reads it.
-            if source in sets or source in told or not path.is_file():
+            if source in sets or source in told or not path.exists():
                 continue
+            if path.is_dir():
+                sha256 = MotionSet(sources=(source,)).sha256
+            else:
+                sha256 = partial(sha256_of, path)
             told.add(source)
             yield _Data(
                 name=f"files/{source}",
                 where=where,
                 source=source,
                 change=f"{source} has changed since the run began: its policy may not fit any more",
-                sha256=partial(sha256_of, path),
+                sha256=sha256,
             )
 
 

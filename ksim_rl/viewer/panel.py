@@ -6,6 +6,7 @@ from functools import partial
 
 import viser
 
+from ksim_rl.scene.motions.motion import ReferenceMotion
 from ksim_rl.viewer.session import SPEEDS, Conditions, Session
 from ksim_rl.viewer.shown_text import as_html, paragraph
 
@@ -53,6 +54,12 @@ class Panel:
         self.push_speed = gui.add_slider("Push (m/s)", 0.1, 3.0, 0.1, 1.0)
         push = gui.add_button("Push", icon=viser.Icon.HAND_MOVE)
         push.on_click(lambda _: session.ask(partial(session.push, float(self.push_speed.value))))
+        motion = session.motion
+        self._scrubber: tuple[viser.GuiDropdownHandle[str], viser.GuiSliderHandle[float]] | None
+        self._scrubber = None
+        if motion is not None:
+            with gui.add_folder("Motion"):
+                self._scrubber = self._add_scrubber(motion.motion)
         # Commands without ranges cannot be set by hand.
         steerable = {name: term for name, term in session.ours.cfg.commands.items() if term.ranges}
         if steerable:
@@ -85,6 +92,7 @@ class Panel:
             self._play.label = label
             self._play.icon = icon
         self._env.value = session.env_index
+        self._show_motion()
         self._status.content = self._status_html(ignored)
         self._error.content = self._error_html()
         self._error.visible = bool(session.error)
@@ -154,6 +162,39 @@ class Panel:
         values = {field: float(slider.value) for field, slider in sliders.items()}
         # Without the tick the command is drawn again.
         self._session.steer(name, values if by_hand.value else None)
+
+    def _add_scrubber(
+        self, motion: ReferenceMotion
+    ) -> tuple[viser.GuiDropdownHandle[str], viser.GuiSliderHandle[float]]:
+        options = []
+        for name, is_held_out in zip(motion.names, motion.held_out, strict=True):
+            options.append(f"{name} (held out)" if is_held_out else name)
+        clip = self._gui.add_dropdown("Clip", options)
+        # Of the longest clip: in a shorter one the rest of the way is its end.
+        step_s = self._session.ours.step_dt
+        time = self._gui.add_slider("Time (s)", 0.0, max(motion.duration_s, step_s), step_s, 0.0)
+
+        def seek(event: viser.GuiEvent, time_s: float) -> None:
+            # Moved by the program, which shows where the env is.
+            if event.client is None:
+                return
+            place = options.index(clip.value)
+            self._session.ask(partial(self._session.seek, place, time_s))
+
+        # Another clip begins at its start.
+        clip.on_update(lambda event: seek(event, 0.0))
+        time.on_update(lambda event: seek(event, float(time.value)))
+        return clip, time
+
+    def _show_motion(self) -> None:
+        motion = self._session.motion
+        if self._scrubber is None or motion is None:
+            return
+        clip, time = self._scrubber
+        env_index = self._session.env_index
+        clip.value = clip.options[motion.clip(env_index)]
+        # On the slider's own marks, which lie a step apart.
+        time.value = round(motion.time_s(env_index) / time.step) * time.step
 
     def _add_condition(self, name: str) -> None:
         widget = self._gui.add_checkbox(name, getattr(self._session.conditions, name))

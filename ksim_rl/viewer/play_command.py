@@ -20,6 +20,7 @@ from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.video import FPS
 from ksim_rl.viewer.played import Played, find
 from ksim_rl.viewer.session import AGENTS, Conditions, Session
+from ksim_rl.viewer.shown_motion import with_choice
 
 DEMO = "zoo:cartpole"
 VIDEO_SUFFIXES = (".mp4", ".gif")
@@ -63,7 +64,8 @@ def session_of(played: Played, *, num_envs: int, seed: int) -> Session:
 
     def make_env(conditions: Conditions) -> EnvBase:
         # Conditions change the task, so each change builds another env.
-        cfg = dataclasses.replace(played.cfg, task=conditions.apply(played.cfg.task))
+        task = with_choice(conditions.apply(played.cfg.task))
+        cfg = dataclasses.replace(played.cfg, task=task)
         return build_env(cfg, num_envs=num_envs, seed=seed)
 
     return Session(make_env, played.policy, title=played.title, seed=seed)
@@ -120,7 +122,8 @@ def _parser() -> OneLineParser:
     )
     parser.add_argument(
         "--motion",
-        help="play a reference motion in the scene of a task, without physics: its name, or a file",
+        help="of a run: the name of the clip that its policy follows; of a task: a reference motion that is played "
+        "without physics, a clip of its sets, or a file",
     )
     parser.add_argument(
         "--num-envs", type=int, default=4, help="of a viewer, which shows one at a time; default: 4"

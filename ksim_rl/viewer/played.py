@@ -14,6 +14,7 @@ from ksim_rl.trainers.other_physics import ENGINE, judged_by, trained_with
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.trainers.run_folder import policy_of, without_nan_guard
 from ksim_rl.viewer.session import UntrainedAgent, showing_motion
+from ksim_rl.viewer.shown_motion import following, place_of
 from ksim_rl.zoo import locate
 
 
@@ -40,13 +41,17 @@ def find(
     """Find a run, a policy of the zoo, or with an agent a task, with changes to its config.
 
     `what` is a run folder, one of its checkpoints, `zoo:NAME` or `task=NAME`, and then `field=value`. A run's own
-    policy acts where `agent` is None. With a `motion`, its name or file, the scene of a task plays it.
+    policy acts where `agent` is None. With a `motion`, its name or file, the scene of a task plays it, and the policy
+    of a run follows it from its start, if it is a clip of its task's motion.
     """
-    if motion is not None:
-        return _motion(what, motion, agent=agent, device=device)
     first, *overrides = what
     # A path may hold "=", so one that exists is a run.
-    if "=" in first and not Path(first).exists():
+    is_run = "=" not in first or Path(first).exists()
+    if motion is not None and agent is not None:
+        raise ValueError(f"--motion {motion} with --agent {agent}: nothing acts in a motion")
+    if motion is not None and not is_run:
+        return _motion(what, motion, device=device)
+    if not is_run:
         if agent is None or not any(text.startswith("task=") for text in what):
             raise ValueError(
                 f"{first!r}: expected a run folder, or task=NAME with --agent zero or random, as it has no policy"
@@ -71,17 +76,20 @@ def find(
     if agent is not None:
         return _without_policy(policy.cfg, agent)
     title = f"{policy.cfg.task_name}, iteration {policy.iteration}{physics}"
-    return Played(cfg=policy.cfg, title=title, folder=saved.run_folder, actor=policy.actor)
+    cfg = policy.cfg
+    if motion is not None:
+        cfg = dataclasses.replace(cfg, task=following(cfg.task, motion))
+        title += f", motion {motion}"
+    return Played(cfg=cfg, title=title, folder=saved.run_folder, actor=policy.actor)
 
 
-def _motion(what: Sequence[str], motion: str, *, agent: str | None, device: str) -> Played:
+def _motion(what: Sequence[str], motion: str, *, device: str) -> Played:
     """Return a motion to play in the scene of a task."""
     if not any(text.startswith("task=") for text in what):
         raise ValueError(f"--motion {motion}: name a task with the motion's robot: task=NAME")
-    if agent is not None:
-        raise ValueError(f"--motion {motion} with --agent {agent}: nothing acts in a motion")
     cfg = conf.compose([*what, f"device={device}"], learns=False)
-    shown = dataclasses.replace(cfg, task=showing_motion(cfg.task, motion))
+    file, clip = place_of(cfg.task, motion)
+    shown = dataclasses.replace(cfg, task=showing_motion(cfg.task, file, clip=clip))
     played = _without_policy(shown, "zero")
     return dataclasses.replace(played, title=f"{cfg.task_name}, motion {motion}")
 

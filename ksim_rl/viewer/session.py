@@ -21,6 +21,7 @@ from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from ksim_rl.envs.contract import part
 from ksim_rl.mdp.motion_tracking import with_motions_in_use
 from ksim_rl.transforms import ActionDelay, ObservationDelay, ObservationNoise
+from ksim_rl.viewer.shown_motion import ShownMotion, shown_motion
 
 AGENTS = ("zero", "random")
 Agent = Callable[[TensorDictBase], TensorDictBase]
@@ -75,14 +76,15 @@ class Conditions:
         )
 
 
-def showing_motion(cfg: ManagerBasedRlEnvCfg, file: str) -> ManagerBasedRlEnvCfg:
+def showing_motion(cfg: ManagerBasedRlEnvCfg, file: str, *, clip: str = "") -> ManagerBasedRlEnvCfg:
     """Return the config of an env that plays a reference motion, whatever acts: each step is an episode of its own.
 
+    Of several clips `clip` comes first, if it is given.
     Each root is the motion's exact state; physics runs in between, and its states are thrown away.
     """
     shown = dataclasses.replace(
         cfg,
-        events={"motion": mdp.ShowMotion(file=file)},
+        events={"motion": mdp.ShowMotion(file=file, clip=clip)},
         terminations={"next_frame": mdp.TimeOut()},
         # Shorter than any env step, of which an episode has at least one.
         episode_length_s=1e-6,
@@ -148,6 +150,7 @@ class Session:
         self.episode_return = 0.0
         self.achieved_speed = 0.0
         self._steered: dict[str, dict[str, float]] = {}
+        self._sought: tuple[int, float] | None = None
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue(MOST_REQUESTS)
         self.refused = 0
         # Clock and pace: the time of the last `advance`, steps that are due, and points of (s, steps).
@@ -225,6 +228,24 @@ class Session:
         self.env_index = env_index
         self.episode_return = 0.0
         self.rewards = {}
+
+    @property
+    def motion(self) -> ShownMotion | None:
+        """The motion that robots follow, if its clips and times can be chosen."""
+        return shown_motion(self.ours)
+
+    def seek(self, clip: int, time_s: float) -> None:
+        """Let all envs begin at a time, s, of a clip of the motion, now and with each later episode.
+
+        A ValueError if there is no such clip or time, or no motion to choose in.
+        """
+        motion = self.motion
+        if motion is None:
+            raise ValueError("this env follows no motion of which a clip could be chosen")
+        motion.choose(clip, time_s)
+        # Kept, so that a rebuilt env is at the same place.
+        self._sought = (clip, time_s)
+        self.reset()
 
     def push(self, speed: float, direction: float | None = None) -> None:
         """Add a horizontal velocity (m/s) in a direction (rad, world frame; None draws one) to the shown env's robot.
@@ -353,7 +374,10 @@ class Session:
         self.built += 1
         # The same seed, so that two conditions are compared on the same starts.
         self.env.set_seed(self.seed)
-        self.reset()
+        if self._sought is None:
+            self.reset()
+        else:
+            self.seek(*self._sought)
         for command, values in self._steered.copy().items():
             self.steer(command, values)
 

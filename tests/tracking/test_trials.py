@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from ksim_rl import conf, mdp
 from ksim_rl.cli import run_commands
 from ksim_rl.scene.motions.motion import motion_path
-from ksim_rl.tracking.starts import StartInMotion
+from ksim_rl.tracking.starts import StartOfTrial
 from ksim_rl.tracking.tasks import HEIGHT_LIMIT, TASKS, UPRIGHT_LIMIT, track_cfg
 from ksim_rl.tracking.trials import run_trials, trial_cfg
 from ksim_rl.trainers.run_folder import Policy
@@ -85,8 +85,11 @@ def test_none_succeeds_where_the_limit_is_tight(short_clip):
 def test_trials_begin_with_the_motion_and_are_not_pushed():
     cfg = trial_cfg(track_cfg("g1_walk"))
     start = cfg.events["start"]
-    assert isinstance(start, StartInMotion)
-    assert (start.start_range, start.part_s, start.joint_range) == ((0.0, 0.0), None, 0.1)
+    assert isinstance(start, StartOfTrial)
+    assert (start.clip, start.part_s, start.joint_range) == ("", None, 0.1)
+    for fields in ({"start_range": (0.0, 0.5)}, {"part_s": 1.0}):
+        with pytest.raises(ValueError, match="begins where it is told"):
+            dataclasses.replace(start, **fields)
     assert "push_robot" not in cfg.events and {"foot_friction", "base_com", "default_pose"} <= set(
         cfg.events
     )

@@ -21,13 +21,14 @@ from ksim_rl.viewer.session import showing_motion
         (["RUN", "--seconds", "-1"], "--seconds=-1.0: expected a finite number in (0.0, inf)"),
         (["RUN", "--num-envs", "0"], "--num-envs=0: expected a whole number >= 1"),
         (
-            ["RUN", "--motion", "walker_walk"],
+            ["num_envs=2", "--motion", "walker_walk"],
             "--motion walker_walk: name a task with the motion's robot",
         ),
         (
             ["task=walker_track", "--motion", "walker_walk", "--agent", "zero"],
             "nothing acts in a motion",
         ),
+        (["RUN", "--motion", "g1_walk", "--agent", "zero"], "nothing acts in a motion"),
         (["RUN", "--output", "clip.avi"], "ends in .mp4 or .gif"),
     ],
 )
@@ -54,7 +55,7 @@ def test_both_ports_are_forwarded():
 
 @pytest.mark.parametrize("task", ["walker_track", "walker_walk"])
 def test_a_motion_is_shown_exactly_from_frame_to_frame(task):
-    cfg = make_cfg(task, ["task.scene.num_envs=2"])
+    cfg = make_cfg(task, ["task.scene.num_envs=2", "task.sim.engine=c"])
     env = ManagerBasedRlEnv(showing_motion(cfg, "walker_walk"))
     motion = env.view.motion("walker_walk")
     root_E = env.reset()

@@ -43,13 +43,11 @@ def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: State | None = None) -> 
     """Build PPO and the discriminator of a run, and observe its reference motions."""
     objective: Any = cfg.objective
     ppo = make_ppo_update(cfg, env)
-    motions = [
-        observe_motion(env, group=objective.style_group, file=file) for file in objective.motions
-    ]
-    # Successive frames of each motion are the transitions; none joins the end of one motion to another.
+    # Successive frames of each clip are the transitions; none joins the end of one clip to another.
     transitions = []
-    for seen_FL in motions:
-        transitions.append(torch.stack((seen_FL[:-1], seen_FL[1:]), 1))
+    for file in objective.motions:
+        for seen_FL in observe_motion(env, group=objective.style_group, file=file):
+            transitions.append(torch.stack((seen_FL[:-1], seen_FL[1:]), 1))
     reference_N2L = torch.cat(transitions)
     return AMPUpdate(objective, ppo=ppo, reference_N2L=reference_N2L, num_envs=cfg.num_envs)
 
