@@ -29,7 +29,7 @@ def errors(actual: np.ndarray, expected: np.ndarray) -> Errors:
 
 
 def worst(several: list[Errors]) -> Errors:
-    """Return, for each statistic, that of the quantity with the worst one."""
+    """Return the worst value of each statistic over all quantities."""
     return Errors(
         median=max(found.median for found in several),
         p95=max(found.p95 for found in several),

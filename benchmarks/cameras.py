@@ -12,8 +12,8 @@ other words are overrides of `ksim-rl train`, for all. The figures of each combi
 * `renderer_bytes_per_env`, `rollout_bytes_per_env`: what the renderer holds of each env, and one rollout; on CUDA
   `torch_bytes_per_env`: all that torch has taken after training.
 
-They go to benchmarks/results/cameras.json as `<device>/<task>/<num_envs>/<size>/<figure>`; those of depth have `depth_`
-before their name. docs/vision.md says what they mean.
+They go to benchmarks/results/cameras.json as `<device>/<task>/<num_envs>/<size>/<figure>`; names of depth figures begin
+with `depth_`. docs/vision.md says what they mean.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def with_camera(cfg: RunCfg, task: str, *, size: int, output: Output) -> RunCfg:
         },
     )
     modules: Any = cfg.modules
-    # Bytes have ends of their own, distances those of the sensor.
+    # The bounds of bytes are known; distances have the sensor's.
     ends = (0.0, sensor.max_depth) if output == "depth" else None
     actor = replace(
         modules.actor,

@@ -44,8 +44,8 @@ class Times:
 def measure(cfg: RunCfg, *, repeats: int = REPEATS) -> dict[str, float]:
     """Time rollouts and physics of both engines; return medians in ms, and how much faster C is, by name.
 
-    Rollouts are those of training, each engine with its own defaults: those of MuJoCo Warp are compiled. Physics is one
-    env step's substeps and the refresh after them.
+    Rollouts run as in training, each engine with its own defaults: MuJoCo Warp's are compiled. Physics is one env
+    step's substeps and the refresh after them.
     """
     trainers = {engine: build(with_engine(cfg, engine)) for engine in ENGINES}
     rollouts = {engine: trainers[engine].collector.collect for engine in ENGINES}

@@ -129,7 +129,7 @@ def old(results: Path, root: Path = ROOT) -> Iterator[Old]:
 
 
 def measured(name: str, group: str = "") -> tuple[str, ...]:
-    """Return the files and folders that a result measures; those of a fault are its row's."""
+    """Return the files and folders that a result measures; a fault's row names its own."""
     if name == "faults":
         row = ROWS.get(group.rpartition("/")[2])
         return () if row is None else row.files

@@ -4,7 +4,7 @@
 
 Each room is imported in new processes, after TorchRL, or for the engine after torch, MuJoCo Warp and Warp. Figures are
 medians of the processor's time, which other programs of the machine do not lengthen, and go to
-benchmarks/results/imports.json, with that of TorchRL itself beside them.
+benchmarks/results/imports.json, beside the time of TorchRL itself.
 """
 
 import statistics

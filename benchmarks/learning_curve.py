@@ -208,7 +208,7 @@ def _start(words: list[str], seed: int, points: Path, gpu: int) -> subprocess.Po
 
 
 def run_cfg(overrides: list[str], env_states: str) -> RunCfg:
-    """Compose a seed's config: that of `ksim-rl train`, with what this benchmark needs, for so many env states.
+    """Compose a seed's config as `ksim-rl train` does, with what this benchmark needs, for so many env states.
 
     Raises:
         ValueError: naming the override that is wrong.

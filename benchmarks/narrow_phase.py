@@ -6,8 +6,8 @@ Two geoms of about 10 cm, turned at random, are brought together along a random 
 engine, and then by up to `depth`, m, further. With `poses=upright` they are turned about the vertical only, and the
 second one stands on the first. Of each pair it prints the share of worlds with as many contacts as in C, and within
 what the depth and the normal of the deepest contact lie in 99 of 100 worlds. Figures go to
-benchmarks/results/narrow_phase.json. The margin is that of one of the geoms: at exactly 0, contacts of C's own with
-height fields are wrong (docs/upstream.md).
+benchmarks/results/narrow_phase.json. One of the geoms has a margin: at exactly 0, contacts of C's own with height
+fields are wrong (docs/upstream.md).
 """
 
 from __future__ import annotations

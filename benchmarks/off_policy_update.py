@@ -2,11 +2,11 @@
 
     python -m benchmarks.off_policy_update device=cuda task=g1_velocity_flat
 
-The update is that of `ksim-rl train task=... objective=fast_sac`; the env states are random numbers of its sizes, so
-that only two envs are built, to know them. `gradient_step_ms` is a whole update over its gradient steps: adding 4 steps
+The update is what `ksim-rl train task=... objective=fast_sac` runs; env states are random numbers, and two envs are
+built, to know their sizes. `gradient_step_ms` is a whole update divided by its gradient steps: adding 4 steps
 of 4096 envs to the replay, drawing minibatches, the steps of critics, actor, temperature and targets. `eager_ms` is the
-same without `objective.compile`, captured in a graph as well; `kernels` are those of a gradient step. Figures go to
-benchmarks/results/off_policy_update.json, as `<device>/<robot>/<figure>`.
+same without `objective.compile`, captured in a graph as well; `kernels` counts the kernels of a gradient step. Figures
+go to benchmarks/results/off_policy_update.json, as `<device>/<robot>/<figure>`.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ trains Go1 with our settings, with each of the three as the peer has it, and wit
 torch's own initialization of all layers, and products in float32. mjlab's `train` command lets CUDA multiply float32
 as TF32, so all three come twice: with products that are not cut (matmul_precision=highest), and as TF32.
 
-Each run is a process of its own, `at_once` of them at a time, whose seconds are those of a run among so many. Other
+Each run is a process of its own, `at_once` of them at a time, so that seconds are longer than of a run alone. Other
 words are overrides of `ksim-rl train`; `variants=ours,discount` takes some of the variants. A level counts as reached
 where the table `velocity` says so. Figures and curves go to benchmarks/results/peer_settings.json, the picture beside
 it, and `python -m benchmarks.pages` writes the table of docs/notes/go1.md.
@@ -48,7 +48,7 @@ KEPT = ("env_states", "seconds", *LEVELS)
 KEPT_POINTS = 40
 # Of the first rollout: bfloat16 moves the logarithm of a ratio by a hundredth in the median, another first policy by 3.
 MOST_LOG_RATIO = 0.3
-# Of weights before and after the first update: those of two draws have a cosine near zero.
+# Of weights before and after the first update: weights of two draws have a cosine near zero.
 LEAST_COSINE = 0.5
 
 Point = dict[str, float]
@@ -195,7 +195,7 @@ class FirstPolicy(Hook):
         log_ratio = float(log_ratio_ET.abs().median())
         if not log_ratio < MOST_LOG_RATIO:
             raise RuntimeError(
-                "the policy that collected first is not that of the networks: the logarithms of its ratios to it have "
+                "the policy that collected first is not the networks' own: the logarithms of its ratios to it have "
                 f"a median of {log_ratio:.3g}, at most {MOST_LOG_RATIO} was expected"
             )
         cosine = float(torch.cosine_similarity(self._weights, _weights(trainer.update), dim=0))

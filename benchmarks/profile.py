@@ -5,7 +5,7 @@
 takes the overrides of `ksim-rl train`. On CUDA one iteration runs without graphs, so that each kernel can be laid to
 the room in which the host launched it: the substeps of physics, their refresh and resets, the terms (all that is
 compiled or left to torch between them: actions, events, commands, rewards, observations, transforms), policy, storage
-of the rollout, GAE and update. The times are those of the kernels alone, since the graphs have no pauses for launches;
+of the rollout, GAE and update. The times count kernels alone, since the graphs have no pauses for launches;
 what the measured iteration (with graphs) takes beyond their sum is the `gaps`, less what runs side by side there. On
 the CPU the rooms are timed on the wall clock. Figures go to benchmarks/results/profile.json: `<room>_ms`,
 `<room>_share` and, on CUDA, `<room>_kernels`. `label=before` keeps them under another name beside the present ones.

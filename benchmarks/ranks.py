@@ -10,8 +10,8 @@ follows its command on one GPU (one seed on each at a time) and on all, the medi
 rollouts. With `tasks=go1_velocity_flat:4096` others are chosen (none with
 `tasks=none`), and `device=cpu` tries it out.
 
-Figures go to benchmarks/results/ranks.json after each part, so that those of a part stay where a later one has no time
-left. All processes have the variables of `NCCL`, which leave NVLink multicast off and which the file records.
+Figures go to benchmarks/results/ranks.json after each part, so that the figures of one part stay when a later one runs
+out of time. All processes have the variables of `NCCL`, which leave NVLink multicast off and which the file records.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def seconds_to_track(seed: str, *, env_states: float, device: str) -> float:
 def seconds_of_seeds(
     size: int, seeds: list[str], *, gpus: int, env_states: str, device: str
 ) -> dict[int, float]:
-    """Return `seconds_to_track` of each seed on so many ranks; those of one rank run side by side, on all GPUs."""
+    """Return `seconds_to_track` of each seed on so many ranks; runs of one rank go side by side, on all GPUs."""
     here = Path(__file__).parents[1]
     shares = (
         [(seeds[gpu::gpus], gpu) for gpu in range(gpus)] if size == 1 and gpus else [(seeds, None)]

@@ -4,7 +4,7 @@
 
 trains each algorithm on 2 and on 4 ranks, and in one process with as many shards, and prints how many tensors of the
 update were compared and their largest difference; then a run on two ranks goes on in one process and on two again, and
-its curve is compared with that of a run without a break. `names=ppo,gru` and `sizes=2` choose, `resumed=no` leaves the
+its curve is compared with a run without a break. `names=ppo,gru` and `sizes=2` choose, `resumed=no` leaves the
 second part out. Figures and curves go to benchmarks/results/ranks.json, the picture to ranks_resumed.png beside it.
 """
 

@@ -115,7 +115,7 @@ def write(
         "device": device_name(device),
         "versions": versions(),
     }
-    # The file's own entries are those of the last run; `runs` keeps which run each group of figures came from, with
+    # The file's own entries belong to the last run; `runs` keeps which run each group of figures came from, with
     # the module at its end where that is not the file's own.
     own = module.rpartition(".")[2]
     ending = "" if own == name else f"/{own}"

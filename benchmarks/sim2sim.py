@@ -4,12 +4,12 @@
     python -m benchmarks.sim2sim task=go1_velocity_flat policy=zoo:go1
     python -m benchmarks.sim2sim policy=runs/large task.sim.timestep=0.005 task.decimation=4 label=trained_at_10_ms
 
-The policy is that of a run folder or of the zoo, or "standing": zero actions, which ask for the default pose. The same
+The policy comes from a run folder or the zoo, or is "standing": zero actions, which ask for the default pose. The same
 env runs on both engines: starts, model parameters, commands, pushes and, with noise=true, the sensors' noise are the
 same draws. A run that C itself trained is judged with another integrator and half the time step, and the words say so.
-Other words are overrides of the run's config, for both engines. Figures go to benchmarks/results/sim2sim.json: those of
-a run under the task's name, those of zero actions under <task>/standing, without noise under .../without_noise, and
-with a `label` under it.
+Other words are overrides of the run's config, for both engines. Figures go to benchmarks/results/sim2sim.json: a run's
+under the task's name, zero actions under <task>/standing, without noise under .../without_noise, and with a `label`
+under it.
 """
 
 from __future__ import annotations

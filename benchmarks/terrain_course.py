@@ -237,7 +237,7 @@ def walk(policy: Policy, course: Course, *, num_envs: int) -> Outcomes:
     runner()
     lost = base.world.overflow_report().messages
     ground = base.view.terrain
-    assert isinstance(ground, PatchedGround)  # that of a TerrainGrid
+    assert isinstance(ground, PatchedGround)  # what a TerrainGrid makes
     # Patches are numbered level by level, with all columns in each.
     kind_E = ground.patches_E - ground.levels_E * grid.num_columns
     of_env = (kind_E, ground.levels_E, runner.arrived_E, runner.fell_E)

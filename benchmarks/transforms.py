@@ -2,13 +2,13 @@
 
     MENAGERIE_ROOT=... python -m benchmarks.transforms device=cuda num_envs=4096
 
-steps an env that does nothing but hand out 48 numbers, bare and with each transform, and prints one table:
-milliseconds of the env step, of the transform's own step and reset (4 of 4096 rows end), and, on CUDA, of its step as
-a graph. Ours and TorchRL's are timed in turn, and each ratio is the median over the rounds; the CPU's times are those
-of the process on one thread: what else the machine does must not count. Where TorchRL has no such transform (noise,
-delays, the time that is left), the nearest one is what people build from its parts: `UnaryTransform` with a function
-that adds noise or turns a count of steps into the time that is left, and `CatFrames` of as many frames as the delay has
-to keep. The chain is noise -> delay -> history of 10 -> groups. Figures go to benchmarks/results/transforms.json.
+steps an env that does nothing but hand out 48 numbers, bare and with each transform, and prints one table: milliseconds
+of the env step, of the transform's own step and reset (4 of 4096 rows end), and, on CUDA, of its step as a graph. Ours
+and TorchRL's are timed in turn, and each ratio is the median over the rounds; on the CPU, process time on one thread is
+measured, so that other load on the machine does not count. Where TorchRL has no such transform (noise, delays, the time
+that is left), the nearest one is what people build from its parts: `UnaryTransform` with a function that adds noise or
+turns a count of steps into the time that is left, and `CatFrames` of as many frames as the delay has to keep. The chain
+is noise -> delay -> history of 10 -> groups. Figures go to benchmarks/results/transforms.json.
 
 `go1=true` (the default on CUDA) also times the captured control step of Unitree Go1, bare and with that chain on its
 observations: `chain_share_of_go1_step` is what the chain adds (`go1_chain_ms`), relative to the bare step. `only=go1`
@@ -158,7 +158,7 @@ def _compare(
     device: torch.device,
     **kwargs: int,
 ) -> Row:
-    """Time the two in turn, each of them first in every other round; return the medians, and that of the ratios."""
+    """Time the two in turn, each of them first in every other round; return the medians, and the median ratio."""
     for work in (mine, theirs):
         if work is not None:
             _time(work, device, **kwargs)

@@ -12,7 +12,7 @@ states (our sampler in its buffer). The same capture is tried on it, and what st
 that the parameters went. `stock_eager_over_update` is what all of ours saves together, bfloat16 included; on the CPU,
 where nothing is captured and all is float32, `update_ms` is `ours_eager_ms`.
 
-Figures go to benchmarks/results/update.json, as `<device>/<env states>/<figure>`; those of other widths, as
+Figures go to benchmarks/results/update.json, as `<device>/<env states>/<figure>`, and for other widths as
 `<device>/<env states>/<widths between x>/<figure>`.
 """
 

@@ -4,8 +4,9 @@
 
 trains with `viewer=browser` and lets a client connect and leave in turn, `blocks` times for `iterations` iterations
 each. The client is a process of its own that speaks viser's protocol and reads every message, as a browser does.
-Figures go to benchmarks/results/viewer.json: `open_share_of_speed` is the median speed of the blocks with a client over
-that of the blocks without. The messages and bytes that it read are there too: a client that read none measured nothing.
+Figures go to benchmarks/results/viewer.json: `open_share_of_speed` is the median speed of blocks with a client, divided
+by the median of blocks without. The messages and bytes that it read are there too: a client that read none measured
+nothing.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ class PPO:
             steps, _ = self.fused(rollout_ET, orders_KD)
             self.kl.copy_(steps["kl"][-1])
         else:
-            # Writes "advantage" and "value_target"; values after a step are those of the true next observation.
+            # Writes "advantage" and "value_target"; the value after a step is computed from the true next observation.
             self.dataset.extend(self.estimate_advantages(rollout_ET))
             for minibatch_B in self._minibatches():
                 step = ppo_step(

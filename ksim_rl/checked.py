@@ -98,7 +98,7 @@ class Checked:
     def data_files(self) -> Sequence[str]:
         """Return the files of data that the config names, as it names them: motions and networks of motors.
 
-        Those of configs in its fields are left out. A run keeps their hashes (`ksim_rl.trainers.kept_models`).
+        Files of configs in its fields are left out. A run keeps the hashes (`ksim_rl.trainers.kept_models`).
         """
         return ()
 

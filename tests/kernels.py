@@ -1,8 +1,8 @@
 """Finds the kernels of the package, and has for each the test that compares its bits.
 
 Kernels are Triton functions that are launched, Warp's, and what `QuickLaunch`, `launch_of` and `launcher_of` make of
-C++, by the function that makes them or the name that they get. Their bits are those of equal runs, of other numbers
-of lanes, or of what they must come to; tests in tests/gpu run where there is a GPU.
+C++, by the function that makes them or the name that they get. Tests compare their bits between equal runs, between
+numbers of lanes, or with the value that they must come to; tests in tests/gpu run where there is a GPU.
 """
 
 import ast

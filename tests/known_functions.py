@@ -1,7 +1,7 @@
 """Keeps the code that Warp generated of functions, which it would generate again for each kernel that calls them.
 
 Warp does so twice for a kernel with static expressions: to learn what these are worth, before it looks into its cache,
-and to compile it. That of the collisions of primitives takes seconds each time, and tests have many sets of geoms. What
+and to compile it. For the collisions of primitives it takes seconds each time, and tests have many sets of geoms. What
 is compiled is the same text. Replaces `ModuleBuilder.build_function`, checked with Warp 1.19.
 """
 

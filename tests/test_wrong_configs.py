@@ -1,4 +1,4 @@
-"""Configs built in Python are checked like those of the command line: a wrong value is a ValueError with its field."""
+"""Configs built in Python are checked like a command line: a wrong value is a ValueError that names its field."""
 
 import pytest
 

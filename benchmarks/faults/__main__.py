@@ -3,9 +3,9 @@
     python -m benchmarks.faults [ROW ...] [form=short] [jobs=N]
     python -m benchmarks.faults merge=FOLDER
 
-Without names all rows of this machine are measured; those of a GPU are left out where there is none, and are never
-counted as passed then. With `jobs` so many rows run side by side, each in a process of its own, the soak first; rows of
-a GPU have it for themselves, last. A row that is named alone spreads its cases over so many processes, if it can.
+Without names all rows of this machine are measured; without a GPU, rows that need one are left out and never count as
+passed. `jobs` is how many rows run side by side, each in a process of its own, the soak first; rows that use the GPU
+have it for themselves, last. A row that is named alone spreads its cases over so many processes, if it can.
 The short form, which CI runs, prints what it found and writes nothing. With BENCHMARK_RESULTS=FOLDER results are
 written there and the page is left alone; `merge` takes them from there. Exit code 1: a limit is broken.
 """

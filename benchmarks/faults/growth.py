@@ -113,7 +113,7 @@ def soak(
 
 
 def figures_of(rows: list[dict[str, float]], *, iterations: int) -> Figures:
-    """Return the growth per iteration once all is settled; a slope is that of the best line."""
+    """Return the growth per iteration once all is settled: the slope of the best line."""
     settled = [row for row in rows if row["iteration"] >= SETTLED * iterations]
     at = np.array([row["iteration"] for row in settled])
 

@@ -219,7 +219,7 @@ ROWS = {
     ),
     "clock": Row(
         fault="the clock of the machine jumps by years between any two looks at it; times of files are upside down",
-        must="the same weights; the newest checkpoint is that of the last iteration; seconds of the run only rise",
+        must="the same weights; the newest checkpoint holds the last iteration; seconds of the run only rise",
         limits={
             "ended_well": (EXACTLY, 1),
             "differ": (EXACTLY, 0),

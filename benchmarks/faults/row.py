@@ -22,7 +22,7 @@ class Row:
     Attributes:
         fault: what is provoked, in a few words.
         must: what has to happen.
-        limits: figure -> how it is compared, and with what; a name is that of one of the `amounts`.
+        limits: figure -> how it is compared, and with what: a number, or the name of one of the `amounts`.
         measure: provokes it in an empty folder, as often as the amounts say, and returns the figures.
         amounts: of the long form, which counts; `short` replaces some of them for CI.
         device: "cpu" or "cuda".

@@ -279,7 +279,7 @@ ROWS = {
     ),
     "resume": Row(
         fault="a run is ended, and resumed in a new process",
-        must="every tensor and value of its last checkpoint is that of the run at a stretch; more cases: resume.json",
+        must="every tensor and value of its last checkpoint is as in a run without a break; more cases: resume.json",
         limits={"compared": (AT_LEAST, 40), "differ": (EXACTLY, 0)},
         measure=resume,
         files=FILES,

@@ -13,7 +13,7 @@ from benchmarks.judge.worlds import Arrays, jacobian_rounding, perturbed, rounde
 DIRECT, SOLVED = 1e-4, 1e-3
 # How many times the change that rounding makes in C.
 TIMES = 30.0
-# The least scale of a quantity, in its units; of what a sensor reads, that of the quantity that it is made of.
+# The least scale of a quantity, in its units; a sensor has the scale of the quantity that it reads.
 LEAST_SCALE = {"qacc": 10.0, "cacc": 10.0, "cfrc_int": 5.0, "cfrc_ext": 5.0}
 LEAST_SCALE |= dict.fromkeys(("sensor force", "sensor torque"), LEAST_SCALE["cfrc_int"])
 LEAST_SCALE |= dict.fromkeys(

@@ -1,4 +1,4 @@
-"""The faults of physics that were mended, and how each is put back; numbers are those of the issue about truth."""
+"""The faults of physics that were mended, and how each is put back; the issue about truth numbered them."""
 
 import importlib
 from collections.abc import Callable, Iterator, Mapping
@@ -321,7 +321,7 @@ FAULTS = {
     ),
     "free and ball joints": Fault(
         number="11",
-        what="actuators of free and ball joints are taken for those of hinges",
+        what="actuators of free and ball joints are treated as actuators of hinges",
         place=("smooth.stages", "_has_affine_actuators"),
         instead=gives(yes),
         needs=("transmission.joint",),
@@ -372,7 +372,7 @@ FAULTS = {
         needs=("enable.sleep", "integrator.Euler", "damping"),
     ),
     "stages of Runge-Kutta": Fault(
-        what="forces on bodies are those of the last stage",
+        what="forces on bodies belong to the last stage",
         place=("integration.integrators", "FORCES_OF_STAGES"),
         instead=gives(()),
         needs=("integrator.RK4", "tree.arm"),

@@ -67,7 +67,7 @@ class RegisteredOutcome:
 
 
 def tasks_of_models(names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return one task for each model among those of `names`, and what is not installed."""
+    """Return one task for each model among the tasks `names`, and what is not installed."""
     found: dict[str, str] = {}
     not_here = []
     for name in names:

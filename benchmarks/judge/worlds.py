@@ -159,7 +159,7 @@ def give_fields(
 def solved_well(mj_model: mujoco.MjModel) -> mujoco.MjModel:
     """Let C solve the constraints of a model as well as it can, and return the model.
 
-    Bodies that C gives no weight have that of our worlds: without it, C's forces are rounding errors.
+    Bodies that C gives no weight have the weight that our worlds give them: without it, C's forces are rounding errors.
     """
     weights = mj_model.body_invweight0[:, 0]
     weights[:] = np.maximum(weights, least_weights(mj_model))

@@ -161,7 +161,7 @@ def row(name: str, size: Mapping[str, str], saved: Mapping[str, Any]) -> str:
 
 
 def own_tasks() -> list[str]:
-    """All tasks but those of suites, which docs/tables.md has."""
+    """All tasks that belong to no suite: docs/tables.md has the suites."""
     return [name for name in envs.names() if not envs.task(name).suite]
 
 

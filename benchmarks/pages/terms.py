@@ -33,13 +33,13 @@ All terms of `ksim_rl.envs.mdp`, by kind: what each gives, with shape, unit, fra
 without a value must be given. The docstring of a term says more: `help(mdp.TrackLinearVelocity)`.
 
 Dims: `E` envs, `L` joints or other elements of a vector, `N` bodies, geoms or contacts, `F` feet, `K` columns of an
-action or a command. Position- and velocity-stage values are those of the current state. Acceleration-stage ones
+action or a command. Position- and velocity-stage values belong to the current state. Acceleration-stage ones
 (contacts, efforts, accelerations) belong to the last physics substep, and read zero in rows that were just reset.
 """
 
 
 def fields_of(term: type) -> str:
-    """The term's own fields with their defaults; those of its kind (such as `weight`) are left out."""
+    """The term's own fields with their defaults; fields that all terms of its kind have (`weight`) are left out."""
     kind = next(kind for kind in KINDS.values() if issubclass(term, kind))
     common = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     parts = []

@@ -31,7 +31,7 @@ does not exist is refused with the near ones.
 
 Shapes have the letters of [concepts](concepts.md#words): `E` envs, `L` joints or other numbers of a vector, `N` bodies,
 sites, elements or rays. Values are float32 unless a type stands before the shape. Quaternions are (w, x, y, z).
-Position- and velocity-stage values are those of the current state. Acceleration-stage ones belong to the last physics
+Position- and velocity-stage values belong to the current state. Acceleration-stage ones belong to the last physics
 substep, and read zero in rows that were just reset. A value without a stage follows no physics: clocks, tables, what
 managers keep.
 
@@ -50,7 +50,7 @@ PARTS = (
     Part(
         "view",
         EnvView,
-        "The env itself. Without a name, quantities are those of all joints and of the first robot.",
+        "The env itself. Without a name, quantities are of all joints and of the first robot.",
     ),
     Part(
         'view.joints("hip.*")', Joints, "Some hinges and slides, by names or regular expressions."
@@ -177,7 +177,7 @@ def _row(name: str, shape: str, text: str, stage: str) -> Row:
 
 
 def _shape_of(member: property) -> str:
-    """Return the shape of a property: that of the quantity which it passes on, where it is one."""
+    """Return the shape of a property; where it passes a quantity on, the quantity's."""
     if isinstance(member, QuantityOf):
         return _shape_of(member.whole)
     if isinstance(member, FirstOf):

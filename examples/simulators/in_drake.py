@@ -51,7 +51,7 @@ from pydrake.systems.framework import DiagramBuilder
 FINER = 10
 """Steps of Drake in one of MuJoCo: efforts are held for a step, which stiff servos need to be short."""
 ROUGH = 10.0
-"""Friction of planes in Drake, which mixes those of a pair; that of a part is chosen so that the pair has its own."""
+"""Friction of planes in Drake, which mixes the frictions of a pair; a part's is chosen so that the mix is MuJoCo's."""
 STIFFNESS = 5e4
 """N/m, of a contact: a foot with a quarter of 15 kg on it sinks in by less than a millimetre."""
 DISSIPATION = 5.0
@@ -260,7 +260,7 @@ def _touch(model: mujoco.MjModel, one: int, other: int) -> bool:
 
 
 def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
-    """Return the sliding friction of a pair: that of the higher priority, or the greater one."""
+    """Return MuJoCo's sliding friction of a pair: from the geom of higher priority, or the larger one."""
     first, second = (float(model.geom_friction[geom, 0]) for geom in (one, other))
     ahead = int(model.geom_priority[one] - model.geom_priority[other])
     if ahead:

@@ -285,7 +285,7 @@ class _Tracer:
             return
         if piece.name in ("view.seed", "view.step_count", "view.reset_count_E"):
             raise NotDescribedError(f"reads {piece.name}, which goes on beyond an episode")
-        # A table has no row per env: limits, poses, indices. That of flat ground is zero everywhere.
+        # A table has no row per env: limits, poses, indices. The table of flat ground is zero everywhere.
         is_flat = piece.name.startswith("view.terrain.") and self._view.terrain.is_flat
         if piece.owner == TABLE and (is_flat or not re.search(r"_E\w*$", piece.name)):
             return

@@ -143,7 +143,7 @@ def moments(made):
 def test_updates_of_squashed_policies_equal_those_of_torch(
     fused_ppo, options, actor_options, monkeypatch
 ):
-    """Torch's entropy is that of a sample, unless the distribution has one; TorchRL remembers which ones have."""
+    """Torch estimates the entropy by a sample, unless the distribution has one; TorchRL remembers which ones have."""
     monkeypatch.setattr(TanhGaussian, "entropy", exact_entropy, raising=False)
     monkeypatch.setattr(
         "ksim_rl.objectives.clip_ppo_loss.has_analytic_entropy", lambda policy: True
@@ -264,8 +264,8 @@ def test_layout_places_every_parameter_once(options):
     index = layout.padded_index(made)
     assert len(index) == layout.num_flat == sum(parameter.numel() for parameter in made.parameters)
     assert len(index.unique()) == len(index)
-    # The weights' tiles cover the padded weights of both networks once each, and so do they the biases; chained kernels
-    # have those of the first layer, and the weights of the second, elsewhere.
+    # The weights' tiles cover the padded weights and the biases of both networks once each; chained kernels have the
+    # first layer's, and the weights of the second, elsewhere.
     covered = torch.zeros(2, layout.num_padded - layout.out, dtype=torch.int64)
     for network, _, _, place, stride, columns, rows, bias in layout.weight_tiles(16).tolist():
         for row in range(rows):

@@ -1,4 +1,4 @@
-"""The policy that collects for the fused kernels, run by Triton's interpreter, is that of their first gradient step."""
+"""The policy that collects equals the policy of the fused kernels' first gradient step, in Triton's interpreter."""
 
 import copy
 

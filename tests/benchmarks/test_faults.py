@@ -44,7 +44,7 @@ from tests.cli.payloads import with_pickles, without_the_check_of_config
 from tests.cli.test_foreign_files import with_pickled_arrays
 
 RESULTS = report.RESULTS / "faults.json"
-# Those of seconds; the others run in the full tests, as their long forms do by the command.
+# Rows that take seconds; the full tests run the others, and the command runs the long form of each.
 QUICK = (
     "latest",
     "corruption",

@@ -83,7 +83,7 @@ def layers(made):
 
 
 def test_the_weights_are_those_that_torch_gives_a_new_layer():
-    """All are uniform within 1 / sqrt(fan_in), those of the output layers too."""
+    """All are uniform within 1 / sqrt(fan_in), the output layers' too."""
     made = update(PPOCfg(), *networks(hidden=(256, 256, 128)))
     before, drawn = {id(layer.weight) for layer in layers(made)}, torch.get_rng_state()
     std = made.actor[0].module.head.std.clone()
@@ -199,7 +199,7 @@ def made_up(*, rises_by, seed=0):
 
 
 def test_a_run_is_judged_by_the_mean_of_a_million_env_states():
-    """A mean over a window of a million that ends at s is that of its middle: s - 0.5 million; see `reached`."""
+    """A mean over a window of a million that ends at s belongs to its middle, s - 0.5 million; see `reached`."""
     found = made_up(rises_by=0.1).found
     assert found["env_states_to_levels"] == pytest.approx(13.9e6 + 0.5e6, abs=1e5)
     assert found["seconds_to_levels"] == pytest.approx(

@@ -169,7 +169,7 @@ TRANSFORMS: Sequence[tuple[str, str]] = (
 
 
 def train(words: Sequence[str], folder: Path) -> int:
-    """Train for an iteration as the command does; words that are given replace those of the smallest task."""
+    """Train for an iteration as the command does; `words` replace the overrides of the smallest task."""
     given = [word.partition("=")[0] for word in words]
     few = ["trainer.num_iterations=1", "trainer.eval_episodes=0", f"hydra.run.dir={folder / 'run'}"]
     own = [word for word in children.SMALLEST if word.partition("=")[0] not in given]

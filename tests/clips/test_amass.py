@@ -1,4 +1,4 @@
-"""Archives like those of AMASS: the standing skeleton, one bent joint, own offsets, and what is wrong."""
+"""Archives as AMASS has them: the standing skeleton, one bent joint, own offsets, and wrong ones."""
 
 import numpy as np
 import pytest

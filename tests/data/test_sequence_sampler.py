@@ -92,7 +92,7 @@ def test_a_masked_env_state_stays_masked_beside_burn_in():
     data = rollout()
     data["obs"][2, 5] = torch.nan
     dataset.extend(data)
-    # Its leaves are those of another row; that it is masked in one sequence, past the burn-in, shows.
+    # Another row's leaves stand in its place; the mask of one sequence, past the burn-in, shows it.
     masked = sum(int((~minibatch_BT[MASK_KEY][:, 2:]).sum()) for minibatch_BT in dataset.epoch())
     assert masked == 1
 

@@ -1,4 +1,4 @@
-"""The names that docs/coming_from.md gives for those of other software exist."""
+"""The names of ours that docs/coming_from.md gives for names of other software exist."""
 
 import importlib
 import re

@@ -1,4 +1,4 @@
-"""The figures in README and docs/speed.md are those of benchmarks/results."""
+"""The figures in README and docs/speed.md agree with benchmarks/results."""
 
 import json
 from typing import Any

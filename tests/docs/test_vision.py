@@ -1,4 +1,4 @@
-"""The page about pictures: its transforms are those of a config."""
+"""The page about pictures: its transforms are a config's."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Envs whose reward and flags lie in a TensorDict of their own, as those of agents do."""
+"""Envs whose reward and flags lie in a nested TensorDict, as in TorchRL's multi-agent envs."""
 
 from torchrl.data import Composite
 

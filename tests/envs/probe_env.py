@@ -127,7 +127,7 @@ def puck_cfg(
 ) -> ManagerBasedRlEnvCfg:
     """Return the config of the puck env; a time-out comes with a positive `episode_length_s`.
 
-    `fields` are those of `ManagerBasedRlEnvCfg`.
+    `fields` are fields of `ManagerBasedRlEnvCfg`.
     """
     terminations: dict[str, TerminationTerm] = {}
     if limit is not None:

@@ -118,7 +118,7 @@ def test_a_policy_that_nothing_should_obey_never_moves_the_robot(control, name):
     run(clock, robot, machine, lines, Unattended(0.3))
     assert machine.fault.startswith(line) and State.POLICY not in lines.states
     assert lines.events[-1] == f"{state} -> damp: fault: {machine.fault}"
-    # From another pose than that of standing it is only told.
+    # From any pose but standing it is only reported.
     if name == "beyond":
         told = [event for event in lines.events if "would be asked for" in event]
         assert [event.endswith(": beyond its limits") for event in told] == 2 * [True, False]

@@ -158,7 +158,7 @@ def test_states_follow_each_other_and_hand_over_smoothly(control):
     assert standing[0].stiffness == pytest.approx(0.0)
     assert standing[-1].pos == pytest.approx(DEFAULT, abs=0.02)
     assert standing[-1].stiffness == pytest.approx([30.0, 20.0], rel=0.02)
-    # No target jumps: the largest step is that of 1.7 rad in 0.4 s, at the steepest place of the curve.
+    # No target jumps: the largest step is at the steepest place of the curve from 0 to 1.7 rad in 0.4 s.
     pos = np.array([command.pos for command in robot.commands])
     asked = np.array([command.stiffness.min() > 1.0 for command in robot.commands])
     jumps = np.abs(np.diff(pos, axis=0)).max(axis=1)[asked[1:] & asked[:-1]]

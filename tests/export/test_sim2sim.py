@@ -111,7 +111,7 @@ def test_what_the_c_engine_trained_is_judged_in_other_physics(tmp_path):
     report = report_of(folder, episodes=4)
     said = "with integrator euler instead of implicitfast, with a time step of 0.005 s instead of 0.01 s"
     assert said in report.table()
-    # Single steps are those of training; whole episodes are not.
+    # Single steps equal training's; whole episodes do not.
     assert report.causes == []
     assert report.return_ratio == pytest.approx(1.0, abs=0.02)
     assert report.return_ratio != pytest.approx(1.0, abs=1e-9)

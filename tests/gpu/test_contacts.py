@@ -1,4 +1,4 @@
-"""Contacts of boxes and of steep capsules on a GPU are those of the C engine."""
+"""Contacts of boxes and of steep capsules on a GPU agree with the C engine."""
 
 import pytest
 

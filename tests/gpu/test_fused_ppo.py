@@ -131,7 +131,7 @@ def test_the_gradient_is_that_of_exact_products(network_options, symmetry):
     # One step, not clipped: the mean of Adam is then a tenth of the gradient.
     one = {"minibatches": 1, "num_epochs": 1, "max_grad_norm": None, "symmetry": symmetry}
     if "distribution" in network_options:
-        one["entropy_coeff"] = 1e-6  # torch has that of a sample
+        one["entropy_coeff"] = 1e-6  # torch estimates it by a sample
     fused = update(actor, critic, **one)
     exact = update(actor, critic, precision="float32", kernels="torch", **one)
     plain = update(actor, critic, kernels="torch", **one)

@@ -23,7 +23,7 @@ class ProbeEnv(MaskedReset):
     Args:
         observe: (step_E, sign_E) -> [E, L]; the sign, 1 or -1, is drawn at each reset.
         reward: (step_E, sign_E, action_E, first_action_E) -> [E], of the state that the action was taken in; the first
-            action is that of the episode.
+            action is the first of the episode.
         length: steps of an episode.
         truncates: how it ends.
     """

@@ -118,7 +118,7 @@ def _normalizers(update):
 
 
 def check_normalizers_count_once():
-    """The statistics are those of all env states collected, each once."""
+    """The statistics count each env state collected, and each once."""
     run = Run(ProbeEnv(sign_only, the_sign, length=3), normalized=True)
     seen = []
     for _ in range(2):

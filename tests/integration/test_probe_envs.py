@@ -1,6 +1,6 @@
 """Our real parts on problems whose answers are known; each fails for one kind of fault only, in this order.
 
-The values are those of Run's discount, 0.5.
+The values hold for Run's discount, 0.5.
 """
 
 import pytest

@@ -312,7 +312,7 @@ def _special_files(mesh: Callable[[str], str]) -> Iterator[tuple[str, Writes]]:
 
 
 def kinds() -> dict[str, Writes]:
-    """Return what writes each kind, by name: those of `malformed_models`, and the generated ones."""
+    """Return what writes each kind, by name: the kinds of `malformed_models`, and the generated ones."""
     texts = (
         {name: xml for name, (xml, _) in MALFORMED.items()} | dict(_generated()) | dict(_enormous())
     )

@@ -110,7 +110,7 @@ def in_c(world: World, cone: str, row: int) -> tuple[mujoco.MjModel, mujoco.MjDa
 
 
 def permute_pool(world: World, seed: int) -> None:
-    """Put the contacts into other places of the pool, but for those of a pair, which keep their order."""
+    """Put the contacts into other places of the pool; contacts of one pair keep their order."""
     d = world.warp_data_E
     count = int(d.nacon.numpy()[0])
     geoms, worlds = d.contact.geom.numpy()[:count], d.contact.worldid.numpy()[:count]

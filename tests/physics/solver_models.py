@@ -21,7 +21,7 @@ _TIES = {
 
 @dataclass(frozen=True)
 class Synthetic:
-    """Balls on a plane, each with a chain of links; `ratio` is the mass of a ball to that of a link."""
+    """Balls on a plane, each with a chain of links; `ratio` is the mass of a ball to the mass of a link."""
 
     condim: int = 3
     cone: str = "pyramidal"

@@ -33,11 +33,11 @@ class Problem:
     def savings(self, qacc: np.ndarray) -> tuple[float, float]:
         """Return what a step of Newton's would save, first where float32 sees it, then in all other directions.
 
-        With the Hessian H scaled to ones on its diagonal, its Cholesky factor in float32 is that of a matrix of which
-        each entry is off by up to (n + 1) 2^-24 or so (Higham, Accuracy and Stability of Numerical Algorithms, theorem
-        10.5), to which the rounding of H itself adds. In a direction whose eigenvalue is smaller, a solver knows
-        neither the curvature nor even its sign: MuJoCo Warp's ends in NaN or meets a good pivot by luck, and ours
-        leaves the direction out. So how far it gets there says nothing about a solver.
+        With the Hessian H scaled to ones on its diagonal, its Cholesky factor in float32 is the exact factor of a
+        matrix whose entries are off by up to (n + 1) 2^-24 or so (Higham, Accuracy and Stability of Numerical
+        Algorithms, theorem 10.5), to which the rounding of H itself adds. In a direction whose eigenvalue is smaller, a
+        solver knows neither the curvature nor even its sign: MuJoCo Warp's ends in NaN or meets a good pivot by luck,
+        and ours leaves the direction out. So how far it gets there says nothing about a solver.
         """
         _, gradient, hessian = self._at(qacc)
         scale = 1.0 / np.sqrt(np.diag(hessian))

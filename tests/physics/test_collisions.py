@@ -1,4 +1,4 @@
-"""The collision pass of our own finds the contacts that MuJoCo Warp's finds, and those of the C engine."""
+"""Our own collision pass finds the contacts that MuJoCo Warp's and the C engine's find."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -104,8 +104,8 @@ def test_it_finds_the_contacts_of_mujoco_warp(make):
     check(make())
 
 
-# Every pair of types that the kernel knows, and what contacts have of their geoms: dimensions, frictions, laws,
-# priorities, margins and gaps, and those of an explicit pair.
+# Every pair of types that the kernel knows, and what contacts take from their geoms or from an explicit pair:
+# dimensions, frictions, laws, priorities, margins and gaps.
 KNOWN = """
 <mujoco>
   <default>

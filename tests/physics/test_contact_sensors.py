@@ -187,7 +187,7 @@ def test_bits_do_not_depend_on_places_in_the_pool(world: World):
 
 
 def test_of_equally_strong_contacts_the_first_in_the_order_of_the_c_engine_counts():
-    """A ball between two walls that press alike: MuJoCo Warp's choice would be that of its sort."""
+    """A ball between two walls that press alike: MuJoCo Warp's choice would depend on its sort."""
     spec = mujoco.MjSpec.from_string(
         """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody>
         <geom name="left" type="box" size="0.1 1 1" pos="-0.19 0 0"/>

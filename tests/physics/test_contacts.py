@@ -1,4 +1,4 @@
-"""Contacts that MuJoCo Warp alone finds otherwise are those of the C engine."""
+"""Contacts that MuJoCo Warp alone would find differently agree with the C engine."""
 
 import warnings
 
@@ -57,7 +57,7 @@ def test_boxes_and_steep_rods_touch_as_in_the_c_engine(turned):
 
 
 def check_contacts(turned: str, device: str = "cpu") -> None:
-    """Compare all contacts of a step with those of the C engine from the same poses."""
+    """Compare all contacts of a step with the C engine's from the same poses."""
     mj_model = load_model(THINGS.format(turned=turned))
     pose_EL = touching(mj_model, seed=0)
     world = World(mj_model, num_envs=NUM_ENVS, device=device, sim=SimCfg(njmax=120, nconmax=24))

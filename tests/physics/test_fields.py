@@ -139,7 +139,7 @@ def test_unknown_and_shared_fields_are_named():
 
 
 def every_joint(fields: tuple[str, ...], *, tendon: str = "") -> World:
-    """Three worlds with other numbers in each of the fields; the constants are those of the model as compiled."""
+    """Three worlds with other numbers in each of the fields; the constants are the compiled model's."""
     spec = mujoco.MjSpec.from_string(EVERY_JOINT.replace("TENDON", tendon))
     prepare_spec(spec, INERTIAL)
     world = World(load_model(spec), num_envs=3, per_world_fields=fields, sim=SIM)

@@ -268,7 +268,7 @@ OTHER_SHAPES = {
 @pytest.mark.parametrize("shape", OTHER_SHAPES)
 @pytest.mark.parametrize("depth", [0.0005, 0.01, 0.1])
 def test_other_shapes_touch_each_prism_as_in_the_c_engine(shape, depth):
-    """Directions are those of a search that ends within a tolerance; a smooth shape has others nearby."""
+    """Directions come from a search that ends within a tolerance; a smooth shape has others nearby."""
     spec = mujoco.MjSpec.from_string(
         f"""<mujoco>
         <asset><mesh name="wedge" vertex="-.1 -.1 -.1 .1 -.1 -.1 0 .12 -.1 0 0 .15 .05 .05 .1"/></asset>

@@ -25,8 +25,8 @@ STATE = ("qpos", "qvel", "act", "time")
 WRITTEN = (*STATE, "qacc_warmstart")
 EULER, FAST = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 Bit = mujoco.mjtDisableBit
-# Without one of actuation and damping MuJoCo Warp forgets the derivative of the other, and without both and springs
-# that of gyroscopic forces.
+# Without one of actuation and damping MuJoCo Warp forgets the derivative of the other, and without both and springs the
+# derivative of gyroscopic forces.
 AS_IN_MUJOCO_WARP = [
     (EULER, 0),
     (EULER, Bit.mjDSBL_EULERDAMP),

@@ -101,7 +101,7 @@ def test_all_sensors_of_contacts_read_what_they_read_in_c(cone: str, one_kernel:
                 mj_model.sensor_adr[sensor] + mj_model.sensor_dim[sensor],
             )
             setting = mj_model.sensor_intprm[sensor]
-            # Forces are those of two solvers.
+            # Forces come from two solvers.
             tolerance = 1e-5 if setting[0] == FOUND_AND_DISTANCE else 2e-2
             message = f"sensor {sensor}, {setting}: {read[at]}, in C {expected[at]}"
             assert (np.abs(read[at] - expected[at]) <= tolerance * scale[at]).all(), message

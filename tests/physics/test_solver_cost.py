@@ -1,4 +1,4 @@
-"""The solver is honest: what its accelerations cost is never above what those of MuJoCo Warp's own solver cost."""
+"""The solver is honest: the cost of its accelerations never exceeds the cost that MuJoCo Warp's solver reaches."""
 
 import os
 

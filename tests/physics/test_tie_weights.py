@@ -58,7 +58,7 @@ def compare(xml: str, sim: SimCfg) -> None:
     mj_data.qpos[:], mj_data.qvel[:] = before
     mujoco.mj_step(world.mj_model, mj_data)
     if sim.integrator != "rk4":  # whose last stage is another in our data
-        # MuJoCo Warp makes rows of connect before those of weld.
+        # MuJoCo Warp makes rows of connect before rows of weld.
         order = world.last_substep("efc.id")[1, : mj_data.nefc].argsort(stable=True)
         np.testing.assert_allclose(world.last_substep("efc.D")[1, order], mj_data.efc_D, rtol=1e-3)
     np.testing.assert_allclose(world.qvel_EL[1], mj_data.qvel, rtol=2e-4, atol=2e-4)

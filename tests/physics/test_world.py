@@ -95,7 +95,7 @@ def test_reset_touches_only_the_masked_rows_even_row_zero():
         assert world.sensordata_EL[mask_E][:, sensor(world, name)].abs().max() == 0, name
     for name in ("qacc", "actuator_force", "qfrc_actuator"):
         assert world.view(name)[mask_E].abs().max() == 0, name
-    # The pose after a refresh is that of qpos0: the torso stands upright.
+    # The pose after a refresh is qpos0: the torso stands upright.
     up = sensor(world, "up")
     torch.testing.assert_close(
         world.sensordata_EL[mask_E][:, up], torch.tensor([[0.0, 0.0, 1.0]] * 2)

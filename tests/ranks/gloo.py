@@ -38,7 +38,7 @@ def as_ranks_compute(dtype: torch.dtype = torch.float32) -> Iterator[None]:
 def results(function: Callable[..., Any], *arguments: Any, size: int, folder: Path) -> list[Any]:
     """Call `function` on each of `size` ranks, and return what it returned there."""
     folder.mkdir(exist_ok=True)
-    # A fork has no threads of its parent, and would wait for those of MuJoCo's pools that it throws away.
+    # A fork has no threads of its parent, and would wait for the threads of MuJoCo's pools that it throws away.
     gc.collect()
     mp.start_processes(
         _run_one, (size, str(folder), function, arguments), nprocs=size, start_method="fork"

@@ -82,7 +82,7 @@ def trained(overrides, num_envs, minibatch, shards):
 
 
 def largest_difference(learnt, parts):
-    """Compare all tensors of one process with those of each rank; rows that are shared out are put together."""
+    """Compare all tensors of one process with each rank's; rows that are shared out are put together."""
     worst = 0.0
     for key, expected in learnt.items():
         # Each rank has the sums of its own observations, and a replay of its own.

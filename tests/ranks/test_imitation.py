@@ -27,8 +27,8 @@ def learnt(name, num_envs, shards, iterations):
 def compared(name, size, folder, *, dtype=torch.float32):
     """Train on ranks and in one process; return how many tensors were compared, and their largest difference.
 
-    That is after three iterations, in float32 after one of AMP, where each about trebles those of rounding: policy
-    and discriminator learn from what they have made of each other.
+    That is after three iterations; for AMP in float32 after one, as each about trebles differences of rounding: policy
+    and discriminator learn from each other.
     """
     iterations = 1 if (name, dtype) == ("amp", torch.float32) else 3
     with as_ranks_compute(dtype):
@@ -51,7 +51,7 @@ def test_ranks_learn_what_one_process_learns(name, size, tmp_path):
     tensors, worst = compared(name, size, tmp_path)
     places = worst / torch.finfo(torch.float32).eps
     print(f"{name}, {size} ranks: {tensors} tensors, largest difference {places:.1f} last places")
-    # That of AMP with 4 ranks is 14 in float32, and 8 of its own in float64: rounding, which grows as learning goes on.
+    # AMP with 4 ranks differs by 14 places in float32, and by 8 in float64: rounding, which grows as learning goes on.
     assert places <= (16 if name == "amp" else 8)
 
 

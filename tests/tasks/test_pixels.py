@@ -170,7 +170,7 @@ def test_a_run_is_evaluated_resumed_exported_and_seen_by_mujoco(tmp_path, capsys
     # Both renderers see the same, edges apart.
     assert float(re.search(r"camera side: ([0-9.]+)% of pixels", said)[1]) < 2.0
     assert float(re.search(r"return ratio ([0-9.]+)", said)[1]) == pytest.approx(1.0, abs=0.01)
-    # Another camera than that of the training is named.
+    # A camera that differs from training's is named.
     model = tmp_path / "export" / "robot.xml"
     moved = re.sub(r'(<camera name="side"[^>]* pos=")[^"]*', r"\g<1>0 -3 4", model.read_text())
     assert moved != model.read_text()

@@ -53,7 +53,7 @@ def test_rewards(ref):
     for name, reference in ref.figures["rewards"].items():
         term, params = ref.cfg.rewards[name], dict(reference["params"])
         assert term.weight == reference["weight"], name
-        # Heights above flat ground are those of the foot sites, which a ray sensor reads in the reference.
+        # On flat ground we take the heights of the foot sites, which a ray sensor reads in the reference.
         if params.pop("height_sensor_name", None):
             assert term.sites == ref.robot.foot_sites
         for field, value in params.items():

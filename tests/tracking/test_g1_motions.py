@@ -15,7 +15,7 @@ from ksim_rl.tracking.g1_motions import CLIPS, FIGURE, FPS, made
 from ksim_rl.tracking.keyframes import foot_paths
 from tests.tracking.g1 import g1_model
 
-# m: half of a sole's length and width, less than those of its contact capsules (0.093 and 0.027).
+# m: half of a sole's length and width, less than its contact capsules' (0.093 and 0.027).
 SOLE = np.array((0.09, 0.025))
 
 

@@ -117,7 +117,7 @@ def is_refused(kind: str, shape: str) -> bool:
 
 
 def build(kind: str, env: LeafEnv) -> Transform:
-    """Return a transform for an env, which writes its observation twice for those of two."""
+    """Return a transform for an env; the env writes its observation twice for transforms that read two."""
     return KINDS[kind](env)
 
 
@@ -357,7 +357,7 @@ def outcome(check: str, kind: str, shape: str) -> str:
 
 
 def main() -> None:
-    """Run all cases, those of parallel envs on two shapes, and print how many hold, are refused, and fail."""
+    """Run all cases, parallel envs on two shapes, and print how many hold, are refused, and fail."""
     warnings.filterwarnings("ignore")
     counts: dict[str, Counter[str]] = {}
     for check in CHECKS:

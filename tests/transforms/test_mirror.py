@@ -197,7 +197,7 @@ def test_the_policy_gets_the_bounds_that_both_images_have():
         (lambda: MirrorMap(source=(1, 0), signs=(1, -1)), "no mirror images"),
         (lambda: MirrorMap(source=(0,), signs=(2.0,)), r"signs\[0\]"),
         (lambda: MirrorMap(source=(0, 1), signs=(1.0,)), "1 numbers for the 2"),
-        (lambda: Mirror("x", maps={"x": POLAR}), "expected those of"),
+        (lambda: Mirror("x", maps={"x": POLAR}), r"maps has the keys \['x'\]: expected \['x'\]"),
         (
             lambda: Mirror("x", in_keys_inv=[], maps={"x": POLAR}, probability=2.0),
             "probability=2.0",

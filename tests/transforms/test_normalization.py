@@ -12,7 +12,7 @@ LENGTHS = (3, 5, 4, 7)
 
 
 def env_states(rollout_ET, key):
-    """Return each env state once: those reached, and those of the resets, [N, L] in float64."""
+    """Return each env state once, the reached ones and the resets, [N, L] in float64."""
     first = torch.zeros_like(rollout_ET["done"][..., 0])
     first[:, 0] = True
     first[:, 1:] = rollout_ET["next", "done"][:, :-1, 0]

@@ -46,7 +46,7 @@ STRANGERS = {
     "part_of_the_token": ("HOST", "http://HOST", "/TOKE"),
     "token_elsewhere": ("HOST", "http://HOST", "/index.html?token=TOKEN"),
 }
-# UUID is the identifier of the slider of pushes, and WIDGET that of the button of pauses.
+# UUID identifies the slider of pushes, and WIDGET the button of pauses.
 TO_VISER = {
     "text": "hello",
     "no_message": b"\xc1",

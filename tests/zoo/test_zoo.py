@@ -1,4 +1,4 @@
-"""Policies of the zoo are whole, small, and read as data; those of Weights & Biases come through a stub of its API."""
+"""Policies of the zoo are whole, small, and read as data; for policies on Weights & Biases a stub is its API."""
 
 import json
 import shutil

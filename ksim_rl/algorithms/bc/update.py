@@ -182,7 +182,7 @@ class BCUpdate(DatasetUpdate):
         if self.critic is not None:
             update_normalizers(self.rollout_ET, self.critic)
         # Once more: the statistics stay as they are, and weigh as much as the policy has learned from the recording.
-        # Those of a short one would be swept away by the first rollouts of a run that goes on from here.
+        # The first rollouts of a run that goes on from here would sweep away the statistics of a short recording.
         self._weigh_recording_()
 
     def _weigh_recording_(self) -> None:

@@ -30,7 +30,7 @@ def few() -> dict[int, Outcome]:
 
 @pytest.fixture(scope="module")
 def more() -> dict[int, Outcome]:
-    """Judge models in a process of its own: that of a model that crashes ends, and the others go on."""
+    """Judge models in a child process: a model that crashes ends it, and the others go on in a new one."""
     tasks = [Task(seed=SEED, number=number) for number in MORE]
     found = {}
     for task, outcome in in_processes(judged, tasks, jobs=1, most_seconds=MOST_SECONDS):

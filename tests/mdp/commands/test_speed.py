@@ -1,4 +1,4 @@
-"""The commanded speed is computed once per command, and never that of another moment."""
+"""The commanded speed is computed once per command, and never stale."""
 
 from dataclasses import dataclass
 

@@ -133,7 +133,7 @@ def test_world_commands_turn_against_the_heading(crowd):
     headed(crowd, 0.7)
     with crowd.driver.scope("commands/world"):
         turned = world(crowd.view)
-    # Rows whose command depends on the heading; the others are those of a command without the kind.
+    # Rows whose command depends on the heading; the others are as without this kind of command.
     is_world = (turned - straight).abs().amax(-1) > 1e-6
     assert abs(is_world.float().mean() - 0.3) < 4.0 * math.sqrt(0.21 / E)
     assert torch.equal(straight[~is_world], plain[~is_world])

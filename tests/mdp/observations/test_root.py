@@ -27,7 +27,7 @@ def close(value, expected, atol=1e-5):
 
 
 def test_root_velocities_in_the_roots_and_in_the_worlds_axes(free_body):
-    # A free joint's linear velocity is that of the frame's origin in the world; the angular one is in the body.
+    # A free joint's linear velocity is the velocity of the frame's origin in the world; the angular one is in the body.
     free_body.place(qpos=(0, 0, 1, *YAW_90, 0, 0), qvel=(1, 0, 0, 0.1, 0.2, 0.3, 0, 0))
     close(free_body.read(mdp.RootLinVel()), [0.0, -1.0, 0.0])
     close(free_body.read(mdp.RootLinVel(frame="world")), [1.0, 0.0, 0.0])

@@ -123,7 +123,7 @@ def test_each_world_moves_as_the_c_engine_with_its_model(runners, name):
 
 @pytest.mark.parametrize("name", SEEN_EVENTS)
 def test_cameras_and_lights_stand_where_the_c_engine_has_them(runners, name):
-    """Only those of poses move any; what colours and lenses do is in the pictures (`test_randomized_looks`)."""
+    """Only randomized poses move any; what colours and lenses do is in the pictures (`test_randomized_looks`)."""
     event, world = ALL[name], runners.world
     runners.restart()
     runners.fire(event)

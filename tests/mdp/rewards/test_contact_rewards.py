@@ -48,7 +48,7 @@ def substeps_above(model, height, *, steps, threshold):
         counts.append(0)
         for _ in range(10):
             mujoco.mj_step(model, data)
-            # The forces of the step are still those of its start, as sensors see them.
+            # The forces still belong to the start of the step, as sensors see them.
             hit = False
             for contact in range(data.ncon):
                 mujoco.mj_contactForce(model, data, contact, force)

@@ -140,7 +140,7 @@ class ChainBench:
         self.drives.reset(mask_E)
 
     def efforts(self, joint: str) -> torch.Tensor:
-        """Let the motor models write their controls; return those of one joint, [E]."""
+        """Let the motor models write their controls; return one joint's, [E]."""
         for hook in self.driver.before_substep:
             hook()
         return self.world.ctrl_EL[:, self.world.mj_model.actuator(joint).id].clone()

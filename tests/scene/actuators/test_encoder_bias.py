@@ -102,7 +102,7 @@ def test_at_rest_the_encoder_reads_the_target(servo):
 def test_after_a_reset_servos_hold_the_encoders_at_the_default_pose(servo):
     env = make(servo)
     env.reset()
-    # No action: targets and controls are those of the reset.
+    # No action: targets and controls stay as the reset set them.
     for _ in range(75):
         # A graph of ten substeps is recorded once; one of all would take seconds.
         env.world.step(10, before=env.driver.before_substep)

@@ -1,7 +1,7 @@
 """Contact sensors on a ball and a box that fall onto the plane: forces and clocks known in closed form.
 
 With timestep h and gravity g MuJoCo's integrator puts a body that starts at rest at z0 - g h^2 k (k + 1) / 2 after k
-substeps. The sensors of an env step are those of its last substep, which starts from the state one substep earlier.
+substeps. The sensors of an env step belong to its last substep, which starts from the state one substep earlier.
 """
 
 from collections.abc import Sequence
@@ -179,7 +179,7 @@ def test_rows_that_reset_read_zero_and_the_others_stay():
 
 
 def test_a_lifted_robot_reads_no_contact_after_the_reset():
-    # The sensors' own readings would still be those of the last substep, in which the bodies lay on the ground.
+    # The sensors' own readings would still be from the last substep, in which the bodies lay on the ground.
     env = falling_env(heights=(0.0, 0.0))
     contacts(env, 50)
     root_E = env.reset(env_ids=[0])
@@ -212,7 +212,7 @@ def test_with_every_substep_the_flight_is_timed_in_substeps():
     states = contacts(env, 15)
     for n, state in enumerate(states, start=1):
         for row, height in enumerate(HEIGHTS):
-            # The sensors of substep k are those of the state before it.
+            # The sensors of substep k read the state before it.
             first = substeps_in_flight(height) + 1
             flying, lands = n * DECIMATION < first, (n - 1) * DECIMATION < first <= n * DECIMATION
             assert state.first_contact_EN[row].eq(float(lands)).all()

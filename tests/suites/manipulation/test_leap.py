@@ -99,7 +99,7 @@ def test_steps_reward_actions_and_move_goals_as_the_formulas_say(env, mj_model):
             new_goal = root["command", "goal"][row].double().numpy()
             if expected["reached"]:
                 num_reached += 1
-                # Of a rotation of less than pi the rotation vector is that of the velocity.
+                # For a rotation of less than pi the rotation vector points along the velocity.
                 turn_E3[row] = 20.0 * rotation_vector(goal_E4[row], new_goal)
                 assert (turn_E3[row] > 2.0 - 1e-3).all() and (turn_E3[row] < 10.0 + 1e-3).all()
             else:

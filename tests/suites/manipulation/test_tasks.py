@@ -13,7 +13,7 @@ from ksim_rl.trainers import RunProgress, run
 from tests.suites.manipulation import truth
 
 TASKS = ("panda_pick_cube", "leap_cube_reorient")
-# The kernels of the hand compile for as long as those of the arm; what it observes and earns is tested by its own file.
+# The hand's kernels compile for as long as the arm's; what it observes and earns is tested by its own file.
 IN_WARP = ("panda_pick_cube", pytest.param("leap_cube_reorient", marks=pytest.mark.full))
 SMALL = "num_envs=8 data.num_env_states_per_minibatch=32 data.num_minibatches=2 trainer.num_iterations=2 device=cpu"
 
