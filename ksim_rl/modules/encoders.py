@@ -6,6 +6,8 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int64, Shaped
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.modules import ConvNet
@@ -148,6 +150,7 @@ class Encoder(nn.Module):
         super().__init__()
         self.shape = spec.shape
         self.dtype = spec.dtype
+        self.layout: Layout = cfg.layout
         maker = f"{type(cfg).__name__}.build for pictures {list(spec.shape)}"
         self.layers = cfg.build(spec, device=device)
         if not isinstance(self.layers, nn.Module):
@@ -197,3 +200,13 @@ class Encoder(nn.Module):
         # States of before shapes were in them say nothing of theirs.
         state_dict.setdefault(f"{prefix}{DESCRIPTION}", self.get_extra_state())
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def picture_layouts(*networks: nn.Module) -> dict[NestedKey, Layout]:
+    """Return the observations that networks read through encoders, and in which order the dims of each stand."""
+    found: dict[NestedKey, Layout] = {}
+    for network in networks:
+        for module in network.modules():
+            if isinstance(module, TensorDictModule) and isinstance(module.module, Encoder):
+                found[unravel_key(module.in_keys[0])] = module.module.layout
+    return found

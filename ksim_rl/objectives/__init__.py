@@ -37,4 +37,5 @@ from ksim_rl.objectives.ppo_step import (
     with_precision_of,
 )
 from ksim_rl.objectives.rollout_estimator import RolloutEstimator
+from ksim_rl.objectives.shifted_pictures import ShiftedPictures
 from ksim_rl.objectives.symmetry import SymmetricAugmentation, mirror_loss

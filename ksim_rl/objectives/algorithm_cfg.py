@@ -13,6 +13,7 @@ from ksim_rl.checked import (
     Positive,
     Repeats,
     Share,
+    WholeNumber,
     Within,
     numbers_of_layers,
 )
@@ -329,6 +330,9 @@ class OffPolicyCfg(GradientCfg):
     autocast: bool = False  # run the networks in bfloat16, with float32 weights
     compile: bool = False  # fuse the kernels of the losses on CUDA
     symmetry: Literal["none", "augment"] = "none"  # "augment" mirrors every second env state
+    random_shift: WholeNumber = (
+        0  # pixels by which pictures in minibatches move at random, as in DrQ-v2
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,6 +48,7 @@ LATER = re.compile(
     r'|"encoders": \{\}, |"in_keys": \["(actor|critic)"\], (?="layer_norm")'
     r'|"motions": \{\}, '
     r'|"recorders": \{\}, |"policy_starts": 0, '
+    r'|"random_shift": 0, '
     r'|"free_root": false, |"root_turn": \[1.0, 0.0, 0.0, 0.0\], '
 )
 

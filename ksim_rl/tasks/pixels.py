@@ -9,7 +9,9 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ksim_rl import mdp
-from ksim_rl.data import DatasetCfg
+from ksim_rl.algorithms import fast_sac
+from ksim_rl.algorithms.fast_sac import FastSACCfg
+from ksim_rl.data import DatasetCfg, ReplayCfg
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.envs.view import EnvView
@@ -71,6 +73,54 @@ def _training(
     )
 
 
+def _fast_sac_training(*, num_iterations: int, v_max: float) -> TrainingCfg:
+    """Return FastSAC with an encoder each for actor and critics, and pictures that move by 4 pixels as in DrQ-v2.
+
+    An iteration is one step of 256 envs and 2 gradient steps. The replay takes 3.2 GB for 64 x 64 pixels in colour, and
+    is left out of checkpoints; `v_max` is the highest return that critics can tell.
+    """
+    # Where each channel is brightest: 128 numbers instead of 1024 before layers of some hundred.
+    encoders = {"actor": EncoderCfg(spatial_softmax=True)}
+    return TrainingCfg(
+        num_envs=256,
+        objective=FastSACCfg(
+            gamma=0.99,
+            tau=0.02,
+            policy_delay=2,
+            target_entropy_per_action=-1.0,
+            random_shift=4,
+            compile=True,
+        ),
+        data=ReplayCfg(
+            num_env_states_per_minibatch=1024,
+            num_minibatches=2,
+            n_step=3,
+            learning_starts=20,
+            save_replay=False,
+        ),
+        modules=ModulesCfg(
+            actor=replace(
+                fast_sac.ACTOR,
+                in_keys=("actor",),
+                encoders=encoders,
+                hidden_dims=(256, 128),
+                obs_normalization=False,
+            ),
+            critic=replace(
+                fast_sac.CRITIC,
+                in_keys=("actor",),
+                encoders=encoders,
+                hidden_dims=(256, 128),
+                num_atoms=51,
+                v_min=0.0,
+                v_max=v_max,
+                obs_normalization=False,
+            ),
+        ),
+        trainer=TrainerCfg(num_iterations=num_iterations, eval_interval=num_iterations // 10),
+    )
+
+
 # -- a pole on a cart --------------------------------------------------------------------------------------------
 
 
@@ -104,6 +154,8 @@ CARTPOLE_BALANCE_PIXELS = Task(
         learning_rate=5e-4,
         entropy_coeff=0.0,
     ),
+    # Rewards are 1 per step at most, so returns 1 / (1 - 0.99).
+    other_trainings=(_fast_sac_training(num_iterations=6_000, v_max=100.0),),
     solved_at=900.0,
 )
 CARTPOLE_SWINGUP_PIXELS = Task(

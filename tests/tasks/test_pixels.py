@@ -9,6 +9,7 @@ import torch
 
 from ksim_rl import conf, envs
 from ksim_rl.algorithms.ppo.wiring import build_networks
+from ksim_rl.objectives import ShiftedPictures
 from ksim_rl.scene.rendering.rendering import choose_gl_platform
 from ksim_rl.tables.measure import run_cfg
 from ksim_rl.tables.table import load
@@ -29,6 +30,12 @@ TINY = [
 ]
 PPO = ["data.num_env_states_per_minibatch=16", "data.num_minibatches=2"]
 ALONE = ["modules.trunk=null", "modules.actor.in_keys=[actor]", "modules.critic.in_keys=[critic]"]
+FAST_SAC = [
+    "objective=fast_sac",
+    "data.capacity=64",
+    "data.num_env_states_per_minibatch=16",
+    "data.learning_starts=2",
+]
 SEES = "+modules.actor.encoders.actor={spatial_softmax: true}"
 
 
@@ -111,9 +118,9 @@ def test_a_policy_without_an_encoder_and_a_replay_without_memory_are_refused():
         build(conf.compose([*TINY, *PPO, f"+task.observations.features={group}"]))
     with pytest.raises(ValueError, match="group 'actor' is an image.*objective.symmetry=none"):
         build(conf.compose([*TINY, *PPO, "objective.symmetry=augment"]))
-    # Three frames of 36 x 36 colours, and the critic's five numbers, now and next.
-    huge = ["objective=fast_sac", "data.capacity=10000000", SEES]
-    with pytest.raises(ValueError, match="23,368 bytes of observations in each env state.*GB"):
+    huge = ["objective=fast_sac", "data.capacity=10000000"]
+    # Three frames now and next, of which a replay stores each once: 4 * 10^7 * 3888 bytes.
+    with pytest.raises(ValueError, match="23,328 bytes of observations in each env.* 156 GB"):
         build(conf.compose([*TINY, *huge]))
 
 
@@ -121,9 +128,23 @@ KINDS = {
     "ppo": PPO,
     "recurrent": [*ALONE, *PPO, SEES, "modules.actor.obs_normalization=true", "data.sequence_length=4",
                   "+modules.recurrent_actor={kind: gru, hidden_dim: 8}"],
-    "fast_sac": ["objective=fast_sac", SEES, "data.capacity=64", "data.num_env_states_per_minibatch=16",
-                 "data.num_minibatches=4", "data.learning_starts=2"],
+    "fast_sac": FAST_SAC,
 }  # fmt: skip
+
+
+def test_fast_sac_sees_with_settings_of_its_own(monkeypatch):
+    moved = []
+    monkeypatch.setattr(ShiftedPictures, "shift_", lambda _, minibatch_B: moved.append(minibatch_B))
+    update = (trainer := build(conf.compose([*TINY, *FAST_SAC, "trainer.warm_up=false"]))).update
+    trainer.train()
+    # Both minibatches of the second iteration in one go.
+    assert [minibatch_B["actor"].shape for minibatch_B in moved] == [(32, 3, 36, 36, 3)]
+    assert update.replay.storage.content["actor"].shape[1:] == (36, 36, 3)
+    env_states = update.replay.storage.get(torch.arange(4))
+    assert env_states["next", "actor"].shape == (4, 3, 36, 36, 3)
+    metrics = {name: float(value) for name, value in update.metrics().items()}
+    assert metrics["replay/env_states"] == 8 and metrics["update/skipped_steps"] == 0
+    assert metrics["loss/value"] > 0
 
 
 @pytest.mark.full

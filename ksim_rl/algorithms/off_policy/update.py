@@ -24,13 +24,14 @@ from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.compiling import compiled
 from ksim_rl.device.state_tree import State, branch
-from ksim_rl.modules import ExploringPolicy, update_normalizers
+from ksim_rl.modules import ExploringPolicy, picture_layouts, update_normalizers
 from ksim_rl.objectives import (
     FlatAdamW,
     OffPolicyCfg,
     OffPolicyLoss,
     SACCfg,
     SACLoss,
+    ShiftedPictures,
     SymmetricAugmentation,
     frozen,
     go_back,
@@ -99,6 +100,10 @@ class OffPolicyUpdate(RolloutUpdate):
             self._images = SymmetricAugmentation(
                 mirror, read=self._observations, device=self.device
             )
+        self._shifted = None
+        if cfg.random_shift:
+            layouts = picture_layouts(self.actor, self.critic)
+            self._shifted = ShiftedPictures(layouts, pixels=cfg.random_shift)
         self._read = fast(self._stored)
         self._count_ = fast(self._counted_)
         self._critic_loss = fast(loss.critic_loss)
@@ -214,10 +219,12 @@ class OffPolicyUpdate(RolloutUpdate):
         return longest
 
     def _stored(self, index_B: Int64[Tensor, " B"]) -> TensorDictBase:
-        """Return env states of the replay for their indices, every second one in the mirror with a symmetry."""
+        """Return env states of the replay for their indices, as `cfg.symmetry` and `cfg.random_shift` change them."""
         env_states_B: TensorDictBase = self.replay.storage.get(index_B)  # type: ignore[arg-type]
         if self._images is not None:
             self._images.reflect_every_second_(env_states_B)
+        if self._shifted is not None:
+            self._shifted.shift_(env_states_B)
         return env_states_B
 
     def _improve_critic(self, minibatch_B: TensorDictBase) -> dict[str, Tensor]:

@@ -1,0 +1,46 @@
+"""Pictures that move at random, against padding and cutting."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.nn.functional import pad
+
+from ksim_rl.objectives import ShiftedPictures
+
+PIXELS = 2
+
+
+def places(pictures_BNHWC, moved_BNHWC):
+    """Where each picture was cut out of one with repeated edges, rows and columns from 0 to 4."""
+    found = []
+    for picture_NHWC, moved_NHWC in zip(pictures_BNHWC, moved_BNHWC, strict=True):
+        padded = pad(picture_NHWC.movedim(-1, 1).float(), [PIXELS] * 4, mode="replicate")
+        fits = []
+        for row in range(2 * PIXELS + 1):
+            for column in range(2 * PIXELS + 1):
+                cut = padded[..., row : row + 7, column : column + 9].movedim(1, -1)
+                if torch.equal(cut.to(picture_NHWC.dtype), moved_NHWC):
+                    fits.append((row, column))
+        (place,) = fits
+        found.append(place)
+    return found
+
+
+def test_frames_of_a_stack_move_together_and_what_follows_by_itself():
+    torch.manual_seed(0)
+    frames = torch.randint(256, (60, 3, 7, 9, 3)).to(torch.uint8)
+    depth = torch.rand(60, 7, 9)
+    leaves = {"rgb": frames, "depth": depth, "joints": torch.rand(60, 2)}
+    minibatch = TensorDict({**leaves, "next": dict(leaves)}, batch_size=[60])
+    ShiftedPictures({"rgb": "HWC", "depth": "HWC"}, pixels=PIXELS).shift_(minibatch)
+    now = places(frames, minibatch["rgb"])
+    following = places(frames, minibatch["next", "rgb"])
+    assert len(set(now)) > 15 and now != following
+    for part in (minibatch, minibatch["next"]):
+        assert part["rgb"].dtype == torch.uint8 and torch.equal(part["joints"], leaves["joints"])
+    assert places(depth[:, None, :, :, None], minibatch["depth"][:, None, :, :, None]) != now
+
+
+def test_networks_without_pictures_are_refused():
+    with pytest.raises(ValueError, match="random_shift=4: no network reads a picture"):
+        ShiftedPictures({}, pixels=4)
