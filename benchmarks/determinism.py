@@ -142,7 +142,7 @@ def state_of(trainer: Trainer) -> dict[str, Any]:
     state["metrics"] = trainer.update.metrics()
     world = _world(trainer)
     if world is not None:
-        # What only MuJoCo Warp's own solver writes is memory that nobody has set.
+        # What only MuJoCo Warp's own solver writes is uninitialized memory.
         names = [
             name for name in views.arrays(world.warp_data_E) if not name.startswith("efc.jtdaj")
         ]

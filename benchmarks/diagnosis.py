@@ -138,7 +138,7 @@ class Contrary(Hook):
 
 
 def killed_units(trainer: Trainer) -> None:
-    """Push three quarters of the first layers' units below the threshold of the ReLU for good."""
+    """Push three quarters of the first layers' units below the threshold of the ReLU, where they stay."""
     with torch.no_grad():
         for name, parameter in [
             *trainer.update.actor.named_parameters(),

@@ -4,7 +4,7 @@
 
 takes the overrides of `ksim-rl train`. Whatever else the machine does slows both alike, but not quite: the C engine
 waits for the slowest of its threads. So times are taken on the wall clock and as the processor time of all threads,
-which is the wall clock's on one core that nobody else uses. Figures go to benchmarks/results/throughput.json.
+which is the wall clock's on one core without other load. Figures go to benchmarks/results/throughput.json.
 """
 
 from __future__ import annotations

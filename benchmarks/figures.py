@@ -160,7 +160,7 @@ def _own(name: str, root: Path) -> list[str]:
 
 
 def _changed_since(commit: str, files: tuple[str, ...], root: Path) -> str:
-    """Return what has changed since a commit, or why nobody can say; empty where nothing has."""
+    """Return what has changed since a commit, or why that is unknown; empty where nothing has."""
     known = commit.removesuffix("-dirty")
     here = _git(root, "cat-file", "-e", f"{known}^{{commit}}")
     if here is None:

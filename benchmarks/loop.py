@@ -8,7 +8,7 @@ period begins at its deadline. Own jitter is how much longer than the median it 
 the loop run until the command was handed to the robot; physics of the simulation come behind that. How late the system
 let it run is another figure. Figures go to benchmarks/results/loop.json, once with real-time priority, if the system
 grants it, and once without, for a tenth of the time. The watchdog waits for 2 s here, so that the measurement goes on
-where a machine of others stands still; how often it would have struck by default is told.
+where a shared machine stands still; how often it would have struck by default is reported.
 """
 
 from __future__ import annotations

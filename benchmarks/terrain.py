@@ -50,7 +50,7 @@ SPREAD = 0.4
 TARGET_STD = 0.1
 """rad of the random targets about the default pose."""
 FOOTPRINT = 0.35
-"""m around a robot's root within which it must not start inside of the ground."""
+"""m around a robot's root: within it no start may lie inside the ground."""
 
 
 def main() -> None:

@@ -4,8 +4,8 @@
 
 takes a run folder or a checkpoint. The course has the kinds of ground of the run's task at all of its levels, from a
 seed that no task has, and robots are spread evenly over kinds and levels, where they stay. Each starts in the middle of
-its patch, turned as the task draws it, and is told to walk straight ahead at 0.8 m/s and not to turn, for one episode
-of the time that this takes from edge to edge (10 s on 8 m). Actions are deterministic; sensor noise, pushes and
+its patch, turned as the task draws it, and is commanded to walk straight ahead at 0.8 m/s and not to turn, for one
+episode of the time that this takes from edge to edge (10 s on 8 m). Actions are deterministic; sensor noise, pushes and
 curricula are off, and models are drawn as in training.
 
 A robot succeeds if it gets as far from the middle as the curriculum asks for the next level (3.2 m of the 4 m to the

@@ -1,4 +1,4 @@
-"""A1 and OP3 follow a velocity command: for a robot of the menagerie that nobody prepared, a task is one line."""
+"""A1 and OP3 follow a velocity command: for an unprepared robot of the menagerie, a task is one line."""
 
 from ksim_rl.envs.tasks import velocity
 

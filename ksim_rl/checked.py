@@ -86,7 +86,7 @@ class Checked:
         self._check_fields()
 
     def _check_fields(self) -> None:
-        """Refuse fields that contradict each other. Whoever overrides it calls `super()._check_fields()` first."""
+        """Refuse fields that contradict each other. Overrides call `super()._check_fields()` first."""
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
         """Return how many numbers of four bytes must lie in memory at least, by the names of the fields that say so.
@@ -196,7 +196,7 @@ def _check_union(field: str, value: object, options: Sequence[Annotation]) -> No
             return
         except ValueError as error:
             errors.append(str(error))
-    # All options failed, so all of their reasons are told.
+    # All options failed, so the error lists the reason of each.
     raise ValueError("; or ".join(errors))
 
 

@@ -49,7 +49,7 @@ def _fresh_torch():
 
 @pytest.fixture(autouse=True, scope="module")
 def _small_heap():
-    """Leave what a file's tests keep for good, such as compiled code, out of the garbage collections of later files."""
+    """Leave what a file's tests keep, such as compiled code, out of the garbage collections of later files."""
     yield
     gc.collect()
     gc.freeze()

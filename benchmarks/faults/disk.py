@@ -204,7 +204,7 @@ def folder_gone(folder: Path, *, cases: int) -> Figures:
 
 ROWS = {
     "disk_full": Row(
-        fault="a full disk at every file that a run opens, makes, renames or flushes, once and for good; "
+        fault="a full disk at every file that a run opens, makes, renames or flushes, once or from then on; "
         "files that cannot grow beyond a size",
         must="the run goes on or ends with a clear error; the last checkpoint loads; nothing half looks whole",
         limits={

@@ -17,7 +17,7 @@ from benchmarks.faults.hostile_folder import PROGRAM
 from benchmarks.faults.row import AT_LEAST, EXACTLY, Figures, Row
 
 MIB = 2**20
-# Variables of whoever measures: a case has its own or none.
+# Variables of the user who measures: a case has its own or none.
 LEFT_OUT = (
     "COLUMNS",
     "DISPLAY",

@@ -1,7 +1,7 @@
 """Sees each thing that a process does to files below a folder before it happens, and can make it fail.
 
 Python tells an audit hook about each file that is opened, made, renamed or deleted, and an exception of the hook is
-what the caller gets; flushes to the disk are wrapped. A hook stays for good: install it in forked processes only.
+what the caller gets; flushes to the disk are wrapped. A hook cannot be removed: install it in forked processes only.
 """
 
 from __future__ import annotations

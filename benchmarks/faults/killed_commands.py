@@ -237,7 +237,7 @@ def _stray(folder: Path) -> list[Path]:
     left = list(folder.rglob(f"{WRITING}*"))
     for lock in folder.rglob(LOCK):
         run = lock.parent
-        # A run that was killed before its first checkpoint begins again beside its folder, into which nobody writes
+        # A run that was killed before its first checkpoint begins again beside its folder, into which no one writes
         # any more.
         if not run.with_name(f"{run.name}_2").exists():
             left.append(lock)

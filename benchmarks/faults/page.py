@@ -23,7 +23,7 @@ NOT_MEASURED = "not measured: no CUDA device"
 def write_row(
     name: str, figures: Mapping[str, float], *, passed: bool, folder: Path | None = None
 ) -> None:
-    """Add what was measured of one row to the results, and make the page's table anew where they are committed."""
+    """Add what was measured of one row to the results, and renew the page's table where they are committed."""
     row = ROWS[name]
     device = torch.device(row.device)
     label = report.device_label(device)
@@ -95,5 +95,5 @@ def table(saved: Mapping[str, Any]) -> str:
 
 
 def with_table(text: str, saved: Mapping[str, Any]) -> str:
-    """Return the page with its table made anew."""
+    """Return the page with its table renewed."""
     return report.filled(text, BEGIN, END, table(saved))

@@ -25,7 +25,7 @@ OPERATIONS_OF_A_SAVE = 12
 
 
 class _Report(Hook):
-    """Says which iteration is done and which is saved, and kills the process in the middle of a save if it is told."""
+    """Says which iteration is done and which is saved, and kills the process in the middle of a save on request."""
 
     interval = 1
 

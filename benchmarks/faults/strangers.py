@@ -205,7 +205,7 @@ ROWS = {
         files=("ksim_rl/terminal.py", "ksim_rl/cli"),
     ),
     "models": Row(
-        fault="malformed models, models that nobody means, and models that explode while they compile",
+        fault="malformed models, models with nonsensical numbers, and models that explode while they compile",
         must="no crash, no hang beyond 10 s, none accepted: one line with the file",
         limits={
             "kinds": (AT_LEAST, "kinds"),

@@ -36,7 +36,7 @@ ROWS = {
     ),
     "viewer_ports": Row(
         fault="other sites, rebound names and clients without the token; malformed messages; numbers beyond; floods",
-        must="nobody is let in; messages are ignored and counted, numbers clamped; what waits is bounded",
+        must="no stranger is let in; messages are ignored and counted, numbers clamped; the queue is bounded",
         limits={
             "strangers": (AT_LEAST, 56),
             "messages": (AT_LEAST, 35),

@@ -79,7 +79,7 @@ def tasks_of_models(names: Sequence[str]) -> tuple[list[str], list[str]]:
             not_here.append(name)
             continue
         except RuntimeError:
-            # It is told of when the task is judged.
+            # It is reported when the task is judged.
             found[name] = name
             continue
         found.setdefault(_digest(_world_of(env).mj_model), name)

@@ -131,7 +131,7 @@ def _of_frame(scene: Scene, draw: Draw, kind: str) -> ET.Element:
     sensor = ET.SubElement(
         scene.sensor, kind, objtype=type_of_object, objname=draw.any(objects[type_of_object])
     )
-    # Accelerations are told in the world's frame alone.
+    # Accelerations are measured in the world's frame alone.
     if not kind.endswith("acc") and draw.takes("sensor_reference", 0.3):
         sensor.set("reftype", "site")
         sensor.set("refname", draw.any(scene.sites))

@@ -17,7 +17,7 @@ def shrunk(
     Args:
         xml: a model that fails.
         fields: in which its worlds differ.
-        fails: whether a model fails in the same way; a model that nobody can compile does not.
+        fails: whether a model fails in the same way; a model that cannot be compiled does not.
         most_trials: of them.
     """
     left = [most_trials]

@@ -80,7 +80,7 @@ def drawn_field(mj_model: mujoco.MjModel, name: str, rng: np.random.Generator) -
 
 
 def sayable(mj_model: mujoco.MjModel, name: str, values: np.ndarray) -> np.ndarray:
-    """Return values of a field, in C's layout, as XML can say them: what it has no word for is as in the model."""
+    """Return values of a field, in C's layout, as XML can say them; what XML cannot say is as in the model."""
     own = np.array(getattr(mj_model, name), dtype=np.float64) if name != GRAVITY else values
     if name in ("body_pos", "body_quat"):
         values[0] = own[0]

@@ -169,7 +169,7 @@ class GymnasiumVectorEnv(VectorEnv):
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """One env for Gymnasium: `(obs, reward, terminated, truncated, info)`, with arrays [L]; whoever steps it resets it.
+    """One env for Gymnasium: `(obs, reward, terminated, truncated, info)`, with arrays [L]; the caller resets it.
 
     `obs` is an array for one observation of `keys`, else a dict; see `Stepper`. The env has one row: `envs.make(name,
     num_envs=1)`. `action_limit` bounds actions without bounds in the env's spec, since others want finite ones.

@@ -68,7 +68,7 @@ class Stepper:
     every leaf that is not nested (`"actor"`, `"critic"`), or all leaves where there is no such.
 
     `autoreset` says when rows that ended are reset: in the "same_step"; in the "next_step", whose action and reward do
-    not count for them; or by whoever calls `reset_rows` ("disabled").
+    not count for them; or by the caller, with `reset_rows` ("disabled").
     """
 
     def __init__(
@@ -175,7 +175,7 @@ class Stepper:
                 f"action is {action.dtype} of shape {tuple(action.shape)}: "
                 f"expected {wanted.dtype} of shape {tuple(wanted.shape)}"
             )
-        # Resets the env where nobody has.
+        # Resets the env where the caller has not.
         root = self.root
         self._action.copy_(action)
         # Looking takes a share of a step. So a change is noticed after at most as many steps as there were before it.
@@ -234,7 +234,7 @@ class Stepper:
             else:
                 env_state_E = self.env.step(td)
                 root_E = step_mdp(env_state_E, keep_other=True)
-                # Rows that ended one step ago took a step that nobody sees.
+                # Rows that ended one step ago took a step that the caller does not see.
                 if self.autoreset == "next_step":
                     root_E = self._reset_where(root_E, self._ended_E)
         # Outputs of a replay stay where they were recorded.

@@ -69,7 +69,7 @@ class RolloutUpdate(ABC):
     """The base of all updates: each is one piece of work on a rollout, without a host sync.
 
     On CUDA the first updates run eagerly and the next is captured. So each rollout must be the same memory, as
-    `RolloutCollector` gives it. Where somebody changes an attribute of a loss, a network or an optimizer from
+    `RolloutCollector` gives it. Where a program changes an attribute of a loss, a network or an optimizer from
     outside, the next one is captured again. The `networks` are all that learn, by the names that a checkpoint gives
     them; so many as `max_skipped_steps` in a row that are not finite, which `guard` counts, end the run. The env's own
     keys of reward and flags are `signals`; see `signal_keys`. The `logged` are names of logged means, by the names that

@@ -5,7 +5,7 @@ import resource
 import sys
 
 # Least bytes of a resource with which the smallest task trains on a CPU, and how a shell limits it. Libraries in C
-# abort the process where there is less, which nobody can catch.
+# abort the process where there is less, which no handler can catch.
 _LEAST = (
     (resource.RLIMIT_AS, "address space", "ulimit -v", 2 * 2**30),
     (resource.RLIMIT_DATA, "memory", "ulimit -d", 2**30),

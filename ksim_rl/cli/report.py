@@ -97,7 +97,7 @@ def _what_is_saved(folder: Path) -> str:
     if saved := checkpoint.saved(folder / "checkpoint"):
         return f"saved are the checkpoints up to {saved[-1].name}; continue with: ksim-rl resume {shown(folder)}"
     if folder.exists():
-        return f"no checkpoint is saved yet; begin anew with: ksim-rl train --config-dir {shown(folder)}"
+        return f"no checkpoint is saved yet; start over with: ksim-rl train --config-dir {shown(folder)}"
     return "nothing is saved, and no folder is left"
 
 

@@ -65,7 +65,7 @@ def resume(arguments: list[str]) -> int:
                 f"ksim-rl train --config-dir {options.run} checkpoint={options.run} {field}=..."
             )
     folder = saved.run_folder
-    # A folder of somebody else may hold links that lead our writing elsewhere.
+    # A folder from another user may hold links that lead our writing elsewhere.
     if not options.trust:
         check_links(folder, below=FOLDERS)
         check_run_tree(saved.config, saved.path, given=fields)
@@ -182,7 +182,7 @@ def _in_physics(
     check_run_tree(saved.config, saved.path, given=fields)
     cfg = conf.changed({**saved.config, "device": device}, saved.path, overrides)
     trained = trained_with(saved.config)
-    # Whoever sets a tolerance alone asks for nothing more.
+    # With a tolerance alone nothing more is asked for.
     if ENGINE not in fields:
         return cfg, f", with {' '.join(overrides)}"
     cfg, physics = judged_by(cfg, trained=trained, given=fields)

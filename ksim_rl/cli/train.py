@@ -153,7 +153,7 @@ def _job_of_a_multirun() -> str:
 
 
 def _folders_of_groups(flags: argparse.Namespace, own_config: bool) -> list[Path]:
-    """Return the folders of groups that Hydra searches and nobody vouches for, checked as the config of a run is."""
+    """Return the folders of groups that Hydra searches and that are not trusted, checked as the config of a run is."""
     searched = conf.searched_folders(flags.overrides)
     for folder in searched:
         conf.check_groups(folder)

@@ -88,7 +88,7 @@ def _table(path: Path, columns: int) -> Array:
                 "of the file, if they are others",
             )
         try:
-            # No header: a row of names fails here and is told by its line.
+            # No header: a row of names fails here, and the error has its line.
             row = [float(cell) for cell in cells]
         except ValueError as error:
             raise refused(

@@ -143,7 +143,7 @@ class Recording:
         # 0, 1, 3, 7 ... rollouts: twice as long after each recording that was dropped.
         self._times += self._is_recorded
         self._waiting = (1 << max(self._times - 1, 0)) - 1
-        what = f"{listed(changes)} since the env's step was recorded: it is recorded anew"
+        what = f"{listed(changes)} since the env's step was recorded: it is recorded again"
         if self._waiting:
             what = (
                 f"{listed(changes)}, and it is not the first change since the env's step was recorded: the Python of "

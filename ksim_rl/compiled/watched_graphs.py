@@ -38,7 +38,7 @@ class WatchedGraphs:
         # More graphs than before: one was captured in this call.
         num_ready = sum(graph.ready for graph in self._graphs)
         if num_ready != self._num_ready:
-            # The call has made its own changes in Python by now; from here on each change is somebody else's.
+            # The call has made its own changes in Python by now; from here on each change comes from outside.
             self._watch.look(self._parts)
             self._num_ready = num_ready
 
@@ -49,7 +49,7 @@ class WatchedGraphs:
         if runs_python:
             what = "Python runs from now on, which is SLOWER"
         else:
-            what = "they are recorded anew"
+            what = "they are recorded again"
         warnings.warn(
             f"{changes} since CUDA graphs were recorded: {what}. What changes often belongs in a tensor that is "
             "written in place",

@@ -117,7 +117,7 @@ def check_composed(cfg: RunCfg, overrides: Sequence[str], *, learns: bool = True
 
 
 def _parse(text: str, loader: ConfigLoader) -> Override:
-    # A flag among the overrides is a slip of habit: the right spelling is told.
+    # A flag among the overrides is a slip of habit: the error has the right spelling.
     if text.startswith("-"):
         raise spelling.of_flag(text)
     if not text.isascii() and text.encode(errors="replace").decode() != text:
@@ -128,7 +128,7 @@ def _parse(text: str, loader: ConfigLoader) -> Override:
     try:
         return OverridesParser.create(config_loader=loader).parse_override(text)
     except HydraException as error:
-        # A single word may be a task or a folder, whose right use is told.
+        # A single word may be a task or a folder; the error shows its right use.
         if "=" not in text and (explained := spelling.of_word(text)) is not None:
             raise explained from error
         reason = " ".join(str(error).split())
@@ -201,7 +201,7 @@ def _listed_groups() -> str:
     return "\n".join(f"{name}: {', '.join(loader.get_group_options(name))}" for name in names)
 
 
-# For `--help`, whose own list has the groups that nobody chooses from.
+# For `--help`, whose own list has groups without a choice.
 OmegaConf.register_new_resolver("listed_groups", _listed_groups, replace=True)
 
 

@@ -55,7 +55,7 @@ def allow_package(name: str) -> None:
 
 
 def load_from_here(names: Sequence[str], *, note: Callable[[str], None]) -> None:
-    """Load plug-ins as `load` does, and also from the working directory, as `--plugin` asks; `note` is told of that.
+    """Load plug-ins as `load` does, and also from the working directory, as `--plugin` asks; `note` reports that.
 
     Only a package that is nowhere else puts the folder on Python's path, behind all else.
     """
@@ -149,7 +149,7 @@ def hint(package: str) -> str:
 
 
 def check_remembered(names: Sequence[str]) -> None:
-    """Refuse a run whose plug-ins nobody named, allowed or installed here; the ValueError has the flag that does."""
+    """Refuse a run whose plug-ins were not named, allowed or installed here; the ValueError has the flag that does."""
     for name in names:
         package = str(name).split(".")[0]
         if package not in packages():

@@ -1,7 +1,7 @@
 """The layout of a folder of episodes: whole episodes of an env, one env state after the other, as memory maps.
 
 `env_states` is a TensorDict `["D"]` as `TensorDict.memmap` writes it. `episodes.json` says how many episodes and env
-states are whole, what a leaf of an env state is, and where it all came from. Whoever writes adds rows to the files of
+states are whole, what a leaf of an env state is, and where it all came from. A writer adds rows to the files of
 the leaves first, then renews the sizes, from the inner TensorDicts to the outer one, and `episodes.json` last: a file
 may hold rows of an episode that was not finished, and no size says so.
 """

@@ -89,7 +89,7 @@ def load(
     if torch.device(device).type != "cpu":
         env_states_D = env_states_D.to(device)
     if sampler is not None:
-        # Those with priorities draw only what they were told of.
+        # Samplers with priorities draw only what was announced to them.
         sampler.extend(torch.arange(len(env_states_D)))
     return ReplayBuffer(
         storage=TensorStorage(env_states_D),

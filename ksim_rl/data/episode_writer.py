@@ -72,7 +72,7 @@ class EpisodeWriter:
         with named(self._folder):
             for file in self._files.values():
                 file.flush()
-        # Nobody has put a link in the place of a folder meanwhile.
+        # No link has taken the place of a folder meanwhile.
         for leaf in self._written.leaves:
             check_folder(leaf.path(self._folder).parent, below=self._folder)
         write_contents(self._folder, self._written)

@@ -17,7 +17,7 @@ def compiled(work: Callable[P, R], *, device: torch.device, wanted: bool = True)
     In a block of `eagerly` it is not wanted.
 
     Left alone, the compiler times two sizes of blocks for sums that need many registers, at the first call of each
-    object again. The winner of a close race is another each time, and adds in another order. So it is told to leave out
+    object again. The winner of a close race is another each time, and adds in another order. So it is set to leave out
     what it cannot time without changing bits.
     """
     if not wanted or device.type != "cuda" or runs_eagerly():

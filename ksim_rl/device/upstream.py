@@ -151,7 +151,7 @@ def launches_diverted(
     """Call `instead(kernel, dim, block_dim)` for each launch that this thread issues in this block.
 
     Loops of Warp go through their body once. Warp can only load modules that it is given, and which kernels a library
-    launches is known to nobody else. Replaces functions of the module `warp`, checked with Warp 1.19.
+    launches is known to no other code. Replaces functions of the module `warp`, checked with Warp 1.19.
     """
     thread = threading.get_ident()
 

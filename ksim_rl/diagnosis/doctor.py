@@ -147,7 +147,7 @@ def _refusal(folder: Path) -> str | None:
     """Return why nothing can be written into a folder, which is made, or None."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Tried, as permissions alone do not tell of full or read-only disks.
+        # Tried, as permissions alone do not show a full or read-only disk.
         with tempfile.NamedTemporaryFile(dir=folder):
             return None
     except OSError as error:
@@ -232,7 +232,7 @@ def _look_at_opengl(report: Report) -> None:
 
 def _try_device(report: Report, device: torch.device) -> None:
     say: Callable[[str], None] = lambda text: show(f"{text} ...", to_stderr=True)  # noqa: E731
-    # Compiling is part of the time that is told.
+    # The reported time includes compiling.
     began = time.monotonic()
     with compile_notice(say):
         done = try_device(device)

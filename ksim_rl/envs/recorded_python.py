@@ -40,7 +40,7 @@ class RecordedPython:
     """The Python that steps of an env run, from the first step on.
 
     A recorded step (kernels, a CUDA graph) runs none of it. So it has to be the same at each step, which the second
-    step shows: `calling` is around each of the first ones. After those, `changes` names the values that somebody has
+    step shows: `calling` is around each of the first ones. After those, `changes` names the values that a program has
     changed from outside, such as an attribute of a term, or one more transform; then the step has to be recorded again.
 
     `others` are objects whose Python becomes part of the recording as well, by name: a policy. A step that puts a

@@ -37,8 +37,8 @@ def with_room(make: Callable[[], EnvBase], *, note: Callable[[str], None]) -> En
     """Return an env that `make` builds, built once more where its worlds lost contacts or rows in a rehearsal.
 
     The new one has the needed room, with a margin, and so has each later world of the same model in this process.
-    `note` is told so in one line. A number of rows or contacts that the env's `sim` gives stays as it is; then `note`
-    is told of the rows that were lost. An env that is no `ManagerBasedRlEnv`, or whose room is certain, is not
+    `note` reports it in one line. A number of rows or contacts that the env's `sim` gives stays as it is; then `note`
+    reports the rows that were lost. An env that is no `ManagerBasedRlEnv`, or whose room is certain, is not
     rehearsed.
     """
     env = make()

@@ -313,7 +313,7 @@ def _order(ours: np.ndarray, theirs: np.ndarray) -> list[int] | None:
     # [theirs, ours]: mean distance of each pair of columns.
     apart = np.abs(theirs[:, :, None] - ours[:, None, :]).mean(0)
     order = apart.argmin(1)
-    # Columns that are equal, such as targets nobody writes, keep their places.
+    # Columns that are equal, such as targets that are never written, keep their places.
     own = np.arange(len(order))
     order = np.where(apart[own, own] <= apart[own, order] + 1e-9, own, order)
     # A permutation, and not the identity: two of theirs that look like one of ours are no order.

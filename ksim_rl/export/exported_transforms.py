@@ -178,7 +178,7 @@ def _check_per_observation(transform: Transform, where: str) -> None:
     kind = type(transform)
     if isinstance(transform, ObservationMap):
         return
-    # Whoever has more than a function of one observation may keep something from step to step.
+    # A class with more than a function of one observation may keep something from step to step.
     own = [
         name
         for name in ("_call", "_step", "forward")

@@ -1,4 +1,4 @@
-"""Writes programs of torch as ONNX files, without what the exporter tells of itself and of this machine."""
+"""Writes programs of torch as ONNX files, without what the exporter adds about itself and this machine."""
 
 import logging
 import warnings

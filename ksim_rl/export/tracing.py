@@ -314,7 +314,7 @@ class _Tracer:
         name = next((name for name, one in buffers.by_name().items() if one is piece.tensor), "")
         if not name or buffers.is_kept(name):
             raise NotDescribedError(
-                f"keeps {piece.name} beyond an episode or for all envs together: an export begins each episode anew"
+                f"keeps {piece.name} beyond an episode or for all envs together: an export forgets at each reset"
             )
         if piece.tensor is None or key_of(piece.tensor) != key_of(tensor):
             raise NotDescribedError(

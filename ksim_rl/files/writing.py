@@ -158,7 +158,7 @@ def whole_folder(folder: Path, *, below: Path) -> Iterator[Path]:
 @contextmanager
 def unfinished_folder(folder: Path) -> Iterator[Path]:
     """Give a new folder in `folder`, which is deleted at the end, and after a kill by who comes here next."""
-    # Whoever writes here next cleans up after a crash.
+    # The next writer cleans up after a crash.
     _remove_abandoned(folder)
     temporary = folder / f"{WRITING}{secrets.token_hex(4)}"
     temporary.mkdir()

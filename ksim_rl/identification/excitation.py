@@ -3,7 +3,7 @@
 Each joint gets a sum of sines of its own, slow ones with large and fast ones with small amplitudes: friction and
 damping show in slow and quick motion, inertia in fast. All are scaled down until the robot, as its files have it, stays
 within a share of its limits and touches nothing of itself. Efforts and velocities, which few sines excite as positions
-do, have sines of their own, so that what each kind of command does can be told apart.
+do, have sines of their own, so that the effects of the kinds of command can be separated.
 """
 
 import copy

@@ -111,5 +111,5 @@ def _entry(number: Estimate) -> dict[str, float | str | None]:
 
 
 def _rounded(value: float) -> float:
-    """Return a number with six digits: more would claim what nobody knows."""
+    """Return a number with six digits: more would claim a precision that is not there."""
     return float(f"{value:.6g}")

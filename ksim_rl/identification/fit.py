@@ -211,7 +211,7 @@ def _estimates(
 
 
 def _estimate(number: FreeNumber, value: float, half: float, remark: str) -> Estimate:
-    # Compared to its usual size too: a damping near zero is told, if it is told to be small.
+    # Compared to its usual size too: a damping near zero is identified, if it is identified as small.
     if not half <= WIDEST * max(value, 1.0):
         wide = f"the log leaves it open by +- {half * number.scale:.2g}: more motion, faster and slower"
         return Estimate(remark=wide)

@@ -252,7 +252,7 @@ def _check_joint(path: Path, joint: DrivenJoint, log: JointLog, place: int) -> N
     motion = float(np.ptp(log.pos_TN[:, place]))
     if motion < LEAST_MOTION:
         raise ValueError(
-            f"{path}: joint {joint.name!r} moves by {motion:.2g} only, from which nothing can be told: move it as "
+            f"{path}: joint {joint.name!r} moves by {motion:.2g} only, which identifies nothing: move it as "
             "`ksim-rl identify --propose` does"
         )
     asked = [

@@ -126,7 +126,7 @@ def read_mcap(
     for topic in joined:
         sent_S, values_SC = topic.table(first)
         last_T = np.searchsorted(sent_S, time_T, side="right") - 1
-        # Before its first message nobody knows what it would have been.
+        # Before its first message its value is unknown.
         told_T &= last_T >= 0
         for name, column_S in zip(topic.names, values_SC.T, strict=True):
             columns[name] = column_S[last_T]

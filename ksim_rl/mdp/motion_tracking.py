@@ -219,7 +219,7 @@ class ResetToMotion(OfMotion, EventTerm):
 class ResetByChoice(ResetToMotion):
     """Begin each episode in the clip, and at the time, that are chosen for its env.
 
-    Whoever chooses writes both buffers, or calls `choose`.
+    To choose, write both buffers, or call `choose`.
 
     Attributes:
         clip: of a set of motions, the one that is chosen at first; empty: the first.
@@ -231,7 +231,7 @@ class ResetByChoice(ResetToMotion):
         super()._check_fields()
         if self.start_range != (0.0, 1.0):
             raise ValueError(
-                f"start_range={self.start_range}: a {type(self).__name__} begins where it is told, and draws nothing: "
+                f"start_range={self.start_range}: a {type(self).__name__} begins where it is set, and draws nothing: "
                 "leave it out"
             )
 

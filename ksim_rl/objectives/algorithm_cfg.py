@@ -182,7 +182,7 @@ class PPOCfg(OnPolicyCfg):
                 f"value_lmbda={self.value_lmbda!r} with advantage='vtrace', whose targets follow from the ratios of "
                 "the policies: leave it out, or use advantage='gae'"
             )
-        # A setting without effect is refused, so that nobody believes in a floor that is not there.
+        # A setting without effect is refused, so that no user relies on a floor that is not there.
         if (
             self.min_advantage_std != PPOCfg.min_advantage_std
             and self.normalize_advantage != "dataset"

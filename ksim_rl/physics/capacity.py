@@ -129,7 +129,7 @@ def probe(mj_model: mujoco.MjModel) -> tuple[int, int]:
     key = _key(mj_model)
     # The cache may hold more than a probe found: `remember` raises its numbers.
     if key not in _cache:
-        # Random states make MuJoCo warn; nobody needs to read it.
+        # Random states make MuJoCo warn, which says nothing here.
         with caught_warnings():
             posed = Need(mj_model)
             fallen = Need(mj_model)

@@ -36,7 +36,7 @@ ENUM_FIELDS = {
     "sensor_type": mujoco.mjtSensor,
 }
 MOST_TIMESTEP = 0.1
-# Numbers that nobody means to be negative.
+# Numbers that are negative by mistake only.
 _OPTIONS = (
     "iterations ls_iterations ccd_iterations noslip_iterations sdf_iterations sdf_initpoints density viscosity "
     "impratio"
@@ -66,7 +66,7 @@ def check_finite(mj_model: mujoco.MjModel, source: str) -> None:
 
 
 def check_meant(mj_model: mujoco.MjModel, source: str) -> None:
-    """Refuse numbers that MuJoCo takes but nobody means: a time step out of (0, 0.1] s, negative counts and losses."""
+    """Refuse numbers that MuJoCo accepts by mistake: a time step out of (0, 0.1] s, negative counts and losses."""
     step = float(mj_model.opt.timestep)
     if not 0.0 < step <= MOST_TIMESTEP:
         raise ValueError(

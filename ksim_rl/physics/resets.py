@@ -54,7 +54,7 @@ def empty_contacts(
 ):
     """Zero the contacts of the worlds that `mask` names, in arrays [contacts, width]; none has a row."""
     contact = wp.tid()
-    # A contact whose world is -1 belongs to nobody, and is emptied, too.
+    # A contact whose world is -1 belongs to no world, and is emptied, too.
     if contact >= nacon[0] or (world_of[contact] >= 0 and not mask[world_of[contact]]):
         return
     for k in range(places.shape[0]):

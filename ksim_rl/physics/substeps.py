@@ -78,7 +78,7 @@ class Substeps:
         self._models: dict[Sensors, mjw.Model] = dict.fromkeys(get_args(Sensors), everything)
         if not self._always_senses:
             self._models["none"] = upstream.without_sensors(warp_model)
-            # Each variant leaves out the kernels whose results nobody reads after that substep.
+            # Each variant leaves out the kernels whose results are not read after that substep.
             self._models["contacts"] = upstream.with_contact_sensors_only(warp_model)
             self._models["kept"] = upstream.without_limit_sensors(self._refresh.kept_by_substep)
         if not self._refresh.needs_cameras:

@@ -126,7 +126,7 @@ class DataViews:
 
         Rows of `efc` beyond `nefc`, and all of `contact` after a reset, hold leftovers.
         """
-        # Views are made once, so that everybody has the same tensor.
+        # Views are made once, so that all readers have the same tensor.
         if name not in self._views:
             check_known("data array", name, self.array_names())
             self._views[name] = self.make_view(name)

@@ -47,7 +47,7 @@ def make_warp_model(
         follow_the_c_engine(warp_model)
     switch_off(mj_model, warp_model)
     let_actuators_add(mj_model, warp_model, expanded)
-    # The report of overflow tells of it, once per rollout.
+    # The overflow report has it, once per rollout.
     warp_model.opt.warn_overflow = 0
     if sim.tolerance is not None:
         warp_model.opt.tolerance.fill_(sim.tolerance)

@@ -277,7 +277,7 @@ def _choice(
     warp_alone: Sequence[str] = (),
     **_: Any,
 ) -> tuple[str, str]:
-    """Choose the engine by arguments that nobody has checked yet; either engine says which of them is wrong."""
+    """Choose the engine by arguments that are not checked yet; either engine says which of them is wrong."""
     if not isinstance(sim, SimCfg):
         sim = SimCfg()
     if not isinstance(mj_model, mujoco.MjModel) or not isinstance(num_envs, int):

@@ -20,7 +20,7 @@ JOIN_S = 300.0
 def connected(*, serves: bool = False) -> dist.TCPStore:
     """Return a new connection to the store of all attempts, which rank 0 `serves` where torchrun does not.
 
-    Raises ValueError where the port is in use, RuntimeError where nobody answers.
+    Raises ValueError where the port is in use, RuntimeError where no one answers.
     """
     host = os.environ["MASTER_ADDR"]
     port = number("MASTER_PORT")

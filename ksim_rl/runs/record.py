@@ -76,7 +76,7 @@ def recorded(
     try:
         earlier = read(folder)[-MOST_SESSIONS + 1 :]
     except ValueError as error:
-        note(f"warning: {error}; it begins anew")
+        note(f"warning: {error}; it starts over")
         earlier = []
     session = Session(
         began=began,
@@ -119,7 +119,7 @@ def read(folder: Path) -> list[Session]:
 
 def status(folder: Path) -> tuple[str, str]:
     """Return how a run stands, a `Status` or "unknown", and why; a process that was killed has failed."""
-    # The lock tells of a living process, which the record cannot.
+    # The lock shows a living process, which the record cannot.
     if is_locked(folder):
         return "running", ""
     try:
@@ -129,7 +129,7 @@ def status(folder: Path) -> tuple[str, str]:
     if not sessions:
         return "unknown", "of an earlier version"
     last = sessions[-1]
-    # Nobody wrote an end, and nobody holds the lock.
+    # No end was written, and no process holds the lock.
     if last.status == "running":
         return "failed", "its process ended without a word: killed, or the machine went down"
     return last.status, last.why

@@ -49,7 +49,7 @@ def locked(folder: Path, *, note: Callable[[str], None]) -> Iterator[None]:
         _write(file, json.dumps(me))
         yield
     finally:
-        # Removed while it is held, so that nobody takes a file that is no longer there for the lock.
+        # Removed while it is held, so that no process takes a file that is no longer there for the lock.
         with suppress(OSError):
             (folder / LOCK).unlink()
         file.close()

@@ -140,7 +140,7 @@ def _compare(part: _Part, field: str, own: list[int], joined_values: np.ndarray)
 
 
 def _own_rows(mj_model: mujoco.MjModel, kind: str) -> list[int]:
-    """Return the rows of a part's elements; the world's body is everybody's."""
+    """Return the rows of a part's elements; the world's body belongs to all parts."""
     count = getattr(mj_model, COUNTS[kind])
     # The world's body is shared; all others belong to one part.
     return list(range(1 if kind == "body" else 0, count))

@@ -34,7 +34,7 @@ def complete_keyframes(spec: mujoco.MjSpec) -> None:
     ]
     if not silent or not len(spec.actuators):
         return
-    # Whoever compiles the spec in the end passes the warnings on.
+    # The final compile of the spec passes the warnings on.
     with caught_warnings():
         mj_model = load_model(spec)
     for key in silent:

@@ -337,7 +337,7 @@ def flat_cfg(
 
 
 class VelocityTask(Task):
-    """A velocity task on flat ground, for a robot that nobody here has seen."""
+    """A velocity task on flat ground, for any robot."""
 
     @classmethod
     def for_robot(

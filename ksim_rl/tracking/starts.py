@@ -179,7 +179,7 @@ class StartOfTrial(ResetByChoice, StartInMotion):
         super()._check_fields()
         if self.part_s is not None:
             raise ValueError(
-                f"part_s={self.part_s:g}: a StartOfTrial begins where it is told, and draws no part: set it to null"
+                f"part_s={self.part_s:g}: a StartOfTrial begins where it is set, and draws no part: set it to null"
             )
 
     def draw_start(self, view: EnvView) -> tuple[Int64[Tensor, " E"] | None, Float[Tensor, " E"]]:

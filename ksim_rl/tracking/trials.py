@@ -186,7 +186,7 @@ def run_trials(
 ) -> Trials:
     """Run trials of each clip of a tracking task by the deterministic actions of its policy.
 
-    `note` is told of room that worlds get, and of contacts and constraints that they lose.
+    `note` reports room that worlds get, and contacts and constraints that they lose.
     """
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET

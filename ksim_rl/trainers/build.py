@@ -188,7 +188,7 @@ def build_evaluator(
     """Build an evaluator with its own envs, without sensor noise and curricula.
 
     Weights and ranges are the config's, whatever levels curricula have reached in training. With a `note`, the
-    worlds get room by a rehearsal, as in training, and `note` is told; in the process of a run they have it already.
+    worlds get room by a rehearsal, as in training, and `note` reports it; in the process of a run they have it already.
     """
     if seed is None:
         seed = cfg.seed + EVALUATION_SEED_OFFSET

@@ -191,7 +191,7 @@ def _is_copy(source: str, kept: KeptModel) -> bool:
 
 def _checked_copy(name: str, kept: KeptModel, run_folder: Path) -> Path:
     """Return the path of a run's copy of a model; a ValueError refuses one that is damaged, or reaches outside."""
-    # A run folder may come from somebody else: links and ".." must not lead out of it.
+    # A run folder may come from another user: links and ".." must not lead out of it.
     check_links(run_folder, below=(FOLDER,))
     inside = (run_folder / FOLDER).resolve()
     path = Path(os.path.abspath(run_folder / FOLDER / kept.copy))
@@ -222,7 +222,7 @@ def _sources(cfg: RunCfg) -> Iterator[tuple[str, str]]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Data:
-    """Data that a config names: its place in the record and in the config, and how a change of it is told."""
+    """Data that a config names: its place in the record and in the config, and how a change of it is reported."""
 
     name: str
     where: str

@@ -51,7 +51,7 @@ class _OwnConsole(Console):
             super().on_broken_pipe()
         except SystemExit:
             with suppress(OSError):  # stderr may be the same pipe
-                print("ksim-rl: nobody reads the output any more; the run goes on", file=sys.stderr)
+                print("ksim-rl: the output is no longer read; the run goes on", file=sys.stderr)
 
 
 class RunProgress:

@@ -42,7 +42,7 @@ class TrainingRecorder:
         self._keys = keys
         self._origin = origin
         self._max_length = max_length
-        # Whoever comes late, or goes on with a run, comes within episodes.
+        # A recorder that starts late, or resumes with a run, starts in the middle of episodes.
         self._starts_within = iteration > 0
         self._iteration = iteration
         self._recorder: EpisodeRecorder | None = None

@@ -11,7 +11,7 @@ from ksim_rl.trainers.algorithm import Update
 # Networks of an update's state.
 ACTOR = "actor"
 CRITIC = "critic"
-# What belongs to a critic, and begins anew with it: its slow copy, and the temperature of SAC.
+# What belongs to a critic, and starts from scratch with it: its slow copy, and the temperature of SAC.
 WITH_CRITIC = (CRITIC, "target_critic", "log_alpha")
 
 
@@ -35,7 +35,8 @@ def load_env_state(env: EnvBase, state: State) -> None:
 def load_networks(update: Update, state: State, path: Path) -> str:
     """Start from the networks and normalizers of a checkpoint; optimizers and counts stay new.
 
-    A policy that was cloned or distilled has no critic: then this run's begins anew. Returned is a line that says so.
+    A policy that was cloned or distilled has no critic: this run's then starts from scratch. Returns a line that says
+    so.
 
     Raises:
         ValueError: if the networks are others, with the path of the checkpoint.
@@ -43,9 +44,9 @@ def load_networks(update: Update, state: State, path: Path) -> str:
     note = ""
     own = update.state_dict()
     if ACTOR in state and CRITIC in own and CRITIC not in state:
-        anew = {name: own[name] for name in WITH_CRITIC if name in own}
-        state = {**state, **anew}
-        note = f"{path} has a policy and no critic: the critic begins anew"
+        fresh = {name: own[name] for name in WITH_CRITIC if name in own}
+        state = {**state, **fresh}
+        note = f"{path} has a policy and no critic: the critic starts from scratch"
         if "target_critic" in own:
             note += "; with data.policy_starts it learns for a while before the policy does"
     try:

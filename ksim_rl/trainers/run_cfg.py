@@ -259,7 +259,7 @@ class RunCfg(TrainingCfg):
     @classmethod
     def from_tree(cls, tree: Tree) -> "RunCfg":
         """Build the config from plain data, also of an earlier version; a ValueError has the full path of a fault."""
-        # Plain data and known packages first: the tree may be of somebody else's run.
+        # Plain data and known packages first: the tree may come from another user's run.
         check_plain(tree, "config")
         plugins.check_remembered(tree.get(PLUGINS) or ())
         tree = up_to_date({key: value for key, value in tree.items() if key != PLUGINS})
@@ -298,7 +298,7 @@ def check_run_tree(tree: Tree, where: Path, *, given: Collection[str] = ()) -> N
 
     `given` are the fields, by dotted path, that the user sets himself.
     """
-    # A run folder may come from somebody else, so unknown fields are refused.
+    # A run folder may come from another user, so unknown fields are refused.
     known = {*(entry.name for entry in fields(RunCfg)), PLUGINS}
     for name in tree:
         if name not in known:

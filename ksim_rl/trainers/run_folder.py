@@ -109,7 +109,7 @@ def _run_locked(
     # Tell now which classes a later command may not find, and not when the run is resumed.
     for note in loading_notes(cfg.to_tree()):
         progress.note(note)
-    # Under the lock nobody else writes here, so unfinished files are leftovers of a crash.
+    # Under the lock no other process writes here, so unfinished files are leftovers of a crash.
     for folder in (run_folder, run_folder / "checkpoint"):
         checkpoint.remove_leftovers(folder)
     with progress.busy("building envs and networks"):
@@ -121,7 +121,7 @@ def _run_locked(
     # Models and config are written before training, so that an interrupted run can be resumed.
     kept_models.keep_models(cfg, run_folder, note=progress.note)
     write_whole(run_folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(cfg.to_tree())))
-    # Ends the run when somebody deletes or moves its folder.
+    # Ends the run when its folder is deleted or moved.
     trainer.watch = watch(run_folder, holds=CONFIG, note=progress.note)
     with recorded(run_folder, note=progress.note) as ended:
         outcome = trainer.train(progress)

@@ -49,7 +49,7 @@ INTERRUPTED = "sum/interrupted"  # how many ranks were asked to stop
 
 
 class Hook:
-    """Something to do between iterations: an evaluation, a schedule of your own, a message to somebody.
+    """Something to do between iterations: an evaluation, a schedule of your own, a message to a user.
 
     When a hook is called, the device has done all queued work, `trainer.metrics` are the present iteration's, and the
     hook may change anything. CUDA graphs keep the numbers that they were captured with, and are captured again where

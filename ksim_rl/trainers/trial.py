@@ -34,7 +34,7 @@ def first_that_fits(
 ) -> int | None:
     """Return the first of some numbers of envs with which the run trains and leaves a tenth of the memory, or None.
 
-    Numbers that do not divide the data are passed over. `note` is told what is tried, and why it does not fit.
+    Numbers that do not divide the data are passed over. `note` reports what is tried, and why it does not fit.
     """
     for num_envs in numbers:
         try:
@@ -56,7 +56,7 @@ def first_that_fits(
             f"num_envs={num_envs} does not train: {(said.strip() or 'no reason').splitlines()[-1]}"
         )
         if ended.returncode > 0 and ended.returncode != DOES_NOT:
-            break  # the config cannot even be built there, and nobody knows whether memory suffices
+            break  # the config cannot even be built there, and whether memory suffices is unknown
     return None
 
 

@@ -12,7 +12,7 @@ from ksim_rl.transforms.groups.group_cfg import ObservationTermCfg
 def training_conditions(cfg: ManagerBasedRlEnvCfg) -> dict[str, str]:
     """Return what a task trains under, a line for each part of it.
 
-    Of a part of the config its fields are told that differ from their defaults.
+    A part of the config is described by the fields that differ from their defaults.
     """
     timestep = float(scene_spec(cfg.scene, cfg.sim).option.timestep)
     found = {"physics": f"{cfg.decimation} steps of {1e3 * timestep:g} ms to an action"}

@@ -220,7 +220,7 @@ class KeyedTransform(RowTransform):
         return super()._reset(tensordict, tensordict_reset)
 
     def _take_seed(self) -> None:
-        """Draw a seed where nobody has given one."""
+        """Draw a seed where none was given."""
         if not self._is_seeded:
             self.seed_(upstream.fresh_seed())
 
@@ -312,7 +312,7 @@ class Switched(Transform):
 
 
 class FollowsLevel(Transform):
-    """Mixin of transforms that a curriculum can drive: the buffer `level`, float32 [], 1 until somebody changes it."""
+    """Mixin of transforms that a curriculum can drive: the buffer `level`, float32 [], 1 until it is changed."""
 
     level: Tensor
 

@@ -80,7 +80,7 @@ _generator_of_worker = torch.Generator()
 
 
 def fresh_seed() -> int:
-    """Return a seed for transforms without one: drawn from torch's default generator, and told apart by the process.
+    """Return a seed for transforms without one: drawn from torch's default generator, and different in each process.
 
     Forked workers share the state that their parent's generator had. Spawned ones know nothing of it, and torch begins
     anywhere there: unless they call `torch.manual_seed` themselves, they draw from a generator that begins at the same

@@ -24,7 +24,7 @@ class BrowserViewer:
     """A server on `host`:`port`, or the next free port; it opens immediately and shows a session once it has one.
 
     Who opens `address` or `pad_address`, which hold a token, can drive; see `ksim_rl.viewer.gate` for who cannot.
-    Nobody beyond this machine reaches the ports with the default host. Raises ValueError for a host or port that
+    With the default host only this machine reaches the ports. Raises ValueError for a host or port that
     cannot be.
     """
 
@@ -116,7 +116,7 @@ class BrowserViewer:
         sent = False
         while goes_on():
             if not self.watched:
-                # The time in which nobody watches must not be made up for.
+                # Time without a viewer must not be made up for.
                 session.rest()
                 sent = False
                 time.sleep(IDLE_S)

@@ -38,7 +38,7 @@ def checked(raw: str | bytes, widgets: Mapping[str, Any]) -> bytes | None:
         if all(map(_is_pose, entries)):
             return raw
         return None
-    # Exactly these fields: others would reach code of viser that nobody has checked.
+    # Exactly these fields: others would reach code of viser unchecked.
     if kind != UPDATE or message.keys() != {"type", "uuid", "updates"}:
         return None
     uuid = message["uuid"]

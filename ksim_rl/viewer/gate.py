@@ -1,4 +1,4 @@
-"""Who may talk to the ports of the viewer: the pages at the printed addresses, and nobody else.
+"""Who may talk to the ports of the viewer: only the pages at the printed addresses.
 
 A port of this machine is open to every page that its user's browser shows. A page of another site may connect to it
 (its `Origin` tells), a name of another site may lead to it (the `Host` tells: that is DNS rebinding), and another user
@@ -19,7 +19,7 @@ from websockets.http11 import Request, Response
 
 # More pages than anybody looks at; each costs a thread or three tasks, and a queue.
 MOST_CLIENTS = 16
-# More than a page sends while somebody turns the view and drags a slider; beyond that rate it waits.
+# More than a page sends while a user turns the view and drags a slider; beyond that rate it waits.
 MESSAGES_PER_S = 240.0
 _EVERYWHERE = ("0.0.0.0", "::", "")
 
@@ -96,7 +96,7 @@ class Gate:
 
 
 def check_listens(host: str, port: int) -> None:
-    """Refuse a host of which this machine is none, and a port that nobody listens on."""
+    """Refuse a host that is not this machine, and a port that no server can listen on."""
     if not 1 <= port <= 65000:
         raise ValueError(f"port {port}: expected 1 to 65000")
     try:
@@ -106,7 +106,7 @@ def check_listens(host: str, port: int) -> None:
             tried.bind(place)
     except (OSError, UnicodeError) as error:
         raise ValueError(
-            f"host {host!r}: nobody can listen there: {error}; expected 127.0.0.1, or an address of this machine"
+            f"host {host!r}: no server can listen there: {error}; expected 127.0.0.1, or an address of this machine"
         ) from error
 
 

@@ -49,7 +49,7 @@ class _Clients:
 
     async def handle(self, handler: Any, connection: ServerConnection) -> None:
         """Let viser serve a connection, unless there are too many."""
-        # A page more is told the reason, which its browser can show.
+        # One page too many gets the reason, which its browser can show.
         if self._open >= MOST_CLIENTS:
             await connection.close(1013, f"{MOST_CLIENTS} pages are open already")
             return

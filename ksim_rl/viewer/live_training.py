@@ -38,7 +38,7 @@ _NOBODY = "alone"
 
 
 class GiveWeights(Hook):
-    """Writes the actor's weights for the viewer every `PERIOD_S`, while somebody watches."""
+    """Writes the actor's weights for the viewer every `PERIOD_S`, while a page is open."""
 
     def __init__(self, folder: Path) -> None:
         self.is_watched = False
@@ -87,7 +87,7 @@ def watched(cfg: RunCfg, note: Callable[[str], None]) -> Iterator[list[Hook]]:
         write_whole(folder / CONFIG, json.dumps(cfg.to_tree()))
         hook = GiveWeights(folder)
         child = start_python(
-            # The pipe ends with this process, however it ends; its output says whether somebody watches.
+            # The pipe ends with this process, however it ends; its output says whether a page is open.
             ["-m", "ksim_rl.viewer.live_training", name],
             stdin=PIPE,
             stdout=PIPE,
@@ -115,7 +115,7 @@ def _listen(child: "Popen[str]", hook: GiveWeights, note: Callable[[str], None])
             hook.is_watched = line.strip() == _SOME
         else:
             note(line.strip())
-    # The child has ended: nobody reads the weights any more.
+    # The child has ended: the weights are not read any more.
     hook.is_watched = False
 
 
@@ -158,7 +158,7 @@ def main(folder: Path) -> None:
             print(_SOME if said else _NOBODY, flush=True)
         path = folder / WEIGHTS
         session.note = session.note or "waiting for the first policy"
-        # A file that appears whole, so its time tells of a new policy.
+        # A file that appears whole, so its time shows that a policy is new.
         if path.exists() and path.stat().st_mtime_ns != read_at:
             read_at = path.stat().st_mtime_ns
             # Data only: no code of a file is run.

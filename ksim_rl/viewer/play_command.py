@@ -165,7 +165,7 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError(
             f"--output {options.output}: expected a file that ends in {' or '.join(VIDEO_SUFFIXES)}"
         )
-    # A missing package, display or port is told now, not after minutes of compiling.
+    # A missing package, display or port is reported now, not after minutes of compiling.
     if options.viewer == "browser":
         check_viser()
         importlib.import_module("ksim_rl.viewer.gate").check_listens(options.host, options.port)
@@ -196,7 +196,7 @@ def _record(played: Played, options: argparse.Namespace, progress: RunProgress) 
         else:
             status = progress.status
         written = record_video(played.cfg, actor, path, status=status, **how)
-    # Exit code 3: the run failed; the reason was told by `note`.
+    # Exit code 3: the run failed; `note` has given the reason.
     if written is None:
         return 3
     progress.note(f"{played.title}: {min(str(written), os.path.relpath(written), key=len)}")

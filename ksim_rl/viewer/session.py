@@ -26,7 +26,7 @@ from ksim_rl.viewer.shown_motion import ShownMotion, shown_motion
 AGENTS = ("zero", "random")
 Agent = Callable[[TensorDictBase], TensorDictBase]
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-# Requests that may wait: more than anybody clicks between two steps. Nobody takes them while nobody watches.
+# Requests that may wait: more than a user clicks between two steps. They are not taken while no page is open.
 MOST_REQUESTS = 256
 # Longer gaps in which nothing was stepped, such as a rebuilt env, are not made up for.
 MOST_LAG_S = 0.1
@@ -253,7 +253,7 @@ class Session:
         A robot that stands on a fixed base gets its first joint pushed instead, in rad/s or m/s. Raises ValueError for
         a speed or direction that is not finite.
         """
-        # Values come from a browser: NaN would spoil the state of the world for good.
+        # Values come from a browser: NaN would spoil the state of the world, and stay in it.
         check_in_range("speed", speed)
         if direction is not None:
             check_in_range("direction", direction)

@@ -149,7 +149,7 @@ def test_a_policy_without_a_critic_is_a_start_that_says_so(tmp_path):
     state = make_trainer().update.state_dict()
     alone = {name: value for name, value in state.items() if name != "critic"}
     before = {name: value.clone() for name, value in update.state_dict()["critic"].items()}
-    assert "the critic begins anew" in load_networks(update, alone, tmp_path)
+    assert "the critic starts from scratch" in load_networks(update, alone, tmp_path)
     assert load_networks(update, state, tmp_path) == ""
     for name, value in before.items():
         assert torch.equal(value, update.state_dict()["critic"][name]), name

@@ -25,7 +25,7 @@ def collector_of(*, rewards, eager=False, **fields):
 
 
 def rewards_of(collector, count=1):
-    """Return the mean rewards of the next rollouts, without saying that something is recorded anew."""
+    """Return the mean rewards of the next rollouts, without saying that something is recorded again."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         return [float(collector.collect()["next", "reward"].mean()) for _ in range(count)]

@@ -160,7 +160,7 @@ def test_a_new_recording_is_said_with_what_has_changed():
     rewards_of(collector)
     double_attribute(collector.env)
     with pytest.warns(
-        RuntimeWarning, match=r"rewards\.term\.scale was 1\.0 and is 2\.0 since .* recorded anew"
+        RuntimeWarning, match=r"rewards\.term\.scale was 1\.0 and is 2\.0 since .* recorded again"
     ):
         collector.collect()
 

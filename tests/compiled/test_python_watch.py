@@ -88,7 +88,7 @@ def test_nothing_has_changed_as_long_as_nothing_changes():
         g=Slotted(),
     )
     watch = watched(part=part)
-    part.d.add_(1.0)  # recordings read tensors anew
+    part.d.add_(1.0)  # recordings read tensors at each replay
     part.a, part.c["k"] = 1, (1, 2)
     assert watch.changes() == []
 

@@ -1,4 +1,4 @@
-"""Graphs are recorded anew where what they were recorded from has changed; what changes often is not recorded."""
+"""Graphs are recorded again where what they were recorded from has changed; what changes often is not recorded."""
 
 import warnings
 
@@ -60,7 +60,7 @@ def made():
 def test_a_change_from_outside_is_followed_and_said():
     graph, watched = made()
     with pytest.warns(
-        RuntimeWarning, match=r"loss\.clip_epsilon was 0\.2 and is 0\.1 since .* recorded anew"
+        RuntimeWarning, match=r"loss\.clip_epsilon was 0\.2 and is 0\.1 since .* recorded again"
     ):
         assert calling(graph, watched, (0.2, 0.2, 0.2, 0.1, 0.1, 0.1)) == [
             0.2,

@@ -139,7 +139,7 @@ def noted_env():
 
 
 def in_order():
-    """Return the kinds in the order of their first call, and start anew."""
+    """Return the kinds in the order of their first call, and start over."""
     kinds = list(dict.fromkeys(calls))
     calls.clear()
     return kinds

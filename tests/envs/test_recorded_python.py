@@ -223,7 +223,7 @@ def test_a_graph_is_forgotten_when_python_has_changed():
     object.__setattr__(env.cfg.rewards["position"], "scale", 2.0)
     followed.follow()
     assert graph.forgotten == 1
-    # Two steps show anew what Python does, and nothing has changed since.
+    # Two steps show again what Python does, and nothing has changed since.
     for _ in range(3):
         with followed.calling():
             step()

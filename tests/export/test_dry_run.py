@@ -47,7 +47,7 @@ def test_the_policy_runs_dry_before_it_stands_and_before_it_moves(folder, contro
         assert robot.commands[k].effort.tolist() == [0.0, 0.0]
     for k in dry[NUM_STEPS:]:
         assert robot.commands[k].pos == pytest.approx(control.joints.default_pos)
-    # What is told is what this policy makes of these measurements, and it begins anew where it counts.
+    # The report shows this policy's actions for these measurements; before it moves the robot, the policy is reset.
     other = PolicyControl(folder, read_json(folder / "export.json"))
     other.command["twist"] = np.array([1.0, -0.5])
     for places in (dry[:NUM_STEPS], dry[NUM_STEPS:], at[State.POLICY]):

@@ -193,7 +193,7 @@ def test_nothing_beyond_the_ranges_of_the_training_reaches_a_policy(folder, cont
     assert control.command["twist"].tolist() == [2.0, 0.5]
     measurement = robot.read()
     expected = control(measurement).pos
-    # Whoever writes it past the operator's words asks for no more.
+    # A command that is written past the operator's words asks for no more.
     control.begin()
     control.command["twist"][:] = (9.0, 0.5)
     assert control(measurement).pos == pytest.approx(expected)

@@ -51,7 +51,7 @@ def differences(env: ManagerBasedRlEnv, traced: Traced, names, *, steps: int = 1
         values_EL, *states = traced.module(*given, *states)
         wanted_EL = torch.cat([current["obs", name] for name in names], -1)
         found.append(float((values_EL - wanted_EL).abs().max()))
-        # One env begins anew, and forgets; the others go on.
+        # One env is reset, and forgets; the others go on.
         begins_E = torch.arange(env.num_envs) == step % 4
         stepped = env.step(env.rand_action(current))
         following = cast("TensorDictBase", stepped["next"])

@@ -140,7 +140,7 @@ def test_seed():
     )
     assert not torch.equal(start("task.seed=6")[0], first)
     drawn, again = start()[1], start()[1]
-    assert drawn >= 0 and again >= 0 and drawn != again, "drawn anew, and stored"
+    assert drawn >= 0 and again >= 0 and drawn != again, "drawn again, and stored"
 
 
 SIM = {

@@ -109,7 +109,7 @@ def test_stock_transforms_around_the_made_env_give_right_sums(env):
 
 
 def check_sums(rollout_ET: TensorDictBase) -> None:
-    """Compare `episode_reward` and `step_count` with sums that start anew after each end."""
+    """Compare `episode_reward` and `step_count` with sums that start over after each end."""
     total_E1, count_E1 = torch.zeros(E, 1), torch.zeros(E, 1, dtype=torch.int64)
     next_ET = rollout_ET["next"]
     for t in range(T):

@@ -53,7 +53,7 @@ def test_long_episodes_raise_the_level_and_short_ones_lower_it():
     survivors = leveled(term, steps=4)
     assert run(survivors, 8) == [0.5] * 3 + [0.75] * 4 + [1.0]
     fallers = puck_env_in_c(limit=0.05, episode_length_s=4 * DT, curriculum={"level": term})
-    # Three episodes have ended after step 2, with 1, 1 and 2 steps; three more after step 3 already count anew.
+    # Three episodes have ended after step 2, with 1, 1 and 2 steps; three more after step 3 already count from zero.
     assert run(fallers, 2) == [0.5, 0.25]
 
 

@@ -120,7 +120,7 @@ def test_vtrace_equals_stock_torchrl_and_the_definition(end_probability, thresho
     out = VTrace(gamma=GAMMA, actor=actor, critic=critic, **thresholds)(data)
     ratio = _ratio(actor, data)
     assert (ratio > 1.0).any() and (ratio < 1.0).any()
-    # The function rather than TorchRL's class, which compares with the log-probability of an action drawn anew.
+    # The function rather than TorchRL's class, which compares with the log-probability of an action drawn again.
     advantage, value_target = vtrace_advantage_estimate(
         GAMMA,
         ratio.log(),

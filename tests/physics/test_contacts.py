@@ -302,6 +302,6 @@ def test_what_turns_about_its_centre_of_mass_and_may_touch_the_ground_is_warned_
     told = [str(warning.message) for warning in caught if "no weight" in str(warning.message)]
     assert len(told) == warns
     assert all("geom 'ground' and geom 'beam' may touch" in text for text in told)
-    # Whoever is not warned of has C's weights to the last bit.
+    # Bodies without a warning have C's weights to the last bit.
     weights = world.warp_model.body_invweight0.numpy()[0]
     assert (weights != mj_model.body_invweight0.astype(np.float32)).any() == warns

@@ -1,4 +1,4 @@
-"""Whoever is dead, stopped or in the same place for too long ends the others, with a cause."""
+"""A rank that is dead, stopped or in the same place for too long ends the others, with a cause."""
 
 import threading
 

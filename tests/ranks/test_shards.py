@@ -1,4 +1,4 @@
-"""A checkpoint of several ranks goes on bit for bit on as many, and is dealt out anew to others."""
+"""A checkpoint of several ranks goes on bit for bit on as many, and is redistributed to others."""
 
 from types import SimpleNamespace
 

@@ -156,7 +156,7 @@ def test_a_record_of_other_things_is_said_and_replaced(run, notes, text):
     assert record.status(run)[0] == "unknown"
     with record.recorded(run, note=notes.append):
         pass
-    assert len(record.read(run)) == 1 and "it begins anew" in notes[0]
+    assert len(record.read(run)) == 1 and "it starts over" in notes[0]
 
 
 def test_what_a_stranger_wrote_does_not_command_the_terminal(run):

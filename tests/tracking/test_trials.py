@@ -88,7 +88,7 @@ def test_trials_begin_with_the_motion_and_are_not_pushed():
     assert isinstance(start, StartOfTrial)
     assert (start.clip, start.part_s, start.joint_range) == ("", None, 0.1)
     for fields in ({"start_range": (0.0, 0.5)}, {"part_s": 1.0}):
-        with pytest.raises(ValueError, match="begins where it is told"):
+        with pytest.raises(ValueError, match="begins where it is set"):
             dataclasses.replace(start, **fields)
     assert "push_robot" not in cfg.events and {"foot_friction", "base_com", "default_pose"} <= set(
         cfg.events

@@ -79,7 +79,7 @@ def test_rewards_ends_and_the_levels_of_curricula_and_commands_reach_the_table(t
         float(row["command/height/height_low"]) == 0.375
         and float(row["command/height/height_high"]) == 0.625
     )
-    assert env.episode_log()["episodes"] == 0.0, "and the sums start anew"
+    assert env.episode_log()["episodes"] == 0.0, "and the sums start over"
 
 
 def test_without_a_curriculum_there_are_no_levels_to_report():

@@ -21,7 +21,7 @@ def parts(trainer):
 
 
 def trained(*args, **options):
-    """Make and train; torch's global generator starts anew with each."""
+    """Make and train; torch's global generator starts over with each."""
     trainer = make_trainer(*args, **options)
     trainer.train()
     return trainer

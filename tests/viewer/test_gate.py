@@ -92,8 +92,8 @@ def test_an_address_is_one_that_a_browser_opens(host):
 @pytest.mark.parametrize(
     ("host", "port", "said"),
     [
-        ("nowhere.invalid", 8080, "'nowhere.invalid': nobody can listen there"),
-        ("203.0.113.7", 8080, "'203.0.113.7': nobody can listen there"),
+        ("nowhere.invalid", 8080, "'nowhere.invalid': no server can listen there"),
+        ("203.0.113.7", 8080, "'203.0.113.7': no server can listen there"),
         ("127.0.0.1", 0, "port 0: expected 1 to 65000"),
         ("127.0.0.1", 70000, "port 70000: expected 1 to 65000"),
     ],

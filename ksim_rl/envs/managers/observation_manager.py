@@ -36,7 +36,7 @@ class ObservationManager:
     def read(
         self, reset_E: Bool[Tensor, " E"] | None = None
     ) -> dict[str, Shaped[Tensor, " E *?leaf"]]:
-        """Return the readings of the current state by term, in memory that nobody else reads or writes.
+        """Return the readings of the current state by term, in memory that no other code reads or writes.
 
         They are float32 [E, L], side by side in one tensor, and images [E, H, W] or [E, H, W, C]. Buffers of terms
         advance in all rows, once per env step, or after a reset in the rows of `reset_E` only; readings of other rows

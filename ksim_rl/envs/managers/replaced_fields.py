@@ -25,7 +25,7 @@ def check_not_replaced(curricula: Mapping[str, CurriculumTerm], overrides: Seque
         every = set(_replaced(term))
         of_curriculum = [field for field in given if _is_in(field, curriculum)]
         for replaced in sorted(every):
-            # Whoever says what the curriculum does with the field knows of it.
+            # The user describes what the curriculum does with the field, and so knows of it.
             if any(not _is_of_others(field, replaced, every) for field in of_curriculum):
                 continue
             for field in given:

@@ -212,7 +212,7 @@ class TermGuard:
                 if torch.equal(bits, old_bits):
                     continue
                 piece = piece or self._memory.holder(bits)
-                # An event that writes state also empties the caches, so that nobody reads this quantity any more.
+                # An event that writes state also empties the caches, so that this quantity is no longer read.
                 if piece is None:
                     continue
                 if not may_write(call.scope, piece):

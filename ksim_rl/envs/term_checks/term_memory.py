@@ -32,7 +32,7 @@ DIFFICULTY = "difficulty"
 """Tables and targets that events and actions write for all to read, and values that curricula write."""
 TABLE = "table"
 QUANTITY = "quantity"
-"""Tensors that nobody writes once they are made, and quantities that were computed once for all readers."""
+"""Tensors that are never written once they are made, and quantities that were computed once for all readers."""
 
 _KIND_OF_ARRAY = {"qpos": STATE, "qvel": STATE, "mocap_pos": MOCAP, "mocap_quat": MOCAP}
 _KIND_OF_ARRAY |= (
@@ -238,7 +238,7 @@ class TermMemory:
         for spelled, part in self._view.parts().items():
             for name, tensor in _tensors_of(part):
                 yield _piece(f"{spelled}.{name}", TABLE, tensor)
-        # Shared by all terms of the process, so nobody may write them.
+        # Shared by all terms of the process, so no term may write them.
         for tensor in constants():
             if tensor.numel():
                 start, end = extent(tensor)

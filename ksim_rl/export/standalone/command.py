@@ -107,7 +107,7 @@ def _check_options(options: argparse.Namespace) -> None:
 
 def _run_all(options: argparse.Namespace) -> list[dict[str, float]]:
     _check_options(options)
-    # What is wrong is said here: a process that fails as it begins has nobody to tell.
+    # Errors are reported here: a child process that fails as it begins cannot report them.
     runner = Runner(options.folder, options.seed)
     _record(runner)
     if options.replay:

@@ -26,7 +26,7 @@ class CommandRange:
 
     def _ends(self, what: Literal["low", "high"], spec: CommandSpec, otherwise: float) -> Array:
         values = spec.get(what)
-        # A command of which nobody knows what it may be, or a folder of before there were ranges.
+        # A command without known bounds, or a folder from before ranges were exported.
         if values is None:
             return np.full(self.size, otherwise)
         try:
@@ -57,7 +57,7 @@ class CommandRange:
 
     def __str__(self) -> str:
         if np.isinf(self.low).all() and np.isinf(self.high).all():
-            return "any numbers, as nobody knows which the policy has seen"
+            return "any numbers, as it is not known which the policy has seen"
         return f"{as_words(self.low)} to {as_words(self.high)}"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ksim_rl.export.standalone.files import Json
 
 RESOLUTION = 1e-5
-"""s, of the times that are told."""
+"""s, of the times that are reported."""
 MOST_BINS = 10_000
 MEMORY_EVERY_S = 5.0
 

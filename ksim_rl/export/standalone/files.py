@@ -22,7 +22,7 @@ MOST_BYTES = 2**30
 FORMAT = 2
 # Far more than an export has of anything that is counted, such as actions or steps of a delay.
 MOST = 1_000_000
-# Of a period: nobody could stop a robot that listens less often.
+# Of a period: a robot that listens less often could not be stopped in time.
 MOST_SECONDS = 10.0
 # Tags by which MuJoCo would load other files or code, and "<!", which begins an XML entity.
 LEAVES_THE_FOLDER = re.compile(rb"<!|<\s*(include|extension|plugin|attach|model)\b", re.IGNORECASE)
@@ -34,7 +34,7 @@ Json: TypeAlias = dict[str, Any]
 
 def read(path: Path, most: int = MOST_BYTES) -> bytes:
     """Return the bytes of a regular file of limited size; links, pipes and devices are refused."""
-    # No link is followed, and a pipe does not block until somebody writes to it.
+    # No link is followed, and a pipe does not block until something is written to it.
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW), "rb") as file:
             # Asked of the open file, not of its path, which could be another file by then.

@@ -3,7 +3,7 @@
     python loop.py --simulate               # a robot of MuJoCo's C engine stands up and walks
     python loop.py --simulate --seconds 0   # the same, with words of yours: stand, policy, stop, damp
 
-The policy runs dry first: what it would ask for is told and checked. Then come the states damp, stand, policy, stop.
+The policy runs dry first: what it would ask for is shown and checked. Then come the states damp, stand, policy, stop.
 Late, lost, repeated or wrong messages, limits of joints, tilt, errors and your stop lead to damped motors. What
 happened is in a log that `ksim-rl identify` reads. For a robot of yours write a class with `read`, `write` and
 `close` (see `Robot`), and give it to `drive`.

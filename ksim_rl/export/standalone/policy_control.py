@@ -170,7 +170,7 @@ class PolicyControl:
             return self._of_root(quantity, node.get("frame", "root"))
         if quantity == "command":
             name = node["command"]
-            # Whatever a stick says, the policy reads what it has seen.
+            # Whatever a stick says, the policy reads only commands that it has seen.
             return lambda _: self.ranges[name].clip(self.command[name])
         if quantity == "default_joint_pos":
             default = self.joints.default_pos[self.joints.columns(node["joints"])]

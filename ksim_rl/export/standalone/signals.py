@@ -237,7 +237,7 @@ class Signals:
         """Recompute all that follows from position and velocity; contacts and forces stay from the last substep."""
         model = self.model
         data = self.data
-        # Velocities of subtrees, too: sensors of momentum read the last substep's where nobody computes them.
+        # Velocities of subtrees, too: sensors of momentum read the last substep's where they are not computed.
         # Cameras and lights of pictures move with their bodies.
         stages = (
             mujoco.mj_kinematics,
@@ -259,7 +259,7 @@ class Signals:
         """Return a function that reads a quantity; a ValueError shows a node that names none."""
         try:
             return self._quantity(node["quantity"], node)
-        # A node is data of a stranger: a missing key or a wrong type is told with its text.
+        # A node is untrusted data: the error for a missing key or a wrong type has its text.
         except (KeyError, TypeError) as error:
             raise ValueError(f"export.json: {str(node)[:200]}: {error}") from None
 
@@ -339,7 +339,7 @@ class Signals:
         }[name]
 
     def _of_bodies(self, name: str, node: Json) -> Value:
-        # `data` is the same object for good, so its arrays may be kept.
+        # `data` stays the same object, so its arrays may be kept.
         data = self.data
         ids = [self.model.body(body).id for body in node["bodies"]]
         return {

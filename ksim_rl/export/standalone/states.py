@@ -149,7 +149,7 @@ class StateMachine:
         return self._damped(self.pose)
 
     def fail(self, now: float, why: str) -> None:
-        """Damp the motors for good, and say why, once."""
+        """Damp the motors from now on, and say why, once."""
         if self.fault:
             return
         self.fault = why
@@ -222,7 +222,7 @@ class StateMachine:
         )
 
     def _run_dry(self, now: float, measurement: Measurement, *, stands: bool) -> None:
-        """Run one step of the policy that nobody obeys, and tell after the last one what it would have asked for."""
+        """Run one step of the policy without sending its action, and report after the last what it would have sent."""
         if self.dry is None or self.dry.is_over():
             return
         self.asked = self.dry(measurement)

@@ -18,11 +18,11 @@ STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SI
 OF_THE_TERMINAL = (signal.SIGTTIN, signal.SIGTTOU)
 """By which a system halts a program in the background that uses the terminal."""
 REST_S = 1.0
-"""With damped motors at the beginning, where nobody says more."""
+"""With damped motors at the beginning, until a word says more."""
 
 
 class Operator(Protocol):
-    """Whoever says what comes next."""
+    """A source of operator words, which say what comes next."""
 
     def words(self, now: float, machine: StateMachine) -> list[str]:
         """Return what was said since the last period."""
@@ -32,7 +32,7 @@ class Operator(Protocol):
 class Keyboard:
     """Lines of a terminal: each is a word, or the numbers of a command; an empty line is `stop`.
 
-    The end of lines is `stop`, too, where the keyboard `leads`: nobody can stop it any more.
+    The end of lines is `stop`, too, where the keyboard `leads`: no word could stop the robot any more.
     """
 
     def __init__(self, lines: TextIO | None, *, leads: bool) -> None:
@@ -48,7 +48,7 @@ class Keyboard:
             for line in self.lines:
                 self.said.put(line.strip() or "stop")
         except ValueError:
-            # Bytes that are no text: somebody said something, and is not heard any more.
+            # Bytes that are no text: the operator said something that cannot be read.
             self.said.put("stop")
         except OSError:  # the terminal is gone, or another program has it
             pass

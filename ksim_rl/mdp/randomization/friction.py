@@ -81,7 +81,7 @@ def _needs(kind: int) -> str:
 
 def _unfelt(mj_model: mujoco.MjModel, geom: int, column: int, reach: tuple[float, float]) -> str:
     """Return why fixed geoms feel none of the values drawn for a geom, or only the upper part; empty if all is felt."""
-    # Bodies welded to the world: the ground, and whatever stands on it for good.
+    # Bodies welded to the world: the ground, and what is fixed to it.
     fixed = np.flatnonzero(mj_model.body_weldid[mj_model.geom_bodyid] == 0)
     grounds = [
         int(other) for other in fixed if other != geom and _collide(mj_model, geom, int(other))

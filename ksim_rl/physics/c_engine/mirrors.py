@@ -44,7 +44,7 @@ class Mirror:
         self._seen.copy_(self.tensor)
 
     def push_changes(self) -> bool:
-        """Write those numbers that somebody has changed since the last copy; whether there are any.
+        """Write the numbers that have changed since the last copy; whether there are any.
 
         The others keep the digits that rounding to float32 takes away.
         """

@@ -28,7 +28,7 @@ class CandidatePairs:
         # Pairs collide if one's contype meets the other's conaffinity; see MuJoCo's filters.
         keep = (affine != 0) & (weld_1 != weld_2)
         if not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
-            # The world (0) is nobody's parent for this filter, so that robots collide with what is fixed to it.
+            # For this filter the world (0) is no parent, so that robots collide with what is fixed to it.
             both_move = (weld_1 != 0) & (weld_2 != 0)
             are_related = (weld_1 == parent_2) | (weld_2 == parent_1)
             keep &= ~(both_move & are_related)

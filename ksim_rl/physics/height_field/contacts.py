@@ -150,7 +150,7 @@ def height_field_contacts(c: Collisions):
                 touch = touch_of_core(prism, core, reach)
                 if touch.distance >= reach:
                     continue
-                # C stops here in silence; a bit of the report of overflow tells of it.
+                # C stops here in silence; we set a bit of the overflow report.
                 if found == MOST:
                     wp.atomic_or(c.overflow, world, TOO_MANY)
                     return

@@ -112,7 +112,7 @@ def dissect(mj_model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
         raise ValueError(
             "no chain of joints ends at the lowest point of the model: it has no feet to stand on"
         )
-    # A leg that the pose lifts is told by its build.
+    # A leg that the pose lifts is recognized by its build.
     builds = {b: _build_of(mj_model, b, root) for b in ends}
     feet = []
     for end in ends:

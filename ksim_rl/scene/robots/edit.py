@@ -224,7 +224,7 @@ def drop_bodies(spec: mujoco.MjSpec, names: Iterable[str]) -> None:
 def replace_collision_geoms(spec: mujoco.MjSpec, geoms: Sequence[CollisionGeom]) -> None:
     """Delete all geoms that can collide and add `geoms`; visual geoms, masses and inertias of all bodies stay.
 
-    Geoms that a tendon wraps around stay too, and collide no more, as do the geoms of bodies that nobody would see
+    Geoms that a tendon wraps around stay too, and collide no more, as do the geoms of bodies that would be invisible
     without them; these lose their names. Explicit pairs of geoms are contacts of the old ones, and go with them, as
     sensors of the old ones do.
     """

@@ -23,7 +23,7 @@ def passive_joints(mj_model: mujoco.MjModel) -> list[int]:
     for actuator in moving:
         moved = _moved_by(mj_model, int(actuator))
         if moved is None:
-            # It cannot be told which joints move: all count as driven.
+            # It is unknown which joints move: all count as driven.
             return []
         driven.update(moved)
     return [joint for joint in joints if joint not in driven]

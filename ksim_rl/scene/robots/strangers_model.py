@@ -1,4 +1,4 @@
-"""Reads the model of a robot that nobody here has seen, and readies it for an analysis."""
+"""Reads the model of an unknown robot, and prepares it for an analysis."""
 
 import dataclasses
 import re
@@ -120,7 +120,7 @@ def read_model(source: Source, drop: Sequence[str] = ()) -> StrangersModel:
 def robot_name(source: Source, spec: mujoco.MjSpec | None = None) -> str:
     """Return the name of a robot: its file without the suffix, or the model's own name.
 
-    A scene that cannot be read is called like its folder: the fault is told where the model is needed.
+    A scene that cannot be read is called like its folder: the error comes where the model is needed.
     """
     is_file = not isinstance(source, mujoco.MjSpec) and not is_xml(source)
     called = Path(source).stem if is_file else "scene"

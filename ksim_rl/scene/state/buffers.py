@@ -63,7 +63,7 @@ class Arena:
         )
 
     def take(self, shape: tuple[int, ...]) -> Shaped[Tensor, " E *shape"]:
-        """Return a buffer [E, *shape], contiguous, that nobody else has."""
+        """Return a new buffer [E, *shape], contiguous."""
         width = math.prod(shape)
         start = self._used
         self._used = self._used + self._num_envs * width

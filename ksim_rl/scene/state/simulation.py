@@ -214,7 +214,7 @@ class Simulation:
             # Of the same class, which others look for.
             error.add_note(f"(in {name.replace('/', '.')})")
             raise
-        # Outside of a term nobody reads or owns buffers.
+        # Outside of a term no buffer is read or owned.
         finally:
             self._scope = self.reader = ""
 

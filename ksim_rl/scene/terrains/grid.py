@@ -134,7 +134,7 @@ class TerrainGrid(Terrain):
             )
             # Mean step between neighbours, by cells per edge: a slope in the same unit for all patches.
             gradient = (columns - 1) * float(np.abs(np.diff(heights_RC)).mean())
-            # Whoever looks at the compiled model alone sees the hardest patch.
+            # The compiled model alone shows the hardest patch.
             if gradient > most:
                 steepest = name
                 most = gradient

@@ -115,7 +115,7 @@ class GoalOrientation(CommandTerm):
 
     def _shown(self, view: EnvView) -> Tensor:
         """The orientation of the mocap body, [E, 4], to be written in place."""
-        # Nobody reads a quantity that derives from that body's pose before the next substep.
+        # No quantity that derives from that body's pose is read before the next substep.
         mocap = int(view.world.mj_model.body_mocapid[view.resolver.one("body", self.mocap)])
         return view.world.view("mocap_quat")[:, mocap]
 

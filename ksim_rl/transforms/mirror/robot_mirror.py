@@ -89,7 +89,7 @@ def mirror_joints(mj_model: "mujoco.MjModel", joints: Sequence[str] | None = Non
     a pose that is its own mirror image. `joints` are hinges and slides in the order of the columns, None for all.
     Raises ValueError where a joint has no counterpart, or the two are no mirror images of each other.
     """
-    # Whoever has a model has MuJoCo; the other transforms need none.
+    # A caller with a model has MuJoCo; the other transforms need none.
     import mujoco
 
     data = mujoco.MjData(mj_model)

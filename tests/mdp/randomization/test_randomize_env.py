@@ -71,7 +71,7 @@ def assert_constants_follow(env: ManagerBasedRlEnv) -> None:
 
 @pytest.fixture(scope="module")
 def env():
-    """Mass anew at each reset, beside a centre of mass from startup and an armature that changes on the way."""
+    """A new mass at each reset, beside a centre of mass from startup and an armature that changes on the way."""
     return runner_env(
         {
             "com": mdp.RandomizeBodyCom(bodies="trunk", ranges=(-0.05, 0.05), operation="add"),

@@ -89,7 +89,7 @@ def test_forces_of_bodies_and_momenta_need_no_sensor(integrator):
     for name in read:
         world.view(name)
     world.field("body_mass")[2] *= 2.0
-    # Beside it, a world in which nobody reads them.
+    # Beside it, a world in which they are not read.
     plain = thrown(mj_model=without_sensors(), sim=sim, per_world_fields=("body_mass",))
     plain.field("body_mass")[2] *= 2.0
     heavier = copy.copy(world.mj_model)

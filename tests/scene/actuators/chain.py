@@ -132,7 +132,7 @@ class ChainBench:
         self.reset(*range(num_envs))
 
     def reset(self, *rows: int) -> None:
-        """Start these rows anew, as the env does."""
+        """Reset these rows, as the env does."""
         mask_E = torch.zeros(self.world.num_envs, dtype=torch.bool)
         mask_E[list(rows)] = True
         self.view.reset_count_E.add_(mask_E)

@@ -1,4 +1,4 @@
-"""MuJoCo Playground's formulas for its two tasks, written anew in NumPy over the state of MuJoCo's C engine."""
+"""MuJoCo Playground's formulas for its two tasks, written again in NumPy over the state of MuJoCo's C engine."""
 
 import dataclasses
 from pathlib import Path
