@@ -23,6 +23,7 @@ from ksim_rl.mdp.randomization.joints import *  # noqa: F403
 from ksim_rl.mdp.randomization.looks import *  # noqa: F403
 from ksim_rl.mdp.randomization.poses import *  # noqa: F403
 from ksim_rl.mdp.randomization.randomize import RandomizeField
+from ksim_rl.mdp.randomization.shapes import *  # noqa: F403
 from ksim_rl.mdp.rewards.feet import *  # noqa: F403
 from ksim_rl.mdp.rewards.joints import *  # noqa: F403
 from ksim_rl.mdp.rewards.tracking import *  # noqa: F403
