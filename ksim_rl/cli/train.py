@@ -21,6 +21,7 @@ from ksim_rl.cli.errors import report, say
 from ksim_rl.cli.report import run_and_report
 from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
+from ksim_rl.data import ReplayCfg
 from ksim_rl.files.writing import check_links
 from ksim_rl.runs.run_lock import is_locked
 from ksim_rl.terminal import show
@@ -190,6 +191,8 @@ def _train_one(
     if cfg.checkpoint is not None:
         cfg = dataclasses.replace(cfg, checkpoint=str(Path(cfg.checkpoint).resolve()))
     cfg = dataclasses.replace(cfg, objective=cfg.objective.with_absolute_paths())
+    if isinstance(cfg.data, ReplayCfg):
+        cfg = dataclasses.replace(cfg, data=cfg.data.with_absolute_paths())
     cfg = _with_models_of(began, cfg, note=say)
     folder = Path(launched.runtime.output_dir)
     # Where the user named the folder of a run that is under way, that run's lock says so.

@@ -8,6 +8,7 @@ from ksim_rl.data.episode_recorder import EpisodeRecorder, leaves_of
 from ksim_rl.data.episode_writer import EpisodeWriter
 from ksim_rl.data.epoch_sampler import BURN_IN_KEY, EpochSampler, SequenceSampler, sequence_length
 from ksim_rl.data.lerobot import check_lerobot, write_lerobot
+from ksim_rl.data.offline import OfflineCfg, OfflineTable, make_offline_table, offline_keys
 from ksim_rl.data.recorder_cfg import RecorderCfg
 from ksim_rl.data.replay_ring import PrioritySampler, ReplayCfg, ReplayRing, ReplaySampler
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter

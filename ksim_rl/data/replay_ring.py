@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Int64, Shaped
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.data.replay_buffers import Sampler
@@ -17,6 +18,7 @@ from ksim_rl.checked import Checked, Count, NonNegative, Repeats, Share, WholeNu
 from ksim_rl.checks import check_count, check_in_range, naming
 from ksim_rl.data.dataset_storage import Stateless
 from ksim_rl.data.epoch_sampler import Entries, SampleInfo, stored
+from ksim_rl.data.offline import OfflineCfg, OfflineTable
 from ksim_rl.data.replay_storage import ReplayStorage, ReplayWriter, SavedByStateDict
 from ksim_rl.device.state_tree import State, branch, tensor
 
@@ -202,6 +204,8 @@ class ReplayCfg(Checked):
     From `learning_starts` until each env has made `policy_starts` steps only the critics learn: critics that know
     nothing would spoil a good policy that a run goes on from (PIRLNav, Ramrakhya et al., arXiv 2301.07302).
 
+    With `offline` a share of each minibatch are recorded env states (RLPD, Ball et al., arXiv 2302.02948).
+
     Without `save_replay` checkpoints are small, and a resumed run begins with an empty replay and random actions until
     `learning_starts`, so that it is not the same run any more.
     """
@@ -212,9 +216,8 @@ class ReplayCfg(Checked):
     capacity: Count = 1024  # env states per env; the end of an episode takes one more
     n_step: Repeats = 1  # rewards that a target sums before it bootstraps
     learning_starts: Count = 10  # steps of each env with random actions before any update
-    policy_starts: WholeNumber = (
-        0  # steps of each env before the policy learns; 0 is with the critics
-    )
+    offline: OfflineCfg | None = None  # recorded episodes that each minibatch has a share of
+    policy_starts: WholeNumber = 0  # steps of each env before the policy learns, too
     prioritized: bool = False  # by the last TD error (Schaul et al., arXiv 1511.05952)
     priority_alpha: NonNegative = 0.6  # how strongly the error counts; 0 is uniform
     priority_beta: Share = 0.4  # how far the weights of the losses undo that; 1 is wholly
@@ -231,6 +234,12 @@ class ReplayCfg(Checked):
                 f"capacity={self.capacity} is less than 2 * num_steps + n_step = {least}: "
                 "one rollout would overwrite itself; raise capacity"
             )
+        if self.offline is not None:
+            self.offline.part_of(self.num_env_states_per_minibatch)
+            if self.prioritized:
+                raise ValueError(
+                    "prioritized=True with offline: priorities are of the replay alone; leave one of them out"
+                )
         if 0 < self.policy_starts <= self.learning_starts:
             raise ValueError(
                 f"policy_starts={self.policy_starts} is not beyond learning_starts={self.learning_starts}: the critics "
@@ -248,6 +257,11 @@ class ReplayCfg(Checked):
     def rollout_length(self, num_envs: int) -> int:
         """Return T, which does not depend on the number of envs; these and minibatches have equal shards."""
         size = self.num_env_states_per_minibatch
+        if self.offline is not None and self.offline.part_of(size) % self.shards:
+            raise ValueError(
+                f"shards={self.shards}: use a divisor of the {self.offline.part_of(size)} env states that are "
+                f"offline.share={self.offline.share!r} of minibatches of {size}"
+            )
         if num_envs % self.shards or size % self.shards:
             raise ValueError(
                 f"shards={self.shards}: use a divisor of num_envs={num_envs} and of minibatches of {size}"
@@ -257,6 +271,13 @@ class ReplayCfg(Checked):
                 "prioritized=True: priorities are compared in one process without shards only"
             )
         return self.num_steps
+
+    def with_absolute_paths(self) -> "ReplayCfg":
+        """Return the same with the path of a folder that leads there from anywhere."""
+        if self.offline is None:
+            return self
+        source = str(Path(self.offline.source).resolve())
+        return replace(self, offline=replace(self.offline, source=source))
 
     def with_rollout_length(self, length: int, num_envs: int) -> "ReplayCfg":
         """Return the same with rollouts of `length` steps."""
@@ -268,15 +289,20 @@ class ReplayRing(ReplayBuffer):
     """Holds the last env states of each env and yields minibatches of B of them, with their successors n steps later.
 
     Its TorchRL parts are `ReplayStorage`, whose other arguments are `of_storage`, `ReplaySampler` or `PrioritySampler`,
-    and `ReplayWriter`. `extend` takes rollouts `["E","T"]`. None of its methods makes a host sync, so all can be
-    captured in a CUDA graph.
+    and `ReplayWriter`. `extend` takes rollouts `["E","T"]`. With `cfg.offline` minibatches have that share of
+    `offline`, a table that has to be set, behind the env states of the ring. None of its methods makes a host sync, so
+    all can be captured in a CUDA graph.
     """
 
     def __init__(self, cfg: ReplayCfg, **of_storage: Any) -> None:
         self._ring = ReplayStorage(capacity=cfg.capacity, n_step=cfg.n_step, **of_storage)
-        sampler: Sampler = ReplaySampler(
-            shards=cfg.shards, minibatch=cfg.num_env_states_per_minibatch
-        )
+        size = cfg.num_env_states_per_minibatch
+        if cfg.offline is None:
+            self._num_offline = 0
+        else:
+            self._num_offline = cfg.offline.part_of(size)
+        self._num_online = size - self._num_offline
+        sampler: Sampler = ReplaySampler(shards=cfg.shards, minibatch=self._num_online)
         if cfg.prioritized:
             exponents = {"alpha": cfg.priority_alpha, "beta": cfg.priority_beta}
             sampler = PrioritySampler(self._ring.max_size, device=self._ring.device, **exponents)
@@ -285,14 +311,17 @@ class ReplayRing(ReplayBuffer):
             sampler=sampler,
             writer=ReplayWriter(),
             collate_fn=lambda data: data,
-            batch_size=cfg.num_env_states_per_minibatch,
+            batch_size=size,
         )
         self.cfg = cfg
+        self.offline: OfflineTable | None = None
 
     @property
     def non_finite_count(self) -> Int64[Tensor, ""]:
-        """Env states refused so far because an element was not finite, on the device."""
-        return self._ring.non_finite_count
+        """Env states refused so far because an element was not finite, recorded ones included, on the device."""
+        if self.offline is None:
+            return self._ring.non_finite_count
+        return self._ring.non_finite_count + self.offline.storage.non_finite_count
 
     @property
     def num_stored(self) -> Int64[Tensor, ""]:
@@ -300,19 +329,22 @@ class ReplayRing(ReplayBuffer):
         return self._ring.available.sum()
 
     def minibatches(
-        self, count: int, *, read: Callable[[Int64[Tensor, " B"]], TensorDictBase] | None = None
+        self, count: int, *, read: Callable[..., TensorDictBase] | None = None
     ) -> Iterator[TensorDictBase]:
-        """Yield `count` minibatches `["B"]`, of env states as `read` gives them for their indices: else as stored.
+        """Yield `count` minibatches `["B"]`, of env states as `read` gives them for their indices: else `env_states`.
 
         With priorities they have "priority_weight" and "index", and each is drawn when it is asked for, by the
         priorities of that moment.
         """
-        read = read or self._ring.get
+        read = read or self.env_states
         size = self.cfg.num_env_states_per_minibatch
         if not self.cfg.prioritized:
             # One gather for all minibatches: a fraction of the kernels.
-            index, _ = self.sampler.sample(self._ring, count * size)
-            for minibatch_B in read(index).split(size):
+            index, _ = self.sampler.sample(self._ring, count * self._num_online)
+            drawn = [index]
+            if self._num_offline:
+                drawn.append(self._recorded(count))
+            for minibatch_B in read(*drawn).split(size):
                 yield dims.name(minibatch_B, dims.B)
             return
         for _ in range(count):
@@ -320,16 +352,58 @@ class ReplayRing(ReplayBuffer):
             minibatch_B = read(index_B).set("index", index_B)
             yield minibatch_B.set("priority_weight", info["priority_weight"][:, None])
 
+    def env_states(
+        self,
+        index_N: Int64[Tensor, " N"],
+        recorded_M: Int64[Tensor, " M"] | None = None,
+    ) -> TensorDictBase:
+        """Return the env states of whole minibatches, one after the other, for indices in ring and offline table."""
+        online_N = self._ring.get(index_N)
+        if recorded_M is None:
+            return online_N
+        assert self.offline is not None
+        offline_M = self.offline.storage.get(recorded_M)
+        # The ring may have more leaves, which a recorder reads.
+        online_N = online_N.select(*offline_M.keys(True, True))
+        parts: list[TensorDictBase] = []
+        recorded = offline_M.split(self._num_offline)
+        for online_B, offline_B in zip(online_N.split(self._num_online), recorded, strict=True):
+            parts += [online_B, offline_B]
+        return TensorDict.cat(parts, dim=0)  # type: ignore[return-value]
+
+    def _recorded(self, count: int) -> Entries:
+        """Draw the recorded env states of so many minibatches."""
+        if self.offline is None:
+            raise RuntimeError(
+                "data.offline is set, and the replay has no offline table: set `offline`"
+            )
+        sampler = ReplaySampler(shards=self.cfg.shards, minibatch=self._num_offline)
+        index, _ = sampler.sample(self.offline.storage, count * self._num_offline)
+        return index
+
     def state_dict(self) -> State:
         """Return the ring, and the priorities where there are any; without `save_replay` nothing."""
         if not self.cfg.save_replay:
             return {}
-        return {"ring": self._ring.state_dict(), "sampler": self.sampler.state_dict()}
+        state = {"ring": self._ring.state_dict(), "sampler": self.sampler.state_dict()}
+        if self.offline is None:
+            return state
+        # The recording itself stays in its folder.
+        return {**state, "offline_sha256": self.offline.sha256}
 
     def load_state_dict(self, state_dict: State) -> None:
-        """Continue where `state_dict` was taken; an empty one empties the ring."""
+        """Continue where `state_dict` was taken; an empty one empties the ring.
+
+        A ValueError where the offline table is another one.
+        """
         if not state_dict:
             self.empty()
             return
+        own = self.offline and self.offline.sha256
+        if state_dict.get("offline_sha256") != own:
+            raise ValueError(
+                "data.offline.source: it is another recording than the checkpoint's, whose sha256 is "
+                f"{state_dict.get('offline_sha256')}, and here {own}: give back the folder as it was"
+            )
         self._ring.load_state_dict(branch(state_dict, "ring"))
         self.sampler.load_state_dict(dict(branch(state_dict, "sampler")))

@@ -47,7 +47,7 @@ LATER = re.compile(
     # Of the networks of off-policy methods, which read one group before they could choose.
     r'|"encoders": \{\}, |"in_keys": \["(actor|critic)"\], (?="layer_norm")'
     r'|"motions": \{\}, '
-    r'|"recorders": \{\}, |"policy_starts": 0, '
+    r'|"recorders": \{\}, |"policy_starts": 0, |"offline": null, '
     r'|"random_shift": 0, '
     r'|"free_root": false, |"root_turn": \[1.0, 0.0, 0.0, 0.0\], '
 )

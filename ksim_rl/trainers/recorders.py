@@ -174,7 +174,6 @@ def origin_of(
     assert clock is not None
     simulated = part(env, SimulatedWorld)
     assert simulated is not None  # the env of a config is ours
-    model = hashlib.sha256(model_bytes(simulated.world.mj_model).tobytes())
     columns = {
         group: {term: (start, stop) for term, (start, stop) in terms.items()}
         for group, terms in observation_columns(env).items()
@@ -184,9 +183,14 @@ def origin_of(
         policy=title,
         step_dt=clock.step_dt,
         weights_sha256=_weights_sha256(policy),
-        model_sha256=model.hexdigest(),
+        model_sha256=model_sha256(simulated),
         columns=columns,
     )
+
+
+def model_sha256(simulated: SimulatedWorld) -> str:
+    """Return the hash of the compiled MuJoCo model of an env's worlds."""
+    return hashlib.sha256(model_bytes(simulated.world.mj_model).tobytes()).hexdigest()
 
 
 def _weights_sha256(policy: TensorDictModuleBase | None) -> str:

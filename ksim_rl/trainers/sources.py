@@ -5,7 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from ksim_rl.checks import naming, near
-from ksim_rl.data import read_episodes
+from ksim_rl.data import ReplayCfg, read_episodes
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.evaluation import Evaluation
 from ksim_rl.trainers.loggers import check_installed
@@ -33,9 +33,13 @@ def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
         if path is not None and not resumes:
             with naming(f"{field}={path}", checkpoint.CheckpointError):
                 checkpoint.load_latest(Path(path))
-    for name in cfg.objective.episode_fields:
-        path = getattr(cfg.objective, name)
-        with naming(f"objective.{name}={path}"):
+    folders = {
+        f"objective.{name}": getattr(cfg.objective, name) for name in cfg.objective.episode_fields
+    }
+    if isinstance(cfg.data, ReplayCfg) and cfg.data.offline is not None:
+        folders["data.offline.source"] = cfg.data.offline.source
+    for field, path in folders.items():
+        with naming(f"{field}={path}"):
             read_episodes(path)
     for kind, entities in (("robots", cfg.task.scene.robots), ("objects", cfg.task.scene.objects)):
         # Reads the model's files, without compiling them.

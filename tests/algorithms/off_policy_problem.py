@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 from ksim_rl.algorithms.bc.demonstration import Demonstration
 from ksim_rl.algorithms.bc.update import BCUpdate
 from ksim_rl.collectors import RolloutCollector
-from ksim_rl.data import DatasetCfg, ReplayCfg
+from ksim_rl.data import DatasetCfg, ReplayCfg, make_offline_table
 from ksim_rl.envs.signal_keys import STANDARD
 from ksim_rl.modules import (
     DeterministicActorCfg,
@@ -164,3 +165,13 @@ def clone_for(name, *, noise=0.1, num_updates=20):
     for _ in range(num_updates):
         update(collector.collect())
     return update.state_dict()
+
+
+def recorded_table(*, episodes=8, n_step=1):
+    """Return a table of the best actions in `TargetEnv`, as a recorder would have found them."""
+    env = make_env(episodes)
+    policy = TensorDictModule(torch.clone, in_keys=["actor"], out_keys=["action"])
+    rollout_ET = env.rollout(LENGTH, policy, break_when_any_done=False)
+    rows_D = rollout_ET.reshape(-1)
+    rows_D["episode"] = torch.arange(episodes).repeat_interleave(LENGTH)
+    return make_offline_table(rows_D, observations=["actor", "critic"], n_step=n_step, gamma=GAMMA)

@@ -229,7 +229,9 @@ def test_actions_that_are_choices_are_refused(tmp_path):
     env = CounterEnv()
     env.action_spec = OneHot(2, shape=(3, 2))
     cpu = torch.device("cpu")
-    with pytest.raises(ValueError, match="are choices, and behavior cloning is for continuous"):
+    with pytest.raises(
+        ValueError, match="are choices, and learning from recorded episodes is for continuous"
+    ):
         read_demonstration(write(tmp_path / "episodes"), env, keys=KEYS, held_out=0.0, device=cpu)
 
 

@@ -6,10 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 
+from ksim_rl.data import OfflineCfg
 from ksim_rl.objectives import NonFiniteStepsError, SACCfg
 from ksim_rl.testing import count_syncs
 from ksim_rl.trainers.restoring import load_networks
-from tests.algorithms.off_policy_problem import GAMMA, OBJECTIVES, clone_for, make_trainer
+from tests.algorithms.off_policy_problem import (
+    GAMMA,
+    OBJECTIVES,
+    clone_for,
+    make_trainer,
+    recorded_table,
+)
 from tests.trainers.target_env import BEST_RETURN, make_env
 
 NAMES = list(OBJECTIVES)
@@ -137,7 +144,14 @@ def test_noise_differs_by_env_and_changes_with_the_episode():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_no_host_sync(name):
-    trainer = make_trainer(name, data={"n_step": 2, "prioritized": name == "fast_sac"})
+    offline = OfflineCfg(source="made_up") if name == "sac" else None
+    trainer = make_trainer(
+        name, data={"n_step": 2, "prioritized": name == "fast_sac", "offline": offline}
+    )
+    if offline:
+        before = trainer.update.actor[0].module.normalizer.count.clone()
+        trainer.update.learn_also_from(recorded_table(n_step=2))
+        assert trainer.update.actor[0].module.normalizer.count == before + 64
     for _ in range(3):
         trainer.iterate()
     rollout = trainer.collector.collect()

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Int64
@@ -11,13 +10,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ksim_rl.algorithms.recorded import check_leaves
 from ksim_rl.checks import naming
-from ksim_rl.data import Episodes, read_episodes
+from ksim_rl.data import read_episodes
 from ksim_rl.data.dataset_storage import MASK_KEY, finite_rows
 from ksim_rl.data.episode_folder import EPISODE_KEY
-from ksim_rl.trainers import checkpoint
-from ksim_rl.transforms import observation_columns
-from ksim_rl.transforms.specs import spell
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +38,7 @@ def read_demonstration(
     """
     with naming(f"objective.episodes={str(folder)!r}"):
         found = read_episodes(folder)
-        _check(found, env, keys)
+        check_leaves(found.contents, env, keys)
     env_states_D = found.env_states_D.select(*keys)
     is_held_out_D = _held_out(found.env_states_D.get(EPISODE_KEY), held_out)
     learned_N = _taken(env_states_D, ~is_held_out_D, device)
@@ -51,41 +48,6 @@ def read_demonstration(
     # What is learned goes through a dataset, which masks such rows itself.
     held_out_N[MASK_KEY] = finite_rows(list(held_out_N.values(True, True)))
     return Demonstration(learned_N=learned_N, held_out_N=held_out_N)
-
-
-def _check(found: Episodes, env: EnvBase, keys: list[NestedKey]) -> None:
-    known = {spell(leaf.key): leaf for leaf in found.contents.leaves}
-    # An action has a spec of its own.
-    spec: Any = env.observation_spec.clone()
-    action: Any = env.action_spec
-    if env.action_keys != ["action"] or not action.dtype.is_floating_point:
-        raise ValueError(
-            "the env's actions are choices, and behavior cloning is for continuous ones"
-        )
-    spec["action"] = action
-    for key in keys:
-        name = spell(key)
-        shape = list(spec[key].shape[1:])
-        if name not in known:
-            raise ValueError(f"it has no {name!r}, which the policy needs; it has {sorted(known)}")
-        leaf = known[name]
-        if list(leaf.shape) != shape or leaf.torch_dtype != spec[key].dtype:
-            raise ValueError(
-                f"its {name!r} is {leaf.dtype} {list(leaf.shape)}, and the env's {spec[key].dtype} {shape}"
-            )
-    # Equal sizes with other terms would be learned in silence.
-    theirs = {
-        group: {term: list(ends) for term, ends in terms.items()}
-        for group, terms in found.contents.origin.columns.items()
-    }
-    ours = observation_columns(env)
-    read = [spell(key) for key in keys]
-    checkpoint.check_columns(
-        *(
-            {group: columns[group] for group in read if group in theirs and group in ours}
-            for columns in (theirs, ours)
-        )
-    )
 
 
 def _held_out(episode_D: Int64[Tensor, " D"], share: float) -> Bool[Tensor, " D"]:

@@ -19,7 +19,7 @@ from ksim_rl.algorithms.gradient_steps import (
     load_optimizer_state,
     optimizer_state,
 )
-from ksim_rl.data import MASK_KEY, ReplayCfg, ReplayRing
+from ksim_rl.data import MASK_KEY, OfflineTable, ReplayCfg, ReplayRing
 from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.compiling import compiled
@@ -131,6 +131,7 @@ class OffPolicyUpdate(RolloutUpdate):
             rate = cfg.alpha_learning_rate
             self.optimizers["alpha"] = FlatAdamW(free, [loss.log_alpha], learning_rate=rate)
         self.steps_made = 0
+        self.notes: list[str] = []  # said at the start of a run
         # Zero until learning starts.
         for name in logged.values():
             self._means[name] = torch.zeros((), device=self.device)
@@ -140,6 +141,14 @@ class OffPolicyUpdate(RolloutUpdate):
         if data.policy_starts:
             self._work.insert(0, self._critics_only)
         self._work.insert(0, self._store_only)
+
+    def learn_also_from(self, table: OfflineTable) -> None:
+        """Let minibatches have `data.offline.share` of recorded env states, which count once for normalizers."""
+        self.replay.offline = table
+        storage = table.storage
+        assert storage.content is not None
+        recorded_N = storage.content.select(*self._observations)[storage.available]
+        update_normalizers(recorded_N, self.actor, self.critic)
 
     @property
     def rollout_keys(self) -> list[NestedKey]:
@@ -218,9 +227,9 @@ class OffPolicyUpdate(RolloutUpdate):
             longest = torch.maximum(longest, self.guard.skipped_in_a_row)
         return longest
 
-    def _stored(self, index_B: Int64[Tensor, " B"]) -> TensorDictBase:
+    def _stored(self, *index: Int64[Tensor, " ?N"]) -> TensorDictBase:
         """Return env states of the replay for their indices, as `cfg.symmetry` and `cfg.random_shift` change them."""
-        env_states_B: TensorDictBase = self.replay.storage.get(index_B)  # type: ignore[arg-type]
+        env_states_B = self.replay.env_states(*index)
         if self._images is not None:
             self._images.reflect_every_second_(env_states_B)
         if self._shifted is not None:

@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl.algorithms.off_policy.update import OffPolicyUpdate
+from ksim_rl.algorithms.recorded import read_offline_table
 from ksim_rl.checks import naming
 from ksim_rl.data import ReplayCfg
 from ksim_rl.device.state_tree import State
@@ -73,17 +74,28 @@ def make_off_policy_update(
             "noise_min": objective.exploration_noise_min,
             "noise_max": objective.exploration_noise_max,
         }
-    return OffPolicyUpdate(
+    data = part_of(cfg, "data", ReplayCfg)
+    update = OffPolicyUpdate(
         objective,
         loss=loss,
         behavior=ExploringPolicy(actor, **bounds, num_envs=cfg.num_envs, **noise),
-        data=part_of(cfg, "data", ReplayCfg),
+        data=data,
         num_envs=cfg.num_envs,
         device=cfg.resolved_device(),
         mirror=mirror_maps(env, loss.observation_keys) if objective.symmetry != "none" else None,
         signals=signal_keys(env),
         stacks=stacked_frames(env),
     )
+    if data.offline is not None:
+        table, update.notes = read_offline_table(
+            data,
+            env,
+            observations=loss.observation_keys,
+            gamma=objective.gamma,
+            device=update.device,
+        )
+        update.learn_also_from(table)
+    return update
 
 
 def make_off_policy_policy(cfg: RunCfg, env: EnvBase) -> TensorDictModuleBase:
