@@ -51,6 +51,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "humanoids": (*STEP, *LEARN, *TASK),
     "identification": IDENTIFY,
     "identified_policy": (*IDENTIFY, "ksim_rl/identification/training_overrides.py", *STEP, *LEARN),
+    "imitation": (*STEP, *LEARN, "ksim_rl/suites", "ksim_rl/data"),
     "imports": (*LEARN[1:4], "ksim_rl/transforms", "ksim_rl/device", "ksim_rl/physics"),
     "learning": (*STEP, *LEARN, *TASK),
     "manipulation": (*STEP, *LEARN, "ksim_rl/suites"),

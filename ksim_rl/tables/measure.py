@@ -9,10 +9,13 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import sys
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
+
+from tensordict.nn import TensorDictModuleBase
 
 from ksim_rl import conf
 from ksim_rl.config import plugins
@@ -24,9 +27,12 @@ from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.runs.listing import METRICS
 from ksim_rl.tables.levels import HELD_STATES, Result, means_of, reached
+from ksim_rl.tables.lineage import EPISODES, overrides_of, runs_of
 from ksim_rl.tables.table import Row, load
+from ksim_rl.terminal import show
 from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
+from ksim_rl.trainers.collecting import CollectCfg, collect_episodes
 from ksim_rl.trainers.run_cfg import reaching_outside
 
 # Points of a curve: enough to draw it, few enough for a file in the repository.
@@ -37,6 +43,10 @@ FIXED = "trainer.eval_interval=0 trainer.checkpoint_interval=0 trainer.stop_when
 HELD_OUT = "evaluation/held_out_success"
 # Two iterations and a few short episodes say whether all parts of a row work, and nothing about how well it learns.
 SMOKE = "num_envs=8 data.num_env_states_per_minibatch=32 data.num_minibatches=2 task.episode_length_s=0.4"
+SMOKE_EPISODES = 4
+# Whoever shows how a task is done does so from other initial states than are trained or evaluated in.
+RECORDED_SEED_OFFSET = 2_000_003
+RECORDED_ENVS = 64  # at the same time
 # Fields that came after the first tables, with values that change nothing, as a fingerprint's text has them.
 LATER = re.compile(
     '"min_advantage_std": 0.0001, |"min_std": 0.001, |"engine": "auto", |"eager": false, '
@@ -53,16 +63,20 @@ LATER = re.compile(
 )
 
 
-def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -> RunCfg:
+def run_cfg(
+    row: Row, seed: int, *, device: str = "auto", smoke: bool = False, runs: Path | None = None
+) -> RunCfg:
     """Compose the config of a seed, as `ksim-rl train` does; a ValueError names the override that is wrong.
 
-    A table is data: a field by which a run writes or listens outside of its folder is refused.
+    The rows that it learns from are found among the `runs` of its table; without, names stand for their folders. A
+    table is data: a field by which a run writes or listens outside of its folder is refused.
     """
     # The same words as on a command line, so that a row can be repeated by hand.
     words = [f"task={row.task}", f"objective={row.objective}", f"seed={seed}", f"device={device}"]
     words += [
         *FIXED.split(),
         *row.overrides,
+        *overrides_of(row, runs, seed),
         f"trainer.eval_episodes={8 if smoke else row.episodes}",
     ]
     cfg = conf.compose([*words, *(SMOKE.split() if smoke else ())])
@@ -94,6 +108,10 @@ def settings(row: Row, cfg: RunCfg) -> str:
     # The seed tells rows of one setting apart; the device is recorded in the result.
     tree = {key: value for key, value in cfg.to_tree().items() if key not in ("seed", "device")}
     tree["row"] = {"levels": dict(row.levels), "episodes": row.episodes, "measure": row.measure}
+    for name in ("recorded", "learns_from", "begins_from"):
+        # Rows of before have none of these.
+        if value := getattr(row, name):
+            tree["row"][name] = value
     # Later fields with values that change nothing must not make older results invalid.
     text = LATER.sub("", json.dumps(tree, sort_keys=True, default=str))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -110,6 +128,7 @@ class _Judge(Hook):
             self._trials = trials
         else:
             self._trials = 0
+        self.actor: TensorDictModuleBase | None = None
         self.found: Result = {"trials": None, "means": {}}
         self.seconds_in_all = 0.0
         self.ended = 0.0
@@ -119,6 +138,7 @@ class _Judge(Hook):
         self.ended = time.monotonic()
         self.seconds_in_all = trainer.clock.total
         assert (evaluator := trainer.evaluator) is not None
+        self.actor = trainer.update.actor
         # Ends before the time limit are falls.
         too_early_E = evaluator.length_E < evaluator.max_steps
         self.found["falls"] = round(float(too_early_E.double().mean()), 5)
@@ -143,9 +163,41 @@ class _Judge(Hook):
                 self.found["means"][HELD_OUT] = trials.held_out
 
 
-def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) -> Result:
-    """Train and judge; return plain data. An interrupted run raises, so that it leaves no result."""
-    cfg = run_cfg(row, seed, device=device, smoke=smoke)
+def _record(cfg: RunCfg, row: Row, judge: _Judge, run_folder: Path, *, smoke: bool) -> int:
+    """Keep episodes of the final policy in the run folder; return how many env states they are."""
+    folder = run_folder / EPISODES
+    # Those of an earlier attempt are of another policy.
+    if folder.is_dir():
+        shutil.rmtree(folder)
+    actor = judge.actor
+    assert actor is not None
+    wanted = SMOKE_EPISODES if smoke else row.recorded
+    contents, interrupt = collect_episodes(
+        cfg,
+        lambda env: actor,
+        folder,
+        CollectCfg(
+            num_episodes=wanted,
+            num_envs=min(wanted, RECORDED_ENVS),
+            seed=cfg.seed + RECORDED_SEED_OFFSET,
+            as_in_training=True,
+        ),
+        title=f"{cfg.task_name}, final policy of seed {cfg.seed}",
+        note=show,
+    )
+    if interrupt.signal is not None:
+        raise KeyboardInterrupt
+    return contents.num_env_states
+
+
+def measure(
+    row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool, runs: Path | None = None
+) -> Result:
+    """Train and judge; return plain data. An interrupted run raises, so that it leaves no result.
+
+    Rows that it learns from are found among the `runs` of its table.
+    """
+    cfg = run_cfg(row, seed, device=device, smoke=smoke, runs=runs)
     judge = _Judge(cfg, row, trials=8 if smoke else row.episodes)
     progress = RunProgress(cfg.trainer.num_iterations)
     began = time.monotonic()
@@ -154,6 +206,8 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
     # Half a run says nothing.
     if outcome.interrupted_by is not None or outcome.evaluation is None:
         raise KeyboardInterrupt
+    if row.recorded:
+        judge.found["recorded_env_states"] = _record(cfg, row, judge, run_folder, smoke=smoke)
     names = ("env_states", "seconds", "episode/return", "episode/length", *row.levels)
     _, lines = read_table(run_folder / METRICS)
     points = []
@@ -173,7 +227,8 @@ def measure(row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool) 
     # Where the package is installed without git, the environment may name the commit.
     code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})
     return {
-        "settings": settings(row, cfg),
+        # Without the folders of this machine.
+        "settings": settings(row, run_cfg(row, seed, device=device, smoke=smoke)),
         "commit": code["commit"] + ("-dirty" if len(code) > 1 else ""),
         "date": session.began,
         "versions": dict(session.versions),
@@ -199,7 +254,12 @@ def main(
     plugins.load([])  # from KSIM_RL_PLUGINS, where `ksim-rl --plugin` has put its own
     # The child composes the row itself: it gets names only.
     found = measure(
-        load(name).rows[row], int(seed), Path(run_folder), device=device, smoke=bool(smoke)
+        load(name).rows[row],
+        int(seed),
+        Path(run_folder),
+        device=device,
+        smoke=bool(smoke),
+        runs=runs_of(Path(run_folder), row),
     )
     path = Path(result)
     path.parent.mkdir(parents=True, exist_ok=True)

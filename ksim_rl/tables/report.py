@@ -8,6 +8,7 @@ from pathlib import Path
 from ksim_rl.config.trees import Tree
 from ksim_rl.files.writing import whole_file, write_whole
 from ksim_rl.tables.levels import Result, is_reached, value_of
+from ksim_rl.tables.lineage import lineage_figures
 from ksim_rl.tables.table import Row, Table
 
 Results = Sequence[Result]
@@ -24,13 +25,16 @@ COLUMNS = ("ours", "seeds", "env states", "seconds + before", "reached")
 def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
     """Return flat figures: `<table>/<row>`, with `/seconds` and `/falls`, or `/success` for these measures; means.
 
-    An infinite value has no figure, and neither has a mean over a group that lacks a row.
+    Rows that learn from others have those of `lineage_figures`. An infinite value has no figure, and neither has a mean
+    over a group that lacks a row.
     """
     figures: dict[str, float] = {}
     for name, results in rows.items():
         figures |= _row_figures(table, name, results)
     for mean_name, mean in table.means.items():
         figures |= _mean_figures(table, mean_name, mean.without, figures)
+    for name, value in lineage_figures(table.rows, rows).items():
+        figures[f"{table.name}/{name}"] = value
     return figures
 
 

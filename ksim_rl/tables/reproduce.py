@@ -3,7 +3,8 @@
 import math
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -11,9 +12,10 @@ import torch
 from ksim_rl.checks import OneLineParser, check_in_range, near
 from ksim_rl.tables import report
 from ksim_rl.tables.levels import is_reached
+from ksim_rl.tables.lineage import depth_of
 from ksim_rl.tables.measure import run_cfg
 from ksim_rl.tables.runner import Runs, gpus_for
-from ksim_rl.tables.table import load, shipped
+from ksim_rl.tables.table import Row, load, shipped
 from ksim_rl.terminal import show
 
 
@@ -64,11 +66,12 @@ def reproduce(arguments: Sequence[str]) -> int:
 
     # A smoke test always runs, since its results say nothing.
     present = {} if smoke else runs.results()
-    # Seed by seed, so that a table that is cut off has some seeds of all rows; the longest first, to end together.
+    # Seed by seed, so that a table that is cut off has some seeds of all rows; the longest first, to end together, but
+    # behind the rows that they learn from.
     jobs = [
         (name, seed)
         for seed in seeds or known
-        for name, row in sorted(rows.items(), key=lambda item: -item[1].env_states)
+        for name, row in sorted(rows.items(), key=partial(_rank, table.rows))
         if seed in row.seeds and seed not in present.get(name, {})
     ]
     # One seed is enough to check a row's config.
@@ -81,6 +84,11 @@ def reproduce(arguments: Sequence[str]) -> int:
     done = runs.complete(seeds)
     missed = [name for name in rows if name in done and is_reached(rows[name], done[name]) is False]
     return 1 if left or (missed and not smoke) else 0
+
+
+def _rank(rows: Mapping[str, Row], named: tuple[str, Row]) -> tuple[int, float]:
+    name, row = named
+    return depth_of(rows, name), -row.env_states
 
 
 def _parser() -> OneLineParser:

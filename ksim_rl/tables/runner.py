@@ -16,6 +16,7 @@ from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 from ksim_rl.files.writing import make_folder, open_own
 from ksim_rl.runs import run_lock
 from ksim_rl.tables.levels import Result
+from ksim_rl.tables.lineage import sources_of
 from ksim_rl.tables.measure import run_cfg, settings
 from ksim_rl.tables.table import Table
 
@@ -88,7 +89,8 @@ class Runs:
                 # One job on each slot; a slot is free as soon as its process has ended.
                 for slot, gpu in enumerate(gpus):
                     if slot not in running:
-                        taken = self._next(waiting, elsewhere, note)
+                        now = [job for job, _ in running.values()]
+                        taken = self._next(waiting, now, elsewhere, note)
                         if taken is not None:
                             job, log = taken
                             running[slot] = job, self._start(job, gpu, log)
@@ -116,11 +118,19 @@ class Runs:
         return left
 
     def _next(
-        self, waiting: list[Job], elsewhere: set[Job], note: Callable[[str], None]
+        self,
+        waiting: list[Job],
+        running: Sequence[Job],
+        elsewhere: set[Job],
+        note: Callable[[str], None],
     ) -> tuple[Job, IO[str]] | None:
         """Take a job that no other process does now, with its log, or None; others' finished jobs are not redone."""
         # A copy, since jobs are taken out of it.
         for job in list(waiting):
+            # What it learns from has to be there first.
+            sources = [(name, job[1]) for name in sources_of(self.table.rows[job[0]])]
+            if any(source in waiting or source in running for source in sources):
+                continue
             log = self._claimed(job)
             if log is None:
                 elsewhere.add(job)

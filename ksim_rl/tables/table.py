@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
-from ksim_rl.checked import Checked, Count, Positive, Seed, Share
+from ksim_rl.checked import Checked, Count, Positive, Seed, Share, WholeNumber
 from ksim_rl.checks import naming, unknown_name
 from ksim_rl.config import plain_data
 from ksim_rl.config.config_tree import from_tree
@@ -37,6 +37,11 @@ class Row(Checked):
         within_s: seconds in which the levels should be reached.
         at_least: share of trials that should succeed.
         most_falls: share of these episodes that may end before their time; the worst seed counts.
+        recorded: so many episodes of the final policy, with its draws, are kept for rows that learn from them.
+        learns_from: the row above whose recorded episodes it learns from, seed by seed: they become
+            `objective.episodes` of `bc`, and else `data.offline.source`.
+        begins_from: the row above whose final networks it begins with, seed by seed.
+        saves_over: the row above, without such a beginning, that it is compared with: how many env states it saves.
         published: returns that others report, by who; `against` names the one to reach, "" none.
     """
 
@@ -53,6 +58,10 @@ class Row(Checked):
     most_falls: Share | None = None
     published: Mapping[str, float] = field(default_factory=dict)
     against: str = ""
+    recorded: WholeNumber = 0
+    learns_from: str = ""
+    begins_from: str = ""
+    saves_over: str = ""
 
     def _check_fields(self) -> None:
         super()._check_fields()
@@ -68,6 +77,13 @@ class Row(Checked):
         # Names and words go into paths and command lines: signs with a meaning there are refused.
         for word in self.overrides:
             check_override(word)
+
+    @property
+    def episodes_field(self) -> str:
+        """The field of its config that names recorded episodes."""
+        if self.objective == "bc":
+            return "objective.episodes"
+        return "data.offline.source"
 
     @property
     def goal(self) -> float | None:
@@ -95,6 +111,34 @@ class Table(Checked):
     rows: Mapping[str, Row]
     means: Mapping[str, Mean] = field(default_factory=dict)
     notes: str = ""
+
+    def _check_fields(self) -> None:
+        super()._check_fields()
+        above: dict[str, Row] = {}
+        for name, row in self.rows.items():
+            for field_name in ("learns_from", "begins_from", "saves_over"):
+                self._check_source(name, field_name, above)
+            if row.learns_from and not above[row.learns_from].recorded:
+                raise ValueError(
+                    f"rows.{name}.learns_from={row.learns_from!r}: that row keeps no episodes: set its `recorded`"
+                )
+            above[name] = row
+
+    def _check_source(self, name: str, field_name: str, above: Mapping[str, Row]) -> None:
+        """Refuse a row that is not above, so that there are no circles, or that lacks a seed."""
+        row = self.rows[name]
+        source = getattr(row, field_name)
+        if not source:
+            return
+        if source not in above:
+            raise ValueError(
+                f"rows.{name}.{field_name}={source!r}: expected the name of a row above it: "
+                f"{', '.join(above) or 'there is none'}"
+            )
+        if above[source].seeds != row.seeds:
+            raise ValueError(
+                f"rows.{name}.{field_name}={source!r}: it has the seeds {above[source].seeds}, and this row {row.seeds}"
+            )
 
     def groups(self) -> dict[str, list[str]]:
         """Return the names of the rows of each group."""

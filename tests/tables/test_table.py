@@ -69,6 +69,7 @@ def test_the_shipped_tables_name_tasks_that_exist():
     assert shipped() == [
         "dm_control",
         "humanoids",
+        "imitation",
         "manipulation",
         "motions",
         "pixels",
@@ -107,6 +108,10 @@ def test_the_other_algorithm_stays_within_its_env_states():
         *(f"pixels:{row}" for row in load("pixels").rows),
         "manipulation:panda_pick_cube",
         "manipulation:leap_cube_reorient",
+        *(
+            pytest.param(f"imitation:{row}", marks=pytest.mark.full)
+            for row in load("imitation").rows
+        ),
         "motions:g1_track",
         *(f"tracking:{clip}" for clip in ("walk", "squat", "turn", "kick")),
         *(f"tasks:{row}" for row in load("tasks").rows),

@@ -1,0 +1,113 @@
+"""Rows that learn from what other rows of their table have left: recorded episodes, or networks to begin from."""
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ksim_rl.tables.levels import Result
+from ksim_rl.tables.table import Row
+
+# In the run folder of a seed.
+EPISODES = "demonstration"
+SUCCESS = "evaluation/metric/"
+
+
+def sources_of(row: Row) -> list[str]:
+    """Return the names of the rows that have to be there before it."""
+    return [name for name in (row.learns_from, row.begins_from) if name]
+
+
+def depth_of(rows: Mapping[str, Row], name: str) -> int:
+    """Return how many rows have to be there one after the other before this one."""
+    below = [depth_of(rows, source) for source in sources_of(rows[name])]
+    return 1 + max(below, default=-1)
+
+
+def overrides_of(row: Row, runs: Path | None = None, seed: int = 0) -> list[str]:
+    """Return the overrides by which a run finds its sources among the `runs` of its table.
+
+    Without `runs` rows stand for their folders, so that a fingerprint is the same on every machine.
+    """
+
+    def folder(name: str) -> str:
+        if runs is None:
+            return name
+        found = run_of(runs, name, seed)
+        if not found.is_dir():
+            raise ValueError(
+                f"{found}: no run of row {name!r} with seed {seed}, which this row learns from: let ksim-rl reproduce "
+                "run that row first"
+            )
+        return str(found)
+
+    words = []
+    if row.begins_from:
+        words.append(f"checkpoint={folder(row.begins_from)!r}")
+    if row.learns_from:
+        words.append(f"{row.episodes_field}={folder(row.learns_from) + '/' + EPISODES!r}")
+    return words
+
+
+def run_of(runs: Path, name: str, seed: int) -> Path:
+    """Return the run folder of a row and seed."""
+    return runs / name / f"seed_{seed}"
+
+
+def runs_of(run_folder: Path, name: str) -> Path:
+    """Return the folder of all runs of a table, from the run folder of a seed of a row."""
+    return run_folder.parents[len(Path(name).parts)]
+
+
+def lineage_figures(
+    rows: Mapping[str, Row], results: Mapping[str, Sequence[Result]]
+) -> dict[str, float]:
+    """Return figures by name of row or group: `<row>_success`, and `<group>/env_states_saved`.
+
+    Success is of the final evaluation and the worst seed, for rows that learn from episodes. Saved are the env states
+    that the row `saves_over` takes to its levels, less those of this row to the same, of all runs that it begins from,
+    and of the episodes that these learned from: a median over the seeds; what is infinite has no figure.
+    """
+    figures: dict[str, float] = {}
+    for name, own in results.items():
+        row = rows[name]
+        if row.learns_from:
+            for level in row.levels:
+                if level.startswith(SUCCESS):
+                    worst = min(result["means"].get(level, 0.0) for result in own)
+                    figures[f"{name}_success"] = round(worst, 4)
+        if row.saves_over in results:
+            saved = _saved(rows, results, name)
+            if math.isfinite(saved):
+                group = name.rpartition("/")[0]
+                figures[f"{group}/env_states_saved".strip("/")] = saved
+    return figures
+
+
+def _saved(rows: Mapping[str, Row], results: Mapping[str, Sequence[Result]], name: str) -> float:
+    taken = [_to_levels(result) for result in results[name]]
+    # All that had to be there before, seed by seed.
+    source = rows[name].begins_from
+    while source:
+        # A source without results would count as nothing.
+        if source not in results:
+            return math.inf
+        taken = [
+            all_in + own["env_states"] for all_in, own in zip(taken, results[source], strict=True)
+        ]
+        recorded = rows[source].learns_from
+        if recorded:
+            shown = [own["recorded_env_states"] for own in results.get(recorded, ())]
+            if len(shown) < len(taken):
+                return math.inf
+            taken = [all_in + own for all_in, own in zip(taken, shown, strict=True)]
+        source = rows[source].begins_from
+    alone = [_to_levels(result) for result in results[rows[name].saves_over]]
+    return statistics.median(alone) - statistics.median(taken)
+
+
+def _to_levels(result: Result) -> float:
+    found = result["env_states_to_levels"]
+    if found is None:
+        return math.inf
+    return found

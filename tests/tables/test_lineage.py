@@ -1,0 +1,128 @@
+"""Rows of a table learn from rows above them: episodes are recorded, cloned, and a run goes on from the clone."""
+
+import pytest
+
+from ksim_rl.data import read_episodes
+from ksim_rl.runs.listing import CONFIG
+from ksim_rl.tables import report
+from ksim_rl.tables.lineage import EPISODES, depth_of, overrides_of
+from ksim_rl.tables.measure import measure, run_cfg, settings
+from ksim_rl.tables.runner import Runs
+from ksim_rl.tables.table import load
+
+TABLE = """
+title: Two ways to a pole
+groups:
+  pole:
+    task: cartpole_swingup
+    objective: ppo
+    measure: seconds
+    levels: {episode/return: 9}
+    overrides: [task.sim.engine=c]
+    seeds: [1, 2]
+    env_states: 1.0e+6
+    rows:
+      nothing: {recorded: 5}
+      bc: {objective: bc, measure: return, levels: {evaluation/metric/up: 0.9}, learns_from: pole/nothing}
+      online: {begins_from: pole/bc, saves_over: pole/nothing}
+"""
+ROWS = ("pole/nothing", "pole/bc", "pole/online")
+
+
+def table(folder, old="", new=""):
+    path = folder / "ours.yaml"
+    path.write_text(TABLE.replace(old, new) if old else TABLE)
+    return load(str(path))
+
+
+def test_sources_come_first_and_are_found_by_seed(tmp_path):
+    rows = table(tmp_path).rows
+    assert [depth_of(rows, name) for name in ROWS] == [0, 1, 2]
+    assert overrides_of(rows["pole/nothing"]) == []
+    clone = rows["pole/bc"]
+    with pytest.raises(ValueError, match="no run of row 'pole/nothing' with seed 2"):
+        overrides_of(clone, tmp_path, 2)
+    found = tmp_path / "pole" / "nothing" / "seed_2"
+    found.mkdir(parents=True)
+    assert overrides_of(clone, tmp_path, 2) == [f"objective.episodes='{found}/{EPISODES}'"]
+    assert overrides_of(clone) == [f"objective.episodes='pole/nothing/{EPISODES}'"]
+    assert overrides_of(rows["pole/online"]) == ["checkpoint='pole/bc'"]
+
+
+def test_a_row_waits_for_what_it_learns_from(tmp_path):
+    runs = Runs(table(tmp_path), tmp_path / "results", tmp_path / "runs", smoke=True)
+    source = ("pole/nothing", 1)
+    clone = ("pole/bc", 1)
+    assert runs._next([clone], [source], set(), print) is None
+    for waiting, expected in (([clone, source], source), ([clone], clone)):
+        job, log = runs._next(waiting, [], set(), print)
+        log.close()
+        assert job == expected
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("learns_from: pole/nothing", "learns_from: pole/nobody", "a row above it: pole/nothing$"),
+        (
+            "begins_from: pole/bc",
+            "begins_from: pole/online",
+            "a row above it: pole/nothing, pole/bc",
+        ),
+        ("{recorded: 5}", "{}", "keeps no episodes: set its `recorded`"),
+        ("objective: bc,", "objective: bc, seeds: [1],", "it has the seeds"),
+    ],
+)
+def test_rows_that_cannot_be_learned_from_are_refused(tmp_path, old, new, message):
+    with pytest.raises(ValueError, match=message):
+        table(tmp_path, old, new)
+
+
+def results_of(to_levels, **more):
+    found = []
+    for env_states in to_levels:
+        found.append(
+            {"env_states_to_levels": env_states, "seconds_to_levels": 1.0, "falls": 0.0, **more}
+        )
+    return found
+
+
+def test_what_a_start_saves_counts_all_that_led_to_it(tmp_path):
+    ours = table(tmp_path)
+    results = {
+        "pole/nothing": results_of([1000.0, 3000.0], recorded_env_states=50),
+        "pole/bc": results_of(
+            [None, None],
+            env_states=100,
+            means={"evaluation/metric/up": 0.75},
+            evaluation={"return_mean": 1.0},
+        ),
+        "pole/online": results_of([200.0, 400.0]),
+    }
+    figures = report.figures_of(ours, results)
+    assert figures["ours/pole/env_states_saved"] == 2000.0 - (300.0 + 100.0 + 50.0)
+    assert figures["ours/pole/bc_success"] == 0.75
+    # A seed that never gets there, of two, makes the median infinite.
+    results["pole/online"][0]["env_states_to_levels"] = None
+    assert "ours/pole/env_states_saved" not in report.figures_of(ours, results)
+    assert "ours/pole/env_states_saved" not in report.figures_of(
+        ours, {name: results[name] for name in ROWS if name != "pole/bc"}
+    )
+
+
+@pytest.mark.full
+def test_the_whole_chain_runs(tmp_path):
+    """Two iterations each: episodes are recorded, cloned, and PPO goes on."""
+    rows = table(tmp_path).rows
+    found = {}
+    for name in ROWS:
+        run_folder = tmp_path / "runs" / name / "seed_1"
+        found[name] = measure(
+            rows[name], 1, run_folder, device="cpu", smoke=True, runs=tmp_path / "runs"
+        )
+    episodes = read_episodes(tmp_path / "runs/pole/nothing/seed_1" / EPISODES)
+    assert found["pole/nothing"]["recorded_env_states"] == len(episodes.env_states_D) > 0
+    assert "pole/bc/seed_1" in (tmp_path / "runs/pole/online/seed_1" / CONFIG).read_text()
+    assert found["pole/online"]["settings"] == settings(
+        rows["pole/online"], run_cfg(rows["pole/online"], 1, device="cpu", smoke=True)
+    )
