@@ -67,6 +67,7 @@ LOOP_PARTS = (
     "policy_control",
     "plan_control",
     "safety",
+    "picture_watch",
     "deadlines",
     "dry_run",
     "states",

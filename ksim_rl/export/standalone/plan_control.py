@@ -7,7 +7,7 @@ import numpy as np
 
 from ksim_rl.export.standalone.commands import CommandRange
 from ksim_rl.export.standalone.description import Export
-from ksim_rl.export.standalone.files import Array, check_seconds, read
+from ksim_rl.export.standalone.files import Array, Json, check_seconds, read
 from ksim_rl.export.standalone.robot_link import DescribedJoints, JointCommand, Measurement
 
 TARGETS = {"pos": "target_position", "vel": "target_velocity", "effort": "target_effort"}
@@ -20,6 +20,7 @@ class PlanControl:
 
     def __init__(self, meta: Export, path: Path) -> None:
         self.joints = DescribedJoints(meta)
+        self.pictures: list[Json] = []
         self.command: dict[str, Array] = {}
         self.ranges: dict[str, CommandRange] = {}
         columns = _columns(path)

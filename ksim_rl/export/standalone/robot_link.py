@@ -8,7 +8,7 @@ import numpy as np
 
 from ksim_rl.export.standalone.commands import CommandRange
 from ksim_rl.export.standalone.description import Export, JointsSpec
-from ksim_rl.export.standalone.files import Array
+from ksim_rl.export.standalone.files import Array, Json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +26,8 @@ class Measurement:
             firmware sends one state again and again.
         estimates: what else `obs.onnx` reads, by the names of its inputs, such as `sensor_imu_ang_vel`.
         pictures: the newest of each camera, by the inputs of `policy.onnx`; see `pictures` in export.json.
+        picture_stamps: when each of them was taken, s of `time.monotonic`, of cameras that tell it; without it a camera
+            counts as frozen where its pictures stay equal to the bit.
     """
 
     stamp: float
@@ -37,6 +39,7 @@ class Measurement:
     count: int | None = None
     estimates: Mapping[str, Array] = field(default_factory=dict)
     pictures: Mapping[str, Array] = field(default_factory=dict)
+    picture_stamps: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,10 +118,12 @@ class DescribedJoints:
 class Control(Protocol):
     """What asks the motors for something once the robot stands.
 
-    `command` is what an operator may change; what is beyond its `ranges` is clipped.
+    `command` is what an operator may change; what is beyond its `ranges` is clipped. `pictures` describes the cameras
+    that it sees by.
     """
 
     joints: DescribedJoints
+    pictures: list[Json]
     command: dict[str, Array]
     ranges: dict[str, CommandRange]
 

@@ -95,8 +95,10 @@ class SimulatedRobot:
         estimates = {}
         for name, read in self.estimates.items():
             estimates[name] = np.array(read())
+        stamp = time.monotonic()
+        pictures = self.runner.sight.drawn()
         return Measurement(
-            stamp=time.monotonic(),
+            stamp=stamp,
             joint_pos=data.qpos[self.pos],
             joint_vel=data.qvel[self.vel],
             joint_effort=data.qfrc_actuator[self.vel],
@@ -105,7 +107,9 @@ class SimulatedRobot:
             # Of the simulation's steps: a robot at rest may measure the same to the bit.
             count=round(data.time / self.model.opt.timestep),
             estimates=estimates,
-            pictures=self.runner.sight.drawn(),
+            pictures=pictures,
+            # A camera of MuJoCo's has no noise: of a robot at rest its pictures are equal.
+            picture_stamps=dict.fromkeys(pictures, stamp),
         )
 
     def write(self, command: JointCommand) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ksim_rl.export.standalone.dry_run import DryRun
 from ksim_rl.export.standalone.files import Array
+from ksim_rl.export.standalone.picture_watch import PictureWatch
 from ksim_rl.export.standalone.robot_link import Control, JointCommand, Measurement
 from ksim_rl.export.standalone.safety import (
     EffortLimit,
@@ -110,6 +111,7 @@ class StateMachine:
         self.times = times
         self.note = note
         self.watch = Watch(self.joints, limits, period)
+        self.picture_watch = PictureWatch(control.pictures, limits, period)
         self.effort_limit = EffortLimit(self.joints, limits.effort_share)
         self.state = State.DAMP if dry is None else State.DRY
         self.fault = ""
@@ -129,6 +131,7 @@ class StateMachine:
         if not self.fault:
             try:
                 measured = self.watch.message(now, measurement)
+                self.picture_watch(now, measured)
                 for word in words:
                     self._obey(now, measured, word)
                 # Braking ends what is wrong with these in any case.
