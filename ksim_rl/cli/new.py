@@ -189,5 +189,5 @@ def _check_name(name: str, task: str, *, field: str = "--name") -> None:
     # A name that shadows an installed package would import the wrong one.
     if importlib.util.find_spec(name) is not None:
         raise ValueError(
-            f"{field} {name}: Python knows a package of this name already; choose another name"
+            f"{field} {name}: a Python package of this name is installed already; choose another name"
         )

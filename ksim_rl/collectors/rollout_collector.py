@@ -193,7 +193,7 @@ class RolloutCollector:
 
     @torch.no_grad()
     def warm_up(self) -> None:
-        """Compile the env's step, if that has not been done and is wanted; env and draws are left as they were."""
+        """Compile the env's step if compiling is on and has not been done; env and draws stay unchanged."""
         # A first reset gives the root, in whose memory all later roots are written.
         if self._root is None:
             self.reset()

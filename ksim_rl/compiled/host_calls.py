@@ -104,7 +104,7 @@ class _Tracer:
             if asked is not None:
                 self._take(asked, _spelled(function), frame)
         elif event == "call":
-            # `os.environ` is Python code, which no event of C shows.
+            # `os.environ` is Python code, so there is no `c_call` event for it.
             if frame.f_code is _ENVIRONMENT:
                 self._take(ENVIRONMENT, "os.environ", frame)
             elif frame.f_code in self._entries:

@@ -68,7 +68,7 @@ class Work:
 
     def shares(self, name: str, other: "Work") -> bool:
         """Whether both use an array at the same place in the same lane."""
-        # One spelling, and no index that is itself read from an array: then equal places are equal elements.
+        # With one spelling, and no index that is itself read from an array, equal lanes use equal elements.
         first, *others = self.texts[name] | other.texts[name]
         is_same = prod(self.shape) == 1 or not others and first.count("[") == 1
         return is_same and self.shape == other.shape and not self.is_whole and not other.is_whole

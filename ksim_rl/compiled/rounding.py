@@ -29,7 +29,7 @@ ROUNDED = frozenset(_NAMES.split())
 def nudged(
     value: Shaped[Tensor, "*shape"], generator: torch.Generator, *, units: int = 1
 ) -> Shaped[Tensor, "*shape"]:
-    """Return a tensor, each floating-point number of which has moved by `units` in the last place, up or down."""
+    """Return a copy with each floating-point number moved by `units` in the last place, up or down at random."""
     if not value.is_floating_point():
         return value
     # Drawn where the generator lives, which is where most of the numbers are: millions of draws take long elsewhere.

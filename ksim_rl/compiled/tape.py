@@ -255,7 +255,7 @@ class Tape:
                         users.setdefault(_storage(tensor), []).append(part)
         outside = {_storage(tensor) for tensor in returned}
         own: dict[int, Kernel] = {}
-        # A storage that is returned must exist outside.
+        # A storage that is returned must exist outside of kernels.
         for place in self._memory.made.keys() & users.keys() - outside:
             kernel, *others = users[place]
             is_alone = isinstance(kernel, Kernel) and all(other is kernel for other in others)

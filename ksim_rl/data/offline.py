@@ -143,7 +143,7 @@ class _Lanes:
 
     @classmethod
     def of(cls, episode_D: Int64[Tensor, " D"], *, num_lanes: int) -> "_Lanes":
-        """Give each episode to the lane that is shortest so far."""
+        """Assign each episode to the lane that is shortest so far."""
         length_N = episode_D.bincount()
         if len(length_N) < num_lanes:
             raise ValueError(

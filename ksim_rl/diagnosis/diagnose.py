@@ -27,8 +27,8 @@ class Finding:
 
 
 def findings(curves: Curves) -> list[Finding]:
-    """Return the faults that the curves show, without those that follow from another one of them."""
-    # Too few rows: medians of the beginning and the end would be of the same ones.
+    """Return the faults that the curves show, except consequences of another fault."""
+    # Too few rows: the medians of the beginning and the end would cover the same rows.
     if curves.num_rows < LEAST_ROWS:
         return []
     seen = {fault: text for fault in FAULTS if (text := fault(curves)) is not None}

@@ -78,7 +78,7 @@ class FittedNet:
         return ""
 
     def entry(self, file: Path) -> MLPActuator:
-        """Return what drives these joints by the network, which stands in `file`."""
+        """Return the actuator that drives these joints with the network in `file`."""
         first = self.joints[0]
         return MLPActuator(
             joints=tuple(joint.name for joint in self.joints),

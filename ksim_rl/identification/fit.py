@@ -25,7 +25,7 @@ from ksim_rl.identification.simulation import Candidate, Simulation
 Array = np.ndarray
 SETTLING_S = 1.0
 """What the robot did before the log began is forgotten by then."""
-# A search in a part of the log comes near, so that the whole is simulated a few times only.
+# A first search uses a part of the log, so that the whole log is simulated only a few times.
 FIRST_S = 6.0
 MOST_STEPS = 15
 LAST_STEPS = 6

@@ -79,7 +79,7 @@ class EncoderCfg(Checked):
         check_layout(spec.shape, self.layout)
         low, high = self._ends(spec.dtype)
         first = _ToChannels(self.layout, low=low, high=high)
-        # Counted on pictures without memory.
+        # Counted on the meta device, which allocates nothing.
         num_channels = first(torch.empty(1, *spec.shape, device="meta")).shape[1]
         # Drawn on the CPU, so that one seed gives the same network on every device.
         convolutions = ConvNet(

@@ -205,7 +205,7 @@ class ClipPPOLoss(objectives.ClipPPOLoss):
     def _advantage(self, tensordict: TensorDictBase) -> Tensor:
         adv_B = tensordict.get(self.tensor_keys.advantage, None)
         estimate = adv_B is None
-        # Without an advantage in the data the value estimator runs on it, which must then be a rollout.
+        # If the data has no advantage, the value estimator computes it: the data must then be a rollout.
         if estimate:
             self.value_estimator(
                 tensordict,

@@ -52,11 +52,11 @@ def clip_and_guard(
     *,
     loss: Float[Tensor, ""] | None = None,
 ) -> tuple[Float32[Tensor, ""], Float32[Tensor, ""]]:
-    """Scale the gradients down to a total norm of at most `max_grad_norm`, in place, and tell if they are finite.
+    """Scale the gradients down to a total norm of at most `max_grad_norm`, in place, and flag what is not finite.
 
-    It is `torch.nn.utils.clip_grad_norm_` without host syncs. Returned are the norm before clipping, and `found_inf`: 1
-    if the norm or the loss is not finite, else 0. A fused optimizer whose `found_inf` is 1 leaves parameters, moments
-    and step count as they are.
+    It is `torch.nn.utils.clip_grad_norm_` without host syncs. Returns the norm before clipping, and `found_inf`: 1 if
+    the norm or the loss is not finite, else 0. A fused optimizer whose `found_inf` is 1 leaves parameters, moments and
+    step count as they are.
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm = nn.utils.get_total_norm(gradients)

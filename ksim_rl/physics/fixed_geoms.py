@@ -3,7 +3,7 @@
 MuJoCo Warp, and our kernel of the kinematics, leave them where `make_data` has put them, which is one place for all.
 """
 
-# Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for.
+# Kernels only look like Python: wp.tid() returns as many indices as are unpacked.
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
 

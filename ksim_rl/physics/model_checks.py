@@ -232,7 +232,7 @@ def _is_still(mj_model: mujoco.MjModel, tendon: int) -> bool:
 
 
 def check_not_simple(mj_model: mujoco.MjModel, per_world_fields: Iterable[str]) -> None:
-    """Refuse moving centres of mass of bodies whose inertia was compiled as diagonal: Warp would keep it so."""
+    """Refuse moving centres of mass of bodies whose inertia was compiled as diagonal: Warp would keep it diagonal."""
     # Body 0, the world, never moves.
     moving = sorted({"body_ipos", "body_iquat"} & set(per_world_fields))
     simple = np.flatnonzero(mj_model.body_simple[1:]) + 1

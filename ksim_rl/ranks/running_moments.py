@@ -73,7 +73,7 @@ def _count_in_torch(
     counted_N = values_NL.isfinite().all(1)
     if valid_N is not None:
         counted_N &= valid_N.bool()
-    # The limit is of all ranks, which have counted about the same.
+    # The limit is for all ranks together, which have counted about the same.
     if until >= 0:
         counted_N &= count * group.size() < until
     weight = counted_N.sum().double()

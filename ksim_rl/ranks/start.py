@@ -76,7 +76,7 @@ def joined(command: str) -> Iterator[None]:
     # Before the first collective on CUDA, which would run on GPU 0 otherwise.
     if backend != "gloo":
         torch.cuda.set_device(number("LOCAL_RANK"))
-    # A separate connection: its thread must not wait for another's key.
+    # A separate connection, since a connection that waits for a key blocks its other threads.
     heart = heartbeat.Heartbeat(_of_attempt(store.of_run(store.connected())))
     # Other versions may have other collectives, and would wait for each other.
     same = {"ksim_rl": _version(), "torch": torch.__version__, "Python": platform.python_version()}

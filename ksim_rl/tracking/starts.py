@@ -44,10 +44,10 @@ _PARTS: WeakKeyDictionary[EnvView, dict[str, Parts]] = WeakKeyDictionary()
 
 
 def parts_of(view: EnvView, file: str, part_s: float) -> Parts:
-    """Return the parts of about `part_s` seconds of a motion; a ValueError if others of another length are in use."""
+    """Return the parts of a motion, about `part_s` seconds each; a ValueError if they already have another length."""
     found = _PARTS.setdefault(view, {})
     if file in found:
-        # Starts would read the weights of other parts than those where episodes have failed.
+        # Else failures would be counted in other parts than starts are drawn from.
         if found[file].part_s != part_s:
             raise ValueError(
                 f"part_s={part_s:g} of motion {file}, and {found[file].part_s:g} elsewhere: give StartInMotion and "

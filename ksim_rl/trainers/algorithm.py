@@ -127,12 +127,12 @@ class Algorithm:
 
 
 def part_of(cfg: RunCfg, field: str, kind: type[Part]) -> Part:
-    """Return a part of a config by its dotted path; a ValueError refuses one of another class than is needed."""
+    """Return a part of a config by its dotted path; a ValueError if it is not a `kind`."""
     value = attrgetter(field)(cfg)
     if not isinstance(value, kind):
         raise ValueError(
             f"{field} is a {type(value).__name__}, and {type(cfg.objective).__name__} needs a {kind.__name__}: "
-            "the choice of objective=... brings what fits"
+            "objective=... on the command line chooses the parts that fit"
         )
     return value
 

@@ -248,7 +248,7 @@ def mesh_of_model(mj_model: mujoco.MjModel, mesh: int) -> Mesh:
     count = mj_model.mesh_facenum[mesh]
     corners = mj_model.mesh_face[first : first + count].reshape(-1)
     normals = mj_model.mesh_facenormal[first : first + count].reshape(-1)
-    # Vertices that share place and normal become one; corners of an edge stay several.
+    # Vertices with the same position and normal are merged; along a sharp edge each face keeps its own.
     both = np.stack([corners, normals], axis=1)
     pairs, faces = np.unique(both, axis=0, return_inverse=True)
     start = mj_model.mesh_vertadr[mesh]

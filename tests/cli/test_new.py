@@ -55,7 +55,7 @@ def test_the_package_has_robot_task_test_and_readme(work, capsys):
             ["tin_man.xml", "--name", "Tin-Man"],
             "--name Tin-Man: expected a name for a Python package",
         ),
-        (["tin_man.xml", "--name", "numpy"], "Python knows a package of this name already"),
+        (["tin_man.xml", "--name", "numpy"], "a Python package of this name is installed already"),
         (
             ["tin_man.xml", "--name", "quadruped"],
             "there is a task 'quadruped_velocity_flat' already",

@@ -229,8 +229,8 @@ class TermGuard:
         """Whether a call with a mask has changed rows outside of the mask."""
         if call.mask_E is None:
             return False
-        # Buffers and forces of an event may change in rows in which nothing new begins. In a rehearsal
-        # nothing has begun. A command draws in its rows only.
+        # An event may change its buffers and forces in all rows, in a rehearsal its buffers alone. A command
+        # may change only the rows that it draws for.
         is_pressing = piece.owner == INPUT and not self._rehearses
         is_kept = piece.owner == call.scope and not call.scope.startswith("commands/")
         if is_pressing or is_kept:

@@ -349,7 +349,7 @@ def _servo(mj_model: mujoco.MjModel, joint: int, gain: str) -> int:
             position = actuator
         else:
             velocity = actuator
-    # With both kinds on one joint, damping is the velocity servo's business.
+    # With both kinds on one joint, damping belongs to the velocity servo.
     if gain == "damping" and velocity is not None:
         return velocity
     if position is not None:

@@ -78,10 +78,12 @@ def _pairs(warp_model: mjw.Model) -> Iterator[tuple[int, int, list[str], int]]:
 def collisions(
     warp_model: mjw.Model, warp_data_E: mjw.Data, lists: ContactLists, *, lanes: int | None = None
 ) -> Callable[[], None]:
-    """Return a launcher of `mjw.collision` for a model for which it is available, with arrays in their final place.
+    """Return a launcher of our collision pass, which replaces `mjw.collision` for models where it is available.
 
-    The pool has to be empty (`nacon`). Places in it are others, as in each run on a GPU; contacts are appended to the
-    lists, unless others come to the pool. `lanes` is how many threads share a world on CUDA; None takes the usual.
+    The launcher keeps the addresses of the arrays. The pool must be empty (`nacon`). The order of contacts in the pool
+    differs from MuJoCo Warp's, which on a GPU varies between runs anyway. Contacts are appended to the lists, unless
+    MuJoCo Warp or a hook changes the pool afterwards. `lanes` is how many threads share a world on CUDA; None takes the
+    usual number.
     """
     m = warp_model
     d = warp_data_E

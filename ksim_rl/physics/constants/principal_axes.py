@@ -22,7 +22,7 @@ def principal_axes(
     inertia_33: Float32[Tensor, "*batch 3 3"],
 ) -> tuple[Float32[Tensor, "*batch 3"], Float32[Tensor, "*batch 4"]]:
     """Return principal moments, and the axes' orientation (w, x, y, z); a diagonal matrix keeps its order and axes."""
-    # In float64: with float32, Warp stops far from the accuracy of float32.
+    # In float64: given float32, Warp's iteration stops far short of float32 accuracy.
     matrices = inertia_33.reshape(-1, 3, 3).double().contiguous()
     moments = matrices.new_empty(matrices.shape[0], 3)
     quats = matrices.new_empty(matrices.shape[0], 4)

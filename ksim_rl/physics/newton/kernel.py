@@ -69,7 +69,7 @@ def layout(
     )
     workspace = max(2 * column, 2 * stride, of_limbs)
     spread = trunk + chains * padded(limb)
-    # So many lanes sum the tile of a limb: a power of two. A lane has three rows of it in its registers.
+    # How many lanes sum the tile of a limb, a power of two; each keeps three rows of it in registers.
     if chains:
         lanes = 1 << (CUDA_LANES // chains).bit_length() - 1
     else:

@@ -50,8 +50,8 @@ class Limits:
 def _narrow(
     limited: np.ndarray, ranges: np.ndarray, margins: np.ndarray, *, differs: bool
 ) -> np.ndarray:
-    """Return which of those with limits may be within the margins of both, in the model or where its fields differ."""
-    # Fields of each world may be drawn at any time: then the width of today proves nothing.
+    """Return the limited elements that may be near both limits at once, in the model or with fields per world."""
+    # Fields per world may be drawn at any time, so their present width proves nothing.
     differs = differs or len(ranges) > 1 or len(margins) > 1
     width = ranges[0, :, 1] - ranges[0, :, 0]
     # Both hold together only where the range is narrower than both margins.

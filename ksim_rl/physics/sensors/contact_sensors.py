@@ -100,7 +100,7 @@ class ContactReadings:
         )
 
     def list(self) -> None:
-        """List each world's contacts, where no kernel of constraint rows has."""
+        """List each world's contacts, if no kernel of constraint rows has done so."""
         # The collision pass was MuJoCo Warp's, which appends nothing.
         self._lists.are_appended = False
         self._lists.append()

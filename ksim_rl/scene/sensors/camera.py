@@ -86,11 +86,11 @@ class CameraSensor(Sensor):
 
     def track(self, name: str, view: WorldView) -> "CameraTracker":
         groups = view.world.mj_model.geom_group
-        # The renderer would end the process.
+        # Without a geom to draw, the renderer would abort the process.
         if not np.isin(groups, self.geom_groups).any():
             raise ValueError(
-                f"scene.sensors.{name}.geom_groups={self.geom_groups}: no geom of the model is in one of them, but in "
-                f"{sorted(set(groups.tolist()))}"
+                f"scene.sensors.{name}.geom_groups={self.geom_groups}: no geom of the model is in one of them; its "
+                f"geoms are in {sorted(set(groups.tolist()))}"
             )
         return CameraTracker(name, self, view)
 

@@ -205,6 +205,6 @@ class Gaps(TerrainPatch):
         outside_RC = lattice.ring_RC - round(self.platform_width / 2 / cell) * cell
         # Position within the period of a trench and the ground after it.
         place_RC = np.mod(outside_RC, width + ground)
-        # Brinks belong to the even ground.
+        # Edges belong to the flat ground.
         in_gap_RC = (outside_RC > TIE) & (place_RC > TIE) & (place_RC < width - TIE)
         return np.where(in_gap_RC, -self.depth, 0.0)
