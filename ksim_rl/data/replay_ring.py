@@ -290,8 +290,8 @@ class ReplayRing(ReplayBuffer):
 
     Its TorchRL parts are `ReplayStorage`, whose other arguments are `of_storage`, `ReplaySampler` or `PrioritySampler`,
     and `ReplayWriter`. `extend` takes rollouts `["E","T"]`. With `cfg.offline` minibatches have that share of
-    `offline`, a table that has to be set, behind the env states of the ring. None of its methods makes a host sync, so
-    all can be captured in a CUDA graph.
+    `offline`, a table that has to be set, behind the env states of the ring, shard by shard. None of its methods makes
+    a host sync, so all can be captured in a CUDA graph.
     """
 
     def __init__(self, cfg: ReplayCfg, **of_storage: Any) -> None:
@@ -366,8 +366,10 @@ class ReplayRing(ReplayBuffer):
         # The ring may have more leaves, which a recorder reads.
         online_N = online_N.select(*offline_M.keys(True, True))
         parts: list[TensorDictBase] = []
-        recorded = offline_M.split(self._num_offline)
-        for online_B, offline_B in zip(online_N.split(self._num_online), recorded, strict=True):
+        # By shards inside of minibatches, as ranks have their rows, to which draws of the losses belong.
+        of_shard = online_N.split(self._num_online // self.cfg.shards)
+        recorded = offline_M.split(self._num_offline // self.cfg.shards)
+        for online_B, offline_B in zip(of_shard, recorded, strict=True):
             parts += [online_B, offline_B]
         return TensorDict.cat(parts, dim=0)  # type: ignore[return-value]
 

@@ -167,11 +167,17 @@ def clone_for(name, *, noise=0.1, num_updates=20):
     return update.state_dict()
 
 
-def recorded_table(*, episodes=8, n_step=1):
+def recorded_table(*, episodes=8, n_step=1, device="cpu"):
     """Return a table of the best actions in `TargetEnv`, as a recorder would have found them."""
     env = make_env(episodes)
     policy = TensorDictModule(torch.clone, in_keys=["actor"], out_keys=["action"])
     rollout_ET = env.rollout(LENGTH, policy, break_when_any_done=False)
     rows_D = rollout_ET.reshape(-1)
     rows_D["episode"] = torch.arange(episodes).repeat_interleave(LENGTH)
-    return make_offline_table(rows_D, observations=["actor", "critic"], n_step=n_step, gamma=GAMMA)
+    return make_offline_table(
+        rows_D,
+        observations=["actor", "critic"],
+        n_step=n_step,
+        gamma=GAMMA,
+        device=device,
+    )

@@ -101,7 +101,8 @@ def test_minibatches_have_their_share_and_draw_each_env_state_alike(shards):
         # Places without an env state are masked: after four draws hardly any.
         mask_B = minibatch_B[MASK_KEY][:, 0]
         is_recorded_B = minibatch_B["actor"][:, 0] >= 0.0
-        expected_B = torch.arange(16) >= 8
+        # One half behind the other, in each shard.
+        expected_B = torch.arange(16) % (16 // shards) >= 8 // shards
         assert (is_recorded_B == expected_B)[mask_B].all()
         drawn += minibatch_B["actor"][expected_B & mask_B, 0].tolist()
     times = [drawn.count(seen) for seen in rows_D["actor"][:, 0].tolist()]

@@ -12,11 +12,12 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Unbounded
 
+from ksim_rl.data import OfflineCfg
 from ksim_rl.device import state_tree
 from ksim_rl.modules.mlp import mlp
 from ksim_rl.objectives import FlatAdamW, SACCfg, TD3Cfg, compare, frozen
 from ksim_rl.objectives.distributional import mean_returns
-from tests.algorithms.off_policy_problem import make_update
+from tests.algorithms.off_policy_problem import make_update, recorded_table
 from tests.gpu.no_syncs import no_syncs
 
 pytestmark = pytest.mark.gpu
@@ -41,7 +42,10 @@ class _Env:
 def _update(name, **options):
     torch.manual_seed(0)
     cfg = OBJECTIVES[name]
-    return make_update(name, _Env(), objective=cfg, device="cuda", learning_starts=1, **options)
+    update = make_update(name, _Env(), objective=cfg, device="cuda", learning_starts=1, **options)
+    if options.get("offline"):
+        update.learn_also_from(recorded_table(n_step=update.data.n_step, device="cuda"))
+    return update
 
 
 def _rollout():
@@ -62,7 +66,14 @@ def _rollout():
 
 
 @pytest.mark.parametrize("name", list(OBJECTIVES))
-@pytest.mark.parametrize("options", [{}, {"prioritized": True, "n_step": 3}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"prioritized": True, "n_step": 3},
+        {"offline": OfflineCfg(source="made_up"), "n_step": 3},
+    ],
+)
 def test_captured_without_syncs_and_learning_what_it_sees(name, options):
     update, rollout = _update(name, **options), _rollout()
     cut = 0

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from ksim_rl import conf
+from ksim_rl.cli.collect import collect
 from ksim_rl.device import state_tree
 from ksim_rl.trainers import build
 from tests.ranks.gloo import results
@@ -100,9 +101,9 @@ def largest_difference(learnt, parts):
     return worst
 
 
-def compared(name, size, folder):
+def compared(name, size, folder, *more):
     """Train on ranks and in one process; return how many tensors were compared, and their largest difference."""
-    overrides = ALGORITHMS[name]
+    overrides = [*ALGORITHMS[name], *more]
     learnt, envs = trained(overrides, 4 * size, 16 * size, size)
     parts = results(trained, overrides, 4, 16, 1, size=size, folder=folder)
     for key, expected in envs.items():
@@ -111,8 +112,8 @@ def compared(name, size, folder):
     return len(learnt), largest_difference(learnt, [part[0] for part in parts])
 
 
-def check(name, size, folder):
-    tensors, worst = compared(name, size, folder)
+def check(name, size, folder, *more):
+    tensors, worst = compared(name, size, folder, *more)
     print(f"{name}, {size} ranks: {tensors} tensors, largest difference {worst:.2g}")
     assert worst <= 1e-6
 
@@ -126,3 +127,11 @@ def test_two_ranks_learn_ppo_as_one_process_does(tmp_path):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_ranks_learn_what_one_process_learns(name, size, tmp_path):
     check(name, size, tmp_path)
+
+
+@pytest.mark.full
+def test_ranks_share_recorded_episodes_as_shards_of_one_process_do(tmp_path):
+    recorded = tmp_path / "recorded"
+    how = ["--agent", "random", "--episodes", "6", "--device", "cpu", "--output", str(recorded)]
+    assert collect([*SMALL[:2], "task.episode_length_s=0.1", *how]) == 0
+    check("fast_sac", 2, tmp_path, f"data.offline={{source: {recorded}}}")
