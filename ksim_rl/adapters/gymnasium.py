@@ -73,7 +73,7 @@ class GymnasiumVectorEnv(VectorEnv):
         self._names = _Names(self._stepper)
         self.num_envs = self._stepper.num_envs
         self.render_mode = self._stepper.render_mode
-        # Tells wrappers of which episode `obs` is where one has ended.
+        # Tells wrappers which episode `obs` belongs to where one has ended.
         self.metadata = {"autoreset_mode": mode, **_rendering(self._stepper)}
         self.single_observation_space = self._names.space
         self.single_action_space = space_of(

@@ -68,7 +68,7 @@ def write_motion(
 ) -> None:
     """Write a motion of the model, whose scene may hold other things without joints, at `fps` frames per second.
 
-    A ValueError refuses fewer than two frames, of which no motion can be read.
+    A ValueError refuses fewer than two frames, which are no motion.
     """
     if len(qpos_FL) < 2:
         raise ValueError(

@@ -22,7 +22,7 @@ Array = np.ndarray
 SHAPES = {"fps": 0, "joint_pos": 2, "body_pos_w": 3, "body_quat_w": 3}
 NAMES = ("joint_names", "body_names")
 MOST_OFF = 0.05
-"""m: by which bodies may be elsewhere than the joints put them, as robots of one name differ a little."""
+"""m: how far bodies may be from where the joints put them, as robots of one name differ a little."""
 
 
 def read_tracking(

@@ -22,7 +22,7 @@ SAME_OUTCOME = 0.25
 MOVES = (1,) * 4 + (8,) * 4
 """Units in the last place of the moves before an error counts as unexplained; most are explained by the first.
 
-The larger ones are for rows with two outcomes, of which rounding chooses one. Of n moves of the error's own size all
+The larger ones are for rows with two outcomes, where rounding chooses one. Of n moves of the error's own size all
 give the other outcome in one row of n + 1; a larger move crosses over more often.
 """
 ROWS_PER_BORDER = 2_000

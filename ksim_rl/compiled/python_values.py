@@ -413,7 +413,7 @@ def _names_in(code: types.CodeType) -> tuple[str, ...]:
 
 
 def _texts_in(code: types.CodeType) -> Iterator[str]:
-    """Yield the texts in code, by which attributes may be named."""
+    """Yield the texts in code, which may name attributes."""
     for constant in code.co_consts:
         if isinstance(constant, str):
             yield constant

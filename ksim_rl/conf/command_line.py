@@ -122,7 +122,7 @@ def _parse(text: str, loader: ConfigLoader) -> Override:
         raise spelling.of_flag(text)
     if not text.isascii() and text.encode(errors="replace").decode() != text:
         raise ValueError(
-            f"override {text!r}: bytes that are no UTF-8, of which Hydra's configs are made: give the folder or file "
+            f"override {text!r}: bytes that are no UTF-8, which Hydra's configs need: give the folder or file "
             "another name"
         )
     try:

@@ -54,7 +54,7 @@ def _comments(owner: type) -> dict[str, str]:
     for field in tree.body:
         if not isinstance(field, ast.AnnAssign) or not isinstance(field.target, ast.Name):
             continue
-        # A field may take several lines, of which any may have the comment.
+        # A field may take several lines, and any of them may have the comment.
         lines = range(field.lineno, (field.end_lineno or field.lineno) + 1)
         said = [comments[line] for line in lines if line in comments]
         if said:

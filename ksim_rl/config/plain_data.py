@@ -31,7 +31,7 @@ class _Loader(_FastLoader):
     def construct_mapping(
         self, node: yaml.MappingNode, deep: bool = False
     ) -> dict[Hashable, Plain]:
-        """Refuse keys that are there twice, of which one would win in silence."""
+        """Refuse duplicate keys: one would win in silence."""
         # By their written form, as 1 and "1" are different keys.
         seen: set[str] = set()
         for key, _ in node.value:
@@ -122,7 +122,7 @@ def _without_references(tree: Any) -> Any:
         return {_without_references(key): _without_references(entry) for key, entry in tree.items()}
     if isinstance(tree, (list, tuple)):
         return [_without_references(entry) for entry in tree]
-    # An escaped one stays, of which Hydra's grammar may make another.
+    # An escaped one stays: Hydra's grammar may turn it into another character.
     if isinstance(tree, str) and "\\" not in tree:
         return _REFERENCE.sub("", tree)
     return tree

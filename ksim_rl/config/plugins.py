@@ -96,7 +96,7 @@ def load(names: Sequence[str]) -> None:
 
 
 def environment() -> dict[str, str]:
-    """Return the variables by which a process that is started finds the plug-ins of this one, by absolute paths."""
+    """Return the environment variables that let a child process find this one's plug-ins, by absolute paths."""
     folders = _folders()
     for name in sorted({name.split(".")[0] for name in _named} | _allowed):
         module = sys.modules.get(name)

@@ -71,7 +71,7 @@ class EpisodeRecorder:
         return self._is_done.is_set()
 
     def record(self, rollout_ET: TensorDictBase, *, restarted: bool = False) -> None:
-        """Take a rollout, whose memory may be overwritten by what the same stream does next.
+        """Take a rollout; later work on the same stream may overwrite its memory.
 
         Where all envs have `restarted` before it, the episodes that ran until then never end, and are left out.
 

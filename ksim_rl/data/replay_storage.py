@@ -135,7 +135,7 @@ class ReplayStorage(SavedByStateDict, Storage):
                 # brings it as its first.
                 finite_N &= self._put(key, leaf, following_N, rollout_ET.get(_next(key)))
             finite_N &= self._put(key, leaf, index_N, rollout_ET.get(key))
-        # First all successors, of which many are env states of this rollout and become available next.
+        # First all successors: many are env states of this rollout and become available next.
         self._make_unavailable(following_N)
         self.available.index_copy_(0, index_N, finite_N)
         self.non_finite_count.add_((~finite_N).sum())
@@ -295,7 +295,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         leaf[index_N] = _finite(self.stacks.newest(key, values_ET).flatten(0, 1).to(leaf.dtype))
         if not leaf.is_floating_point():
             return torch.ones_like(index_N, dtype=torch.bool)
-        # All frames of a stack, of which the older ones have been refused with their own env states.
+        # All frames of a stack; the older ones have been refused with their own env states.
         return values_ET.isfinite().reshape(index_N.numel(), -1).all(1)
 
     def _make_unavailable(self, row_N: Tensor) -> None:

@@ -62,7 +62,7 @@ def explained(error: BaseException) -> str | None:
 
 
 def _user_name() -> str:
-    """Return the user's name, of which torch makes the name of its folder, or the number where it has none."""
+    """Return the user's name, which torch puts into the name of its folder, or the user's number if it has no name."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # an id without a name, as in containers

@@ -18,5 +18,5 @@ def rank() -> int:
 
 
 def first_row(num_rows: int) -> int:
-    """Return the place of this rank's first row among the rows of all ranks, each of which has `num_rows`."""
+    """Return the place of this rank's first row among the rows of all ranks, where each rank has `num_rows`."""
     return rank() * num_rows

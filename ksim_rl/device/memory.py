@@ -16,7 +16,7 @@ _UNITS = {None: 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
 class TooManyEnvsError(ValueError):
-    """Memory does not suffice for so many envs, of which one takes at least `per_env` bytes."""
+    """Memory does not suffice for so many envs, each of at least `per_env` bytes."""
 
     def __init__(self, text: str, *, per_env: int) -> None:
         super().__init__(text)

@@ -136,7 +136,7 @@ class Recorder(TorchDispatchMode):
 
 
 class _HostMethods(TorchFunctionMode):
-    """Refuses methods of tensors by which Python reads numbers, which would become constants of the recording."""
+    """Refuses tensor methods that read numbers into Python, where they would become constants of the recording."""
 
     def __torch_function__(
         self,

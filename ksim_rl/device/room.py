@@ -11,7 +11,7 @@ _NUMBER_BYTES = 4
 
 
 def check_room(cfg: Checked, *, num_envs: int, device: torch.device, path: str = "") -> None:
-    """Refuse a config of which one part alone takes more memory than a device has in all.
+    """Refuse a config if one part alone takes more memory than the whole device has.
 
     `Checked.least_numbers` gives the sizes, so that nothing has to be allocated to know them. What passes may
     still be too much: a failed allocation tells. The ValueError names the fields, which stand at `path`.

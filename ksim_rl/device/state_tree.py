@@ -26,7 +26,7 @@ State: TypeAlias = Mapping[str, Value]
 
 
 DESCRIPTION = "_extra_state"
-"""The end of the names by which modules of torch describe themselves in a state, such as the pictures of an encoder."""
+"""How names end under which torch modules describe themselves in a state, such as the pictures of an encoder."""
 
 
 def branch(state: State, name: str) -> State:

@@ -13,7 +13,7 @@ MOST_STEPS = 2**31 - 1
 def episode_steps(cfg: ManagerBasedRlEnvCfg, step_dt: float) -> int:
     """Return the env steps of `step_dt` seconds after which an episode is cut; 0 for never.
 
-    Raises ValueError for more than are counted, and for a delay by which nothing arrives within an episode.
+    Raises ValueError for more than are counted, and for a delay longer than an episode.
     """
     steps = cfg.episode_length_s / step_dt
     # Written so that NaN is refused, too.

@@ -20,7 +20,7 @@ LIKE = 2e-2
 """Relative errors: up to SAME two signals count as equal, up to LIKE a reason explains their difference."""
 MOST_OFF = 0.2
 """Share of pixels in which two renderers may differ: edges, lights and textures are not drawn alike."""
-# Env steps by which a signal may be late or early and still be recognized.
+# A signal may be late or early by so many env steps and still be recognized.
 MOST_SHIFT = 4
 
 

@@ -54,7 +54,7 @@ def _history(name: str, shape: tuple[int, ...], **frame: Any) -> StateSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One term that the policy reads: `size` numbers in a frame, of which `length` stand `stride` steps apart."""
+    """One term that the policy reads: `size` numbers per frame, and `length` frames that are `stride` steps apart."""
 
     name: str
     size: int

@@ -168,7 +168,7 @@ def _drawing(meta: Export) -> dict[str, str] | None:
 
 
 def _other_physics(meta: Export, option: mujoco.MjOption) -> tuple[list[str], str]:
-    """Return the runner's arguments by which the C engine judges an export, and the words for them."""
+    """Return the runner's arguments for judging an export with the C engine, and the words for them."""
     # Warp is other physics already.
     if meta.get("engine") != "c":
         return [], ""

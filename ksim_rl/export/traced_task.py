@@ -1,4 +1,4 @@
-"""Traces what a policy observes, and the rewards, terminations and metrics by which a simulator rates it."""
+"""Traces what a policy observes, and the rewards, terminations and metrics that a simulator rates it by."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -146,7 +146,7 @@ def greatest_difference(
 
 
 def _errors(found_L: np.ndarray, wanted: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Return the greatest error of each term, whose numbers stand side by side in what was found."""
+    """Return the greatest error of each term; the numbers of the terms are concatenated in what was found."""
     errors = {}
     start = 0
     for name, wanted_L in wanted.items():

@@ -251,5 +251,5 @@ def _best_law(
 
 
 def _share(said: Array, true: Array) -> float:
-    """Return the root mean square of what was said wrongly, as a share of the truth's."""
+    """Return the root mean square of the prediction error, as a share of the truth's."""
     return float(np.sqrt(np.mean((said - true) ** 2) / np.mean(true**2)))

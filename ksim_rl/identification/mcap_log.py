@@ -193,7 +193,7 @@ def _records(path: Path, data: bytes) -> Iterator["McapRecord"]:
 
 
 def _unpacked(path: Path, compression: str, data: bytes) -> bytes:
-    """Return the bytes of a chunk, of which there may be so many and not more."""
+    """Return the bytes of a chunk, up to a limit."""
     import lz4.frame
     import zstandard
 

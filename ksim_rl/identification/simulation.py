@@ -138,7 +138,7 @@ class Simulation:
         some = len(numbers_KNP)
         for field in ("armature", "damping", "frictionloss"):
             entries = self._batch.expand(f"dof_{field}")
-            # A damping has three coefficients, of which the first is the linear one.
+            # A damping has three coefficients; the first is the linear one.
             rows = entries.reshape(len(entries), entries.shape[1], -1)
             rows[:some, self._dof, 0] = numbers_KNP[..., KINDS.index(field)]
         bias = self._batch.expand("actuator_biasprm")

@@ -107,7 +107,7 @@ def _robot_of(name: str, cfg: ManagerBasedRlEnvCfg) -> str:
 
 
 def _late(actuators: Sequence[Actuator], delay_s: Estimate, timestep: float) -> list[Actuator]:
-    """Return actuators whose targets arrive late by what was found, in whole physics steps from below to above."""
+    """Return actuators with the delay that was found, in whole physics steps: rounded down to rounded up."""
     lags = {
         "min_lag": math.floor(delay_s.low / timestep),
         "max_lag": math.ceil(delay_s.high / timestep),

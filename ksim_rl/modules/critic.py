@@ -76,7 +76,7 @@ class QNetworkCfg(OffPolicyNetworkCfg):
 
     in_keys: ObservationKeys = ("critic",)
     num_networks: Count = 2  # critics side by side
-    num_atoms: Count = 1  # values of which each predicts the probability; 1 predicts the value
+    num_atoms: Count = 1  # values with a predicted probability each; 1 predicts the value
     v_min: float = -10.0  # the lowest atom
     v_max: float = 10.0  # the highest atom
 

@@ -140,7 +140,7 @@ class _ToChannels(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Maps pictures [*batch, *shape] to features [*batch, F], by what a config builds for one batch dim.
+    """Maps pictures [*batch, *shape] to features [*batch, F], with a network that a config builds for one batch dim.
 
     `spec` is the spec of one picture. A ValueError tells where the config's module does not fit, or pictures differ,
     also those that a loaded state was learned on: weights of convolutions fit pictures of any size.

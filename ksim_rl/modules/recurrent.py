@@ -176,7 +176,7 @@ class RecurrentModule(TensorDictModule):
     name tells the states of several modules in one TensorDict apart.
 
     By default every element of the batch is one step. Under TorchRL's `set_recurrent_mode(True)`, where its and our
-    losses run, the batch is [B, T]: sequences, of which only the first step's state is read. At each step whose
+    losses run, the batch is [B, T]: sequences, and only the first step's state is read. At each step whose
     `is_init` is True the state is zero, whatever it was before.
 
     An env carries the state from step to step, and begins each episode with zeros, if it has the transforms of

@@ -198,7 +198,7 @@ class PPOCfg(OnPolicyCfg):
         return self.estimate_each_epoch or self.advantage == "vtrace"
 
     def check_recurrent(self) -> None:
-        """Refuse a symmetry, of which recurrent states know nothing."""
+        """Refuse a symmetry, which recurrent states do not support."""
         if self.symmetry != "none":
             raise ValueError(
                 f"objective.symmetry={self.symmetry!r}: a recurrent state has no known mirror image; use none, or "

@@ -1,4 +1,4 @@
-"""Checks the options of TorchRL's value estimators, of which ours take some and refuse others by name."""
+"""Checks the options of TorchRL's value estimators: ours take some and refuse others by name."""
 
 from typing import Any
 

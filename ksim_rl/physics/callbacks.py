@@ -6,7 +6,7 @@ import mujoco_warp as mjw
 
 
 class Callbacks:
-    """The callbacks of a world's model, of which those that are set by now are our own.
+    """The callbacks of a world's model; those that are set by now are our own.
 
     Ours only launch kernels; those that a program sets later may do anything.
     """

@@ -156,7 +156,7 @@ def _key(mj_model: mujoco.MjModel) -> bytes:
 
 
 def _round_up(needed: float) -> int:
-    # A model of which no contact or row was seen has room for a few, too.
+    # A model without any contact or row so far has room for a few, too.
     return MULTIPLE * math.ceil((needed + EXTRA) / MULTIPLE)
 
 
@@ -172,7 +172,8 @@ def _most_limits(mj_model: mujoco.MjModel) -> int:
 def _unseen_rows(mj_model: mujoco.MjModel) -> int:
     """Return how many rows of equality constraints worlds may have that C makes none of, so that no probe sees them.
 
-    These are off at first, and may be switched on, or tie what no joint moves, of which MuJoCo Warp makes rows.
+    These are off at first and may be switched on, or they tie bodies that no joint moves: MuJoCo Warp makes rows for
+    them.
     """
     is_unseen = (mj_model.eq_active0 == 0) | (kinds_of_ties(mj_model) == FIXED_TIE)
     return int(rows_of_equalities(mj_model)[is_unseen].sum())
@@ -195,7 +196,7 @@ class Need:
 
 
 def _look_at_poses(mj_model: mujoco.MjModel, need: Need) -> None:
-    """Show the model's own poses, and random ones in the ground, of which a few go on."""
+    """Show the model's own poses, and random ones in the ground; a few of these are simulated further."""
     # A fixed seed, so that a model has the same capacity in every process.
     rng = np.random.default_rng(0)
     mj_data = mujoco.MjData(mj_model)

@@ -122,7 +122,7 @@ def take_the_law_of_priority(warp_model: mjw.Model, warp_data_E: mjw.Data) -> No
 def _have_direct_laws_of_priority(
     warp_model: mjw.Model, pairs: np.ndarray, pair_ids: np.ndarray
 ) -> bool:
-    """Return whether geoms of different priority may touch, one of which gives stiffness and damping directly."""
+    """Return whether geoms of different priority may touch where one of them gives stiffness and damping directly."""
     # A <pair> has a law of its own, which no priority changes.
     pairs = pairs[pair_ids[:, 0] == upstream.NO_PAIR]
     differs = np.diff(warp_model.geom_priority.numpy()[pairs])[:, 0] != 0

@@ -101,7 +101,7 @@ def write_fields(mj_model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> 
         # Of frames that its compiler found equal C looks at one, and at gravity compensation if it found any; and the
         # inertia of simple bodies, and margins of whole bodies, are fields that no world has.
         mujoco.mj_setConst(mj_model, mujoco.MjData(mj_model))
-        # `mj_setConst` overwrites derived fields, of which the world has its own.
+        # `mj_setConst` overwrites derived fields; the world has its own.
         _copy_fields(mj_model, fields)
 
 

@@ -253,7 +253,7 @@ def warn_of_weightless(mj_model: mujoco.MjModel) -> None:
     if found.size:
         first, second = (_element(mj_model, "geom", int(geom)) for geom in found[0])
         warnings.warn(
-            f"{first} and {second} may touch, of which one is fixed and the other turns about its centre of mass: "
+            f"{first} and {second} may touch; one is fixed and the other turns about its centre of mass: "
             "MuJoCo gives their contact no weight, so that C's forces are rounding errors; here the body has "
             f"{SHARE:g} of its mass's inverse weight in all contacts. Move the joint away from the centre of mass, or "
             "keep the two apart by contype or <exclude/>",

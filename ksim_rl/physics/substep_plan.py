@@ -18,7 +18,7 @@ class SubstepPlan:
     Attributes:
         dynamics: all before the constraints: kinematics, inertias, smooth forces.
         broad_phase: which pairs of geoms may touch.
-        collisions: the same and the contacts of those pairs, of which MuJoCo Warp may find some.
+        collisions: the same and the contacts of those pairs; MuJoCo Warp may find some of them.
         rows: the constraint rows.
         solver: the accelerations that the constraints leave.
         integration: the state at the end of the substep.

@@ -20,7 +20,7 @@ class Timing:
         """Begin to collect."""
         if size() == 1:
             return
-        # Each iteration is a new place, by which the others see that this rank moves.
+        # Each iteration is a new place, which shows the others that this rank moves.
         heartbeat.at(f"in iteration {iteration}")
         self._began = time.perf_counter()
         if self._device.type == "cuda":

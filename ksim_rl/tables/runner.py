@@ -55,7 +55,7 @@ class Runs:
         return found
 
     def complete(self, seeds: Sequence[int]) -> dict[str, list[Result]]:
-        """Return the results of the rows of which each of `seeds` (none: all of the row) is there."""
+        """Return the results of rows for which all of `seeds` (none: all of the row) are there."""
         rows = self.table.rows
         found = {}
         for name, results in self.results().items():
@@ -203,7 +203,7 @@ def _result(path: Path) -> Result:
 def gpus_for(device: str, *, per_gpu: int) -> list[str]:
     """Return the GPUs of jobs, as `CUDA_VISIBLE_DEVICES` names them, each `per_gpu` times; [""] on the CPU."""
     every = ",".join(str(index) for index in range(torch.cuda.device_count()))
-    # "" is the CPU, of which there is one.
+    # "" is the CPU; there is only one.
     if device == "cpu":
         named = [""]
     else:

@@ -144,7 +144,7 @@ def _keep(
         return kept
     if files.size > MOST_KEPT_BYTES:
         note(
-            f"task.scene.{name.replace('/', '.')}: {files.size / 2**20:.0f} MiB of model, of which the run keeps only "
+            f"task.scene.{name.replace('/', '.')}: {files.size / 2**20:.0f} MiB of model: the run keeps only "
             f"the hash (copies end at {MOST_KEPT_BYTES // 2**20} MiB)"
         )
         return kept
@@ -268,7 +268,7 @@ def _data(cfg: RunCfg) -> Iterator[_Data]:
 def _with_source(entity: MjcfRobot | MenagerieRobot, source: str) -> MjcfRobot | ModelRobot:
     if isinstance(entity, MjcfRobot):
         return dataclasses.replace(entity, source=source)
-    # Others name a model of the menagerie, of which no copy is kept.
+    # Others name a model of the menagerie; no copy of it is kept.
     assert isinstance(entity, ModelRobot)
     return dataclasses.replace(entity, model=source)
 

@@ -152,7 +152,7 @@ def check_installed(cfg: LoggerCfg) -> None:
 def make_loggers(
     cfg: LoggerCfg, run_folder: Path, *, config: Tree | None = None
 ) -> list[MetricLogger]:
-    """Open the loggers of a run, some of which show its `config`; a RuntimeError names a service that refuses."""
+    """Open the loggers of a run, some of them show its `config`; a RuntimeError names a service that refuses."""
     loggers: list[MetricLogger] = []
     if cfg.csv:
         loggers.append(CsvTable(run_folder / METRICS))

@@ -15,7 +15,7 @@ from ksim_rl.trainers.run_cfg import RunCfg
 ENGINES = {"auto": "the engine that suits", "warp": "MuJoCo Warp", "c": "MuJoCo's C engine"}
 PREFIX = "task.sim."
 ENGINE = f"{PREFIX}engine"
-# The integrator by which a run of another one is judged.
+# The integrator that judges runs of any other integrator.
 _OTHER_INTEGRATOR = {"euler": "implicitfast", "discrete": "implicitfast"}
 
 
@@ -41,7 +41,7 @@ def check_physics_alone(fields: Collection[str], command: str) -> None:
 
 
 def judged_by(cfg: RunCfg, *, trained: str, given: Collection[str] = ()) -> tuple[RunCfg, str]:
-    """Return the config by which `cfg.task.sim.engine` judges a run, and words that say which physics that is.
+    """Return the config with which `cfg.task.sim.engine` judges a run, and words that say which physics that is.
 
     The C engine judges a run of MuJoCo Warp as it is configured. A run that the C engine itself trained would meet what
     it knows: it is judged with another integrator, and with half the time step and twice the substeps, unless `given`,
@@ -62,7 +62,7 @@ def judged_by(cfg: RunCfg, *, trained: str, given: Collection[str] = ()) -> tupl
 
 
 def other_integrator(option: mujoco.MjOption) -> tuple[str, str]:
-    """Return the integrator by which a run of this one is judged, and how to say that."""
+    """Return the integrator that judges a run of this one, and how to say that."""
     # "mjINT_IMPLICITFAST" is "implicitfast" in a config.
     own = mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_").lower()
     other = _OTHER_INTEGRATOR.get(own, "euler")

@@ -314,7 +314,7 @@ def check_run_tree(tree: Tree, where: Path, *, given: Collection[str] = ()) -> N
 
 
 def reaching_outside(tree: Tree, *, given: Collection[str] = ()) -> Iterator[tuple[str, Plain]]:
-    """Yield the fields of a run's tree, by dotted path, by which a run writes or listens elsewhere.
+    """Yield the fields of a run's tree, by dotted path, that make a run write or listen elsewhere.
 
     Those that are `given` are left out, with all that is below them.
     """

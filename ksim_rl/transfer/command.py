@@ -72,7 +72,7 @@ def judge_all(
         try:
             found = judge(policy.cfg, policy.actor, condition, episodes=episodes, seconds=seconds)
         except ValueError as error:
-            # As trained it must run; others may ask for what the task does not have, as friction of a pole.
+            # As trained it must run; other conditions may not apply to the task, as friction to a pole.
             if number == 1:
                 raise
             refused[condition.name] = " ".join(str(error).split())

@@ -1,4 +1,4 @@
-"""The conditions under which every policy is judged: one list, of which none may be left out.
+"""The conditions under which every policy is judged: one list, and none may be left out.
 
 Each changes a task's config, and all else stays as in training: starts, commands and what the task itself draws.
 """
@@ -82,7 +82,7 @@ def _time_step(timestep: float) -> Change:
 
 
 def _late_actions(delay_s: float) -> Change:
-    """Return the change by which actions arrive late, each episode by up to `JITTER_S` more or less."""
+    """Return the change that makes actions arrive late, each episode by up to `JITTER_S` more or less."""
 
     def change(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
         timestep = _timestep(cfg)

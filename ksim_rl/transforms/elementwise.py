@@ -19,7 +19,7 @@ Range = tuple[float | None, float | None]
 
 
 def clipped(value: Num[Tensor, "*leaf"], clip: Range) -> Num[Tensor, "*leaf"]:
-    """Return a value within [low, high], of which one may be None; NaN stays NaN."""
+    """Return a value clamped to [low, high], either of which may be None; NaN stays NaN."""
     return torch.clamp(value, *clip)
 
 
@@ -87,7 +87,7 @@ class ActionMap(_Map):
 
 
 class _Clip:
-    """The limits of each key, (low, high) of which one may be None, and their effect on values and specs."""
+    """The limits of each key, (low, high) where one may be None, and their effect on values and specs."""
 
     ranges: Sequence[Range]
 
@@ -158,7 +158,7 @@ class ActionClip(_Clip, ActionMap):
 def check_clip(field: str, ends: Range) -> None:
     """Refuse all but a pair (low, high) with low < high and at least one limit."""
     if not isinstance(ends, tuple | list) or len(ends) != 2 or ends[0] is None and ends[1] is None:
-        raise ValueError(f"{field}={ends!r}: expected a pair (low, high), of which one may be None")
+        raise ValueError(f"{field}={ends!r}: expected a pair (low, high), where one may be None")
     for end in ends:
         if end is not None:
             checks.check_in_range(field, end)

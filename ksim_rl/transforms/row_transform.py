@@ -42,7 +42,7 @@ class RowTransform(CheckedKeys, ABC):
             self.register_buffer(name, None)
 
     def _per_key(self, name: str) -> list[str]:
-        """Return the names of buffers of which there is one per key."""
+        """Return the names of buffers that exist once per key."""
         return [f"{name}_{index}" for index in range(len(self.in_keys or self.in_keys_inv))]
 
     def _size_rows(self, specs: Composite) -> None:

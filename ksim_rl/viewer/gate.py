@@ -38,7 +38,7 @@ class Gate:
         self.ignored = 0
         self._host = host
         self._count = threading.Lock()
-        # Names by which a browser of this machine, or of the network, may ask.
+        # Host names that a browser on this machine, or on the network, may use.
         self._names = {"localhost", host.lower()}
         self._is_local = _is_address(host, local=True) or host == "localhost"
         # A viewer for this machine alone answers to no name of the network.

@@ -86,7 +86,7 @@ def showing_motion(cfg: ManagerBasedRlEnvCfg, file: str, *, clip: str = "") -> M
         cfg,
         events={"motion": mdp.ShowMotion(file=file, clip=clip)},
         terminations={"next_frame": mdp.TimeOut()},
-        # Shorter than any env step, of which an episode has at least one.
+        # Shorter than any env step; an episode has at least one.
         episode_length_s=1e-6,
         rewards={},
         metrics={},
@@ -241,7 +241,7 @@ class Session:
         """
         motion = self.motion
         if motion is None:
-            raise ValueError("this env follows no motion of which a clip could be chosen")
+            raise ValueError("this env follows no motion: there is no clip to choose")
         motion.choose(clip, time_s)
         # Kept, so that a rebuilt env is at the same place.
         self._sought = (clip, time_s)

@@ -151,7 +151,7 @@ def test_another_model_that_is_asked_for_is_taken(robot, run, tmp_path):
 def test_above_a_size_only_the_hash_is_kept_and_a_change_is_told(robot, run, monkeypatch):
     monkeypatch.setattr(kept_models, "MOST_KEPT_BYTES", 100)
     cfg, said = kept(robot, run)
-    assert len(said) == 1 and "of which the run keeps only the hash" in said[0]
+    assert len(said) == 1 and "the run keeps only the hash" in said[0]
     assert read_record(run)["robots/cart"].copy == "" and not (run / "models").exists()
     robot.write_text(ROBOT + "\n")
     assert with_kept_models(cfg, run, note=said.append) == cfg

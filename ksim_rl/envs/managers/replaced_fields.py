@@ -37,7 +37,7 @@ def check_not_replaced(curricula: Mapping[str, CurriculumTerm], overrides: Seque
 
 
 def check_one_writer(curricula: Mapping[str, CurriculumTerm]) -> None:
-    """Refuse two curricula that write one field, of which the later one would hide the earlier one.
+    """Refuse two curricula that write one field: the later one would hide the earlier one.
 
     Raises:
         ValueError: naming the field and both curricula.

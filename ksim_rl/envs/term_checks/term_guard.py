@@ -243,7 +243,7 @@ class TermGuard:
 
 
 def _odd_numbers(like: Shaped[Tensor, "*shape"]) -> Tensor:
-    """Return numbers in [0.01, 0.02], no two neighbors of which are equal, in the shape of a tensor."""
+    """Return numbers in [0.01, 0.02] in the shape of a tensor; neighbors always differ."""
     # Multiples of the golden ratio, modulo 1, are spread evenly, so neighbors differ.
     places = torch.arange(like.numel(), dtype=torch.float64, device=like.device)
     golden_ratio = 0.6180339887498949

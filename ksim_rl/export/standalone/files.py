@@ -24,7 +24,7 @@ FORMAT = 2
 MOST = 1_000_000
 # Of a period: a robot that listens less often could not be stopped in time.
 MOST_SECONDS = 10.0
-# Tags by which MuJoCo would load other files or code, and "<!", which begins an XML entity.
+# Tags that make MuJoCo load other files or code, and "<!", which begins an XML entity.
 LEAVES_THE_FOLDER = re.compile(rb"<!|<\s*(include|extension|plugin|attach|model)\b", re.IGNORECASE)
 # Attributes of MJCF that name a file or a folder.
 PATHS = re.compile(r"\b(?:file\w*|content_type|\w*dir)\s*=\s*[\"']([^\"']*)[\"']")

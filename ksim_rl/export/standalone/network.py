@@ -30,7 +30,7 @@ class Network:
 
         # As bytes: a path would let ONNX load further files from beside it.
         data = read(path)
-        # The protobuf field by which a tensor keeps its weights in another file.
+        # The protobuf field of a tensor whose weights are in another file.
         if b"\x0a\x08location" in data:
             raise ValueError(f"{path}: weights outside of the file: expected all of them in it")
         # Episodes run in parallel processes; a small network gains nothing from threads.
@@ -104,7 +104,7 @@ class Policy(Network):
             self._check_picture(spec)
 
     def _check_picture(self, spec: Json) -> None:
-        """Refuse a description of pictures by which `run` would fold, or cast, them to others."""
+        """Refuse a description of pictures with which `run` would reshape, or cast, them to other pictures."""
         name = spec["input"]
         if name not in self.inputs:
             raise ValueError(f"{self.path}: no input {name!r}: export.json has such pictures")

@@ -75,7 +75,7 @@ def _gather_moments(
     moment: wp.array2d[float],
     kept: wp.array3d[float],
 ):
-    """Copy the moments of some actuators, each of which has all degrees of freedom in its row."""
+    """Copy the moments of some actuators; each has all degrees of freedom in its row."""
     world, place, dof = wp.tid()
     kept[world, place, dof] = moment[world, rowadr[world, actuators[place]] + dof]
 

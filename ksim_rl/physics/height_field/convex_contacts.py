@@ -36,7 +36,7 @@ TYPES = tuple(GEOM_TYPES[name] for name in ("CYLINDER", "ELLIPSOID", "MESH"))
 MESH = GEOM_TYPES["MESH"]
 MOST = wp.constant(int(mujoco.mjMAXCONPAIR))
 TOO_MANY = wp.constant(int(mjw.OverflowType.HFIELD))
-# Searches in parallel on a GPU, each of which has memory of its own, about 5 kB.
+# Searches in parallel on a GPU, each with its own memory, about 5 kB.
 SEARCHES = 8192
 # Below this depth, m, the direction from one closest place to the other is rounding of float32.
 TOUCHING = wp.constant(1.0e-6)

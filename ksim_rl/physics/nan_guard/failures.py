@@ -44,7 +44,7 @@ class Failure:
 
 
 def write(path: Path, failure: Failure) -> None:
-    """Write a failure: safetensors, of which nothing is ever executed, completely or not at all."""
+    """Write a failure as safetensors, which are never executed; completely or not at all."""
     tensors = {_MODEL: model_bytes(failure.mj_model)}
     for prefix, arrays in (
         (_STATE, failure.states),

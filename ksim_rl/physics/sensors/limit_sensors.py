@@ -62,7 +62,7 @@ class LimitSensors:
         self.reads_tendons = bool((present & is_speed & is_of_tendon).any())
 
     def read_state(self, *, in_refresh: bool = False) -> None:
-        """Launch the reading of distances and speeds, of which a refresh leaves delayed ones alone."""
+        """Launch the reading of distances and speeds; a refresh leaves delayed ones alone."""
         m = self._warp_model
         d = self._warp_data_E
         if in_refresh:

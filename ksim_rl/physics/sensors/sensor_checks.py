@@ -63,7 +63,7 @@ def check_delayed(mj_model: mujoco.MjModel) -> None:
 
 
 def check_sites_of_meshes(mj_model: mujoco.MjModel) -> None:
-    """Refuse sensors of things inside a site with the shape of a mesh, of which MuJoCo Warp knows no inside."""
+    """Refuse sensors of objects inside a mesh-shaped site: MuJoCo Warp does not compute the inside of a mesh."""
     kinds = mujoco.mjtSensor
     m = mj_model
     for sensor in np.flatnonzero(

@@ -13,7 +13,7 @@ RIDGE = 2 * SLAB
 """m: a sole that is narrower has no room for two capsules."""
 MOST_LEVELLING = 30
 LEVELLING_STEP = 2
-"""Degrees by which a foot may be tilted, and the step in which its sole is looked for."""
+"""How far a foot may be tilted while its sole is looked for, and the step of the search, degrees."""
 LIMB = 0.15
 """Share of the robot's height from which on a limb is worth a hull."""
 NO_FREE_JOINT = (

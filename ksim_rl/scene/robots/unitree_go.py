@@ -125,7 +125,7 @@ class UnitreeGo1(UnitreeQuadruped):
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh, editable model of the robot alone, whose free joint has a name."""
         spec = super().spec()
-        # The menagerie leaves the free joint without a name, by which terms would look it up.
+        # The menagerie leaves the free joint without a name, which terms need to look it up.
         for joint in spec.joints:
             if joint.type == mujoco.mjtJoint.mjJNT_FREE:
                 joint.name = "floating_base_joint"

@@ -321,7 +321,7 @@ def from_contact(
     normal: Float[Tensor, "*batch 3"],
     tangent: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Return vectors of contacts' own axes, of which the first two are given, in the world's."""
+    """Return vectors in world axes that are given in the contacts' own axes; the first two of these axes are given."""
     # Columns are the contact's axes in the world; the third one follows from the first two.
     axes = torch.stack((normal, tangent, torch.linalg.cross(normal, tangent)), dim=-1)
     return product(axes, vector[..., None])[..., 0]

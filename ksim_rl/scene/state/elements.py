@@ -98,7 +98,7 @@ class Joints(_Elements):
     @quantity
     def pos_rel_EL(self) -> Float[Tensor, "E L"]:
         """Positions minus the default pose, rad or m; position stage."""
-        # Computed once for all joints, of which parts take columns.
+        # Computed once for all joints; parts take columns.
         if self is self._every_joint:
             return self.pos_EL - self._tables.default_pos_EL
         return self._every_joint.pos_rel_EL[:, self.index]

@@ -34,7 +34,7 @@ class Simulation:
         buffers, shared_values: tensors that are kept from step to step, with and without a row per env.
         seed, step_count: int64 []; of all draws, and how many env steps have begun.
         reset_count_E, episode_step_E: int64 [E]; how often each env was reset, and env steps since then.
-        time_out_offset_E: int64 [E]; env steps by which a staggered episode times out earlier.
+        time_out_offset_E: int64 [E]; how many env steps earlier a staggered episode times out.
         before_substep, after_substep: called around each physics substep (see `World.step`), amid its changes of state.
         substep_sensors: at which substeps the world computes its sensors.
     """
