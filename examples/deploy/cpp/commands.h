@@ -26,7 +26,7 @@ struct Command {
   std::string range() const {
     const auto is_open = [](double value) { return std::isinf(value); };
     if (std::all_of(low.begin(), low.end(), is_open) && std::all_of(high.begin(), high.end(), is_open)) {
-      return "any numbers, as nobody knows which the policy has seen";
+      return "any numbers, as it is not known which the policy has seen";
     }
     return as_words(low) + " to " + as_words(high);
   }
@@ -39,7 +39,7 @@ struct Command {
  private:
   static Numbers ends(const Json& spec, const char* what, size_t size, double otherwise) {
     const Json* found = spec.find(what);
-    // A command of which nobody knows what it may be.
+    // A command without known bounds.
     if (found == nullptr || found->is_null()) return Numbers(size, otherwise);
     const Numbers values = found->numbers();
     if (values.size() != size) throw std::runtime_error(found->place + text(": expected %zu numbers", size));

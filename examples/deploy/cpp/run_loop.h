@@ -12,7 +12,7 @@
 
 namespace ksim {
 
-// Whoever says what comes next: words since the last period.
+// A source of operator words, which say what comes next: the words since the last period.
 using Operator = std::function<Names(double, const StateMachine&)>;
 
 // Waits for a robot's first message.

@@ -36,7 +36,7 @@ def message(count, measured):
 
 
 def serve(robot, command_of, channel, period):
-    """Step the robot in real time, with the newest command, until nobody commands it any more."""
+    """Step the robot in real time, with the newest command, until commands end."""
     channel.settimeout(SILENT_S)
     _, loop_address = channel.recvfrom(65536)
     channel.setblocking(False)
@@ -48,7 +48,7 @@ def serve(robot, command_of, channel, period):
     command = command_of(**dict.fromkeys(COMMAND, still))
     while time.monotonic() - heard < SILENT_S:
         channel.sendto(message(count, robot.read()), loop_address)
-        # Nobody waits for the loop: without a new command motors do as they were told last.
+        # Time does not wait for the loop: without a new command the motors keep the last one.
         deadline += period
         time.sleep(max(0.0, deadline - time.monotonic()))
         while True:

@@ -175,7 +175,7 @@ class StateMachine {
     return command;
   }
 
-  // Run one step of the policy that nobody obeys, and tell after the last one what it would have asked for.
+  // Run one step of the policy without sending its action, and report after the last what it would have sent.
   void run_dry(double now, const Measurement& measurement, bool stands) {
     if (dry.is_over()) return;
     asked = dry(measurement);

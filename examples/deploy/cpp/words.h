@@ -13,11 +13,11 @@
 namespace ksim {
 
 // Lines of a terminal: each is a word, or the numbers of a command; an empty line is `stop`. The end of lines is `stop`,
-// too, where the keyboard leads: nobody can stop it any more.
+// too, where the keyboard leads: no word could stop the robot any more.
 class Keyboard {
  public:
   explicit Keyboard(bool leads) {
-    // It waits for a line when the program ends, so nobody waits for it, and it holds nothing but what is static.
+    // It may still wait for a line when the program ends, so it is not joined, and it holds only static data.
     std::thread([leads] { listen(leads); }).detach();
   }
 
