@@ -2,11 +2,12 @@
 
     python -m benchmarks.terrain_course run=RUN device=cuda num_envs=1000
 
-takes a run folder or a checkpoint. The course has the kinds of ground of the run's task at all of its levels, from a
-seed that no task has, and robots are spread evenly over kinds and levels, where they stay. Each starts in the middle of
-its patch, turned as the task draws it, and is commanded to walk straight ahead at 0.8 m/s and not to turn, for one
-episode of the time that this takes from edge to edge (10 s on 8 m). Actions are deterministic; sensor noise, pushes and
-curricula are off, and models are drawn as in training.
+takes a run folder or a checkpoint; with teacher=RUN the policy that it learned from walks the same course. The course
+has the kinds of ground of the run's task at all of its levels, from a seed that no task has, and robots are spread
+evenly over kinds and levels, where they stay. Each starts in the middle of its patch, turned as the task draws it, and
+is commanded to walk straight ahead at 0.8 m/s and not to turn, for one episode of the time that this takes from edge to
+edge (10 s on 8 m). Actions are deterministic; sensor noise, pushes and curricula are off, and models are drawn as in
+training.
 
 A robot succeeds if it gets as far from the middle as the curriculum asks for the next level (3.2 m of the 4 m to the
 edge) and does not fall, be it before or after that. A fall is any end of an episode that is no truncation, which in
@@ -17,7 +18,9 @@ Figures go to benchmarks/results/terrain_course.json, under <device>/<task>/<kin
 least half of the robots succeed on. `success_by_level` has the shares of successes, from the easiest level on.
 `trained_level` is the mean level that the curriculum came to in training, over the last million env states before the
 policy was saved. Levels count from 0, and who has mastered the last goes on at a random one, so that it stays below it.
-`lost` has a line for each kind of contacts or constraints that the physics had no room for.
+With a teacher, `share_of_teacher` is the success in the mean over kinds divided by the teacher's, and `weakest` the
+least success of a kind at the hardest level. `lost` has a line for each kind of contacts or constraints that the
+physics had no room for.
 """
 
 from __future__ import annotations
@@ -53,7 +56,7 @@ from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.run_folder import Policy, load_policy, without_nan_guard
 from ksim_rl.zoo import locate
 
-OPTIONS = {"run": "", "device": "auto", "num_envs": "1000"}
+OPTIONS = {"run": "", "teacher": "", "device": "auto", "num_envs": "1000"}
 SPEED = 0.8
 """m/s ahead."""
 GROUND_SEED, ROBOT_SEED = 1_000, 2_000
@@ -131,6 +134,12 @@ def main() -> None:
     success_by_level, figures = summary(
         outcomes, kinds=course.grid.columns, num_levels=course.grid.num_levels
     )
+    if options["teacher"]:
+        figures |= beside_teacher(
+            load_policy(locate(options["teacher"]), device=options["device"]),
+            success_by_level,
+            num_envs=num_envs,
+        )
     figures |= {"num_envs": num_envs, **trained(path, policy.iteration)}
     device = policy.cfg.resolved_device()
     prefix = f"{report.device_label(device)}/{policy.cfg.task_name}"
@@ -269,6 +278,36 @@ def summary(
     for name in ("success", "fell", "levels"):
         figures[name] = statistics.fmean(figures[f"{kind}/{name}"] for kind in kinds)
     return success_by_level, figures
+
+
+def beside_teacher(
+    teacher: Policy, success_by_level: Mapping[str, list[float]], *, num_envs: int
+) -> dict[str, float]:
+    """Return `share_of_teacher` and `weakest` of a policy with these successes, as the teacher walks its own course.
+
+    Raises:
+        ValueError: if the teacher's ground has other kinds or levels, or it arrives nowhere.
+    """
+    course = course_of(teacher.cfg.task)
+    outcomes = walk(teacher, course, num_envs=num_envs)
+    theirs, _ = summary(outcomes, kinds=course.grid.columns, num_levels=course.grid.num_levels)
+    sizes = {kind: len(shares) for kind, shares in success_by_level.items()}
+    if sizes != {kind: len(shares) for kind, shares in theirs.items()}:
+        raise ValueError(
+            f"teacher: its ground has {course.grid.num_levels} levels of {sorted(theirs)}, and the policy's has "
+            f"{sizes}: take the run from which it learned"
+        )
+    means = [
+        statistics.fmean(statistics.fmean(shares) for shares in successes.values())
+        for successes in (success_by_level, theirs)
+    ]
+    if means[1] == 0.0:
+        raise ValueError("teacher: it arrives nowhere, so that there is nothing to compare with")
+    return {
+        "teacher_success": means[1],
+        "share_of_teacher": means[0] / means[1],
+        "weakest": min(shares[-1] for shares in success_by_level.values()),
+    }
 
 
 def trained(path: Path, iteration: int) -> dict[str, float]:

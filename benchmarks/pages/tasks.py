@@ -182,9 +182,12 @@ def page(sizes: Mapping[str, Mapping[str, str]] | None = None) -> str:
 
 def learned(tables: Mapping[str, Mapping[str, Any]]) -> str:
     """What the tables of results have for each task, and of which commit it is."""
-    rows = [
-        (table, name, of_table) for table in TABLES for name, of_table in load(table).rows.items()
-    ]
+    rows = []
+    for table in TABLES:
+        for name, of_table in load(table).rows.items():
+            # Tasks of suites have a page of their own.
+            if not envs.task(of_table.task).suite:
+                rows.append((table, name, of_table))
     lines: dict[str, list[str]] = {name: [] for name in own_tasks()}
     runs_of: dict[str, list[Any]] = {name: [] for name in lines}
     for table, name, of_table in rows:

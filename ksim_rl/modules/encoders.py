@@ -69,12 +69,13 @@ class EncoderCfg(Checked):
     def build(self, spec: TensorSpec, *, device: Device = None) -> nn.Module:
         """Return the module that maps pictures [B, *shape] as the env gives them to features [B, F].
 
-        `spec` has the shape and the dtype of one picture, or of N stacked ones: [H, W], [H, W, C] or [N, H, W, C].
+        `spec` has the shape and the dtype of one picture, or of N stacked ones: [H, W], [H, W, C] or [N, H, W, C]. N
+        stacked distances [N, H, W] are read as channels, with the layout "CHW".
         """
-        if spec.dtype not in (torch.uint8, torch.float32):
+        if spec.dtype not in (torch.uint8, torch.float16, torch.float32):
             raise ValueError(
-                f"it reads pictures of {spec.dtype}, and only uint8 or float32 is an amount of light or a distance: "
-                "map ids to colours first, or name an encoder of your own by _target_"
+                f"it reads pictures of {spec.dtype}, and only uint8, float16 or float32 is an amount of light or a "
+                "distance: map ids to colours first, or name an encoder of your own by _target_"
             )
         check_layout(spec.shape, self.layout)
         low, high = self._ends(spec.dtype)

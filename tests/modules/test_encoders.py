@@ -77,6 +77,7 @@ def by_torch(encoder, pictures_BCHW):
             lambda x: torch.cat([x[:, n].permute(0, 3, 1, 2) for n in (0, 1)], 1) / 255,
         ),
         ((2, H, W), torch.float32, {"layout": "CHW"}, lambda x: x),
+        ((2, H, W), torch.float16, {"layout": "CHW"}, lambda x: x.float()),
         (
             (2, 3, H, W),
             torch.float32,

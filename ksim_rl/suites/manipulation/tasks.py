@@ -12,6 +12,7 @@ from ksim_rl.modules import ActorCfg, CriticCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.suites.manipulation.leap import leap_cube_reorient
 from ksim_rl.suites.manipulation.panda import panda_pick_cube
+from ksim_rl.suites.manipulation.panda_pixels import PANDA_PIXELS
 from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 
 _ppo = partial(PPOCfg, clip_value=False, critic_coeff=0.25)
@@ -57,5 +58,5 @@ LEAP = Task(
         trainer=TrainerCfg(num_iterations=1831, eval_interval=100),
     ),
 )
-TASKS = (PANDA, LEAP)
+TASKS = (PANDA, PANDA_PIXELS, LEAP)
 """For the registry."""

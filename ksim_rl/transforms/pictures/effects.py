@@ -246,7 +246,9 @@ class DepthSteps(PictureEffect):
         return float(rounded[0]), float(rounded[1])
 
     def __call__(self, pictures_ENHWC: Pictures, draws_EK: Draws) -> Changed:
-        return (pictures_ENHWC / self.step).round() * self.step
+        # In float32: some meters are more steps than float16 has digits for.
+        rounded_ENHWC = (pictures_ENHWC.float() / self.step).round() * self.step
+        return rounded_ENHWC.to(pictures_ENHWC.dtype)
 
 
 @dataclass(frozen=True, kw_only=True)

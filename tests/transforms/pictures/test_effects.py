@@ -138,6 +138,10 @@ def test_depth_has_holes_steps_and_a_range():
     none_E = torch.zeros(E, 0)
     steps = DepthSteps(step=0.25)(depth, none_E)
     torch.testing.assert_close(steps, (depth * 4).round() / 4)
+    # 3 m are 3000 steps of 1 mm, more than float16 has digits for: the nearest one is the number itself.
+    far = (3.0 + depth / 6).half()
+    half = DepthSteps(step=0.001)(far, none_E)
+    assert half.dtype == torch.float16 and torch.equal(half, far)
     seen = DepthRange(reach=(1.0, 4.0))(depth, none_E)
     is_within = (depth >= 1.0) & (depth <= 4.0)
     assert torch.equal(seen, torch.where(is_within, depth, 0.0))
