@@ -38,7 +38,7 @@ COUNTS = "number = 0\nwhile True:\n    number += 1\n"
 
 
 def main() -> int:
-    """Run the loop twice, and write what it tells of itself; the code is 1 beyond 1 ms or where memory grows."""
+    """Run the loop twice, and write its own report; the exit code is 1 beyond 1 ms or where memory grows."""
     parser = OneLineParser(prog="python -m benchmarks.loop", description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0, help="of the policy")
     parser.add_argument("--policy", default="zoo:quadruped", help="a run, or one of the zoo")
@@ -91,7 +91,7 @@ def main() -> int:
 
 
 def run_loop(folder: Path, seconds: float, files: Path, name: str, *words: str) -> dict[str, Any]:
-    """Run the loop of an exported folder, and return what it tells of itself."""
+    """Run the loop of an exported folder, and return its report."""
     output = files / f"{name}.json"
     done = subprocess.run(
         [

@@ -87,7 +87,7 @@ def main() -> None:
 
 
 def model(one: str, other: str, *, margin: float) -> mujoco.MjModel:
-    """Return two geoms, of which the second is free, and the first if it is no ground."""
+    """Return two geoms; the second is free, and so is the first unless it is ground."""
     first = (
         f"<geom {GROUNDS[one]}/>"
         if one in GROUNDS

@@ -84,7 +84,7 @@ def compare(
 
 
 def make_rollout(cfg: Any, env: EnvBase, *, device: torch.device) -> TensorDict:
-    """Return random env states `["E","T"]` of the env's sizes, 2 percent of which end an episode."""
+    """Return random env states `["E","T"]` of the env's sizes; 2 percent of them end an episode."""
     shape = (cfg.num_envs, cfg.data.num_steps)
     spec: Any = env.observation_spec
 

@@ -301,7 +301,7 @@ def write(cfg: RunCfg, runs: Mapping[str, Mapping[int, Run]], *, at_once: int) -
 
 
 def median_of(found: Iterable[Mapping[str, Any]], key: str) -> float | None:
-    """Return the median over seeds, of which one that has None never got there; None where the median is such."""
+    """Return the median over seeds, where None stands for a seed that never got there; None if the median is None."""
     middle = statistics.median(math.inf if one[key] is None else one[key] for one in found)
     return middle if math.isfinite(middle) else None
 

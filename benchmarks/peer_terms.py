@@ -211,7 +211,7 @@ class Replay:
 def differences(
     record: Record, values: Mapping[str, list[np.ndarray]], ctrl: Sequence[int]
 ) -> Iterator[tuple[str, float]]:
-    """Yield the largest relative difference of each term, in the states in which it means the same (`ON_PURPOSE`)."""
+    """Yield the largest relative difference of each term, over states where both mean the same (`ON_PURPOSE`)."""
     decimation = len(record["substep/ctrl"]) // len(record["action"])
     ours_by_name = {name: np.stack(kept) for name, kept in values.items()}
     means_same = same_states(record, ours_by_name)

@@ -98,7 +98,7 @@ def main() -> None:
     cfg = command_line.compose([*options.overrides, "logger=local", "trainer.eval_episodes=0"])
     if options.iterations < 4:
         raise ValueError(
-            f"--iterations {options.iterations}: expected at least 4, of which the last half counts"
+            f"--iterations {options.iterations}: expected at least 4: the last half of them counts"
         )
     if options.python is None or not has_mjlab(options.python):
         print("no peer: give --python the interpreter of an environment with mjlab and rsl_rl")

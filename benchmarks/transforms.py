@@ -138,7 +138,7 @@ def _renew_generator(device: torch.device) -> None:
 def _time(
     work: Callable[[], object], device: torch.device, *, calls: int = CALLS, per: int = 1
 ) -> float:
-    """Return the ms of one of `calls` calls, each of which does the thing `per` times."""
+    """Return the ms of one of `calls` calls, each of which runs the transform `per` times."""
 
     def repeatedly() -> None:
         for _ in range(calls):

@@ -213,7 +213,7 @@ def make_networks(device: torch.device, *, hidden_dims: tuple[int, ...] = HIDDEN
 def make_rollout(
     actor: ProbabilisticTensorDictSequential, *, num_envs: int, device: torch.device, obs: int = OBS
 ) -> TensorDict:
-    """Return random env states `["E","T"]` in time-major memory, 2 percent of which end an episode."""
+    """Return random env states `["E","T"]` in time-major memory; 2 percent of them end an episode."""
     generator = torch.Generator(device).manual_seed(0)
 
     def draw(*shape: int) -> Tensor:

@@ -136,7 +136,7 @@ def train(num_iterations: int = 60, num_envs: int = 64) -> float:
         data=DatasetCfg(num_env_states_per_minibatch=4 * num_envs, num_minibatches=4),
         device=device,
     )
-    # Rollouts of 16 steps, of which the leaves are kept that the update reads: pictures as bytes.
+    # Rollouts of 16 steps that keep only the leaves that the update reads; pictures stay bytes.
     collector = RolloutCollector(
         env, update.behavior, rollout_length=16, keys=[*update.rollout_keys]
     )

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import pytest
 
 WORDS = ("menagerie", "ksim_rl[dm_control]", "ksim_rl[playground]")
-"""What the errors of missing models say, of which each names one."""
+"""What the errors of missing models say; each names one model."""
 
 
 @contextmanager

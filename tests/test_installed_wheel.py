@@ -1,4 +1,4 @@
-"""A wheel in a clean environment: what somebody has who ran `pip install` and nothing else."""
+"""A wheel in a clean environment, as `pip install` alone leaves it."""
 
 import os
 import resource

@@ -259,7 +259,7 @@ def test_no_function_of_the_package_is_left_out(package, record_property):
 
 
 def _wrong_call(shaped):
-    """Return arguments for a function of the package, of which one has an axis too many."""
+    """Return arguments for a function of the package; one of them has an axis too many."""
     signature = inspect.signature(shaped.function)
     values = dict.fromkeys(signature.parameters)
     wrong, _ = shaped.arguments[0]

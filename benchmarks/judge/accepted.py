@@ -17,7 +17,7 @@ DEPTH_CEILINGS = {
     "hfield": 2e-3,
     "element": 2e-3,
 }
-# Of what is deeper, in m, the direction in which it is least deep is often one of many.
+# In deeper contacts, m, the direction of least depth is often one of many.
 DEEP = 0.02
 
 

@@ -345,7 +345,7 @@ FAULTS = {
     ),
     "overflow": Fault(
         number="13",
-        what="what finds no room is not told of",
+        what="contacts and rows that find no room are not reported",
         place=("native", "headers.text_of"),
         instead=Rewrite(
             lines={"a.overflow.data[world] | lacking(world, a)": "0"},

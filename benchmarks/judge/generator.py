@@ -33,7 +33,7 @@ UNSUPPORTED = (
     ("diagexact", "enable"),
     ("speculative", "enable"),
 )
-# Fields of the worlds' own, of which a model has a few. What they derive is asked for by the name of its source.
+# Fields per world; a model has a few of them. Derived fields are requested by the name of their source.
 _FIELDS = (
     "body_mass body_ipos body_inertia body_pos body_quat body_gravcomp geom_pos geom_quat geom_size geom_friction "
     "geom_solref geom_margin dof_armature dof_damping dof_frictionloss jnt_range jnt_stiffness jnt_pos qpos0 "

@@ -17,7 +17,7 @@ class Scene:
         geoms: names by type; `moving_geoms` the names on bodies that move.
         bodies: names of bodies that move; `tools` those without joints of their own, `mocaps` those that mocap moves.
         sites, moving_sites: names of all sites, and of those on bodies that move.
-        pad: the site of which a touch sensor is made.
+        pad: the site of a touch sensor.
     """
 
     worldbody: ET.Element = dataclasses.field(default_factory=lambda: _section("worldbody"))

@@ -320,7 +320,7 @@ def _sensors(
     found = {}
     for sensor in range(mj_model.nsensor):
         columns, name = c_engine.columns_of(mj_model, sensor), c_engine.name_of(mj_model, sensor)
-        # What sticks pulls at contacts, of which a refresh finds no new ones.
+        # Adhesion pulls at contacts, and a refresh finds no new ones.
         if not _is_of_adhesion(mj_model, sensor):
             found[f"sensor {name} later"] = later[columns]
         if all_of_them or c_engine.is_kept(mj_model, sensor):

@@ -8,7 +8,7 @@ ROBOTS = {
     "Go1 on flat ground, 12 joints": "h200/go1_velocity_flat/4096",
     "G1 on flat ground, 29 joints": "h200/g1_velocity_flat/4096",
 }
-# Bytes in a frame, of which colours take one each and distances four, and the frames of an observation.
+# Bytes in a frame (one per color, four per distance), and the frames of an observation.
 PICTURES = {
     "64 x 64 RGB": (64 * 64 * 3, 1),
     "64 x 64 RGB, 3 frames": (64 * 64 * 3, 3),

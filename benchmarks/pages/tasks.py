@@ -181,7 +181,7 @@ def page(sizes: Mapping[str, Mapping[str, str]] | None = None) -> str:
 
 
 def learned(tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """What the tables of results have for each task, and of which commit it is."""
+    """Results of each task in the tables of results, with their commit."""
     rows = []
     for table in TABLES:
         for name, of_table in load(table).rows.items():

@@ -39,7 +39,7 @@ What you read is not yours to write ([terms are pure](own_task.md#terms-are-pure
 
 
 class Part(NamedTuple):
-    """A class of which the page has a table: how a term spells an object of it, and what that is."""
+    """A class with a table on the page: how a term spells an object of it, and what that is."""
 
     spelled: str
     owner: type

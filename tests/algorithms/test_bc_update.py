@@ -171,7 +171,7 @@ def test_an_update_that_goes_on_from_its_state_is_the_same():
 
 
 def write(folder, *, episodes=20, **changed):
-    """Write episodes of a `CounterEnv` of 2 actions, of which leaves may be others."""
+    """Write episodes of a `CounterEnv` of 2 actions; some leaves may differ."""
     leaves = {("obs", "vector"): (3,), ("action",): (2,)} | changed.pop("leaves", {})
     made = [Leaf(key=key, shape=shape) for key, shape in leaves.items() if shape is not None]
     with EpisodeWriter(folder, made, origin=Origin(**changed)) as writer:

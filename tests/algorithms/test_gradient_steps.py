@@ -60,7 +60,7 @@ def test_amp_and_distillation_anneal_the_rate_of_the_policy_too(make):
     trainer = make(iterations=3, num_envs=16, cfg=cfg)
     trainer.train()
     assert trainer.metrics["update/learning_rate"] == pytest.approx(1e-3, rel=1e-6)
-    # As a loop of somebody's own may go on.
+    # As a user's own loop may go on.
     trainer.iterate()
     assert trainer.metrics["update/learning_rate"] == 0.0
     if make is make_amp:  # whose discriminator has a rate of its own

@@ -12,7 +12,7 @@ def run(*words: str) -> int:
 def test_warmup_says_how_long_it_took_and_where_the_kernels_are(capsys):
     sizes = ("num_envs=4", "data.num_env_states_per_minibatch=8", "data.num_minibatches=2")
     assert run("warmup", "task=cartpole_balance", "device=cpu", *sizes) == 0
-    # Kernels that no cache has yet are told of before.
+    # Kernels that no cache has yet are announced.
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("cartpole_balance on cpu: ") and "kernel modules were compiled" in last
 

@@ -17,7 +17,7 @@ from tests.collectors.recorded_puck import Calling, Constant, collector_of, rewa
 SCALE = 1.0
 
 
-# -- what somebody changes from outside: it follows ----------------------------------------------------------------
+# -- what a program changes from outside: it follows ---------------------------------------------------------------
 
 
 class OfGlobal(Constant):

@@ -59,7 +59,7 @@ def test_each_move_is_another_one():
 
 
 def at_borders(num_rows, moves):
-    """Return how many rows at a border stay unexplained, of which the recorded step has the other outcome.
+    """Return how many rows at a border stay unexplained; in these the recorded step has the other outcome.
 
     The border is up to one unit away from the input; a move is of several roundings.
     """

@@ -12,7 +12,7 @@ from tests.collectors.test_compiled_step import made
 from tests.compiled.test_tape import CASES, E, floats, whole
 
 NUMBER = 3
-"""Lanes, of which some have a place more than others."""
+"""Lanes, where some have one place more than others."""
 DECLARED = re.compile(r"^([\w ]+) ([mc]\d+)\[(.+)\];$")
 
 

@@ -1,4 +1,4 @@
-"""Libraries are told from the packages of a user, wherever an installer has put them."""
+"""Libraries are distinguished from a user's packages, wherever an installer has put them."""
 
 import importlib
 import sys

@@ -374,7 +374,7 @@ def test_memory_that_only_a_kernel_uses_is_given_back_and_other_memory_kept():
         return result
 
     x = floats(4)
-    # Behind the beginning of its storage, which nobody else keeps.
+    # Behind the beginning of its storage, which nothing else keeps.
     inputs = [torch.cat((x, x))[E:]]
     with recording.recorded() as recorder:
         returned = function(inputs.pop())

@@ -103,7 +103,7 @@ def test_stacks_have_the_bits_of_stored_ones(n_step, lengths, colours):
 
 
 def test_a_gap_in_the_middle_of_episodes_joins_no_frames():
-    """Rollouts that nobody kept lie between, so older frames come from the stacks, and take places."""
+    """Rollouts that were not kept lie between, so older frames come from the stacks, and take places."""
     camera = _Camera(end=0.1)
     frames, stacks = _rings()
     for _ in range(9):

@@ -115,7 +115,7 @@ GIVEN = "constexpr int OFFSET = 100;"
         (": Counted {", ": Numbered {", "inherits from 'Numbered', which one struct has to be"),
         ("float slope;", "float count;", "Arguments has a field twice: count"),
         ('shared.cuh"', 'shared.cuh"  // both', "an include is a line of its own: '#include"),
-        # Samples that nobody gives would reach the kernel.
+        # Missing samples would reach the kernel.
         ("given {", "given\n{", "`namespace given {` is a line of its own"),
         (GIVEN, GIVEN + "\nconstexpr bool IS_FAST = true;", "and no 'constexpr bool IS_FAST"),
         (GIVEN, GIVEN + "\n  constexpr int LENGTH = 3;", "and no '  constexpr int LENGTH"),

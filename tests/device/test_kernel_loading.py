@@ -112,7 +112,7 @@ def test_a_module_that_another_device_has_loaded_is_loaded_whole(values):
 
 
 def test_a_module_of_the_same_content_has_the_same_name_and_hash_and_another_constant_another_hash():
-    """The next process finds it in Warp's cache; names are told apart here, as a process has one of each."""
+    """The next process finds it in Warp's cache; names differ here, as a process has one of each."""
     made = {
         name: two_kernels(name, adds=adds) for name, adds in (("a", 2.0), ("b", 2.0), ("c", 3.0))
     }

@@ -1,4 +1,4 @@
-"""Python that a recording would freeze is refused after two steps; what changes later is told, or refused by name."""
+"""Python that a recording would freeze is refused after two steps; later changes are reported, or refused by name."""
 
 import time
 from dataclasses import dataclass, field

@@ -314,7 +314,7 @@ def test_whoever_draws_is_refused_too():
 
 @dataclass(frozen=True, kw_only=True)
 class BadLater(RewardTerm):
-    """Begins to move the puck when it is told to."""
+    """Begins to move the puck on request."""
 
     is_bad: ClassVar[list[bool]] = []
 

@@ -184,7 +184,7 @@ def test_the_loop_runs_over_the_network_and_brakes_when_messages_end(pair):
     while not stub.refused and time.monotonic() < until:
         stub.step()
     assert stub.refused == 1
-    # That the sender goes away is told to the reader, and is no measurement.
+    # The reader sees that the sender goes away, which is no measurement.
     newest = robot.read()
     del stub.states
     until = time.monotonic() + 0.3

@@ -1,4 +1,4 @@
-"""A robot on a bench, in whose time nobody waits, for the loop of an exported folder."""
+"""A simulated robot for the loop of an exported folder, in simulated time."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ TIMES = Times(stand_seconds=0.4, blend_seconds=0.2, stop_seconds=0.2, damp_secon
 
 
 class Clock:
-    """Time that passes only where somebody waits."""
+    """Time that passes only in waits."""
 
     def __init__(self):
         self.time = 0.0

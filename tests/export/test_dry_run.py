@@ -1,4 +1,4 @@
-"""Before a policy may move a robot it runs dry: what it would ask for is told, checked, and sent nowhere."""
+"""Before a policy may move a robot it runs dry: what it would ask for is shown, checked, and sent nowhere."""
 
 import csv
 import dataclasses
@@ -38,7 +38,7 @@ def test_the_policy_runs_dry_before_it_stands_and_before_it_moves(folder, contro
     assert not machine.fault
     at = {state: [k for k, one in enumerate(lines.states) if one is state] for state in State}
     dry = [k for k, asked in enumerate(lines.asked) if asked is not None]
-    # The state of a period is told behind it: the last dry one has led on.
+    # The state of a period is reported after it: the last dry one has led on.
     assert dry[:NUM_STEPS] == list(range(NUM_STEPS)) and at[State.DRY] == dry[: NUM_STEPS - 1]
     assert dry[NUM_STEPS:] == at[State.STAND][-NUM_STEPS:]
     # All that was sent meanwhile is to brake, and to hold the default pose.

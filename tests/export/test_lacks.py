@@ -15,7 +15,7 @@ from ksim_rl.transforms import ObservationTermCfg
 
 @dataclass(frozen=True, kw_only=True)
 class OwnReward(RewardTerm):
-    """It is drawn, which nobody else can do."""
+    """It is drawn, which other software cannot repeat."""
 
     def __call__(self, view: EnvView) -> Tensor:
         return view.uniform(1)[:, 0]

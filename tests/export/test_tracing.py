@@ -101,7 +101,7 @@ NAMES = [
 def test_the_observations_and_rewards_of_a_task_are_traced(task):
     with skipped_without_models():
         env = built(task)
-    # What moment of a motion an episode began at, nobody outside is told.
+    # The time of a motion at which an episode began is not known outside.
     if "_track" in task:
         with pytest.raises(
             NotDescribedError,

@@ -121,7 +121,7 @@ def group_that_takes_minutes_to_read(folder):
 
 @bomb
 def table_of_30_mb(folder):
-    """Its cells are a letter each, of which a table of text took a hundred bytes."""
+    """Its cells are one letter each, and a table of text took a hundred bytes for each."""
     path = folder / "metrics.csv"
     columns = 3000
     head = ",".join(["env_states", *(f"m{number}" for number in range(columns))])

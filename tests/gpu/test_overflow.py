@@ -1,4 +1,4 @@
-"""Overflows on the GPU: each is told, by eager substeps and by replays of their graphs."""
+"""Overflows on the GPU: each is reported, by eager substeps and by replays of their graphs."""
 
 import pytest
 

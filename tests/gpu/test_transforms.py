@@ -110,7 +110,7 @@ def test_rings_of_any_dtype_and_width_give_back_what_was_pushed(dtype, shape):
     unmoved = begin(ring_EM, age_E, pushed_TE[0], nobody_E).view(pushed_TE[0].shape)
     assert torch.equal(unmoved, pushed_TE[0])
     again_EN = push(ring_EM, age_E, pushed_TE[8], num_frames=length, stride=1).view(shaped)
-    assert torch.equal(again_EN[:, 0], pushed_TE[6]), "a reset of nobody changes no ring"
+    assert torch.equal(again_EN[:, 0], pushed_TE[6]), "a reset of no row changes no ring"
     assert bool((age_E == 2**34 + 9).all())
 
 

@@ -26,7 +26,7 @@ OF_OTHER_SCENES = {
 
 
 def test_no_term_is_left_out():
-    """Those in modules of which one term is there; others need reference motions."""
+    """Terms in modules with at least one such term; others need reference motions."""
     used = {type(term) for term in (*OBSERVATIONS.values(), *REWARDS.values())}
     modules = {term.__module__ for term in used}
     library = [getattr(mdp, name) for name in mdp.__all__]

@@ -191,7 +191,7 @@ def test_makes_no_host_sync_and_no_compiler_break(symmetry):
 
 
 def _half_rollout(actor, *, num_envs=32, length=4):
-    """Return one-step episodes with reward -(a - 0.5 sign(x))^2, of which only those with x > 0 are ever seen."""
+    """Return one-step episodes with reward -(a - 0.5 sign(x))^2; only x > 0 is ever seen."""
     obs = torch.rand(num_envs, length, 1) * 0.5 + 0.5
     data = TensorDict({"actor": obs, "critic": obs.clone()}, [num_envs, length])
     with torch.no_grad():

@@ -62,7 +62,7 @@ FULL = """<mujoco model="full">
   <keyframe><key name="home" qpos="0 0" ctrl="0 0" time="0"/></keyframe>
 </mujoco>"""
 
-# Numbers of `FULL`, by element and attribute, each of which is replaced by what is none.
+# Numbers of `FULL`, by element and attribute; each is replaced by a text that is no number.
 NUMBERS = (
     *(
         "timestep",

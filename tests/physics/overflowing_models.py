@@ -77,7 +77,7 @@ def can_on_fine_field() -> mujoco.MjModel:
 
 @functools.cache
 def sensed_box(reduction: str) -> mujoco.MjModel:
-    """Return a box that touches the floor in four points, for two of which MuJoCo Warp's contact sensor has room."""
+    """Return a box that touches the floor in four points; MuJoCo Warp's contact sensor has room for two."""
     return load_model(
         f"""<mujoco>
           <custom><numeric name="contact_sensor_maxmatch" data="2"/></custom>

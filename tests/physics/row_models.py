@@ -1,4 +1,4 @@
-"""A model that has constraint rows of all kinds, states in which it touches, and the C engine's view of them."""
+"""A model that has constraint rows of all kinds, states with contacts, and the C engine's view of them."""
 
 import functools
 
@@ -70,7 +70,7 @@ def mj_model(cone: str) -> mujoco.MjModel:
 def touching(
     cone: str, *, njmax: int = 120, nconmax: int = 40, device: str = "cpu", num_envs: int = NUM_ENVS
 ) -> World:
-    """Return worlds in other states each, of which the last one hangs in the air, with what precedes the rows."""
+    """Return worlds in different states, after the stages that precede the rows; the last one hangs in the air."""
     sim = SimCfg(njmax=njmax, nconmax=nconmax, one_kernel_dynamics=True)
     world = World(
         mj_model(cone), num_envs=num_envs, sim=sim, device=device, per_world_fields=PER_WORLD

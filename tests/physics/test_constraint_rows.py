@@ -121,7 +121,7 @@ def test_rows_are_those_of_mujoco_warp(cone: str):
         mjw.make_constraint(world.warp_model, world.warp_data_E)
     for name in COUNTS:
         np.testing.assert_array_equal(counts[name], getattr(world.warp_data_E, name).numpy())
-    # A contact of which one has rows has as many of the other.
+    # A contact with rows in one has as many in the other.
     theirs_addresses = world.warp_data_E.contact.efc_address.numpy().copy()
     count = int(world.warp_data_E.nacon.numpy()[0])
     np.testing.assert_array_equal(

@@ -72,7 +72,7 @@ def in_c(mj_model: mujoco.MjModel, state: dict[str, np.ndarray]) -> dict[str, np
 
 
 def stepped(model: str, sim: SimCfg, fields: tuple[str, ...]) -> World:
-    """Worlds each of which has another value in one of `fields`, and in nothing else, after a few substeps."""
+    """Worlds that differ in one of `fields` each, and in nothing else, after a few substeps."""
     mj_model = compiled(model)
     world = World(mj_model, num_envs=len(fields), sim=sim, per_world_fields=fields)
     world.view("cam_xpos")
@@ -156,7 +156,7 @@ def test_no_field_is_left_out():
     assert {*tested, *OF_PICTURES, *OF_OTHER_TESTS, *REFUSED} == set(per_world_fields())
 
 
-# What follows from fields in C, of which no world needs its own: bounds of volume hierarchies, frames that are equal to
+# What follows from fields in C, and is equal in all worlds: bounds of volume hierarchies, frames that are equal to
 # others, statistics and lengths of sleep, the inertia of simple bodies, and what is switched on where fields differ.
 _ONLY_IN_C = {
     *(

@@ -146,7 +146,7 @@ def piled(
 def check_overflows(
     scene: Sequence[Any], *, ours: bool, device: str = "cpu", num_envs: int = 3
 ) -> None:
-    """Make the room of a scene too small in every way, and look that each is told, and no other."""
+    """Make the room of a scene too small in every way, and check that each overflow is reported, and no other."""
     mj_model = pile(*scene)
     # On a GPU the threads of MuJoCo Warp's rows race for the Jacobian, and those that lose count no rows.
     counts_all = ours or device == "cpu"

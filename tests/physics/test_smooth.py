@@ -124,7 +124,7 @@ def mixed() -> mujoco.MjModel:
 
 
 def moved(model: mujoco.MjModel | None = None, **kwargs) -> World:
-    """Worlds in other states each, the first of which is pushed by nothing."""
+    """Worlds in different states; nothing pushes the first."""
     kwargs.setdefault("sim", SimCfg(one_kernel_dynamics=True))
     world = World(mixed() if model is None else model, num_envs=NUM_ENVS, **kwargs)
     generator = torch.Generator().manual_seed(0)

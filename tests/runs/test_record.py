@@ -113,7 +113,7 @@ def test_commit_and_changes_of_a_plug_in_are_kept(run, package, notes):
 def test_a_repository_that_only_lies_around_is_not_asked(
     run, tmp_path, package, monkeypatch, notes
 ):
-    """Where somebody's folder is the working directory, its settings would have git run programs."""
+    """Where another user's folder is the working directory, its settings would have git run programs."""
     mark = tmp_path / "executed"
     around = tmp_path / "around"
     around.mkdir()

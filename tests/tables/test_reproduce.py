@@ -179,7 +179,7 @@ def test_a_job_that_another_process_took_first_is_no_failure(reproduce, monkeypa
 
     monkeypatch.setattr(runner.run_lock, "is_locked", is_locked)
     code, started, _ = reproduce("--rows", "ppo/Balance", "--seeds", "1", fail=("ppo/Balance", 1))
-    # It fails again, and nobody else does it.
+    # It fails again, and no other process runs it.
     assert started == [("ppo/Balance", 1)] * 2 and code == 1
 
 
@@ -274,7 +274,7 @@ def test_settings_differ_by_everything_but_the_seed():
 TRIALS = sorted(map(str, (RESULTS.parent / "tables").glob("*.yaml")))
 
 
-# The tables with the most rows, of which each builds its config.
+# The tables with the most rows; each row builds its config.
 LONG_TABLES = ("dm_control", "tasks")
 
 

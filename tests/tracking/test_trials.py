@@ -1,4 +1,4 @@
-"""Trials: who gets to the end of a motion within the limits succeeds, and nobody else."""
+"""A trial succeeds if it reaches the end of the motion within the limits, and only then."""
 
 import dataclasses
 

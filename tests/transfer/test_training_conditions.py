@@ -1,4 +1,4 @@
-"""What a policy has met in training is told in the words of its task."""
+"""The conditions of a policy's training are described in the words of its task."""
 
 import dataclasses
 

@@ -85,7 +85,7 @@ def test_stacked_and_flat_agree():
 
 
 def test_it_equals_catframes():
-    """TorchRL's transform with padding "same" does the same, where nobody resets part of the rows by hand."""
+    """TorchRL's transform with padding "same" does the same, unless a part of the rows is reset by hand."""
     chain = Compose(
         ObservationHistory([VECTOR], ["ours"], length=4),
         CatFrames(4, -1, in_keys=[VECTOR], out_keys=["theirs"], padding="same"),

@@ -53,7 +53,7 @@ def test_what_is_shown_is_what_arrived_last(every, dropped):
 def test_a_delay_behind_it_is_the_lag_of_the_camera():
     hold = ObservationHold("count", "held", every=4, fresh_key="fresh")
     lag = DelayCfg(min_lag=1, max_lag=3)
-    # The flag goes the way of its picture: it tells of the one that is shown.
+    # The flag travels with its picture: it belongs to the one that is shown.
     delay = ObservationDelay(["held", "fresh"], ["late", "late_fresh"], delay=lag)
     rollout_ET = rollout(hold, delay)
     held_ET, late_ET = rollout_ET["held"][:4], rollout_ET["late"][:4]

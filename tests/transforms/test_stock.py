@@ -1,4 +1,4 @@
-"""TorchRL's own transforms in configs: a written list, complete, of which each class works in an env."""
+"""TorchRL's own transforms in configs: the written list is complete, and each class works in an env."""
 
 import pytest
 import torch

@@ -182,7 +182,7 @@ def filled(message, known):
 
 @contextlib.contextmanager
 def viewed(port):
-    """Yield a viewer that nobody watches, and its session; nothing is stepped but by `advance`."""
+    """Yield a viewer without an open page, and its session; only `advance` steps it."""
     session = session_of("cartpole_swingup")
     session.play(False)
     viewer = BrowserViewer(port=port)
@@ -249,7 +249,7 @@ def pushes(viewer, session, values):
 
 
 def waiting_after_a_flood(viewer, session, *, messages):
-    """Ask for steps through both doors while nobody takes the requests; return how many were done at last."""
+    """Ask for steps through both doors while requests are not taken; return how many were done at last."""
     done = []
     for _ in range(messages):
         session.ask(lambda: done.append(1))

@@ -18,7 +18,7 @@ TETRAHEDRON = "0 0 0  1 0 0  0 1 0  0 0 1"
 
 
 class Recorder:
-    """Stands in for viser's scene, and keeps what it was told."""
+    """Stands in for viser's scene, and keeps the calls."""
 
     def __init__(self):
         self.meshes, self.grids, self.labels = {}, [], []

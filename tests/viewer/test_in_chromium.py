@@ -61,7 +61,7 @@ def page(served, tmp_path_factory):
 
 
 def step(page, session):
-    """Click Step, and wait until the page tells of it."""
+    """Click Step, and wait until the page shows it."""
     wanted = session.steps + 1
     click(page, "Step")
     until(lambda: f"step {wanted}" in page.execute_script(TEXT), f"step {wanted}")

@@ -1,4 +1,4 @@
-"""A training gives its weights to the viewer while somebody watches, and otherwise does nothing for it."""
+"""A training gives its weights to the viewer while a page is open, and otherwise does nothing for it."""
 
 from types import SimpleNamespace
 

@@ -7,7 +7,7 @@ from benchmarks.judge.trial import Verdict
 from benchmarks.judge.workers import in_processes
 from tests.benchmarks.judge.rare_models import MODELS, judged
 
-# Models of which some states are judged by the depths of contacts alone.
+# Models with states that are judged by the depths of contacts alone.
 BY_DEPTHS = "cloths that touch themselves"
 QUICK = [name for name in MODELS if name != BY_DEPTHS]
 

@@ -16,7 +16,7 @@ from tests.physics.models import SUBSTEPS, quadruped
 
 IN_C = SimCfg(engine="c")
 NUM_ENVS = 4
-# What a step reads of a world, all of which is float32 between two steps.
+# What a step reads of a world: all of it is float32 between two steps.
 STATE = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "time")
 TABLE = """
 <mujoco>

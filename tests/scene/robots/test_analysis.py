@@ -1,4 +1,4 @@
-"""Robots that nobody here has seen: what `analyse` finds is true of the model, and what it proposes stands."""
+"""Unknown robots: what `analyse` finds is true of the model, and what it proposes stands."""
 
 import dataclasses
 

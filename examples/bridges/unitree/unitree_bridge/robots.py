@@ -17,7 +17,7 @@ class Kind:
         joints: by name, in the order of the motors, which begins with motor 0.
         messages: the module of its messages.
         command: returns a new command, whose motors are off.
-        layout: of the command's C struct, of which the checksum is taken.
+        layout: of the command's C struct, for its checksum.
     """
 
     name: str
