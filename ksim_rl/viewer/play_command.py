@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 import os
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -18,6 +18,7 @@ from ksim_rl.files.writing import check_links
 from ksim_rl.trainers import RunProgress, record_video
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.video import FPS
+from ksim_rl.viewer.drive_recorder import check_new, recording
 from ksim_rl.viewer.played import Played, find
 from ksim_rl.viewer.session import AGENTS, Conditions, Session
 from ksim_rl.viewer.shown_motion import with_choice
@@ -40,6 +41,16 @@ def play(arguments: list[str]) -> int:
         if options.viewer is None:
             return _record(played, options, progress)
         session = session_of(played, num_envs=options.num_envs, seed=options.seed)
+    with ExitStack() as opened:
+        opened.callback(session.close)
+        if options.record is not None:
+            kept = recording(session, played, options.record, note=progress.note)
+            opened.enter_context(kept)
+        _show(session, options, progress)
+    return 0
+
+
+def _show(session: Session, options: argparse.Namespace, progress: RunProgress) -> None:
     try:
         if options.viewer == "native":
             # Imported here: each needs packages or a display that the other does not.
@@ -49,9 +60,6 @@ def play(arguments: list[str]) -> int:
     # Ctrl-C is the way to close a viewer, not a failure.
     except KeyboardInterrupt:
         progress.note("closed")
-    finally:
-        session.close()
-    return 0
 
 
 def demo(arguments: list[str]) -> int:
@@ -126,7 +134,15 @@ def _parser() -> OneLineParser:
         "without physics, a clip of its sets, or a file",
     )
     parser.add_argument(
-        "--num-envs", type=int, default=4, help="of a viewer, which shows one at a time; default: 4"
+        "--num-envs",
+        type=int,
+        help="of a viewer, which shows one at a time; default: 4, or 1 with --record",
+    )
+    parser.add_argument(
+        "--record",
+        type=Path,
+        metavar="FOLDER",
+        help="of a viewer: keep what is driven, as whole episodes in a new folder",
     )
     parser.add_argument(
         "--host",
@@ -160,7 +176,15 @@ def _check(options: argparse.Namespace) -> None:
     given = {name: value for name, value in of_video.items() if value is not None}
     for name in ("--seconds", "--fps"):
         check_in_range(name, given.get(name, 1.0), low=0.0, low_open=True)
+    if options.num_envs is None:
+        options.num_envs = 4 if options.record is None else 1
     check_count("--num-envs", options.num_envs)
+    if options.record is not None:
+        if options.viewer is None:
+            raise ValueError("--record: of a viewer, in which one drives: add --live")
+        if options.num_envs != 1:
+            raise ValueError(f"--record with --num-envs {options.num_envs}: one env is driven")
+        check_new(options.record)
     if options.output is not None and options.output.suffix not in VIDEO_SUFFIXES:
         raise ValueError(
             f"--output {options.output}: expected a file that ends in {' or '.join(VIDEO_SUFFIXES)}"

@@ -122,6 +122,7 @@ class Session:
         rewards: the weighted reward terms of that env in the last step.
         note: a remark beside the figures, such as how old the policy is.
         refused: how many requests found no room.
+        listener: is called with each step `["E"]`, its "next" included, and whether all envs began anew before it.
     """
 
     def __init__(
@@ -149,6 +150,8 @@ class Session:
         self.rewards: dict[str, float] = {}
         self.episode_return = 0.0
         self.achieved_speed = 0.0
+        self.listener: Callable[[TensorDictBase, bool], None] | None = None
+        self._is_new = True  # no step since all envs began anew
         self._steered: dict[str, dict[str, float]] = {}
         self._sought: tuple[int, float] | None = None
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue(MOST_REQUESTS)
@@ -168,6 +171,11 @@ class Session:
                 f"{type(self.env).__name__}: the viewer shows envs of this package only"
             )
         return found
+
+    @property
+    def root_E(self) -> TensorDictBase:
+        """What the agent sees at the next step, `["E"]`."""
+        return self._root_E
 
     @property
     def observations(self) -> Mapping[str, Float[Tensor, " ?L"]]:
@@ -217,6 +225,7 @@ class Session:
         """Start new episodes in all envs."""
         with torch.no_grad():
             self._root_E = self.env.reset()
+        self._is_new = True
         # Figures begin again with the episode.
         self.episode_return = 0.0
         self.rewards = {}
@@ -392,6 +401,9 @@ class Session:
             next_E = stepped_E.get("next")
             # One transfer from the device per step of a viewer is no loss.
             reward, done = (float(next_E.get(key)[self.env_index]) for key in ("reward", "done"))
+            if self.listener is not None:
+                self.listener(stepped_E, self._is_new)
+            self._is_new = False
             self._root_E = self.env.maybe_reset(self.env.step_mdp(stepped_E))
         self.rewards = dict(zip(self.ours.reward_manager.names, rewards_R, strict=True))
         if done:

@@ -29,6 +29,9 @@ from ksim_rl.viewer.session import showing_motion
             "nothing acts in a motion",
         ),
         (["RUN", "--motion", "g1_walk", "--agent", "zero"], "nothing acts in a motion"),
+        (["RUN", "--record", "driven"], "--record: of a viewer, in which one drives: add --live"),
+        (["RUN", "--live", "--record", "tests"], "--record tests: it holds something"),
+        (["RUN", "--live", "--record", "x", "--num-envs", "2"], "one env is driven"),
         (["RUN", "--output", "clip.avi"], "ends in .mp4 or .gif"),
     ],
 )
