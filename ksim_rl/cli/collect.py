@@ -59,7 +59,7 @@ def collect(arguments: list[str]) -> int:
 
 
 def _summary(folder: Path) -> str:
-    """Say what lies in a folder of episodes."""
+    """Describe the content of a folder of episodes."""
     found = read_episodes(folder)
     number_D = found.env_states_D["episode"]
     reward_D = found.env_states_D["next", "reward"].flatten().to(torch.float64)

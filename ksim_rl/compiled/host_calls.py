@@ -50,7 +50,7 @@ ENVIRONMENT = "an environment variable"
 
 @dataclass(frozen=True, kw_only=True)
 class HostCall:
-    """A call of `name`, which asks for `what`, from the code at `place`, in a `part` of the env (or "")."""
+    """A call of `name`, which reads `what` from the host, in the code at `place`, in a `part` of the env (or "")."""
 
     what: str
     name: str

@@ -1,4 +1,4 @@
-"""Writes the page of `ksim-rl train --help`: groups, and the fields of a config with what each means."""
+"""Writes the page of `ksim-rl train --help`: groups, and the fields of a config with their meaning."""
 
 import dataclasses
 import json
@@ -99,7 +99,7 @@ def _inside(value: Any, name: str) -> Any:
 
 
 def _summary(value: Any) -> str:
-    """Return what a dataclass is, by the first line of its docstring."""
+    """Return a dataclass's description, the first line of its docstring."""
     if not dataclasses.is_dataclass(value):
         return ""
     text = (type(value).__doc__ or "").split("\n\n")[0]

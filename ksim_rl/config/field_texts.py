@@ -1,4 +1,4 @@
-"""Reads what docstrings and comments say of the attributes of a class, for help and for pages."""
+"""Reads the descriptions of a class's attributes from docstrings and comments, for help and for pages."""
 
 import ast
 import dataclasses

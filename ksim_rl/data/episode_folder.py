@@ -132,7 +132,7 @@ class Origin(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class Contents(Checked):
-    """What a folder of episodes holds; `asked` is the number of episodes that were to be written, 0 for any."""
+    """The content of a folder of episodes; `asked` is the number of episodes that were to be written, 0 for any."""
 
     leaves: tuple[Leaf, ...]
     origin: Origin
@@ -179,7 +179,7 @@ def write_contents(folder: Path, contents: Contents) -> None:
 
 
 def _write_sizes(folder: Path, leaves: Sequence[Leaf], num_rows: int) -> None:
-    """Write what `TensorDict.load_memmap` reads of a TensorDict, inner ones first."""
+    """Write the metadata that `TensorDict.load_memmap` reads, of inner TensorDicts first."""
     below: dict[str, list[Leaf]] = {}
     entries: dict[str, Any] = {}
     for leaf in leaves:
@@ -203,7 +203,7 @@ def _write_sizes(folder: Path, leaves: Sequence[Leaf], num_rows: int) -> None:
 
 
 def read_contents(folder: Path) -> Contents:
-    """Return what a folder of episodes holds; a ValueError where it is none, or says what cannot be."""
+    """Return the content of a folder of episodes; a ValueError if it is no such folder, or contradicts itself."""
     path = folder / CONTENTS
     try:
         tree = json.loads(read_bytes(path, limit=MOST_CONFIG_BYTES))

@@ -57,7 +57,7 @@ def read_episodes(folder: Path | str) -> Episodes:
 
 
 def mend(folder: Path | str) -> None:
-    """Renew the sizes that TensorDict reads from what `episodes.json` says.
+    """Renew the sizes that TensorDict reads, from `episodes.json`.
 
     Where a process was killed within a commit, some of them are of the commit before: then `load_memmap` raises a
     RuntimeError, while `read_episodes` and `load` of this library go by `episodes.json` and need none of this. A
@@ -117,7 +117,7 @@ def _check_order(episode_D: Int64[Tensor, " D"], folder: Path, num_episodes: int
 
 
 def _mapped(leaf: Leaf, folder: Path, num_rows: int) -> Shaped[Tensor, "D *?leaf"]:
-    """Map the first rows of a leaf's file into memory, so that what is written there stays there."""
+    """Map the first rows of a leaf's file into memory, privately: writes do not reach the file."""
     path = leaf.path(folder)
     needed = num_rows * leaf.num_bytes
     # The file that was checked is the one that is mapped.

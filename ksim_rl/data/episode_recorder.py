@@ -22,7 +22,7 @@ DONE_KEY = ("next", "done")
 
 @dataclass
 class _HostBuffer:
-    """A rollout in memory of the host, by leaf [T, E, ...], and what says that it has arrived there."""
+    """A rollout in host memory, by leaf [T, E, ...], and the event after its copy."""
 
     leaves: dict[Key, torch.Tensor]
     arrived: torch.cuda.Event | None = None
@@ -95,7 +95,7 @@ class EpisodeRecorder:
         self._full.put(buffer)
 
     def close(self) -> None:
-        """Write what has been taken, and close the folder."""
+        """Write all rollouts that were taken, and close the folder."""
         self._is_closed = True
         self._full.put(None)
         self._thread.join()

@@ -36,7 +36,7 @@ class FrameStacks:
     def newest(
         self, key: NestedKey, leaf_ET: Shaped[Tensor, "E T *leaf"]
     ) -> Shaped[Tensor, "E T *frame"]:
-        """Return what the ring stores of an observation: the newest frame of a stack, and all of others; a view."""
+        """Return the part of an observation that the ring stores, as a view: a stack's newest frame, or all of it."""
         if key in self.num_frames:
             return leaf_ET[:, :, -1]
         return leaf_ET

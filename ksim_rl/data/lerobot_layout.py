@@ -35,7 +35,7 @@ class Feature:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What `info.json` says of it."""
+        """Its entry of `info.json`."""
         if self.is_video:
             height, width, _ = self.leaf.shape
             names = ["height", "width", "channels"]
@@ -86,7 +86,7 @@ def features_of(contents: Contents) -> list[Feature]:
 
 
 def _name(leaf: Leaf) -> str | None:
-    """Return what LeRobot calls a leaf, or None for what the next frame has."""
+    """Return LeRobot's name for a leaf, or None if the next frame has the leaf."""
     first, *rest = leaf.key
     if first == "next":
         if rest[0] in ("reward", "done", "terminated", "truncated"):

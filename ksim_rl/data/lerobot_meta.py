@@ -1,4 +1,4 @@
-"""Writes what LeRobot reads first of a dataset: sizes, columns, where episodes lie, the task and statistics."""
+"""Writes LeRobot's metadata of a dataset: sizes, columns, where episodes lie, the task and statistics."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -32,7 +32,7 @@ def write_meta(
     folder: Path,
     fps: int,
 ) -> None:
-    """Write what LeRobot reads first: sizes, columns, where episodes lie, the task and statistics."""
+    """Write the metadata: sizes, columns, where episodes lie, the task and statistics."""
     import pyarrow
     from pyarrow import parquet
 

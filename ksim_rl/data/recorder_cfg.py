@@ -1,4 +1,4 @@
-"""Configures what of a training's episodes is kept."""
+"""Configures which of a training's episodes are kept, and which leaves."""
 
 from dataclasses import dataclass
 

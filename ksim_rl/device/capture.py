@@ -244,7 +244,7 @@ class WarpGraphs:
             self._stream = None
 
     def run(self, key: Hashable, launches: Callable[[], None], *, live: bool = False) -> None:
-        """Run `launches`, in order with torch's current stream. `key` names what it does.
+        """Run `launches`, in order with torch's current stream. `key` names the work.
 
         Where they are `live`, they are issued one by one each time, since their Python has to run.
         """

@@ -1,4 +1,4 @@
-"""Describes what autograd hands to functions with gradients of their own."""
+"""Types the context that autograd passes to functions with custom gradients."""
 
 from typing import Protocol
 

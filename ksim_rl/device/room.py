@@ -25,7 +25,7 @@ def check_room(cfg: Checked, *, num_envs: int, device: torch.device, path: str =
 
 
 def check_bytes(given: str, needed: float, *, num_envs: int, device: torch.device) -> None:
-    """Refuse what takes more memory than a device has in all; `given` are the fields and values that ask for it."""
+    """Refuse sizes that take more memory than the whole device has; `given` has the fields and values that do."""
     total = total_bytes(device)
     if needed > total:
         raise ValueError(

@@ -23,7 +23,7 @@ BOUND_SHARE = 0.005
 
 @torch.no_grad()
 def probed(update: Any, env: EnvBase, rollout_ET: TensorDictBase | None) -> dict[str, float]:
-    """Return what the `actor` and `critic` of an update, and the actions, are like in a rollout `["E","T"]`.
+    """Return statistics of an update's `actor` and `critic`, and of the actions, in a rollout `["E","T"]`.
 
     `policy/dead_units` is the share of hidden units whose output is the same in all of its first env states,
     `policy/observation_rms` the root mean square of the normalizers' outputs there, 1 where their statistics fit, and

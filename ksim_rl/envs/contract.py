@@ -113,6 +113,6 @@ def part(env: EnvBase, kind: type[Part]) -> Part | None:
 
 
 def missing_parts(env: EnvBase) -> list[str]:
-    """Return one line for each part that the env lacks, which says what a run cannot do then."""
+    """Return one line for each part that the env lacks, with the consequence for a run."""
     name = type(innermost(env)).__name__
     return [f"{name} has {kind.without}" for kind in PARTS if part(env, kind) is None]

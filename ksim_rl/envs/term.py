@@ -146,7 +146,7 @@ class CommandTerm(Term):
         return view.shared("ranges_2N", tuple(zip(*self.ranges.values(), strict=True)))
 
     def bounds(self, view: EnvView, ranges: CommandRanges) -> Sequence[tuple[float, float]] | None:
-        """Return what each column may be, (low, high), if it is drawn from `ranges`; None where this is not known.
+        """Return the bounds of each column, (low, high), if it is drawn from `ranges`; None where they are unknown.
 
         A robot that runs the policy is kept from commands beyond.
         """

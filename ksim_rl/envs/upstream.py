@@ -27,7 +27,7 @@ def can_reset_nothing(env: EnvBase) -> bool:
 def resolved_set_state(
     env: EnvBase, tensordict: TensorDictBase | None, set_state: bool | None, select_reset_only: bool
 ) -> bool | None:
-    """Return what `reset(set_state=...)` means for this tensordict, which has to be of the env's batch size."""
+    """Interpret `reset(set_state=...)` for this tensordict, which must have the env's batch size."""
     if tensordict is not None:
         env._assert_tensordict_shape(tensordict)
     return env._resolve_set_state(set_state, tensordict, select_reset_only)

@@ -68,7 +68,7 @@ def noise(cfg: NoiseCfg | None, size: int) -> NoiseSpec | None:
 
 
 def observations(env: ManagerBasedRlEnv, groups: Sequence[str]) -> list[TermSpec]:
-    """Return what becomes of the readings of each term of groups, in the order in which a policy reads them."""
+    """Return the processing of each term's readings, in the order in which a policy reads the terms."""
     found: list[TermSpec] = []
     for group in groups:
         cfg: ObservationGroupCfg = env.cfg.observations[group]

@@ -1,4 +1,4 @@
-"""Sorts the transforms of a task by what an export makes of them: stages of actions, parts of the policy, nothing."""
+"""Sorts the transforms of a task for an export: stages of actions, parts of the policy, or left out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ COMPARED_STEPS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class TaskTransforms:
-    """What becomes of the transforms of a task that a policy or its robot notices.
+    """The exported form of all transforms of a task that a policy or its robot notices.
 
     Attributes:
         stages: descriptions of what an action passes on its way to the action terms, in this order.
@@ -118,7 +118,7 @@ def _(transform: ActionScale) -> ScaleStage:
 
 
 class PerObservation(nn.Module):
-    """What a transform makes of each observation by itself: tensors [..., L] to as many [..., M]."""
+    """A transform as a function of each observation by itself: tensors [..., L] to as many [..., M]."""
 
     def __init__(self, transform: Transform) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Describes the pictures that a policy reads: the camera, and what becomes of its pictures on their way."""
+"""Describes the pictures that a policy reads: the camera, and the processing of its pictures."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -178,7 +178,7 @@ def _is_of_training(transform: Transform, pictures: Sequence[PictureInput]) -> b
 
 
 def _behind(picture: PictureInput, transform: Transform, where: str) -> PictureInput:
-    """Return what a picture is behind a transform that acts in evaluation, too."""
+    """Return the description of a picture after a transform that also acts in evaluation."""
     kind = type(transform).__name__
     in_place = picture.group in {unravel_key(key) for key in transform.in_keys}
     # Frames that are stacked first would be late, or lost, as one.

@@ -24,7 +24,7 @@ Arrays = dict[str, np.ndarray]
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """What a recording keeps, in the order of the export.
+    """The content of a recording, in the order of the export.
 
     Attributes:
         groups: of observations, which the policy reads as vectors.
@@ -221,7 +221,7 @@ class Recording:
 
 
 def _vectors(current: TensorDictBase, groups: Sequence[NestedKey]) -> Tensor:
-    """Return what a policy reads as numbers, side by side [E, L]."""
+    """Return the numbers that a policy reads, concatenated [E, L]."""
     vectors = [current[group] for group in groups]
     if not vectors:
         return torch.zeros(*current.batch_size, 0)

@@ -158,7 +158,7 @@ def sim2sim(
 
 
 def _drawing(meta: Export) -> dict[str, str] | None:
-    """Return what a process has to know that draws pictures; a ValueError tells how to get what draws."""
+    """Return the environment of a process that draws pictures; a ValueError says how to install a renderer."""
     if not meta.get("pictures"):
         return None
     try:

@@ -24,7 +24,7 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class TracedTask:
-    """The terms of a task as functions of what a robot can measure.
+    """The terms of a task as functions of a robot's measurements.
 
     Attributes:
         obs: the terms that the policy observes, before noise, clip, scale, delay and history; None if it only sees.
@@ -54,7 +54,7 @@ class TracedTask:
 def trace_task(
     env: ManagerBasedRlEnv, groups: Sequence[str], note: Callable[[str], None]
 ) -> TracedTask:
-    """Trace the terms of groups that are vectors, and what rates an episode; what cannot be traced of that is left out.
+    """Trace the terms of vector groups, and the terms that rate an episode; of these, untraceable ones are left out.
 
     Raises NotDescribedError, naming the term, for one that the policy observes.
     """
@@ -146,7 +146,7 @@ def greatest_difference(
 
 
 def _errors(found_L: np.ndarray, wanted: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Return the greatest error of each term; the numbers of the terms are concatenated in what was found."""
+    """Return the greatest error of each term; the numbers of the terms are concatenated in `found`."""
     errors = {}
     start = 0
     for name, wanted_L in wanted.items():

@@ -1,4 +1,4 @@
-"""Traces terms over what a robot can measure, so that they are written once, in torch, and run elsewhere as ONNX.
+"""Traces terms over a robot's measurements, so that they are written once, in torch, and run elsewhere as ONNX.
 
 Each term runs once while torch's operations are written down. What it reads of the view by name becomes an input (see
 `measurements`), what it keeps in `view.buffer` a pair of an input and an output, and a table a constant.
@@ -72,7 +72,7 @@ class TracedInput:
 
 @dataclass(frozen=True, kw_only=True)
 class TracedState:
-    """What a term keeps from step to step: an input, zeros in a new episode, and the output that feeds it next."""
+    """The memory of a term from step to step: an input, zeros in a new episode, and the output that feeds it next."""
 
     input: str
     output: str
@@ -211,7 +211,7 @@ class _Tracer:
             return term(self._view)
 
     def _states_of(self, scope: str) -> list[tuple[Tensor, Tensor]]:
-        """Return what a term keeps, and copies."""
+        """Return the memory of a term, and copies."""
         return [
             (piece.tensor, piece.tensor.clone())
             for piece in self._memory.lasting()
@@ -309,7 +309,7 @@ class _Tracer:
         return node
 
     def _state(self, piece: Piece, tensor: Tensor) -> fx.Node:
-        """Return the node of what the term keeps, as it is when the term has run up to here."""
+        """Return the node of the term's memory, as it is when the term has run up to here."""
         buffers = self._driver.buffers
         name = next((name for name, one in buffers.by_name().items() if one is piece.tensor), "")
         if not name or buffers.is_kept(name):

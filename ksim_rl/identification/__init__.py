@@ -1,1 +1,1 @@
-"""Finds the numbers of a robot's joints in a log of its commands and encoders, and proposes what to log."""
+"""Identifies the parameters of a robot's joints from a log of commands and encoders, and proposes the commands."""

@@ -1,4 +1,4 @@
-"""`ksim-rl identify` proposes what to command to a robot that is held, and finds its numbers or networks in the log."""
+"""`ksim-rl identify` proposes commands for a robot that is held, and finds its parameters or networks in the log."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What was found of a robot: numbers with their uncertainty, as a table and as a file."""
+"""Identified parameters of a robot, with their uncertainty, as a table and as a file."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Decides which numbers of a joint a log can tell, and at what sizes their search begins."""
+"""Decides which parameters of a joint a log can identify, and where their search begins."""
 
 import math
 from dataclasses import dataclass
@@ -79,7 +79,7 @@ def untold(joint: DrivenJoint, targets: Targets, place: int) -> dict[str, str]:
 
 
 def remark_of_sum(joint: DrivenJoint, held: dict[str, str]) -> dict[str, str]:
-    """Return what a number holds besides its own, by kind."""
+    """Return remarks on parameters that include another one, by kind."""
     if "damping" in held:
         own = joint.nominal["damping"]
         if own > 0.0:

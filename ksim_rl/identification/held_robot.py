@@ -136,7 +136,7 @@ def robot_classes() -> dict[str, type]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Motor:
-    """What the robot's files say of the motor of a joint, in units at the joint."""
+    """The nominal motor of a joint, from the robot's files, in units at the joint."""
 
     stiffness: float
     damping: float
@@ -242,7 +242,7 @@ def _weld(
 
 
 def _leave_motors_alone(spec: mujoco.MjSpec, motors: Mapping[str, _Motor]) -> None:
-    """Take out what has no part in the joints' motion, and give each joint the motor of `HeldRobot`."""
+    """Remove what does not affect the joints' motion, and give each joint the motor of `HeldRobot`."""
     for kind in (spec.keys, spec.sensors, spec.actuators):
         for element in list(kind):
             spec.delete(element)

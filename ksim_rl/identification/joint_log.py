@@ -45,7 +45,7 @@ BEYOND = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class JointLog:
-    """What was commanded, and what the encoders read: positions [T, N], rad or m, at times [T], s."""
+    """Commands and encoder readings: positions [T, N], rad or m, at times [T], s."""
 
     time_T: Float[Array, " T"]
     pos_TN: Float[Array, "T N"]
@@ -130,7 +130,7 @@ def _of_joints(
 
 
 def _read_columns(path: Path) -> tuple[dict[str, Float[Array, " T"]], list[str]]:
-    """Return the columns of numbers of a table by their names, and what of the file is no part of it."""
+    """Return a table's columns of numbers by name, and notes about the rest of the file."""
     data = read_bytes(path, limit=MOST_TEXT_BYTES, follows_links=True)
     if path.suffix == ".mcap":
         return read_mcap(path, data, time=TIME, most_cells=MOST_CELLS)

@@ -217,7 +217,7 @@ def _unpacked(path: Path, compression: str, data: bytes) -> bytes:
 
 
 def _decoder(topic: str, encoding: str, schema: str) -> Decoder:
-    """Return what reads the messages of a topic."""
+    """Return the reader of a topic's messages."""
     if encoding == "json":
         return _from_json
     if encoding == "cdr" and schema == JOINT_STATE:
@@ -243,7 +243,7 @@ def _from_json(data: bytes) -> Row:
 
 
 def _joint_state_decoder(prefix: str) -> Decoder:
-    """Return what reads joint states, whose names get a prefix of their kinds."""
+    """Return the reader of joint states, whose names get a prefix of their kinds."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory
 

@@ -1,4 +1,4 @@
-"""Turns a log into what a simulated motor sees and does in each physics step: errors, velocities and efforts."""
+"""Turns a log into a simulated motor's inputs and efforts in each physics step: errors, velocities, efforts."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +20,7 @@ STAMPS = 1.05
 
 @dataclass(frozen=True, kw_only=True)
 class MotorSignals:
-    """What motors saw and did in S physics steps, for N joints in the order of the robot.
+    """Inputs and efforts of motors in S physics steps, for N joints in the order of the robot.
 
     Attributes:
         timestep: s.
@@ -36,7 +36,7 @@ class MotorSignals:
 
 
 def motor_signals(robot: HeldRobot, log: JointLog, timestep: float) -> MotorSignals:
-    """Return the signals of a log in steps of `timestep`, s; a ValueError names what the log lacks for them."""
+    """Return the signals of a log in steps of `timestep`, s; a ValueError names missing columns."""
     asked_TN = log.targets.by_kind.get("pos")
     if asked_TN is None:
         raise ValueError(

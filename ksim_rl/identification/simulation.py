@@ -25,7 +25,7 @@ _DERIVED = ("dof_invweight0", "body_invweight0", "actuator_acc0", "dof_M0")
 
 @dataclass(frozen=True, kw_only=True)
 class Targets:
-    """What the joints were asked for: each value is held until the next one.
+    """The commands of the joints: each value is held until the next one.
 
     Attributes:
         time_T: s.
@@ -76,7 +76,7 @@ class Candidate:
 def asked(
     numbers_NP: Float[Array, "N P"], by_kind: Mapping[TargetKind, Float[Array, "S N"]]
 ) -> Float[Array, "S N"]:
-    """Return what targets add to the effort of motors with these numbers, N m or N."""
+    """Return the targets' contribution to the effort of motors with these parameters, N m or N."""
     total_SN = np.zeros((1, len(numbers_NP)))
     for kind, target_SN in by_kind.items():
         total_SN = total_SN + numbers_NP[:, KINDS.index(FACTORS[kind])] * target_SN

@@ -1,4 +1,4 @@
-"""Says what was found of a robot in the words of `ksim-rl train`: a delay, ranges to draw from, and networks."""
+"""Turns identified parameters into overrides of `ksim-rl train`: a delay, ranges to draw from, and networks."""
 
 import math
 import re

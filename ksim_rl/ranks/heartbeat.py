@@ -63,7 +63,7 @@ class Heartbeat:
         self._tell("done", "1")
 
     def ended(self, error: BaseException) -> None:
-        """Tell the others what ended this rank."""
+        """Tell the others why this rank ended."""
         self._tell("ended", f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
 
     def _tell(self, what: str, text: str) -> None:

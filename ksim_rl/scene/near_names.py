@@ -1,4 +1,4 @@
-"""Refuses what terms misspell, with the near names."""
+"""Refuses misspelled names in terms, and suggests similar ones."""
 
 from typing import TYPE_CHECKING, NoReturn
 

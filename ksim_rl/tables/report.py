@@ -90,7 +90,7 @@ def write(table: Table, rows: Mapping[str, Results], folder: Path, *, seeds: Seq
 
 
 def _tree(table: Table, rows: Mapping[str, Results], seeds: Sequence[int]) -> Tree:
-    """Return what is written as JSON; `seeds` are the ones that were asked for, none for all of the table."""
+    """Return the content of the JSON file; `seeds` are the ones that were asked for, none for all of the table."""
     counted = _all_results(rows)
     # Commit and versions of the newest result stand for the table; all commits are listed.
     newest = max(counted, key=lambda result: result["date"], default={})

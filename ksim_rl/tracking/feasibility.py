@@ -1,4 +1,4 @@
-"""Says how feasible a motion is for a two-legged robot: where the ground would push, and what motors would give."""
+"""Measures how feasible a motion is for a two-legged robot: the ground's pressure point, and the motors' torques."""
 
 from dataclasses import dataclass
 
@@ -51,7 +51,7 @@ class Feasibility:
     touches: tuple[str, ...]
 
     def faults(self) -> list[str]:
-        """Return what the robot cannot do, a line each; none of a feasible motion."""
+        """Return a line for each thing that the robot cannot do; none for a feasible motion."""
         found = []
         if self.off_sole > 0.0:
             found.append(

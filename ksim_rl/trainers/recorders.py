@@ -69,7 +69,7 @@ class TrainingRecorder:
             self.close()
 
     def close(self) -> None:
-        """Write what has been taken."""
+        """Write all rollouts that were taken."""
         self._is_over = True
         recorder = self._recorder
         self._recorder = None

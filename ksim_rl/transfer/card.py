@@ -31,7 +31,7 @@ _HEAD = (
 
 @dataclass(frozen=True, kw_only=True)
 class TransferCard:
-    """What came of a policy under each condition.
+    """The results of a policy under each condition.
 
     Attributes:
         policy: as it was named.
@@ -62,7 +62,7 @@ class TransferCard:
 
     @property
     def as_trained(self) -> Judged:
-        """What the others are compared with."""
+        """The result that the others are compared with."""
         return self.judged[CONDITIONS[0].name]
 
     def share(self, name: str) -> float:

@@ -66,7 +66,7 @@ def changed(robot: Robot, change: Callable[[Actuator], Actuator]) -> ChangedRobo
 
 
 def entries(robot: Robot) -> list[Actuator]:
-    """Return what drives a robot's joints: its own entries, and those that its model's actuators amount to."""
+    """Return the actuators of a robot's joints: its own entries, and entries equivalent to its model's actuators."""
     own: Sequence[Actuator] = getattr(robot, "actuators", ())
     mj_model = robot.spec().compile()
     names = [mj_model.joint(joint).name for joint in scalar_joint_ids(mj_model)]

@@ -1,4 +1,4 @@
-"""Runs a policy's episodes under one condition in MuJoCo's C engine, and measures what a robot would feel."""
+"""Runs a policy's episodes under one condition in MuJoCo's C engine, and measures the load on a robot."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Says in words what a policy has met in its training: physics, motors, noise, and what events drew."""
+"""Describes the conditions of a policy's training: physics, motors, noise, and the draws of events."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from ksim_rl.transforms.groups.group_cfg import ObservationTermCfg
 
 
 def training_conditions(cfg: ManagerBasedRlEnvCfg) -> dict[str, str]:
-    """Return what a task trains under, a line for each part of it.
+    """Return the conditions of a task's training, a line for each part.
 
     A part of the config is described by the fields that differ from their defaults.
     """
@@ -49,7 +49,7 @@ def _motor(entry: Actuator) -> str:
 
 
 def _errors(term: ObservationTermCfg) -> str:
-    """Return what is wrong with the readings of a term in training."""
+    """Return the errors that training adds to the readings of a term."""
     parts = []
     if term.noise is not None:
         parts.append(_told(term.noise))

@@ -84,7 +84,7 @@ class ObservationHold(KeyedTransform):
         return self._show(next_tensordict, due_E)
 
     def _show(self, tensordict: TensorDictBase, arrives_E: Tensor) -> TensorDictBase:
-        """Write the observations of the rows where they arrive, and what is held in the others."""
+        """Write new observations in the rows where they arrive, and the held ones in the others."""
         for index, key in enumerate(self.in_keys):
             value = tensordict.get(key)
             held_E: Tensor = getattr(self, f"held_{index}")

@@ -1,4 +1,4 @@
-"""Finds what a command lets act in a task: the policy of a run or of the zoo, or an agent without one."""
+"""Finds the policy that a command plays in a task: of a run or of the zoo, or an agent without one."""
 
 import dataclasses
 from collections.abc import Sequence

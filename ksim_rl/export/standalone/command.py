@@ -94,7 +94,7 @@ def main() -> None:
 
 
 def _check_options(options: argparse.Namespace) -> None:
-    """Refuse what would be found out in another process, or behind the last episode."""
+    """Refuse wrong arguments now, before they fail in another process or after the last episode."""
     for name, least in (("episodes", 1), ("refine", 1), ("seed", 0)):
         value = getattr(options, name)
         if value < least:

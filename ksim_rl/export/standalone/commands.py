@@ -12,7 +12,7 @@ MOST_OFF = 1e-5
 
 
 class CommandRange:
-    """The numbers of one command, and what each may be."""
+    """The numbers of one command, and their ranges."""
 
     def __init__(self, name: str, spec: CommandSpec) -> None:
         self.name = name

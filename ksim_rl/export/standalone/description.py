@@ -1,4 +1,4 @@
-"""The entries of export.json, as types: what a folder says of its policy and of the env that it was trained in."""
+"""The entries of export.json, as types: the description of a folder's policy and of the env that it was trained in."""
 
 from collections.abc import Sequence
 from typing import Any, Literal, TypeAlias, TypedDict
@@ -30,7 +30,7 @@ class NoiseSpec(TypedDict):
 
 
 class TermSpec(TypedDict):
-    """What becomes of the readings of an observation term on their way to the policy."""
+    """How the readings of an observation term are processed on their way to the policy."""
 
     name: str
     size: int  # of one frame
@@ -114,7 +114,7 @@ class ClipStage(TypedDict):
 
 
 class ScaleStage(TypedDict):
-    """Numbers that actions are multiplied with, and what is added then."""
+    """Factors of actions, and offsets that are added to the product."""
 
     kind: Literal["scale"]
     scale: float | Sequence[float]
@@ -192,7 +192,7 @@ class JointsSpec(TypedDict):
 
 
 class GraphSpec(TypedDict):
-    """What an ONNX file of terms reads: measurements, each with its input's name, and states."""
+    """The inputs of an ONNX file of terms: measurements, each with its input's name, and states."""
 
     output: str
     # Each has the entries that its quantity has.
@@ -201,7 +201,7 @@ class GraphSpec(TypedDict):
 
 
 class PolicySpec(TypedDict):
-    """What policy.onnx reads and gives."""
+    """The inputs and outputs of policy.onnx."""
 
     inputs: list[str]
     outputs: list[str]
@@ -233,7 +233,7 @@ class _OfRun(TypedDict, total=False):
 
 
 class Export(_OfRun):
-    """What export.json says."""
+    """The content of export.json."""
 
     joint_names: list[str]
     joints: JointsSpec

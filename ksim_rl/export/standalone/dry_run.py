@@ -1,4 +1,4 @@
-"""Runs a policy dry: on what a robot measures, while its motors do something else, to see what it would ask for."""
+"""Runs a policy dry: on a robot's measurements, without sending its actions, to check its targets first."""
 
 from collections.abc import Callable
 
@@ -55,7 +55,7 @@ class DryRun:
         return self.steps >= self.num_steps
 
     def __call__(self, measurement: Measurement) -> JointCommand:
-        """Run one step of the policy, and return what it would have asked of the motors."""
+        """Run one step of the policy, and return the targets that it would have sent to the motors."""
         began = self.clock()
         asked = self.control(measurement)
         self.took.add(self.clock() - began)
@@ -71,7 +71,7 @@ class DryRun:
         return asked
 
     def lines(self) -> list[str]:
-        """Return what the policy would have asked for: a line about time, and one for each joint with a motor."""
+        """Return a report of the policy's targets: a line about time, and one for each joint with a motor."""
         found = [
             f"dry run: {self.steps} steps of {1e3 * self.took.quantile(0.5):.2f} ms, 99 % of them within "
             f"{1e3 * self.took.quantile(0.99):.2f} ms; a period has {1e3 * self.period:g} ms"
@@ -91,7 +91,7 @@ class DryRun:
         return found
 
     def check(self, *, stands: bool) -> None:
-        """Raise Fault where the policy was too slow, or asked a robot that stands for what its joints cannot do.
+        """Raise Fault if the policy was too slow, or asked a standing robot for positions beyond its joints' limits.
 
         From another pose than it has learned in, a policy may ask for anything: there only its time counts. Efforts are
         told and not refused: what is beyond their limit is never sent.

@@ -171,7 +171,7 @@ def check_parent(option: str, path: Path) -> None:
 
 
 def measurements(meta: Export) -> list[Json]:
-    """Return what fills the inputs of `obs.onnx`: nothing of a policy that only sees."""
+    """Return the sources of the inputs of `obs.onnx`: none for a policy that reads only pictures."""
     if meta["obs"] is None:
         return []
     return meta["obs"]["measurements"]

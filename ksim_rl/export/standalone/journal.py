@@ -1,4 +1,4 @@
-"""Writes what a loop did, in the form that `ksim-rl identify` reads, from a thread of its own."""
+"""Logs a loop in the form that `ksim-rl identify` reads, from a separate thread."""
 
 import queue
 import threading
@@ -94,7 +94,7 @@ class Journal:
         command: JointCommand,
         asked: JointCommand | None = None,
     ) -> None:
-        """Log a period; without a measurement the readings are NaN. `asked` is what a policy that runs dry asks for."""
+        """Log a period; without a measurement the readings are NaN. `asked` has the targets of a dry run."""
         if self.only not in (None, state):
             return
         if measurement is None:
@@ -119,7 +119,7 @@ class Journal:
         self._put(Line(form=form, values=(self._since(now),), is_event=True))
 
     def close(self) -> None:
-        """Write what waits, for at most 5 s."""
+        """Write the queued lines, for at most 5 s."""
         self.waiting.put(None)
         self.thread.join(5.0)
 

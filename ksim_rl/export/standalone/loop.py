@@ -20,7 +20,7 @@ PRIORITY = 20
 
 
 class Clock(Protocol):
-    """What tells the time, s, and waits."""
+    """A clock that tells the time, s, and waits."""
 
     def now(self) -> float:
         """Return the time."""
@@ -97,7 +97,7 @@ def run_loop(
 
 
 def calm_python() -> None:
-    """Keep what would make a period late out of the loop: the garbage collector, and long turns of other threads."""
+    """Avoid late periods: turn off the garbage collector and long turns of other threads."""
     gc.collect()
     # The loop makes no circles of references, so that nothing is left for the collector.
     gc.freeze()

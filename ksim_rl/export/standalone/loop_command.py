@@ -211,7 +211,7 @@ def _check_options(options: argparse.Namespace, *, has_robot: bool) -> None:
 def _operators(
     options: argparse.Namespace, plan: PlanControl | None, others: Sequence[Operator]
 ) -> list[Operator]:
-    """Return all who say what comes next; from here on signals of the system are words, too."""
+    """Return all sources of operator words; from here on signals of the system count as words, too."""
     interrupts = Interrupts()
     interrupts.listen()
     heard: list[Operator] = [interrupts, *others]
@@ -268,7 +268,7 @@ def _set_command(control: PolicyControl, values: Sequence[float] | None) -> None
 
 
 def _said_of_commands(control: Control) -> list[str]:
-    """Return a line for each command: what it is at first, and what it may be."""
+    """Return a line for each command: its first value, and its range."""
     lines = []
     for name, values in control.command.items():
         allowed = control.ranges[name]

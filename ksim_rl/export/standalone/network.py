@@ -91,7 +91,7 @@ class Network:
         return first[0].astype(np.float64)
 
     def advance(self) -> None:
-        """Let the step end: what the last run has kept is read by the next one."""
+        """End the step: the next run reads the states that the last run has written."""
         self.states = self.next_states
 
 

@@ -1,4 +1,4 @@
-"""Runs an exported policy on what a robot measures: measurement to observation, to action, to targets of joints."""
+"""Runs an exported policy on a robot's measurements: measurement to observation, to action, to joint targets."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -102,7 +102,7 @@ class PolicyControl:
         return found + [name for name in sorted(self.of_root) if getattr(measurement, name) is None]
 
     def __call__(self, measurement: Measurement) -> JointCommand:
-        """Run one step of the policy, and return what it asks of the motors."""
+        """Run one step of the policy, and return its targets for the motors."""
         action = self.policy(self._frame(measurement), self._pictures(measurement))
         for change in self.chain:
             action = change(action)
@@ -158,7 +158,7 @@ class PolicyControl:
         return found
 
     def _source(self, node: Json) -> Reading:
-        """Return what fills an input of `obs.onnx`: what is none of the loop's own is an estimate of the robot."""
+        """Return the value of an input of `obs.onnx`: the loop's own number, or else an estimate of the robot."""
         quantity = node["quantity"]
         if quantity in OF_TARGETS:
             kind = OF_TARGETS[quantity]

@@ -1,4 +1,4 @@
-"""What passes between a loop and a robot: measurements one way, commands of joints the other."""
+"""The interface between a loop and a robot: measurements one way, commands of joints the other."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from ksim_rl.export.standalone.files import Array, Json
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
-    """What a robot measured at one moment; arrays have the joints of `joints.names` in export.json, in this order.
+    """A robot's measurements at one moment; arrays have the joints of `joints.names` in export.json, in this order.
 
     Attributes:
         stamp: when it arrived, s of `time.monotonic`.
@@ -44,7 +44,7 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True)
 class JointCommand:
-    """What motors are asked for, by joint, in the order of `joints.names`; a joint without a motor has zeros.
+    """Targets and gains of the motors, by joint, in the order of `joints.names`; a joint without a motor has zeros.
 
     A motor exerts `effort + stiffness * (pos - measured pos) + damping * (vel - measured vel)`.
     """
@@ -57,7 +57,7 @@ class JointCommand:
 
 
 class Robot(Protocol):
-    """What a loop asks of a robot; none of these may wait for the robot."""
+    """The methods that a loop needs of a robot; none of them may block."""
 
     def read(self) -> Measurement | None:
         """Return the newest measurement, or None before the first."""
@@ -73,7 +73,7 @@ class Robot(Protocol):
 
 
 class DescribedJoints:
-    """The joints of export.json: gains, the pose that a policy stands in, and what they may not pass."""
+    """The joints of export.json: gains, the default pose of the policy, and limits."""
 
     def __init__(self, meta: Export) -> None:
         joints: JointsSpec = meta["joints"]
@@ -116,7 +116,7 @@ class DescribedJoints:
 
 
 class Control(Protocol):
-    """What asks the motors for something once the robot stands.
+    """The controller of the motors once the robot stands.
 
     `command` is what an operator may change; what is beyond its `ranges` is clipped. `pictures` describes the cameras
     that it sees by.
@@ -132,7 +132,7 @@ class Control(Protocol):
         ...
 
     def __call__(self, measurement: Measurement) -> JointCommand:
-        """Return what the motors are asked for in this period."""
+        """Return the command to the motors in this period."""
         ...
 
 
@@ -142,7 +142,7 @@ def _finite(
     *,
     least: float = -np.inf,
 ) -> Array:
-    """Return an entry of export.json with a number for each joint; what no motor may be given is refused."""
+    """Return an entry of export.json, a number for each joint; a ValueError if one is not finite or below `least`."""
     numbers = np.array(joints[what], float)
     for name, number in zip(joints["names"], numbers, strict=True):
         if not np.isfinite(number) or number < least:

@@ -1,4 +1,4 @@
-"""What ends a loop's motion: measurements that are late, wrong or beyond limits; and the limit of a motor's torque."""
+"""Ends a loop's motion after measurements that are late, wrong or beyond limits, and limits a motor's torque."""
 
 import dataclasses
 import math
@@ -25,7 +25,7 @@ class Fault(Exception):  # noqa: N818
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What a robot may not pass.
+    """The limits of a robot's motion.
 
     Attributes:
         late_periods: periods without a new message, or by which the loop itself may be late.
@@ -59,7 +59,7 @@ def option_of(name: str) -> str:
 
 
 class Watch:
-    """Finds what is wrong with a robot's measurements; each method raises Fault with one line that names it."""
+    """Finds faults in a robot's measurements; each method raises Fault with one line that names it."""
 
     def __init__(self, joints: DescribedJoints, limits: Limits, period: float) -> None:
         self.joints = joints
@@ -219,7 +219,7 @@ def tilt_of(root_quat: Array) -> float:
 
 
 class EffortLimit:
-    """Keeps what motors are asked for within their effort limits at the measured state, and counts where it has to.
+    """Keeps commands within the motors' effort limits at the measured state, and counts how often it has to.
 
     Targets of positions are moved, to between the measured position and the target. Where damping and effort alone are
     beyond the limit, all of a joint's command is made smaller: a target, or an effort, that made up for a brake that is

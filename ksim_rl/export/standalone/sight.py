@@ -1,4 +1,4 @@
-"""Draws what a policy sees in the model of an exported folder, by MuJoCo's own renderer."""
+"""Draws a policy's pictures from the model of an exported folder, with MuJoCo's own renderer."""
 
 import importlib
 import os
@@ -91,7 +91,7 @@ class Camera:
 
 
 class Sight:
-    """What a policy sees: the pictures of its cameras, at their rates, with their losses and lags."""
+    """The pictures of a policy's cameras, at their rates, with their losses and lags."""
 
     def __init__(self, signals: Signals) -> None:
         self.draws = signals

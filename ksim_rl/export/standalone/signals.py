@@ -137,7 +137,7 @@ class Noise:
 
 
 class Values:
-    """What one ONNX file makes of the quantities that it reads."""
+    """Computes one ONNX file's outputs from the quantities that it reads."""
 
     def __init__(self, signals: "Signals", name: Literal["obs", "scores"]) -> None:
         spec = signals.meta[name]
@@ -252,7 +252,7 @@ class Signals:
         mujoco.mj_sensorVel(model, data)
 
     def bias_of(self, names: list[str]) -> Array:
-        """Return what the encoders of some joints read beyond their positions, rad or m."""
+        """Return the bias of the encoders of some joints, rad or m."""
         return np.array([self.bias[name] for name in names])
 
     def quantity(self, node: Json) -> Value:

@@ -83,7 +83,7 @@ class SimulatedRobot:
         return None
 
     def read(self) -> Measurement:
-        """Return what the sensors read now; a message of a simulation is never late."""
+        """Return the sensors' readings now; a message of a simulation is never late."""
         data = self.data
         root_quat = None
         root_ang_vel = None

@@ -1,4 +1,4 @@
-"""What becomes of readings and actions on their way: clips, scales, filters, targets of joints."""
+"""The stages of readings and actions: clips, scales, filters, joint targets."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ Stage = Callable[[Array], Array]
 
 
 def clipped_and_scaled(spec: TermSpec) -> Stage:
-    """Return what happens to the raw values of an observation term, without its noise and delay."""
+    """Return the processing of an observation term's raw values, without noise and delay."""
     low, high = spec["clip"]
     # JSON has no infinity: None is a side without a bound.
     low = -np.inf if low is None else low
@@ -48,7 +48,7 @@ class LowPass:
 
 
 def stage(spec: LowPassStage | ClipStage | ScaleStage, resets: list[Callable[[], None]]) -> Stage:
-    """Return a stage of `action_chain` other than a delay; what keeps memory adds its reset to `resets`."""
+    """Return a stage of `action_chain` other than a delay; a stage with memory adds its reset to `resets`."""
     if spec["kind"] == "clip":
         return lambda action: np.clip(action, spec["low"], spec["high"])
     if spec["kind"] == "scale":
@@ -59,7 +59,7 @@ def stage(spec: LowPassStage | ClipStage | ScaleStage, resets: list[Callable[[],
 
 
 def shaping(spec: ShapeSpec, resets: list[Callable[[], None]]) -> Stage:
-    """Return what makes targets of an action's columns: clip, tanh, scale, filter and offset, in this order."""
+    """Return the function from an action's columns to targets: clip, tanh, scale, filter and offset, in this order."""
     low, high = spec["clip"] or (-np.inf, np.inf)
     scale = np.asarray(spec["scale"])
     offset = np.asarray(spec["offset"])

@@ -1,4 +1,4 @@
-"""The states of a loop: damp, stand up, policy, stop; what each asks of motors, and what leads to the next."""
+"""The states of a loop: damp, stand up, policy, stop; their motor commands, and the transitions between them."""
 
 import dataclasses
 import math
@@ -24,7 +24,7 @@ from ksim_rl.export.standalone.safety import (
 
 
 class State(Enum):
-    """What a loop does; numbers stand in its log."""
+    """The state of a loop; the numbers are the ones in its log."""
 
     DAMP = 0
     """Motors brake and hold nothing: the beginning, and the end."""
@@ -275,5 +275,5 @@ def smooth(passed: float, seconds: float) -> float:
 
 
 def between(first: Between, last: Between, share: float) -> Between:
-    """Return what lies between two values, at a share of the way."""
+    """Interpolate between two values, at a share of the way."""
     return first + share * (last - first)

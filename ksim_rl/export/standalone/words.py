@@ -64,7 +64,7 @@ class Keyboard:
 
 
 class Unattended:
-    """Says what leads from one state to the next: stand after a rest, policy, and stop after some seconds of it."""
+    """Says the words by a timetable: stand after a rest, policy, and stop after some seconds of it."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
@@ -133,7 +133,7 @@ class Interrupts:
 
 
 def sort_words(said: Sequence[str], machine: StateMachine, now: float) -> list[str]:
-    """Return the words among what was said, and take over what are numbers of the policy's first command."""
+    """Return the words of the last lines, and set the policy's first command from lines of numbers."""
     found = []
     for line in said:
         try:

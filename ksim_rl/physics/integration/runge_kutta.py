@@ -186,7 +186,7 @@ class _ExactFilters:
         self._stage = 0
 
     def rate(self) -> None:
-        """Launch what moves them by their rate, before the stage computes the next one."""
+        """Advance them by their rate, before the stage computes the next one."""
         m = self._warp_model
         d = self._warp_data_E
         fraction = STAGE_TIMES[self._stage]

@@ -43,7 +43,7 @@ def motion_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def _known(path: Path) -> _Known | None:
-    """Return what is known of a file, unless it has changed since."""
+    """Return the known content of a file, unless it has changed since."""
     known = _KNOWN.get(path.absolute())
     if known is None or not path.exists() or known.stamp != _stamp(path):
         return None

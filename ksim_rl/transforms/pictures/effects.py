@@ -1,4 +1,4 @@
-"""What may happen to pictures, as data: each effect maps pictures [E, N, H, W, C] and draws per env to new pictures.
+"""Effects on pictures, as data: each effect maps pictures [E, N, H, W, C] and draws per env to new pictures.
 
 The N stacked pictures of an env are changed alike. Bytes are rounded to bytes; floats keep their dtype.
 """
