@@ -72,7 +72,7 @@ def test_a_loaded_policy_acts_from_the_first_step_and_waits_for_its_critics(tmp_
     """The critics begin to learn at step 8, and the policy at step 16."""
     trainer = make_trainer("fast_sac", data={"policy_starts": 16})
     update = trainer.update
-    said = load_networks(update, clone_for("fast_sac", num_updates=1), tmp_path)
+    said = load_networks(update, clone_for("fast_sac", num_updates=0), tmp_path)
     assert "the critic starts from scratch; with data.policy_starts" in said
     networks = (update.actor, update.critic)
     first = [[own.clone() for own in network.parameters()] for network in networks]

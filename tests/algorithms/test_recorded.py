@@ -1,22 +1,21 @@
 """Recorded episodes are compared with the env of a run that learns from them, and refused by what differs."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
-from ksim_rl import conf
+from ksim_rl import envs
 from ksim_rl.algorithms.recorded import check_origin
 from ksim_rl.data.episode_folder import EPISODE, Contents, Origin
-from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.recorders import origin_of
 
-OVERRIDES = ["task=cartpole_balance", "task.sim.engine=c", "device=cpu"]
+OVERRIDES = ["task.scene.num_envs=1", "task.sim.engine=c"]
 
 
 def test_another_rate_or_model_is_refused_and_an_unknown_one_noted():
-    cfg = conf.compose(OVERRIDES)
-    env = build_env(cfg, num_envs=1, seed=0)
-    origin = origin_of(cfg, env, title="made up")
+    env = envs.build(envs.make_cfg("cartpole_balance", OVERRIDES), device="cpu")
+    origin = origin_of(SimpleNamespace(task_name="made_up"), env, title="made up")
 
     def compared(**changed):
         found = Contents(leaves=(EPISODE,), origin=replace(origin, **changed))

@@ -1,5 +1,6 @@
 """What is driven in a viewer becomes whole episodes, with the env states that were seen."""
 
+import pytest
 import torch
 
 from ksim_rl.data import read_episodes
@@ -10,6 +11,7 @@ from ksim_rl.viewer.played import find
 TASK = ["task=cartpole_swingup", "task.sim.engine=c", "task.episode_length_s=0.03"]
 
 
+@pytest.mark.full
 def test_whole_episodes_are_those_that_were_driven(tmp_path):
     played = find(TASK, agent="random", device="cpu")
     session = session_of(played, num_envs=1, seed=0)
