@@ -131,6 +131,33 @@ class Capsule(FreeBody):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Stand(Checked):
+    """A block on the plane z = 0 that does not move, for things to stand on: body and geom are called "stand".
+
+    Edges are in m; friction is sliding (1), torsional (m) and rolling (m), as in MJCF.
+    """
+
+    size: tuple[Positive, Positive, Positive] = (0.3, 0.3, 0.6)
+    friction: tuple[NonNegative, NonNegative, NonNegative] = (0.6, 0.005, 0.0001)
+    rgba: tuple[Share, Share, Share, Share] = (0.55, 0.5, 0.45, 1.0)
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a new spec of the model."""
+        spec = mujoco.MjSpec()
+        spec.modelname = "stand"
+        half = [edge / 2 for edge in self.size]
+        body = spec.worldbody.add_body(name="stand", pos=[0.0, 0.0, half[2]])
+        body.add_geom(
+            name="stand",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=half,
+            friction=list(self.friction),
+            rgba=list(self.rgba),
+        )
+        return spec
+
+
+@dataclass(frozen=True, kw_only=True)
 class Mesh(FreeBody):
     """A thing of a mesh, an OBJ, STL or MSH file: body, joint and geom are all called "mesh".
 
