@@ -34,7 +34,6 @@ class NativeKernel:
     ) -> None:
         types = {name: _type_of(kind) for name, kind in fields.items()}
         arguments: Any = wp.struct(type("Arguments", (), {"__annotations__": types}))
-        upstream.leave_out_derivatives(arguments)
 
         # The C++ sees the thread's place under the names that its author chose.
         @wp.func_native(f"const int {indices[0]} = index_0, {indices[1]} = index_1;\n{source}")

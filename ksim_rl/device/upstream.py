@@ -16,8 +16,6 @@ from typing import Any
 
 import torch
 import warp as wp
-from warp._src import codegen
-from warp._src.codegen import Struct
 
 # torch 2.10 to 2.13 and Warp 1.19: exceptions of a failed allocation carry no size, only these texts do (Warp's, then
 # torch's on CUDA and on the CPU).
@@ -33,8 +31,6 @@ ABSENT_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 # Warp 1.19 raises a bare exception with these words where the file of a compiled module is none.
 UNLOADABLE = "Failed to load "
-# What Warp 1.19 writes next after a struct.
-_DERIVATIVES = "\nstatic CUDA_CALLABLE void adj_"
 # Clang's, which Warp 1.19 carries.
 TEMPLATES_IN_HEADER = "-fpch-instantiate-templates"
 
@@ -112,36 +108,6 @@ def keep_templates_in_header() -> None:
         flags = "-march=native"
     if TEMPLATES_IN_HEADER not in flags.split():
         wp.config.cpu_compiler_flags = f"{flags} {TEMPLATES_IN_HEADER}".lstrip()
-
-
-# Names in C++ of the structs without derivatives.
-_plain_structs: set[str] = set()
-
-
-def leave_out_derivatives(struct: Struct) -> None:
-    """Let Warp write no derivatives of a struct, which takes a fifth of the time that our kernels compile.
-
-    It writes them of every struct that a kernel takes, and none of ours has a backward pass. Checked with Warp 1.19.
-    """
-    _shorten_structs()
-    _plain_structs.add(struct.native_name)
-
-
-@functools.cache
-def _shorten_structs() -> None:
-    """Replace `codegen_struct`, which has no setting for it."""
-    write = codegen.codegen_struct
-
-    @functools.wraps(write)
-    def write_without(struct: Struct, *given: Any, **named: Any) -> str:
-        text = write(struct, *given, **named)
-        if struct.native_name not in _plain_structs:
-            return text
-        # The struct itself comes first.
-        plain, _, _ = text.partition(_DERIVATIVES)
-        return f"{plain}\n"
-
-    codegen.codegen_struct = write_without
 
 
 def watch_loads(mend: Callable[[Path, Exception, int], None]) -> None:

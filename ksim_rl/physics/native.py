@@ -12,7 +12,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from ksim_rl.device import headers
-from ksim_rl.device.upstream import leave_out_derivatives, with_preamble
+from ksim_rl.device.upstream import with_preamble
 from ksim_rl.physics.structs import Field, filled, values_of
 from ksim_rl.physics.upstream import Struct
 
@@ -104,7 +104,6 @@ def _kernel(
 
     Problem.__annotations__ = dict(types)
     struct = wp.struct(Problem)
-    leave_out_derivatives(struct)
     # Or else loops over nothing are compiled.
     known = f"__builtin_assume(lane >= 0 && lane < {lanes});\n"
     values = [f"problem.{name}" for name, _ in types]

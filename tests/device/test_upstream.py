@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 import warp as wp
-from warp._src import codegen
 from warp._src.build import build_cpu
 
 from ksim_rl.device import upstream
@@ -124,18 +123,6 @@ def test_templates_in_the_header_are_not_worked_out_for_each_module(tmp_path: Pa
             seconds[flags] = time.thread_time() - start
     without, with_templates = seconds.values()
     assert with_templates < without / 3, "Clang's -fpch-instantiate-templates does nothing any more"
-
-
-def test_derivatives_are_left_out_of_the_structs_that_are_named_and_of_no_other() -> None:
-    of_another = codegen.codegen_struct(Pair)
-    assert "adj_atomic_add(" in of_another and "void adj_" in of_another, (
-        "Warp writes other derivatives of a struct"
-    )
-    named = wp.struct(type("Named", (), {"__annotations__": {"first": int, "second": float}}))
-    upstream.leave_out_derivatives(named)
-    expected, _, _ = of_another.replace(Pair.native_name, named.native_name).partition("\nstatic ")
-    assert codegen.codegen_struct(named).strip() == expected.strip()
-    assert codegen.codegen_struct(Pair) == of_another
 
 
 def test_diversion_ends_with_its_block() -> None:
