@@ -191,14 +191,14 @@ def test_a_job_belongs_to_who_has_its_log_until_that_process_ends(reproduce, tmp
         runner.Runs(load(path), tmp_path / "new", tmp_path / "new_runs", smoke=False)
         for _ in range(2)
     )
-    taken, log = first._next([job], set(), print)
+    taken, log = first._next([job], [], set(), print)
     assert taken == job
     sleeper = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, stdout=log)
     log.close()
     elsewhere = set()
-    assert second._next([job], elsewhere, print) is None and elsewhere == {job}
+    assert second._next([job], [], elsewhere, print) is None and elsewhere == {job}
     sleeper.communicate(b"\n")
-    assert second._next([job], elsewhere, print)[0] == job
+    assert second._next([job], [], elsewhere, print)[0] == job
 
 
 def test_what_another_process_has_done_meanwhile_is_kept(reproduce, tmp_path, capsys):
@@ -207,7 +207,7 @@ def test_what_another_process_has_done_meanwhile_is_kept(reproduce, tmp_path, ca
     runs = runner.Runs(
         load(path), reproduce.folder / "poles", tmp_path / "runs" / "poles", smoke=False
     )
-    assert runs._next([("ppo/Balance", 1)], set(), print) is None
+    assert runs._next([("ppo/Balance", 1)], [], set(), print) is None
     assert "ppo/Balance, seed 1: done by another process" in capsys.readouterr().out
 
 
