@@ -99,7 +99,7 @@ def read_offline_table(
 ) -> tuple[OfflineTable, list[str]]:
     """Read `data.offline.source` onto a device; return it with notes of what could not be compared.
 
-    A ValueError names a leaf, the control rate or the model where it is not that of the env.
+    A ValueError names a leaf, the control rate or the model where it differs from the env's.
     """
     assert data.offline is not None
     folder = Path(data.offline.source)

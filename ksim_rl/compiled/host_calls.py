@@ -150,7 +150,7 @@ class _Tracer:
             self._add(HostCall(what=RANDOM, name="numpy.random", place=place, part=part))
 
     def _take(self, what: str, name: str, frame: types.FrameType | None) -> None:
-        # Python's own modules ask for whoever calls them: `random.uniform`, `Path.read_text`.
+        # Python's own modules ask on behalf of their callers: `random.uniform`, `Path.read_text`.
         # Up to the first frame outside of the standard library.
         while frame is not None and package_of(_module(frame)) in sys.stdlib_module_names:
             frame = frame.f_back

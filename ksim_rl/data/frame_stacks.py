@@ -77,7 +77,7 @@ class FrameStacks:
     def depths(
         self, first_E: Int64[Tensor, " E"], done_ET: Bool[Tensor, "E T"]
     ) -> Int64[Tensor, "E T"]:
-        """Return the depth of each env state of a rollout, from that of the first and the ends of episodes."""
+        """Return the depth of each env state of a rollout, from the first one's depth and the ends of episodes."""
         step_T = torch.arange(done_ET.shape[1], device=done_ET.device)
         # The step at which the episode begins that a step belongs to; the first one has begun before the rollout.
         begins_ET = torch.where(done_ET, step_T + 1, -self.reach).roll(1, 1)

@@ -299,7 +299,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         return values_ET.isfinite().reshape(index_N.numel(), -1).all(1)
 
     def _make_unavailable(self, row_N: Tensor) -> None:
-        """Mark rows that hold no env state yet, and those of env states whose place they take."""
+        """Mark rows that hold no env state yet, and rows of env states whose place they take."""
         self.available.index_fill_(0, row_N, False)
         if self.stacks.reach:
             self.available.index_fill_(0, self._beyond(row_N), False)

@@ -1,4 +1,4 @@
-"""The description of an env for whoever runs its policy elsewhere: joints, terms, actions, limits."""
+"""The description of an env for running its policy elsewhere: joints, terms, actions, limits."""
 
 from collections.abc import Sequence
 

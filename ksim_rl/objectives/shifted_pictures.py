@@ -15,7 +15,7 @@ class ShiftedPictures:
 
     The frames of a stack move together, and the observation that follows an env state by draws of its own, as in DrQ-v2
     (Yarats et al., arXiv 2107.09645). `layouts` has the pictures by key. Draws are of torch's default generator, as
-    those of the minibatch are. Makes no host sync. A ValueError says where networks read no picture.
+    the minibatch's are. Makes no host sync. A ValueError says where networks read no picture.
     """
 
     def __init__(self, layouts: Mapping[NestedKey, Layout], *, pixels: int) -> None:

@@ -191,7 +191,7 @@ class Substeps:
         if sensors == "contacts":
             # Contact sensors that follow MuJoCo Warp's may be of sites, and of velocities.
             return self._reads_contacts or warp_model.sensor_contact_acc_adr.size > 0
-        # Otherwise sensors, or whoever reads views after the last substep, do.
+        # Otherwise sensors, or readers of views after the last substep, do.
         return is_last or sensors != "none"
 
     def place_fixed_geoms(self) -> None:

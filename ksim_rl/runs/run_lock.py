@@ -69,7 +69,7 @@ def _take(folder: Path) -> IO[str]:
         file = open_own(folder / LOCK)
         try:
             if try_lock(file):
-                with suppress(FileNotFoundError):  # whoever had it may have removed it meanwhile
+                with suppress(FileNotFoundError):  # its holder may have removed it meanwhile
                     if os.path.samestat(os.fstat(file.fileno()), os.stat(folder / LOCK)):
                         return file
             elif (holder := file.read(MOST_LETTERS)) or attempt == 20:

@@ -166,7 +166,7 @@ class _Judge(Hook):
 def _record(cfg: RunCfg, row: Row, judge: _Judge, run_folder: Path, *, smoke: bool) -> int:
     """Keep episodes of the final policy in the run folder; return how many env states they are."""
     folder = run_folder / EPISODES
-    # Those of an earlier attempt are of another policy.
+    # Episodes of an earlier attempt are of another policy.
     if folder.is_dir():
         shutil.rmtree(folder)
     actor = judge.actor

@@ -101,7 +101,7 @@ class Lifted(RewardTerm):
 
     Attributes:
         body, geom: the box and its geom, which stands upright.
-        stand, rise: the height of the stand, and that of the box above it that counts as lifted, m.
+        stand, rise: the height of the stand, and the height above it at which the box counts as lifted, m.
     """
 
     body: str
@@ -238,7 +238,7 @@ def g1_carry_box() -> ManagerBasedRlEnvCfg:
     scale = {of_robot(joint): value for joint, value in ROBOT.action_scale.items()}
     return ManagerBasedRlEnvCfg(
         decimation=4,
-        # A held box slips where friction is as soft as contact. Rows are those of a robot that lies on its arms.
+        # A held box slips where friction is as soft as contact. Rows suffice for a robot that lies on its arms.
         sim=dataclasses.replace(velocity.sim(cone="elliptic", impratio=10.0), njmax=320),
         scene=_scene(),
         observations=_observations(),

@@ -184,7 +184,7 @@ class StartOfTrial(ResetByChoice, StartInMotion):
 
     def draw_start(self, view: EnvView) -> tuple[Int64[Tensor, " E"] | None, Float[Tensor, " E"]]:
         """Return what was chosen."""
-        # Drawn and not used: the errors that are drawn next are those of `StartInMotion` at the same seed.
+        # Drawn and not used, so that the errors that are drawn next equal `StartInMotion`'s at the same seed.
         view.uniform(2)
         return super().draw_start(view)
 

@@ -147,9 +147,9 @@ class _Own(Transform):
         ([ObservationHistory("count", length=3, flat=False)], {"count": 3}),
         ([_Own(), ObservationHistory([VECTOR], ["a"], length=2, flat=False)], {"a": 2}),
         ([ObservationHistory("count", length=3)], {}),
-        # The frames between those of a larger stride are in no stack.
+        # With a larger stride, the frames in between are in no stack.
         ([ObservationHistory("count", length=3, stride=2, flat=False)], {}),
-        # The newest frames of late or changed stacks are not those of the steps before.
+        # The newest frames of late or changed stacks are not the frames of the steps before.
         *(
             ([ObservationHistory(["count", "drawn"], length=2, flat=False), behind], {"drawn": 2})
             for behind in (

@@ -14,7 +14,7 @@
 
 namespace ksim {
 
-// A table of all periods as CSV, and a line with # in front for each event, which is shown, too. Columns are as those of
+// A table of all periods as CSV, and a line with # in front for each event, which is shown, too. Columns are as in
 // loop.py. Nothing here waits for the disk: what it cannot take is dropped, and counted in `lost`.
 class Journal {
  public:

@@ -90,7 +90,7 @@ class Json {
     return found;
   }
 
-  // `size` numbers: those of a list, or one for all.
+  // `size` numbers: the list's, or one for all.
   Numbers spread(size_t size) const {
     if (kind == Kind::number) return Numbers(size, number_);
     Numbers found = numbers();

@@ -1,4 +1,4 @@
-// What a robot may not pass, and how long hand-overs last: the options of the loop, as those of loop.py.
+// The limits of a robot's motion, and how long hand-overs last: options of the loop, as in loop.py.
 #pragma once
 
 #include <stdexcept>

@@ -12,7 +12,7 @@
 
 int main(int count, char** arguments) try {
   const ksim::Options options = ksim::parse_options(count, arguments);
-  if (options.port == 0) throw std::runtime_error("--port: expected that of the robot on the loopback address");
+  if (options.port == 0) throw std::runtime_error("--port: expected the robot's port on the loopback address");
   ksim::PolicyControl control(options.folder, ksim::read_json(options.folder + "/export.json"));
   ksim::UdpRobot robot(options.port);
   return ksim::drive(robot, control, options);

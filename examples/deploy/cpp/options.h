@@ -1,4 +1,4 @@
-// The options of the loop: those of loop.py that a robot of yours needs.
+// The options of loop.py that your own robot needs.
 #pragma once
 
 #include <cstring>

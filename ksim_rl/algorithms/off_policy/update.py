@@ -53,12 +53,12 @@ OF_TEMPERATURE = {"entropy": "loss/entropy", "alpha": "update/alpha"}
 class OffPolicyUpdate(RolloutUpdate):
     """Adds a rollout to the replay and improves actor and critics with minibatches of it, without a host sync.
 
-    Until each env has made `learning_starts` steps, rollouts have random actions, or those of the policy whose weights
-    were loaded, and there are no gradient steps. Until `policy_starts` the critics learn alone. From then on an update
-    is `num_minibatches` gradient steps of the critics, each followed by one of the target networks, and by one of the
-    actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`, `mirror` has mirror
-    images of the networks' inputs and of the action. Of observations that `stacks` knows to be so many frames (see
-    `stacked_frames`), the replay holds each frame once. `shared`: `RolloutUpdate`'s other arguments.
+    Until each env has made `learning_starts` steps, rollouts have random actions, or actions of the policy whose
+    weights were loaded, and there are no gradient steps. Until `policy_starts` the critics learn alone. From then on an
+    update is `num_minibatches` gradient steps of the critics, each followed by one of the target networks, and by one
+    of the actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`, `mirror` has
+    mirror images of the networks' inputs and of the action. Of observations that `stacks` knows to be so many frames
+    (see `stacked_frames`), the replay holds each frame once. `shared`: `RolloutUpdate`'s other arguments.
     """
 
     def __init__(

@@ -62,7 +62,7 @@ def read_json(path: Path) -> Export:
             f"{path}: format 1, of before observations were traced: write it once more with `ksim-rl export RUN`; the "
             "folder's own runner.py still runs it"
         )
-    # Entries are not looked at here: whoever reads a size or a number checks it.
+    # Entries are not looked at here: the reader of a size or a number checks it.
     return cast(Export, found)
 
 

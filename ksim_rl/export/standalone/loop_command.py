@@ -224,7 +224,7 @@ def _operators(
         seconds = math.inf if seconds else 0.0
     if options.dry_run:
         heard.append(EndOfDryRun())
-        # The end is said; whoever has no keyboard shall not end it sooner.
+        # The end is set; a missing keyboard must not end it sooner.
         heard.append(Keyboard(sys.stdin, leads=False))
         return heard
     heard.append(Keyboard(sys.stdin, leads=not seconds))

@@ -41,7 +41,7 @@ class PictureWatch:
     def __call__(self, now: float, measurement: Measurement) -> None:
         """Look at the pictures of a measurement at a time, s of `time.monotonic`."""
         for name, oldest in self.oldest.items():
-            # Of a robot without this camera nothing was promised; whoever reads it says so.
+            # A robot without this camera promised nothing; the reader of the picture reports it.
             if name in measurement.picture_stamps:
                 self._check_age(name, now - measurement.picture_stamps[name], oldest)
             elif name in measurement.pictures:

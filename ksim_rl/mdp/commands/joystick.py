@@ -74,5 +74,5 @@ class JoystickCommand(CommandTerm):
         visualizer.text((x, y, z + 0.3), shown)
 
     def _held(self, view: EnvView) -> Tensor:
-        # Kept over resets: whoever steers does not know of them.
+        # Kept over resets: the driver does not know of them.
         return view.buffer("held_EK", len(self.axes), keep=True)

@@ -109,8 +109,8 @@ class RandomizeSolidSize(RandomizeGeomSize):
             if mass <= 0.0 or not np.allclose(fits, model.body_inertia[body], rtol=1e-3):
                 raise ValueError(
                     f"RandomizeSolidSize.geoms={self.geoms!r}: body {model.body(body).name!r} has another mass or "
-                    f"inertia than that of geom {model.geom(geom).name!r} alone: take RandomizeGeomSize, which leaves "
-                    "both as they are"
+                    f"inertia than geom {model.geom(geom).name!r} alone would give: use RandomizeGeomSize, which keeps "
+                    "both"
                 )
             size_E3 = view.field("geom_size")[:, geom]
             mass_E = torch.full_like(size_E3[:, 0], mass)

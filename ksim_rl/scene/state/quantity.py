@@ -19,7 +19,7 @@ def quantity(compute: Callable[[Any], Shaped[Tensor, "*shape"]]) -> property:
         return value
 
     read.__name__ = name
-    # For whoever asks for the shape.
+    # For callers that ask for the shape.
     read.__annotations__["return"] = compute.__annotations__["return"]
     return property(read, doc=compute.__doc__)
 

@@ -1,4 +1,4 @@
-"""Things of another size in each world are those of models that MuJoCo compiles with these sizes."""
+"""Objects of another size in each world equal models that MuJoCo compiles with these sizes."""
 
 import dataclasses
 
@@ -152,7 +152,7 @@ def test_what_has_no_size_of_its_own_is_refused(tmp_path):
         (
             MjcfRobot(source=two),
             mdp.RandomizeSolidSize(geoms="cube/yolk", ranges={0: (0.01, 0.02)}),
-            "has another mass or inertia than that of geom 'cube/yolk' alone",
+            "has another mass or inertia than geom 'cube/yolk' alone",
         ),
     ):
         scene = dataclasses.replace(cfg.scene, objects={"cube": thing}, num_envs=1)
