@@ -59,6 +59,13 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "motions": (*STEP, *LEARN, "ksim_rl/tracking"),
     "nan_names": ("ksim_rl/envs/non_finite.py", "ksim_rl/device/quick_launch.py"),
     "narrow_phase": ("ksim_rl/physics",),
+    "networked_policy": (
+        "ksim_rl/identification/actuator_nets.py",
+        "ksim_rl/identification/motor_signals.py",
+        "ksim_rl/identification/excitation.py",
+        *STEP,
+        *LEARN,
+    ),
     "num_envs": (*STEP, *LEARN),
     "pixels": (*STEP, *LEARN, *TASK),
     "off_policy_update": (*LEARN, "ksim_rl/device"),

@@ -57,6 +57,8 @@ TRAINING = (
     "device=cpu",
 )
 EPISODES = 100
+EFFORT_NOISE = 0.1
+"""N m, of measured efforts; the limits are 20 to 60."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +99,7 @@ def main() -> int:
             for name, overrides in (("without", []), ("with", found)):
                 run = Path(folder) / f"{name}_{seed}"
                 train(run, [*overrides, f"seed={seed}"])
-                returns[name].append(score(run, _on(hidden)))
+                returns[name].append(score(run, put_in(hidden)))
                 at_home[name].append(score(run, lambda cfg: cfg))
                 print(f"{name}, seed {seed}: {returns[name][-1]:.2f} on the hidden arm", flush=True)
     figures = {f"hidden_arm/{name}": mean(values) for name, values in returns.items()}
@@ -128,8 +130,8 @@ def identified(hidden: HiddenArm, folder: Path) -> list[str]:
     return json.loads(found.read_text())["overrides"][TASK]
 
 
-def follow(hidden: HiddenArm, plan: Sequence[str]) -> str:
-    """Return the log of the hidden arm under the lines of a plan of positions."""
+def follow(hidden: HiddenArm, plan: Sequence[str], *, has_efforts: bool = False) -> str:
+    """Return the log of the hidden arm under the lines of a plan of positions, with measured efforts where asked."""
     table = np.loadtxt(plan[1:], delimiter=",")
     spec = hidden.spec()
     spec.option.timestep = PHYSICS_S
@@ -140,12 +142,21 @@ def follow(hidden: HiddenArm, plan: Sequence[str]) -> str:
     motors = [model.actuator(name).id for name in names]
     data.qpos[address] = table[0, 1:]
     rng = np.random.default_rng([hidden.seed, 57])
-    lines = [",".join([plan[0], *(f"{name}.position" for name in names)])]
+    speeds = [int(model.joint(name).dofadr[0]) for name in names]
+    head = [plan[0], *(f"{name}.position" for name in names)]
+    if has_efforts:
+        head += [f"{name}.effort" for name in names]
+    lines = [",".join(head)]
     for row, (time, *asked) in enumerate(table):
         read = data.qpos[address] + rng.normal(0.0, NOISE, len(names))
         counted = np.round(read / COUNT) * COUNT
-        lines.append(",".join(f"{value:.9g}" for value in (*table[row], *counted)))
+        cells = [*table[row], *counted]
         data.ctrl[motors] = asked
+        if has_efforts:
+            # Of the motors at the reading, before anything moves.
+            mujoco.mj_forward(model, data)
+            cells += list(data.qfrc_actuator[speeds] + rng.normal(0.0, EFFORT_NOISE, len(names)))
+        lines.append(",".join(f"{value:.9g}" for value in cells))
         until = table[min(row + 1, len(table) - 1), 0]
         mujoco.mj_step(model, data, nstep=round((until - time) / PHYSICS_S))
     return "\n".join(lines) + "\n"
@@ -169,7 +180,7 @@ def score(run: Path, change: Change) -> float:
     ).return_mean
 
 
-def _on(hidden: HiddenArm) -> Change:
+def put_in(hidden: HiddenArm) -> Change:
     """Return the change that puts the hidden arm into the task, without what its training drew."""
 
     def change(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:

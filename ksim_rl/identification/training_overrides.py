@@ -17,6 +17,7 @@ from ksim_rl.mdp.randomization.joints import (
     RandomizeJointFrictionLoss,
 )
 from ksim_rl.scene.actuators import Actuator, DelayedActuator, without_delay
+from ksim_rl.scene.scene import scene_spec
 
 EVENTS: Mapping[str, type[RandomizeJointField]] = {
     "armature": RandomizeJointArmature,
@@ -71,13 +72,11 @@ def left_out(findings: Findings, cfg: ManagerBasedRlEnvCfg) -> list[str]:
 
 
 def time_step(cfg: ManagerBasedRlEnvCfg) -> float:
-    """Return the physics step of a task, s, in which delays and the past of networks count."""
-    timestep = cfg.sim.timestep
-    if timestep is None:
-        raise ValueError(
-            "--task: it leaves its time step to the model, and delays count in these: choose a task that sets one"
-        )
-    return timestep
+    """Return the physics step of a task, s, in which delays and the past of networks count.
+
+    A task that leaves it to the model has the model's.
+    """
+    return float(scene_spec(cfg.scene, cfg.sim).option.timestep)
 
 
 def net_override(robot: str, entries: Sequence[Actuator], cfg: ManagerBasedRlEnvCfg) -> str:

@@ -4,7 +4,12 @@ import pytest
 
 from ksim_rl import conf, envs
 from ksim_rl.identification.findings import Estimate, Findings
-from ksim_rl.identification.training_overrides import left_out, net_override, overrides
+from ksim_rl.identification.training_overrides import (
+    left_out,
+    net_override,
+    overrides,
+    time_step,
+)
 from ksim_rl.scene.actuators import DelayedActuator, MLPActuator
 from ksim_rl.scene.robots import Arm, UnitreeGo2
 
@@ -87,6 +92,10 @@ def test_networks_drive_the_robot_of_a_task(tmp_path):
     assert not set(line) & set(" \t'\"$")
     changed = conf.compose(["task=go2_velocity_flat", line]).task
     assert list(changed.scene.robots["go2"].actuators) == entries
+    # An arm's servos are its model's own, and so is its time step.
+    arm = envs.task("arm_reach").cfg()
+    assert net_override("arm", [], arm) == "task.scene.robots.arm.actuators=[]"
+    assert time_step(arm) == 0.005
     with pytest.raises(ValueError, match="'a b' cannot stand in words of a shell"):
         net_override("go2", [MLPActuator(joints="a b", file="a")], cfg)
     with pytest.raises(ValueError, match="'cartpole' has no field `actuators`"):

@@ -15,8 +15,10 @@ from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.loggers import WandbCfg
 from ksim_rl.zoo import cards, locate, read_card, wandb_runs
 from ksim_rl.zoo.adding import add
-from ksim_rl.zoo.cards import FOLDER, MOST_BYTES
+from ksim_rl.zoo.cards import FOLDER, MOST_BYTES, read_transfer
 
+PAGES = Path(__file__).parents[2] / "docs"
+NOT_JUDGED = {"humanoid"}
 NAMES = [card.name for card in cards()]
 
 
@@ -40,14 +42,23 @@ def test_an_entry_is_small_and_says_where_it_comes_from(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_page_has_the_figures_of_the_card(name):
-    page = (Path(__file__).parents[2] / "docs" / "zoo.md").read_text()
+    page = (PAGES / "zoo.md").read_text()
     (row,) = [line for line in page.splitlines() if line.startswith(f"| `{name}` |")]
     card = read_card(name)
-    _, _, task, trained, earned, compared, _ = (cell.strip() for cell in row.split("|"))
+    _, _, task, trained, earned, compared, kept, _ = (cell.strip() for cell in row.split("|"))
     assert task == f"`{card.task}`" and trained.endswith(f", commit {card.commit[:7]}")
     assert float(earned.split()[0]) == pytest.approx(card.return_mean, abs=0.5)
     assert float(compared.split()[1]) == pytest.approx(card.sim2sim["return_ratio"], abs=5e-4)
     assert compared.endswith(f", {card.sim2sim['episodes']:.0f} episodes")
+    transfer = read_transfer(name)
+    if name in NOT_JUDGED:
+        assert transfer is None and kept == "-"
+        return
+    weakest = transfer["weakest"]
+    link = f"cards/{name}/card.md"
+    assert kept == f"[x {weakest['share']:.2f}, {weakest['condition']}]({link})"
+    assert transfer["verdict"] in (PAGES / link).read_text()
+    assert (PAGES / "cards" / name / "card.png").stat().st_size > 10_000
 
 
 def test_one_is_copied_into_a_run_folder(tmp_path, monkeypatch):
@@ -220,6 +231,13 @@ def test_the_list_names_all(capsys):
     assert ended.value.code == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in NAMES)
+    weakest = read_transfer(NAMES[0])["weakest"]["share"]
+    (row,) = [line for line in listed.splitlines() if line.startswith(NAMES[0])]
+    assert f"x {weakest:.2f}" in row
+    with pytest.raises(SystemExit):
+        main(["zoo", NAMES[0]])
+    shown = json.loads(capsys.readouterr().out)["transfer"]
+    assert shown["weakest"]["share"] == weakest and "as trained" in shown["shares"]
 
 
 # -- Weights & Biases --------------------------------------------------------------------------------------------

@@ -108,9 +108,19 @@ class Arm(ShippedModel):
 
     Its weight is compensated, as in many small arms. The tip reaches 0.6 m from the shoulder, 0.16 m above the
     table, and points straight down in the ready pose. Only the pusher collides, with whatever has `contype` 1.
+    `actuators`, such as networks that were fitted to a log, replace the servos.
     """
 
     name: ClassVar[str] = "arm"
 
+    actuators: tuple[Actuator, ...] = ()
+
     joints: ClassVar[tuple[str, ...]] = ("yaw", "shoulder", "elbow", "wrist")
     tip: ClassVar[str] = "tip"
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a new spec of the model."""
+        spec = super().spec()
+        # Without actuators this changes nothing.
+        set_actuators(spec, self.actuators)
+        return spec
