@@ -106,8 +106,10 @@ def test_the_blind_see_black(name):
     cfg = run_cfg(load("pixels").rows[name], 1, device="cpu", smoke=True)
     env = build_env(cfg, num_envs=2, seed=1)
     root = env.reset()
-    (pictures,) = [leaf for leaf in root.values(True, True) if leaf.dtype == torch.uint8]
-    assert pictures.shape[-3:] == (64, 64, 3) and not pictures.any()
+    pictures = [leaf for leaf in root.values(True, True) if leaf.dtype == torch.uint8]
+    assert pictures
+    for leaf in pictures:
+        assert leaf.shape[-3:] == (64, 64, 3) and not leaf.any()
 
 
 def test_a_policy_without_an_encoder_and_a_replay_without_memory_are_refused():
