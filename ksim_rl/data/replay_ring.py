@@ -1,5 +1,6 @@
 """The replay of off-policy learning: it holds the last env states of each env, and draws of them."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -207,7 +208,7 @@ class ReplayCfg(Checked):
     With `offline` a share of each minibatch are recorded env states (RLPD, Ball et al., arXiv 2302.02948).
 
     Without `save_replay` checkpoints are small, and a resumed run begins with an empty replay and random actions until
-    `learning_starts`, so that it is not the same run any more.
+    `learning_starts`, so that it is not the same run any more; steps until `policy_starts` are counted again, too.
     """
 
     num_env_states_per_minibatch: Count  # env states of a gradient step
@@ -240,10 +241,14 @@ class ReplayCfg(Checked):
                 raise ValueError(
                     "prioritized=True with offline: priorities are of the replay alone; leave one of them out"
                 )
-        if 0 < self.policy_starts <= self.learning_starts:
+        # Learning begins with the first whole rollout that reaches `learning_starts`.
+        rollouts = max(1, math.ceil(self.learning_starts / self.num_steps))
+        learns_at = rollouts * self.num_steps
+        if 0 < self.policy_starts <= learns_at:
             raise ValueError(
-                f"policy_starts={self.policy_starts} is not beyond learning_starts={self.learning_starts}: the critics "
-                "learn alone in between; raise it, or leave it at 0"
+                f"policy_starts={self.policy_starts} is not beyond step {learns_at}, at which learning starts with "
+                f"learning_starts={self.learning_starts} and num_steps={self.num_steps}: the critics learn alone in "
+                "between; raise it, or leave it at 0"
             )
 
     def least_numbers(self, num_envs: int) -> Mapping[tuple[str, ...], float]:
@@ -384,28 +389,28 @@ class ReplayRing(ReplayBuffer):
         return index
 
     def state_dict(self) -> State:
-        """Return the ring, and the priorities where there are any; without `save_replay` nothing."""
-        if not self.cfg.save_replay:
-            return {}
-        state = {"ring": self._ring.state_dict(), "sampler": self.sampler.state_dict()}
+        """Return the ring and its priorities, without `save_replay` neither, and the hash of a recording."""
+        state: State = {}
+        if self.cfg.save_replay:
+            state = {"ring": self._ring.state_dict(), "sampler": self.sampler.state_dict()}
         if self.offline is None:
             return state
         # The recording itself stays in its folder.
         return {**state, "offline_sha256": self.offline.sha256}
 
     def load_state_dict(self, state_dict: State) -> None:
-        """Continue where `state_dict` was taken; an empty one empties the ring.
+        """Continue where `state_dict` was taken; one without a ring empties it.
 
         A ValueError where the offline table is another one.
         """
-        if not state_dict:
-            self.empty()
-            return
         own = self.offline and self.offline.sha256
         if state_dict.get("offline_sha256") != own:
             raise ValueError(
                 "data.offline.source: it is another recording than the checkpoint's, whose sha256 is "
                 f"{state_dict.get('offline_sha256')}, and here {own}: give back the folder as it was"
             )
+        if "ring" not in state_dict:
+            self.empty()
+            return
         self._ring.load_state_dict(branch(state_dict, "ring"))
         self.sampler.load_state_dict(dict(branch(state_dict, "sampler")))

@@ -10,10 +10,10 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import Compose, Transform
 
 from ksim_rl.checked import Checked, Count
-from ksim_rl.transforms import ring
+from ksim_rl.transforms import ring, stock
 from ksim_rl.transforms.checked_keys import Keys
 from ksim_rl.transforms.columns import side_by_side
 from ksim_rl.transforms.row_transform import RowTransform
@@ -211,13 +211,13 @@ def stacked_frames(env: EnvBase) -> dict[NestedKey, int]:
     """Return how many frames each observation [E, N, ...] stacks of which every one is the newest of an earlier step.
 
     Those are the results of an `ObservationHistory` with `flat=False` and a stride of 1 that nothing changes after it.
-    A transform of a user's own behind it may change anything, so nothing is said then.
+    A transform of a user's own behind it may change anything, and one that steps the env itself leaves frames out, so
+    nothing is said then.
     """
     assert env.output_spec is not None  # making the specs is what counts the dims
     found: dict[NestedKey, int] = {}
     for transform in _from_inside(env):
-        # Only of these the out keys are known to be all that they write.
-        if type(transform).__module__.partition(".")[0] not in ("ksim_rl", "torchrl"):
+        if not _is_known(transform):
             found.clear()
         for key in transform.out_keys or ():
             found.pop(unravel_key(key), None)
@@ -228,6 +228,15 @@ def stacked_frames(env: EnvBase) -> dict[NestedKey, int]:
             if batch_dims == 1:
                 found[unravel_key(key)] = transform.length
     return found
+
+
+def _is_known(transform: Transform) -> bool:
+    """Return whether a transform writes its out keys alone, and makes one step of the env inside of it at a time."""
+    kind = type(transform)
+    package = kind.__module__.partition(".")[0]
+    if package == stock.PACKAGE:
+        return kind is Compose or kind.__name__ in stock.DATA
+    return package == "ksim_rl"
 
 
 def _from_inside(env: EnvBase) -> list[Transform]:

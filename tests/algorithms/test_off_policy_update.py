@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from ksim_rl.data import OfflineCfg
+from ksim_rl.data import OfflineCfg, ReplayCfg
 from ksim_rl.objectives import NonFiniteStepsError, SACCfg
 from ksim_rl.testing import count_syncs
 from ksim_rl.trainers.restoring import load_networks
@@ -113,9 +113,12 @@ def test_the_return_of_a_cloned_policy_is_kept():
     assert lowest[0] < 0.995 * BEST_RETURN < lowest[200]
 
 
-def test_a_policy_that_starts_before_its_critics_is_refused():
-    with pytest.raises(ValueError, match="policy_starts=8 is not beyond learning_starts=8"):
-        make_trainer("fast_sac", data={"policy_starts": 8})
+@pytest.mark.parametrize(("starts", "steps", "learns_at"), [(8, 4, 8), (11, 6, 12), (20, 32, 32)])
+def test_a_policy_that_starts_before_its_critics_is_refused(starts, steps, learns_at):
+    data = {"num_env_states_per_minibatch": 8, "num_minibatches": 1, "learning_starts": 8}
+    ReplayCfg(**data, num_steps=steps, policy_starts=learns_at + 1)
+    with pytest.raises(ValueError, match=f"policy_starts={starts} is not beyond step {learns_at},"):
+        ReplayCfg(**data, num_steps=steps, policy_starts=starts)
 
 
 def test_weights_for_actions_of_another_range_are_refused():
@@ -264,11 +267,13 @@ def _compare(one, other, path=""):
 
 
 def test_without_a_saved_replay_a_resumed_run_warms_up_again(tmp_path):
-    options = {"data": {"save_replay": False}}
+    options = {"data": {"save_replay": False, "offline": OfflineCfg(source="made_up")}}
     trainer = make_trainer("sac", tmp_path / "run", **options)
+    resumed = make_trainer("sac", **options)
+    for each in (trainer, resumed):
+        each.update.learn_also_from(recorded_table())
     for _ in range(4):
         trainer.iterate()
-    resumed = make_trainer("sac", **options)
     resumed.load(trainer.save())
     assert resumed.update.metrics()["replay/env_states"] == 0
     assert torch.equal(*(next(iter(one.update.actor.parameters())) for one in (trainer, resumed)))

@@ -70,13 +70,14 @@ def test_all_that_is_drawn_is_what_was_recorded(n_step, shards):
     assert len({(int(a), int(b)) for a, b in zip(episode_N, shard_N, strict=True)}) == len(LENGTHS)
 
 
-def ring_of(rows_D, *, size=8, share=0.25, shards=1):
+def ring_of(rows_D, *, size=8, share=0.25, shards=1, save_replay=True):
     cfg = ReplayCfg(
         num_env_states_per_minibatch=size,
         num_minibatches=400,
         capacity=20,
         shards=shards,
         offline=OfflineCfg(source="made_up", share=share),
+        save_replay=save_replay,
     )
     ring = ReplayRing(cfg, num_envs=2, **SHARED)
     ring.offline = make_offline_table(rows_D, shards=shards, **SHARED)
@@ -121,8 +122,13 @@ def test_a_replay_goes_on_with_the_same_recording_only():
     assert (drawn[0] == drawn[1]).all()
     other = recording()
     other["next", "reward"][3] += 1.0
-    with pytest.raises(ValueError, match="another recording than the checkpoint's"):
-        ring_of(other).load_state_dict(ring.state_dict())
+    # Whether or not the replay itself is saved.
+    without = ring_of(recording(), save_replay=False)
+    for saved in (ring.state_dict(), without.state_dict()):
+        with pytest.raises(ValueError, match="another recording than the checkpoint's"):
+            ring_of(other).load_state_dict(saved)
+    again.load_state_dict(without.state_dict())
+    assert again.num_stored == 0
 
 
 def test_rows_that_are_not_finite_are_counted_and_never_drawn():

@@ -1,7 +1,13 @@
 import pytest
 import torch
 from torchrl.data import Unbounded
-from torchrl.envs.transforms import CatFrames, Compose, Transform
+from torchrl.envs.transforms import (
+    CatFrames,
+    Compose,
+    FrameSkipTransform,
+    StepCounter,
+    Transform,
+)
 
 from ksim_rl.envs.masked_transformed_env import MaskedTransformedEnv
 from ksim_rl.testing import CounterEnv
@@ -158,6 +164,9 @@ class _Own(Transform):
             )
         ),
         ([ObservationHistory("count", length=3, flat=False), _Own()], {}),
+        # Its steps are several of the history.
+        ([ObservationHistory("count", length=3, flat=False), FrameSkipTransform(2)], {}),
+        ([ObservationHistory("count", length=3, flat=False), StepCounter()], {"count": 3}),
     ],
 )
 def test_only_stacks_that_nothing_changes_are_known_as_such(chain, found):

@@ -297,9 +297,10 @@ class OffPolicyUpdate(RolloutUpdate):
             load_optimizer_state(optimizer, saved, what=f"{name} optimizer")
         exploration = branch(state, "exploration")
         state_tree.copy_into(self.behavior.exploration_state(), exploration, what="exploration")
-        self.replay.load_state_dict(branch(state, "replay"))
+        replay = branch(state, "replay")
+        self.replay.load_state_dict(replay)
         # Without a replay the run has to collect random actions first, as at its start.
-        if state["replay"]:
+        if "ring" in replay:
             self.steps_made = int(state_tree.number(state, "steps_made"))
         else:
             self.steps_made = 0
