@@ -12,6 +12,7 @@ import re
 import shutil
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.runs.listing import METRICS
 from ksim_rl.tables.levels import HELD_STATES, Result, means_of, reached
-from ksim_rl.tables.lineage import EPISODES, overrides_of, runs_of
+from ksim_rl.tables.lineage import EPISODES, overrides_of, runs_of, sources_of
 from ksim_rl.tables.table import Row, load
 from ksim_rl.terminal import show
 from ksim_rl.tracking.trials import run_trials
@@ -105,8 +106,22 @@ def run_cfg(
     return replace(cfg, trainer=trainer, objective=replace(cfg.objective, **quick))
 
 
-def settings(row: Row, cfg: RunCfg) -> str:
-    """Return a fingerprint of all that makes a row except its seed: seeds of different settings are never mixed."""
+def settings_of(rows: Mapping[str, Row], name: str, *, smoke: bool = False) -> str:
+    """Return the fingerprint of a row, which is another one where a row that it learns from has other settings."""
+    row = rows[name]
+    return settings(row, run_cfg(row, 1, smoke=smoke), sources=_sources(rows, name, smoke=smoke))
+
+
+def _sources(rows: Mapping[str, Row], name: str, *, smoke: bool) -> list[str]:
+    """Return the fingerprints of the rows that a row learns from."""
+    return [settings_of(rows, source, smoke=smoke) for source in sources_of(rows[name])]
+
+
+def settings(row: Row, cfg: RunCfg, *, sources: Sequence[str] = ()) -> str:
+    """Return a fingerprint of all that makes a row except its seed: seeds of different settings are never mixed.
+
+    `sources` are the fingerprints of the rows that it learns from.
+    """
     # The seed tells rows of one setting apart; the device is recorded in the result.
     tree = {key: value for key, value in cfg.to_tree().items() if key not in ("seed", "device")}
     tree["row"] = {"levels": dict(row.levels), "episodes": row.episodes, "measure": row.measure}
@@ -114,6 +129,8 @@ def settings(row: Row, cfg: RunCfg) -> str:
         # Rows of before have none of these.
         if value := getattr(row, name):
             tree["row"][name] = value
+    if sources:
+        tree["row"]["sources"] = list(sources)
     # Later fields with values that change nothing must not make older results invalid.
     text = LATER.sub("", json.dumps(tree, sort_keys=True, default=str))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -193,11 +210,18 @@ def _record(cfg: RunCfg, row: Row, judge: _Judge, run_folder: Path, *, smoke: bo
 
 
 def measure(
-    row: Row, seed: int, run_folder: Path, *, device: str, smoke: bool, runs: Path | None = None
+    row: Row,
+    seed: int,
+    run_folder: Path,
+    *,
+    device: str,
+    smoke: bool,
+    runs: Path | None = None,
+    sources: Sequence[str] = (),
 ) -> Result:
     """Train and judge; return plain data. An interrupted run raises, so that it leaves no result.
 
-    Rows that it learns from are found among the `runs` of its table.
+    Rows that it learns from are found among the `runs` of its table; `sources` are their fingerprints.
     """
     cfg = run_cfg(row, seed, device=device, smoke=smoke, runs=runs)
     judge = _Judge(cfg, row, trials=8 if smoke else row.episodes)
@@ -230,7 +254,7 @@ def measure(
     code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})
     return {
         # Without the folders of this machine.
-        "settings": settings(row, run_cfg(row, seed, device=device, smoke=smoke)),
+        "settings": settings(row, run_cfg(row, seed, device=device, smoke=smoke), sources=sources),
         "commit": code["commit"] + ("-dirty" if len(code) > 1 else ""),
         "date": session.began,
         "versions": dict(session.versions),
@@ -255,13 +279,15 @@ def main(
     go_to_parents_folder()  # the table, and the paths of the command, are as they were given there
     plugins.load([])  # from KSIM_RL_PLUGINS, where `ksim-rl --plugin` has put its own
     # The child composes the row itself: it gets names only.
+    rows = load(name).rows
     found = measure(
-        load(name).rows[row],
+        rows[row],
         int(seed),
         Path(run_folder),
         device=device,
         smoke=bool(smoke),
         runs=runs_of(Path(run_folder), row),
+        sources=_sources(rows, row, smoke=bool(smoke)),
     )
     path = Path(result)
     path.parent.mkdir(parents=True, exist_ok=True)

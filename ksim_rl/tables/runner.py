@@ -17,7 +17,7 @@ from ksim_rl.files.writing import make_folder, open_own
 from ksim_rl.runs import run_lock
 from ksim_rl.tables.levels import Result
 from ksim_rl.tables.lineage import sources_of
-from ksim_rl.tables.measure import run_cfg, settings
+from ksim_rl.tables.measure import settings_of
 from ksim_rl.tables.table import Table
 
 # Polling is enough: runs take minutes.
@@ -35,7 +35,7 @@ class Runs:
         self.run_folder = run_folder
         self.smoke = smoke
         # Composing a config is slow, and each row is asked for many times.
-        self._of = cache(lambda name: run_cfg(table.rows[name], 1, smoke=smoke))
+        self._settings = cache(lambda name: settings_of(table.rows, name, smoke=smoke))
 
     def results(self) -> dict[str, dict[int, Result]]:
         """Return the results that count, by row and seed: results of the settings that the row has now."""
@@ -45,7 +45,7 @@ class Runs:
             present = {seed: _result(path) for seed, path in paths.items() if path.exists()}
             if present:
                 # Composed only where there is a result to compare with.
-                own = settings(row, self._of(name))
+                own = self._settings(name)
             else:
                 own = ""
             # A result of other settings is no result of this row.
@@ -86,6 +86,13 @@ class Runs:
                     waiting = []
                     for _, process in running.values():
                         process.kill()
+                now = [job for job, _ in running.values()]
+                for job, source in self._orphans(waiting, now):
+                    waiting.remove(job)
+                    left += 1
+                    note(
+                        f"{job[0]}, seed {job[1]}: row {source!r}, which it learns from, has no result"
+                    )
                 # One job on each slot; a slot is free as soon as its process has ended.
                 for slot, gpu in enumerate(gpus):
                     if slot not in running:
@@ -116,6 +123,21 @@ class Runs:
                 process.kill()
                 process.wait()
         return left
+
+    def _orphans(self, waiting: Sequence[Job], running: Sequence[Job]) -> list[tuple[Job, str]]:
+        """Return jobs that can never begin, each with a row that it learns from, which failed or is not run.
+
+        Half a run leaves a folder and a checkpoint, too: a row learns only from runs with results.
+        """
+        found = []
+        for job in waiting:
+            name, seed = job
+            for source in sources_of(self.table.rows[name]):
+                is_coming = (source, seed) in waiting or (source, seed) in running
+                if not is_coming and seed not in self.results()[source]:
+                    found.append((job, source))
+                    break
+        return found
 
     def _next(
         self,

@@ -1,14 +1,17 @@
 """Rows of a table learn from rows above them: episodes are recorded, cloned, and a run goes on from the clone."""
 
+from dataclasses import dataclass
+
 import pytest
 
 from ksim_rl.data import read_episodes
 from ksim_rl.runs.listing import CONFIG
+from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import report
-from ksim_rl.tables.lineage import EPISODES, depth_of, overrides_of
-from ksim_rl.tables.measure import measure, run_cfg, settings
+from ksim_rl.tables.lineage import EPISODES, depth_of, overrides_of, sources_of
+from ksim_rl.tables.measure import measure, settings_of
 from ksim_rl.tables.runner import Runs
-from ksim_rl.tables.table import load
+from ksim_rl.tables.table import Row, load
 
 TABLE = """
 title: Two ways to a pole
@@ -47,6 +50,28 @@ def test_sources_come_first_and_are_found_by_seed(tmp_path):
     assert overrides_of(clone, tmp_path, 2) == [f"objective.episodes='{found}/{EPISODES}'"]
     assert overrides_of(clone) == [f"objective.episodes='pole/nothing/{EPISODES}'"]
     assert overrides_of(rows["pole/online"]) == ["checkpoint='pole/bc'"]
+
+
+@dataclass(frozen=True)
+class Composed:
+    """Stands for the config of a row, which takes long to compose."""
+
+    row: Row
+
+    def to_tree(self):
+        return {"overrides": list(self.row.overrides)}
+
+
+def test_other_settings_of_a_row_are_others_of_all_that_learn_from_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(measuring, "run_cfg", lambda row, seed, **options: Composed(row))
+    rows = table(tmp_path).rows
+    changed = table(
+        tmp_path, "{recorded: 5}", "{recorded: 5, overrides: [objective.gamma=0.9]}"
+    ).rows
+    for name in ROWS:
+        assert settings_of(rows, name) != settings_of(changed, name)
+    # Nothing but the settings of their sources tells these apart.
+    assert rows["pole/online"] == changed["pole/online"]
 
 
 def test_a_row_waits_for_what_it_learns_from(tmp_path):
@@ -118,11 +143,15 @@ def test_the_whole_chain_runs(tmp_path):
     for name in ROWS:
         run_folder = tmp_path / "runs" / name / "seed_1"
         found[name] = measure(
-            rows[name], 1, run_folder, device="cpu", smoke=True, runs=tmp_path / "runs"
+            rows[name],
+            1,
+            run_folder,
+            device="cpu",
+            smoke=True,
+            runs=tmp_path / "runs",
+            sources=[found[source]["settings"] for source in sources_of(rows[name])],
         )
     episodes = read_episodes(tmp_path / "runs/pole/nothing/seed_1" / EPISODES)
     assert found["pole/nothing"]["recorded_env_states"] == len(episodes.env_states_D) > 0
     assert "pole/bc/seed_1" in (tmp_path / "runs/pole/online/seed_1" / CONFIG).read_text()
-    assert found["pole/online"]["settings"] == settings(
-        rows["pole/online"], run_cfg(rows["pole/online"], 1, device="cpu", smoke=True)
-    )
+    assert found["pole/online"]["settings"] == settings_of(rows, "pole/online", smoke=True)

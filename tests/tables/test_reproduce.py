@@ -16,7 +16,7 @@ from ksim_rl.envs.term import Reduction
 from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import reproduce as reproduce_command
 from ksim_rl.tables import runner
-from ksim_rl.tables.measure import measure, run_cfg, settings
+from ksim_rl.tables.measure import measure, run_cfg, settings, settings_of
 from ksim_rl.tables.table import load, shipped
 
 TABLE = """
@@ -77,9 +77,8 @@ def reproduce(monkeypatch, tmp_path):
     failing = {}
     monkeypatch.setattr(runner.Runs, "_start", start)
     # Composing a run's config takes its time, and has tests of its own below.
-    monkeypatch.setattr(runner, "settings", lambda row, cfg: str(row.overrides))
-    for module in (runner, reproduce_command):
-        monkeypatch.setattr(module, "run_cfg", lambda row, seed, **options: None)
+    monkeypatch.setattr(runner, "settings_of", lambda rows, name, smoke: str(rows[name].overrides))
+    monkeypatch.setattr(reproduce_command, "run_cfg", lambda row, seed, **options: None)
     path = tmp_path / "poles.yaml"
 
     def reproduce(*words, text=TABLE, fail=None):
@@ -168,6 +167,18 @@ def test_what_another_process_does_is_waited_for_and_not_done_again(reproduce, m
     assert (code, started) == (0, [("ppo/Balance", 2)])
     assert table["figures"]["poles/ppo/Balance"] == 101.5
     assert "ppo/Balance, seed 1: done by another process" in capsys.readouterr().out
+
+
+def test_a_row_whose_source_has_failed_does_not_begin(reproduce, capsys):
+    text = TABLE.replace("{task: reacher}", "{task: reacher, begins_from: ppo/Balance}")
+    options = {"text": text, "fail": ("ppo/Balance", 1)}
+    only_one = ("--seeds", "1", "--rows", "ppo/(Balance|Other)")
+    code, started, _ = reproduce(*only_one, **options)
+    assert (code, started) == (1, [("ppo/Balance", 1)])
+    said = "ppo/Other, seed 1: row 'ppo/Balance', which it learns from, has no result"
+    assert said in capsys.readouterr().out
+    # Nor where its source is not run at all, as another one might have its folder now.
+    assert reproduce(*only_one[:3], "ppo/Other", text=text)[:2] == (1, [])
 
 
 def test_a_job_that_another_process_took_first_is_no_failure(reproduce, monkeypatch):
@@ -289,8 +300,8 @@ def tables_with_results():
 @pytest.mark.parametrize("table", tables_with_results())
 def test_committed_results_are_of_the_settings_that_rows_have_now(table):
     table = load(table)
-    for name, row in table.rows.items():
-        expected = settings(row, run_cfg(row, 1, device="cpu"))
+    for name in table.rows:
+        expected = settings_of(table.rows, name)
         for path in (RESULTS / "tables" / table.name / name).glob("seed_*.json"):
             assert json.loads(path.read_text())["settings"] == expected, path
 
