@@ -19,7 +19,7 @@ from ksim_rl.trainers import RunProgress, record_video
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.video import FPS
 from ksim_rl.viewer.drive_recorder import check_new, recording
-from ksim_rl.viewer.played import Played, find
+from ksim_rl.viewer.played import Played, find, names_run
 from ksim_rl.viewer.session import AGENTS, Conditions, Session
 from ksim_rl.viewer.shown_motion import with_choice
 
@@ -184,6 +184,10 @@ def _check(options: argparse.Namespace) -> None:
             raise ValueError("--record: of a viewer, in which one drives: add --live")
         if options.num_envs != 1:
             raise ValueError(f"--record with --num-envs {options.num_envs}: one env is driven")
+        if options.motion is not None and not names_run(options.what[0]):
+            raise ValueError(
+                f"--record with --motion {options.motion}: nothing acts in a motion: name a run whose policy follows it"
+            )
         check_new(options.record)
     if options.output is not None and options.output.suffix not in VIDEO_SUFFIXES:
         raise ValueError(

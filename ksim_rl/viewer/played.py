@@ -35,6 +35,12 @@ class Played:
         return self.actor
 
 
+def names_run(first: str) -> bool:
+    """Return whether the first word of a command is a run or one of the zoo, and no field of a config."""
+    # A path may hold "=", so one that exists is a run.
+    return "=" not in first or Path(first).exists()
+
+
 def find(
     what: Sequence[str], *, agent: str | None, device: str, motion: str | None = None
 ) -> Played:
@@ -45,8 +51,7 @@ def find(
     of a run follows it from its start, if it is a clip of its task's motion.
     """
     first, *overrides = what
-    # A path may hold "=", so one that exists is a run.
-    is_run = "=" not in first or Path(first).exists()
+    is_run = names_run(first)
     if motion is not None and agent is not None:
         raise ValueError(f"--motion {motion} with --agent {agent}: nothing acts in a motion")
     if motion is not None and not is_run:

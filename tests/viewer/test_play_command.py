@@ -32,6 +32,10 @@ from ksim_rl.viewer.session import showing_motion
         (["RUN", "--record", "driven"], "--record: of a viewer, in which one drives: add --live"),
         (["RUN", "--live", "--record", "tests"], "--record tests: it holds something"),
         (["RUN", "--live", "--record", "x", "--num-envs", "2"], "one env is driven"),
+        (
+            ["task=walker_track", "--motion", "walker_walk", "--live", "--record", "x"],
+            "--record with --motion walker_walk: nothing acts in a motion",
+        ),
         (["RUN", "--output", "clip.avi"], "ends in .mp4 or .gif"),
     ],
 )
