@@ -207,6 +207,7 @@ FAULTS = {
     "beyond": (harmed(joint_pos=lambda _: np.array([0.0, -2.9])), "left is at -2.900"),
     "fast": (harmed(joint_vel=lambda _: np.array([0.0, 21.0])), "left moves with 21.0"),
     "not finite": (harmed(joint_vel=lambda _: np.array([np.nan, 0.0])), "joint_vel of right"),
+    "no estimate": (harmed(estimates=lambda _: {}), "no sensor in a message"),
     "too few": (harmed(joint_effort=lambda _: np.zeros(1)), "joint_effort has"),
 }
 
@@ -222,6 +223,25 @@ def test_a_walk_and_every_fault_are_those_of_loop_py(replay, folder):
     for robot_of, said in FAULTS.values():
         machine = compare(replay, folder, robot_of, Script(**WALK))
         assert said in machine.fault
+
+
+BROKEN = {
+    "0.3,1x": "joint_pos has '1x' in a message: expected a number",
+    "0.3,": "joint_pos has the shape (1,): expected (2,)",
+    "-": "joint_pos has '-' in a message",
+    "0.3,,": "joint_pos has '' in a message",
+}
+
+
+@pytest.mark.parametrize("pos", BROKEN)
+def test_a_broken_line_is_no_measurement(replay, folder, pos):
+    line = f"0.0 - 0.0 7 {pos} 0,0 0,0 1,0,0,0 0,0,0.1 sensor=0,0,0\n"
+    done = subprocess.run(
+        [str(replay), str(folder)], input=line, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1 and BROKEN[pos] in done.stdout
+    # Motors brake, and hold nothing.
+    assert done.stdout.splitlines()[-1].split()[4] == "0,0"
 
 
 @pytest.fixture(scope="module")

@@ -85,6 +85,7 @@ inline int drive(Robot& robot, PolicyControl& control, const Options& options) {
   const Punctuality found = run_loop(driven, machine, operators, journal, period);
   journal.close();
   tell(found, machine, period, options);
+  if (journal.is_torn) std::cout << "the log is not whole: is the disk full?\n";
   if (journal.lost > 0) std::cout << journal.lost << " lines of the log were lost\n";
   const bool is_half = options.dry_run && !dry.is_over();
   return machine.fault.empty() && !is_half ? 0 : 1;

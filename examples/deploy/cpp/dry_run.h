@@ -14,7 +14,8 @@ class DryRun {
 
   DryRun(PolicyControl& control, double period, double seconds, double margin, Now now)
       : control_(control), joints_(control.joints), period_(period), margin_(margin), now_(now) {
-    num_steps_ = std::max(1L, std::lround(seconds / period));
+    // Of more, a long would not hold the number: they take days.
+    num_steps_ = std::max(1L, std::lround(std::min(seconds / period, 1e9)));
     begin();
   }
 

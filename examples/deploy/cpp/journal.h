@@ -79,6 +79,7 @@ class Journal {
   }
 
   long lost = 0;
+  bool is_torn = false;  // the disk did not take all of it; known once it is closed
 
  private:
   static constexpr size_t most_waiting = 1000;
@@ -135,7 +136,7 @@ class Journal {
         if (line[0] == '#') std::cout << line.substr(2) << std::flush;
       }
     }
-    file_.flush();
+    is_torn = !file_.flush();
   }
 
   size_t size_;

@@ -249,6 +249,7 @@ class JsonReader {
 };
 
 inline Json read_json(const std::string& path) {
+  check_locale();
   std::ifstream file(path, std::ios::binary);
   if (!file) throw std::runtime_error(path + " cannot be read");
   std::stringstream content;

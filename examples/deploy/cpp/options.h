@@ -20,13 +20,13 @@ struct Options {
 };
 
 inline double number_of(const std::string& option, const char* value) {
-  char* end = nullptr;
-  const double found = std::strtod(value, &end);
-  if (end == value || *end != '\0') throw std::runtime_error(option + " " + value + ": expected a number");
-  return found;
+  const std::optional<double> found = number_in(value);
+  if (!found) throw std::runtime_error(option + " " + value + ": expected a number");
+  return *found;
 }
 
 inline Options parse_options(int count, char** arguments) {
+  check_locale();
   Options options;
   double port = 0.0;
   std::vector<NumberOption> numbers = number_options(options.limits, options.times);
@@ -67,6 +67,7 @@ inline Options parse_options(int count, char** arguments) {
   if (options.dry_run && options.seconds > 0.0) {
     throw std::runtime_error("--seconds: a dry run has --dry-seconds: leave out one of the two");
   }
+  if (port != std::floor(port)) throw std::runtime_error(text("--port %g: expected a whole number", port));
   options.port = static_cast<int>(port);
   return options;
 }

@@ -3,13 +3,13 @@
 //
 //   replay FOLDER [--stand-seconds 0.4 ...] < messages
 //
-// A message is `TIME WORDS STAMP COUNT POS VEL EFFORT QUAT ANG_VEL [NAME=NUMBERS]...`: times in s, lists with commas, `-`
-// for what is not there, and STAMP `-` for no measurement; WORDS are an operator's, with commas, and _ for blanks. The
-// answer is lines with # for what happened, and `STATE POS VEL EFFORT STIFFNESS DAMPING`.
+// A message is `TIME WORDS STAMP`, times in s, and what `measurement_of` reads; STAMP is `-` for no measurement. WORDS
+// are an operator's, with commas, and _ for blanks. The answer is lines with # for what happened, and `STATE POS VEL
+// EFFORT STIFFNESS DAMPING`.
 
 #include <iostream>
-#include <sstream>
 
+#include "messages.h"
 #include "options.h"
 #include "states.h"
 #include "words.h"
@@ -18,44 +18,9 @@ namespace ksim {
 
 double now_of_replay = 0.0;  // the time of the message that is answered
 
-Names parts_of(const std::string& line, char mark) {
-  Names parts;
-  std::istringstream stream(line);
-  for (std::string part; std::getline(stream, part, mark);) parts.push_back(part);
-  return parts;
-}
-
-Numbers numbers_in(const std::string& list) {
-  Numbers found;
-  for (const auto& part : parts_of(list, ',')) found.push_back(std::strtod(part.c_str(), nullptr));
-  return found;
-}
-
-std::optional<Numbers> optional_numbers(const std::string& list) {
-  if (list == "-") return std::nullopt;
-  return numbers_in(list);
-}
-
-std::optional<Measurement> measurement_of(const Names& fields) {
-  if (fields[2] == "-") return std::nullopt;
-  Measurement found;
-  found.stamp = std::strtod(fields[2].c_str(), nullptr);
-  if (fields[3] != "-") found.count = std::strtoll(fields[3].c_str(), nullptr, 10);
-  found.joint_pos = numbers_in(fields[4]);
-  found.joint_vel = numbers_in(fields[5]);
-  found.joint_effort = numbers_in(fields[6]);
-  found.root_quat = optional_numbers(fields[7]);
-  found.root_ang_vel = optional_numbers(fields[8]);
-  for (size_t k = 9; k < fields.size(); ++k) {
-    const size_t mark = fields[k].find('=');
-    found.estimates[fields[k].substr(0, mark)] = numbers_in(fields[k].substr(mark + 1));
-  }
-  return found;
-}
-
 Names words_of(const std::string& field) {
   if (field == "-") return {};
-  Names words = parts_of(field, ',');
+  Names words = split(field, ',');
   for (auto& word : words) std::replace(word.begin(), word.end(), '_', ' ');
   return words;
 }
@@ -74,11 +39,15 @@ int replay(const Options& options) {
   const auto note = [](double, const std::string& line) { std::cout << "# " << line << "\n"; };
   StateMachine machine(control, dry, period, options.limits, options.times, note);
   for (std::string line; std::getline(std::cin, line);) {
-    const Names fields = parts_of(line, ' ');
-    if (fields.size() < 9) throw std::runtime_error("a message of " + text("%zu fields", fields.size()));
-    now_of_replay = std::strtod(fields[0].c_str(), nullptr);
+    const Names fields = fields_of(line);
+    if (fields.size() < 3) throw std::runtime_error("a message of " + text("%zu fields", fields.size()));
+    now_of_replay = numbers_in("TIME", fields[0]).at(0);
     const Names words = sort_words(words_of(fields[1]), machine, now_of_replay);
-    const JointCommand command = machine.tick(now_of_replay, measurement_of(fields), words);
+    std::optional<Measurement> measurement;
+    damping_after("read", machine, now_of_replay, [&] {
+      if (fields[2] != "-") measurement = measurement_of(fields, 3, numbers_in("STAMP", fields[2]).at(0));
+    });
+    const JointCommand command = machine.tick(now_of_replay, measurement, words);
     std::cout << name_of(machine.state);
     for (const Numbers* values : {&command.pos, &command.vel, &command.effort, &command.stiffness, &command.damping}) {
       std::cout << " " << listed(*values);

@@ -27,18 +27,6 @@ inline Measurement first_measurement(Robot& robot, double period) {
   throw std::runtime_error(text("no message from the robot in %g s: is it on, and is it this network?", wait));
 }
 
-// Makes a fault of whatever others' code throws: motors would stay as they are.
-template <typename Action>
-void damping_after(const char* what, StateMachine& machine, Action&& action) {
-  try {
-    action();
-  } catch (const std::exception& error) {
-    machine.fail(Clock::now(), std::string(what) + ": " + error.what());
-  } catch (...) {
-    machine.fail(Clock::now(), std::string(what) + ": an unknown error");
-  }
-}
-
 // Asks the system to run this thread before others, and to keep its memory; returns a line that says whether it does.
 inline std::string ask_for_real_time() {
   constexpr int priority = 20;
@@ -64,8 +52,8 @@ inline Punctuality run_loop(Robot& robot, StateMachine& machine, const std::vect
     }
     std::optional<Measurement> measurement;
     Names words;
-    damping_after("read", machine, [&] { measurement = robot.read(); });
-    damping_after("operator", machine, [&] {
+    damping_after("read", machine, woken, [&] { measurement = robot.read(); });
+    damping_after("operator", machine, woken, [&] {
       Names said;
       for (const auto& one : operators) {
         for (const auto& word : one(woken, machine)) said.push_back(word);
@@ -74,8 +62,8 @@ inline Punctuality run_loop(Robot& robot, StateMachine& machine, const std::vect
     });
     const JointCommand command = machine.tick(woken, measurement, words);
     const double sent = Clock::now();
-    damping_after("write", machine, [&] { robot.write(command); });
-    damping_after("log", machine, [&] { journal.period(woken, machine.state, measurement, command, machine.asked); });
+    damping_after("write", machine, sent, [&] { robot.write(command); });
+    damping_after("log", machine, sent, [&] { journal.period(woken, machine.state, measurement, command, machine.asked); });
     punctuality.add(deadline, woken, sent);
     if (machine.is_over(sent)) return punctuality;
     const double done = Clock::now();

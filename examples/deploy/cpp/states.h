@@ -217,4 +217,16 @@ class StateMachine {
   double first_share_ = 0.0;
 };
 
+// Makes a fault of whatever others' code throws: motors would stay as they are.
+template <typename Action>
+void damping_after(const char* what, StateMachine& machine, double now, Action&& action) {
+  try {
+    action();
+  } catch (const std::exception& error) {
+    machine.fail(now, std::string(what) + ": " + error.what());
+  } catch (...) {
+    machine.fail(now, std::string(what) + ": an unknown error");
+  }
+}
+
 }  // namespace ksim

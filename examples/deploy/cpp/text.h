@@ -1,8 +1,12 @@
 // Text of numbers, as the lines of log and terminal have it.
 #pragma once
 
+#include <clocale>
 #include <cstdarg>
 #include <cstdio>
+#include <cstdlib>
+#include <optional>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -19,6 +23,22 @@ __attribute__((format(printf, 1, 2))) inline std::string text(const char* form, 
   std::vsnprintf(line, sizeof line, form, values);
   va_end(values);
   return line;
+}
+
+// Refuse a locale with a decimal comma: numbers of messages would end there, and commands have commas between numbers.
+inline void check_locale() {
+  const std::string point = std::localeconv()->decimal_point;
+  if (point == ".") return;
+  throw std::runtime_error("this program's locale writes numbers with '" + point +
+                           "': call std::setlocale(LC_NUMERIC, \"C\") first");
+}
+
+// Returns the number that a text is, all of it; none where it is anything else.
+inline std::optional<double> number_in(const std::string& line) {
+  char* end = nullptr;
+  const double value = std::strtod(line.c_str(), &end);
+  if (line.empty() || end != line.c_str() + line.size()) return std::nullopt;
+  return value;
 }
 
 // Returns names with a comma between each two.

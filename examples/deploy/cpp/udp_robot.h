@@ -3,19 +3,18 @@
 #pragma once
 
 #include <cstring>
-#include <sstream>
 
 #include <arpa/inet.h>
 #include <fcntl.h>
 #include <sys/socket.h>
 
 #include "deadlines.h"
-#include "robot_link.h"
+#include "messages.h"
 
 namespace ksim {
 
-// A measurement is `COUNT POS VEL EFFORT QUAT ANG_VEL [NAME=NUMBERS]...`, lists with commas, and - for what it has not; a
-// command is `POS VEL EFFORT STIFFNESS DAMPING`. The first datagram to the robot, `hello`, tells it where the loop is.
+// A measurement is what `measurement_of` reads, a command `POS VEL EFFORT STIFFNESS DAMPING`, lists with commas. The first
+// datagram to the robot, `hello`, tells it where the loop is.
 class UdpRobot : public Robot {
  public:
   explicit UdpRobot(int port) : socket_(socket(AF_INET, SOCK_DGRAM, 0)) {
@@ -39,7 +38,8 @@ class UdpRobot : public Robot {
     while (true) {
       const ssize_t size = recv(socket_, datagram, sizeof datagram, 0);
       if (size < 0) break;
-      newest_ = parsed(std::string(datagram, static_cast<size_t>(size)));
+      const std::string line(datagram, static_cast<size_t>(size));
+      newest_ = measurement_of(fields_of(line), 0, Clock::now());
     }
     return newest_;
   }
@@ -63,33 +63,6 @@ class UdpRobot : public Robot {
     std::string line;
     for (double value : values) line += text(line.empty() ? "%.9g" : ",%.9g", value);
     return line;
-  }
-
-  static Numbers numbers_in(const std::string& list) {
-    Numbers found;
-    std::istringstream parts(list);
-    for (std::string part; std::getline(parts, part, ',');) found.push_back(std::strtod(part.c_str(), nullptr));
-    return found;
-  }
-
-  static Measurement parsed(const std::string& line) {
-    Names fields;
-    std::istringstream parts(line);
-    for (std::string part; parts >> part;) fields.push_back(part);
-    if (fields.size() < 6) throw std::runtime_error(text("a message of %zu fields", fields.size()));
-    Measurement found;
-    found.stamp = Clock::now();
-    if (fields[0] != "-") found.count = std::strtoll(fields[0].c_str(), nullptr, 10);
-    found.joint_pos = numbers_in(fields[1]);
-    found.joint_vel = numbers_in(fields[2]);
-    found.joint_effort = numbers_in(fields[3]);
-    if (fields[4] != "-") found.root_quat = numbers_in(fields[4]);
-    if (fields[5] != "-") found.root_ang_vel = numbers_in(fields[5]);
-    for (size_t k = 6; k < fields.size(); ++k) {
-      const size_t mark = fields[k].find('=');
-      found.estimates[fields[k].substr(0, mark)] = numbers_in(fields[k].substr(mark + 1));
-    }
-    return found;
   }
 
   int socket_;

@@ -70,7 +70,11 @@ class Watch {
     check_joints("joint_effort", measurement.joint_effort);
     if (measurement.root_quat) check_array("root_quat", *measurement.root_quat, 4);
     if (measurement.root_ang_vel) check_array("root_ang_vel", *measurement.root_ang_vel, 3);
-    for (const auto& [name, values] : measurement.estimates) check_array(name, values, values.size());
+    for (const auto& [name, values] : measurement.estimates) {
+      estimated_.insert(name);
+      check_array(name, values, values.size());
+    }
+    for (const auto& name : estimated_) check_given(name, measurement.estimates.count(name) != 0);
     if (!measurement.root_quat) return;
     double sum = 0.0;
     for (double value : *measurement.root_quat) sum += value * value;
@@ -140,6 +144,7 @@ class Watch {
   const Joints& joints_;
   Limits limits_;
   std::set<std::string> given_;
+  std::set<std::string> estimated_;
   std::optional<long long> count_;
   double counted_at_ = 0.0;
   Numbers readings_;

@@ -108,9 +108,9 @@ inline std::optional<Numbers> numbers_of(const std::string& line) {
   std::istringstream parts(line);
   Numbers values;
   for (std::string part; parts >> part;) {
-    char* end = nullptr;
-    values.push_back(std::strtod(part.c_str(), &end));
-    if (*end != '\0') return std::nullopt;
+    const std::optional<double> value = number_in(part);
+    if (!value) return std::nullopt;
+    values.push_back(*value);
   }
   return values;
 }

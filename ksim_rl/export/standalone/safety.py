@@ -71,6 +71,7 @@ class Watch:
         self.count: int | None = None
         self.counted_at = 0.0
         self.given: set[str] = set()
+        self.estimated: set[str] = set()
         self.readings: list[Array] = []
         self.changed_at = 0.0
 
@@ -152,6 +153,9 @@ class Watch:
         for what, values in (others | dict(measurement.estimates)).items():
             if values is not None and not np.isfinite(values).all():
                 raise Fault(f"{what} is {values.tolist()}")
+        self.estimated |= measurement.estimates.keys()
+        for what in sorted(self.estimated - measurement.estimates.keys()):
+            raise Fault(f"no {what} in a message: the ones before had it")
         if measurement.root_quat is not None:
             length = float(np.linalg.norm(measurement.root_quat))
             if not 0.99 <= length <= 1.01:
