@@ -11,7 +11,7 @@ from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.registry import build
 from ksim_rl.mdp.motion_tracking import ResetByChoice, with_motions_in_use
-from ksim_rl.scene.motions.motion_set import MotionSet, load_set
+from ksim_rl.scene.motions.motion_set import load_set, set_of
 from ksim_rl.scene.terrains import PlaneTerrain
 
 MOST_ENVS = 2048
@@ -35,13 +35,14 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> list[Float[Tensor,
     cfg = base.cfg
     device = base.device
     assert device is not None
-    chosen = cfg.scene.motions.get(file, MotionSet(sources=(file,)))
     # On the CPU: only the lengths of its clips are needed here.
-    motion = load_set(chosen, base.world.mj_model, torch.device("cpu"))
+    motion = load_set(set_of(cfg.scene.motions, file), base.world.mj_model, torch.device("cpu"))
     clips: list[int] = []
     counts: list[int] = []
-    for clip, duration_s in enumerate(motion.duration_C.tolist()):
-        # The least bit more, so that rounding does not cost the last frame.
+    for clip, last in enumerate(motion.last_C.tolist()):
+        # As the float32 of `duration_C` it would cost half of all clips their last frame.
+        duration_s = last / motion.fps
+        # The least bit more, so that rounding does not cost it either.
         frames = 1 + int(duration_s / base.step_dt + 1e-6)
         if frames < 2:
             raise ValueError(

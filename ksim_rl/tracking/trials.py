@@ -24,6 +24,7 @@ from ksim_rl.envs.room import with_room
 from ksim_rl.mdp.events import PushByVelocity
 from ksim_rl.mdp.motion_tracking import MotionFinished
 from ksim_rl.mdp.terminations import TimeOut
+from ksim_rl.scene.motions.motion_set import set_of
 from ksim_rl.tracking.starts import StartInMotion, StartOfTrial
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.build import EVALUATION_SEED_OFFSET, build_env
@@ -192,8 +193,7 @@ def run_trials(
         seed = cfg.seed + EVALUATION_SEED_OFFSET
     of_trials = dataclasses.replace(cfg, task=trial_cfg(cfg.task, pushes=pushes))
     file = followed_motion(cfg.task)
-    chosen = cfg.task.scene.motions.get(file)
-    clips = len(chosen.files()) if chosen is not None else 1
+    clips = len(set_of(cfg.task.scene.motions, file).files())
     # As many clips at a time as fit into one env.
     at_once = min(clips, max(1, MOST_ENVS // trials))
     env = with_room(partial(build_env, of_trials, num_envs=trials * at_once, seed=seed), note=note)

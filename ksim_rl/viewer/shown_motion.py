@@ -1,13 +1,12 @@
 """The motion that a viewer's robot follows, or that is played without a policy: its clips, and when in one it is."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ksim_rl.checks import check_in_range, near
 from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from ksim_rl.mdp.motion_tracking import ResetByChoice
 from ksim_rl.scene.motions.motion import ReferenceMotion
-from ksim_rl.scene.motions.motion_set import MotionSet
+from ksim_rl.scene.motions.motion_set import set_of
 from ksim_rl.scene.state.motion_clock import motion_clip, motion_time
 from ksim_rl.tracking.starts import StartInMotion
 from ksim_rl.tracking.trials import followed_motion, starting_by_choice
@@ -71,7 +70,7 @@ def with_choice(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
 def following(cfg: ManagerBasedRlEnvCfg, clip: str) -> ManagerBasedRlEnvCfg:
     """Return the config of a tracking task whose episodes begin with a clip; a ValueError if its motion has no such."""
     file = followed_motion(cfg)
-    names: Sequence[str] = tuple(cfg.scene.motions.get(file, MotionSet(sources=(file,))).files())
+    names = tuple(set_of(cfg.scene.motions, file).files())
     if clip not in names:
         raise ValueError(
             f"--motion {clip}: the task follows {file}, which has no clip of that name: {near(clip, names)}"

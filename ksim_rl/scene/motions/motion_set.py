@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -79,6 +79,11 @@ class MotionSet(Checked):
                 "clips is left to train on: hold out fewer"
             )
         return held_out
+
+
+def set_of(motions: Mapping[str, MotionSet], file: str) -> MotionSet:
+    """Return the set that a term's `file` means: one of a scene's sets by its name, else the file or folder itself."""
+    return motions.get(file, MotionSet(sources=(file,)))
 
 
 def load_set(chosen: MotionSet, mj_model: mujoco.MjModel, device: torch.device) -> ReferenceMotion:

@@ -12,7 +12,7 @@ from ksim_rl.checks import near
 from ksim_rl.device import random
 from ksim_rl.physics import World
 from ksim_rl.scene.motions.motion import ReferenceMotion
-from ksim_rl.scene.motions.motion_set import MotionSet, load_set
+from ksim_rl.scene.motions.motion_set import MotionSet, load_set, set_of
 from ksim_rl.scene.names import NameResolver, Patterns, as_index, as_patterns, scalar_joint_ids
 from ksim_rl.scene.near_names import NearNames
 from ksim_rl.scene.state.buffers import ActuatorParams
@@ -280,13 +280,13 @@ class WorldView(NearNames):
         return self._simulation.derived()
 
     def motion(self, file: str) -> ReferenceMotion:
-        """Return the reference motion of an .npz file, or of the name of a set of motions in the scene's config.
+        """Return the reference motion of an .npz file, a folder, or the name of a set of motions in the scene's config.
 
         It is read once, while the env is constructed.
         """
         # Reading a file belongs to construction: a captured step could not do it.
         if file not in self._motions:
-            chosen = self._motion_sets.get(file, MotionSet(sources=(file,)))
+            chosen = set_of(self._motion_sets, file)
             self._motions[file] = load_set(chosen, self.world.mj_model, self.device)
         return self._motions[file]
 
