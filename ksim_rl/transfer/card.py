@@ -112,9 +112,8 @@ class TransferCard:
         for condition in CONDITIONS:
             name = condition.name
             if name in self.refused:
-                lines.append(
-                    f"| {name} | cannot apply: {self.refused[name]} |{' |' * (len(head) - 2)}"
-                )
+                why = _cell(self.refused[name])
+                lines.append(f"| {name} | cannot apply: {why} |{' |' * (len(head) - 2)}")
                 continue
             found = self.judged[name]
             cells = [
@@ -128,7 +127,7 @@ class TransferCard:
             cells += [_short(found.errors[error]) for error in errors]
             lines.append(f"| {' | '.join(cells)} |")
         lines += ["", "What it has met in training:", "", "| part | of the task |", "|---|---|"]
-        lines += [f"| {part} | `{text}` |" for part, text in self.trained.items()]
+        lines += [f"| {_cell(part)} | `{_cell(text)}` |" for part, text in self.trained.items()]
         return "\n".join(map(printable, lines)) + "\n"
 
     def numbers(self) -> str:
@@ -172,6 +171,11 @@ class TransferCard:
         axes.set_xlabel("the lesser share of return and of upright episodes, of as trained")
         axes.set_title(f"{self.policy} ({self.task})", fontsize=10)
         figure.savefig(picture, dpi=110)
+
+
+def _cell(text: str) -> str:
+    """Return a text that stays in its cell of a table, whatever bars it has, such as those of regular expressions."""
+    return text.replace("|", r"\|")
 
 
 def _short(value: float) -> str:

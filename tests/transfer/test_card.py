@@ -20,7 +20,11 @@ def judged(return_mean=10.0, upright=1.0):
 def card(refused=(), **changed):
     found = {name: judged() for name in NAMES if name not in refused} | changed
     reasons = dict.fromkeys(refused, "its ground is no plane")
-    how = {"episodes": 4, "seconds": 2.0, "trained": {"event push": "PushByVelocity()"}}
+    how = {
+        "episodes": 4,
+        "seconds": 2.0,
+        "trained": {"event push": "PushByVelocity()", "event legs": "A(joints='left|right')"},
+    }
     return TransferCard(policy="zoo:x", task="a_task", judged=found, refused=reasons, **how)
 
 
@@ -55,6 +59,8 @@ def test_the_page_and_the_numbers_have_every_condition(tmp_path):
     assert [row.split(" | ")[0].removeprefix("| ") for row in rows[1:]] == NAMES
     assert "cannot apply: its ground is no plane" in page and "1 cannot apply to a_task" in page
     assert len({row.count("|") for row in rows}) == 1
+    # A bar in a regular expression ends no cell.
+    assert r"| event legs | `A(joints='left\|right')` |" in training
     numbers = json.loads(found.numbers())
     assert numbers["judged"][NAMES[0]]["impact"] is None
     assert numbers["weakest"]["share"] == 1.0 and len(numbers["shares"]) == len(NAMES) - 1
