@@ -124,6 +124,12 @@ class EventTerm(Term):
         """Return a line for each field that this event writes without effect in this model; a build warns."""
         return ()
 
+    def check_beside(self, view: EnvView, events: Mapping[str, "EventTerm"]) -> None:
+        """Refuse, by a ValueError, events of the same env that would undo what this one writes, or the other way round.
+
+        `events` has them all by name, in the order in which they run; this one is among them.
+        """
+
     @abstractmethod
     def __call__(self, view: EnvView, mask_E: Bool[Tensor, " E"]) -> None:
         """Apply the event to the rows of `mask_E`, bool [E]; other rows must stay bit-identical."""

@@ -41,6 +41,7 @@ class EventManager:
         # Events that may read commands wait for these: see `rehearse_starts`.
         self._rehearse(name for name, term in terms.items() if term.mode != "start")
         for name, term in terms.items():
+            term.check_beside(view, terms)
             for line in term.without_effect(view):
                 warnings.warn(f"events.{name}: {line}", UserWarning, stacklevel=2)
 

@@ -4,6 +4,7 @@ Kinds of geoms and meshes are the same in all worlds: a world cannot have a ball
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -17,7 +18,13 @@ from ksim_rl.envs.term import EventTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import array_constant, constant
 from ksim_rl.mdp.fields import OfEntity
-from ksim_rl.mdp.randomization.bodies import NUM_SIZES, RandomizeGeomSize
+from ksim_rl.mdp.randomization.bodies import (
+    NUM_SIZES,
+    RandomizeBodyField,
+    RandomizeBodyMass,
+    RandomizeGeomSize,
+    RandomizePseudoInertia,
+)
 from ksim_rl.mdp.randomization.randomize import write_entries
 from ksim_rl.scene import quaternion
 
@@ -89,7 +96,8 @@ class RandomizeSolidSize(RandomizeGeomSize):
     Each world is as if its model were compiled with its sizes.
 
     Attributes:
-        constant: what stays: the "mass" that the model has, or its "density".
+        constant: what stays: the "mass", which `RandomizeBodyMass` may draw before, in the same mode; or the "density"
+            of the model.
     """
 
     constant: Literal["mass", "density"] = "mass"
@@ -113,14 +121,36 @@ class RandomizeSolidSize(RandomizeGeomSize):
                     "both"
                 )
             size_E3 = view.field("geom_size")[:, geom]
-            mass_E = torch.full_like(size_E3[:, 0], mass)
             if self.constant == "density":
-                mass_E = mass_E * volume(kind, size_E3) / float(volume(kind, own_13))
+                mass_E = mass * volume(kind, size_E3) / float(volume(kind, own_13))
+            else:
+                # Worlds may differ in it already.
+                mass_E = view.field("body_mass")[:, body]
             inertia_E3 = mass_E[:, None] * inertia_per_mass(kind, size_E3)
             mass_E11 = mass_E[:, None, None]
             write_entries(view.field("body_mass"), (body,), (0,), mask_E, mass_E11)
             write_entries(
                 view.field("body_inertia"), (body,), range(3), mask_E, inertia_E3[:, None]
+            )
+
+    def check_beside(self, view: EnvView, events: Mapping[str, EventTerm]) -> None:
+        model = view.world.mj_model
+        own = set(model.geom_bodyid[list(self.ids(view))].tolist())
+        is_behind = False
+        for name, event in events.items():
+            is_behind = is_behind or event is self
+            if not isinstance(event, RandomizeBodyField | RandomizePseudoInertia):
+                continue
+            shared = own.intersection(view.resolver.ids("body", event.bodies))
+            if "body_inertia" not in event.per_world_fields or not shared:
+                continue
+            draws_mass = isinstance(event, RandomizeBodyMass) and self.constant == "mass"
+            if draws_mass and event.mode == self.mode and not is_behind:
+                continue
+            raise ValueError(
+                f"events.{name} draws mass or inertia of body {model.body(min(shared)).name!r}, as "
+                f"RandomizeSolidSize.geoms={self.geoms!r} does, and one would undo the other: leave it out, or let "
+                "RandomizeBodyMass alone run before it, in the same mode and with constant='mass'"
             )
 
 
@@ -155,11 +185,12 @@ def _only_geom(view: EnvView, name: str) -> int:
     """Return the geom of an entity's root; a ValueError if it is not a primitive one, in the middle of the body."""
     model = view.world.mj_model
     (body,) = view.entity(name).root_bodies.ids
-    geoms = np.flatnonzero(model.geom_bodyid == body)
+    # Those of bodies that hang from it, too: they would reach below.
+    geoms = np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.body_rootid[body])
     lone = len(geoms) == 1 and int(model.geom_type[geoms[0]]) in set(NUM_SIZES)
     if not lone or model.geom_pos[geoms[0]].any() or model.geom_quat[geoms[0], 1:].any():
         raise ValueError(
-            f"SetDown.entity={name!r}: body {model.body(body).name!r} is not one primitive geom about its origin: "
-            "place it with ResetRootUniform"
+            f"SetDown.entity={name!r}: body {model.body(body).name!r} is not one primitive geom about its origin, "
+            "alone: place it with ResetRootUniform"
         )
     return int(geoms[0])

@@ -136,7 +136,9 @@ def test_what_has_no_size_of_its_own_is_refused(tmp_path):
     file = tmp_path / "corner.obj"
     file.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     two = EGG.replace("</body>", '<geom name="yolk" size="0.01" mass="0.1"/></body>')
-    cfg = envs.make_cfg("arm_push")
+    hung = EGG.replace(
+        "</body>", '<body><joint axis="0 0 1"/><geom size="0.1" mass="0.1"/></body></body>'
+    )
     for thing, event, message in (
         (
             Mesh(file=str(file)),
@@ -154,17 +156,55 @@ def test_what_has_no_size_of_its_own_is_refused(tmp_path):
             mdp.RandomizeSolidSize(geoms="cube/yolk", ranges={0: (0.01, 0.02)}),
             "has another mass or inertia than geom 'cube/yolk' alone",
         ),
+        (MjcfRobot(source=hung), mdp.SetDown(entity="cube"), "is not one primitive geom"),
     ):
-        scene = dataclasses.replace(cfg.scene, objects={"cube": thing}, num_envs=1)
-        bare = dataclasses.replace(
-            cfg,
-            scene=scene,
-            observations={},
-            commands={},
-            rewards={},
-            metrics={},
-            events={"event": event},
-            sim=dataclasses.replace(cfg.sim, engine="c"),
-        )
         with pytest.raises(ValueError, match=message):
-            envs.build(bare)
+            envs.build(one_thing(thing, {"event": event}))
+
+
+def one_thing(thing, events, num_envs=1):
+    cfg = envs.make_cfg("arm_push")
+    return dataclasses.replace(
+        cfg,
+        scene=dataclasses.replace(cfg.scene, objects={"cube": thing}, num_envs=num_envs),
+        observations={},
+        commands={},
+        rewards={},
+        metrics={},
+        events=events,
+        sim=dataclasses.replace(cfg.sim, engine="c"),
+    )
+
+
+SIZE = mdp.RandomizeSolidSize(geoms="cube/box", ranges=(0.5, 1.5), operation="scale")
+MASS = mdp.RandomizeBodyMass(bodies="cube/box", ranges=(0.5, 2.0))
+
+
+def test_masses_are_drawn_before_the_size():
+    made = envs.build(one_thing(Box(mass=0.3), {"mass": MASS, "size": SIZE}, num_envs=3)).base_env
+    made.reset()
+    body = made.world.mj_model.body("cube/box").id
+    geom = made.world.mj_model.geom("cube/box").id
+    mass_E = made.view.field("body_mass")[:, body]
+    assert len(set(mass_E.tolist())) == 3 and mass_E.min() >= 0.15 and mass_E.max() <= 0.6
+    # Of a box of its half edges.
+    size_E3 = made.view.field("geom_size")[:, geom]
+    first_E = mass_E * (size_E3[:, 1] ** 2 + size_E3[:, 2] ** 2) / 3.0
+    np.testing.assert_allclose(made.view.field("body_inertia")[:, body, 0], first_E, rtol=1e-5)
+
+
+def test_what_would_undo_mass_or_inertia_is_refused(env):
+    message = "events.mass draws mass or inertia of body '(cube|box)/box'"
+    with pytest.raises(ValueError, match=message):
+        envs.build(one_thing(Box(), {"size": SIZE, "mass": MASS}))
+    size = dataclasses.replace(SIZE, geoms="box/box")
+    mass = dataclasses.replace(MASS, bodies="box/box")
+    size.check_beside(env.view, {"mass": mass, "size": size})
+    size.check_beside(env.view, {"mass": dataclasses.replace(mass, bodies="egg/egg")})
+    for event, beside in (
+        (size, dataclasses.replace(mass, mode="reset")),
+        (dataclasses.replace(size, constant="density"), mass),
+        (size, mdp.RandomizePseudoInertia(bodies="box/box", alpha=(-0.1, 0.1))),
+    ):
+        with pytest.raises(ValueError, match=message):
+            event.check_beside(env.view, {"mass": beside, "size": event})
