@@ -7,7 +7,7 @@ themselves, and the place pays only as far as the box is up, so that pushing it 
 import dataclasses
 from dataclasses import dataclass
 
-import torch
+import mujoco
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,6 +21,7 @@ from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.commands.pose import OfTarget
 from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import GaussianReward
+from ksim_rl.mdp.randomization.shapes import geom_size, reach_down
 from ksim_rl.modules import ActorCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.scene import quaternion
@@ -97,10 +98,10 @@ class PalmsAtSides(GaussianReward):
 
 @dataclass(frozen=True, kw_only=True)
 class Lifted(RewardTerm):
-    """How far a box's underside is above a stand, as a fraction of `rise`, in [0, 1], [E]; position stage.
+    """How far the lowest corner of a box is above a stand, as a fraction of `rise`, in [0, 1], [E]; position stage.
 
     Attributes:
-        body, geom: the box and its geom, which stands upright.
+        body, geom: the box and its geom.
         stand, rise: the height of the stand, and the height above it at which the box counts as lifted, m.
     """
 
@@ -110,8 +111,10 @@ class Lifted(RewardTerm):
     rise: Positive
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        half_E = _half_edges(view, self.geom)[:, 2]
-        height_E = view.body(self.body).pos_EL[:, 2] - half_E - self.stand
+        box = view.body(self.body)
+        # A box that is tipped onto an edge has its middle higher, and is not lifted.
+        down_E = reach_down(mujoco.mjtGeom.mjGEOM_BOX, _half_edges(view, self.geom), box.quat_EL)
+        height_E = box.pos_EL[:, 2] - down_E - self.stand
         return (height_E / self.rise).clamp(0.0, 1.0)
 
 
@@ -127,13 +130,7 @@ class CarriedToPlace(OfTarget, GaussianReward):
 
 def _half_edges(view: EnvView, geom: str) -> Float[Tensor, "E 3"]:
     """Return half of the edges of a box in each world, m."""
-    place = view.resolver.one("geom", geom)
-    if "geom_size" in view.world.per_world_fields():
-        return view.field("geom_size")[:, place]
-    own_3 = torch.tensor(
-        view.world.mj_model.geom_size[place], dtype=torch.float32, device=view.device
-    )
-    return own_3.expand(view.num_envs, 3)
+    return geom_size(view, view.resolver.one("geom", geom))
 
 
 def _scene() -> SceneCfg:

@@ -1,6 +1,7 @@
 """G1 and its box: rewards against their formulas in states that are set, and what ends or wins an episode."""
 
 import dataclasses
+import math
 
 import mujoco
 import numpy as np
@@ -71,11 +72,22 @@ def test_palms_pay_where_they_hold_the_box(base):
 def test_the_place_pays_as_far_as_the_box_is_up(base):
     lifted, carried = base.cfg.rewards["lifted"], base.cfg.rewards["place"]
     place_E3 = base.view.command("place")
-    rest_E = STAND_HEIGHT + half_edges(base)[:, 2]
+    half_E3 = half_edges(base)
+    rest_E = STAND_HEIGHT + half_E3[:, 2]
+    # On the edge along x, an eighth of a turn from upright.
+    tipped_E = STAND_HEIGHT + half_E3[:, 1:].sum(-1) * 0.5**0.5
+    tipped = (math.cos(math.pi / 8.0), math.sin(math.pi / 8.0), 0.0, 0.0)
+    upright = (1.0, 0.0, 0.0, 0.0)
     pos_E3 = place_E3 + torch.tensor([0.05, 0.0, 0.0])
-    for rise, share in ((-0.1, 0.0), (0.03, 0.5), (0.3, 1.0)):
-        pos_E3[:, 2] = rest_E + rise
-        put_box(base, pos_E3)
+    for low_E, quat_4, rise, share in (
+        (rest_E, upright, -0.1, 0.0),
+        (rest_E, upright, 0.03, 0.5),
+        (rest_E, upright, 0.3, 1.0),
+        (tipped_E, tipped, 0.0, 0.0),
+        (tipped_E, tipped, 0.03, 0.5),
+    ):
+        pos_E3[:, 2] = low_E + rise
+        put_box(base, pos_E3, quat_4)
         torch.testing.assert_close(lifted(base.view), torch.full((E,), share), atol=1e-4, rtol=0.0)
         off_E = (pos_E3 - place_E3).square().sum(-1)
         torch.testing.assert_close(

@@ -68,6 +68,14 @@ def inertia_per_mass(kind: _GEOM, size_E3: Float[Tensor, "E 3"]) -> Float[Tensor
     return torch.stack((across_E, across_E, along_E), dim=-1)
 
 
+def geom_size(view: EnvView, geom: int) -> Float[Tensor, "E 3"]:
+    """Return the present size of a geom in each world by MuJoCo's columns, m."""
+    if "geom_size" in view.world.per_world_fields():
+        return view.field("geom_size")[:, geom]
+    own_3 = array_constant(view.world.mj_model.geom_size[geom], view.device)
+    return own_3.expand(view.num_envs, 3)
+
+
 def reach_down(
     kind: _GEOM, size_E3: Float[Tensor, "E 3"], quat_E4: Float[Tensor, "E 4"]
 ) -> Float[Tensor, " E"]:
@@ -169,12 +177,7 @@ class SetDown(OfEntity, EventTerm):
         model = view.world.mj_model
         kind = _GEOM(int(model.geom_type[geom]))
         quat_E4 = entity.root_quat_EL
-        if "geom_size" in view.world.per_world_fields():
-            size_E3 = view.field("geom_size")[:, geom]
-        else:
-            own_3 = array_constant(model.geom_size[geom], view.device)
-            size_E3 = own_3.expand(view.num_envs, 3)
-        rest_E = self.height + reach_down(kind, size_E3, quat_E4)
+        rest_E = self.height + reach_down(kind, geom_size(view, geom), quat_E4)
         if not view.terrain.is_flat:
             rest_E = rest_E + view.terrain.origins_E3[:, 2]
         pos_E3 = torch.cat((entity.root_pos_EL[:, :2], rest_E[:, None]), dim=-1)
