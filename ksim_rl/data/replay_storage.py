@@ -127,6 +127,8 @@ class ReplayStorage(SavedByStateDict, Storage):
             # Successors first, as for the env states below.
             self.stacks.depth[following_N] = (depth_N + 1).clamp_max(self.stacks.reach)
             self.stacks.depth[index_N] = depth_N
+            # The first place of an episode follows none, and takes the oldest frame of another env state, too.
+            self.available.index_fill_(0, self._beyond(index_N), False)
         # One element that is not finite makes its env state invalid, whichever leaf it is in.
         finite_N = torch.ones(self.num_envs * length, dtype=torch.bool, device=self.device)
         for key, leaf in self.content.items(True, True):
