@@ -45,7 +45,12 @@ def overrides_of(row: Row, runs: Path | None = None, seed: int = 0) -> list[str]
     if row.begins_from:
         words.append(f"checkpoint={folder(row.begins_from)!r}")
     if row.learns_from:
-        words.append(f"{row.episodes_field}={folder(row.learns_from) + '/' + EPISODES!r}")
+        episodes = f"{folder(row.learns_from)}/{EPISODES}"
+        if row.objective == "bc":
+            words.append(f"objective.episodes={episodes!r}")
+        else:
+            # As a whole, since there is no field of it before.
+            words.append(f"data.offline={{source: {episodes!r}}}")
     return words
 
 

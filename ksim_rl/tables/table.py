@@ -39,7 +39,7 @@ class Row(Checked):
         most_falls: share of these episodes that may end before their time; the worst seed counts.
         recorded: so many episodes of the final policy, with its draws, are kept for rows that learn from them.
         learns_from: the row above whose recorded episodes it learns from, seed by seed: they become
-            `objective.episodes` of `bc`, and else `data.offline.source`.
+            `objective.episodes` of `bc`, and else `data.offline`, with its share of a half.
         begins_from: the row above whose final networks it begins with, seed by seed.
         saves_over: the row above, without such a beginning, that it is compared with: how many env states it saves.
         published: returns that others report, by who; `against` names the one to reach, "" none.
@@ -77,13 +77,6 @@ class Row(Checked):
         # Names and words go into paths and command lines: signs with a meaning there are refused.
         for word in self.overrides:
             check_override(word)
-
-    @property
-    def episodes_field(self) -> str:
-        """The field of its config that names recorded episodes."""
-        if self.objective == "bc":
-            return "objective.episodes"
-        return "data.offline.source"
 
     @property
     def goal(self) -> float | None:

@@ -1,15 +1,15 @@
 """Rows of a table learn from rows above them: episodes are recorded, cloned, and a run goes on from the clone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 
-from ksim_rl.data import read_episodes
+from ksim_rl.data import OfflineCfg, read_episodes
 from ksim_rl.runs.listing import CONFIG
 from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import report
 from ksim_rl.tables.lineage import EPISODES, depth_of, overrides_of, sources_of
-from ksim_rl.tables.measure import measure, settings_of
+from ksim_rl.tables.measure import measure, run_cfg, settings_of
 from ksim_rl.tables.runner import Runs
 from ksim_rl.tables.table import Row, load
 
@@ -50,6 +50,8 @@ def test_sources_come_first_and_are_found_by_seed(tmp_path):
     assert overrides_of(clone, tmp_path, 2) == [f"objective.episodes='{found}/{EPISODES}'"]
     assert overrides_of(clone) == [f"objective.episodes='pole/nothing/{EPISODES}'"]
     assert overrides_of(rows["pole/online"]) == ["checkpoint='pole/bc'"]
+    other = replace(clone, objective="fast_sac")
+    assert run_cfg(other, 1).data.offline == OfflineCfg(source=f"pole/nothing/{EPISODES}")
 
 
 @dataclass(frozen=True)
