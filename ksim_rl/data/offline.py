@@ -96,8 +96,8 @@ def make_offline_table(
     check_bytes(
         f"{rows_D.shape[0]:,} recorded env states",
         places * shards * row_bytes,
-        num_envs=shards,
         device=torch.device(device),
+        fix="record fewer, or smaller observations",
     )
     own = {spell(key): rows_D.get(key)[own_D] for key in offline_keys(observations)}
     content = {}

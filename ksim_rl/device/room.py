@@ -24,13 +24,26 @@ def check_room(cfg: Checked, *, num_envs: int, device: torch.device, path: str =
             check_bytes(given, _NUMBER_BYTES * numbers, num_envs=num_envs, device=device)
 
 
-def check_bytes(given: str, needed: float, *, num_envs: int, device: torch.device) -> None:
-    """Refuse sizes that take more memory than the whole device has; `given` has the fields and values that do."""
+def check_bytes(
+    given: str,
+    needed: float,
+    *,
+    device: torch.device,
+    num_envs: int | None = None,
+    fix: str = "lower it",
+) -> None:
+    """Refuse sizes that take more memory than the whole device has; `given` has the fields and values that do.
+
+    Sizes that depend on the number of envs are given with it.
+    """
     total = total_bytes(device)
     if needed > total:
+        envs = ""
+        if num_envs is not None:
+            envs = f" with num_envs={num_envs}"
         raise ValueError(
-            f"{given}: takes at least {needed / 1e9:,.0f} GB of memory with num_envs={num_envs}, and {device} has "
-            f"{total / 1e9:.1f} GB: lower it"
+            f"{given}: takes at least {needed / 1e9:,.0f} GB of memory{envs}, and {device} has {total / 1e9:.1f} GB: "
+            f"{fix}"
         )
 
 

@@ -23,8 +23,11 @@ FREE = frozenset(
     {
         "collector.warmup",
         "data.learning_starts",
+        "data.policy_starts",
         "objective.max_skipped_steps",
         "objective.policy_delay",
+        # Beyond the size of a picture it moves all of it away.
+        "objective.random_shift",
         "seed",
         "task.observations.actor.delay.resample_every",
         "task.scene.terrain.max_initial_level",

@@ -6,6 +6,7 @@ from tensordict import TensorDict
 
 from ksim_rl.data import OfflineCfg, ReplayCfg, ReplayRing, make_offline_table
 from ksim_rl.data.dataset_storage import MASK_KEY
+from ksim_rl.device import room
 from ksim_rl.testing import count_syncs
 
 LENGTHS = (5, 1, 3, 4)
@@ -159,6 +160,15 @@ def spoilt(key, row, value):
 def test_what_it_refuses(rows_D, shards, message):
     with pytest.raises(ValueError, match=message):
         make_offline_table(rows_D, shards=shards, **SHARED)
+
+
+def test_what_no_memory_holds_is_refused(monkeypatch):
+    monkeypatch.setattr(room, "total_bytes", lambda device: 100)
+    said = (
+        "^13 recorded env states: takes at least 0 GB of memory, and cpu has 0.0 GB: record fewer"
+    )
+    with pytest.raises(ValueError, match=said):
+        make_offline_table(recording(), **SHARED)
 
 
 @pytest.mark.parametrize(
