@@ -14,27 +14,30 @@ class ShiftedPictures:
     """Moves each picture of a minibatch by up to `pixels` in each direction; edges are repeated.
 
     The frames of a stack move together, and the observation that follows an env state by draws of its own, as in DrQ-v2
-    (Yarats et al., arXiv 2107.09645). `layouts` has the pictures by key. Draws are of torch's default generator, as
-    the minibatch's are. Makes no host sync. A ValueError says where networks read no picture.
+    (Yarats et al., arXiv 2107.09645). `layouts` has the pictures by key, and a minibatch
+    `minibatch` rows. Draws are of torch's default generator, as the minibatch's are. Makes no host sync. A ValueError says where networks read no picture.
     """
 
-    def __init__(self, layouts: Mapping[NestedKey, Layout], *, pixels: int) -> None:
+    def __init__(self, layouts: Mapping[NestedKey, Layout], *, pixels: int, minibatch: int) -> None:
         if not layouts:
             raise ValueError(
                 f"random_shift={pixels}: no network reads a picture through an encoder, so there is nothing to move; "
                 "leave it at 0"
             )
         self._effect = RandomShift(pixels=pixels)
+        self._minibatch = minibatch
         self._layouts: dict[NestedKey, Layout] = {}
         for key, layout in layouts.items():
             self._layouts[key] = layout
             self._layouts[unravel_key(("next", key))] = layout
 
     def shift_(self, minibatch_B: TensorDictBase) -> None:
-        """Replace the pictures by moved ones."""
+        """Replace the pictures of one or several minibatches by moved ones."""
         for key, layout in self._layouts.items():
             pictures = minibatch_B.get(key)
-            size = pictures.shape[0]
-            draws_B2 = ranks.rand((size, 2), device=pictures.device)
+            # By rows of a minibatch, of which each rank has a part as a shard of one process has.
+            count = pictures.shape[0] // self._minibatch
+            draws_MB2 = ranks.rand((count, self._minibatch, 2), dim=1, device=pictures.device)
+            draws_B2 = draws_MB2.flatten(0, 1)
             moved = self._effect(framed(pictures, layout), draws_B2)
             minibatch_B.set(key, unframed(moved, pictures.ndim - 1, layout))

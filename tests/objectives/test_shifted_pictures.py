@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torch.nn.functional import pad
 
 from ksim_rl.objectives import ShiftedPictures
+from ksim_rl.ranks import draws
 
 PIXELS = 2
 
@@ -32,7 +33,7 @@ def test_frames_of_a_stack_move_together_and_what_follows_by_itself():
     depth = torch.rand(60, 7, 9)
     leaves = {"rgb": frames, "depth": depth, "joints": torch.rand(60, 2)}
     minibatch = TensorDict({**leaves, "next": dict(leaves)}, batch_size=[60])
-    ShiftedPictures({"rgb": "HWC", "depth": "HWC"}, pixels=PIXELS).shift_(minibatch)
+    ShiftedPictures({"rgb": "HWC", "depth": "HWC"}, pixels=PIXELS, minibatch=30).shift_(minibatch)
     now = places(frames, minibatch["rgb"])
     following = places(frames, minibatch["next", "rgb"])
     assert len(set(now)) > 15 and now != following
@@ -41,6 +42,24 @@ def test_frames_of_a_stack_move_together_and_what_follows_by_itself():
     assert places(depth[:, None, :, :, None], minibatch["depth"][:, None, :, :, None]) != now
 
 
+def test_ranks_move_the_rows_that_shards_of_one_process_have(monkeypatch):
+    depth_MB = torch.rand(3, 8, 7, 9)
+
+    def moved(part_MB):
+        torch.manual_seed(0)
+        rows = part_MB.flatten(0, 1)
+        minibatches = TensorDict({"depth": rows, "next": {"depth": rows}}, batch_size=[len(rows)])
+        size = part_MB.shape[1]
+        ShiftedPictures({"depth": "HWC"}, pixels=PIXELS, minibatch=size).shift_(minibatches)
+        return minibatches["depth"].unflatten(0, part_MB.shape[:2])
+
+    whole_MB = moved(depth_MB)
+    monkeypatch.setattr(draws, "size", lambda: 2)
+    monkeypatch.setattr(draws, "first_row", lambda num_rows: num_rows)
+    # The second of two ranks.
+    assert torch.equal(moved(depth_MB[:, 4:]), whole_MB[:, 4:])
+
+
 def test_networks_without_pictures_are_refused():
     with pytest.raises(ValueError, match="random_shift=4: no network reads a picture"):
-        ShiftedPictures({}, pixels=4)
+        ShiftedPictures({}, pixels=4, minibatch=1)

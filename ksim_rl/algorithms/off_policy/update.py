@@ -103,7 +103,11 @@ class OffPolicyUpdate(RolloutUpdate):
         self._shifted = None
         if cfg.random_shift:
             layouts = picture_layouts(self.actor, self.critic)
-            self._shifted = ShiftedPictures(layouts, pixels=cfg.random_shift)
+            self._shifted = ShiftedPictures(
+                layouts,
+                pixels=cfg.random_shift,
+                minibatch=data.num_env_states_per_minibatch,
+            )
         self._read = fast(self._stored)
         self._count_ = fast(self._counted_)
         self._critic_loss = fast(loss.critic_loss)
