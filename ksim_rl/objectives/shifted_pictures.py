@@ -14,8 +14,9 @@ class ShiftedPictures:
     """Moves each picture of a minibatch by up to `pixels` in each direction; edges are repeated.
 
     The frames of a stack move together, and the observation that follows an env state by draws of its own, as in DrQ-v2
-    (Yarats et al., arXiv 2107.09645). `layouts` has the pictures by key, and a minibatch
-    `minibatch` rows. Draws are of torch's default generator, as the minibatch's are. Makes no host sync. A ValueError says where networks read no picture.
+    (Yarats et al., arXiv 2107.09645). `layouts` has the pictures by key, and a minibatch has `minibatch` rows. Draws
+    are of torch's default generator, as the minibatch's are. Makes no host sync. A ValueError says where networks
+    read no picture.
     """
 
     def __init__(self, layouts: Mapping[NestedKey, Layout], *, pixels: int, minibatch: int) -> None:
