@@ -117,6 +117,11 @@ def parts(value: object, path: str = "") -> Iterator[tuple[str, Checked]]:
             yield from parts(getattr(value, field.name), f"{path}.{field.name}".removeprefix("."))
 
 
+def named_files(value: object) -> set[str]:
+    """Return the files of data that a config and the configs in it name."""
+    return {file for _, part in parts(value) for file in part.data_files()}
+
+
 def numbers_of_layers(widths: Sequence[int]) -> float:
     """Return how many numbers layers of these widths need to learn, for the weights between them and the biases."""
     weights = sum(below * above for below, above in pairwise(widths))

@@ -1,6 +1,7 @@
 """Reference motions are turned here into the observations of an env in which it is played."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Float
@@ -11,20 +12,23 @@ from ksim_rl.envs.contract import part
 from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.envs.registry import build
 from ksim_rl.mdp.motion_tracking import ResetByChoice, with_motions_in_use
-from ksim_rl.scene.motions.motion_set import load_set, set_of
+from ksim_rl.scene.motions.motion_set import MotionSet, load_set, set_of
 from ksim_rl.scene.terrains import PlaneTerrain
 
 MOST_ENVS = 2048
 """That the frames of motions are observed in at a time."""
 
 
-def observe_motion(env: EnvBase, *, group: str, file: str) -> list[Float[Tensor, "?F L"]]:
+def observe_motion(
+    env: EnvBase, *, group: str, file: str, motions: Mapping[str, MotionSet] | None = None
+) -> list[Float[Tensor, "?F L"]]:
     """Return an observation group along each clip of a motion that is not held out, one row per env step.
 
     Envs of their own, on a plane, are put into the motion's states, and the group's terms and transforms compute as
     they always do; noise is off. Terms that read more than positions and velocities (commands, actions, contacts,
     forces) read their values after a reset. The given env, around a `ManagerBasedRlEnv`, stays as it is, and its device
-    has the rows; `file` is a motion as `view.motion` reads it, or a folder, each clip at least as long as an env step.
+    has the rows; `file` is a motion as `view.motion` reads it, of the sets of the env or of `motions`, each clip
+    at least as long as an env step.
     """
     # Transforms around the env are not the env itself, whose config is needed.
     base = part(env, ManagerBasedRlEnv)
@@ -35,8 +39,9 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> list[Float[Tensor,
     cfg = base.cfg
     device = base.device
     assert device is not None
+    sets = {**cfg.scene.motions, **(motions or {})}
     # On the CPU: only the lengths of its clips are needed here.
-    motion = load_set(set_of(cfg.scene.motions, file), base.world.mj_model, torch.device("cpu"))
+    motion = load_set(set_of(sets, file), base.world.mj_model, torch.device("cpu"))
     clips: list[int] = []
     counts: list[int] = []
     for clip, last in enumerate(motion.last_C.tolist()):
@@ -66,7 +71,7 @@ def observe_motion(env: EnvBase, *, group: str, file: str) -> list[Float[Tensor,
     # The same terms, an env for each frame, without anything that acts, ends or rewards.
     played = dataclasses.replace(
         cfg,
-        scene=dataclasses.replace(cfg.scene, num_envs=num_envs, terrain=ground),
+        scene=dataclasses.replace(cfg.scene, num_envs=num_envs, terrain=ground, motions=sets),
         observations={group: cfg.observations[group]},
         events={"play": start},
         rewards={},

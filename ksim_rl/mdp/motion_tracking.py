@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from ksim_rl.checked import Positive, Within, parts
+from ksim_rl.checked import Positive, Within, named_files
 from ksim_rl.checks import near
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
 from ksim_rl.envs.term import EventTerm, ObservationTerm, Term, TerminationTerm
@@ -294,6 +294,6 @@ class ShowMotion(ResetByChoice):
 
 def with_motions_in_use(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
     """Return a config some of whose terms were taken away, without the sets of motions that no other one names."""
-    named = {file for _, part in parts(cfg) for file in part.data_files()}
+    named = named_files(cfg)
     motions = {name: chosen for name, chosen in cfg.scene.motions.items() if name in named}
     return dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, motions=motions))

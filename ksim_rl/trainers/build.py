@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ksim_rl import envs, ranks
+from ksim_rl.checked import named_files
 from ksim_rl.collectors import RolloutCollector
 from ksim_rl.data import ReplayCfg
 from ksim_rl.device import state_tree
@@ -162,7 +163,12 @@ def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None 
 
     It carries the memory of a recurrent policy, and tells recurrent networks where episodes begin.
     """
-    scene = dataclasses.replace(cfg.task.scene, num_envs=num_envs)
+    # Sets that the objective alone reads, which an env would refuse: AMP shows them to no term of the task.
+    others = named_files(cfg.objective) - named_files(cfg.task)
+    motions = {
+        name: chosen for name, chosen in cfg.task.scene.motions.items() if name not in others
+    }
+    scene = dataclasses.replace(cfg.task.scene, num_envs=num_envs, motions=motions)
     task = dataclasses.replace(cfg.task, scene=scene, seed=seed)
     env = envs.build(task, device=cfg.resolved_device(), render_mode=render_mode)
     if cfg.modules.recurrent:

@@ -1,5 +1,6 @@
 """AMP: the style of a motion is recovered without any other reward, resume is exact, physics gives the features."""
 
+import dataclasses
 import math
 
 import pytest
@@ -9,6 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ksim_rl import conf
 from ksim_rl.device import state_tree
 from ksim_rl.objectives import AMPCfg
+from ksim_rl.scene.motions import MotionSet
 from ksim_rl.testing import count_syncs
 from ksim_rl.trainers import build
 from tests.algorithms.imitation_problems import TURN, PlaneEnv, make_amp
@@ -182,7 +184,12 @@ SMALL = [
 
 
 def test_a_run_compares_transitions_that_last_one_env_step():
-    trainer = build(conf.compose(SMALL))
+    cfg = conf.compose([*SMALL, "objective.motions=[clips]"])
+    # A set that no term of the task reads.
+    motions = {"clips": MotionSet(sources=("walker_walk",))}
+    scene = dataclasses.replace(cfg.task.scene, motions=motions)
+    task = dataclasses.replace(cfg.task, scene=scene)
+    trainer = build(dataclasses.replace(cfg, task=task))
     update = trainer.update
     # Eight seconds in steps of 20 ms.
     assert update.reference_N2L.shape == (400, 2, 19)

@@ -46,7 +46,11 @@ def make_amp_update(cfg: RunCfg, env: EnvBase, resumed: State | None = None) -> 
     # Successive frames of each clip are the transitions; none joins the end of one clip to another.
     transitions = []
     for file in objective.motions:
-        for seen_FL in observe_motion(env, group=objective.style_group, file=file):
+        # The env leaves out sets that none of its terms reads.
+        seen = observe_motion(
+            env, group=objective.style_group, file=file, motions=cfg.task.scene.motions
+        )
+        for seen_FL in seen:
             transitions.append(torch.stack((seen_FL[:-1], seen_FL[1:]), 1))
     reference_N2L = torch.cat(transitions)
     return AMPUpdate(objective, ppo=ppo, reference_N2L=reference_N2L, num_envs=cfg.num_envs)
