@@ -15,7 +15,7 @@ from ksim_rl.config.plain_data import read_yaml
 from ksim_rl.files import arrays, reading
 from ksim_rl.files.writing import check_links
 from ksim_rl.scene.actuators import nets
-from ksim_rl.scene.motions import motion
+from ksim_rl.scene.motions import contents, motion
 from ksim_rl.trainers import loggers, run_folder
 from tests.cli.payloads import Bomb, call, signs, with_pickles
 
@@ -72,7 +72,7 @@ def test_data_files_are_files_of_a_size(kind, special, place, monkeypatch):
 
 
 def test_an_archive_that_unpacks_to_more_than_it_may_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(motion, "MOST_DATA_BYTES", 100_000)
+    monkeypatch.setattr(contents, "MOST_DATA_BYTES", 100_000)
     np.savez_compressed(tmp_path / "motion.npz", fps=30.0, qpos=np.zeros(100_000), qvel=np.zeros(1))
     with pytest.raises(ValueError, match="arrays are larger than 100000 bytes"):
         motion._read(tmp_path / "motion.npz")
