@@ -57,7 +57,8 @@ def test_the_picture_shows_the_robot_on_its_floor(run, tmp_path):
     except RuntimeError as error:
         pytest.skip(f"no OpenGL here: {error}")
     path = tmp_path / "stance.png"
-    assert run("--picture", str(path))[0] == 0
+    code, _, err = run("--picture", str(path))
+    assert code == 0, err
     picture = np.asarray(Image.open(path), dtype=float)
     assert picture.shape[:2] == (480, 640)
     # It stands in the middle, where the picture differs from column to column; the sides show ground alone.
