@@ -163,7 +163,7 @@ def build_env(cfg: RunCfg, *, num_envs: int, seed: int, render_mode: str | None 
 
     It carries the memory of a recurrent policy, and tells recurrent networks where episodes begin.
     """
-    # Sets that the objective alone reads, which an env would refuse: AMP shows them to no term of the task.
+    # Sets that the objective alone reads, and no term of the task: an env would refuse them.
     others = named_files(cfg.objective) - named_files(cfg.task)
     motions = {
         name: chosen for name, chosen in cfg.task.scene.motions.items() if name not in others
