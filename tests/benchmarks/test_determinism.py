@@ -115,6 +115,7 @@ def test_what_is_laid_out_like_the_pool_is_named_and_not_counted():
     ]
 
 
+@pytest.mark.full
 def test_the_command_writes_figures_and_hashes(monkeypatch, capsys):
     written = {}
     monkeypatch.setattr(report, "write", lambda name, **what: written.update(what))

@@ -31,6 +31,7 @@ def test_the_first_version_has_no_reward_for_staying_up(gentle) -> None:
     assert list(gentle.TASK.cfg().rewards) == ["force"]
 
 
+@pytest.mark.full
 def test_the_mended_version_keeps_the_contract_and_the_original_reward(gentle) -> None:
     exec(compile(CHANGES["cartpole_gentle"], "gentle.py", "exec"), vars(gentle))  # noqa: S102
     cfg = gentle.cartpole_gentle()

@@ -135,6 +135,7 @@ KINDS = {
 }  # fmt: skip
 
 
+@pytest.mark.full
 def test_fast_sac_sees_with_settings_of_its_own(monkeypatch):
     moved = []
     monkeypatch.setattr(ShiftedPictures, "shift_", lambda _, minibatch_B: moved.append(minibatch_B))

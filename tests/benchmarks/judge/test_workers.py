@@ -18,6 +18,7 @@ def do(task: str) -> str:
     return task.upper()
 
 
+@pytest.mark.full
 def test_others_go_on():
     tasks = ["a", "crash", "b", "hang", "c"]
     found = dict(in_processes(do, tasks, jobs=2, most_seconds=8.0))
