@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import torch
-from jaxtyping import Bool, Int64, Shaped
+from jaxtyping import Bool, Int64
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch import Tensor
 from ksim_rl.checked import Checked, Filled, Within
 from ksim_rl.data.dataset_storage import finite_rows
 from ksim_rl.data.episode_folder import EPISODE_KEY
-from ksim_rl.data.replay_storage import DONE, REWARD, TERMINATED, ReplayStorage
+from ksim_rl.data.replay_storage import DONE, REWARD, TERMINATED, ReplayStorage, made_finite
 from ksim_rl.device.group import first_row, size
 from ksim_rl.device.room import check_bytes
 from ksim_rl.transforms.specs import spell
@@ -102,13 +102,13 @@ def make_offline_table(
     own = {spell(key): rows_D.get(key)[own_D] for key in offline_keys(observations)}
     content = {}
     for key in kept:
-        value_N = _finite(own[spell(key)])
+        value_N = made_finite(own[spell(key)])
         content[spell(key)] = stored = value_N.new_zeros(places * shards, *value_N.shape[1:])
         stored[index_N] = value_N
         if key in observations:
             # The observation that an episode ends with takes a place of its own.
             following_N = own[spell(unravel_key(("next", key)))]
-            stored[index_N[ends_N] + shards] = _finite(following_N[ends_N])
+            stored[index_N[ends_N] + shards] = made_finite(following_N[ends_N])
     finite_N = finite_rows(own.values())[:, 0]
     available = torch.zeros(places * shards, dtype=torch.bool)
     available[index_N] = finite_N
@@ -193,12 +193,6 @@ def _check_rows(
                 f"{spell(key)!r} after env state {row} is not what its 'next' says: rows of an "
                 "episode have to follow one another"
             )
-
-
-def _finite(values: Shaped[Tensor, "N *?leaf"]) -> Shaped[Tensor, "N *?leaf"]:
-    if values.is_floating_point():
-        return values.nan_to_num(0.0, 0.0, 0.0)
-    return values
 
 
 def _sha256(rows_D: TensorDictBase) -> str:

@@ -5,7 +5,7 @@ from os import PathLike
 from typing import Any
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Int64, Shaped
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
@@ -279,7 +279,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         depth_E = torch.zeros_like(self.head_E)
         if not self.stacks.reach:
             return depth_E, depth_E
-        first = {key: _finite(rollout_ET.get(key)[:, 0]) for key in self.stacks.num_frames}
+        first = {key: made_finite(rollout_ET.get(key)[:, 0]) for key in self.stacks.num_frames}
         content: Any = {key: self.content.get(key) for key in first}
         depth_E, lacks_E = self.stacks.begun(first, content, self._head_index())
         skipped_E = lacks_E * self.stacks.reach
@@ -294,7 +294,7 @@ class ReplayStorage(SavedByStateDict, Storage):
 
     def _put(self, key: NestedKey, leaf: Tensor, index_N: Tensor, values_ET: Tensor) -> Tensor:
         """Write rows, and return which were finite, bool [N]; other elements become zero."""
-        leaf[index_N] = _finite(self.stacks.newest(key, values_ET).flatten(0, 1).to(leaf.dtype))
+        leaf[index_N] = made_finite(self.stacks.newest(key, values_ET).flatten(0, 1).to(leaf.dtype))
         if not leaf.is_floating_point():
             return torch.ones_like(index_N, dtype=torch.bool)
         # All frames of a stack; the older ones have been refused with their own env states.
@@ -332,7 +332,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         return reward_B, done_B, terminated_B, steps_B
 
 
-def _finite(leaf: Tensor) -> Tensor:
+def made_finite(leaf: Shaped[Tensor, "*leaf"]) -> Shaped[Tensor, "*leaf"]:
     """Return a leaf with zeros where it is not finite."""
     if leaf.is_floating_point():
         return leaf.nan_to_num(0.0, 0.0, 0.0)
