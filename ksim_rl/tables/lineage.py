@@ -70,7 +70,7 @@ def lineage_figures(
     """Return figures by name of row or group: `<row>_success`, and `<group>/env_states_saved`.
 
     Success is of the final evaluation and the worst seed, for rows that learn from episodes. Saved are the env states
-    that the row `saves_over` needs to reach its levels, minus the env states that this row needs, those of all runs
+    that the row `saves_over` needs to reach its levels, minus the env states that this row needs, of all runs
     that it begins from, and the episodes that these learned from: a median over the seeds. An infinite value has no
     figure.
     """

@@ -129,15 +129,24 @@ class Runs:
 
         Half a run leaves a folder and a checkpoint, too: a row learns only from runs with results.
         """
-        found = []
+        coming = {*waiting, *running}
+        ended: list[tuple[Job, Job]] = []
         for job in waiting:
-            name, seed = job
-            for source in sources_of(self.table.rows[name]):
-                is_coming = (source, seed) in waiting or (source, seed) in running
-                if not is_coming and seed not in self.results()[source]:
-                    found.append((job, source))
-                    break
-        return found
+            ended += [(job, source) for source in self._sources(job) if source not in coming]
+        if not ended:
+            return []
+        # Files are read once for all jobs, as this is asked at each poll.
+        results = self.results()
+        found: dict[Job, str] = {}
+        for job, (source, seed) in ended:
+            if seed not in results[source]:
+                found.setdefault(job, source)
+        return list(found.items())
+
+    def _sources(self, job: Job) -> list[Job]:
+        """Return the jobs that have to be done before this one: rows that it learns from, with its seed."""
+        name, seed = job
+        return [(source, seed) for source in sources_of(self.table.rows[name])]
 
     def _next(
         self,
@@ -150,8 +159,7 @@ class Runs:
         # A copy, since jobs are taken out of it.
         for job in list(waiting):
             # What it learns from has to be there first.
-            sources = [(name, job[1]) for name in sources_of(self.table.rows[job[0]])]
-            if any(source in waiting or source in running for source in sources):
+            if any(source in waiting or source in running for source in self._sources(job)):
                 continue
             log = self._claimed(job)
             if log is None:
