@@ -17,7 +17,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
@@ -85,38 +85,68 @@ class HiddenArm:
 
 def main() -> int:
     """Identify a hidden arm, train with and without the result, and write what both do on it."""
-    parser = OneLineParser(prog="python -m benchmarks.identified_policy", description=__doc__)
-    parser.add_argument("--seed", type=int, default=7, help="of the hidden arm and the noise")
-    parser.add_argument("--trainings", type=int, default=3, help="with each, of seeds 0, 1, ...")
-    options: Any = parser.parse_args()
-    check_count("--trainings", options.trainings)
+    options = asked("identified_policy", __doc__)
     hidden = HiddenArm(seed=options.seed)
-    returns: dict[str, list[float]] = {"without": [], "with": []}
-    at_home: dict[str, list[float]] = {"without": [], "with": []}
     with tempfile.TemporaryDirectory() as folder:
         found = identified(hidden, Path(folder))
-        for seed in range(options.trainings):
-            for name, overrides in (("without", []), ("with", found)):
-                run = Path(folder) / f"{name}_{seed}"
-                train(run, [*overrides, f"seed={seed}"])
-                returns[name].append(score(run, put_in(hidden)))
-                at_home[name].append(score(run, lambda cfg: cfg))
-                print(f"{name}, seed {seed}: {returns[name][-1]:.2f} on the hidden arm", flush=True)
-    figures = {f"hidden_arm/{name}": mean(values) for name, values in returns.items()}
+        returns = trained(hidden, found, trainings=options.trainings, folder=Path(folder))
+    figures = {f"hidden_arm/{name}": mean(values) for name, values in returns.hidden.items()}
     for name, value in figures.items():
         print(f"{name}: return {value:.2f}")
+    write("identified_policy", figures, returns, seed=options.seed)
+    return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Returns:
+    """Returns of policies trained "with" what was found and "without", by seed of the training.
+
+    Attributes:
+        hidden: on the hidden arm.
+        at_home: in the env of the training.
+    """
+
+    hidden: dict[str, list[float]]
+    at_home: dict[str, list[float]]
+
+
+def asked(benchmark: str, text: str | None) -> Any:
+    """Return the options of the command line: `seed` and `trainings`."""
+    parser = OneLineParser(prog=f"python -m benchmarks.{benchmark}", description=text)
+    parser.add_argument("--seed", type=int, default=7, help="of the hidden arm and the noise")
+    parser.add_argument("--trainings", type=int, default=3, help="with each, of seeds 0, 1, ...")
+    options = parser.parse_args()
+    check_count("--trainings", options.trainings)
+    return options
+
+
+def trained(hidden: HiddenArm, found: Sequence[str], *, trainings: int, folder: Path) -> Returns:
+    """Train with the overrides that were `found` and without, and return what the policies come to."""
+    returns = Returns(hidden={"without": [], "with": []}, at_home={"without": [], "with": []})
+    for seed in range(trainings):
+        for name, overrides in (("without", []), ("with", found)):
+            run = folder / f"{name}_{seed}"
+            train(run, [*overrides, f"seed={seed}"])
+            on_hidden = score(run, put_in(hidden))
+            returns.hidden[name].append(on_hidden)
+            returns.at_home[name].append(score(run, lambda cfg: cfg))
+            print(f"{name}, seed {seed}: {on_hidden:.2f} on the hidden arm", flush=True)
+    return returns
+
+
+def write(benchmark: str, figures: Mapping[str, float], returns: Returns, *, seed: int) -> None:
+    """Write the results of a benchmark of the hidden arm, and say where."""
     path = report.write(
-        "identified_policy",
+        benchmark,
         figures=figures,
         device=torch.device("cpu"),
-        module="benchmarks.identified_policy",
-        seed=options.seed,
+        module=f"benchmarks.{benchmark}",
+        seed=seed,
         episodes=EPISODES,
-        returns=returns,
-        returns_in_training=at_home,
+        returns=returns.hidden,
+        returns_in_training=returns.at_home,
     )
     print(f"written to {path}")
-    return 0
 
 
 def identified(hidden: HiddenArm, folder: Path) -> list[str]:

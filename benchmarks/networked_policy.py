@@ -16,16 +16,13 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
-from typing import Any
 
 import mujoco
 import numpy as np
-import torch
 
-from benchmarks import command_line, report
-from benchmarks.identified_policy import EPISODES, TASK, HiddenArm, follow, put_in, score, train
+from benchmarks import command_line
+from benchmarks.identified_policy import TASK, HiddenArm, asked, follow, trained, write
 from ksim_rl import envs
-from ksim_rl.checks import OneLineParser, check_count
 from ksim_rl.identification.actuator_nets import FittedNet, fit_nets
 from ksim_rl.identification.command import identify
 from ksim_rl.identification.held_robot import hold
@@ -55,40 +52,18 @@ class SlowArm(HiddenArm):
 
 def main() -> int:
     """Fit networks to a hidden arm, train with and without them, and write what both do on it."""
-    parser = OneLineParser(prog="python -m benchmarks.networked_policy", description=__doc__)
-    parser.add_argument("--seed", type=int, default=7, help="of the hidden arm and the noise")
-    parser.add_argument("--trainings", type=int, default=3, help="with each, of seeds 0, 1, ...")
-    options: Any = parser.parse_args()
-    check_count("--trainings", options.trainings)
+    options = asked("networked_policy", __doc__)
     hidden = SlowArm(seed=options.seed)
-    returns: dict[str, list[float]] = {"without": [], "with": []}
-    at_home: dict[str, list[float]] = {"without": [], "with": []}
     with tempfile.TemporaryDirectory() as folder:
         nets, override = networks(hidden, Path(folder))
-        for seed in range(options.trainings):
-            for name, overrides in (("without", []), ("with", [override])):
-                run = Path(folder) / f"{name}_{seed}"
-                train(run, [*overrides, f"seed={seed}"])
-                returns[name].append(score(run, put_in(hidden)))
-                at_home[name].append(score(run, lambda cfg: cfg))
-                print(f"{name}, seed {seed}: {returns[name][-1]:.2f} on the hidden arm", flush=True)
-    figures = {f"slow_arm/{name}": mean(values) for name, values in returns.items()}
+        returns = trained(hidden, [override], trainings=options.trainings, folder=Path(folder))
+    figures = {f"slow_arm/{name}": mean(values) for name, values in returns.hidden.items()}
     for net in nets:
         figures[f"held_out/{net.name}"] = net.error
         figures[f"held_out_law/{net.name}"] = net.pd_error
     for name, value in figures.items():
         print(f"{name}: {value:.3f}")
-    path = report.write(
-        "networked_policy",
-        figures=figures,
-        device=torch.device("cpu"),
-        module="benchmarks.networked_policy",
-        seed=options.seed,
-        episodes=EPISODES,
-        returns=returns,
-        returns_in_training=at_home,
-    )
-    print(f"written to {path}")
+    write("networked_policy", figures, returns, seed=options.seed)
     return 0
 
 
