@@ -174,7 +174,7 @@ class TransferCard:
 
 
 def _cell(text: str) -> str:
-    """Return a text that stays in its cell of a table, whatever bars it has, such as those of regular expressions."""
+    """Return a text that stays in its cell of a table, whatever bars it has, as regular expressions do."""
     return text.replace("|", r"\|")
 
 

@@ -122,7 +122,7 @@ class Session:
         rewards: the weighted reward terms of that env in the last step.
         note: a remark beside the figures, such as how old the policy is.
         refused: how many requests found no room.
-        listener: is called with each step `["E"]`, its "next" included, and whether all envs began anew before it.
+        listener: is called with each step `["E"]`, its "next" included, and whether all envs were reset before it.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class Session:
         self.episode_return = 0.0
         self.achieved_speed = 0.0
         self.listener: Callable[[TensorDictBase, bool], None] | None = None
-        self._is_new = True  # no step since all envs began anew
+        self._is_new = True  # no step since all envs were reset
         self._steered: dict[str, dict[str, float]] = {}
         self._sought: tuple[int, float] | None = None
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue(MOST_REQUESTS)
