@@ -8,7 +8,7 @@ then the seconds until all ranks have ended after one was killed (`kill=no` leav
 follows its command on one GPU (one seed on each at a time) and on all, the median of `seeds` (1,2,3,4,5; none with
 `seeds=none`), without the first iteration; there the env states per update are the same on all as on one, with shorter
 rollouts. With `tasks=go1_velocity_flat:4096` others are chosen (none with
-`tasks=none`), and `device=cpu` tries it out.
+`tasks=none`), and `device=cpu` tries it out. A third part names the algorithm: `g1_velocity_flat:4096:fast_sac`.
 
 Figures go to benchmarks/results/ranks.json after each part, so that the figures of one part stay when a later one runs
 out of time. All processes have the variables of `NCCL`, which leave NVLink multicast off and which the file records.
@@ -39,7 +39,10 @@ from ksim_rl import conf, ranks
 from ksim_rl.tables.table import load
 from ksim_rl.trainers import build
 
-TASKS = "go1_velocity_flat:16384,go1_velocity_flat:4096,g1_velocity_flat:4096"
+TASKS = (
+    "go1_velocity_flat:16384,go1_velocity_flat:4096,g1_velocity_flat:4096,"
+    "g1_velocity_flat:4096:fast_sac"
+)
 OPTIONS = {
     "tasks": TASKS,
     "seeds": "1,2,3,4,5",
@@ -70,14 +73,16 @@ def worker(device: str, tasks: str) -> None:
                 print(json.dumps(figures), flush=True)
 
 
-def measured(device: str, task: str, num_envs: str) -> dict[str, float]:
-    """Return what whole iterations of a task take."""
+def measured(device: str, task: str, num_envs: str, objective: str = "ppo") -> dict[str, float]:
+    """Return what whole iterations of a task take; algorithms with a replay keep their own rollout length."""
     run = [
         f"task={task}",
+        f"objective={objective}",
         f"num_envs={num_envs}",
         f"device={device}",
-        "collector.rollout_length=24",
     ]
+    if objective == "ppo":
+        run.append(f"collector.rollout_length={ROLLOUT_LENGTH}")
     trainer = build(conf.compose([*run, "logger=none", "trainer.eval_episodes=0"]))
     own = trainer.update.device
 
@@ -244,9 +249,9 @@ def compare(tasks: str, size: int, *, device: str, label: str, saved: Callable[.
         by_size.append([json.loads(line) for line in text.splitlines() if line.startswith("{")])
         print(f"{count} of {device}: {time.monotonic() - began:.0f} s", flush=True)
     for word, one, all_ranks in zip(tasks.split(","), *by_size, strict=True):
-        task, _, num_envs = word.partition(":")
+        task, num_envs, *objective = word.split(":")
         ratio = all_ranks["env_states_per_s"] / one["env_states_per_s"]
-        prefix = f"{label}/{task}/{num_envs}"
+        prefix = "/".join([label, task, num_envs, *objective])
         name = {2: "two"}.get(size, str(size))
         figures = {f"{prefix}/{name}_over_one": round(ratio, 3)}
         figures |= {f"{prefix}/one_{key}": round(value, 3) for key, value in one.items()}
@@ -254,7 +259,7 @@ def compare(tasks: str, size: int, *, device: str, label: str, saved: Callable[.
         saved(figures=figures)
         times = [f"{part['iteration_ms']:.1f}" for part in (one, all_ranks)]
         speeds = [f"{part['env_states_per_s']:,.0f}" for part in (one, all_ranks)]
-        table.add_row(task, num_envs, *times, *speeds, f"{ratio:.3f}")
+        table.add_row(" ".join([task, *objective]), num_envs, *times, *speeds, f"{ratio:.3f}")
     Console().print(table)
 
 
