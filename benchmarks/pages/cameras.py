@@ -3,7 +3,11 @@
 from benchmarks.pages.committed import results
 from benchmarks.pages.table import table
 
-TASKS = {"cartpole": "cartpole_balance", "Go1": "go1_velocity_flat"}
+TASKS = {
+    "cartpole": "cartpole_balance",
+    "Go1": "go1_velocity_flat",
+    "G1 (capsules)": "g1_velocity_flat",
+}
 PICTURES = {"RGB": "", "depth": "depth_"}
 NUM_ENVS = 4096
 SIZE = 64
