@@ -59,6 +59,22 @@ def value_of(row: Row, results: Sequence[Result]) -> float | None:
     return None
 
 
+def further_figures(row: Row, results: Sequence[Result]) -> dict[str, float]:
+    """Return `Row.figures` of all seeds: seconds are a median, and of all else the lowest counts.
+
+    A mean that a seed lacks, as no episode ended there, gives no figure.
+    """
+    figures = {}
+    for name, source in row.figures.items():
+        if source == "seconds":
+            figures[name] = statistics.median(result["seconds"] for result in results)
+        elif source == "success":
+            figures[name] = min(result["trials"]["success"] for result in results)
+        elif all(source in result["means"] for result in results):
+            figures[name] = min(result["means"][source] for result in results)
+    return figures
+
+
 def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
     """Return whether a row reaches all its goals; None where it has none."""
     value = value_of(row, results)

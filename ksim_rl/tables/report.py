@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ksim_rl.config.trees import Tree
 from ksim_rl.files.writing import whole_file, write_whole
-from ksim_rl.tables.levels import Result, is_reached, value_of
+from ksim_rl.tables.levels import Result, further_figures, is_reached, value_of
 from ksim_rl.tables.lineage import lineage_figures
 from ksim_rl.tables.table import Row, Table
 
@@ -25,8 +25,8 @@ COLUMNS = ("ours", "seeds", "env states", "seconds + before", "reached")
 def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
     """Return flat figures: `<table>/<row>`, with `/seconds` and `/falls`, or `/success` for these measures; means.
 
-    Rows that learn from others also have the figures of `lineage_figures`. An infinite value has no figure, and neither
-    has a mean over a group that lacks a row.
+    Each row also has its `Row.figures`, and rows that learn from others those of `lineage_figures`. An infinite value has
+    no figure, and neither has a mean over a group that lacks a row.
     """
     figures: dict[str, float] = {}
     for name, results in rows.items():
@@ -52,6 +52,8 @@ def _row_figures(table: Table, name: str, results: Results) -> dict[str, float]:
     if value is not None:
         digits = 4 if row.measure == "success" else 2
         figures[key] = round(value, digits)
+    for further_name, further in further_figures(row, results).items():
+        figures[f"{table.name}/{name}/{further_name}"] = round(further, 4)
     return figures
 
 
@@ -198,6 +200,15 @@ def _cells(row: Row, results: Results) -> list[str]:
 
 
 def _our_cell(row: Row, results: Results) -> str:
+    """Return the value of a row, and its further figures, but for those that the cell or another one has."""
+    cell = _measured(row, results)
+    for name, value in further_figures(row, results).items():
+        if row.figures[name] not in ("seconds", "success"):
+            cell += f", {name} {value:.3f}"
+    return cell
+
+
+def _measured(row: Row, results: Results) -> str:
     """Return the value of a row as its measure is read: seconds and falls, trials, or a return with its spread."""
     value = value_of(row, results)
     if row.measure == "seconds":

@@ -42,6 +42,8 @@ class Row(Checked):
             `objective.episodes` of `bc`, and else `data.offline`, with its share of a half.
         begins_from: the row above whose final networks it begins with, seed by seed.
         saves_over: the row above, without such a beginning, that it is compared with: how many env states it saves.
+        figures: further figures by name. Each has a source: "seconds" of the whole training, "success" of the trials,
+            or one of the means of the end, such as `evaluation/metric/<name>`.
         published: returns that others report, by who; `against` names the one to reach, "" none.
     """
 
@@ -56,6 +58,7 @@ class Row(Checked):
     within_s: Positive | None = None
     at_least: Share | None = None
     most_falls: Share | None = None
+    figures: Mapping[str, str] = field(default_factory=dict)
     published: Mapping[str, float] = field(default_factory=dict)
     against: str = ""
     recorded: WholeNumber = 0
@@ -72,11 +75,30 @@ class Row(Checked):
             raise ValueError(
                 "levels={}: measure=seconds waits until metrics reach some; give one at least"
             )
+        for name, source in self.figures.items():
+            self._check_figure(name, source)
         check_name("task", self.task)
         check_name("objective", self.objective)
         # Names and words go into paths and command lines: signs with a meaning there are refused.
         for word in self.overrides:
             check_override(word)
+
+    def _check_figure(self, name: str, source: str) -> None:
+        """Refuse a further figure that no result has, or that has the name of another one."""
+        check_name("figures", name)
+        if name in (self.measure, "falls"):
+            raise ValueError(f"figures.{name}: measure={self.measure} writes it: choose another name")
+        if source == "success" and self.measure != "success":
+            raise ValueError(
+                f"figures.{name}='success': measure={self.measure} runs no trials: set measure=success, or name "
+                "a mean such as evaluation/metric/success"
+            )
+        is_mean = source in self.levels or source.startswith("evaluation/")
+        if source not in ("seconds", "success") and not is_mean:
+            raise ValueError(
+                f"figures.{name}={source!r}: expected seconds, success, evaluation/..., or one of the levels: "
+                f"{', '.join(self.levels) or 'there are none'}"
+            )
 
     @property
     def goal(self) -> float | None:

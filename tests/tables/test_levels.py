@@ -62,6 +62,30 @@ def test_the_seed_with_the_fewest_successes_counts():
     assert figures_of(table, {"walk": results}) == {"tracking/walk/success": 0.95}
 
 
+def test_further_figures_have_names_of_their_own():
+    row = Row(
+        **COMMON,
+        measure="success",
+        figures={
+            "least_trained": "success",
+            "mean_held_out": "evaluation/held_out_success",
+            "seconds": "seconds",
+            "absent": "evaluation/metric/nothing",
+        },
+    )
+    results = []
+    for success, held_out, seconds in ((1.0, 0.8, 250.0), (0.96, 0.9, 260.0), (0.98, 0.85, 300.0)):
+        means = {"evaluation/held_out_success": held_out}
+        results.append({"trials": {"success": success}, "means": means, "seconds": seconds})
+    table = Table(name="motions", title="", rows={"track": row})
+    assert figures_of(table, {"track": results}) == {
+        "motions/track/success": 0.96,
+        "motions/track/least_trained": 0.96,
+        "motions/track/mean_held_out": 0.8,
+        "motions/track/seconds": 260.0,
+    }
+
+
 def test_beside_a_return_each_seed_should_end_with_its_levels():
     row = Row(**COMMON, levels=LEVELS, published={"PPO": 500.0}, against="PPO")
     good = {"evaluation": {"return_mean": 600.0}, "means": {"linear": 1.4, "angular": 1.0}}

@@ -9,7 +9,7 @@ import pytest
 from ksim_rl import envs
 from ksim_rl.conf import compose
 from ksim_rl.suites.dm_control.domains import DOMAINS
-from ksim_rl.tables.measure import run_cfg
+from ksim_rl.tables.measure import HELD_OUT, run_cfg
 from ksim_rl.tables.table import load, shipped
 
 OWN = """
@@ -53,6 +53,9 @@ def test_rows_inherit_the_fields_of_their_group(tmp_path):
         ("against: PPO", "measure: seconds", "levels=.*measure=seconds"),
         ("against: PPO", "overrides: [seed=3]", "'seed=3' has a field of its own"),
         ("rows:", "lines:", "groups that have rows"),
+        ("against: PPO", "figures: {best: trials}", "figures.best='trials': expected seconds"),
+        ("against: PPO", "figures: {best: success}", "figures.best='success': .*no trials"),
+        ("against: PPO", "figures: {falls: seconds}", "figures.falls: .*another name"),
     ],
 )
 def test_what_is_wrong_in_a_table_is_named(tmp_path, old, new, message):
@@ -151,14 +154,20 @@ def test_the_tables_have_every_task_and_that_of_tasks_asks_of_each_what_the_task
             )
 
 
-@pytest.mark.parametrize("table", ["humanoids", "tasks", "velocity"])
-def test_levels_are_of_metrics_that_the_task_has(table):
+@pytest.mark.parametrize("table", ["humanoids", "motions", "tasks", "velocity"])
+def test_levels_and_figures_are_of_metrics_that_the_task_has(table):
     for row in load(table).rows.values():
         cfg = envs.task(row.task).cfg()
-        known = {f"reward/{name}" for name in cfg.rewards} | {
-            f"evaluation/metric/{name}" for name in cfg.metrics
-        }
-        assert set(row.levels) <= known, row.task
+        known = {f"reward/{name}" for name in cfg.rewards} | {HELD_OUT, "seconds", "success"}
+        for name in cfg.metrics:
+            known |= {f"metric/{name}", f"evaluation/metric/{name}"}
+        assert {*row.levels, *row.figures.values()} <= known, row.task
+
+
+def test_the_table_of_motions_writes_the_figures_that_its_page_names():
+    rows = load("motions").rows
+    assert set(rows["g1_track"].figures) == {"least_trained", "mean_held_out", "seconds"}
+    assert rows["g1_carry_box"].figures == {"success": "evaluation/metric/success"}
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "tables.md"
