@@ -25,8 +25,8 @@ COLUMNS = ("ours", "seeds", "env states", "seconds + before", "reached")
 def figures_of(table: Table, rows: Mapping[str, Results]) -> dict[str, float]:
     """Return flat figures: `<table>/<row>`, with `/seconds` and `/falls`, or `/success` for these measures; means.
 
-    Each row also has its `Row.figures`, and rows that learn from others those of `lineage_figures`. An infinite value has
-    no figure, and neither has a mean over a group that lacks a row.
+    Each row also has its `Row.figures`, and rows that learn from others the figures of `lineage_figures`. An infinite
+    value has no figure, and neither has a mean over a group that lacks a row.
     """
     figures: dict[str, float] = {}
     for name, results in rows.items():
