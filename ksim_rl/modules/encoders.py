@@ -16,6 +16,7 @@ from ksim_rl.checked import NUMBERS_PER_WEIGHT, Checked, Count, Range
 from ksim_rl.checks import check_choice
 from ksim_rl.device.state_tree import DESCRIPTION
 from ksim_rl.modules.mlp import ACTIVATIONS, Device
+from ksim_rl.modules.picture_blocks import BlockConvolution, PictureBlocks, block_size
 from ksim_rl.transforms.pictures.layout import Layout, check_layout, framed
 
 
@@ -79,9 +80,15 @@ class EncoderCfg(Checked):
             )
         check_layout(spec.shape, self.layout)
         low, high = self._ends(spec.dtype)
-        first = _ToChannels(self.layout, low=low, high=high)
+        kernel_size = self.kernel_sizes[0]
+        stride = self.strides[0]
+        block = block_size(kernel_size, stride)
+        blocks = PictureBlocks(
+            self.layout, low=low, block=block, kernel_size=kernel_size, stride=stride
+        )
         # Counted on the meta device, which allocates nothing.
-        num_channels = first(torch.empty(1, *spec.shape, device="meta")).shape[1]
+        framed_BNHWC = framed(torch.empty(1, *spec.shape, device="meta"), self.layout)
+        num_channels = framed_BNHWC.shape[1] * framed_BNHWC.shape[-1]
         # Drawn on the CPU, so that one seed gives the same network on every device.
         convolutions = ConvNet(
             in_features=num_channels,
@@ -92,7 +99,10 @@ class EncoderCfg(Checked):
             aggregator_class=SpatialSoftmax if self.spatial_softmax else nn.Flatten,
             aggregator_kwargs={},
         )
-        return nn.Sequential(first, convolutions).to(device)
+        plain = convolutions[0]
+        assert isinstance(plain, nn.Conv2d)
+        convolutions[0] = BlockConvolution(plain, block=block, scale=1.0 / (high - low))
+        return nn.Sequential(blocks, convolutions).to(device)
 
     def _ends(self, dtype: torch.dtype) -> tuple[float, float]:
         """Return the values that become 0 and 1."""
@@ -122,22 +132,6 @@ class SpatialSoftmax(nn.Module):
         x_BC = (weights_BCHW.sum(-2) * x_W).sum(-1)
         y_BC = (weights_BCHW.sum(-1) * y_H).sum(-1)
         return torch.cat((x_BC, y_BC), -1)
-
-
-class _ToChannels(nn.Module):
-    """Maps pictures [B, *shape] to float32 [B, C, H, W], scaled; the channels of N stacked pictures stand in a row."""
-
-    def __init__(self, layout: Layout, *, low: float, high: float) -> None:
-        super().__init__()
-        self.layout: Layout = layout
-        self.low = low
-        self.factor = 1.0 / (high - low)
-
-    def forward(self, pictures: Shaped[Tensor, " B *shape"]) -> Float[Tensor, "B C H W"]:
-        """Return the pictures as the convolutions read them."""
-        channels_BNCHW = framed(pictures, self.layout).movedim(-1, -3)
-        # Floats are made here, for the pictures at hand only: datasets keep bytes.
-        return (channels_BNCHW.flatten(1, 2).float() - self.low) * self.factor
 
 
 class Encoder(nn.Module):

@@ -87,7 +87,9 @@ class Row(Checked):
         """Refuse a further figure that no result has, or that has the name of another one."""
         check_name("figures", name)
         if name in (self.measure, "falls"):
-            raise ValueError(f"figures.{name}: measure={self.measure} writes it: choose another name")
+            raise ValueError(
+                f"figures.{name}: measure={self.measure} writes it: choose another name"
+            )
         if source == "success" and self.measure != "success":
             raise ValueError(
                 f"figures.{name}='success': measure={self.measure} runs no trials: set measure=success, or name "

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional
 from torchrl.data import Composite, Unbounded
-from torchrl.modules import set_recurrent_mode
+from torchrl.modules import ConvNet, set_recurrent_mode
 
 from ksim_rl.device.state_tree import copy_into
 from ksim_rl.modules import (
@@ -96,6 +96,40 @@ def test_features_are_those_of_torch(shape, dtype, fields, channels_first):
     expected = by_torch(encoder, channels_first(pictures_BT.flatten(0, 1)))
     torch.testing.assert_close(features_BTF, expected.unflatten(0, (2, 3)))
     assert features_BTF.shape[-1] == encoder.num_features
+
+
+# Windows of whole blocks of 4, 3 and 2 pixels, of single pixels, and windows that their stride does not divide.
+@pytest.mark.parametrize(("kernel_size", "stride"), [(8, 4), (3, 3), (4, 2), (2, 1), (5, 2)])
+def test_blocks_of_pixels_are_read_as_by_torchrls_network(kernel_size, stride):
+    sizes = {"kernel_sizes": (kernel_size, 2), "strides": (stride, 1)}
+    # Neither side is a multiple of a stride, so that some rows and columns are read by no window.
+    spec = picture_spec(2, 22, 19, 3)
+    encoder = Encoder(EncoderCfg(channels=(4, 5), **sizes), spec)
+    plain = ConvNet(
+        in_features=6,
+        num_cells=[4, 5],
+        **sizes,
+        activation_class=nn.ReLU,
+        aggregator_class=nn.Flatten,
+        aggregator_kwargs={},
+    )
+    # A state of TorchRL's network is one of the encoder's.
+    encoder.layers[1].load_state_dict(plain.state_dict())
+    pictures = torch.randint(256, (3, *spec.shape), dtype=torch.uint8)
+    expected = plain(torch.cat([pictures[:, 0], pictures[:, 1]], -1).permute(0, 3, 1, 2) / 255)
+    features = encoder(pictures)
+    torch.testing.assert_close(features, expected, atol=1e-6, rtol=1e-6)
+    weights = (torch.linspace(0.0, 1.0, expected.numel()).reshape(expected.shape),)
+    found = torch.autograd.grad(features, list(encoder.parameters()), weights)
+    for gradient, other in zip(
+        found, torch.autograd.grad(expected, list(plain.parameters()), weights), strict=True
+    ):
+        torch.testing.assert_close(gradient, other, atol=1e-5, rtol=1e-5)
+    # Autocast rounds weights, and no byte: 255 has as many digits as bfloat16.
+    exact = encoder.layers[0](pictures)
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = encoder.layers[0](pictures)
+    assert rounded.dtype == torch.bfloat16 and torch.equal(rounded.float(), exact)
 
 
 def test_spatial_softmax_is_where_a_channel_is_brightest():
