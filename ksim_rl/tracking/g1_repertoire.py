@@ -1,4 +1,4 @@
-"""The clips of Unitree G1 from which one policy learns many motions: twelve kinds, each with several ways to do it.
+"""The clips of Unitree G1 from which one policy learns many motions: thirteen kinds, each with several ways to do it.
 
 A clip is named `<kind>_<variant>`, and its mirror image `<kind>_<variant>_mirrored`.
 """
@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
+from ksim_rl.tracking.g1_gestures import gesture
 from ksim_rl.tracking.g1_motions import FEET, FEET_APART, MIDDLE, NARROW, STAND, Clip
 from ksim_rl.tracking.keyframes import Choreography, FootMove, Keys
 
@@ -14,6 +15,8 @@ WALKING = 0.72
 """m: the root's height while feet are lifted, so that the knees have room."""
 BEGIN_S = 0.9
 """s: until then weight moves onto the first standing foot."""
+GESTURES = 16
+"""Random gestures: the seeds below it."""
 Step = tuple[float, float, float]
 """m ahead, m to the left, and rad to the left by which the place of the feet moves with a step."""
 
@@ -357,6 +360,8 @@ KINDS: Mapping[str, Mapping[str, Plan]] = {
         "aside": partial(dance, 0.6, dip=0.0, swing=0.5, step=0.05),
         "aside_twist": partial(dance, 0.66, dip=0.0, swing=0.5, twist=0.08, step=0.04),
     },
+    # Named by their seeds.
+    "gesture": {str(seed): partial(gesture, seed) for seed in range(GESTURES)},
 }
 """The plans by kind and variant."""
 REPERTOIRE: Mapping[str, Clip] = {

@@ -134,7 +134,7 @@ def _parser() -> OneLineParser:
         else:
             one.add_argument("--height", type=float, default=HEIGHT, help="of the person, m")
     own = kinds.add_parser(
-        "generate", help="the package's plans of Unitree G1, sixty motions of twelve kinds"
+        "generate", help="the package's plans of Unitree G1, 77 motions of thirteen kinds"
     )
     own.add_argument(
         "folder", type=Path, help="where to write, an .npz file for each, and its mirror image"

@@ -13,8 +13,8 @@ from ksim_rl.tracking.keyframes import foot_paths
 from tests.tracking.g1 import g1_model
 
 
-def test_there_are_sixty_clips_of_twelve_kinds():
-    assert len(KINDS) == 12 and len(REPERTOIRE) >= 60
+def test_there_are_77_clips_of_thirteen_kinds():
+    assert (len(KINDS), len(REPERTOIRE)) == (13, 77)
     assert all(len(variants) >= 4 for variants in KINDS.values())
     plans = [repr(clip.plan()) for clip in REPERTOIRE.values()]
     assert len(set(plans)) == len(plans), "no two are the same"
