@@ -72,13 +72,15 @@ class BlockConvolution(nn.Conv2d):
         self.block = block
         self.scale = scale
 
-    def forward(self, input: Float[Tensor, "B C H W"]) -> Float[Tensor, "B O H2 W2"]:
+    def forward(self, blocks_BCHW: Float[Tensor, "B C H W"]) -> Float[Tensor, "B O H2 W2"]:
         """Return what the plain convolution gives for the scaled pictures."""
         windows = self.kernel_size[0] // self.block
         # [O, I, M, S, M, S]
         parts = self.weight.unflatten(3, (windows, self.block)).unflatten(2, (windows, self.block))
         weight_OIMM = parts.permute(0, 3, 5, 1, 2, 4).flatten(1, 3) * self.scale
-        return functional.conv2d(input, weight_OIMM, self.bias, stride=self.stride[0] // self.block)
+        return functional.conv2d(
+            blocks_BCHW, weight_OIMM, self.bias, stride=self.stride[0] // self.block
+        )
 
 
 def block_size(kernel_size: int, stride: int) -> int:
