@@ -8,6 +8,8 @@ from ksim_rl.config.trees import Tree
 from ksim_rl.tables.table import Row
 
 HELD_STATES = 1e6
+COURSE_LEAST = "evaluation/course_least"
+"""The least share of robots, over kinds of ground, that cross the row's level of the course."""
 Point = Mapping[str, float]
 # What `measure` found for a seed of a row, as plain data.
 Result = Tree
@@ -75,6 +77,18 @@ def further_figures(row: Row, results: Sequence[Result]) -> dict[str, float]:
     return figures
 
 
+def falls_of(row: Row, results: Sequence[Result]) -> float:
+    """Return the share of falls of the worst seed: on the course where the row has one, else in the last evaluation."""
+    if row.course_level is not None:
+        return max(result["course"]["fell"] for result in results)
+    return max(result["falls"] for result in results)
+
+
+def course_least_of(results: Sequence[Result]) -> float:
+    """Return the least share of robots that cross a kind of ground at the row's level, of all kinds and seeds."""
+    return min(result["means"][COURSE_LEAST] for result in results)
+
+
 def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
     """Return whether a row reaches all its goals; None where it has none."""
     value = value_of(row, results)
@@ -89,7 +103,9 @@ def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
     for name, level in row.levels.items() if row.measure != "seconds" else ():
         found += [result["means"].get(name, -math.inf) >= level for result in results]
     if row.most_falls is not None:
-        found.append(max(result["falls"] for result in results) < row.most_falls)
+        found.append(falls_of(row, results) < row.most_falls)
+    if row.course_least is not None:
+        found.append(course_least_of(results) >= row.course_least)
     if found:
         return all(found)
     return None

@@ -7,7 +7,14 @@ from pathlib import Path
 
 from ksim_rl.config.trees import Tree
 from ksim_rl.files.writing import whole_file, write_whole
-from ksim_rl.tables.levels import Result, further_figures, is_reached, value_of
+from ksim_rl.tables.levels import (
+    Result,
+    course_least_of,
+    falls_of,
+    further_figures,
+    is_reached,
+    value_of,
+)
 from ksim_rl.tables.lineage import lineage_figures
 from ksim_rl.tables.table import Row, Table
 
@@ -45,7 +52,7 @@ def _row_figures(table: Table, name: str, results: Results) -> dict[str, float]:
     figures = {}
     if row.measure == "seconds":
         # The worst seed counts: a gait that falls with one seed is no success.
-        figures[f"{key}/falls"] = max(result["falls"] for result in results)
+        figures[f"{key}/falls"] = falls_of(row, results)
     # The return has the plain name, as most rows measure it.
     if row.measure != "return":
         key += f"/{row.measure}"
@@ -213,8 +220,11 @@ def _measured(row: Row, results: Results) -> str:
     value = value_of(row, results)
     if row.measure == "seconds":
         seconds = "not reached" if value is None else f"{value:.1f} s"
-        falls = max(result["falls"] for result in results)
-        return f"{seconds}, falls {100 * falls:.1f} %"
+        cell = f"{seconds}, falls {100 * falls_of(row, results):.1f} %"
+        if row.course_level is not None:
+            least = course_least_of(results)
+            cell += f", at least {100 * least:.0f} % cross level {row.course_level}"
+        return cell
     if row.measure == "success" and value is not None:
         return f"{100 * value:.1f} % of trials succeed"
     cell = ""

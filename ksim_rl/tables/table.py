@@ -36,7 +36,11 @@ class Row(Checked):
             of its last million env states. There `evaluation/metric/<name>` is of the final evaluation's episodes.
         within_s: seconds in which the levels should be reached.
         at_least: share of trials that should succeed.
-        most_falls: share of these episodes that may end before their time; the worst seed counts.
+        most_falls: share of these episodes, or with a course of the robots on it, that may end in a termination before
+            their time; the worst seed counts.
+        course_level: the final policy also walks the course of its rough ground (`ksim_rl.tasks.terrain_course`), and
+            the shares of robots that succeed on each kind of ground at this level count, the easiest being 0.
+        course_least: the least of these shares that is asked for, over kinds and seeds.
         recorded: so many episodes of the final policy, with its draws, are kept for rows that learn from them.
         learns_from: the row above whose recorded episodes it learns from, seed by seed: they become
             `objective.episodes` of `bc`, and else `data.offline`, with its share of a half.
@@ -59,6 +63,8 @@ class Row(Checked):
     at_least: Share | None = None
     most_falls: Share | None = None
     figures: Mapping[str, str] = field(default_factory=dict)
+    course_level: WholeNumber | None = None
+    course_least: Share | None = None
     published: Mapping[str, float] = field(default_factory=dict)
     against: str = ""
     recorded: WholeNumber = 0
@@ -77,6 +83,10 @@ class Row(Checked):
             )
         for name, source in self.figures.items():
             self._check_figure(name, source)
+        if self.course_least is not None and self.course_level is None:
+            raise ValueError(
+                f"course_least={self.course_least}: it is of a level of the course; give course_level, too"
+            )
         check_name("task", self.task)
         check_name("objective", self.objective)
         # Names and words go into paths and command lines: signs with a meaning there are refused.

@@ -30,7 +30,8 @@ class Evaluator:
     """Runs the first episode of each env from the same seed, with the policy's deterministic action; all ranks share.
 
     The envs `["E"]` are stepped by nothing else. Their own `max_episode_length` is the natural `max_steps`.
-    After a call `length_E`, float64 [E], has the steps of each episode.
+    After a call `length_E`, float64 [E], has the steps of each episode, and `terminated_E`, bool [E], tells which ones
+    a termination ended, and neither a truncation nor the step limit.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class Evaluator:
         # float64: sums over many steps must not depend on their order.
         self._return_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
         self.length_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
+        self.terminated_E = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._running_E = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._current_E: TensorDictBase | None = None
         # One step is captured, and replayed for each step of an episode.
@@ -87,6 +89,7 @@ class Evaluator:
             self._keep(first_E)
         self._return_E.zero_()
         self.length_E.zero_()
+        self.terminated_E.zero_()
         self._running_E.fill_(True)
 
     def _count_one_step(self) -> None:
@@ -95,10 +98,11 @@ class Evaluator:
             acting_E = self.policy(self._current_E.copy())
             stepped_E, current_E = self.env.step_and_maybe_reset(acting_E)
         next_E = stepped_E.get("next")
-        reward_E, done_E = (next_E.get(key).reshape(-1) for key in self._signals[:2])
+        reward_E, done_E, terminated_E = (next_E.get(key).reshape(-1) for key in self._signals[:3])
         # Only the first episode of each env counts: after its end the env goes on unseen.
         self._return_E.add_(torch.where(self._running_E, reward_E.to(torch.float64), 0.0))
         self.length_E.add_(self._running_E)
+        self.terminated_E.logical_or_(self._running_E & terminated_E)
         # After the sums, so that the last step of an episode counts.
         self._running_E.logical_and_(~done_E)
         self._keep(current_E)

@@ -1,5 +1,7 @@
 """When a curve has reached its levels, and what several seeds come to."""
 
+from dataclasses import replace
+
 import pytest
 
 from ksim_rl.tables.levels import is_reached, reached, value_of
@@ -83,6 +85,28 @@ def test_further_figures_have_names_of_their_own():
         "motions/track/least_trained": 0.96,
         "motions/track/mean_held_out": 0.8,
         "motions/track/seconds": 260.0,
+    }
+
+
+def test_of_a_course_the_worst_seed_counts_and_its_falls_take_the_place_of_others():
+    row = Row(**COMMON, measure="seconds", levels=LEVELS, most_falls=0.05, course_level=7)
+    figures = {"course_least": "evaluation/course_least"}
+    row = replace(row, within_s=100.0, course_least=0.9, figures=figures)
+
+    def seed(fell, least):
+        means = {"evaluation/course_least": least}
+        return {"seconds_to_levels": 50.0, "falls": 0.5, "course": {"fell": fell}, "means": means}
+
+    good = seed(0.04, 0.92)
+    assert is_reached(row, [good, good]) is True
+    table = Table(name="rough", title="", rows={"go1": row})
+    worse = seed(0.03, 0.89)
+    assert is_reached(row, [good, worse]) is False
+    assert is_reached(row, [seed(0.05, 0.95)]) is False
+    assert figures_of(table, {"go1": [good, worse]}) == {
+        "rough/go1/falls": 0.04,
+        "rough/go1/course_least": 0.89,
+        "rough/go1/seconds": 50.0,
     }
 
 

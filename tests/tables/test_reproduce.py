@@ -319,6 +319,32 @@ def test_a_seed_is_trained_and_its_final_policy_judged(tmp_path):
     assert found["seconds_before"] > 0.0 and len(found["commit"]) >= 7
 
 
+@pytest.mark.full
+def test_the_final_policy_walks_the_course_of_its_row(tmp_path):
+    row = replace(load("rough").rows["go1"], overrides=("task.sim.engine=c",))
+    found = measure(row, 1, tmp_path / "run", device="cpu", smoke=True)
+    course = found["course"]
+    assert len(course["success_by_level"]) == 8 and course["level"] == 9
+    # Nobody gets 3.2 m away in the 0.4 s of a smoke test.
+    assert (course["fell"], course["lost"]) == (0.0, [])
+    assert found["means"]["evaluation/course_least"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"course_level": 9}, "course_level: .*needs a TerrainGrid"),
+        ({"course_least": 0.9}, "course_least=0.9: .*give course_level"),
+    ],
+)
+def test_a_course_of_a_task_on_flat_ground_is_refused_before_training(tmp_path, fields, message):
+    path = tmp_path / "one.yaml"
+    path.write_text(TABLE)
+    row = load(str(path)).rows["ppo/Balance"]
+    with pytest.raises(ValueError, match=message):
+        run_cfg(replace(row, **fields), 1, device="cpu")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Steps(MetricTerm):
     """How many steps the episode has made."""

@@ -76,6 +76,7 @@ def test_the_shipped_tables_name_tasks_that_exist():
         "manipulation",
         "motions",
         "pixels",
+        "rough",
         "tasks",
         "tracking",
         "velocity",
@@ -108,6 +109,7 @@ def test_the_other_algorithm_stays_within_its_env_states():
     [
         "velocity:fast_sac/go1",
         "humanoids:g1_flat",
+        *(pytest.param(f"rough:{row}", marks=pytest.mark.full) for row in load("rough").rows),
         *(f"pixels:{row}" for row in load("pixels").rows),
         "manipulation:panda_pick_cube",
         "manipulation:leap_cube_reorient",

@@ -42,6 +42,13 @@ def test_an_episode_ends_at_a_termination():
     assert (result.return_mean, result.length_mean) == (pytest.approx(3.0), 3.0)
 
 
+@pytest.mark.parametrize(("terminate_at", "terminated"), [(3, True), (None, False)])
+def test_terminations_are_told_from_other_ends(terminate_at, terminated):
+    evaluate = evaluator(exact, max_steps=2 * LENGTH, terminate_at=terminate_at)
+    evaluate()
+    assert evaluate.terminated_E.tolist() == [terminated] * 5
+
+
 def test_episodes_beyond_the_step_limit_are_counted_as_unfinished():
     result = evaluator(exact, max_steps=5)()
     assert (result.length_mean, result.unfinished) == (5.0, 5)
