@@ -4,11 +4,11 @@ from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
@@ -16,6 +16,12 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from ksim_rl.objectives.estimator_options import check_options
 from ksim_rl.objectives.masked import standardized
+
+# Numbers that a network reads at a time, as no gradient is tracked here: 1 GiB in float32. Vectors of a rollout are
+# fewer; pictures, which are bytes until then, may be a hundred times as many.
+MOST_NUMBERS = 2**28
+
+Output = TypeVar("Output", Tensor, TensorDictBase)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,7 +217,9 @@ class RolloutEstimator(ValueEstimatorBase):
             nullcontext() if params is None else params.to_module(critic),
             set_recurrent_mode(True),
         ):
-            unrolled = critic(tensordict.select(*critic.in_keys))
+            outputs: list[TensorDictBase] = _in_pieces(critic, tensordict.select(*critic.in_keys))
+        # Its stub says Tensor.
+        unrolled: Any = TensorDict.cat(outputs)
         tensordict.get("next").update(unrolled.get("next"))
         return unrolled.get(self.tensor_keys.value)
 
@@ -220,7 +228,7 @@ class RolloutEstimator(ValueEstimatorBase):
     ) -> Tensor:
         """Return the outputs of `network` for `inputs` in one batch dim, with the batch dims of `inputs` again."""
         if inputs.batch_dims < 2:
-            return network(inputs)
+            return torch.cat(_in_pieces(network, inputs))
         # Rows are taken in the order of the memory, which saves a copy of all observations.
         leaf = next(iter(inputs.values(include_nested=True, leaves_only=True)))
         if leaf.movedim(time_dim, 0).is_contiguous():
@@ -234,7 +242,8 @@ class RolloutEstimator(ValueEstimatorBase):
         # Rows go back to the batch dims in the order in which they were taken.
         shape = list(inputs.batch_size)
         shape.insert(0, shape.pop(first))
-        return network(rows).unflatten(0, shape).movedim(0, first)
+        outputs = torch.cat(_in_pieces(network, rows))
+        return outputs.unflatten(0, shape).movedim(0, first)
 
     def value_estimate(
         self,
@@ -248,6 +257,18 @@ class RolloutEstimator(ValueEstimatorBase):
         copy = tensordict.copy()
         self(copy, params=params, target_params=target_params, time_dim=time_dim)
         return copy.get(self.tensor_keys.value_target)
+
+
+def _in_pieces(network: Callable[[TensorDictBase], Output], inputs: TensorDictBase) -> list[Output]:
+    """Return the outputs of `network` for parts of the first batch dim, of at most `MOST_NUMBERS` numbers each.
+
+    Its elements, rows or envs with all of their steps, are read each by itself, so that only rounding differs.
+    """
+    numbers = 0
+    for leaf in inputs.values(include_nested=True, leaves_only=True):
+        numbers += leaf[0].numel()
+    size = max(1, MOST_NUMBERS // max(1, numbers))
+    return [network(piece) for piece in inputs.split(size)]
 
 
 def carries_state(network: TensorDictModuleBase) -> bool:

@@ -8,6 +8,7 @@ from torchrl.modules import set_recurrent_mode
 from ksim_rl import conf
 from ksim_rl.device import state_tree
 from ksim_rl.modules import recurrent_modules
+from ksim_rl.objectives import rollout_estimator
 from ksim_rl.testing import count_syncs
 from ksim_rl.trainers import build, load_policy
 
@@ -74,8 +75,13 @@ def test_sequences_have_the_probabilities_that_the_rollout_had(trainer):
         )
 
 
+# All envs at once, or one at a time.
+@pytest.mark.parametrize("most_numbers", [rollout_estimator.MOST_NUMBERS, 1])
 @torch.no_grad()
-def test_values_are_those_of_a_critic_that_walks_along_with_the_env(trainer):
+def test_values_are_those_of_a_critic_that_walks_along_with_the_env(
+    trainer, most_numbers, monkeypatch
+):
+    monkeypatch.setattr(rollout_estimator, "MOST_NUMBERS", most_numbers)
     update, collector = trainer.update, trainer.collector
     (recurrent,) = recurrent_modules(update.critic)
     state_E = {key: update._carried._state_E[key].clone() for key in recurrent.state_keys}

@@ -5,7 +5,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.objectives import ClipPPOLoss as StockClipPPOLoss
 from torchrl.objectives import value
 
-from ksim_rl.objectives import GAE, TDLambda
+from ksim_rl.objectives import GAE, TDLambda, rollout_estimator
 from ksim_rl.testing import count_syncs
 from tests.objectives.problems import networks, rollout
 
@@ -55,6 +55,22 @@ def test_equals_stock_torchrl(end_probability, normalize):
     for key in OUT_KEYS:
         torch.testing.assert_close(out[key], expected[key], atol=1e-6, rtol=1e-6)
         assert not out[key].requires_grad
+
+
+def test_a_critic_reads_no_more_numbers_at_a_time_than_fit(monkeypatch):
+    actor, critic = networks()
+    data = rollout(actor, num_envs=5, length=7)
+    gae = GAE(gamma=GAMMA, lmbda=LMBDA, critic=critic)
+    expected = gae(data.clone())
+    rows = []
+    critic.register_forward_pre_hook(lambda _, inputs: rows.append(inputs[0].numel()))
+    numbers = sum(data[key].shape[-1] for key in critic.in_keys)
+    # Eleven rows and a part of one more: 35 rows are 11, 11, 11 and 2, now and for what follows.
+    monkeypatch.setattr(rollout_estimator, "MOST_NUMBERS", 12 * numbers - 1)
+    found = gae(data.clone())
+    assert rows == [11, 11, 11, 2] * 2
+    for key in OUT_KEYS:
+        torch.testing.assert_close(found[key], expected[key])
 
 
 def test_memory_layout_names_and_time_dim_do_not_matter():
