@@ -118,6 +118,7 @@ def test_the_other_algorithm_stays_within_its_env_states():
             for row in load("imitation").rows
         ),
         "motions:g1_track",
+        pytest.param("motions:g1_style", marks=pytest.mark.full),
         *(f"tracking:{clip}" for clip in ("walk", "squat", "turn", "kick")),
         *(f"tasks:{row}" for row in load("tasks").rows),
         *(
