@@ -1,6 +1,6 @@
 """Keeps the last env states of each env in a ring, which stores each observation once."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
 
@@ -63,7 +63,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         observations: list[NestedKey],
         n_step: int = 1,
         gamma: float = 0.99,
-        stacks: Mapping[NestedKey, int] | None = None,
+        stacks: Mapping[NestedKey, Sequence[int]] | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         self.capacity = capacity
@@ -113,9 +113,8 @@ class ReplayStorage(SavedByStateDict, Storage):
         places_ET = 1 + done_ET.to(torch.int64)
         # Places taken by the rollout before each step, so that all of it is written in one go.
         before_ET = places_ET.cumsum(1) - places_ET
-        self._cut_where_not_continued(rollout_ET)
-        depth_E, skipped_E = self._begin_stacks(rollout_ET)
-        place_ET = (self.head_E + skipped_E)[:, None] + before_ET
+        goes_on_E = self._cut_where_not_continued(rollout_ET)
+        place_ET = self.head_E[:, None] + before_ET
         # A place of an env is a row of the storage at place * num_envs + env.
         index_N = (place_ET % self.places * self.num_envs + self._env_E[:, None]).flatten()
         following_N = (
@@ -123,6 +122,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         ).flatten()
 
         if self.stacks.reach:
+            depth_E = torch.where(goes_on_E, self.stacks.depth[self._head_index()], 0)
             depth_N = self.stacks.depths(depth_E, done_ET).flatten()
             # Successors first, as for the env states below.
             self.stacks.depth[following_N] = (depth_N + 1).clamp_max(self.stacks.reach)
@@ -137,18 +137,28 @@ class ReplayStorage(SavedByStateDict, Storage):
                 # brings it as its first.
                 finite_N &= self._put(key, leaf, following_N, rollout_ET.get(_next(key)))
             finite_N &= self._put(key, leaf, index_N, rollout_ET.get(key))
+        # Stacks that show frames that were never written cannot be put together; after `reach` steps all can.
+        known_N = finite_N.clone()
+        for key in self.stacks.ages:
+            leaf = self.content.get(key)
+            known_N &= self.stacks.is_exact(key, leaf, index_N, rollout_ET.get(key))
+            following_ET = rollout_ET.get(_next(key))
+            known_N &= self.stacks.is_exact(key, leaf, following_N, following_ET)
         # First all successors: many are env states of this rollout and become available next.
         self._make_unavailable(following_N)
-        self.available.index_copy_(0, index_N, finite_N)
+        self.available.index_copy_(0, index_N, known_N)
         self.non_finite_count.add_((~finite_N).sum())
         # In place: a captured write finds the next places where this one has left them.
-        taken_E = places_ET.sum(1) + skipped_E
+        taken_E = places_ET.sum(1)
         self.head_E.add_(taken_E).remainder_(self.places)
-        # Places before the first env state of all are never drawn.
-        taken_E = torch.where(self.filled_E > 0, taken_E, taken_E - skipped_E)
         self.filled_E.add_(taken_E).clamp_max_(self.capacity)
         # After the end of an episode the newest observation's place still has its env state of a round ago.
-        self._make_unavailable(self._head_index())
+        head_E = self._head_index()
+        self._make_unavailable(head_E)
+        if self.stacks.reach:
+            # An episode that begins there has no older frames.
+            depth_E = self.stacks.depth[head_E]
+            self.stacks.depth[head_E] = torch.where(done_ET[:, -1], 0, depth_E)
         return index_N
 
     @torch.no_grad()
@@ -248,7 +258,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         kept_ET = rollout_ET.select(
             *(key for key in produced if key[0] != "next" or key in _LEAVES)
         )
-        for key in self.stacks.num_frames:
+        for key in self.stacks.ages:
             kept_ET.set(key, self.stacks.newest(key, kept_ET.get(key)))
         # Asked for as a whole first: a refusal then names the size of all of it, and not of its first leaf.
         row = sum(leaf[0, 0].nbytes for leaf in kept_ET.values(True, True))
@@ -259,38 +269,22 @@ class ReplayStorage(SavedByStateDict, Storage):
         """Return the index of the newest observation of each env, [E]."""
         return self.head_E * self.num_envs + self._env_E
 
-    def _cut_where_not_continued(self, rollout_ET: TensorDictBase) -> None:
-        """Drop the newest env state of envs that were reset in between: its successor is about to be overwritten."""
+    def _cut_where_not_continued(self, rollout_ET: TensorDictBase) -> Tensor:
+        """Drop the newest env state of envs that were reset in between: its successor is about to be overwritten.
+
+        Returns the others, bool [E], where the first observation of the rollout is the newest one here.
+        """
         assert self.content is not None
         head_E = self._head_index()
-        # The env was not reset in between if its newest observation is the first one of this rollout.
-        last_E = self.index(self._env_E, torch.ones_like(self._env_E))
-        continued_E = self.available[last_E]
+        goes_on_E = torch.ones_like(self._env_E, dtype=torch.bool)
         for key in self.observations:
-            newest_E = self.stacks.read(key, self.content.get(key), head_E)
-            same = newest_E == rollout_ET.get(key)[:, 0]
-            continued_E = continued_E & same.reshape(self.num_envs, -1).all(1)
+            first_E = self.stacks.newest(key, rollout_ET.get(key))[:, 0]
+            same = self.content.get(key)[head_E] == first_E
+            goes_on_E = goes_on_E & same.reshape(self.num_envs, -1).all(1)
         # After the end of an episode the newest env state lies one place further back, with all that follows it.
-        self.available.index_copy_(0, last_E, continued_E)
-
-    def _begin_stacks(self, rollout_ET: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return the depth of each env's first stacks, and how many places their older frames have taken, each [E]."""
-        assert self.content is not None
-        depth_E = torch.zeros_like(self.head_E)
-        if not self.stacks.reach:
-            return depth_E, depth_E
-        first = {key: made_finite(rollout_ET.get(key)[:, 0]) for key in self.stacks.num_frames}
-        content: Any = {key: self.content.get(key) for key in first}
-        depth_E, lacks_E = self.stacks.begun(first, content, self._head_index())
-        skipped_E = lacks_E * self.stacks.reach
-        for steps_ago in range(self.stacks.reach + 1):
-            place_E = (self.head_E + skipped_E - steps_ago) % self.places
-            row_E = place_E * self.num_envs + self._env_E
-            self.stacks.put_older_(content, first, row_E, steps_ago=steps_ago, where_E=lacks_E)
-            # Frames alone are no env state, and take the place of one; rows of other envs stay as they are.
-            for taken_E in (row_E, self._beyond(row_E)):
-                self.available[taken_E] = self.available[taken_E] & ~lacks_E
-        return depth_E, skipped_E
+        last_E = self.index(self._env_E, torch.ones_like(self._env_E))
+        self.available.index_copy_(0, last_E, self.available[last_E] & goes_on_E)
+        return goes_on_E
 
     def _put(self, key: NestedKey, leaf: Tensor, index_N: Tensor, values_ET: Tensor) -> Tensor:
         """Write rows, and return which were finite, bool [N]; other elements become zero."""

@@ -135,7 +135,7 @@ def _check_rollout(cfg: RunCfg, env: EnvBase, keys: Sequence[NestedKey]) -> None
         size = leaf.shape.numel() * leaf.dtype.itemsize // cfg.num_envs
         if key in keys:
             now += size
-            kept += size // stacks.get(key, 1)
+            kept += size // len(stacks.get(key, (0,)))
         if unravel_key(("next", key)) in keys:
             following += size
     length = cfg.data.rollout_length(cfg.num_envs)

@@ -207,26 +207,28 @@ class ObservationHistory(RingTransform):
         return stacked
 
 
-def stacked_frames(env: EnvBase) -> dict[NestedKey, int]:
-    """Return how many frames each observation [E, N, ...] stacks of which every one is the newest of an earlier step.
+def stacked_frames(env: EnvBase) -> dict[NestedKey, tuple[int, ...]]:
+    """Return the ages of the frames that each observation [E, N, ...] stacks, each the newest of an earlier step.
 
-    Those are the results of an `ObservationHistory` with `flat=False` and a stride of 1 that nothing changes after it.
-    A transform of a user's own behind it may change anything, and one that steps the env itself leaves frames out, so
-    nothing is said then.
+    An age is how many env steps ago that was, such as (8, 4, 0). Those observations are the results of an
+    `ObservationHistory` with `flat=False` that nothing changes after it. A transform of a user's own behind it may
+    change anything, and one that steps the env itself leaves frames out, so nothing is said then.
     """
     assert env.output_spec is not None  # making the specs is what counts the dims
-    found: dict[NestedKey, int] = {}
+    found: dict[NestedKey, tuple[int, ...]] = {}
     for transform in _from_inside(env):
         if not _is_known(transform):
             found.clear()
         for key in transform.out_keys or ():
             found.pop(unravel_key(key), None)
-        if not isinstance(transform, ObservationHistory) or transform.flat or transform.stride > 1:
+        if not isinstance(transform, ObservationHistory) or transform.flat:
             continue
+        oldest = (transform.length - 1) * transform.stride
+        ages = tuple(range(oldest, -1, -transform.stride))
         for key, batch_dims in zip(transform.out_keys, transform.batch_dims, strict=True):
             # The frames of several agents stand behind the dim of agents.
             if batch_dims == 1:
-                found[unravel_key(key)] = transform.length
+                found[unravel_key(key)] = ages
     return found
 
 

@@ -11,7 +11,7 @@ from ksim_rl.transforms import ObservationHistory
 from tests.transforms.leaf_env import LeafEnv
 
 NUM_ENVS, CAPACITY = 3, 13
-STACKS = {"rgb": 3, "depth": 2}
+STACKS = {"rgb": (4, 2, 0), "depth": (1, 0)}
 OBSERVATIONS = ["rgb", "depth", "joints"]
 
 
@@ -27,16 +27,17 @@ class _Camera:
 
     def reset(self, rows):
         for row in rows:
-            self.frames[row] = [self._picture()] * 3
+            self.frames[row] = [self._picture()] * 5
 
     def _picture(self):
         return torch.randint(self.colours, (2, 2, 3), generator=self.generator).to(torch.uint8)
 
     def _observed(self):
-        rgb = torch.stack([torch.stack(own[-3:]) for own in self.frames])
+        rgb = torch.stack([torch.stack(own[-5::2]) for own in self.frames])
         return {
             "rgb": rgb,
-            "depth": rgb[:, -2:, ..., 0].float() / 8,
+            "depth": torch.stack([torch.stack(own[-2:])[..., 0] for own in self.frames]).float()
+            / 8,
             "joints": rgb[:, -1, 0, 0, :1].float(),
         }
 
@@ -87,8 +88,6 @@ def _assert_equal(first, second):
 def test_stacks_have_the_bits_of_stored_ones(n_step, lengths, colours):
     camera = _Camera(colours=colours)
     frames, stacks = _rings(n_step=n_step)
-    # Both begin in the middle of an episode, as where a run goes on without its replay.
-    camera.rollout(2)
     for number, length in enumerate(lengths):
         # Now and then someone resets an env between rollouts.
         if number % 5 == 4:
@@ -102,22 +101,28 @@ def test_stacks_have_the_bits_of_stored_ones(n_step, lengths, colours):
     assert torch.equal(frames.filled_E, stacks.filled_E)
 
 
-def test_a_gap_in_the_middle_of_episodes_joins_no_frames():
-    """Rollouts that were not kept lie between, so older frames come from the stacks, and take places."""
-    camera = _Camera(end=0.1)
+def test_after_a_gap_stacks_are_left_out_until_their_frames_were_written():
+    """Rollouts begin in the middle of an episode, as where a run goes on without its replay, or one is not kept."""
+    camera = _Camera(end=0.0)
+    camera.rollout(2)
     frames, stacks = _rings()
-    for _ in range(9):
-        rollout = camera.rollout(3)
+    for _ in range(3):
+        rollout = camera.rollout(6)
         frames.write(rollout), stacks.write(rollout)
         camera.rollout(1)
-        first, second = _by_age(frames), _by_age(stacks)
-        kept = [ring[ring[MASK_KEY].squeeze(-1)] for ring in (first, second)]
-        # Two places fewer, so that the oldest env states are missing.
-        known = {bytes(row["rgb"].numpy()): row for row in kept[1]}
-        for row in kept[0]:
-            other = known[bytes(row["rgb"].numpy())]
-            assert all(torch.equal(row[key], other[key]) for key in row.keys(True, True))
-        assert len(kept[0]) > len(kept[1]) / 2
+    first, second = _by_age(frames), _by_age(stacks)
+    kept_AE = first[MASK_KEY].reshape(CAPACITY, NUM_ENVS)
+    # The oldest frame is from four steps ago; the last env state before a gap has lost what followed it.
+    for age, is_kept_E in enumerate(kept_AE, start=1):
+        assert bool((is_kept_E == (age in (1, 2, 8))).all()), age
+    kept = first[MASK_KEY].squeeze(-1)
+    assert bool((first[kept] == second[kept]).all())
+    # The next rollout goes on where the last one ended, so all is known again.
+    frames, stacks = _rings()
+    for _ in range(3):
+        rollout = camera.rollout(6)
+        frames.write(rollout), stacks.write(rollout)
+    _assert_equal(frames, stacks)
 
 
 def test_a_stack_that_is_not_finite_is_refused_with_each_env_state_that_shows_it():
@@ -178,10 +183,11 @@ def test_each_frame_costs_its_bytes_once():
 def test_what_the_transform_of_the_library_stacks():
     """Rows end after 3 and 4 steps; episodes begin within rollouts and between them."""
     env = TransformedEnv(
-        LeafEnv([2], (2, 2, 3), torch.uint8), ObservationHistory(["x"], length=3, flat=False)
+        LeafEnv([2], (2, 2, 3), torch.uint8),
+        ObservationHistory(["x"], length=3, stride=2, flat=False),
     )
     shared = {"num_envs": 2, "capacity": 16, "observations": ["x"]}
-    frames, stacks = ReplayStorage(stacks={"x": 3}, **shared), ReplayStorage(**shared)
+    frames, stacks = ReplayStorage(stacks={"x": (4, 2, 0)}, **shared), ReplayStorage(**shared)
     root = env.reset()
     for _ in range(4):
         rollout = env.rollout(5, auto_reset=False, tensordict=root, break_when_any_done=False)

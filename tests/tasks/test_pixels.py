@@ -129,8 +129,8 @@ def test_a_policy_without_an_encoder_and_a_replay_without_memory_are_refused():
     with pytest.raises(ValueError, match="group 'actor' is an image.*objective.symmetry=none"):
         build(conf.compose([*TINY, *PPO, "objective.symmetry=augment"]))
     huge = ["objective=fast_sac", "data.capacity=10000000"]
-    # Three frames now and next; a replay stores stacks whole: 4 * 10^7 * 11664 bytes.
-    with pytest.raises(ValueError, match="23,328 bytes of observations in each env.* 467 GB"):
+    # Three frames now and next; a replay stores each frame once: 4 * 10^7 * 3888 bytes.
+    with pytest.raises(ValueError, match="23,328 bytes of observations in each env.* 156 GB"):
         build(conf.compose([*TINY, *huge]))
 
 

@@ -150,14 +150,16 @@ class _Own(Transform):
 @pytest.mark.parametrize(
     ("chain", "found"),
     [
-        ([ObservationHistory("count", length=3, flat=False)], {"count": 3}),
-        ([_Own(), ObservationHistory([VECTOR], ["a"], length=2, flat=False)], {"a": 2}),
+        ([ObservationHistory("count", length=3, flat=False)], {"count": (2, 1, 0)}),
+        ([_Own(), ObservationHistory([VECTOR], ["a"], length=2, flat=False)], {"a": (1, 0)}),
         ([ObservationHistory("count", length=3)], {}),
-        # With a larger stride, the frames in between are in no stack.
-        ([ObservationHistory("count", length=3, stride=2, flat=False)], {}),
+        ([ObservationHistory("count", length=3, stride=2, flat=False)], {"count": (4, 2, 0)}),
         # The newest frames of late or changed stacks are not the frames of the steps before.
         *(
-            ([ObservationHistory(["count", "drawn"], length=2, flat=False), behind], {"drawn": 2})
+            (
+                [ObservationHistory(["count", "drawn"], length=2, flat=False), behind],
+                {"drawn": (1, 0)},
+            )
             for behind in (
                 ObservationDelay("count", delay=DelayCfg(max_lag=1)),
                 ObservationScale("count", scale=2.0),
@@ -166,7 +168,7 @@ class _Own(Transform):
         ([ObservationHistory("count", length=3, flat=False), _Own()], {}),
         # Its steps are several of the history.
         ([ObservationHistory("count", length=3, flat=False), FrameSkipTransform(2)], {}),
-        ([ObservationHistory("count", length=3, flat=False), StepCounter()], {"count": 3}),
+        ([ObservationHistory("count", length=3, flat=False), StepCounter()], {"count": (2, 1, 0)}),
     ],
 )
 def test_only_stacks_that_nothing_changes_are_known_as_such(chain, found):

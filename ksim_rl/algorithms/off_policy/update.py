@@ -1,6 +1,6 @@
 """An off-policy iteration puts a rollout into the replay and makes gradient steps; it is one CUDA graph on CUDA."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -57,8 +57,8 @@ class OffPolicyUpdate(RolloutUpdate):
     weights were loaded, and there are no gradient steps. Until `policy_starts` the critics learn alone. From then on an
     update is `num_minibatches` gradient steps of the critics, each followed by one of the target networks, and by one
     of the actor (and the temperature) every `policy_delay`, which divides that number. For `cfg.symmetry`, `mirror` has
-    mirror images of the networks' inputs and of the action. Of observations that `stacks` knows to be so many frames
-    (see `stacked_frames`), the replay holds each frame once. `shared`: `RolloutUpdate`'s other arguments.
+    mirror images of the networks' inputs and of the action. Of observations whose frames' ages are in `stacks` (see
+    `stacked_frames`), the replay holds each frame once. `shared`: `RolloutUpdate`'s other arguments.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class OffPolicyUpdate(RolloutUpdate):
         data: ReplayCfg,
         num_envs: int,
         mirror: Mapping[NestedKey, MirrorMap] | None = None,
-        stacks: Mapping[NestedKey, int] | None = None,
+        stacks: Mapping[NestedKey, Sequence[int]] | None = None,
         **shared: Any,
     ) -> None:
         if data.num_minibatches % cfg.policy_delay:
@@ -117,9 +117,7 @@ class OffPolicyUpdate(RolloutUpdate):
             num_envs=num_envs,
             observations=self._observations,
             gamma=cfg.gamma,
-            stacks={
-                key: number for key, number in (stacks or {}).items() if key in self._observations
-            },
+            stacks={key: ages for key, ages in (stacks or {}).items() if key in self._observations},
             device=self.device,
         )
         # The optimizer of the critics moves the targets in the same step.
