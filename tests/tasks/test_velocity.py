@@ -18,8 +18,12 @@ OWN = ("quadruped_velocity_flat", "humanoid_velocity_flat")
 # Go1 has a file of its own.
 MENAGERIE = ("go2_velocity_flat", "t1_velocity_flat", "g1_velocity_flat")
 GET_UP = ("quadruped_get_up", "humanoid_get_up")
+MENAGERIE_GET_UP = ("go1_get_up", "g1_get_up", "t1_get_up")
 # On flat ground nothing else pushes or pulls: what stands here is held by the default targets alone.
 CALM = ("~task.events.push_robot",)
+
+
+UPRIGHT_E4 = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1)
 
 
 def slow(names):
@@ -68,8 +72,10 @@ def test_groups_and_rewards_of_random_actions(env):
     assert torch.isfinite(reward).all() and reward.abs().max() < 1.0
 
 
-@pytest.fixture(scope="module", params=GET_UP)
+@pytest.fixture(scope="module", params=[*GET_UP, *slow(MENAGERIE_GET_UP)])
 def fallen(request):
+    (robot,) = envs.task(request.param).cfg().scene.robots.values()
+    loaded_spec(robot)
     env = envs.make(request.param, num_envs=8, seed=1)
     yield env
     env.close()
@@ -136,6 +142,26 @@ def test_get_up_rates_the_stance_highest(fallen):
     )
     assert reward["standing"][3] < 0.2  # it shakes
     assert stands_E[:4].tolist() == [1.0, 0.0, 0.0, 1.0]
+
+
+def test_who_stands_later_than_within_3_s_has_not_stood_soon():
+    soon = envs.task("go1_get_up").cfg().metrics["stood_soon"]
+    env = envs.make("quadruped_get_up", num_envs=2, seed=1, overrides=["task.sim.engine=c"])
+    base = env.base_env
+    view = base.view
+    everyone_E = torch.ones(2, dtype=torch.bool)
+    env.reset()
+    view.write_root_pose(everyone_E, view.default_qpos_L[:3].repeat(2, 1), UPRIGHT_E4)
+    base.driver.refreshed()
+    found = []
+    for steps in (150, 151):
+        base.driver.episode_step_E.fill_(steps)
+        with base.driver.scope("test"):
+            found.append(soon(view).tolist())
+    # 50 steps are a second.
+    assert found == [[1.0, 1.0], [0.0, 0.0]]
+    assert soon.reduce == "max"
+    env.close()
 
 
 def test_actions_of_the_delayed_quadruped_arrive_up_to_two_steps_late():

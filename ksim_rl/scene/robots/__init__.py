@@ -2,7 +2,7 @@
 
 from ksim_rl.scene.robots import edit
 from ksim_rl.scene.robots.analysis import JointAnalysis, RobotAnalysis, analyse
-from ksim_rl.scene.robots.booster_t1 import BoosterT1
+from ksim_rl.scene.robots.booster_t1 import BoosterT1, GrippingT1
 from ksim_rl.scene.robots.control_models import (
     Arm,
     Cartpole,

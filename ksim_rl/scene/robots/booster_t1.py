@@ -6,7 +6,7 @@ gains here are chosen per group: legs and waist stiff enough to stand on, arms a
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from ksim_rl.scene.actuators import Actuator, PositionActuator
@@ -138,4 +138,15 @@ class BoosterT1(MenagerieRobot):
             )
             for side in SIDES
         ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrippingT1(BoosterT1):
+    """T1 whose trunk and limbs have friction too, on the ground and on each other, for tasks in which it lies there."""
+
+    # As MuJoCo has it where no geom has priority.
+    collision_geoms: ClassVar[tuple[CollisionGeom, ...]] = tuple(
+        geom if geom.name in BoosterT1.foot_geoms else replace(geom, condim=3, priority=0)
+        for geom in BoosterT1.collision_geoms
     )
