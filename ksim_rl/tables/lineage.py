@@ -1,4 +1,4 @@
-"""Rows that learn from what other rows of their table have left: recorded episodes, or networks to begin from."""
+"""Rows that learn from what other rows of their table have left: episodes, networks to begin from, or a teacher."""
 
 import math
 import statistics
@@ -15,7 +15,7 @@ SUCCESS = "evaluation/metric/"
 
 def sources_of(row: Row) -> list[str]:
     """Return the names of the rows that have to be there before it."""
-    return [name for name in (row.learns_from, row.begins_from) if name]
+    return [name for name in (row.learns_from, row.begins_from, row.taught_by) if name]
 
 
 def depth_of(rows: Mapping[str, Row], name: str) -> int:
@@ -44,6 +44,8 @@ def overrides_of(row: Row, runs: Path | None = None, seed: int = 0) -> list[str]
     words = []
     if row.begins_from:
         words.append(f"checkpoint={folder(row.begins_from)!r}")
+    if row.taught_by:
+        words.append(f"objective.teacher={folder(row.taught_by)!r}")
     if row.learns_from:
         episodes = f"{folder(row.learns_from)}/{EPISODES}"
         if row.objective == "bc":
@@ -67,9 +69,11 @@ def runs_of(run_folder: Path, name: str) -> Path:
 def lineage_figures(
     rows: Mapping[str, Row], results: Mapping[str, Sequence[Result]]
 ) -> dict[str, float]:
-    """Return figures by name of row or group: `<row>_success`, and `<group>/env_states_saved`.
+    """Return figures by name of row or group: `<row>_success`, `<row>/share_of_teacher`, `<group>/env_states_saved`.
 
-    Success is of the final evaluation and the worst seed, for rows that learn from episodes. Saved are the env states
+    Success is of the final evaluation and the worst seed, for rows that learn from episodes. The share of a teacher is
+    the success on the row's course over its teacher's on its own, in the mean over kinds of ground and levels, and the
+    worst seed's; a teacher that arrives nowhere gives none. Saved are the env states
     that the row `saves_over` needs to reach its levels, minus the env states that this row needs, of all runs
     that it begins from, and the episodes that these learned from: a median over the seeds. An infinite value has no
     figure.
@@ -82,12 +86,36 @@ def lineage_figures(
                 if level.startswith(SUCCESS):
                     worst = min(result["means"].get(level, 0.0) for result in own)
                     figures[f"{name}_success"] = round(worst, 4)
+        if row.taught_by in results:
+            shares = _shares_of_teacher(own, results[row.taught_by])
+            if shares:
+                figures[f"{name}/share_of_teacher"] = round(min(shares), 4)
         if row.saves_over in results:
             saved = _saved(rows, results, name)
             if math.isfinite(saved):
                 group = name.rpartition("/")[0]
                 figures[f"{group}/env_states_saved".strip("/")] = saved
     return figures
+
+
+def _shares_of_teacher(results: Sequence[Result], teachers: Sequence[Result]) -> list[float]:
+    """Return the shares, seed by seed, or none where one of them has no course, or a teacher arrives nowhere."""
+    shares = []
+    for own, teacher in zip(results, teachers, strict=True):
+        success = _course_success(own)
+        reachable = _course_success(teacher)
+        if success is None or not reachable:
+            return []
+        shares.append(success / reachable)
+    return shares
+
+
+def _course_success(result: Result) -> float | None:
+    """Return the share that succeeds on a result's course, in the mean over kinds and levels; None without one."""
+    if "course" not in result:
+        return None
+    by_level = result["course"]["success_by_level"].values()
+    return statistics.fmean(statistics.fmean(shares) for shares in by_level)
 
 
 def _saved(rows: Mapping[str, Row], results: Mapping[str, Sequence[Result]], name: str) -> float:

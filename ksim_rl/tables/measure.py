@@ -141,7 +141,7 @@ def settings(row: Row, cfg: RunCfg, *, sources: Sequence[str] = ()) -> str:
     # The seed tells rows of one setting apart; the device is recorded in the result.
     tree = {key: value for key, value in cfg.to_tree().items() if key not in ("seed", "device")}
     tree["row"] = {"levels": dict(row.levels), "episodes": row.episodes, "measure": row.measure}
-    for name in ("recorded", "learns_from", "begins_from"):
+    for name in ("recorded", "learns_from", "begins_from", "taught_by"):
         # Rows of before have none of these.
         if value := getattr(row, name):
             tree["row"][name] = value

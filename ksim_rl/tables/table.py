@@ -45,6 +45,8 @@ class Row(Checked):
         learns_from: the row above whose recorded episodes it learns from, seed by seed: they become
             `objective.episodes` of `bc`, and else `data.offline`, with its share of a half.
         begins_from: the row above whose final networks it begins with, seed by seed.
+        taught_by: the row above whose final policy teaches this one by `distillation`, seed by seed. Where both have a
+            `course_level`, `share_of_teacher` compares how many robots succeed on their courses.
         saves_over: the row above, without such a beginning, that it is compared with: how many env states it saves.
         figures: further figures by name. Each has a source: "seconds" of the whole training, "success" of the trials,
             or one of the means of the end, such as `evaluation/metric/<name>`.
@@ -70,6 +72,7 @@ class Row(Checked):
     recorded: WholeNumber = 0
     learns_from: str = ""
     begins_from: str = ""
+    taught_by: str = ""
     saves_over: str = ""
 
     def _check_fields(self) -> None:
@@ -143,7 +146,7 @@ class Table(Checked):
         super()._check_fields()
         above: dict[str, Row] = {}
         for name, row in self.rows.items():
-            for field_name in ("learns_from", "begins_from", "saves_over"):
+            for field_name in ("learns_from", "begins_from", "taught_by", "saves_over"):
                 self._check_source(name, field_name, above)
             if row.learns_from and not above[row.learns_from].recorded:
                 raise ValueError(

@@ -137,6 +137,28 @@ def test_what_a_start_saves_counts_all_that_led_to_it(tmp_path):
     )
 
 
+def test_a_student_is_compared_with_its_teacher_seed_by_seed(tmp_path):
+    student = "{objective: distillation, measure: return, taught_by: pole/nothing}"
+    ours = table(tmp_path, "      bc:", f"      student: {student}\n      bc:")
+    row = ours.rows["pole/student"]
+    assert sources_of(row) == ["pole/nothing"] and depth_of(ours.rows, "pole/student") == 1
+    assert overrides_of(row) == ["objective.teacher='pole/nothing'"]
+    shown = {"evaluation": {"return_mean": 1.0}, "means": {}}
+    teacher = results_of([1.0, 1.0], **shown)
+    learned = results_of([1.0, 1.0], **shown)
+    results = {"pole/nothing": teacher, "pole/student": learned}
+    share = "ours/pole/student/share_of_teacher"
+    assert share not in report.figures_of(ours, results)
+    # Half of all robots arrive with a teacher; of the students' 0.4 and 0.3.
+    for own in teacher:
+        own["course"] = {"success_by_level": {"flat": [1.0, 0.6], "stairs": [0.4, 0.0]}}
+    learned[0]["course"] = {"success_by_level": {"flat": [0.9, 0.5], "stairs": [0.2, 0.0]}}
+    learned[1]["course"] = {"success_by_level": {"flat": [0.8, 0.4], "stairs": [0.0, 0.0]}}
+    assert report.figures_of(ours, results)[share] == 0.6
+    teacher[1]["course"] = {"success_by_level": {"flat": [0.0, 0.0], "stairs": [0.0, 0.0]}}
+    assert share not in report.figures_of(ours, results)
+
+
 @pytest.mark.full
 def test_the_whole_chain_runs(tmp_path):
     """Two iterations each: episodes are recorded, cloned, and PPO goes on."""

@@ -145,6 +145,8 @@ def test_the_tables_have_every_task_and_that_of_tasks_asks_of_each_what_the_task
         for row in load(name).rows.values()
         if not envs.task(row.task).suite
     }
+    # A teacher is there for its student, and is in the table of its own task as well.
+    elsewhere.discard(load("pixels").rows["go1_heights"].task)
     own = [name for name in envs.names() if not envs.task(name).suite]
     assert sorted([*(row.task for row in rows.values()), *elsewhere]) == own
     for name, row in rows.items():
