@@ -46,6 +46,8 @@ TASK = (
     "+task.curriculum.level={_target_: ksim_rl.mdp.LinearLevel, end_step: 100}",
     "+task.curriculum.weight={_target_: ksim_rl.mdp.RewardWeightByLevel, "
     "reward: track_linear_velocity, start: 1.0, end: 2.0}",
+    # Its stages would write the ranges that the level below writes.
+    "~task.curriculum.command_ranges",
     "+task.curriculum.speed={_target_: ksim_rl.mdp.CommandRangesByLevel, command: twist, "
     "start: {lin_vel_x: [-0.5, 0.5]}, end: {lin_vel_x: [-1.0, 1.0]}}",
     "modules.actor.hidden_dims=[16]",

@@ -36,7 +36,8 @@ def commands(prefix: str) -> list[str]:
 def test_the_robot_stands_and_is_drawn(folder: Path) -> None:
     (script,) = commands("python")
     heights = re.findall(r"0\.\d+", run(folder, script).split("upright")[0])
-    assert len(heights) == 4 and all(0.2 < float(height) < 0.3 for height in heights)
+    # Two links of 0.15 m and a foot's radius of 0.015 m are the most that straight legs reach.
+    assert len(heights) == 4 and all(0.2 < float(height) < 0.315 for height in heights)
     picture = np.asarray(Image.open(folder / "stool.png"))
     seat = (picture[..., 0] > 1.5 * picture[..., 2]) & (picture[..., 0] > 60)
     assert seat.sum() > 500  # the red cushions

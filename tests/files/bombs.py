@@ -5,6 +5,7 @@ import os
 import resource
 import signal
 import struct
+import sys
 import traceback
 import zipfile
 from collections.abc import Callable
@@ -324,6 +325,8 @@ def read_apart(write: Callable[[Path], Reads], folder: Path) -> tuple[str, str]:
 def _read_and_say(reads: Reads, pipe: int) -> None:
     """Leave the process with what came of it in the pipe; the child of a test runner must not return."""
     try:
+        # Coverage of `make test-full` would take three times the processor time.
+        sys.settrace(None)
         mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (mapped + MOST_BYTES, mapped + MOST_BYTES))
         # Processor time, since other programs may hold the machine up; wall time only ends what waits for ever.
