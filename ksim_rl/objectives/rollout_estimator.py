@@ -217,7 +217,11 @@ class RolloutEstimator(ValueEstimatorBase):
             nullcontext() if params is None else params.to_module(critic),
             set_recurrent_mode(True),
         ):
-            outputs: list[TensorDictBase] = _in_pieces(critic, tensordict.select(*critic.in_keys))
+            # Without what it reads, so that no pictures are copied.
+            outputs: list[TensorDictBase] = _in_pieces(
+                lambda piece: critic(piece).select(self.tensor_keys.value, "next"),
+                tensordict.select(*critic.in_keys),
+            )
         # Its stub says Tensor.
         unrolled: Any = TensorDict.cat(outputs)
         tensordict.get("next").update(unrolled.get("next"))
@@ -262,7 +266,8 @@ class RolloutEstimator(ValueEstimatorBase):
 def _in_pieces(network: Callable[[TensorDictBase], Output], inputs: TensorDictBase) -> list[Output]:
     """Return the outputs of `network` for parts of the first batch dim, of at most `MOST_NUMBERS` numbers each.
 
-    Its elements, rows or envs with all of their steps, are read each by itself, so that only rounding differs.
+    Its elements, rows or envs with all of their steps, are read each by itself, so that only rounding differs; a user's
+    encoder with batch statistics has those of each piece.
     """
     numbers = 0
     for leaf in inputs.values(include_nested=True, leaves_only=True):

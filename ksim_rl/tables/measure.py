@@ -32,7 +32,14 @@ from ksim_rl.runs.listing import METRICS
 from ksim_rl.tables.levels import COURSE_LEAST, HELD_STATES, Result, means_of, reached
 from ksim_rl.tables.lineage import EPISODES, overrides_of, runs_of, sources_of
 from ksim_rl.tables.table import Row, load
-from ksim_rl.tasks.terrain_course import course_of, summary, walk
+from ksim_rl.tasks.terrain_course import (
+    GROUND_SEED,
+    ROBOT_SEED,
+    SPEED,
+    course_of,
+    summary,
+    walk,
+)
 from ksim_rl.terminal import show
 from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
@@ -146,7 +153,8 @@ def settings(row: Row, cfg: RunCfg, *, sources: Sequence[str] = ()) -> str:
         if value := getattr(row, name):
             tree["row"][name] = value
     if row.course_level is not None:
-        tree["row"]["course_level"] = row.course_level
+        # Policies of other courses are not compared.
+        tree["row"]["course"] = [row.course_level, COURSE_ROBOTS, SPEED, GROUND_SEED, ROBOT_SEED]
     if sources:
         tree["row"]["sources"] = list(sources)
     # Later fields with values that change nothing must not make older results invalid.

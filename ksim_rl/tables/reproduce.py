@@ -38,7 +38,10 @@ def reproduce(arguments: Sequence[str]) -> int:
             f"--seeds: {strangers} are none of {known}; try other seeds with ksim-rl train"
         )
     # Times are measured: another run on the GPU would lengthen them.
-    timed = [name for name, row in rows.items() if row.measure == "seconds"]
+    timed = []
+    for name, row in rows.items():
+        if row.measure == "seconds" or "seconds" in row.figures.values():
+            timed.append(name)
     check_in_range("--per-gpu", options.per_gpu, low=1)
     if options.per_gpu > 1 and timed:
         raise ValueError(

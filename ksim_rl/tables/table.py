@@ -108,6 +108,10 @@ class Row(Checked):
                 f"figures.{name}='success': measure={self.measure} runs no trials: set measure=success, or name "
                 "a mean such as evaluation/metric/success"
             )
+        if source == "evaluation/course_least" and self.course_level is None:
+            raise ValueError(
+                f"figures.{name}={source!r}: no course is walked: set course_level, or leave the figure out"
+            )
         is_mean = source in self.levels or source.startswith("evaluation/")
         if source not in ("seconds", "success") and not is_mean:
             raise ValueError(

@@ -93,17 +93,28 @@ class Stands(MetricTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class StoodSoon(MetricTerm):
-    """1 where it stands, as `Stands` has it, and no more than `within_s` of the episode have passed, else 0, [E].
+    """1 where it stands, as `Stands` has it, between `after_s` and `within_s` of the episode, else 0, [E].
 
-    `reduce="max"` (the default) asks whether it has stood by then.
+    `reduce="max"` (the default) asks whether it has stood by then. Before `after_s` it may still fall from where it
+    began, as high as it stands.
     """
 
     reduce: Reduction = "max"
     standing_height: float
+    after_s: Positive = 0.5
     within_s: Positive = 3.0
 
+    def _check_fields(self) -> None:
+        super()._check_fields()
+        if self.after_s >= self.within_s:
+            raise ValueError(
+                f"after_s={self.after_s}, within_s={self.within_s}: expected after_s < within_s"
+            )
+
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        is_soon_E = view.episode_step_E <= round(self.within_s / view.step_dt)
+        has_landed_E = view.episode_step_E > round(self.after_s / view.step_dt)
+        is_early_E = view.episode_step_E <= round(self.within_s / view.step_dt)
+        is_soon_E = has_landed_E & is_early_E
         return (is_soon_E & stands(view, self.standing_height)).to(torch.float32)
 
 

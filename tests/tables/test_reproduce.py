@@ -243,9 +243,15 @@ def test_runs_share_a_gpu_where_no_row_measures_seconds(reproduce, monkeypatch):
         "Other: {task: reacher}",
         "Other: {task: reacher, measure: seconds, levels: {episode/return: 5}}",
     )
-    (reproduce.folder.parent / "poles.yaml").write_text(timed)
-    with pytest.raises(ValueError, match="ppo/Other measures seconds"):
-        reproduce_command.reproduce([str(reproduce.folder.parent / "poles.yaml"), "--per-gpu", "2"])
+    with_seconds = TABLE.replace(
+        "Other: {task: reacher}", "Other: {task: reacher, figures: {seconds: seconds}}"
+    )
+    for text in (timed, with_seconds):
+        (reproduce.folder.parent / "poles.yaml").write_text(text)
+        with pytest.raises(ValueError, match="ppo/Other measures seconds"):
+            reproduce_command.reproduce(
+                [str(reproduce.folder.parent / "poles.yaml"), "--per-gpu", "2"]
+            )
 
 
 def test_a_row_whose_levels_no_seed_reaches_is_in_the_table(reproduce):

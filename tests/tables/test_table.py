@@ -55,6 +55,11 @@ def test_rows_inherit_the_fields_of_their_group(tmp_path):
         ("rows:", "lines:", "groups that have rows"),
         ("against: PPO", "figures: {best: trials}", "figures.best='trials': expected seconds"),
         ("against: PPO", "figures: {best: success}", "figures.best='success': .*no trials"),
+        (
+            "against: PPO",
+            "figures: {best: evaluation/course_least}",
+            "figures.best='evaluation/course_least': no course",
+        ),
         ("against: PPO", "figures: {falls: seconds}", "figures.falls: .*another name"),
     ],
 )
