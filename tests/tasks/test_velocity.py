@@ -101,7 +101,9 @@ def test_get_up_starts_anywhere_and_rewards_standing(fallen):
         standing_E = base.cfg.rewards["standing"](view)
         stands_E = base.cfg.metrics["stands"](view)
     assert (standing_E >= 0).all() and (standing_E <= 1).all()
-    assert (standing_E[~tall_E] < 0.6).all()
+    # At three quarters of the height at most 0.75 squared is left.
+    low_E = height_E < 0.75 * base.cfg.rewards["height"].standing_height
+    assert low_E.any() and (standing_E[low_E] < 0.6).all()
     assert not stands_E[
         ~tall_E & (height_E < 0.6 * base.cfg.rewards["height"].standing_height)
     ].any()
