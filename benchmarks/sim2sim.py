@@ -18,7 +18,6 @@ import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,13 +27,10 @@ from torch import nn
 from benchmarks import command_line, report
 from ksim_rl import conf
 from ksim_rl.checks import check_choice
-from ksim_rl.envs.contract import part
-from ksim_rl.envs.manager_based_rl_env import ManagerBasedRlEnv
 from ksim_rl.export.sim2sim import ratio_error
 from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.algorithm import make_policy
 from ksim_rl.trainers.build import build_env, build_evaluator
-from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.other_physics import in_c_engine, judged_by
 from ksim_rl.trainers.run_folder import Policy, policy_of
 from ksim_rl.zoo import locate
@@ -56,34 +52,6 @@ class Episodes:
     return_N: np.ndarray
     length_N: np.ndarray
     fell_N: np.ndarray
-
-
-class EpisodeRunner(Evaluator):
-    """Runs one episode in each env, and remembers which of them ended other than by time."""
-
-    def __init__(self, base: ManagerBasedRlEnv, **parts: Any) -> None:
-        super().__init__(**parts)
-        self._base = base
-        self._fell_E = torch.zeros_like(self._running_E)
-
-    def episodes(self) -> Episodes:
-        """Run them."""
-        self()
-        return Episodes(
-            return_N=self._return_E.cpu().numpy(),
-            length_N=self.length_E.cpu().numpy(),
-            fell_N=self._fell_E.cpu().numpy(),
-        )
-
-    def _start(self) -> None:
-        super()._start()
-        self._fell_E.zero_()
-
-    def _count_one_step(self) -> None:
-        began_E = self._running_E.clone()
-        super()._count_one_step()
-        # The root of the next step belongs to the next episode; the view still says how this one ended.
-        self._fell_E.logical_or_(began_E & ~self._running_E & self._base.view.terminated_E)
 
 
 def main() -> int:
@@ -126,15 +94,12 @@ def run(policy: Policy, *, episodes: int, noise: bool) -> Episodes:
     built = build_evaluator(policy.cfg, policy.actor, episodes=episodes, note=print)
     # Evaluations leave the noise out.
     built.env.train(noise)
-    base = part(built.env, ManagerBasedRlEnv)
-    assert base is not None  # the env of a config is ours
-    parts = {
-        "env": built.env,
-        "policy": policy.actor,
-        "max_steps": built.max_steps,
-        "seed": built.seed,
-    }
-    found = EpisodeRunner(base, **parts).episodes()
+    built()
+    found = Episodes(
+        return_N=built.return_E.cpu().numpy(),
+        length_N=built.length_E.cpu().numpy(),
+        fell_N=built.terminated_E.cpu().numpy(),
+    )
     built.env.close(raise_if_closed=False)
     return found
 

@@ -138,12 +138,12 @@ class ReplayStorage(SavedByStateDict, Storage):
                 finite_N &= self._put(key, leaf, following_N, rollout_ET.get(_next(key)))
             finite_N &= self._put(key, leaf, index_N, rollout_ET.get(key))
         # Stacks that show frames that were never written cannot be put together; after `reach` steps all can.
-        known_N = finite_N.clone()
+        known_N = finite_N
         for key in self.stacks.ages:
             leaf = self.content.get(key)
-            known_N &= self.stacks.is_exact(key, leaf, index_N, rollout_ET.get(key))
+            known_N = known_N & self.stacks.is_exact(key, leaf, index_N, rollout_ET.get(key))
             following_ET = rollout_ET.get(_next(key))
-            known_N &= self.stacks.is_exact(key, leaf, following_N, following_ET)
+            known_N = known_N & self.stacks.is_exact(key, leaf, following_N, following_ET)
         # First all successors: many are env states of this rollout and become available next.
         self._make_unavailable(following_N)
         self.available.index_copy_(0, index_N, known_N)

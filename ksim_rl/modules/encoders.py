@@ -16,7 +16,7 @@ from ksim_rl.checked import NUMBERS_PER_WEIGHT, Checked, Count, Range
 from ksim_rl.checks import check_choice
 from ksim_rl.device.state_tree import DESCRIPTION
 from ksim_rl.modules.mlp import ACTIVATIONS, Device
-from ksim_rl.modules.picture_blocks import BlockConvolution, PictureBlocks, block_size
+from ksim_rl.modules.picture_blocks import BlockConvolution, PictureBlocks
 from ksim_rl.transforms.pictures.layout import Layout, check_layout, framed
 
 
@@ -80,11 +80,8 @@ class EncoderCfg(Checked):
             )
         check_layout(spec.shape, self.layout)
         low, high = self._ends(spec.dtype)
-        kernel_size = self.kernel_sizes[0]
-        stride = self.strides[0]
-        block = block_size(kernel_size, stride)
         blocks = PictureBlocks(
-            self.layout, low=low, block=block, kernel_size=kernel_size, stride=stride
+            self.layout, low=low, kernel_size=self.kernel_sizes[0], stride=self.strides[0]
         )
         # Counted on the meta device, which allocates nothing.
         framed_BNHWC = framed(torch.empty(1, *spec.shape, device="meta"), self.layout)
@@ -101,7 +98,7 @@ class EncoderCfg(Checked):
         )
         plain = convolutions[0]
         assert isinstance(plain, nn.Conv2d)
-        convolutions[0] = BlockConvolution(plain, block=block, scale=1.0 / (high - low))
+        convolutions[0] = BlockConvolution(plain, scale=1.0 / (high - low))
         return nn.Sequential(blocks, convolutions).to(device)
 
     def _ends(self, dtype: torch.dtype) -> tuple[float, float]:

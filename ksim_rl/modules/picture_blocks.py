@@ -16,13 +16,11 @@ class PictureBlocks(nn.Module):
     oldest first. Rows and columns at the end that no window of the convolution reaches are left out.
     """
 
-    def __init__(
-        self, layout: Layout, *, low: float, block: int, kernel_size: int, stride: int
-    ) -> None:
+    def __init__(self, layout: Layout, *, low: float, kernel_size: int, stride: int) -> None:
         super().__init__()
         self.layout: Layout = layout
         self.low = low
-        self.block = block
+        self.block = _block_size(kernel_size, stride)
         self.kernel_size = kernel_size
         self.stride = stride
 
@@ -58,7 +56,7 @@ class BlockConvolution(nn.Conv2d):
     pictures in colour have 9. The scale goes into the weights, which are fewer than the pixels.
     """
 
-    def __init__(self, plain: nn.Conv2d, *, block: int, scale: float) -> None:
+    def __init__(self, plain: nn.Conv2d, *, scale: float) -> None:
         # The weights of the plain one, so that none are drawn here.
         super().__init__(
             plain.in_channels,
@@ -69,7 +67,7 @@ class BlockConvolution(nn.Conv2d):
         )
         self.weight = plain.weight
         self.bias = plain.bias
-        self.block = block
+        self.block = _block_size(self.kernel_size[0], self.stride[0])
         self.scale = scale
 
     def forward(self, blocks_BCHW: Float[Tensor, "B C H W"]) -> Float[Tensor, "B O H2 W2"]:
@@ -83,7 +81,7 @@ class BlockConvolution(nn.Conv2d):
         )
 
 
-def block_size(kernel_size: int, stride: int) -> int:
+def _block_size(kernel_size: int, stride: int) -> int:
     """Return the side of blocks that windows cover whole, pixels: the stride, or 1 where it does not divide them."""
     if kernel_size % stride == 0:
         return stride

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
@@ -218,12 +218,10 @@ class RolloutEstimator(ValueEstimatorBase):
             set_recurrent_mode(True),
         ):
             # Without what it reads, so that no pictures are copied.
-            outputs: list[TensorDictBase] = _in_pieces(
+            unrolled = _in_pieces(
                 lambda piece: critic(piece).select(self.tensor_keys.value, "next"),
                 tensordict.select(*critic.in_keys),
             )
-        # Its stub says Tensor.
-        unrolled: Any = TensorDict.cat(outputs)
         tensordict.get("next").update(unrolled.get("next"))
         return unrolled.get(self.tensor_keys.value)
 
@@ -232,7 +230,7 @@ class RolloutEstimator(ValueEstimatorBase):
     ) -> Tensor:
         """Return the outputs of `network` for `inputs` in one batch dim, with the batch dims of `inputs` again."""
         if inputs.batch_dims < 2:
-            return torch.cat(_in_pieces(network, inputs))
+            return _in_pieces(network, inputs)
         # Rows are taken in the order of the memory, which saves a copy of all observations.
         leaf = next(iter(inputs.values(include_nested=True, leaves_only=True)))
         if leaf.movedim(time_dim, 0).is_contiguous():
@@ -246,8 +244,7 @@ class RolloutEstimator(ValueEstimatorBase):
         # Rows go back to the batch dims in the order in which they were taken.
         shape = list(inputs.batch_size)
         shape.insert(0, shape.pop(first))
-        outputs = torch.cat(_in_pieces(network, rows))
-        return outputs.unflatten(0, shape).movedim(0, first)
+        return _in_pieces(network, rows).unflatten(0, shape).movedim(0, first)
 
     def value_estimate(
         self,
@@ -263,17 +260,23 @@ class RolloutEstimator(ValueEstimatorBase):
         return copy.get(self.tensor_keys.value_target)
 
 
-def _in_pieces(network: Callable[[TensorDictBase], Output], inputs: TensorDictBase) -> list[Output]:
-    """Return the outputs of `network` for parts of the first batch dim, of at most `MOST_NUMBERS` numbers each.
+def _in_pieces(network: Callable[[TensorDictBase], Output], inputs: TensorDictBase) -> Output:
+    """Return the output of `network`, which reads parts of the first batch dim, of at most `MOST_NUMBERS` numbers each.
 
     Its elements, rows or envs with all of their steps, are read each by itself, so that only rounding differs; a user's
-    encoder with batch statistics has those of each piece.
+    encoder with batch statistics takes them from each part.
     """
     numbers = 0
     for leaf in inputs.values(include_nested=True, leaves_only=True):
         numbers += leaf[0].numel()
     size = max(1, MOST_NUMBERS // max(1, numbers))
-    return [network(piece) for piece in inputs.split(size)]
+    pieces = inputs.split(size)
+    # The common case, without a copy.
+    if len(pieces) == 1:
+        return network(inputs)
+    # It joins tensordicts, too, which its stub does not say.
+    joined: Any = torch.cat([network(piece) for piece in pieces])
+    return joined
 
 
 def carries_state(network: TensorDictModuleBase) -> bool:

@@ -5,11 +5,9 @@ import statistics
 from collections.abc import Iterable, Mapping, Sequence
 
 from ksim_rl.config.trees import Tree
-from ksim_rl.tables.table import Row
+from ksim_rl.tables.table import COURSE_LEAST, Row
 
 HELD_STATES = 1e6
-COURSE_LEAST = "evaluation/course_least"
-"""The least share of robots, over kinds of ground, that cross the row's level of the course."""
 Point = Mapping[str, float]
 # What `measure` found for a seed of a row, as plain data.
 Result = Tree

@@ -102,20 +102,13 @@ def _shares_of_teacher(results: Sequence[Result], teachers: Sequence[Result]) ->
     """Return the shares, seed by seed, or none where one of them has no course, or a teacher arrives nowhere."""
     shares = []
     for own, teacher in zip(results, teachers, strict=True):
-        success = _course_success(own)
-        reachable = _course_success(teacher)
-        if success is None or not reachable:
+        if "course" not in own or "course" not in teacher:
             return []
-        shares.append(success / reachable)
+        reachable = teacher["course"]["success"]
+        if not reachable:
+            return []
+        shares.append(own["course"]["success"] / reachable)
     return shares
-
-
-def _course_success(result: Result) -> float | None:
-    """Return the share that succeeds on a result's course, in the mean over kinds and levels; None without one."""
-    if "course" not in result:
-        return None
-    by_level = result["course"]["success_by_level"].values()
-    return statistics.fmean(statistics.fmean(shares) for shares in by_level)
 
 
 def _saved(rows: Mapping[str, Row], results: Mapping[str, Sequence[Result]], name: str) -> float:

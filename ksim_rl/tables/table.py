@@ -18,6 +18,8 @@ from ksim_rl.tables.rules import check_name, check_override
 
 SUFFIX = ".yaml"
 FOLDER = Path(str(files("ksim_rl.tables")))
+COURSE_LEAST = "evaluation/course_least"
+"""The least share of robots, over kinds of ground, that cross the row's level of the course."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +110,7 @@ class Row(Checked):
                 f"figures.{name}='success': measure={self.measure} runs no trials: set measure=success, or name "
                 "a mean such as evaluation/metric/success"
             )
-        if source == "evaluation/course_least" and self.course_level is None:
+        if source == COURSE_LEAST and self.course_level is None:
             raise ValueError(
                 f"figures.{name}={source!r}: no course is walked: set course_level, or leave the figure out"
             )

@@ -230,9 +230,11 @@ def humanoid_get_up() -> ManagerBasedRlEnvCfg:
 # -- robots of the menagerie: nothing was trained yet, and heights, action scales and room are guesses -----------------
 
 
-def _soon_too(cfg: ManagerBasedRlEnvCfg, standing_height: float) -> ManagerBasedRlEnvCfg:
+def _soon_too(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
     """Return the config with a second metric: whether the robot has stood within 3 s."""
-    soon = StoodSoon(standing_height=standing_height)
+    in_the_end = cfg.metrics["stands"]
+    assert isinstance(in_the_end, Stands)
+    soon = StoodSoon(standing_height=in_the_end.standing_height)
     return dataclasses.replace(cfg, metrics={**cfg.metrics, "stood_soon": soon})
 
 
@@ -244,55 +246,56 @@ def _twice(scale: Mapping[str, float]) -> dict[str, float]:
 def go1_get_up() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree Go1."""
     robot = UnitreeGo1()
-    height = 0.27
     cfg = get_up_cfg(
         robot,
-        standing_height=height,
+        standing_height=0.27,
         drop_height=(0.2, 0.3),
         action_scale=_twice(robot.action_scale),
         # As in its velocity tasks, with room for a whole body on the ground.
         sim=dataclasses.replace(velocity.sim(cone="elliptic", impratio=10.0), njmax=GO1_ROWS),
         viewer=ViewerCfg(body=robot.root_body, distance=1.5, elevation=-10.0, azimuth=90.0),
     )
-    return _soon_too(cfg, height)
+    return _soon_too(cfg)
 
 
 def g1_get_up() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree G1."""
     robot = UnitreeG1()
-    height = 0.74
     cfg = get_up_cfg(
         robot,
-        standing_height=height,
+        standing_height=0.74,
         drop_height=(0.05, 0.15),
         action_scale=_twice(robot.action_scale),
         sim=dataclasses.replace(velocity.sim(), njmax=G1_ROWS),
         imu=robot.imu,
         viewer=ViewerCfg(body=robot.torso_body, distance=3.0, elevation=-10.0, azimuth=90.0),
     )
-    return _soon_too(cfg, height)
+    return _soon_too(cfg)
 
 
 def t1_get_up() -> ManagerBasedRlEnvCfg:
     """Return the config of Booster T1, whose arms have friction here: it pushes itself up with them."""
     robot = GrippingT1()
-    height = 0.65
     cfg = get_up_cfg(
         robot,
-        standing_height=height,
+        standing_height=0.65,
         drop_height=(0.05, 0.15),
         action_scale={".*": 0.7},
         sim=dataclasses.replace(velocity.sim(), njmax=T1_ROWS),
         viewer=ViewerCfg(body=robot.root_body, distance=3.0, elevation=-10.0, azimuth=90.0),
     )
-    return _soon_too(cfg, height)
+    return _soon_too(cfg)
 
 
+ON_FOUR_LEGS = velocity_training.training(num_iterations=1_000, entropy_coeff=0.005)
+ON_TWO_LEGS = velocity_training.training(
+    num_iterations=3_000, entropy_coeff=0.005, actor=ActorCfg(init_std=0.5)
+)
 QUADRUPED = Task(
     name="quadruped_get_up",
     description="our quadruped gets up from any pose",
     cfg=quadruped_get_up,
-    training=velocity_training.training(num_iterations=1_000, entropy_coeff=0.005),
+    training=ON_FOUR_LEGS,
 )
 HUMANOID = Task(
     name="humanoid_get_up",
@@ -300,29 +303,23 @@ HUMANOID = Task(
     cfg=humanoid_get_up,
     # An output layer of ordinary scale acts the more, the faster joints move, until statistics of observations are
     # known: the humanoid then throws itself about so hard that no engine simulates it, MuJoCo's own included.
-    training=velocity_training.training(
-        num_iterations=3_000, entropy_coeff=0.005, actor=ActorCfg(init_std=0.5)
-    ),
+    training=ON_TWO_LEGS,
 )
 GO1 = Task(
     name="go1_get_up",
     description="Unitree Go1 gets up from any pose",
     cfg=go1_get_up,
-    training=velocity_training.training(num_iterations=1_000, entropy_coeff=0.005),
+    training=ON_FOUR_LEGS,
 )
 G1 = Task(
     name="g1_get_up",
     description="Unitree G1 gets up from any pose",
     cfg=g1_get_up,
-    training=velocity_training.training(
-        num_iterations=3_000, entropy_coeff=0.005, actor=ActorCfg(init_std=0.5)
-    ),
+    training=ON_TWO_LEGS,
 )
 T1 = Task(
     name="t1_get_up",
     description="Booster T1 gets up from any pose",
     cfg=t1_get_up,
-    training=velocity_training.training(
-        num_iterations=3_000, entropy_coeff=0.005, actor=ActorCfg(init_std=0.5)
-    ),
+    training=ON_TWO_LEGS,
 )

@@ -70,25 +70,21 @@ class Outcomes:
 
 
 class Walk(Evaluator):
-    """Runs one episode in each env; `arrived_E` and `fell_E` are of these episodes only."""
+    """Runs one episode in each env; `arrived_E` is of these episodes only."""
 
     def __init__(self, base: ManagerBasedRlEnv, course: Course, **parts: Any) -> None:
         super().__init__(**parts)
         self._base, self._course = base, course
-        self.arrived_E, self.fell_E = (torch.zeros_like(self._running_E) for _ in range(2))
+        self.arrived_E = torch.zeros_like(self._running_E)
 
     def _start(self) -> None:
         super()._start()
         self.arrived_E.zero_()
-        self.fell_E.zero_()
 
     def _count_one_step(self) -> None:
-        began_E = self._running_E.clone()
         super()._count_one_step()
-        view = self._base.view
-        self.fell_E.logical_or_(began_E & view.terminated_E)
         # Where an episode has just ended, the next one's start is there to be seen.
-        away_E = distance_from_origin(view, self._course.entity)
+        away_E = distance_from_origin(self._base.view, self._course.entity)
         self.arrived_E.logical_or_(self._running_E & (away_E >= self._course.distance))
 
 
@@ -181,7 +177,7 @@ def walk(policy: Policy, course: Course, *, num_envs: int) -> Outcomes:
     assert isinstance(ground, PatchedGround)  # what a TerrainGrid makes
     # Patches are numbered level by level, with all columns in each.
     kind_E = ground.patches_E - ground.levels_E * grid.num_columns
-    of_env = (kind_E, ground.levels_E, runner.arrived_E, runner.fell_E)
+    of_env = (kind_E, ground.levels_E, runner.arrived_E, runner.terminated_E)
     kind_E, level_E, arrived_E, fell_E = (figure_E.cpu() for figure_E in of_env)
     env.close(raise_if_closed=False)
     return Outcomes(kind_E=kind_E, level_E=level_E, arrived_E=arrived_E, fell_E=fell_E, lost=lost)

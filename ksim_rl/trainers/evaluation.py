@@ -30,8 +30,8 @@ class Evaluator:
     """Runs the first episode of each env from the same seed, with the policy's deterministic action; all ranks share.
 
     The envs `["E"]` are stepped by nothing else. Their own `max_episode_length` is the natural `max_steps`.
-    After a call `length_E`, float64 [E], has the steps of each episode, and `terminated_E`, bool [E], tells which ones
-    a termination ended, and neither a truncation nor the step limit.
+    After a call `return_E` and `length_E`, float64 [E], have the return and the steps of each episode, and
+    `terminated_E`, bool [E], tells which ones a termination ended.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Evaluator:
         num_envs = env.batch_size[0]
         device = env.device or torch.device("cpu")
         # float64: sums over many steps must not depend on their order.
-        self._return_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
+        self.return_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
         self.length_E = torch.zeros(num_envs, dtype=torch.float64, device=device)
         self.terminated_E = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._running_E = torch.ones(num_envs, dtype=torch.bool, device=device)
@@ -64,7 +64,7 @@ class Evaluator:
                     return None
                 self._step()
         # Of all ranks, in one order, so that each rank computes the same figures.
-        own = self._return_E, self.length_E, self._running_E.to(torch.float64)
+        own = self.return_E, self.length_E, self._running_E.to(torch.float64)
         return_E, length_E, running_E = (torch.cat(ranks.gather(figure_E)) for figure_E in own)
         figures = torch.stack(
             [*torch.std_mean(return_E, correction=0), length_E.mean(), running_E.sum()]
@@ -87,7 +87,7 @@ class Evaluator:
             self._current_E = first_E.clone()
         else:
             self._keep(first_E)
-        self._return_E.zero_()
+        self.return_E.zero_()
         self.length_E.zero_()
         self.terminated_E.zero_()
         self._running_E.fill_(True)
@@ -100,7 +100,7 @@ class Evaluator:
         next_E = stepped_E.get("next")
         reward_E, done_E, terminated_E = (next_E.get(key).reshape(-1) for key in self._signals[:3])
         # Only the first episode of each env counts: after its end the env goes on unseen.
-        self._return_E.add_(torch.where(self._running_E, reward_E.to(torch.float64), 0.0))
+        self.return_E.add_(torch.where(self._running_E, reward_E.to(torch.float64), 0.0))
         self.length_E.add_(self._running_E)
         self.terminated_E.logical_or_(self._running_E & terminated_E)
         # After the sums, so that the last step of an episode counts.

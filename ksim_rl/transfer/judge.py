@@ -98,7 +98,6 @@ class JudgingEvaluator(Evaluator):
     ) -> None:
         super().__init__(env, policy, max_steps=max_steps, seed=seed)
         self._base = base
-        self._fell_E = torch.zeros_like(self._running_E)
         self._limited, self._limit_L = _limits(base)
         self._last_vel: list[Tensor] = []
         self._read: dict[str, list[Tensor]] = {}
@@ -111,8 +110,8 @@ class JudgingEvaluator(Evaluator):
         """Run the episodes and return their figures."""
         self()
         return Judged(
-            return_mean=float(self._return_E.mean()),
-            upright=1.0 - float(self._fell_E.double().mean()),
+            return_mean=float(self.return_E.mean()),
+            upright=1.0 - float(self.terminated_E.double().mean()),
             errors={name: _mean(self._all(f"error/{name}")) for name in self._tracking},
             effort=_percentile(self._all("effort")),
             speed=_percentile(self._all("speed")),
@@ -123,16 +122,13 @@ class JudgingEvaluator(Evaluator):
 
     def _start(self) -> None:
         super()._start()
-        self._fell_E.zero_()
         self._last_vel.clear()
         self._read.clear()
 
     def _count_one_step(self) -> None:
-        began_E = self._running_E.clone()
         super()._count_one_step()
         view = self._base.view
-        # The row of an episode that ended shows the next one's start already, but how it ended.
-        self._fell_E.logical_or_(began_E & ~self._running_E & view.terminated_E)
+        # The row of an episode that ended shows the next one's start already.
         runs_E = self._running_E
         joints = view.joints()
         limited_EL = joints.effort_EL[:, self._limited]

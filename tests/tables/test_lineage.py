@@ -151,11 +151,11 @@ def test_a_student_is_compared_with_its_teacher_seed_by_seed(tmp_path):
     assert share not in report.figures_of(ours, results)
     # Half of all robots arrive with a teacher; of the students' 0.4 and 0.3.
     for own in teacher:
-        own["course"] = {"success_by_level": {"flat": [1.0, 0.6], "stairs": [0.4, 0.0]}}
-    learned[0]["course"] = {"success_by_level": {"flat": [0.9, 0.5], "stairs": [0.2, 0.0]}}
-    learned[1]["course"] = {"success_by_level": {"flat": [0.8, 0.4], "stairs": [0.0, 0.0]}}
+        own["course"] = {"success": 0.5}
+    learned[0]["course"] = {"success": 0.4}
+    learned[1]["course"] = {"success": 0.3}
     assert report.figures_of(ours, results)[share] == 0.6
-    teacher[1]["course"] = {"success_by_level": {"flat": [0.0, 0.0], "stairs": [0.0, 0.0]}}
+    teacher[1]["course"] = {"success": 0.0}
     assert share not in report.figures_of(ours, results)
 
 
