@@ -91,7 +91,15 @@ REFUSED = {
         "--timestep: --task says it",
     ),
     "a blank in a path": (
-        ["log.csv", "--robot", "quadruped", "--nets", "my nets", "--task", "go2_velocity_flat"],
+        [
+            "log.csv",
+            "--robot",
+            "quadruped",
+            "--nets",
+            "my nets",
+            "--task",
+            "quadruped_velocity_flat",
+        ],
         "my nets' cannot stand in words of a shell",
     ),
     "seconds": (("--propose", "quadruped", "--seconds", "1"), "--seconds=1.0"),

@@ -12,6 +12,7 @@ from ksim_rl.identification.training_overrides import (
 )
 from ksim_rl.scene.actuators import DelayedActuator, MLPActuator
 from ksim_rl.scene.robots import Arm, UnitreeGo2
+from tests.absent_models import skipped_without_models
 
 
 def found(robot, names, **left_out):
@@ -30,9 +31,15 @@ def found(robot, names, **left_out):
     )
 
 
+def lines_for_go2(findings):
+    """The overrides of Go2's task; its actuators are read from the model of the menagerie."""
+    with skipped_without_models():
+        return overrides(findings, envs.task("go2_velocity_flat").cfg())
+
+
 def test_a_training_takes_them():
     names = UnitreeGo2.joint_names
-    lines = overrides(found("go2", names), envs.task("go2_velocity_flat").cfg())
+    lines = lines_for_go2(found("go2", names))
     # Words of a shell: `$(cat FILE)` cuts at blanks.
     assert not any(set(line) & set(" \t'\"$") for line in lines)
     cfg = conf.compose(["task=go2_velocity_flat", *lines]).task
@@ -52,7 +59,7 @@ def test_a_training_takes_them():
 
 @pytest.mark.full
 def test_an_env_draws_them():
-    lines = overrides(found("go2", UnitreeGo2.joint_names), envs.task("go2_velocity_flat").cfg())
+    lines = lines_for_go2(found("go2", UnitreeGo2.joint_names))
     env = envs.make("go2_velocity_flat", num_envs=4, device="cpu", overrides=lines)
     drawn = env.view.field("dof_armature")[:, 6:]
     assert 0.011 <= drawn.min() < drawn.max() <= 0.013
@@ -66,9 +73,7 @@ def test_what_was_not_told_is_left_as_it_was():
         "stiffness": Estimate(remark="no positions"),
         "damping": Estimate(remark="within the servo"),
     }
-    lines = overrides(
-        found("go2", UnitreeGo2.joint_names, **nothing), envs.task("go2_velocity_flat").cfg()
-    )
+    lines = lines_for_go2(found("go2", UnitreeGo2.joint_names, **nothing))
     assert not any("identified_damping" in line for line in lines)
     gains = [line for line in lines if "identified_gains" in line]
     assert len(gains) == 12 and all("stiffness:null" in line for line in gains)
