@@ -3,10 +3,13 @@
 import math
 import statistics
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from ksim_rl.data import ReplayCfg
 from ksim_rl.tables.levels import Result
 from ksim_rl.tables.table import Row
+from ksim_rl.trainers import RunCfg
 
 # In the run folder of a seed.
 EPISODES = "demonstration"
@@ -24,36 +27,45 @@ def depth_of(rows: Mapping[str, Row], name: str) -> int:
     return 1 + max(below, default=-1)
 
 
-def overrides_of(row: Row, runs: Path | None = None, seed: int = 0) -> list[str]:
-    """Return the overrides by which a run finds its sources among the `runs` of its table.
+def overrides_of(row: Row) -> list[str]:
+    """Return the overrides that name what a row learns from.
 
-    Without `runs` rows stand for their folders, so that a fingerprint is the same on every machine.
+    Rows stand for their folders, so that a fingerprint is the same on every machine; `with_sources` finds the folders.
     """
-
-    def folder(name: str) -> str:
-        if runs is None:
-            return name
-        found = run_of(runs, name, seed)
-        if not found.is_dir():
-            raise ValueError(
-                f"{found}: no run of row {name!r} with seed {seed}, which this row learns from: let ksim-rl reproduce "
-                "run that row first"
-            )
-        return str(found)
-
     words = []
     if row.begins_from:
-        words.append(f"checkpoint={folder(row.begins_from)!r}")
+        words.append(f"checkpoint={row.begins_from!r}")
     if row.taught_by:
-        words.append(f"objective.teacher={folder(row.taught_by)!r}")
+        words.append(f"objective.teacher={row.taught_by!r}")
     if row.learns_from:
-        episodes = f"{folder(row.learns_from)}/{EPISODES}"
+        episodes = f"{row.learns_from}/{EPISODES}"
         if row.objective == "bc":
             words.append(f"objective.episodes={episodes!r}")
         else:
             # As a whole, since there is no field of it before.
             words.append(f"data.offline={{source: {episodes!r}}}")
     return words
+
+
+def with_sources(cfg: RunCfg, row: Row, folders: Mapping[str, Path]) -> RunCfg:
+    """Return the config of a row with the run folders of the rows that it learns from, in place of their names."""
+    # The fields of `overrides_of`: nothing else of the config differs from the one that has names.
+    if row.begins_from:
+        cfg = replace(cfg, checkpoint=str(folders[row.begins_from]))
+    if row.taught_by:
+        taught = {"teacher": str(folders[row.taught_by])}
+        cfg = replace(cfg, objective=replace(cfg.objective, **taught))
+    if row.learns_from:
+        episodes = str(folders[row.learns_from] / EPISODES)
+        if row.objective == "bc":
+            shown = {"episodes": episodes}
+            cfg = replace(cfg, objective=replace(cfg.objective, **shown))
+        else:
+            assert isinstance(cfg.data, ReplayCfg)
+            assert cfg.data.offline is not None
+            offline = replace(cfg.data.offline, source=episodes)
+            cfg = replace(cfg, data=replace(cfg.data, offline=offline))
+    return cfg
 
 
 def run_of(runs: Path, name: str, seed: int) -> Path:

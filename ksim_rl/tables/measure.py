@@ -30,7 +30,8 @@ from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.runs.listing import METRICS
 from ksim_rl.tables.levels import HELD_STATES, Result, means_of, reached
-from ksim_rl.tables.lineage import EPISODES, overrides_of, runs_of, sources_of
+from ksim_rl.tables.inputs import Sources
+from ksim_rl.tables.lineage import EPISODES, overrides_of, runs_of, sources_of, with_sources
 from ksim_rl.tables.table import COURSE_LEAST, Row, load
 from ksim_rl.tasks.terrain_course import (
     GROUND_SEED,
@@ -79,20 +80,18 @@ LATER = re.compile(
 )
 
 
-def run_cfg(
-    row: Row, seed: int, *, device: str = "auto", smoke: bool = False, runs: Path | None = None
-) -> RunCfg:
+def run_cfg(row: Row, seed: int, *, device: str = "auto", smoke: bool = False) -> RunCfg:
     """Compose the config of a seed, as `ksim-rl train` does; a ValueError names the override that is wrong.
 
-    The rows that it learns from are found among the `runs` of its table; without, names stand for their folders. A
-    table is data: a field by which a run writes or listens outside of its folder is refused.
+    Names stand for the folders of the rows that it learns from. A table is data: a field by which a run writes or
+    listens outside of its folder is refused.
     """
     # The same words as on a command line, so that a row can be repeated by hand.
     words = [f"task={row.task}", f"objective={row.objective}", f"seed={seed}", f"device={device}"]
     words += [
         *FIXED.split(),
         *row.overrides,
-        *overrides_of(row, runs, seed),
+        *overrides_of(row),
         f"trainer.eval_episodes={8 if smoke else row.episodes}",
     ]
     cfg = conf.compose([*words, *(SMOKE.split() if smoke else ())])
@@ -129,15 +128,28 @@ def _check_course(row: Row, cfg: RunCfg) -> None:
     check_in_range("course_level", row.course_level, low=0, high=course.grid.num_levels - 1)
 
 
-def settings_of(rows: Mapping[str, Row], name: str, *, smoke: bool = False) -> str:
-    """Return the fingerprint of a row, which is another one where a row that it learns from has other settings."""
-    row = rows[name]
-    return settings(row, run_cfg(row, 1, smoke=smoke), sources=_sources(rows, name, smoke=smoke))
+class RowCfgs:
+    """The configs of a table's rows, each composed once, and their fingerprints."""
 
+    def __init__(self, rows: Mapping[str, Row], *, smoke: bool = False) -> None:
+        self.rows = rows
+        self._smoke = smoke
+        self._cfgs: dict[str, RunCfg] = {}
 
-def _sources(rows: Mapping[str, Row], name: str, *, smoke: bool) -> list[str]:
-    """Return the fingerprints of the rows that a row learns from."""
-    return [settings_of(rows, source, smoke=smoke) for source in sources_of(rows[name])]
+    def cfg(self, name: str) -> RunCfg:
+        """Return the config of a row with seed 1, which names the rows that it learns from."""
+        if name not in self._cfgs:
+            self._cfgs[name] = run_cfg(self.rows[name], 1, smoke=self._smoke)
+        return self._cfgs[name]
+
+    def settings(self, name: str) -> str:
+        """Return the fingerprint of a row, which is another one where a row that it learns from has other settings."""
+        sources = self.source_settings(name)
+        return settings(self.rows[name], self.cfg(name), sources=list(sources.values()))
+
+    def source_settings(self, name: str) -> dict[str, str]:
+        """Return the fingerprints of the rows that a row learns from, by name."""
+        return {source: self.settings(source) for source in sources_of(self.rows[name])}
 
 
 def settings(row: Row, cfg: RunCfg, *, sources: Sequence[str] = ()) -> str:
@@ -272,14 +284,20 @@ def measure(
     *,
     device: str,
     smoke: bool,
-    runs: Path | None = None,
-    sources: Sequence[str] = (),
+    sources: Sources | None = None,
 ) -> Result:
     """Train and judge; return plain data. An interrupted run raises, so that it leaves no result.
 
-    Rows that it learns from are found among the `runs` of its table; `sources` are their fingerprints.
+    A row that learns from others needs the `sources`.
     """
-    cfg = run_cfg(row, seed, device=device, smoke=smoke, runs=runs)
+    # Composed once: the fingerprint is of the very config that is trained, but for the folders of this machine.
+    named = run_cfg(row, seed, device=device, smoke=smoke)
+    cfg = named
+    learned_from: list[str] = []
+    if sources_of(row):
+        assert sources is not None
+        cfg = with_sources(named, row, sources.folders(row, seed))
+        learned_from = [sources.settings[name] for name in sources_of(row)]
     judge = _Judge(cfg, row, trials=8 if smoke else row.episodes)
     progress = RunProgress(cfg.trainer.num_iterations)
     began = time.monotonic()
@@ -315,8 +333,7 @@ def measure(
     # Where the package is installed without git, the environment may name the commit.
     code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})
     return {
-        # Without the folders of this machine.
-        "settings": settings(row, run_cfg(row, seed, device=device, smoke=smoke), sources=sources),
+        "settings": settings(row, named, sources=learned_from),
         "commit": code["commit"] + ("-dirty" if len(code) > 1 else ""),
         "date": session.began,
         "versions": dict(session.versions),
@@ -342,14 +359,14 @@ def main(
     plugins.load([])  # from KSIM_RL_PLUGINS, where `ksim-rl --plugin` has put its own
     # The child composes the row itself: it gets names only.
     rows = load(name).rows
+    cfgs = RowCfgs(rows, smoke=bool(smoke))
     found = measure(
         rows[row],
         int(seed),
         Path(run_folder),
         device=device,
         smoke=bool(smoke),
-        runs=runs_of(Path(run_folder), row),
-        sources=_sources(rows, row, smoke=bool(smoke)),
+        sources=Sources(runs=runs_of(Path(run_folder), row), settings=cfgs.source_settings(row)),
     )
     path = Path(result)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from ksim_rl.files.writing import make_folder, open_own
 from ksim_rl.runs import run_lock
 from ksim_rl.tables.levels import Result
 from ksim_rl.tables.lineage import sources_of
-from ksim_rl.tables.measure import settings_of
+from ksim_rl.tables.measure import RowCfgs
 from ksim_rl.tables.table import Table
 
 # Polling is enough: runs take minutes.
@@ -35,7 +35,7 @@ class Runs:
         self.run_folder = run_folder
         self.smoke = smoke
         # Composing a config is slow, and each row is asked for many times.
-        self._settings = cache(lambda name: settings_of(table.rows, name, smoke=smoke))
+        self._settings = cache(RowCfgs(table.rows, smoke=smoke).settings)
 
     def results(self) -> dict[str, dict[int, Result]]:
         """Return the results that count, by row and seed: results of the settings that the row has now."""

@@ -4,12 +4,14 @@ from dataclasses import dataclass, replace
 
 import pytest
 
+from ksim_rl import conf
 from ksim_rl.data import OfflineCfg, read_episodes
 from ksim_rl.runs.listing import CONFIG
 from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import report
-from ksim_rl.tables.lineage import EPISODES, depth_of, overrides_of, sources_of
-from ksim_rl.tables.measure import measure, run_cfg, settings_of
+from ksim_rl.tables.inputs import Sources
+from ksim_rl.tables.lineage import EPISODES, depth_of, overrides_of, sources_of, with_sources
+from ksim_rl.tables.measure import FIXED, RowCfgs, measure, run_cfg
 from ksim_rl.tables.runner import Runs
 from ksim_rl.tables.table import Row, load
 
@@ -43,15 +45,42 @@ def test_sources_come_first_and_are_found_by_seed(tmp_path):
     assert [depth_of(rows, name) for name in ROWS] == [0, 1, 2]
     assert overrides_of(rows["pole/nothing"]) == []
     clone = rows["pole/bc"]
+    sources = Sources(runs=tmp_path, settings={})
     with pytest.raises(ValueError, match="no run of row 'pole/nothing' with seed 2"):
-        overrides_of(clone, tmp_path, 2)
+        sources.folders(clone, 2)
     found = tmp_path / "pole" / "nothing" / "seed_2"
     found.mkdir(parents=True)
-    assert overrides_of(clone, tmp_path, 2) == [f"objective.episodes='{found}/{EPISODES}'"]
+    folders = sources.folders(clone, 2)
+    assert folders == {"pole/nothing": found}
     assert overrides_of(clone) == [f"objective.episodes='pole/nothing/{EPISODES}'"]
+    cfg = run_cfg(clone, 2)
+    assert with_sources(cfg, clone, folders).objective.episodes == f"{found}/{EPISODES}"
     assert overrides_of(rows["pole/online"]) == ["checkpoint='pole/bc'"]
     other = replace(clone, objective="fast_sac")
-    assert run_cfg(other, 1).data.offline == OfflineCfg(source=f"pole/nothing/{EPISODES}")
+    cfg = run_cfg(other, 1)
+    assert cfg.data.offline == OfflineCfg(source=f"pole/nothing/{EPISODES}")
+    cfg = with_sources(cfg, other, folders)
+    assert cfg.data.offline == OfflineCfg(source=f"{found}/{EPISODES}")
+
+
+def test_the_folders_of_sources_are_all_that_differs_from_what_a_row_stands_for(tmp_path):
+    """The words of a command line with these folders compose the same config."""
+    student = "{objective: distillation, measure: return, taught_by: pole/nothing}"
+    rows = table(tmp_path, "      bc:", f"      student: {student}\n      bc:").rows
+    folders = {name: tmp_path / name for name in rows}
+    for name in ("pole/student", "pole/bc", "pole/online"):
+        row = rows[name]
+        named = run_cfg(row, 1)
+        words = [f"task={row.task}", f"objective={row.objective}", "seed=1", *FIXED.split()]
+        words += ["trainer.eval_episodes=128", *row.overrides]
+        for word in overrides_of(row):
+            for source in sources_of(row):
+                word = word.replace(source, str(folders[source]))
+            words.append(word)
+        by_hand = conf.compose(words)
+        found = with_sources(named, row, folders)
+        assert found.to_tree() == by_hand.to_tree() | {"trainer": found.to_tree()["trainer"]}
+        assert found != named
 
 
 @dataclass(frozen=True)
@@ -65,13 +94,22 @@ class Composed:
 
 
 def test_other_settings_of_a_row_are_others_of_all_that_learn_from_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(measuring, "run_cfg", lambda row, seed, **options: Composed(row))
+    composed = []
+
+    def compose(row, seed, **options):
+        composed.append(row)
+        return Composed(row)
+
+    monkeypatch.setattr(measuring, "run_cfg", compose)
     rows = table(tmp_path).rows
     changed = table(
         tmp_path, "{recorded: 5}", "{recorded: 5, overrides: [objective.gamma=0.9]}"
     ).rows
+    ours = RowCfgs(rows)
+    theirs = RowCfgs(changed)
     for name in ROWS:
-        assert settings_of(rows, name) != settings_of(changed, name)
+        assert ours.settings(name) != theirs.settings(name)
+    assert len(composed) == 2 * len(ROWS), "each row once, however many learn from it"
     # Nothing but the settings of their sources tells these apart.
     assert rows["pole/online"] == changed["pole/online"]
 
@@ -163,6 +201,7 @@ def test_a_student_is_compared_with_its_teacher_seed_by_seed(tmp_path):
 def test_the_whole_chain_runs(tmp_path):
     """Two iterations each: episodes are recorded, cloned, and PPO goes on."""
     rows = table(tmp_path).rows
+    cfgs = RowCfgs(rows, smoke=True)
     found = {}
     for name in ROWS:
         run_folder = tmp_path / "runs" / name / "seed_1"
@@ -172,10 +211,9 @@ def test_the_whole_chain_runs(tmp_path):
             run_folder,
             device="cpu",
             smoke=True,
-            runs=tmp_path / "runs",
-            sources=[found[source]["settings"] for source in sources_of(rows[name])],
+            sources=Sources(runs=tmp_path / "runs", settings=cfgs.source_settings(name)),
         )
     episodes = read_episodes(tmp_path / "runs/pole/nothing/seed_1" / EPISODES)
     assert found["pole/nothing"]["recorded_env_states"] == len(episodes.env_states_D) > 0
     assert "pole/bc/seed_1" in (tmp_path / "runs/pole/online/seed_1" / CONFIG).read_text()
-    assert found["pole/online"]["settings"] == settings_of(rows, "pole/online", smoke=True)
+    assert found["pole/online"]["settings"] == cfgs.settings("pole/online")

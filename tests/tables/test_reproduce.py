@@ -16,7 +16,7 @@ from ksim_rl.envs.term import Reduction
 from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import reproduce as reproduce_command
 from ksim_rl.tables import runner
-from ksim_rl.tables.measure import measure, run_cfg, settings, settings_of
+from ksim_rl.tables.measure import RowCfgs, measure, run_cfg, settings
 from ksim_rl.tables.table import load, shipped
 
 TABLE = """
@@ -77,7 +77,9 @@ def reproduce(monkeypatch, tmp_path):
     failing = {}
     monkeypatch.setattr(runner.Runs, "_start", start)
     # Composing a run's config takes its time, and has tests of its own below.
-    monkeypatch.setattr(runner, "settings_of", lambda rows, name, smoke: str(rows[name].overrides))
+    monkeypatch.setattr(
+        runner.RowCfgs, "settings", lambda self, name: str(self.rows[name].overrides)
+    )
     monkeypatch.setattr(reproduce_command, "run_cfg", lambda row, seed, **options: None)
     path = tmp_path / "poles.yaml"
 
@@ -306,8 +308,9 @@ def tables_with_results():
 @pytest.mark.parametrize("table", tables_with_results())
 def test_committed_results_are_of_the_settings_that_rows_have_now(table):
     table = load(table)
+    cfgs = RowCfgs(table.rows)
     for name in table.rows:
-        expected = settings_of(table.rows, name)
+        expected = cfgs.settings(name)
         for path in (RESULTS / "tables" / table.name / name).glob("seed_*.json"):
             assert json.loads(path.read_text())["settings"] == expected, path
 
