@@ -29,8 +29,8 @@ from ksim_rl.files.writing import write_whole
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.runs.listing import METRICS
-from ksim_rl.tables.levels import HELD_STATES, Result, means_of, reached
 from ksim_rl.tables.inputs import Sources
+from ksim_rl.tables.levels import HELD_STATES, Result, means_of, reached
 from ksim_rl.tables.lineage import EPISODES, overrides_of, runs_of, sources_of, with_sources
 from ksim_rl.tables.table import COURSE_LEAST, Row, load
 from ksim_rl.tasks.terrain_course import (
