@@ -8,9 +8,11 @@ A compiler sees what the CPU would run; what only a GPU does is compiled by `tes
 
 import argparse
 import json
+import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -22,19 +24,50 @@ from tests.docs.guide import REPOSITORY
 
 COMPILERS = ("g++", "clang++")
 FILE = "compile_commands.json"
+OF_WARP = Path(wp.__file__).parent / "native"
+BUILTIN = "builtin.h"
+# An include, before which a header has comments and its `#pragma once` alone.
+_BEGINS_WITH = re.compile(r'(?:\s*(?://[^\n]*|#pragma once)\n)*\s*#include "([^"]+)"\n')
 
 
 def command(header: Path, compiler: str, root: Path = REPOSITORY) -> list[str]:
     """Return the command that checks a header, in which paths of includes begin at `root`."""
-    of_warp = Path(wp.__file__).parent / "native"
     # Of `#pragma once` in the main file, and pragmas of CUDA, compilers warn.
     flags = ["-std=c++17", "-fsyntax-only", "-w", "-xc++"]
-    return [compiler, *flags, f"-I{root}", f"-isystem{of_warp}", str(header)]
+    return [compiler, *flags, f"-I{root}", f"-isystem{OF_WARP}", str(header)]
 
 
-def errors_of(header: Path, compiler: str, root: Path = REPOSITORY) -> str:
-    """Return what a compiler says of a header; nothing where it compiles."""
-    done = subprocess.run(command(header, compiler, root), capture_output=True, text=True)
+def begins_with_builtin(header: Path, root: Path = REPOSITORY) -> bool:
+    """Whether a compiler reads Warp's header before all code of this one."""
+    found = _BEGINS_WITH.match(header.read_text())
+    if found is None:
+        return False
+    included = found[1]
+    if included == BUILTIN:
+        return True
+    return (root / included).is_file() and begins_with_builtin(root / included, root)
+
+
+def precompile_builtin(folder: Path) -> Path | None:
+    """Let g++ read Warp's header once, which is nine tenths of each check; returns the path to include, or none."""
+    # A name of its own: an include of builtin.h has to find Warp's.
+    prefix = folder / "precompiled.h"
+    flags = ["-std=c++17", "-w", "-xc++-header", f"-isystem{OF_WARP}"]
+    made = [COMPILERS[0], *flags, str(OF_WARP / BUILTIN), "-o", f"{prefix}.gch"]
+    return None if subprocess.run(made, capture_output=True).returncode else prefix
+
+
+def errors_of(
+    header: Path, compiler: str, root: Path = REPOSITORY, precompiled: Path | None = None
+) -> str:
+    """Return what a compiler says of a header; nothing where it compiles.
+
+    `precompiled` takes the place of Warp's header where a compiler would read that first.
+    """
+    checked = command(header, compiler, root)
+    if precompiled is not None and begins_with_builtin(header, root):
+        checked += ["-include", str(precompiled)]
+    done = subprocess.run(checked, capture_output=True, text=True)
     return done.stderr if done.returncode else ""
 
 
@@ -64,8 +97,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if compiler is None:
         show(f"headers: not checked, since there is neither {' nor '.join(COMPILERS)}")
         return
-    with ThreadPoolExecutor(2) as pool:
-        errors = list(pool.map(lambda header: errors_of(header, compiler), found))
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(2) as pool:
+        precompiled = None
+        if compiler == COMPILERS[0]:
+            precompiled = precompile_builtin(Path(folder))
+        checks = [
+            pool.submit(errors_of, header, compiler, precompiled=precompiled) for header in found
+        ]
+        errors = [check.result() for check in checks]
     for text in filter(None, errors):
         show(text, to_stderr=True)
     if any(errors):

@@ -1,5 +1,6 @@
 """Headers of kernels: their text, their struct and constants, and that they compile alone and are never an old one."""
 
+import functools
 import shutil
 import sys
 
@@ -156,6 +157,40 @@ def test_headers_compile_alone(toy):
         )
     )
     assert "CUDA_CALLABLE" in syntax.errors_of(kernel, compiler, toy.parent)
+
+
+@pytest.mark.parametrize(
+    ("first", "begins"),
+    [
+        ('#include "builtin.h"\n', True),
+        # Through another header.
+        ('// Its reason.\n#pragma once\n#include "toy/between.cuh"\n', True),
+        ("", False),
+        ("struct Before {};\n" + '#include "builtin.h"\n', False),
+        ('#include "toy/empty.cuh"\n#include "builtin.h"\n', False),
+        ('#include "toy/missing.cuh"\n', False),
+    ],
+)
+def test_a_header_that_a_precompiled_one_would_help_out_is_compiled_without(toy, first, begins):
+    (toy / "empty.cuh").write_text("#pragma once\n")
+    header = toy / "first.cuh"
+    header.write_text(first + "CUDA_CALLABLE inline int one() { return 1; }\n")
+    assert syntax.begins_with_builtin(header, toy.parent) == begins
+
+
+def test_a_precompiled_header_hides_no_error(toy, tmp_path):
+    compiler = syntax.COMPILERS[0]
+    if shutil.which(compiler) is None:
+        pytest.skip(f"there is no {compiler}")
+    precompiled = syntax.precompile_builtin(tmp_path)
+    kernel = toy / "kernel.cuh"
+    errors = functools.partial(syntax.errors_of, kernel, compiler, toy.parent, precompiled)
+    assert not errors()
+    kernel.write_text(KERNEL.replace("scaled(", "scald("))
+    assert "scald" in errors()
+    # A header that forgot to include it.
+    kernel.write_text(KERNEL[KERNEL.index("namespace kernel") :])
+    assert "CUDA_CALLABLE" in errors()
 
 
 def test_each_file_of_cpp_is_a_part_of_a_kernel():
