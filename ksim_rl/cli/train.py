@@ -182,10 +182,15 @@ def _train_one(
             f"{', '.join(map(str, groups))}: {path}={value!r} reaches outside of the run folder, and groups of a "
             f"folder may not: set {path} on the command line"
         )
-    cfg = RunCfg.from_tree(plain)
+    own = conf.own_files()
+    with conf.naming_files(own):
+        cfg = RunCfg.from_tree(plain)
     launched = HydraConfig.get()
+    # A run that is made again has its own config, and what files said in it before.
+    if began is None:
+        conf.check_files_not_replaced(cfg, own, launched.overrides.task)
     # Only here for a config of the user's own, and for the last jobs of a long sweep.
-    conf.check_composed(cfg, launched.overrides.task)
+    conf.check_composed(cfg, launched.overrides.task, again=began is not None)
     cfg = dataclasses.replace(cfg, device=str(cfg.resolved_device()))
     # The run's own config must find its files from anywhere.
     if cfg.checkpoint is not None:

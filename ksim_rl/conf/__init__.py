@@ -10,6 +10,7 @@ from ksim_rl.conf.command_line import (
     without_sweeps,
 )
 from ksim_rl.conf.help_page import completions, help_page
+from ksim_rl.conf.own_files import check_files_not_replaced, naming_files, own_files
 from ksim_rl.conf.registration import (
     MODULE,
     NAME,

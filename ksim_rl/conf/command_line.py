@@ -14,12 +14,13 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from ksim_rl import envs
 from ksim_rl.checks import check_known
 from ksim_rl.conf import spelling
 from ksim_rl.conf.registration import CHOSEN_BY_TASK, MODULE, NAME, RUN_AGAIN, register, store_run
 from ksim_rl.config.overrides import check_parsed, quoting
 from ksim_rl.config.trees import Tree
-from ksim_rl.envs.managers.replaced_fields import check_not_replaced
+from ksim_rl.envs.managers.replaced_fields import check_not_replaced, overridden_curricula
 from ksim_rl.trainers import RunCfg
 
 # A sweep over more combinations than this is checked in part here; each job checks its own config again.
@@ -99,12 +100,17 @@ def _compose(overrides: list[str], name: str, *, learns: bool) -> RunCfg:
     plain = OmegaConf.to_container(hydra.compose(name, overrides=overrides), resolve=True)
     assert isinstance(plain, dict)
     cfg = RunCfg.from_tree({str(key): value for key, value in plain.items()})
-    check_composed(cfg, overrides, learns=learns)
+    check_composed(cfg, overrides, learns=learns, again=name == RUN_AGAIN)
     return cfg
 
 
-def check_composed(cfg: RunCfg, overrides: Sequence[str], *, learns: bool = True) -> None:
-    """Refuse overrides of one job whose values the composed config would not keep, of data sizes or by a curriculum."""
+def check_composed(
+    cfg: RunCfg, overrides: Sequence[str], *, learns: bool = True, again: bool = False
+) -> None:
+    """Refuse overrides of one job whose values the composed config would not keep, of data sizes or by a curriculum.
+
+    Where a run is made `again` or goes on, a curriculum that it was given itself need not be named once more.
+    """
     # Data sizes follow from the rollout length, so only one of the two may be given.
     for override in overrides:
         if override.partition("=")[0] in SIZES and cfg.collector.rollout_length is not None:
@@ -113,7 +119,12 @@ def check_composed(cfg: RunCfg, overrides: Sequence[str], *, learns: bool = True
                 "the two out, or set collector.rollout_length=null"
             )
     if learns:
-        check_not_replaced(cfg.task.curriculum, overrides)
+        given_before = []
+        # The task of a package that is not loaded here, or of a program, has no curriculum to compare with.
+        if again and cfg.task_name in envs.names():
+            own = envs.task(cfg.task_name).cfg().curriculum
+            given_before = overridden_curricula(cfg.task.curriculum, own)
+        check_not_replaced(cfg.task.curriculum, overrides, given_before)
 
 
 def _parse(text: str, loader: ConfigLoader) -> Override:

@@ -42,14 +42,15 @@ def given_fields(overrides: Iterable[str]) -> list[str]:
         if override.is_sweep_override():
             found.append(override.key_or_group)
         else:
-            found.extend(_leaves(override.key_or_group, _plain(override)))
+            found.extend(leaves(override.key_or_group, _plain(override)))
     return found
 
 
-def _leaves(path: str, value: Plain) -> Iterator[str]:
+def leaves(path: str, value: Plain) -> Iterator[str]:
+    """Yield the fields that a value at `path` gives values, down into mappings: "a.b" and "a.c" of {b: 1, c: 2}."""
     if isinstance(value, dict) and value:
         for name, inside in value.items():
-            yield from _leaves(f"{path}.{name}", inside)
+            yield from leaves(f"{path}.{name}", inside)
     else:
         yield path
 

@@ -3,27 +3,41 @@
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
+from ksim_rl.config import config_tree
 from ksim_rl.config.overrides import given_fields
+from ksim_rl.config.trees import Plain
 from ksim_rl.envs.term import CurriculumTerm
 
 PATH = "task"
 
 
-def check_not_replaced(curricula: Mapping[str, CurriculumTerm], overrides: Sequence[str]) -> None:
+def check_not_replaced(
+    curricula: Mapping[str, CurriculumTerm],
+    overrides: Sequence[str],
+    given_before: Sequence[str] = (),
+) -> None:
     """Refuse overrides of fields whose values a curriculum replaces, unless they are of the curriculum as well.
 
     Args:
         curricula: the task's, with the overrides.
         overrides: Hydra's, such as "task.commands.twist.lin_vel_x=[0,1]".
+        given_before: fields of curricula that the user has overridden in the run that goes on, such as
+            "task.curriculum.ranges.stages.9.lin_vel_x".
 
     Raises:
         ValueError: naming the field, the curriculum, and how to go without it.
     """
-    given = given_fields(overrides)
+    check_given(curricula, given_fields(overrides), given_before)
+
+
+def check_given(
+    curricula: Mapping[str, CurriculumTerm], given: Sequence[str], given_before: Sequence[str]
+) -> None:
+    """Do the same for fields that were given values, be it by overrides or in a file."""
     for name, term in curricula.items():
         curriculum = f"{PATH}.curriculum.{name}"
         every = set(_replaced(term))
-        of_curriculum = [field for field in given if _is_in(field, curriculum)]
+        of_curriculum = [field for field in (*given, *given_before) if _is_in(field, curriculum)]
         for replaced in sorted(every):
             # The user describes what the curriculum does with the field, and so knows of it.
             if any(not _is_of_others(field, replaced, every) for field in of_curriculum):
@@ -34,6 +48,23 @@ def check_not_replaced(curricula: Mapping[str, CurriculumTerm], overrides: Seque
                         f"{field}: the curriculum {name!r} replaces {PATH}.{replaced} in training: leave it out, "
                         f"~{curriculum}, or override its values too"
                     )
+
+
+def overridden_curricula(
+    curricula: Mapping[str, CurriculumTerm], defaults: Mapping[str, CurriculumTerm]
+) -> list[str]:
+    """Return the fields in which curricula differ from a task's own: "task.curriculum.ranges.stages.9.lin_vel_x"."""
+    trees = (config_tree.to_tree(terms) for terms in (curricula, defaults))
+    return list(_differing(f"{PATH}.curriculum", *trees))
+
+
+def _differing(path: str, tree: Plain, other: Plain) -> Iterator[str]:
+    if not isinstance(tree, dict) or not isinstance(other, dict):
+        if tree != other:
+            yield path
+        return
+    for name, value in tree.items():
+        yield from _differing(f"{path}.{name}", value, other.get(name))
 
 
 def check_one_writer(curricula: Mapping[str, CurriculumTerm]) -> None:

@@ -8,7 +8,11 @@ from ksim_rl import conf, envs
 from ksim_rl.cli.main import main
 from ksim_rl.config.overrides import given_fields
 from ksim_rl.envs import mdp
-from ksim_rl.envs.managers.replaced_fields import check_not_replaced, check_one_writer
+from ksim_rl.envs.managers.replaced_fields import (
+    check_not_replaced,
+    check_one_writer,
+    overridden_curricula,
+)
 from ksim_rl.viewer.played import find
 from tests.envs.probe_env import puck_cfg
 
@@ -70,6 +74,16 @@ def test_who_overrides_another_field_of_a_curriculum_does_not_know_of_this_one()
         check_not_replaced(curricula, ["task.commands.twist.lin_vel_x=[0,1]", of_z])
 
 
+def test_a_run_that_goes_on_knows_of_the_curricula_that_it_was_given():
+    own = CURRICULA["ranges"]
+    wider = mdp.CommandRangesByStage(command="twist", stages={9: {"lin_vel_x": (0.0, 2.0)}})
+    assert overridden_curricula({"ranges": own}, {"ranges": own}) == []
+    given = overridden_curricula({"ranges": wider}, {"ranges": own})
+    assert given == ["task.curriculum.ranges.stages.9.lin_vel_x"]
+    check_not_replaced({"ranges": wider}, ["task.commands.twist.lin_vel_x=[0,1]"], given)
+    assert overridden_curricula({"ranges": own}, {}) == ["task.curriculum.ranges"]
+
+
 @pytest.mark.parametrize(
     ("first", "second", "field"),
     [
@@ -114,8 +128,17 @@ def test_a_training_is_refused_and_an_evaluation_is_not():
     tree = whole.to_tree()
     # Evaluations leave curricula out.
     assert conf.changed(tree, Path("config.yaml"), [RANGE]).task == whole.task
-    with pytest.raises(ValueError, match="'command_ranges' replaces"):
-        conf.changed(tree, Path("config.yaml"), [RANGE], learns=True)
+    # The run was given stages of its own: they need not be named once more where it goes on.
+    slower = "task.commands.twist.lin_vel_x=[0.0,0.3]"
+    resumed = conf.changed(tree, Path("config.yaml"), [slower], learns=True).task
+    assert resumed.commands["twist"].ranges["lin_vel_x"] == (0.0, 0.3)
+    assert resumed.curriculum == whole.task.curriculum
+    # Stages of another field are no word about this one, nor are the task's own.
+    turn = "task.curriculum.command_ranges.stages.120000.ang_vel_z=[0.0,0.6]"
+    for given in ([], [turn]):
+        tree = conf.compose([f"task={TASK}", *given]).to_tree()
+        with pytest.raises(ValueError, match="'command_ranges' replaces"):
+            conf.changed(tree, Path("config.yaml"), [RANGE], learns=True)
 
 
 @pytest.mark.full
