@@ -12,7 +12,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from ksim_rl.files.writing import write_whole
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.runs.listing import METRICS
-from ksim_rl.tables.inputs import Sources
+from ksim_rl.tables.inputs import FilesHere, Sources, files_read, hashes_of
 from ksim_rl.tables.levels import HELD_STATES, Result, means_of, reached
 from ksim_rl.tables.lineage import EPISODES, overrides_of, runs_of, sources_of, with_sources
 from ksim_rl.tables.table import COURSE_LEAST, Row, load
@@ -45,6 +45,7 @@ from ksim_rl.terminal import show
 from ksim_rl.tracking.trials import run_trials
 from ksim_rl.trainers import Hook, RunCfg, RunProgress, Trainer, run
 from ksim_rl.trainers.collecting import CollectCfg, collect_episodes
+from ksim_rl.trainers.kept_models import ReadFile
 from ksim_rl.trainers.run_cfg import reaching_outside
 from ksim_rl.trainers.run_folder import Policy
 
@@ -135,6 +136,8 @@ class RowCfgs:
         self.rows = rows
         self._smoke = smoke
         self._cfgs: dict[str, RunCfg] = {}
+        self._settings: dict[str, str] = {}
+        self._files: dict[str, FilesHere] = {}
 
     def cfg(self, name: str) -> RunCfg:
         """Return the config of a row with seed 1, which names the rows that it learns from."""
@@ -144,12 +147,38 @@ class RowCfgs:
 
     def settings(self, name: str) -> str:
         """Return the fingerprint of a row, which is another one where a row that it learns from has other settings."""
-        sources = self.source_settings(name)
-        return settings(self.rows[name], self.cfg(name), sources=list(sources.values()))
+        if name not in self._settings:
+            sources = list(self.source_settings(name).values())
+            self._settings[name] = settings(self.rows[name], self.cfg(name), sources=sources)
+        return self._settings[name]
 
     def source_settings(self, name: str) -> dict[str, str]:
         """Return the fingerprints of the rows that a row learns from, by name."""
         return {source: self.settings(source) for source in sources_of(self.rows[name])}
+
+    def sources(self, name: str, runs: Path) -> Sources:
+        """Return what a row may find of the rows that it learns from, among the `runs` of its table."""
+        files = hashes_of(self._read_by_sources(name))
+        return Sources(runs=runs, settings=self.source_settings(name), files=files)
+
+    def read_by(self, name: str) -> Iterator[ReadFile]:
+        """Yield what a row reads, and then what the rows read that it learns from, with their names in front."""
+        yield from files_read(self.cfg(name), self.rows[name])
+        yield from self._read_by_sources(name)
+
+    def fits(self, name: str, result: Result) -> bool:
+        """Return whether a result is of the settings that a row has now, and of the files that are there now."""
+        if result["settings"] != self.settings(name):
+            return False
+        # Hashed once: large models take a second.
+        if name not in self._files:
+            self._files[name] = FilesHere.of(self.read_by(name))
+        return self._files[name].fit(result.get("files"))
+
+    def _read_by_sources(self, name: str) -> Iterator[ReadFile]:
+        for source in sources_of(self.rows[name]):
+            for file in self.read_by(source):
+                yield replace(file, name=f"{source}: {file.name}")
 
 
 def settings(row: Row, cfg: RunCfg, *, sources: Sequence[str] = ()) -> str:
@@ -298,6 +327,7 @@ def measure(
         assert sources is not None
         cfg = with_sources(named, row, sources.folders(row, seed))
         learned_from = [sources.settings[name] for name in sources_of(row)]
+    files = hashes_of(files_read(named, row))
     judge = _Judge(cfg, row, trials=8 if smoke else row.episodes)
     progress = RunProgress(cfg.trainer.num_iterations)
     began = time.monotonic()
@@ -306,6 +336,11 @@ def measure(
     # Half a run says nothing.
     if outcome.interrupted_by is not None or outcome.evaluation is None:
         raise KeyboardInterrupt
+    # Clips and models are read in training, in trials and on the course.
+    if changed := [
+        name for name, sha256 in hashes_of(files_read(named, row)).items() if files[name] != sha256
+    ]:
+        raise ValueError(f"{changed[0]} has changed while the row was trained: run it again")
     if row.course_level is not None:
         assert judge.actor is not None
         course = _walk_course(cfg, row, judge.actor, smoke=smoke)
@@ -334,6 +369,7 @@ def measure(
     code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})
     return {
         "settings": settings(row, named, sources=learned_from),
+        "files": files | dict(sources.files if sources else {}),
         "commit": code["commit"] + ("-dirty" if len(code) > 1 else ""),
         "date": session.began,
         "versions": dict(session.versions),

@@ -4,7 +4,6 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
-from functools import cache
 from pathlib import Path
 from subprocess import STDOUT, Popen
 from typing import IO
@@ -35,22 +34,17 @@ class Runs:
         self.run_folder = run_folder
         self.smoke = smoke
         # Composing a config is slow, and each row is asked for many times.
-        self._settings = cache(RowCfgs(table.rows, smoke=smoke).settings)
+        self._cfgs = RowCfgs(table.rows, smoke=smoke)
 
     def results(self) -> dict[str, dict[int, Result]]:
-        """Return the results that count, by row and seed: results of the settings that the row has now."""
+        """Return the results that count, by row and seed: of the settings and files that it has now."""
         found: dict[str, dict[int, Result]] = {}
         for name, row in self.table.rows.items():
             paths = {seed: self.folder / name / f"seed_{seed}.json" for seed in row.seeds}
             present = {seed: _result(path) for seed, path in paths.items() if path.exists()}
-            if present:
-                # Composed only where there is a result to compare with.
-                own = self._settings(name)
-            else:
-                own = ""
-            # A result of other settings is no result of this row.
+            # A result of other settings or files is no result of this row.
             found[name] = {
-                seed: result for seed, result in present.items() if result["settings"] == own
+                seed: result for seed, result in present.items() if self._cfgs.fits(name, result)
             }
         return found
 

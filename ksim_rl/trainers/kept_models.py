@@ -6,6 +6,7 @@ and so do files of data: motions, sets of them, and networks of motors.
 """
 
 import dataclasses
+import hashlib
 import json
 import os
 import warnings
@@ -75,6 +76,32 @@ def keep_models(cfg: RunCfg, run_folder: Path, *, note: Callable[[str], None]) -
     if record != earlier:
         plain = {name: dataclasses.asdict(kept) for name, kept in record.items()}
         write_whole(run_folder / RECORD, json.dumps(plain, indent=2) + "\n")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadFile:
+    """A model or data that a config reads.
+
+    Models of the menagerie and motions of the package are the same for all who have these.
+
+    Attributes:
+        name: its name in `models.json`.
+        is_own: whether it lies in a folder of the user's.
+        sha256: returns its hash; a ValueError says why it cannot be read.
+    """
+
+    name: str
+    is_own: bool
+    sha256: Callable[[], str]
+
+
+def files_read(cfg: RunCfg) -> Iterator[ReadFile]:
+    """Yield the models and the files of data that a config reads."""
+    for name, source in _sources(cfg):
+        is_own = Path(source).expanduser().is_file()
+        yield ReadFile(name=name, is_own=is_own, sha256=partial(_sha256_of_model, source))
+    for data in _data(cfg):
+        yield ReadFile(name=data.name, is_own=data.is_own, sha256=data.sha256)
 
 
 def with_kept_models(
@@ -228,6 +255,7 @@ class _Data:
     where: str
     source: str
     change: str
+    is_own: bool
     sha256: Callable[[], str]
 
 
@@ -242,6 +270,7 @@ def _data(cfg: RunCfg) -> Iterator[_Data]:
             source=source,
             change=f"the motions of {source} have changed since the run began: other clips may be held out than in "
             "its training",
+            is_own=any(map(_is_own, motions.sources)),
             sha256=motions.sha256,
         )
     told: set[str] = set()
@@ -261,8 +290,22 @@ def _data(cfg: RunCfg) -> Iterator[_Data]:
                 where=where,
                 source=source,
                 change=f"{source} has changed since the run began: its policy may not fit any more",
+                is_own=_is_own(source),
                 sha256=sha256,
             )
+
+
+def _sha256_of_model(source: str) -> str:
+    """Return the hash of a model's files; of one that is text, the text's."""
+    files = files_of_model(source)
+    if files is None:
+        return hashlib.sha256(source.encode()).hexdigest()
+    return files.sha256()
+
+
+def _is_own(source: str) -> bool:
+    """Return whether a file of data is none of the package's."""
+    return motion_path(source) == Path(source)
 
 
 def _with_source(entity: MjcfRobot | MenagerieRobot, source: str) -> MjcfRobot | ModelRobot:

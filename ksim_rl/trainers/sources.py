@@ -17,28 +17,38 @@ ALWAYS = ("iteration", "seconds", "rollout/reward", "throughput/env_states_per_s
 NAMED_LATER = ("curriculum", "command", "physics")
 
 
+def checkpoints_of(cfg: RunCfg) -> dict[str, str]:
+    """Return the run folders and checkpoints that a config names, by the dotted paths of their fields."""
+    named = {}
+    if cfg.checkpoint is not None:
+        named["checkpoint"] = cfg.checkpoint
+    for name in cfg.objective.checkpoint_fields:
+        named[f"objective.{name}"] = getattr(cfg.objective, name)
+    return named
+
+
+def recordings_of(cfg: RunCfg) -> dict[str, str]:
+    """Return the folders of episodes that a config names, by the dotted paths of their fields."""
+    named = {}
+    for name in cfg.objective.episode_fields:
+        named[f"objective.{name}"] = getattr(cfg.objective, name)
+    if isinstance(cfg.data, ReplayCfg) and cfg.data.offline is not None:
+        named["data.offline.source"] = cfg.data.offline.source
+    return named
+
+
 def check_sources(cfg: RunCfg, *, resumes: bool = False) -> None:
     """Refuse a run whose checkpoints, loggers' packages, robots' files or targets are not there, by a ValueError.
 
     Nothing is compiled or written. A run that `resumes` has its starting point in its own checkpoint.
     """
     check_installed(cfg.logger)
-    named = {"checkpoint": cfg.checkpoint}
-    named |= {
-        f"objective.{name}": getattr(cfg.objective, name)
-        for name in cfg.objective.checkpoint_fields
-    }
-    for field, path in named.items():
+    for field, path in checkpoints_of(cfg).items():
         # Read as a whole, hashes included: a damaged file must fail now and not after minutes.
-        if path is not None and not resumes:
+        if not resumes:
             with naming(f"{field}={path}", checkpoint.CheckpointError):
                 checkpoint.load_latest(Path(path))
-    folders = {
-        f"objective.{name}": getattr(cfg.objective, name) for name in cfg.objective.episode_fields
-    }
-    if isinstance(cfg.data, ReplayCfg) and cfg.data.offline is not None:
-        folders["data.offline.source"] = cfg.data.offline.source
-    for field, path in folders.items():
+    for field, path in recordings_of(cfg).items():
         with naming(f"{field}={path}"):
             read_episodes(path)
     for kind, entities in (("robots", cfg.task.scene.robots), ("objects", cfg.task.scene.objects)):

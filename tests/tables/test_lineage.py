@@ -211,7 +211,7 @@ def test_the_whole_chain_runs(tmp_path):
             run_folder,
             device="cpu",
             smoke=True,
-            sources=Sources(runs=tmp_path / "runs", settings=cfgs.source_settings(name)),
+            sources=cfgs.sources(name, tmp_path / "runs"),
         )
     episodes = read_episodes(tmp_path / "runs/pole/nothing/seed_1" / EPISODES)
     assert found["pole/nothing"]["recorded_env_states"] == len(episodes.env_states_D) > 0

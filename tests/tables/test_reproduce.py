@@ -80,6 +80,7 @@ def reproduce(monkeypatch, tmp_path):
     monkeypatch.setattr(
         runner.RowCfgs, "settings", lambda self, name: str(self.rows[name].overrides)
     )
+    monkeypatch.setattr(runner.RowCfgs, "read_by", lambda self, name: ())
     monkeypatch.setattr(reproduce_command, "run_cfg", lambda row, seed, **options: None)
     path = tmp_path / "poles.yaml"
 
