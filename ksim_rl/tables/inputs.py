@@ -1,14 +1,18 @@
 """What a row reads beside its settings: files, and run folders of the rows that it learns from."""
 
 import hashlib
+import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from ksim_rl.files.reading import MOST_TENSOR_BYTES, check_regular
+from ksim_rl.files.reading import MOST_TENSOR_BYTES, MOST_TEXT_BYTES, check_regular, read_bytes
+from ksim_rl.files.writing import write_whole
+from ksim_rl.runs.record import read as read_sessions
+from ksim_rl.tables.levels import Result
 from ksim_rl.tables.lineage import overrides_of, run_of, sources_of
 from ksim_rl.tables.table import Row
 from ksim_rl.trainers import RunCfg
@@ -17,36 +21,84 @@ from ksim_rl.trainers.kept_models import ReadFile
 from ksim_rl.trainers.kept_models import files_read as files_of_run
 from ksim_rl.trainers.sources import checkpoints_of, recordings_of
 
+# In the run folder of a seed of a row, once all of it is done.
+FINISHED = "row.json"
+# What tells the run of a result from all others.
+OF_RESULT = ("settings", "files", "commit", "date")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sources:
-    """What a row may find of the rows that it learns from.
+    """Where a row finds the runs of the rows that it learns from.
 
     Attributes:
         runs: the folder of all runs of the table.
-        settings: the fingerprints of these rows, by name.
-        files: the hashes of the files that these rows read, with the names of the rows in front.
+        fits: whether a result of a row, by name, is of the settings and files that the row has now.
+        results: the folder of the table's results, of which these runs have to be; None where there are none.
     """
 
     runs: Path
-    settings: Mapping[str, str]
-    files: Mapping[str, str] = field(default_factory=dict)
+    fits: Callable[[str, Result], bool]
+    results: Path | None = None
 
-    def folders(self, row: Row, seed: int) -> dict[str, Path]:
-        """Return the run folders of the rows that a row learns from, by name.
+    def of(self, row: Row, seed: int) -> dict[str, Result]:
+        """Return what the finished runs of a row's sources say of themselves, by name; see `write_finished`.
 
-        A ValueError names one that is not there.
+        A ValueError names a run that is not there or not finished, or that is none of its row and its result.
         """
         found = {}
         for name in sources_of(row):
-            folder = run_of(self.runs, name, seed)
-            if not folder.is_dir():
-                raise ValueError(
-                    f"{folder}: no run of row {name!r} with seed {seed}, which this row learns from: let ksim-rl "
-                    "reproduce run that row first"
-                )
-            found[name] = folder
+            finished = self.finished(name, seed)
+            if isinstance(finished, str):
+                raise ValueError(f"row {name!r}, which this row learns from: {finished}")
+            found[name] = finished
         return found
+
+    def folders(self, row: Row, seed: int) -> dict[str, Path]:
+        """Return the run folders of the rows that a row learns from, by name."""
+        return {name: run_of(self.runs, name, seed) for name in sources_of(row)}
+
+    def finished(self, name: str, seed: int) -> Result | str:
+        """Return what the finished run of a row says of itself, or why there is none that others may learn from."""
+        folder = run_of(self.runs, name, seed)
+        path = folder / FINISHED
+        if not path.exists():
+            return f"{folder} is no finished run of it with seed {seed}; {self._fix(name, seed)}"
+        finished = json.loads(read_bytes(path, limit=MOST_TEXT_BYTES))
+        sessions = read_sessions(folder)
+        # Whoever went on with the run by hand has other networks in its folder.
+        is_last = bool(sessions) and sessions[-1].began == finished["date"]
+        if finished["seed"] != seed or not is_last or not self.fits(name, finished):
+            return f"{folder} is a run of another seed, other settings or other files; {self._fix(name, seed)}"
+        if self.results is None:
+            return finished
+        result = self.results / name / f"seed_{seed}.json"
+        if not result.exists():
+            return finished
+        counted = json.loads(read_bytes(result, limit=MOST_TEXT_BYTES))
+        if any(counted.get(key) != finished[key] for key in OF_RESULT):
+            return f"{folder} is another run than {result} is of; {self._fix(name, seed)}"
+        return finished
+
+    def _fix(self, name: str, seed: int) -> str:
+        fix = "let ksim-rl reproduce run that row"
+        if self.results is None:
+            return fix
+        result = self.results / name / f"seed_{seed}.json"
+        if not result.exists():
+            return fix
+        return f"move {result} away, and {fix} anew"
+
+
+def write_finished(run_folder: Path, result: Result, seed: int) -> None:
+    """Say in a run folder which run it is: settings, files, commit and date of its result, and its seed."""
+    finished = {"seed": seed, **{key: result[key] for key in OF_RESULT}}
+    write_whole(run_folder / FINISHED, json.dumps(finished, indent=1) + "\n")
+
+
+def clear_finished(run_folder: Path) -> None:
+    """Say in a run folder that its run is not finished any more, as it begins anew."""
+    (run_folder / FINISHED).unlink(missing_ok=True)
 
 
 def files_read(cfg: RunCfg, row: Row) -> Iterator[ReadFile]:

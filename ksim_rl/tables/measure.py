@@ -29,7 +29,14 @@ from ksim_rl.files.writing import write_whole
 from ksim_rl.runs import record
 from ksim_rl.runs.csv_table import read_table, thinned
 from ksim_rl.runs.listing import METRICS
-from ksim_rl.tables.inputs import FilesHere, Sources, files_read, hashes_of
+from ksim_rl.tables.inputs import (
+    FilesHere,
+    Sources,
+    clear_finished,
+    files_read,
+    hashes_of,
+    write_finished,
+)
 from ksim_rl.tables.levels import HELD_STATES, Result, means_of, reached
 from ksim_rl.tables.lineage import EPISODES, overrides_of, runs_of, sources_of, with_sources
 from ksim_rl.tables.table import COURSE_LEAST, Row, load
@@ -148,23 +155,16 @@ class RowCfgs:
     def settings(self, name: str) -> str:
         """Return the fingerprint of a row, which is another one where a row that it learns from has other settings."""
         if name not in self._settings:
-            sources = list(self.source_settings(name).values())
+            sources = [self.settings(source) for source in sources_of(self.rows[name])]
             self._settings[name] = settings(self.rows[name], self.cfg(name), sources=sources)
         return self._settings[name]
-
-    def source_settings(self, name: str) -> dict[str, str]:
-        """Return the fingerprints of the rows that a row learns from, by name."""
-        return {source: self.settings(source) for source in sources_of(self.rows[name])}
-
-    def sources(self, name: str, runs: Path) -> Sources:
-        """Return what a row may find of the rows that it learns from, among the `runs` of its table."""
-        files = hashes_of(self._read_by_sources(name))
-        return Sources(runs=runs, settings=self.source_settings(name), files=files)
 
     def read_by(self, name: str) -> Iterator[ReadFile]:
         """Yield what a row reads, and then what the rows read that it learns from, with their names in front."""
         yield from files_read(self.cfg(name), self.rows[name])
-        yield from self._read_by_sources(name)
+        for source in sources_of(self.rows[name]):
+            for file in self.read_by(source):
+                yield replace(file, name=f"{source}: {file.name}")
 
     def fits(self, name: str, result: Result) -> bool:
         """Return whether a result is of the settings that a row has now, and of the files that are there now."""
@@ -174,11 +174,6 @@ class RowCfgs:
         if name not in self._files:
             self._files[name] = FilesHere.of(self.read_by(name))
         return self._files[name].fit(result.get("files"))
-
-    def _read_by_sources(self, name: str) -> Iterator[ReadFile]:
-        for source in sources_of(self.rows[name]):
-            for file in self.read_by(source):
-                yield replace(file, name=f"{source}: {file.name}")
 
 
 def settings(row: Row, cfg: RunCfg, *, sources: Sequence[str] = ()) -> str:
@@ -317,17 +312,24 @@ def measure(
 ) -> Result:
     """Train and judge; return plain data. An interrupted run raises, so that it leaves no result.
 
-    A row that learns from others needs the `sources`.
+    A row that learns from others needs the `sources`; a ValueError says what is wrong with their runs.
     """
     # Composed once: the fingerprint is of the very config that is trained, but for the folders of this machine.
     named = run_cfg(row, seed, device=device, smoke=smoke)
     cfg = named
     learned_from: list[str] = []
+    files_of_sources: dict[str, str] = {}
     if sources_of(row):
         assert sources is not None
+        finished = sources.of(row, seed)
         cfg = with_sources(named, row, sources.folders(row, seed))
-        learned_from = [sources.settings[name] for name in sources_of(row)]
+        learned_from = [finished[name]["settings"] for name in sources_of(row)]
+        for name, source in finished.items():
+            files_of_sources |= {
+                f"{name}: {file}": sha256 for file, sha256 in source["files"].items()
+            }
     files = hashes_of(files_read(named, row))
+    clear_finished(run_folder)
     judge = _Judge(cfg, row, trials=8 if smoke else row.episodes)
     progress = RunProgress(cfg.trainer.num_iterations)
     began = time.monotonic()
@@ -367,9 +369,10 @@ def measure(
     session = record.read(run_folder)[-1]
     # Where the package is installed without git, the environment may name the commit.
     code = session.code.get("ksim_rl", {"commit": os.environ.get("GIT_COMMIT", "unknown")})
-    return {
+    result = {
+        # Without the folders of this machine.
         "settings": settings(row, named, sources=learned_from),
-        "files": files | dict(sources.files if sources else {}),
+        "files": files | files_of_sources,
         "commit": code["commit"] + ("-dirty" if len(code) > 1 else ""),
         "date": session.began,
         "versions": dict(session.versions),
@@ -385,6 +388,9 @@ def measure(
         "env_states_to_levels": None if end is None else end["env_states"],
         "curve": thinned(points, KEPT_POINTS),
     }
+    # Last: other rows learn from a run that has all that its row keeps.
+    write_finished(run_folder, result, seed)
+    return result
 
 
 def main(
@@ -402,7 +408,11 @@ def main(
         Path(run_folder),
         device=device,
         smoke=bool(smoke),
-        sources=Sources(runs=runs_of(Path(run_folder), row), settings=cfgs.source_settings(row)),
+        sources=Sources(
+            runs=runs_of(Path(run_folder), row),
+            fits=cfgs.fits,
+            results=runs_of(Path(result), row),
+        ),
     )
     path = Path(result)
     path.parent.mkdir(parents=True, exist_ok=True)

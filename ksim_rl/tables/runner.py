@@ -14,6 +14,7 @@ from ksim_rl.config.child_processes import start_python
 from ksim_rl.files.reading import MOST_DATA_BYTES, read_bytes
 from ksim_rl.files.writing import make_folder, open_own
 from ksim_rl.runs import run_lock
+from ksim_rl.tables.inputs import Sources
 from ksim_rl.tables.levels import Result
 from ksim_rl.tables.lineage import sources_of
 from ksim_rl.tables.measure import RowCfgs
@@ -35,6 +36,7 @@ class Runs:
         self.smoke = smoke
         # Composing a config is slow, and each row is asked for many times.
         self._cfgs = RowCfgs(table.rows, smoke=smoke)
+        self._runs = Sources(runs=run_folder, fits=self._cfgs.fits, results=folder)
 
     def results(self) -> dict[str, dict[int, Result]]:
         """Return the results that count, by row and seed: of the settings and files that it has now."""
@@ -81,12 +83,10 @@ class Runs:
                     for _, process in running.values():
                         process.kill()
                 now = [job for job, _ in running.values()]
-                for job, source in self._orphans(waiting, now):
+                for job, why in self._orphans(waiting, now):
                     waiting.remove(job)
                     left += 1
-                    note(
-                        f"{job[0]}, seed {job[1]}: row {source!r}, which it learns from, has no result"
-                    )
+                    note(f"{job[0]}, seed {job[1]}: {why}")
                 # One job on each slot; a slot is free as soon as its process has ended.
                 for slot, gpu in enumerate(gpus):
                     if slot not in running:
@@ -119,9 +119,9 @@ class Runs:
         return left
 
     def _orphans(self, waiting: Sequence[Job], running: Sequence[Job]) -> list[tuple[Job, str]]:
-        """Return jobs that can never begin, each with a row that it learns from, which failed or is not run.
+        """Return jobs that can never begin, each with the reason: a row that it learns from has failed or is not run.
 
-        Half a run leaves a folder and a checkpoint, too: a row learns only from runs with results.
+        Half a run leaves a folder and a checkpoint, too: a row learns only from finished runs, whose results count.
         """
         coming = {*waiting, *running}
         ended: list[tuple[Job, Job]] = []
@@ -134,7 +134,11 @@ class Runs:
         found: dict[Job, str] = {}
         for job, (source, seed) in ended:
             if seed not in results[source]:
-                found.setdefault(job, source)
+                found.setdefault(job, f"row {source!r}, which it learns from, has no result")
+                continue
+            finished = self._runs.finished(source, seed)
+            if isinstance(finished, str):
+                found.setdefault(job, f"row {source!r}, which it learns from: {finished}")
         return list(found.items())
 
     def _sources(self, job: Job) -> list[Job]:

@@ -1,5 +1,8 @@
 """Rows of a table learn from rows above them: episodes are recorded, cloned, and a run goes on from the clone."""
 
+import json
+import math
+import shutil
 from dataclasses import dataclass, replace
 
 import pytest
@@ -9,7 +12,7 @@ from ksim_rl.data import OfflineCfg, read_episodes
 from ksim_rl.runs.listing import CONFIG
 from ksim_rl.tables import measure as measuring
 from ksim_rl.tables import report
-from ksim_rl.tables.inputs import Sources
+from ksim_rl.tables.inputs import Sources, clear_finished, write_finished
 from ksim_rl.tables.lineage import EPISODES, depth_of, overrides_of, sources_of, with_sources
 from ksim_rl.tables.measure import FIXED, RowCfgs, measure, run_cfg
 from ksim_rl.tables.runner import Runs
@@ -45,11 +48,8 @@ def test_sources_come_first_and_are_found_by_seed(tmp_path):
     assert [depth_of(rows, name) for name in ROWS] == [0, 1, 2]
     assert overrides_of(rows["pole/nothing"]) == []
     clone = rows["pole/bc"]
-    sources = Sources(runs=tmp_path, settings={})
-    with pytest.raises(ValueError, match="no run of row 'pole/nothing' with seed 2"):
-        sources.folders(clone, 2)
+    sources = Sources(runs=tmp_path, fits=lambda name, result: True)
     found = tmp_path / "pole" / "nothing" / "seed_2"
-    found.mkdir(parents=True)
     folders = sources.folders(clone, 2)
     assert folders == {"pole/nothing": found}
     assert overrides_of(clone) == [f"objective.episodes='pole/nothing/{EPISODES}'"]
@@ -63,6 +63,7 @@ def test_sources_come_first_and_are_found_by_seed(tmp_path):
     assert cfg.data.offline == OfflineCfg(source=f"{found}/{EPISODES}")
 
 
+@pytest.mark.full
 def test_the_folders_of_sources_are_all_that_differs_from_what_a_row_stands_for(tmp_path):
     """The words of a command line with these folders compose the same config."""
     student = "{objective: distillation, measure: return, taught_by: pole/nothing}"
@@ -197,6 +198,98 @@ def test_a_student_is_compared_with_its_teacher_seed_by_seed(tmp_path):
     assert share not in report.figures_of(ours, results)
 
 
+RESULT = {"settings": "now", "files": {}, "commit": "abc", "date": "2026-01-01 10:00:00"}
+
+
+@pytest.fixture
+def teacher(tmp_path):
+    """The finished run of pole/nothing with seed 1, and its result; returns where both lie."""
+    folder = tmp_path / "runs" / "pole" / "nothing" / "seed_1"
+    folder.mkdir(parents=True)
+    session = {"began": RESULT["date"], "command": "", "status": "done"}
+    (folder / "run.json").write_text(json.dumps({"sessions": [session]}))
+    write_finished(folder, RESULT, 1)
+    result = tmp_path / "results" / "pole" / "nothing" / "seed_1.json"
+    result.parent.mkdir(parents=True)
+    result.write_text(json.dumps({**RESULT, "falls": 0.0}))
+    return folder, result
+
+
+def is_asked(tmp_path, settings="now"):
+    """Ask for the sources of the clone with seed 1, where rows have these settings."""
+    sources = Sources(
+        runs=tmp_path / "runs",
+        fits=lambda name, result: result["settings"] == settings,
+        results=tmp_path / "results",
+    )
+    return sources.of(table(tmp_path).rows["pole/bc"], 1)
+
+
+def test_a_row_learns_from_the_finished_run_that_its_source_counts_with(tmp_path, teacher):
+    assert is_asked(tmp_path) == {"pole/nothing": {"seed": 1, **RESULT}}
+    folder, result = teacher
+    # As on a machine that has trained and not yet written.
+    result.unlink()
+    assert is_asked(tmp_path) == {"pole/nothing": {"seed": 1, **RESULT}}
+
+
+def begin_anew(folder, result):
+    clear_finished(folder)
+
+
+def take_another_seeds(folder, result):
+    write_finished(folder, RESULT, 2)
+
+
+def go_on_by_hand(folder, result):
+    sessions = json.loads((folder / "run.json").read_text())["sessions"]
+    sessions.append({"began": "2026-01-02 10:00:00", "command": "", "status": "done"})
+    (folder / "run.json").write_text(json.dumps({"sessions": sessions}))
+
+
+def train_elsewhere(folder, result):
+    result.write_text(json.dumps({**RESULT, "commit": "abd"}))
+
+
+def leave_an_empty_folder(folder, result):
+    shutil.rmtree(folder)
+    folder.mkdir()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (begin_anew, "is no finished run of it with seed 1; move .*seed_1.json away"),
+        (leave_an_empty_folder, "is no finished run of it with seed 1"),
+        (take_another_seeds, "is a run of another seed, other settings or other files"),
+        (go_on_by_hand, "is a run of another seed, other settings or other files"),
+        (train_elsewhere, "is another run than .*seed_1.json is of; move"),
+    ],
+)
+def test_a_row_learns_from_no_other_run(tmp_path, teacher, change, message):
+    change(*teacher)
+    with pytest.raises(ValueError, match=f"row 'pole/nothing', .*{message}"):
+        is_asked(tmp_path)
+
+
+def test_a_row_learns_from_no_run_of_earlier_settings(tmp_path, teacher):
+    with pytest.raises(ValueError, match="other settings"):
+        is_asked(tmp_path, settings="changed")
+
+
+def test_a_row_whose_source_has_a_result_but_no_run_says_so_before_it_begins(
+    tmp_path, teacher, monkeypatch
+):
+    monkeypatch.setattr(measuring.RowCfgs, "fits", lambda self, name, result: True)
+    runs = Runs(table(tmp_path), tmp_path / "results", tmp_path / "runs", smoke=False)
+    monkeypatch.setattr(Runs, "_start", lambda *_: pytest.fail("it begins"))
+    begin_anew(*teacher)
+    said = []
+    assert runs.run([("pole/bc", 1)], gpus=[""], until=math.inf, note=said.append) == 1
+    assert "pole/bc, seed 1: row 'pole/nothing', which it learns from: " in said[0]
+    assert "is no finished run of it with seed 1" in said[0]
+
+
 @pytest.mark.full
 def test_the_whole_chain_runs(tmp_path):
     """Two iterations each: episodes are recorded, cloned, and PPO goes on."""
@@ -211,7 +304,7 @@ def test_the_whole_chain_runs(tmp_path):
             run_folder,
             device="cpu",
             smoke=True,
-            sources=cfgs.sources(name, tmp_path / "runs"),
+            sources=Sources(runs=tmp_path / "runs", fits=cfgs.fits),
         )
     episodes = read_episodes(tmp_path / "runs/pole/nothing/seed_1" / EPISODES)
     assert found["pole/nothing"]["recorded_env_states"] == len(episodes.env_states_D) > 0
