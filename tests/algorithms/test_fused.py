@@ -43,6 +43,8 @@ def full(*values):
     [
         # Observations that are stored as 48 columns, and multiplied as 64.
         ({}, {"actor_obs": 40}),
+        # Two pieces, of 256 and 16 columns: heights beside the state.
+        full({"adam_eps": 1e-5}, {"actor_obs": 259, "hidden": (32, 16, 16)}),
         (
             {
                 "clip_epsilon": 1.0,

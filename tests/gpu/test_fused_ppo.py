@@ -94,6 +94,9 @@ def parameters(made):
         ({"hidden_dims": (48, 32, 16), "action_dim": 1}, "none"),
         ({}, "loss"),
         ({"hidden_dims": (1024, 1024), "activation": "relu", "obs": 298}, "none"),
+        # Heights beside the state: observations in two pieces, of which the second is small, or large.
+        ({"obs": 259}, "none"),
+        ({"obs": 298, "action_dim": 29}, "augment"),
         (
             {
                 "hidden_dims": (512, 512, 256, 128),
@@ -156,6 +159,7 @@ def test_the_gradient_is_that_of_exact_products(network_options, symmetry):
     "network_options",
     [
         {"hidden_dims": (256, 256, 128), "action_dim": 21, "obs": 67, "init_std": 0.03},
+        {"hidden_dims": (256, 256, 128), "action_dim": 29, "obs": 298},
         {"hidden_dims": (256, 128)},
         {"hidden_dims": (128, 128), "activation": "silu", "state_dependent_std": True, **SQUASHED},
     ],
@@ -283,7 +287,9 @@ def test_no_host_sync(hidden_dims):
         made.metrics()
 
 
-@pytest.mark.parametrize("network_options", [{}, {"obs": 45, "action_dim": 29, "std_type": "log"}])
+@pytest.mark.parametrize(
+    "network_options", [{}, {"obs": 45, "action_dim": 29, "std_type": "log"}, {"obs": 298}]
+)
 def test_the_ratio_at_the_first_step_is_one(network_options):
     actor, critic = networks(output_gain=1.0, **network_options)
     obs = network_options.get("obs", OBS)

@@ -60,6 +60,8 @@ NUM_STATISTICS = 16
 # Points of the quadrature for the entropy of squashed actions: it is good to 1e-3 nats for standard deviations to 1.5
 # before the tanh.
 NODES = 16
+# As TF32, observations in two pieces take more registers than in one, up to so many columns.
+TF32_PIECE = 256
 
 
 def _squashing(networks: FusedNetworks, zeros_A: Tensor) -> dict[str, Any]:
@@ -188,8 +190,7 @@ class FusedPPO:
             **vars(cfg),
             **{name.upper(): value for part in described for name, value in vars(part).items()},
             **dict(zip(("H1", "H2", "H3"), layout.hidden, strict=False)),
-            # As TF32, observations in two pieces take more registers than in one.
-            **({"HEAD": layout.obs, "REST": 0} if self._tf32 else {}),
+            **({"HEAD": layout.obs, "REST": 0} if self._tf32 and layout.obs <= TF32_PIECE else {}),
             **dict(zip(("parameters", "means", "variances"), parameters.flat, strict=True)),
             **dict(zip(("beta1", "beta2"), cfg.betas, strict=True)),
             **{
