@@ -14,6 +14,7 @@ from benchmarks import report, tasks
 from benchmarks.pages.committed import last_run, results
 from ksim_rl import envs
 from ksim_rl.scene.scene import SceneCfg
+from ksim_rl.tables.levels import worst
 from ksim_rl.tables.table import Row, load
 
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
@@ -226,8 +227,8 @@ def learned_row(of_table: Row, saved: Mapping[str, Any] | None) -> str:
         asked.append(f"return {saved['value']:.4g} ({saved['goal']:g})")
     for name, level in of_table.levels.items() if of_table.measure == "return" else ():
         values = [run["means"].get(name) for run in runs]
-        worst = "not logged" if None in values else f"{min(values):.2f}"
-        asked.append(f"{name.rpartition('/')[2]} {worst} ({level:g})")
+        reached = "not logged" if None in values else f"{worst(name, values):.2f}"
+        asked.append(f"{name.rpartition('/')[2]} {reached} ({level:g})")
     cells += [f"{states / 1e6:.1f} million", took, f"{statistics.fmean(returns):.1f}{spread}"]
     verdict = {True: "yes", False: "no", None: NOTHING}[saved["reached"]]
     return f"| {' | '.join([*cells, ', '.join(asked) or NOTHING, verdict, str(len(runs))])} |"

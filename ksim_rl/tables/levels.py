@@ -1,6 +1,7 @@
 """Finds when a learning curve reaches levels, and whether several seeds do so together."""
 
 import math
+import re
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -8,9 +9,61 @@ from ksim_rl.config.trees import Tree
 from ksim_rl.tables.table import COURSE_LEAST, Row
 
 HELD_STATES = 1e6
+# Words of names whose figures should be small.
+OF_ERRORS = {
+    "acceleration",
+    "cost",
+    "distance",
+    "drift",
+    "error",
+    "errors",
+    "fall",
+    "fallen",
+    "falls",
+    "fell",
+    "force",
+    "loss",
+    "mpjpe",
+    "mpkpe",
+    "penetration",
+    "power",
+    "seconds",
+    "slip",
+    "termination",
+    "torque",
+    "violation",
+}
 Point = Mapping[str, float]
 # What `measure` found for a seed of a row, as plain data.
 Result = Tree
+
+
+def less_is_better(name: str) -> bool:
+    """Return whether a figure of this name is an error, told by the words of the name; of all others more is better.
+
+    So `metric/pose_distance` is one, and `termination/fell`, and `metric/success` is none.
+    """
+    words = re.split(r"[/_ ]", name.lower())
+    # A reward is one even of an error, and who reaches the end of the time has not failed.
+    if name.startswith("reward/") or name.endswith("time_out"):
+        return False
+    return not OF_ERRORS.isdisjoint(words)
+
+
+def worst(name: str, values: Iterable[float]) -> float:
+    """Return the worst of several seeds' values of a figure."""
+    if less_is_better(name):
+        return max(values)
+    return min(values)
+
+
+def holds(name: str, value: float | None, level: float) -> bool:
+    """Return whether a value is as good as a level, or better; a seed without one has it not."""
+    if value is None:
+        return False
+    if less_is_better(name):
+        return value <= level
+    return value >= level
 
 
 def means_of(points: Sequence[Point], names: Iterable[str]) -> dict[str, float]:
@@ -36,7 +89,7 @@ def reached(points: Sequence[Point], levels: Mapping[str, float]) -> Point | Non
             if other["env_states"] <= point["env_states"] + HELD_STATES
         ]
         means = means_of(held, levels)
-        if all(means.get(name, -math.inf) >= level for name, level in levels.items()):
+        if all(holds(name, means.get(name), level) for name, level in levels.items()):
             return held[-1]
     return None
 
@@ -60,7 +113,7 @@ def value_of(row: Row, results: Sequence[Result]) -> float | None:
 
 
 def further_figures(row: Row, results: Sequence[Result]) -> dict[str, float]:
-    """Return `Row.figures` of all seeds: seconds are a median, and of all else the lowest counts.
+    """Return `Row.figures` of all seeds: seconds are a median, and of all else the worst seed counts.
 
     A mean that a seed lacks, as no episode ended there, gives no figure.
     """
@@ -71,7 +124,7 @@ def further_figures(row: Row, results: Sequence[Result]) -> dict[str, float]:
         elif source == "success":
             figures[name] = min(result["trials"]["success"] for result in results)
         elif all(source in result["means"] for result in results):
-            figures[name] = min(result["means"][source] for result in results)
+            figures[name] = worst(source, [result["means"][source] for result in results])
     return figures
 
 
@@ -99,7 +152,7 @@ def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
         found.append(is_good)
     # With seconds the levels are the measure itself; else each seed has to have them.
     for name, level in row.levels.items() if row.measure != "seconds" else ():
-        found += [result["means"].get(name, -math.inf) >= level for result in results]
+        found += [holds(name, result["means"].get(name), level) for result in results]
     if row.most_falls is not None:
         found.append(falls_of(row, results) < row.most_falls)
     if row.course_least is not None:

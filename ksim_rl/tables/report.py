@@ -1,6 +1,7 @@
 """Writes a table: figures as JSON, rows as Markdown, and a picture."""
 
 import json
+import math
 import statistics
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,9 @@ from ksim_rl.tables.levels import (
     falls_of,
     further_figures,
     is_reached,
+    less_is_better,
     value_of,
+    worst,
 )
 from ksim_rl.tables.lineage import lineage_figures
 from ksim_rl.tables.table import Row, Table
@@ -237,6 +240,7 @@ def _measured(row: Row, results: Results) -> str:
     if row.measure == "return":
         # Levels are a second condition, whose worst seed is shown.
         for level in row.levels:
-            worst = min(result["means"].get(level, float("-inf")) for result in results)
-            cell += f", {level.rpartition('/')[2]} {worst:.2f}"
+            absent = math.inf if less_is_better(level) else -math.inf
+            of_seeds = [result["means"].get(level, absent) for result in results]
+            cell += f", {level.rpartition('/')[2]} {worst(level, of_seeds):.2f}"
     return cell

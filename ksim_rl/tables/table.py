@@ -34,8 +34,10 @@ class Row(Checked):
             training metrics hold, the median over the seeds, one that does not get there counting as infinite; or
             "success" of the final policy in `episodes` trials of a tracking task, the lowest over the seeds.
         episodes: of the final evaluation: deterministic actions, fresh envs.
-        levels: of training metrics, which seconds wait for; with another measure each seed should have them in the mean
-            of its last million env states. There `evaluation/metric/<name>` is of the final evaluation's episodes.
+        levels: of training metrics, which seconds wait for: at least, and at most of errors, which
+            `ksim_rl.tables.levels.less_is_better` tells by their names; with another measure each seed should have them
+            in the mean of its last million env states. There `evaluation/metric/<name>` is of the final evaluation's
+            episodes.
         within_s: seconds in which the levels should be reached.
         at_least: share of trials that should succeed.
         most_falls: share of these episodes, or with a course of the robots on it, that may end in a termination before

@@ -1,10 +1,12 @@
 """When a curve has reached its levels, and what several seeds come to."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
 
-from ksim_rl.tables.levels import is_reached, reached, value_of
+from ksim_rl import envs
+from ksim_rl.tables.levels import is_reached, less_is_better, reached, value_of
 from ksim_rl.tables.report import figures_of
 from ksim_rl.tables.table import Row, Table
 
@@ -86,6 +88,87 @@ def test_further_figures_have_names_of_their_own():
         "motions/track/mean_held_out": 0.8,
         "motions/track/seconds": 260.0,
     }
+
+
+ERRORS = {
+    "action_acceleration",
+    "angular_velocity_error",
+    "body_drift",
+    "body_pos_error",
+    "ee_pos_error",
+    "joint_pos_error",
+    "linear_velocity_error",
+    "mpkpe",
+    "pose_distance",
+    "r_mpkpe",
+}
+GOOD = {
+    "at_target",
+    "forward_speed",
+    "goals_reached",
+    "stands",
+    "stood_soon",
+    "success",
+    "target_reached",
+}
+
+
+def test_each_metric_of_the_package_is_known_to_be_an_error_or_none():
+    named = set()
+    for name in envs.names():
+        # Tasks of the suites have metrics of their own packages, and some need models that are not here.
+        with suppress(ValueError, ImportError):
+            named |= set(envs.task(name).cfg().metrics)
+    assert named <= ERRORS | GOOD, "a new metric: is less of it better?"
+    for name in ERRORS:
+        assert less_is_better(f"evaluation/metric/{name}"), name
+    for name in GOOD:
+        assert not less_is_better(f"evaluation/metric/{name}"), name
+
+
+@pytest.mark.parametrize(
+    ("name", "is_error"),
+    [
+        ("termination/fell_over", True),
+        ("termination/time_out", False),
+        ("reward/action_acceleration", False),
+        ("reward/track_linear_velocity", False),
+        ("evaluation/course_least", False),
+        ("evaluation/held_out_success", False),
+        ("episode/return", False),
+        ("loss/policy", True),
+    ],
+)
+def test_figures_beside_metrics_are_errors_by_their_names(name, is_error):
+    assert less_is_better(name) is is_error
+
+
+def test_of_an_error_the_worst_seed_is_the_one_with_the_largest():
+    error = "evaluation/metric/pose_distance"
+    good = "evaluation/metric/success"
+    figures = {"distance": error, "success": good}
+    row = Row(**COMMON, figures=figures, levels={error: 0.3, good: 0.9})
+
+    def seed(distance, success):
+        return {"evaluation": {"return_mean": 1.0}, "means": {error: distance, good: success}}
+
+    table = Table(name="motions", title="", rows={"style": row})
+    found = figures_of(table, {"style": [seed(0.1, 0.95), seed(0.25, 0.9)]})
+    assert found["motions/style/distance"] == 0.25
+    assert found["motions/style/success"] == 0.9
+    assert is_reached(row, [seed(0.1, 0.95), seed(0.3, 0.9)]) is True
+    assert is_reached(row, [seed(0.1, 0.95), seed(0.31, 0.9)]) is False
+    without = {"evaluation": {"return_mean": 1.0}, "means": {good: 1.0}}
+    assert is_reached(row, [without]) is False, "no episode ended"
+
+
+def test_the_level_of_an_error_holds_in_the_mean_where_it_is_small_enough():
+    points = curve(1.0, 0.3, 0.5, 0.3, 0.3, 0.3)
+    for point in points:
+        point["metric/mpkpe"] = point.pop("linear")
+    found = reached(points, {"metric/mpkpe": 0.4})
+    assert found is not None and found["env_states"] == 1.5e6, "0.3, 0.5 and 0.3"
+    assert reached(points, {"metric/mpkpe": 0.2}) is None
 
 
 def test_of_a_course_the_worst_seed_counts_and_its_falls_take_the_place_of_others():
