@@ -15,7 +15,6 @@ from ksim_rl.mdp.fields import (
     OfContacts,
     OfEntity,
     OfJoints,
-    contact_force,
     distance_from_origin,
     root_height,
 )
@@ -135,13 +134,17 @@ class JointLimitViolated(OfJoints, TerminationTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class IllegalContact(OfContacts, TerminationTerm):
-    """Something touches that should not: its sensor sees more than `threshold`; acceleration stage."""
+    """Something touches that should not: its sensor sees more than `threshold`; acceleration stage.
+
+    A sensor with `every_substep` has seen each substep of the env step, others the last one.
+    """
 
     threshold: NonNegative = 0.0
 
     def __call__(self, view: EnvView) -> Bool[Tensor, " E"]:
-        # One element is enough.
-        return (contact_force(view, self.sensor) > self.threshold).any(-1)
+        force_ESN = torch.linalg.vector_norm(view.contact(self.sensor).force_history_ESN3, dim=-1)
+        # One element in one substep is enough.
+        return (force_ESN > self.threshold).flatten(1).any(-1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -232,7 +232,8 @@ class RolloutEstimator(ValueEstimatorBase):
         if inputs.batch_dims < 2:
             return _in_pieces(network, inputs)
         # Rows are taken in the order of the memory, which saves a copy of all observations.
-        leaf = next(iter(inputs.values(include_nested=True, leaves_only=True)))
+        # As a list: compiled by torch 2.14, a generator that is left half read ends in an error.
+        leaf = list(inputs.values(include_nested=True, leaves_only=True))[0]
         if leaf.movedim(time_dim, 0).is_contiguous():
             first = time_dim
         else:

@@ -73,7 +73,7 @@ COURSE_ROBOTS = 4096
 # Fields that came after the first tables, with values that change nothing, as a fingerprint's text has them.
 LATER = re.compile(
     '"min_advantage_std": 0.0001, |"min_std": 0.001, |"engine": "auto", |"eager": false, '
-    r'|"about": "both", |"value_lmbda": null, '
+    r'|"about": "both", |"along": "vertical", |"value_lmbda": null, '
     r'|"dropped": \[\], |"rel_world_envs": 0.0, |"lag_group": "", |"per_substep": false, '
     # Of an ActuatorAction, whose last field is its scale.
     r'|"offset": 0.0, (?="scale": [^,{}]*\})'

@@ -17,7 +17,7 @@ from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
 from ksim_rl.scene.robots.unitree_go import UnitreeGo1, UnitreeGo2
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity, velocity_training
-from ksim_rl.tasks.rough_ground import on_rough_ground
+from ksim_rl.tasks.rough_ground import on_rough_ground, rated_by_contacts
 from ksim_rl.trainers import TrainingCfg
 from ksim_rl.transforms import ActionDelay, DelayCfg
 from ksim_rl.transforms.transform_cfg import TransformCfg
@@ -237,6 +237,22 @@ def go1_velocity_rough() -> ManagerBasedRlEnvCfg:
     return on_rough_ground(flat, root_height=height, njmax=208, nconmax=40)
 
 
+def go1_velocity_rough_mjlab() -> ManagerBasedRlEnvCfg:
+    """Return the config of Unitree Go1 with the terms of mjlab's task on rough ground, whose terrains are others."""
+    legs = GO1_ROBOT.foot_sites
+    return rated_by_contacts(
+        go1_velocity_rough(),
+        GO1_ROBOT,
+        collides={
+            "shank_collision": [f"{leg}_calf_collision{i}" for leg in legs for i in (1, 2)],
+            "trunk_head_collision": ["trunk_collision", "head_collision"],
+        },
+        ends=[f"{leg}_thigh_collision{i}" for leg in legs for i in (1, 2, 3)],
+        njmax=256,
+        nconmax=64,
+    )
+
+
 def g1_velocity_rough() -> ManagerBasedRlEnvCfg:
     """Return the config of Unitree G1."""
     flat = g1_velocity_flat()
@@ -246,4 +262,7 @@ def g1_velocity_rough() -> ManagerBasedRlEnvCfg:
 
 ROUGH = "over stairs, slopes and rough ground"
 GO1_ROUGH = _task(go1_velocity_rough, "Unitree Go1", ROUGH, num_iterations=10_000)
+GO1_ROUGH_MJLAB = _task(
+    go1_velocity_rough_mjlab, "Unitree Go1", f"{ROUGH}, rated as in mjlab", num_iterations=10_000
+)
 G1_ROUGH = _task(g1_velocity_rough, "Unitree G1", ROUGH, num_iterations=30_000, **CALM)

@@ -2,10 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from ksim_rl.mdp import HeightScan, OutsideTerrain, TerrainLevels
+from ksim_rl.mdp import HeightScan, OutsideTerrain, TerrainLevels, Upright
 from tests.scene.terrains.ground_bench import GRID, NUM_ENVS, GroundBench, ground_heights
 
 EVERYBODY = torch.ones(NUM_ENVS, dtype=torch.bool)
@@ -145,6 +146,31 @@ def test_a_scan_does_not_turn_with_tilt(bench):
     bench.world.refresh()
     bench.driver.refreshed()
     assert torch.allclose(read(bench, HeightScan()), upright, atol=1e-6)
+
+
+def test_upright_along_the_ground_is_about_the_plane_that_rays_of_the_c_engine_hit(bench):
+    yaw, place, std = 0.7, (0.9, -0.2), 0.45
+    stand(bench, place, yaw)
+    grid = [(x, y) for y in np.linspace(-0.5, 0.5, 11) for x in np.linspace(-0.8, 0.8, 17)]
+    taken = [grid[int(i)] for i in np.linspace(0, 186, 32)]
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    points = np.array([(cos * x - sin * y, sin * x + cos * y) for x, y in taken]) + place
+    found = read(bench, Upright(std=std, along="ground"))
+    pitched = read(bench, Upright(std=std, along="ground", about="pitch"))
+    expected = []
+    ahead = []
+    for row in range(NUM_ENVS):
+        hits = np.column_stack((points, ground_heights(bench.mj_model(row), points)))
+        _, variances, axes = np.linalg.svd(hits - hits.mean(0))
+        normal = axes[2] if variances[2] ** 2 < 0.1 * variances[1] ** 2 else np.array([0, 0, 1.0])
+        # The ball is turned about z alone: the sine of its tilt is of the normal's horizontal part.
+        expected.append(math.exp(-float(normal[:2] @ normal[:2]) / std**2))
+        ahead.append(math.exp(-((normal[0] * cos + normal[1] * sin) ** 2) / std**2))
+    assert found.tolist() == pytest.approx(expected, abs=2e-4)
+    assert pitched.tolist() == pytest.approx(ahead, abs=2e-4)
+    # Flat ground, then the steepest slope.
+    assert found[0] == 1.0 and min(expected) < 0.9
+    assert bool((read(bench, Upright(std=std)) == 1.0).all())
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Rough velocity tasks are the flat ones on a terrain in levels, seen by actor and critic."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -33,6 +35,24 @@ def test_it_is_the_flat_task_but_for_the_ground(robot):
         assert isinstance(seen.pop("height_scan").term, HeightScan) and seen == group.terms
     assert dict(rough.terminations).keys() - flat.terminations.keys() == {"outside_terrain"}
     assert dict(rough.curriculum).keys() - flat.curriculum.keys() == {"terrain_level"}
+
+
+def test_go1_as_in_mjlab_is_rated_along_the_ground_and_by_what_it_knocks_against():
+    rough, mjlab = (envs.task(f"go1_velocity_rough{how}").cfg() for how in ("", "_mjlab"))
+    assert mjlab.rewards["upright"] == dataclasses.replace(rough.rewards["upright"], along="ground")
+    costs = {"self_collisions", "shank_collision", "trunk_head_collision"}
+    assert dict(mjlab.rewards).keys() - rough.rewards.keys() == costs
+    assert {mjlab.rewards[name].weight for name in costs} == {-0.1}
+    assert set(mjlab.terminations) == {"time_out", "outside_terrain", "illegal_contact"}
+    assert mjlab.terminations["illegal_contact"].threshold == 10.0
+    for field in ("actions", "commands", "observations", "events", "metrics", "curriculum"):
+        assert getattr(mjlab, field) == getattr(rough, field), field
+    # Every geom of a shank, of the trunk and the head, and of the thighs.
+    counts = {
+        name: len(mjlab.scene.sensors[name].geoms)
+        for name in (*costs - {"self_collisions"}, "illegal_contact")
+    }
+    assert counts == {"shank_collision": 8, "trunk_head_collision": 2, "illegal_contact": 12}
 
 
 def test_go1_stands_on_every_kind_of_ground():

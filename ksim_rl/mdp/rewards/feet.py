@@ -50,6 +50,7 @@ class SelfCollision(OfContacts, RewardTerm):
 
     The sensor is one of the robot against itself: `ContactSensor(subtrees=(root,), against=root,
     against_kind="subtree", reduce="strongest", every_substep=True)`. Without `every_substep` only the last is seen.
+    With a sensor of parts against the ground it counts their collisions alike.
     """
 
     threshold: NonNegative = 10.0

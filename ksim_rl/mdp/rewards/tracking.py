@@ -30,9 +30,13 @@ from ksim_rl.mdp.fields import (
 from ksim_rl.mdp.rewards.joints import second_difference
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import Patterns
+from ksim_rl.scene.sensors.rays import grid_points
 
 Turn = Literal["both", "roll", "pitch"]
 _RATE_COLUMNS = {"both": slice(0, 2), "roll": slice(0, 1), "pitch": slice(1, 2)}
+# 32 of the 17 x 11 points of the height scan, evenly taken in their order.
+_TAKEN = torch.linspace(0, 186, 32).long()
+_AROUND = tuple((x, y) for x, y, _ in grid_points((1.6, 1.0), 0.1)[_TAKEN].tolist())
 # A turn about x moves the vertical out of y, and the other way round.
 _TILT_COLUMNS = {"both": slice(0, 2), "roll": slice(1, 2), "pitch": slice(0, 1)}
 
@@ -168,10 +172,27 @@ class OfTilt(OfEntity):
 
 @dataclass(frozen=True, kw_only=True)
 class Upright(OfTilt, GaussianReward):
-    """exp(-|g_xy|^2 / std^2), `g` the direction of gravity in the body's frame; position stage."""
+    """exp(-|g_xy|^2 / std^2), `g` the direction of gravity in the body's frame; position stage.
+
+    With `along="ground"`, `g` is against the normal of the ground instead: of the plane through 32 points of a grid of
+    1.6 x 1.0 m about the root, which turns with its yaw, as mjlab's velocity tasks on rough ground have it. Where these
+    points lie on no plane, it is gravity.
+    """
+
+    along: Literal["vertical", "ground"] = "vertical"
 
     def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        return self.rate(self.tilt(view))
+        if self.along == "vertical":
+            return self.rate(self.tilt(view))
+        entity = view.entity(self.entity)
+        normal_E3 = entity.ground_scan(_AROUND).normal_E3
+        if self.body is None:
+            axes_E33 = entity.root.axes_E33
+        else:
+            axes_E33 = view.body(self.body).axes_E33
+        # The normal's components along the body's x and y axes.
+        tilt_E2 = (axes_E33[:, _TILT_COLUMNS[self.about]] * normal_E3[:, None]).sum(-1)
+        return self.rate(tilt_E2.square().sum(-1))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ from torch import Tensor
 from ksim_rl.scene import quaternion
 from ksim_rl.scene.names import scalar_joint_ids
 from ksim_rl.scene.near_names import NearNames
+from ksim_rl.scene.small_matrices import plane_normal
 from ksim_rl.scene.state.elements import Bodies, Body, Joints
 from ksim_rl.scene.state.quantity import quantity
 from ksim_rl.scene.state.simulation import Simulation
@@ -44,6 +45,17 @@ class GroundScan(NearNames):
         y_EN = sin_E1 * self._x_N + cos_E1 * self._y_N
         points_EN2 = root_E3[:, None, :2] + torch.stack((x_EN, y_EN), dim=-1)
         return root_E3[:, 2:] - self._state.ground.heights(points_EN2)
+
+    @quantity
+    def normal_E3(self) -> Float[Tensor, "E 3"]:
+        """The upward normal of the plane through the ground at the points, world frame; z where there is none."""
+        # In axes that turn with the root's yaw, where x and y of the points are constant.
+        places_EN2 = torch.stack((self._x_N, self._y_N), dim=-1).expand(*self.below_EN.shape, 2)
+        points_EN3 = torch.cat((places_EN2, -self.below_EN[..., None]), dim=-1)
+        x_E, y_E, z_E = plane_normal(points_EN3).unbind(-1)
+        sin_E = torch.sin(self._entity.heading_E)
+        cos_E = torch.cos(self._entity.heading_E)
+        return torch.stack((cos_E * x_E - sin_E * y_E, sin_E * x_E + cos_E * y_E, z_E), dim=-1)
 
 
 class Entity(NearNames):

@@ -68,12 +68,16 @@ def test_self_collision_counts_the_substeps_of_a_hard_contact(make_bench):
     bench = make_bench(HAMMER, 2, {"own": sensor})
     bench.place(qpos=[[0.06], [1.0]])
     term, counts = mdp.SelfCollision(sensor="own"), []
+    illegal, ended = mdp.IllegalContact(sensor="own", threshold=10.0), []
     for _ in range(30):
         bench.step()
+        # One substep is enough to end an episode.
+        ended.append(bench.read(illegal, "terminations/x").tolist()[0])
         counts.append(bench.read(term, "rewards/x").tolist())
     falling, hovering = zip(*counts, strict=True)
     expected = substeps_above(bench.world.mj_model, 0.06, steps=30, threshold=10.0)
     assert list(falling) == expected
+    assert ended == [count > 0 for count in expected]
     assert set(hovering[:20]) == {0.0}
     # It lands within an env step, and in the end the 20 N of its weight exceed 10 N in each substep, never 30 N.
     assert {count for count in expected if 0 < count < 10} and expected[-1] == 10
