@@ -70,14 +70,33 @@ def _own_plugins():
         yield
 
 
+def _compiles_in_haste(config: pytest.Config) -> bool:
+    """Whether kernels are for the CPU, and the long tests do not run."""
+    long_tests_run = "full" in config.option.markexpr.replace("not full", "")
+    return not long_tests_run and not torch.cuda.is_available()
+
+
 def pytest_configure(config):
     """Compile the CPU's kernels without optimization, in half of the time, where the long tests do not run.
 
     `make test-full` runs with the optimized kernels that users get.
     """
-    long_tests_run = "full" in config.option.markexpr.replace("not full", "")
-    if not long_tests_run and not torch.cuda.is_available():
+    if _compiles_in_haste(config):
         wp.config.optimization_level = 0
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_compiler(pytestconfig):
+    """Compile in the thread of the test: workers share the cores, and each thread precompiles Warp's header."""
+    if not _compiles_in_haste(pytestconfig):
+        yield
+        return
+    # Imported here, after the shapes are enforced.
+    from ksim_rl.device import kernel_loading
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernel_loading, "MOST_WORKERS", 1)
+        yield
 
 
 def pytest_collection_modifyitems(items):

@@ -11,9 +11,9 @@ first line of a burst to stderr; a program with its own display sets another:
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 
 import torch
 import warp as wp
@@ -129,10 +129,26 @@ def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) 
     """Compile and load modules, side by side, for launches of the block sizes beside them; of any on the CPU."""
     of_cpu = device.type == "cpu"
     load_one = partial(wp.force_load, warp_device(device), max_workers=0)
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
-        waiting = []
-        for module, block_dim in modules:
-            # On the CPU a kernel is compiled for one thread whatever it is launched with.
-            waiting.append(pool.submit(load_one, [module], None if of_cpu else block_dim))
-        for one in waiting:
-            one.result()
+    # On the CPU a kernel is compiled for one thread whatever it is launched with.
+    loads = [
+        partial(load_one, [module], None if of_cpu else block_dim) for module, block_dim in modules
+    ]
+    workers = min(os.cpu_count() or 1, MOST_WORKERS)
+    if workers == 1:
+        for load_it in loads:
+            load_it()
+        return
+    waiting = [_compilers(workers).submit(load_it) for load_it in loads]
+    wait(waiting)
+    for one in waiting:
+        one.result()
+
+
+@cache
+def _compilers(count: int) -> ThreadPoolExecutor:
+    """Threads that stay for later models: Warp precompiles its header for each thread, for the CPU in a second."""
+    return ThreadPoolExecutor(count, thread_name_prefix="kernel_compiler")
+
+
+# A forked child has none of its parent's threads, and would wait for them.
+os.register_at_fork(after_in_child=_compilers.cache_clear)

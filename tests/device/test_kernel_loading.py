@@ -1,5 +1,7 @@
 """Kernels that are loaded together; a kernel that has not run must not have run."""
 
+import os
+import signal
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -171,6 +173,56 @@ def test_another_thread_waits_until_what_was_put_apart_is_loaded(monkeypatch):
         load_some(increase)
         first.result()
     assert loaded == [["threads.double"]] * 2
+
+
+@pytest.fixture
+def compilers(monkeypatch):
+    """The threads that were to load something, of which there are two at most."""
+    threads: list[threading.Thread] = []
+
+    def note(*args, **options) -> None:
+        threads.append(threading.current_thread())
+
+    monkeypatch.setattr(kernel_loading, "MOST_WORKERS", 2)
+    monkeypatch.setattr(wp, "force_load", note)
+    return threads
+
+
+MODULES = [(wp.get_module(name), None) for name in ("one", "two", "three")]
+
+
+def test_threads_that_compile_stay_for_later_kernels(compilers):
+    """A new one would precompile Warp's header again, which takes a second."""
+    for _ in range(3):
+        kernel_loading.load(MODULES, CPU)
+    assert len(compilers) == 9 and len(set(compilers)) <= min(2, os.cpu_count() or 1)
+
+
+def test_a_single_compiler_is_the_thread_that_asks(compilers, monkeypatch):
+    monkeypatch.setattr(kernel_loading, "MOST_WORKERS", 1)
+    kernel_loading.load(MODULES, CPU)
+    assert compilers == [threading.current_thread()] * 3
+
+
+def test_a_forked_child_has_threads_of_its_own_that_compile(compilers):
+    kernel_loading.load(MODULES, CPU)
+    child = os.fork()
+    if not child:
+        # Nothing of pytest's runs in the child, whatever happens.
+        try:
+            kernel_loading.load(MODULES, CPU)
+        finally:
+            os._exit(len(compilers))
+    ended, status = 0, 0
+    deadline = time.monotonic() + 30.0
+    while not ended and time.monotonic() < deadline:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        time.sleep(0.01)
+    if not ended:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    assert ended, "it waits for threads of its parent"
+    assert os.waitstatus_to_exitcode(status) == 6
 
 
 def test_compiled_modules_call_the_hook_and_cached_ones_do_not():
