@@ -11,7 +11,7 @@ import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
-# Modules in which torch 2.10 to 2.13 and Triton 3.6 and 3.7 compile, or read what was compiled. What is raised while
+# Modules in which torch 2.10 to 2.14 and Triton 3.6 and 3.7 compile, or read what was compiled. What is raised while
 # compiled code runs, such as for want of memory, does not pass through them.
 _COMPILERS = (
     "torch._inductor.compile_fx",

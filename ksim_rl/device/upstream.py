@@ -17,7 +17,7 @@ from typing import Any
 import torch
 import warp as wp
 
-# torch 2.10 to 2.13 and Warp 1.19: exceptions of a failed allocation carry no size, only these texts do (Warp's, then
+# torch 2.10 to 2.14 and Warp 1.19: exceptions of a failed allocation carry no size, only these texts do (Warp's, then
 # torch's on CUDA and on the CPU).
 ALLOCATION_REFUSALS = (
     r"Failed to allocate (?P<size>\d+) bytes",
@@ -38,7 +38,8 @@ TEMPLATES_IN_HEADER = "-fpch-instantiate-templates"
 def current_stream_handle(device: torch.device) -> int:
     """Return the handle of torch's current CUDA stream.
 
-    The documented way makes a stream object, which takes longer than a launch. Checked with torch 2.10 to 2.13.
+    The documented way makes a stream object, which takes longer than a launch. Checked with torch 2.10 to 2.13; 2.14.1
+    has it, and was not tried on a GPU.
     """
     return torch._C._cuda_getCurrentRawStream(device.index)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -47,7 +48,7 @@ def free_cublas_workspaces() -> None:
     """Forget the memory that matrix products took, on Hopper 32 MiB for each stream; the next one takes it again.
 
     Torch keeps it for ever. Its own graph trees do this before a capture, so that it lies in a graph's pool. The name
-    is torch 2.13's.
+    is torch 2.13's, and 2.14.1 has it.
     """
     torch._C._cuda_clearCublasWorkspaces()
 

@@ -1,6 +1,6 @@
 """Undocumented interfaces of torch and TorchRL that the transforms use.
 
-All was checked with torch 2.13.0 and TorchRL 0.14.1; `tests/transforms/test_upstream.py` names what moved.
+All was checked with torch 2.13.0 and 2.14.1, and TorchRL 0.14.1; `tests/transforms/test_upstream.py` names what moved.
 """
 
 import multiprocessing

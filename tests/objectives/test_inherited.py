@@ -1,7 +1,7 @@
 """What objectives uses of TorchRL and torch beyond their documents is still there; each failure names what moved.
 
 These are methods that losses inherit and override, so that they cannot be hidden behind functions of the room. Checked
-with TorchRL 0.14.1 and torch 2.10 to 2.13.
+with TorchRL 0.14.1 and torch 2.10 to 2.14.
 """
 
 import inspect
