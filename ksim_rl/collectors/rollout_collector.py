@@ -284,6 +284,8 @@ class RolloutCollector:
         assert self._root is not None
         what = "state of another collector (build the env with the same num_envs)"
         copy_into(self._root.flatten_keys(".").to_dict(), state, what=what)
+        # Episodes go on that ran when the state was taken: a reset of before is undone.
+        self._restarted = False
 
     def _rollout(self) -> None:
         assert self._root is not None
