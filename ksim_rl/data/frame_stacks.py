@@ -13,7 +13,7 @@ class FrameStacks:
 
     The frame of k steps ago lies k places further back. `depth`, int64 by place, says how many places back the frames
     of its episode go, at most `reach`; frames from before stand for the first one, as `ObservationHistory` repeats it.
-    After a gap in what was written a stack may differ from the one that was seen: see `is_exact`.
+    After a gap in what was written a stack may differ from the one that was seen: see `are_exact`.
 
     Attributes:
         ages: by how many env steps each frame of a stack [E, N, *frame] is older than the newest one, for each
@@ -59,21 +59,42 @@ class FrameStacks:
         # The rows of one env are num_envs apart, and the ring closes at the end.
         return rows[(index_B[:, None] - places_BN * self.num_envs) % rows.shape[0]]
 
-    def is_exact(
+    def are_exact(
         self,
-        key: NestedKey,
         rows: Shaped[Tensor, " R *frame"],
-        index_N: Int64[Tensor, " N"],
-        leaf_ET: Shaped[Tensor, "E T *leaf"],
-    ) -> Bool[Tensor, " N"]:
-        """Return where `read` gives the observations that were seen, of N = E * T env states.
+        index_ET: tuple[Int64[Tensor, "E T"], Int64[Tensor, "E T"]],
+        seen_ET: tuple[Shaped[Tensor, "E T *leaf"], Shaped[Tensor, "E T *leaf"]],
+        *,
+        key: NestedKey,
+        done_ET: Bool[Tensor, "E T"],
+    ) -> Bool[Tensor, "E T"]:
+        """Return where `read` gives both an observation and the one that follows it, as they were seen in a rollout.
 
-        It does not where a stack shows frames that were never written: an env was stepped in between, or written first
-        in the middle of an episode.
+        `index_ET` and `seen_ET` are of the observations and of those that follow them. It does not where a stack shows
+        frames that were never written: an env was stepped in between, or written first in the middle of an episode.
         """
-        seen_N = leaf_ET.flatten(0, 1)
-        same_N = self.read(key, rows, index_N) == seen_N
-        return same_N.reshape(index_N.numel(), -1).all(1)
+        now_ET, following_ET = seen_ET
+        is_next_ET = self._is_read(rows, index_ET[1], following_ET, key=key)
+        # Within an episode an observation lies where the one lies that followed, so that each stack is read once.
+        is_now_ET = torch.empty_like(is_next_ET)
+        is_now_ET[:, :1] = self._is_read(rows, index_ET[0][:, :1], now_ET[:, :1], key=key)
+        goes_on_ET = is_next_ET[:, :-1] & _are_equal(now_ET[:, 1:], following_ET[:, :-1])
+        # The first stack of an episode repeats its newest frame.
+        begins_ET = _are_equal(now_ET[:, 1:], now_ET[:, 1:, -1:].expand_as(now_ET[:, 1:]))
+        is_now_ET[:, 1:] = torch.where(done_ET[:, :-1], begins_ET, goes_on_ET)
+        return is_now_ET & is_next_ET
+
+    def _is_read(
+        self,
+        rows: Shaped[Tensor, " R *frame"],
+        index_ET: Int64[Tensor, "E T"],
+        seen_ET: Shaped[Tensor, "E T *leaf"],
+        *,
+        key: NestedKey,
+    ) -> Bool[Tensor, "E T"]:
+        """Return where `read` gives what was seen."""
+        read_N = self.read(key, rows, index_ET.flatten())
+        return _are_equal(read_N.view_as(seen_ET), seen_ET)
 
     def depths(
         self, first_E: Int64[Tensor, " E"], done_ET: Bool[Tensor, "E T"]
@@ -84,3 +105,9 @@ class FrameStacks:
         begins_ET = torch.where(done_ET, step_T + 1, -self.reach).roll(1, 1)
         begins_ET[:, 0] = -first_E
         return (step_T - begins_ET.cummax(1).values).clamp_max(self.reach)
+
+
+def _are_equal(
+    first_ET: Shaped[Tensor, "E T *leaf"], second_ET: Shaped[Tensor, "E T *leaf"]
+) -> Bool[Tensor, "E T"]:
+    return (first_ET == second_ET).flatten(2).all(2)

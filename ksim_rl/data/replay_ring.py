@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Int64, Shaped
+from jaxtyping import Bool, Int64, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
@@ -327,6 +327,15 @@ class ReplayRing(ReplayBuffer):
         if self.offline is None:
             return self._ring.non_finite_count
         return self._ring.non_finite_count + self.offline.storage.non_finite_count
+
+    @property
+    def inexact_count(self) -> Int64[Tensor, ""]:
+        """Env states dropped so far because a stack of frames cannot be put together, on the device."""
+        return self._ring.inexact_count
+
+    def cut(self, is_cut_E: Bool[Tensor, " E"] | None = None) -> None:
+        """Let the next rollout of envs, None for all, follow on nothing: see `ReplayStorage.cut`."""
+        self._ring.cut(is_cut_E)
 
     @property
     def num_stored(self) -> Int64[Tensor, ""]:

@@ -5,7 +5,7 @@ from os import PathLike
 from typing import Any
 
 import torch
-from jaxtyping import Int64, Shaped
+from jaxtyping import Bool, Int64, Shaped
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
@@ -51,8 +51,13 @@ class ReplayStorage(SavedByStateDict, Storage):
     end of an episode, whose terminal observation follows, at an env state that is not finite, and at the newest one.
 
     An env state with an element that is not finite is stored as invalid, with zeros for such elements, and counted.
-    Invalid places have ("collector", "mask") False, which TorchRL's losses leave out of their means. All that is stored
-    is finite. Of the `observations`, which are stored once, each has a leaf at ("next", key) too.
+    So is one with a stack of frames that the ring cannot put together, as in the first steps after a gap in what was
+    written: `inexact_count` counts it. Invalid places have ("collector", "mask") False, which TorchRL's losses leave
+    out of their means. All that is stored is finite. Of the `observations`, which are stored once, each has a leaf at
+    ("next", key) too.
+
+    Rollouts of an env follow one another where the first observation is the newest one here. After a gap in which
+    envs were reset or stepped that may be so by chance, as with pictures that are all black: tell it by `cut`.
     """
 
     def __init__(
@@ -82,6 +87,9 @@ class ReplayStorage(SavedByStateDict, Storage):
         self.head_E = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.filled_E = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.non_finite_count = torch.zeros((), dtype=torch.int64, device=self.device)
+        self.inexact_count = torch.zeros((), dtype=torch.int64, device=self.device)
+        # Of the next rollout: whether it follows on none of before.
+        self._is_cut_E = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
         self._env_E = torch.arange(num_envs, device=self.device)
         self.stacks.size_(self.max_size, self.device)
 
@@ -90,6 +98,14 @@ class ReplayStorage(SavedByStateDict, Storage):
     ) -> Int64[Tensor, "*batch"]:
         """Return the index of the env state that lies `age` >= 1 places behind the newest observation of `env`."""
         return (self.head_E[env] - age) % self.places * self.num_envs + env
+
+    @torch.no_grad()
+    def cut(self, is_cut_E: Bool[Tensor, " E"] | None = None) -> None:
+        """Let the next rollout of envs, None for all, follow on nothing: they were reset, or stepped, in between."""
+        if is_cut_E is None:
+            self._is_cut_E.fill_(True)
+        else:
+            self._is_cut_E.logical_or_(is_cut_E)
 
     @torch.no_grad()
     def write(self, rollout_ET: TensorDictBase) -> Int64[Tensor, " N"]:
@@ -138,16 +154,21 @@ class ReplayStorage(SavedByStateDict, Storage):
                 finite_N &= self._put(key, leaf, following_N, rollout_ET.get(_next(key)))
             finite_N &= self._put(key, leaf, index_N, rollout_ET.get(key))
         # Stacks that show frames that were never written cannot be put together; after `reach` steps all can.
-        known_N = finite_N
+        known_ET = torch.ones_like(done_ET)
         for key in self.stacks.ages:
-            leaf = self.content.get(key)
-            known_N = known_N & self.stacks.is_exact(key, leaf, index_N, rollout_ET.get(key))
-            following_ET = rollout_ET.get(_next(key))
-            known_N = known_N & self.stacks.is_exact(key, leaf, following_N, following_ET)
+            known_ET &= self.stacks.are_exact(
+                self.content.get(key),
+                (index_N.view(done_ET.shape), following_N.view(done_ET.shape)),
+                (rollout_ET.get(key), rollout_ET.get(_next(key))),
+                key=key,
+                done_ET=done_ET,
+            )
+        known_N = finite_N & known_ET.flatten()
         # First all successors: many are env states of this rollout and become available next.
         self._make_unavailable(following_N)
         self.available.index_copy_(0, index_N, known_N)
         self.non_finite_count.add_((~finite_N).sum())
+        self.inexact_count.add_((finite_N & ~known_N).sum())
         # In place: a captured write finds the next places where this one has left them.
         taken_E = places_ET.sum(1)
         self.head_E.add_(taken_E).remainder_(self.places)
@@ -214,6 +235,7 @@ class ReplayStorage(SavedByStateDict, Storage):
         }
         if self.stacks.reach:
             counters["depth"] = self.stacks.depth
+            counters["inexact_count"] = self.inexact_count
         return counters
 
     @torch.no_grad()
@@ -237,7 +259,10 @@ class ReplayStorage(SavedByStateDict, Storage):
         own = self._counters()
         if content:
             copy_into(self._leaves(), content, what="the replay's content")
-        copy_into(own, {name: state_dict[name] for name in own}, what="the replay")
+        # Replays of before did not count them.
+        counted = {"inexact_count": torch.zeros_like(self.inexact_count), **state_dict}
+        copy_into(own, {name: counted[name] for name in own}, what="the replay")
+        self._is_cut_E.zero_()
 
     @torch.no_grad()
     def _empty(self) -> None:
@@ -272,11 +297,12 @@ class ReplayStorage(SavedByStateDict, Storage):
     def _cut_where_not_continued(self, rollout_ET: TensorDictBase) -> Tensor:
         """Drop the newest env state of envs that were reset in between: its successor is about to be overwritten.
 
-        Returns the others, bool [E], where the first observation of the rollout is the newest one here.
+        Returns the others, bool [E], where nothing was cut and the first observation of the rollout is the newest one.
         """
         assert self.content is not None
         head_E = self._head_index()
-        goes_on_E = torch.ones_like(self._env_E, dtype=torch.bool)
+        goes_on_E = ~self._is_cut_E
+        self._is_cut_E.zero_()
         for key in self.observations:
             first_E = self.stacks.newest(key, rollout_ET.get(key))[:, 0]
             same = self.content.get(key)[head_E] == first_E

@@ -20,7 +20,7 @@ Tensors = dict[str, Shaped[Tensor, "*?leaf"]]
 # Below it, `ReplayRing` keeps rows in the order of places and, in each place, of envs.
 _RING = "/replay/ring/"
 # Counters of each rank, which metrics add up.
-_COUNTERS = ("/non_finite_count", "/non_finite_env_states")
+_COUNTERS = ("/inexact_count", "/non_finite_count", "/non_finite_env_states")
 # The parts of `RunningMoments`: of the observations that a rank has seen itself.
 _COUNT = "count"
 _MEAN = "exact_mean"

@@ -87,6 +87,13 @@ class HasWarmUp(Protocol):
 
 
 @runtime_checkable
+class FollowsEpisodes(Protocol):
+    """An update that keeps env states of earlier rollouts, and is told where all envs were reset between two."""
+
+    def restarted(self) -> None: ...  # noqa: D102
+
+
+@runtime_checkable
 class HasProgress(Protocol):
     """An update that depends on the share of the run, in [0, 1], that is done, such as by its learning rate."""
 

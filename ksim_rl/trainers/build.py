@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
@@ -21,7 +21,7 @@ from ksim_rl.device.eager import eagerly
 from ksim_rl.device.room import check_bytes, check_room
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.modules import RecurrentStatePrimer, recurrent_transforms, state_spec
-from ksim_rl.trainers.algorithm import HasWarmUp, make_update
+from ksim_rl.trainers.algorithm import FollowsEpisodes, HasWarmUp, make_update
 from ksim_rl.trainers.checkpoint import Checkpoint, fitting
 from ksim_rl.trainers.evaluation import Evaluator
 from ksim_rl.trainers.loggers import check_installed, make_loggers
@@ -93,6 +93,8 @@ def build(
         keys=keys,
         cfg=cfg.collector,
     )
+    if isinstance(update, FollowsEpisodes):
+        collector.listeners.append(_Restarts(update))
     trainer = Trainer(
         cfg.trainer,
         collector=collector,
@@ -124,6 +126,21 @@ def build(
         recorders = make_recorders(cfg, env, run_folder, iteration=trainer.iteration)
         collector.listeners.extend(recorders)
     return trainer
+
+
+class _Restarts:
+    """Tells an update where all envs were reset between two rollouts: a listener of the collector."""
+
+    def __init__(self, update: FollowsEpisodes) -> None:
+        self._update = update
+
+    def record(self, rollout_ET: TensorDictBase, *, restarted: bool = False) -> None:
+        """Pass it on, before the update learns from the rollout."""
+        if restarted:
+            self._update.restarted()
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to write."""
 
 
 def _check_rollout(cfg: RunCfg, env: EnvBase, keys: Sequence[NestedKey]) -> None:

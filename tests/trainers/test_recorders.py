@@ -8,6 +8,7 @@ import torch
 from ksim_rl import conf, data
 from ksim_rl.data import RecorderCfg
 from ksim_rl.data.episode_writer import EpisodeWriter
+from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.build import build
 
 SMALL = (
@@ -116,3 +117,55 @@ def test_a_run_that_goes_on_writes_another_folder(tmp_path):
         build(cfg, run_folder=tmp_path).train()
     names = sorted(path.name for path in (tmp_path / "episodes" / "all").iterdir())
     assert names == ["from_iteration_000001", "from_iteration_000001_2"]
+
+
+def test_a_resumed_run_does_not_record_the_episode_that_ran_as_a_whole_one(tmp_path):
+    words = [word for word in SMALL if "num_iterations" not in word and "length_s" not in word]
+    cfg = conf.compose([*words, "trainer.num_iterations=3", "task.episode_length_s=0.15"])
+    build(cfg, run_folder=tmp_path).train()
+    saved = checkpoint.load_latest(tmp_path)
+    going_on = dataclasses.replace(
+        cfg,
+        trainer=dataclasses.replace(cfg.trainer, num_iterations=9),
+        recorders={"all": RecorderCfg(num_envs=4)},
+    )
+    trainer = build(going_on, run_folder=tmp_path, resume_from=saved)
+    listening = Listening()
+    trainer.collector.listeners.append(listening)
+    trainer.train()
+    rollout_ET = torch.cat(listening.rollouts, dim=1)
+    expected = []
+    for env in range(4):
+        # The first to end had begun before.
+        expected += episodes_in(rollout_ET, env)[1:]
+    recorded = data.read_episodes(tmp_path / "episodes" / "all" / "from_iteration_000004")
+    assert len(expected) > 0
+    own = sorted(recorded.env_states_D["action"].flatten().tolist())
+    assert own == sorted(torch.cat(expected)["action"].flatten().tolist())
+
+
+def test_an_update_that_keeps_env_states_is_told_where_all_envs_were_reset(tmp_path):
+    words = [word for word in SMALL if "minibatch" not in word and "modules" not in word]
+    cfg = conf.compose(
+        [
+            *words,
+            "objective=fast_sac",
+            "data.num_env_states_per_minibatch=8",
+            "objective.compile=false",
+        ]
+    )
+    trainer = build(cfg, run_folder=tmp_path)
+    told = []
+    trainer.update.restarted = lambda: told.append(True)
+    collector = trainer.collector
+    collector.collect()
+    collector.collect()
+    assert len(told) == 1, "before the first one"
+    state = trainer.state_dict()
+    collector.reset()
+    collector.collect()
+    assert len(told) == 2
+    # Episodes go on that ran when the state was taken.
+    trainer.load_state_dict(state)
+    collector.collect()
+    assert len(told) == 2

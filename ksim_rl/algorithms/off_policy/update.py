@@ -175,10 +175,15 @@ class OffPolicyUpdate(RolloutUpdate):
         if learns:
             self.behavior.random.fill_(False)
 
+    def restarted(self) -> None:
+        """Let no env state of before the next rollout go on in it."""
+        self.replay.cut()
+
     def metrics(self) -> dict[str, Num[Tensor, ""]]:
         """Return the measurements of the last update; see `RolloutUpdate`."""
         return super().metrics() | {
             "replay/env_states": self.replay.num_stored,
+            "replay/inexact_env_states": self.replay.inexact_count,
             "update/non_finite_env_states": self.replay.non_finite_count,
         }
 
