@@ -158,7 +158,7 @@ def evaluate(arguments: list[str]) -> int:
         evaluate = build_evaluator(policy.cfg, policy.actor, **how)
         evaluation = evaluate()
         # Before the env goes out of scope: contacts that found no room spoil the result.
-        losses = losses_of(evaluate.env)
+        losses = losses_of(evaluate.env).lines
     for text in losses:
         say(f"warning: {text}")
     assert evaluation is not None

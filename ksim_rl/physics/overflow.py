@@ -51,6 +51,12 @@ class OverflowReport:
         return not self.messages
 
     @property
+    def lost_worlds(self) -> int:
+        """How many worlds have lost contacts or constraints, at least: the most that lost one kind of them."""
+        counts = [count for name, count in self.worlds.items() if name not in METRIC_BITS]
+        return max(counts, default=0)
+
+    @property
     def nconmax(self) -> int:
         """Places in the pool of contacts, per world."""
         return self.naconmax // self.num_envs

@@ -140,8 +140,24 @@ def course_least_of(results: Sequence[Result]) -> float:
     return min(result["means"][COURSE_LEAST] for result in results)
 
 
+def lost_worlds_of(results: Sequence[Result]) -> int:
+    """Return in how many worlds of the final evaluations, trials and courses contacts or constraints were lost."""
+    total = 0
+    for result in results:
+        for name in ("evaluation", "trials", "course"):
+            part = result.get(name) or {}
+            # Courses of before have lines alone.
+            total += part.get("lost_worlds", len(part.get("lost", ())))
+    return total
+
+
 def is_reached(row: Row, results: Sequence[Result]) -> bool | None:
-    """Return whether a row reaches all its goals; None where it has none."""
+    """Return whether a row reaches all its goals; None where it has none.
+
+    Where an evaluation has lost contacts or constraints nothing is reached: its figures are of other physics.
+    """
+    if lost_worlds_of(results):
+        return False
     value = value_of(row, results)
     found = []
     if row.goal is not None:

@@ -271,6 +271,7 @@ def _walk_course(cfg: RunCfg, row: Row, actor: TensorDictModuleBase, *, smoke: b
         },
         "fell_by_kind": {kind: round(figures[f"{kind}/fell"], 4) for kind in by_level},
         "lost": list(outcomes.lost),
+        "lost_worlds": outcomes.lost_worlds,
     }
 
 

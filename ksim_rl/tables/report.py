@@ -15,6 +15,7 @@ from ksim_rl.tables.levels import (
     further_figures,
     is_reached,
     less_is_better,
+    lost_worlds_of,
     value_of,
     worst,
 )
@@ -212,6 +213,8 @@ def _cells(row: Row, results: Results) -> list[str]:
 def _our_cell(row: Row, results: Results) -> str:
     """Return the value of a row, and its further figures, but for those that the cell or another one has."""
     cell = _measured(row, results)
+    if lost := lost_worlds_of(results):
+        cell += f", contacts lost in {lost} worlds"
     for name, value in further_figures(row, results).items():
         if row.figures[name] not in ("seconds", "success"):
             cell += f", {name} {value:.3f}"

@@ -30,6 +30,7 @@ from ksim_rl.mdp.fields import distance_from_origin
 from ksim_rl.scene.terrains import PatchedGround, TerrainGrid
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.evaluation import Evaluator
+from ksim_rl.trainers.metrics import losses_of
 from ksim_rl.trainers.run_folder import Policy, without_nan_guard
 
 SPEED = 0.8
@@ -59,7 +60,7 @@ class Course:
 class Outcomes:
     """What came of each robot: the index of its kind, its level, whether it got far enough, whether it fell, [E].
 
-    And a line for each kind of contacts or constraints that the physics lost.
+    And a line for each kind of contacts or constraints that the physics lost, and in how many worlds, at least.
     """
 
     kind_E: Tensor
@@ -67,6 +68,7 @@ class Outcomes:
     arrived_E: Tensor
     fell_E: Tensor
     lost: tuple[str, ...] = ()
+    lost_worlds: int = 0
 
 
 class Walk(Evaluator):
@@ -172,7 +174,7 @@ def walk(policy: Policy, course: Course, *, num_envs: int) -> Outcomes:
         seed=ROBOT_SEED,
     )
     runner()
-    lost = base.world.overflow_report().messages
+    losses = losses_of(env)
     ground = base.view.terrain
     assert isinstance(ground, PatchedGround)  # what a TerrainGrid makes
     # Patches are numbered level by level, with all columns in each.
@@ -180,7 +182,14 @@ def walk(policy: Policy, course: Course, *, num_envs: int) -> Outcomes:
     of_env = (kind_E, ground.levels_E, runner.arrived_E, runner.terminated_E)
     kind_E, level_E, arrived_E, fell_E = (figure_E.cpu() for figure_E in of_env)
     env.close(raise_if_closed=False)
-    return Outcomes(kind_E=kind_E, level_E=level_E, arrived_E=arrived_E, fell_E=fell_E, lost=lost)
+    return Outcomes(
+        kind_E=kind_E,
+        level_E=level_E,
+        arrived_E=arrived_E,
+        fell_E=fell_E,
+        lost=losses.lines,
+        lost_worlds=losses.worlds,
+    )
 
 
 def summary(

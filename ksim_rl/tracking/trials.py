@@ -54,12 +54,14 @@ class Trials:
         success: the share of successes; of many clips the least of those that were trained on.
         errors: by metric, means over all steps of all trials; of many clips over those that were trained on.
         clips: the results by clip, where the motion has several.
+        lost_worlds: in how many envs, at least, the physics had no room for all contacts and constraints.
     """
 
     trials: int
     success: float
     errors: dict[str, float]
     clips: tuple[ClipTrials, ...] = ()
+    lost_worlds: int = 0
 
     @property
     def held_out(self) -> float | None:
@@ -218,7 +220,8 @@ def run_trials(
         steps_C += runner.length_E[rows].view(count, trials).sum(1).tolist()
         errors_CM += runner.errors_EM[rows].view(count, trials, -1).sum(1).tolist()
         success_C += runner.ended_well_E[rows].double().view(count, trials).mean(1).tolist()
-    for text in losses_of(env):
+    losses = losses_of(env)
+    for text in losses.lines:
         note(f"warning: {text}")
     env.close(raise_if_closed=False)
     names = list(base.cfg.metrics)
@@ -227,6 +230,7 @@ def run_trials(
         trials=trials,
         success=min(success_C[place] for place in trained),
         errors=_means(names, [steps_C[c] for c in trained], [errors_CM[c] for c in trained]),
+        lost_worlds=losses.worlds,
         clips=tuple(
             ClipTrials(
                 clip=name,

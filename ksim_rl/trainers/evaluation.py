@@ -17,13 +17,17 @@ from ksim_rl.envs.signal_keys import signal_keys
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Statistics over episodes. `unfinished` ones were cut at the step limit, and count with their returns so far."""
+    """Statistics over episodes. `unfinished` ones were cut at the step limit, and count with their returns so far.
+
+    In `lost_worlds` envs, at least, the physics had no room for all contacts and constraints, as far as it was asked.
+    """
 
     return_mean: float
     return_std: float
     length_mean: float
     episodes: int
     unfinished: int
+    lost_worlds: int = 0
 
 
 class Evaluator:

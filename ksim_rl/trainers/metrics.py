@@ -157,10 +157,18 @@ def explain_physics(env: EnvBase, counts: Mapping[str, float]) -> PhysicsReport:
     )
 
 
-def losses_of(env: EnvBase) -> tuple[str, ...]:
-    """Return a line for each kind of contacts or constraints that were lost since the last look; reads the device."""
+@dataclass(frozen=True, kw_only=True)
+class Losses:
+    """Contacts and constraints that found no room: a line for each kind, and in how many worlds, at least."""
+
+    lines: tuple[str, ...] = ()
+    worlds: int = 0
+
+
+def losses_of(env: EnvBase) -> Losses:
+    """Return the contacts and constraints that were lost since the last look; reads the device."""
     simulated = part(env, SimulatedWorld)
     if simulated is None:
-        return ()
-    world = simulated.world
-    return tuple(world.explain_overflow(world.overflow_counts().tolist()).messages)
+        return Losses()
+    report = simulated.world.overflow_report()
+    return Losses(lines=tuple(report.messages), worlds=report.lost_worlds)

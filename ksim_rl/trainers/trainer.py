@@ -2,7 +2,7 @@
 
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -99,9 +99,10 @@ class EvaluationHook(Hook):
             evaluation = self.evaluator(stop=lambda: ranks.size() == 1 and bool(trainer.interrupt))
         if evaluation is None:  # it was asked to stop
             return
-        for text in losses_of(self.evaluator.env):
+        losses = losses_of(self.evaluator.env)
+        for text in losses.lines:
             trainer.progress.note(f"warning: evaluation at iteration {trainer.iteration}: {text}")
-        trainer.evaluation = evaluation
+        trainer.evaluation = evaluation = replace(evaluation, lost_worlds=losses.worlds)
         self._evaluated_at = trainer.iteration  # so that the end is not evaluated twice
         figures = {f"evaluation/{name}": value for name, value in asdict(evaluation).items()}
         trainer.log(figures | probed(trainer.update, trainer.collector.env, trainer.rollout_ET))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from ksim_rl import envs
-from ksim_rl.tables.levels import is_reached, less_is_better, reached, value_of
+from ksim_rl.tables.levels import is_reached, less_is_better, lost_worlds_of, reached, value_of
 from ksim_rl.tables.report import figures_of
 from ksim_rl.tables.table import Row, Table
 
@@ -191,6 +191,22 @@ def test_of_a_course_the_worst_seed_counts_and_its_falls_take_the_place_of_other
         "rough/go1/course_least": 0.89,
         "rough/go1/seconds": 50.0,
     }
+
+
+def test_nothing_is_reached_on_contacts_that_were_lost():
+    good = {"evaluation": {"return_mean": 600.0, "lost_worlds": 0}, "trials": None}
+    assert is_reached(RETURN, [good, good]) is True
+    for lost in (
+        {"evaluation": {"return_mean": 600.0, "lost_worlds": 3}},
+        {"trials": {"success": 1.0, "lost_worlds": 3}},
+        {"course": {"fell": 0.0, "lost": ["rows"], "lost_worlds": 3}},
+    ):
+        assert is_reached(RETURN, [good, good | lost]) is False
+        assert lost_worlds_of([good, good | lost]) == 3
+        assert is_reached(Row(**COMMON), [good | lost]) is False, "a row without a goal, too"
+    # A course of before has a line for each kind of loss.
+    before = good | {"course": {"fell": 0.0, "lost": ["rows", "pool"]}}
+    assert is_reached(RETURN, [before]) is False
 
 
 def test_beside_a_return_each_seed_should_end_with_its_levels():

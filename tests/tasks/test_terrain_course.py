@@ -63,6 +63,19 @@ def throw(policy, first, later):
     return walk(policy, thrown, num_envs=NUM_ENVS)
 
 
+def test_robots_that_walk_without_room_for_their_contacts_are_counted(untrained):
+    course = course_of(untrained.cfg.task)
+    cfg = dataclasses.replace(course.cfg, episode_length_s=0.4)
+    short = dataclasses.replace(course, cfg=cfg)
+    assert walk(untrained, short, num_envs=NUM_ENVS).lost_worlds == 0
+    cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, njmax=30))
+    tight = dataclasses.replace(course, cfg=cfg)
+    outcomes = walk(untrained, tight, num_envs=NUM_ENVS)
+    # They land on four feet within the time.
+    assert 1 <= outcomes.lost_worlds <= NUM_ENVS
+    assert "constraint rows needed" in outcomes.lost[0]
+
+
 def test_the_course_of_go1_asks_for_one_speed_and_pushes_nobody():
     task = envs.task("go1_velocity_rough").cfg()
     course = course_of(task)
