@@ -13,7 +13,8 @@ least half of the robots succeed on. `success_by_level` has the shares of succes
 policy was saved. Levels count from 0, and who has mastered the last goes on at a random one, so that it stays below it.
 With a teacher, `share_of_teacher` is the success in the mean over kinds divided by the teacher's, and `weakest` the
 least success of a kind at the hardest level. `lost` has a line for each kind of contacts or constraints that the
-physics had no room for.
+physics had no room for, and `lost_worlds` in how many worlds that was so, the teacher's included: figures of these are
+not of the physics that was asked for.
 """
 
 from __future__ import annotations
@@ -58,8 +59,10 @@ def main() -> None:
         figures |= beside_teacher(
             load_policy(locate(options["teacher"]), device=options["device"]),
             success_by_level,
+            success=figures["success"],
             num_envs=num_envs,
         )
+    figures["lost_worlds"] = figures.get("lost_worlds", 0) + outcomes.lost_worlds
     figures |= {"num_envs": num_envs, **trained(path, policy.iteration)}
     device = policy.cfg.resolved_device()
     prefix = f"{report.device_label(device)}/{policy.cfg.task_name}"
@@ -81,31 +84,34 @@ def main() -> None:
 
 
 def beside_teacher(
-    teacher: Policy, success_by_level: Mapping[str, list[float]], *, num_envs: int
+    teacher: Policy,
+    success_by_level: Mapping[str, list[float]],
+    *,
+    success: float,
+    num_envs: int,
 ) -> dict[str, float]:
     """Return `share_of_teacher` and `weakest` of a policy with these successes, as the teacher walks its own course.
+
+    `success` is the policy's in all, of the same `summary`; `lost_worlds` are the teacher's.
 
     Raises:
         ValueError: if the teacher's ground has other kinds or levels, or it arrives nowhere.
     """
     course = course_of(teacher.cfg.task)
     outcomes = walk(teacher, course, num_envs=num_envs)
-    theirs, _ = summary(outcomes, kinds=course.grid.columns, num_levels=course.grid.num_levels)
+    theirs, own = summary(outcomes, kinds=course.grid.columns, num_levels=course.grid.num_levels)
     sizes = {kind: len(shares) for kind, shares in success_by_level.items()}
     if sizes != {kind: len(shares) for kind, shares in theirs.items()}:
         raise ValueError(
             f"teacher: its ground has {course.grid.num_levels} levels of {sorted(theirs)}, and the policy's has "
             f"{sizes}: take the run from which it learned"
         )
-    means = [
-        statistics.fmean(statistics.fmean(shares) for shares in successes.values())
-        for successes in (success_by_level, theirs)
-    ]
-    if means[1] == 0.0:
+    if own["success"] == 0.0:
         raise ValueError("teacher: it arrives nowhere, so that there is nothing to compare with")
     return {
-        "teacher_success": means[1],
-        "share_of_teacher": means[0] / means[1],
+        "teacher_success": own["success"],
+        "share_of_teacher": success / own["success"],
+        "lost_worlds": outcomes.lost_worlds,
         "weakest": min(shares[-1] for shares in success_by_level.values()),
     }
 

@@ -34,6 +34,7 @@ def test_a_student_is_measured_by_its_teacher_on_the_same_kinds_of_ground(monkey
         level_E=torch.tensor([0, 1, 0, 1]),
         arrived_E=torch.tensor([True, True, True, False]),
         fell_E=torch.zeros(4, dtype=torch.bool),
+        lost_worlds=2,
     )
     grid = TerrainGrid(patches={"a": FlatPatch(), "b": FlatPatch()}, num_levels=2, num_columns=2)
     task = dataclasses.replace(
@@ -46,12 +47,14 @@ def test_a_student_is_measured_by_its_teacher_on_the_same_kinds_of_ground(monkey
     monkeypatch.setattr(terrain_course, "walk", lambda *_, **__: theirs)
     run = command_line.compose(["task=cartpole_balance", "device=cpu"])
     teacher = Policy(cfg=run, actor=torch.nn.Identity(), iteration=0)
-    found = beside_teacher(teacher, {"a": [1.0, 0.5], "b": [0.5, 0.25]}, num_envs=4)
+    ours = {"a": [1.0, 0.5], "b": [0.5, 0.25]}
+    # The share is of the mean that the course's own summary gives.
+    found = beside_teacher(teacher, ours, success=0.6, num_envs=4)
     assert found == pytest.approx(
-        {"teacher_success": 0.75, "share_of_teacher": 0.75, "weakest": 0.25}
+        {"teacher_success": 0.75, "share_of_teacher": 0.8, "weakest": 0.25, "lost_worlds": 2}
     )
     with pytest.raises(ValueError, match="take the run from which it learned"):
-        beside_teacher(teacher, {"a": [1.0, 0.5]}, num_envs=4)
+        beside_teacher(teacher, {"a": [1.0, 0.5]}, success=0.75, num_envs=4)
     theirs.arrived_E.zero_()
     with pytest.raises(ValueError, match="teacher: it arrives nowhere"):
-        beside_teacher(teacher, {"a": [1.0, 0.5], "b": [0.5, 0.25]}, num_envs=4)
+        beside_teacher(teacher, ours, success=0.6, num_envs=4)
