@@ -377,7 +377,7 @@ class ReplayRing(ReplayBuffer):
             return online_N
         assert self.offline is not None
         offline_M = self.offline.storage.get(recorded_M)
-        # The ring may have more leaves, which a recorder reads.
+        # The ring keeps all leaves that it is given.
         online_N = online_N.select(*offline_M.keys(True, True))
         parts: list[TensorDictBase] = []
         # By shards inside of minibatches, as ranks have their rows, to which draws of the losses belong.

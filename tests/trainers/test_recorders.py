@@ -169,3 +169,29 @@ def test_an_update_that_keeps_env_states_is_told_where_all_envs_were_reset(tmp_p
     trainer.load_state_dict(state)
     collector.collect()
     assert len(told) == 2
+
+
+def test_a_replay_keeps_no_leaf_that_a_recorder_alone_reads(tmp_path):
+    words = [word for word in SMALL if "minibatch" not in word and "modules" not in word]
+    words += [
+        "objective=fast_sac",
+        "data.num_env_states_per_minibatch=8",
+        "objective.compile=false",
+    ]
+    cfg = conf.compose([*words, "trainer.num_iterations=1"])
+    of_ring = []
+    for recorders in ({}, {"all": RecorderCfg(num_envs=4)}):
+        trainer = build(dataclasses.replace(cfg, recorders=recorders), run_folder=tmp_path)
+        trainer.train()
+        ring = trainer.update.state_dict()["replay"]["ring"]
+        of_ring.append({name: leaf.shape for name, leaf in ring["content"].items()})
+        if recorders:
+            recorded = set(trainer.rollout_ET.keys(True, True))
+            assert len(recorded) > len(trainer.update.rollout_keys)
+    assert of_ring[0] == of_ring[1]
+    # A checkpoint of before kept them.
+    state = trainer.update.state_dict()
+    content = state["replay"]["ring"]["content"]
+    content["pictures"] = torch.zeros(len(content["action"]), 3)
+    trainer.update.load_state_dict(state)
+    trainer.update(trainer.collector.collect())

@@ -37,6 +37,7 @@ from ksim_rl.objectives import (
     go_back,
 )
 from ksim_rl.transforms import MirrorMap
+from ksim_rl.transforms.specs import spell
 
 # Names of the logged means, by the names that the losses give them.
 LOGGED = {
@@ -189,7 +190,8 @@ class OffPolicyUpdate(RolloutUpdate):
 
     def _store(self) -> None:
         rollout_ET = self.rollout_ET
-        self.replay.extend(rollout_ET)
+        # A recorder of the run may read more: the ring would keep it for each of its env states.
+        self.replay.extend(rollout_ET.select(*self.rollout_keys))
         # Unlike on policy, gradient steps need not see the statistics that the actions were drawn with.
         update_normalizers(rollout_ET, self.actor, self.critic)
         # An env that ended an episode anywhere in the rollout explores with another scale of noise from now on.
@@ -304,7 +306,7 @@ class OffPolicyUpdate(RolloutUpdate):
             load_optimizer_state(optimizer, saved, what=f"{name} optimizer")
         exploration = branch(state, "exploration")
         state_tree.copy_into(self.behavior.exploration_state(), exploration, what="exploration")
-        replay = branch(state, "replay")
+        replay = self._of_own_leaves(branch(state, "replay"))
         self.replay.load_state_dict(replay)
         # Without a replay the run has to collect random actions first, as at its start.
         if "ring" in replay:
@@ -314,6 +316,16 @@ class OffPolicyUpdate(RolloutUpdate):
             self.behavior.random.fill_(True)
         if self.steps_made >= self.data.learning_starts:
             self.behavior.random.fill_(False)
+
+    def _of_own_leaves(self, replay: State) -> State:
+        """Return the state of a replay without leaves that this run does not read, which replays of before held."""
+        if "ring" not in replay:
+            return replay
+        read = {spell(key) for key in self.rollout_keys}
+        ring = branch(replay, "ring")
+        content = branch(ring, "content")
+        own = {name: content[name] for name in content if name in read}
+        return {**replay, "ring": {**ring, "content": own}}
 
     def load_weights(self, state: State) -> None:
         """Take networks and temperature of a `state_dict`; a ValueError names a tensor or action bound that differs.
