@@ -28,6 +28,7 @@ from ksim_rl.mdp.rewards.feet import *  # noqa: F403
 from ksim_rl.mdp.rewards.joints import *  # noqa: F403
 from ksim_rl.mdp.rewards.tracking import *  # noqa: F403
 from ksim_rl.mdp.steered_actions import *  # noqa: F403
+from ksim_rl.mdp.task_space_actions import *  # noqa: F403
 from ksim_rl.mdp.terminations import *  # noqa: F403
 
 

@@ -1,4 +1,4 @@
-"""Passive things for `SceneCfg.objects`; doors, drawers and whatever else has joints are `MjcfRobot`s of their MJCF."""
+"""Passive things for `SceneCfg.objects`; doors and whatever else has joints are `MjcfRobot`s of their MJCF."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from xml.sax.saxutils import quoteattr
 import mujoco
 import numpy as np
 
-from ksim_rl.checked import Checked, Filled, NonNegative, Positive, Share
+from ksim_rl.checked import Checked, Filled, NonNegative, Positive, Share, Within
 from ksim_rl.physics import load_model, load_spec
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -155,6 +155,65 @@ class Stand(Checked):
             rgba=list(self.rgba),
         )
         return spec
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawer(Checked):
+    """A cabinet that does not move, with a drawer that slides out of it along -x: 0 is closed.
+
+    The front is a square of 30 cm in the plane x = 0. Its handle is a bar of 16 cm along y, 7 cm before the front and
+    near its upper edge, so that a gripper that points down has room. Bodies are "cabinet", "drawer" and "handle", the
+    joint is "slide", and the site "grip" is the middle of the bar.
+
+    Attributes:
+        height: of the bar above the plane z = 0, m; the cabinet is 2 cm higher.
+        travel: how far the drawer comes out, m.
+        mass: of the drawer, kg.
+        friction_loss, damping: of the slide, N and N s/m.
+        friction: sliding (1), torsional (m) and rolling (m), as in MJCF.
+    """
+
+    height: Annotated[float, Within(low=0.3)] = 0.32
+    travel: Positive = 0.25
+    mass: Positive = 1.0
+    friction_loss: NonNegative = 2.0
+    damping: NonNegative = 5.0
+    friction: tuple[NonNegative, NonNegative, NonNegative] = (1.0, 0.005, 0.0001)
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a new spec of the model."""
+        friction = " ".join(f"{number:.9g}" for number in self.friction)
+        slide = f'range="0 {self.travel:.9g}" damping="{self.damping:.9g}" frictionloss="{self.friction_loss:.9g}"'
+        # What touches furniture says so itself: furniture does not touch itself.
+        return load_spec(f"""
+            <mujoco model="drawer">
+              <default>
+                <geom type="box" contype="3" conaffinity="0" friction="{friction}" rgba="0.6 0.45 0.3 1"/>
+                <default class="handle"><geom type="capsule" size="0.008" rgba="0.2 0.2 0.25 1"/></default>
+              </default>
+              <worldbody>
+                <body name="cabinet" pos="0 0 {self.height:.9g}">
+                  <geom name="left" pos="0.17 0.155 -0.14" size="0.17 0.005 0.16"/>
+                  <geom name="right" pos="0.17 -0.155 -0.14" size="0.17 0.005 0.16"/>
+                  <geom name="top" pos="0.17 0 0.015" size="0.17 0.15 0.005"/>
+                  <geom name="bottom" pos="0.17 0 -0.295" size="0.17 0.15 0.005"/>
+                  <body name="drawer">
+                    <joint name="slide" type="slide" axis="-1 0 0" limited="true" {slide}/>
+                    <inertial pos="0.14 0 -0.14" mass="{self.mass:.9g}" diaginertia="0.02 0.02 0.02"/>
+                    <geom name="front" pos="0.005 0 -0.14" size="0.005 0.148 0.148" rgba="0.7 0.55 0.4 1"/>
+                    <geom name="tray" pos="0.15 0 -0.28" size="0.14 0.14 0.005"/>
+                    <body name="handle">
+                      <inertial pos="-0.07 0 0" mass="0.05" diaginertia="1e-4 1e-5 1e-4"/>
+                      <geom name="bar" class="handle" fromto="-0.07 -0.08 0 -0.07 0.08 0"/>
+                      <geom name="left_post" class="handle" fromto="-0.07 0.08 0 0 0.08 0"/>
+                      <geom name="right_post" class="handle" fromto="-0.07 -0.08 0 0 -0.08 0"/>
+                      <site name="grip" pos="-0.07 0 0"/>
+                    </body>
+                  </body>
+                </body>
+              </worldbody>
+            </mujoco>
+            """)
 
 
 @dataclass(frozen=True, kw_only=True)

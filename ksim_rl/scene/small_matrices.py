@@ -1,4 +1,4 @@
-"""Products of small matrices in full precision, and planes through points."""
+"""Products and systems of small matrices in full precision, and planes through points."""
 
 import math
 
@@ -16,6 +16,21 @@ def product(a: Float[Tensor, "*a N K"], b: Float[Tensor, "*b K M"]) -> Float[Ten
     `a @ b` would keep three digits on a GPU, once a trainer has set `torch.set_float32_matmul_precision("high")`.
     """
     return (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)
+
+
+def solved(a_ENN: Float[Tensor, "E N N"], b_EN: Float[Tensor, "E N"]) -> Float[Tensor, "E N"]:
+    """Return x of a x = b for symmetric positive definite a, small N.
+
+    `torch.linalg.solve` makes the host wait. Such a matrix needs no pivots.
+    """
+    size = b_EN.shape[1]
+    rows_ENM = torch.cat((a_ENN, b_EN[..., None]), dim=-1)
+    is_row_NN1 = torch.eye(size, dtype=torch.bool, device=b_EN.device)[..., None]
+    for place in range(size):
+        row_E1M = rows_ENM[:, place : place + 1] / rows_ENM[:, place : place + 1, place : place + 1]
+        others_ENM = rows_ENM - rows_ENM[:, :, place : place + 1] * row_E1M
+        rows_ENM = torch.where(is_row_NN1[place], row_E1M, others_ENM)
+    return rows_ENM[..., -1]
 
 
 def plane_normal(points_EN3: Float[Tensor, "E N 3"]) -> Float[Tensor, "E 3"]:

@@ -10,6 +10,7 @@ from ksim_rl.data import DatasetCfg
 from ksim_rl.envs.task import Task
 from ksim_rl.modules import ActorCfg, CriticCfg
 from ksim_rl.objectives import PPOCfg
+from ksim_rl.suites.manipulation.drawer import DRAWER
 from ksim_rl.suites.manipulation.leap import leap_cube_reorient
 from ksim_rl.suites.manipulation.panda import panda_pick_cube
 from ksim_rl.suites.manipulation.panda_pixels import PANDA_PIXELS
@@ -58,5 +59,5 @@ LEAP = Task(
         trainer=TrainerCfg(num_iterations=1831, eval_interval=100),
     ),
 )
-TASKS = (PANDA, PANDA_PIXELS, LEAP)
+TASKS = (PANDA, PANDA_PIXELS, LEAP, DRAWER)
 """For the registry."""
