@@ -170,5 +170,6 @@ def losses_of(env: EnvBase) -> Losses:
     simulated = part(env, SimulatedWorld)
     if simulated is None:
         return Losses()
-    report = simulated.world.overflow_report()
+    world = simulated.world
+    report = world.explain_overflow(world.overflow_counts().tolist())
     return Losses(lines=tuple(report.messages), worlds=report.lost_worlds)

@@ -5,8 +5,6 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from ksim_rl.trainers import Evaluator
-from ksim_rl.trainers import trainer as training
-from ksim_rl.trainers.metrics import Losses
 from tests.trainers.target_env import LENGTH, make_env, make_trainer
 
 
@@ -31,18 +29,6 @@ def test_the_return_is_the_sum_over_one_episode_of_each_env():
     assert result.return_mean == pytest.approx(LENGTH * 0.75)
     assert result.return_std == pytest.approx(0.0, abs=1e-6)
     assert (result.length_mean, result.episodes, result.unfinished) == (LENGTH, 5, 0)
-
-
-def test_a_run_says_how_many_worlds_lost_contacts_in_its_evaluation(monkeypatch):
-    trainer = make_trainer()
-    evaluated = trainer.evaluator.env
-    lost = Losses(lines=("constraint rows needed 9",), worlds=4)
-
-    def losses(env):
-        return lost if env is evaluated else Losses()
-
-    monkeypatch.setattr(training, "losses_of", losses)
-    assert trainer.train().evaluation.lost_worlds == 4
 
 
 def test_only_the_first_episode_counts():

@@ -173,6 +173,7 @@ class LossyWorld:
 
         class Report:
             metrics = {"nefc_share": rows / 20}
+            lost_worlds = worlds
             messages = (
                 f"constraint rows needed {rows} per world but has 20: set sim.njmax >= {rows} "
                 f"(NEFC in {worlds} worlds)",
@@ -212,6 +213,8 @@ def test_contacts_that_an_evaluation_lost_are_said():
     assert [note.split(":")[:2] for note in notes.notes if "njmax" in note] == [
         ["warning", " evaluation at iteration 2"]
     ]
+    # And counted, for tables of results.
+    assert trainer.evaluation.lost_worlds == 4
 
 
 class GuardedWorld(LossyWorld):
