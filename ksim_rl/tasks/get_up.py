@@ -30,6 +30,7 @@ from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
 from ksim_rl.scene.robots.unitree_go import UnitreeGo1
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity, velocity_training
+from ksim_rl.tasks.bent_joints import BendJointsApart
 from ksim_rl.tasks.planar import upright
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
 
@@ -37,6 +38,8 @@ from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, Observation
 GO1_ROWS = 96
 G1_ROWS = 320
 T1_ROWS = 128
+# Joints begin within this of the default pose, rad.
+BENT = (-0.6, 0.6)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +175,7 @@ def get_up_cfg(
                     **dict.fromkeys(("roll", "pitch", "yaw"), (-math.pi, math.pi)),
                 }
             ),
-            "bend": mdp.ResetJoints(position_range=(-0.6, 0.6)),
+            "bend": mdp.ResetJoints(position_range=BENT),
             "encoder_bias": mdp.RandomizeEncoderBias(ranges=(-0.015, 0.015)),
             "foot_friction": velocity.foot_friction(robot, low=0.4, high=1.2),
         },
@@ -230,12 +233,20 @@ def humanoid_get_up() -> ManagerBasedRlEnvCfg:
 # -- robots of the menagerie: nothing was trained yet, and heights, action scales and room are guesses -----------------
 
 
-def _soon_too(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
-    """Return the config with a second metric: whether the robot has stood within 3 s."""
+def _apart_and_soon(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
+    """Return the config with starts in which no limb lies inside another, and the metric of standing within 3 s.
+
+    Joints bent by themselves have arms in the hips of T1 in 18 % of all starts, and of G1's 52 % are of such a kind.
+    """
     in_the_end = cfg.metrics["stands"]
     assert isinstance(in_the_end, Stands)
     soon = StoodSoon(standing_height=in_the_end.standing_height)
-    return dataclasses.replace(cfg, metrics={**cfg.metrics, "stood_soon": soon})
+    apart = BendJointsApart(position_range=BENT)
+    return dataclasses.replace(
+        cfg,
+        metrics={**cfg.metrics, "stood_soon": soon},
+        events={**(cfg.events or {}), "bend": apart},
+    )
 
 
 def _twice(scale: Mapping[str, float]) -> dict[str, float]:
@@ -249,13 +260,13 @@ def go1_get_up() -> ManagerBasedRlEnvCfg:
     cfg = get_up_cfg(
         robot,
         standing_height=0.27,
-        drop_height=(0.2, 0.3),
+        drop_height=(0.22, 0.32),
         action_scale=_twice(robot.action_scale),
         # As in its velocity tasks, with room for a whole body on the ground.
         sim=dataclasses.replace(velocity.sim(cone="elliptic", impratio=10.0), njmax=GO1_ROWS),
         viewer=ViewerCfg(body=robot.root_body, distance=1.5, elevation=-10.0, azimuth=90.0),
     )
-    return _soon_too(cfg)
+    return _apart_and_soon(cfg)
 
 
 def g1_get_up() -> ManagerBasedRlEnvCfg:
@@ -270,7 +281,7 @@ def g1_get_up() -> ManagerBasedRlEnvCfg:
         imu=robot.imu,
         viewer=ViewerCfg(body=robot.torso_body, distance=3.0, elevation=-10.0, azimuth=90.0),
     )
-    return _soon_too(cfg)
+    return _apart_and_soon(cfg)
 
 
 def t1_get_up() -> ManagerBasedRlEnvCfg:
@@ -284,7 +295,7 @@ def t1_get_up() -> ManagerBasedRlEnvCfg:
         sim=dataclasses.replace(velocity.sim(), njmax=T1_ROWS),
         viewer=ViewerCfg(body=robot.root_body, distance=3.0, elevation=-10.0, azimuth=90.0),
     )
-    return _soon_too(cfg)
+    return _apart_and_soon(cfg)
 
 
 ON_FOUR_LEGS = velocity_training.training(num_iterations=1_000, entropy_coeff=0.005)
