@@ -14,7 +14,7 @@ from ksim_rl.data.episode_folder import EPISODE_KEY, Contents
 from ksim_rl.envs.contract import EpisodeClock, SimulatedWorld, part
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.recorders import model_sha256
-from ksim_rl.transforms import observation_columns
+from ksim_rl.transforms import observation_columns, stacked_frames
 from ksim_rl.transforms.specs import path_of, spell
 
 
@@ -115,6 +115,18 @@ def read_offline_table(
             n_step=data.n_step,
             gamma=gamma,
             device=device,
+            beside=_replay_bytes(data, env, observations),
         )
     notes = [f"data.offline.source={folder}: not compared with this env: {it}" for it in unknown]
     return table, notes
+
+
+def _replay_bytes(data: ReplayCfg, env: EnvBase, observations: Sequence[NestedKey]) -> int:
+    """Return how many bytes the observations of a run's own replay take, which keeps each frame of a stack once."""
+    stacks = stacked_frames(env)
+    total = 0
+    for key in observations:
+        spec = env.observation_spec[key]
+        # Of all envs.
+        total += spec.shape.numel() * spec.dtype.itemsize // len(stacks.get(key, (0,)))
+    return data.capacity * total

@@ -71,11 +71,12 @@ def make_offline_table(
     n_step: int = 1,
     gamma: float = 0.99,
     device: torch.device | str = "cpu",
+    beside: int = 0,
 ) -> OfflineTable:
     """Lay out recorded env states `["D"]`, with the `offline_keys` and "episode", of which a rank keeps its part.
 
-    A ValueError says where rows do not follow one another, what has no end, and what no memory holds. Rows with a
-    number that is not finite are counted and never drawn.
+    A ValueError says where rows do not follow one another, what has no end, and what no memory holds, which has to hold
+    `beside` bytes of a replay, too. Rows with a number that is not finite are counted and never drawn.
     """
     episode_D = env_states_D.get(EPISODE_KEY)
     rows_D = env_states_D.select(*offline_keys(observations))
@@ -93,12 +94,13 @@ def make_offline_table(
     kept = [*observations, "action", REWARD, DONE, TERMINATED]
     places = int(lanes.taken_E.max()) + 1
     row_bytes = sum(rows_D.get(key)[0].nbytes for key in kept)
-    check_bytes(
-        f"{rows_D.shape[0]:,} recorded env states",
-        places * shards * row_bytes,
-        device=torch.device(device),
-        fix="record fewer, or smaller observations",
-    )
+    given = f"{rows_D.shape[0]:,} recorded env states"
+    fix = "record fewer, or smaller observations"
+    if beside:
+        given += " beside the replay"
+        fix += ", or lower data.capacity"
+    needed = places * shards * row_bytes + beside
+    check_bytes(given, needed, device=torch.device(device), fix=fix)
     own = {spell(key): rows_D.get(key)[own_D] for key in offline_keys(observations)}
     content = {}
     for key in kept:

@@ -169,6 +169,11 @@ def test_what_no_memory_holds_is_refused(monkeypatch):
     )
     with pytest.raises(ValueError, match=said):
         make_offline_table(recording(), **SHARED)
+    # Each alone would fit: 17 places of 14 bytes or more, and the replay.
+    monkeypatch.setattr(room, "total_bytes", lambda device: 1000)
+    make_offline_table(recording(), **SHARED)
+    with pytest.raises(ValueError, match="beside the replay: .* or lower data.capacity"):
+        make_offline_table(recording(), beside=900, **SHARED)
 
 
 @pytest.mark.parametrize(

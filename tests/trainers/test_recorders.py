@@ -8,8 +8,9 @@ import torch
 from ksim_rl import conf, data
 from ksim_rl.data import RecorderCfg
 from ksim_rl.data.episode_writer import EpisodeWriter
+from ksim_rl.device import room
 from ksim_rl.trainers import checkpoint
-from ksim_rl.trainers.build import build
+from ksim_rl.trainers.build import build, build_env
 
 SMALL = (
     "task=cartpole_swingup",
@@ -195,3 +196,24 @@ def test_a_replay_keeps_no_leaf_that_a_recorder_alone_reads(tmp_path):
     content["pictures"] = torch.zeros(len(content["action"]), 3)
     trainer.update.load_state_dict(state)
     trainer.update(trainer.collector.collect())
+
+
+def test_a_recording_and_a_replay_have_to_fit_together(tmp_path, monkeypatch):
+    train(tmp_path, all=RecorderCfg(num_envs=4))
+    recording = tmp_path / "episodes" / "all" / "from_iteration_000001"
+    words = [word for word in SMALL if "minibatch" not in word and "modules" not in word]
+    words += [
+        "objective=fast_sac",
+        "data.num_env_states_per_minibatch=8",
+        "objective.compile=false",
+    ]
+    words += [f"data.offline={{source: {str(recording)!r}}}", "data.capacity=200000"]
+    words += [f"modules.{name}.hidden_dims=[8]" for name in ("actor", "critic")]
+    cfg = conf.compose(words)
+    env = build_env(cfg, num_envs=4, seed=0)
+    groups = {key for kind in (cfg.modules.actor, cfg.modules.critic) for key in kind.in_keys}
+    ring_bytes = sum(4 * 200_000 * 4 * env.observation_spec[key].shape[-1] for key in groups)
+    # The recording alone is some kilobytes.
+    monkeypatch.setattr(room, "total_bytes", lambda device: ring_bytes + 100)
+    with pytest.raises(ValueError, match="recorded env states beside the replay: takes at least"):
+        build(cfg)
