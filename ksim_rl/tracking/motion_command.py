@@ -1,5 +1,6 @@
-"""`ksim-rl motion` makes motion files of a robot: of CSV, BVH, AMASS-like and tracking files, and of its own plans."""
+"""`ksim-rl motion` makes motion files of a robot: of CSV, BVH, AMASS and tracking files, of runs, and of own plans."""
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,11 +21,13 @@ from ksim_rl.scene.robots.booster_t1 import BoosterT1
 from ksim_rl.scene.robots.own_robots import Humanoid
 from ksim_rl.scene.robots.unitree_g1 import UnitreeG1
 from ksim_rl.terminal import show
+from ksim_rl.tracking.assistance import rolled_out
 from ksim_rl.tracking.feasibility import feasibility
 from ksim_rl.tracking.g1_motions import FIGURE, FPS
 from ksim_rl.tracking.g1_motions import model as g1
 from ksim_rl.tracking.g1_repertoire import REPERTOIRE
 from ksim_rl.tracking.keyframes import perform
+from ksim_rl.trainers.run_folder import load_policy
 
 ROBOTS = {"g1": UnitreeG1, "t1": BoosterT1, "humanoid": Humanoid}
 
@@ -45,6 +48,8 @@ def motion(arguments: Sequence[str]) -> int:
     options = _parser().parse_args(arguments)
     if options.kind == "generate":
         return _generate(options.folder, options.only)
+    if options.kind == "rollout":
+        return _roll_out(options)
     model = model_of(options.robot)
     # A CSV holds the robot's own joints, so nothing has to be retargeted.
     if options.kind == "csv":
@@ -72,6 +77,21 @@ def motion(arguments: Sequence[str]) -> int:
     if options.kind == "tracking" and options.robot == "g1":
         for fault in feasibility(model, qpos_FL, options.fps, figure=FIGURE).faults():
             show(f"  not feasible as it is: {fault}")
+    return 0
+
+
+def _roll_out(options: argparse.Namespace) -> int:
+    """Write what the policy of a tracking run does along its motion, as a motion for another policy."""
+    policy = load_policy(options.run, device=options.device)
+    found, model = rolled_out(
+        policy.cfg, policy.actor, clip=options.clip, trials=options.trials, note=show
+    )
+    write_motion(options.motion, model, found.qpos_FL, found.fps)
+    seconds = (len(found.qpos_FL) - 1) / found.fps
+    show(
+        f"{options.motion}: {len(found.qpos_FL)} frames, {seconds:.2f} s; {found.success:.1%} of {options.trials} "
+        f"trials came to the end, and this one was off the motion by {found.error:.3f}"
+    )
     return 0
 
 
@@ -133,6 +153,14 @@ def _parser() -> OneLineParser:
             one.add_argument("--z-up", action="store_true")
         else:
             one.add_argument("--height", type=float, default=HEIGHT, help="of the person, m")
+    rollout = kinds.add_parser(
+        "rollout", help="what the policy of a tracking run does along its motion, without help"
+    )
+    rollout.add_argument("run", type=Path, help="a run folder, or one of its checkpoints")
+    rollout.add_argument("motion", type=Path, help="the .npz file to write")
+    rollout.add_argument("--clip", default="", help="of several clips the one to follow")
+    rollout.add_argument("--trials", type=int, default=64, help="of which the best is written")
+    rollout.add_argument("--device", default="auto", help="cpu, cuda, cuda:<index> or auto")
     own = kinds.add_parser(
         "generate", help="the package's plans of Unitree G1, 77 motions of thirteen kinds"
     )

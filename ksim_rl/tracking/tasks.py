@@ -23,6 +23,7 @@ from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity, velocity_training
 from ksim_rl.tasks.velocity import noisy
 from ksim_rl.tracking import terms
+from ksim_rl.tracking.assistance import AssistRoot, assisted
 from ksim_rl.tracking.starts import FailedParts, StartInMotion
 from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
@@ -178,6 +179,25 @@ def track_cfg(file: str) -> ManagerBasedRlEnvCfg:
     )
 
 
+def assisted_cfg() -> ManagerBasedRlEnvCfg:
+    """Return the config of `g1_track` with help at the pelvis, of 60 % of the weight at most, that is withdrawn.
+
+    The help is whole for the first 6,000 env steps, and gone after 24,000.
+    """
+    cfg = track_set_cfg()
+    # 33 kg: a mass at 8 rad/s, damped critically; of the turn about half a kg m^2.
+    assist = AssistRoot(
+        file=SET,
+        stiffness=2000.0,
+        damping=500.0,
+        turn_stiffness=100.0,
+        turn_damping=15.0,
+        max_force=200.0,
+        max_torque=50.0,
+    )
+    return assisted(cfg, assist, begin_step=6_000, end_step=24_000)
+
+
 def track_set_cfg() -> ManagerBasedRlEnvCfg:
     """Return the config of following many motions of G1 with one policy: the package's, unless others are given.
 
@@ -230,6 +250,12 @@ TASKS = (
         name="g1_track",
         description="Unitree G1 follows many motions, a folder of them, with its whole body",
         cfg=track_set_cfg,
+        training=training(),
+    ),
+    Task(
+        name="g1_track_assisted",
+        description="Unitree G1 follows motions that it cannot do, with help at its root that is withdrawn",
+        cfg=assisted_cfg,
         training=training(),
     ),
     _task("walk", "a walk"),

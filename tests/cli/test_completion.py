@@ -47,7 +47,8 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
     ("line", "offered"),
     [
         ("ksim-rl tr", ["train"]),
-        ("ksim-rl train task=go1_velocity_", ["go1_velocity_flat", "go1_velocity_rough"]),
+        ("ksim-rl train task=go2_velocity_", ["go2_velocity_flat"]),
+        ("ksim-rl train task=g1_velocity_", ["g1_velocity_flat", "g1_velocity_rough"]),
         ("ksim-rl train objective.clip_e", ["objective.clip_epsilon="]),
         ("ksim-rl train seed=1 modules=g", ["gru"]),
         ("ksim-rl envs cartpole_s", ["cartpole_swingup", "cartpole_swingup_pixels"]),
