@@ -34,7 +34,7 @@ _NO_CODE = {
 def crammed(texts: Mapping[Path, str]) -> Iterator[tuple[Path, int]]:
     """Yield the places of short statements that hold two or more comprehensions, ternaries or lambdas."""
     for path, text in texts.items():
-        for node in ast.walk(signatures.parse(text)):
+        for node in signatures.nodes(text):
             if not isinstance(node, _STATEMENTS) or _lines(node) > 2:
                 continue
             held = [inner for inner in ast.walk(node) if isinstance(inner, _NESTING)]
@@ -55,7 +55,7 @@ def any_per_function(texts: Mapping[Path, str]) -> float:
     words = 0
     functions = 0
     for text in texts.values():
-        for node in ast.walk(signatures.parse(text)):
+        for node in signatures.nodes(text):
             words += isinstance(node, ast.Name) and node.id == "Any"
             functions += isinstance(node, ast.FunctionDef)
     return words / max(functions, 1)

@@ -160,7 +160,7 @@ class House:
 
     def _imports(self, name: str, path: Path, modules: dict[str, Path]) -> Iterator[str]:
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        for node in ast.walk(signatures.parse(self.texts[path])):
+        for node in signatures.nodes(self.texts[path]):
             if isinstance(node, ast.Import):
                 yield from (alias.name for alias in node.names if alias.name in modules)
             elif isinstance(node, ast.ImportFrom):
@@ -256,7 +256,7 @@ def probes(house: House) -> list[str]:
         f"{house.name(path)}:{node.lineno} {ast.unparse(node).splitlines()[0]}"
         for path, text in house.texts.items()
         if house.room(path) in ROOMS_WITHOUT_PROBES
-        for node in ast.walk(signatures.parse(text))
+        for node in signatures.nodes(text)
         if _is_probe(node)
     ]
 
@@ -318,7 +318,7 @@ def long_signatures(house: House) -> list[str]:
 
 def _operators(text: str) -> set[str]:
     """Return the names of functions that a module makes operators of torch, whose schemas are flat."""
-    calls = [node for node in ast.walk(signatures.parse(text)) if isinstance(node, ast.Call)]
+    calls = [node for node in signatures.nodes(text) if isinstance(node, ast.Call)]
     made = [
         call for call in calls if isinstance(call.func, ast.Name) and call.func.id == "as_operator"
     ]

@@ -298,6 +298,13 @@ class _Decorating(ast.NodeTransformer):
             PLAIN.append(name)
         return node
 
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        """Visit the statements inside of one: nine tenths of a tree are expressions, which define no function."""
+        for part in ("body", "orelse", "handlers", "finalbody", "cases"):
+            for inner in getattr(node, part, ()):
+                self.visit(inner)
+        return node
+
     def _inside(self, node: ast.FunctionDef | ast.ClassDef) -> None:
         self.scope.append(node.name)
         self.generic_visit(node)
@@ -318,13 +325,14 @@ class ShapeCheckingLoader(importlib.machinery.SourceFileLoader):
     def get_code(self, fullname: str) -> CodeType:
         # Without the cache of bytecode, which runs outside of tests read too.
         path = self.get_filename(fullname)
-        tree = ast.parse(self.get_data(path), path)
-        imported = {
-            alias.asname or alias.name
-            for node in ast.walk(tree)
-            if isinstance(node, ast.ImportFrom) and node.module == "jaxtyping"
-            for alias in node.names
-        }
+        source = self.get_data(path)
+        tree = ast.parse(source, path)
+        imported: set[str] = set()
+        # Walking through a tree takes longer than parsing it.
+        if b"jaxtyping" in source:
+            for node in ast.walk(tree):
+                if isinstance(node, ast.ImportFrom) and node.module == "jaxtyping":
+                    imported.update(alias.asname or alias.name for alias in node.names)
         tree = _Decorating(fullname, imported | self.aliases).visit(tree)
         return compile(tree, path, "exec", dont_inherit=True)
 

@@ -57,10 +57,16 @@ def parse(text: str) -> ast.Module:
 
 
 @functools.cache
+def nodes(text: str) -> tuple[ast.AST, ...]:
+    """Return all nodes of a source, which several checks look through."""
+    return tuple(ast.walk(parse(text)))
+
+
+@functools.cache
 def docstring_lines(text: str) -> frozenset[int]:
     """Return the numbers of the lines that docstrings stand in."""
     lines: set[int] = set()
-    for node in ast.walk(parse(text)):
+    for node in nodes(text):
         is_documented = isinstance(
             node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
         )
@@ -256,7 +262,7 @@ def _wrong_suffixes(path: Path, root: Path) -> Iterator[tuple[str, str]]:
 
 def _wrong_models(path: Path, root: Path) -> Iterator[tuple[str, str]]:
     where = path.relative_to(root)
-    for node in ast.walk(parse(path.read_text())):
+    for node in nodes(path.read_text()):
         if isinstance(node, ast.arg | ast.AnnAssign) and node.annotation is not None:
             text, patterns = ast.unparse(node.annotation).removesuffix(" | None"), _MODELS
             names = [node.arg] if isinstance(node, ast.arg) else [_last_name(node.target)]
