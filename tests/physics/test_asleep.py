@@ -58,7 +58,7 @@ def test_equalities_of_tendons_are_refused_where_trees_may_sleep(engine: Literal
         World(mujoco.MjModel.from_xml_string(xml), num_envs=1, sim=SimCfg(engine=engine))
 
 
-@pytest.mark.parametrize("tolerance", ("1e-9", "0.05", "0.2"))
+@pytest.mark.parametrize("tolerance", ("1e-9", pytest.param("0.05", marks=pytest.mark.full), "0.2"))
 def test_trees_fall_asleep_as_in_c(tolerance: str):
     xml = f"""
 <mujoco>

@@ -122,8 +122,16 @@ def test_a_spec_is_analysed_like_a_file(robot):
     check_proposals(analyse(robot.spec()), len(robot.foot_sites))
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-@pytest.mark.parametrize("sole", SOLES)
+def bipeds():
+    """Each sole, and a right leg with the left one's axes beside a mirrored one; all pairs in full runs."""
+    pairs = [(sole, mirrored) for sole in SOLES for mirrored in (False, True)]
+    return [
+        pytest.param(*pair, marks=[pytest.mark.full] if number in (1, 2, 5) else [])
+        for number, pair in enumerate(pairs)
+    ]
+
+
+@pytest.mark.parametrize(("sole", "mirrored"), bipeds())
 def test_a_biped_without_motors_armature_ranges_or_pose_stands(sole, mirrored):
     found = analyse(biped(sole, mirrored=mirrored))
     check_proposals(found, 2)
