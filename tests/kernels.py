@@ -86,7 +86,10 @@ TESTS = {
     "physics/fixed_geoms.py": {"place_fixed_geoms": SINGLE_MODELS},
     "physics/sensors/contact_sensors.py": {"__init__": EQUAL_WORLDS},
     "physics/constants/least_weights.py": {"raise_weights": SINGLE_MODELS},
-    "physics/height_field/contacts.py": {"height_field_contacts": EQUAL_WORLDS},
+    "physics/height_field/contacts.py": {
+        "height_field_contacts": EQUAL_WORLDS,
+        "list_near_pairs": EQUAL_WORLDS,
+    },
     "physics/height_field/convex_contacts.py": {"convex_height_field_contacts": SINGLE_MODELS},
     "physics/kernels.py": {
         "align_steep_capsules": SINGLE_MODELS,

@@ -4,6 +4,10 @@ MuJoCo Warp (4.0) treats each triangle as the top of a prism, as C does, and run
 is not level, some contacts (about one in 25 of a small ball on a slope or on rough ground) get a depth of centimetres
 and a normal straight up or down, which kicks robots; and it keeps fewer contacts than C. A ball, a capsule or a box
 against a prism needs no such search: our kernel is exact.
+
+Two kernels find the contacts. The first lists the pairs that have ground within their reach at all, which are few. The
+second gives each of them a warp, whose lanes take one prism each: a trunk that lies on stairs has hundreds below it,
+and one thread for all of them kept the whole launch waiting.
 """
 
 # Kernels are Python only in their spelling: wp.tid() gives as many indices as it is asked for, and a number that a loop
@@ -14,6 +18,7 @@ against a prism needs no such search: our kernel is exact.
 # pyright: reportAttributeAccessIssue=false, reportReturnType=false, reportInvalidTypeForm=false
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -23,7 +28,15 @@ import warp as wp
 from ksim_rl.physics import upstream
 from ksim_rl.physics.height_field import convex_contacts
 from ksim_rl.physics.height_field.fields import CONTACT_FIELDS, DATA_FIELDS, MODEL_FIELDS
-from ksim_rl.physics.height_field.geometry import Core, field_of, prism_of, touch_of_core
+from ksim_rl.physics.height_field.geometry import (
+    Core,
+    Field,
+    Touch,
+    field_of,
+    field_point,
+    prism_of,
+    touch_of_core,
+)
 from ksim_rl.physics.structs import filled, struct_with
 from ksim_rl.physics.upstream import contact_params, make_frame, write_contact
 
@@ -33,6 +46,9 @@ SPHERE, CAPSULE, BOX, HEIGHT_FIELD = (
 
 # As many contacts as a pair may have in C (`mjMAXCONPAIR`), which leaves out the others in silence.
 MOST = wp.constant(int(mujoco.mjMAXCONPAIR))
+# A warp for a pair on a GPU; so many of them are launched, and take the listed pairs in turn.
+LANES = 32
+MOST_WARPS = 16384
 TOO_MANY = wp.constant(int(mjw.OverflowType.HFIELD))
 
 
@@ -46,6 +62,22 @@ class Collisions:
 
     pairs: wp.array[wp.vec2i]
     pair_ids: wp.array[wp.vec2i]
+    # The listed pairs, as pair * worlds + world, and how many they are.
+    listed: wp.array[int]
+    count: wp.array[int]
+    worlds: int
+    warps: int
+
+
+@wp.struct
+class Cells:
+    """The cells of a lattice below a geom, from one row and column on, and the height of its lowest point."""
+
+    low_row: int
+    low_column: int
+    rows: int
+    columns: int
+    lowest: float
 
 
 @wp.func
@@ -72,18 +104,11 @@ def core_of(kind: int, size: wp.vec3, center: wp.vec3, turn: wp.mat33) -> Core:
     return core
 
 
-@wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
-def height_field_contacts(c: Collisions):
-    """Append the contacts of one pair (height field, geom) in one world, one for each prism that it touches."""
-    world, pair = wp.tid()
+@wp.func
+def params_of(c: Collisions, pair: int, world: int):
+    """Return the parameters of contacts of a pair, as MuJoCo Warp has them: margin and gap are the second and third."""
     ground = c.pairs[pair][0]
     geom = c.pairs[pair][1]
-    patch = c.geom_dataid[world % c.geom_dataid.shape[0], ground]
-    size = c.hfield_size[patch]
-    field_turn = c.geom_xmat[world, ground]
-    # In the frame of the field, where its lattice is aligned with the axes.
-    center = wp.transpose(field_turn) @ (c.geom_xpos[world, geom] - c.geom_xpos[world, ground])
-    bound = c.geom_rbound[world % c.geom_rbound.shape[0], geom]
     geoms, margin, gap, condim, friction, solref, solreffriction, solimp, adhesion = contact_params(
         c.geom_condim,
         c.geom_priority,
@@ -111,52 +136,136 @@ def height_field_contacts(c: Collisions):
         # The parameters of the geom with priority hold alone, which MuJoCo Warp's function does not know of this one.
         stronger = wp.where(c.geom_priority[ground] > c.geom_priority[geom], ground, geom)
         solref = c.geom_solref[world % c.geom_solref.shape[0], stronger]
-    # Contacts exist up to this distance, m; the bounding sphere rules most pairs out.
-    reach = margin + gap
-    if center[2] - bound > size[2] + reach or center[2] + bound < -size[3] - reach:
-        return
-    if wp.abs(center[0]) - bound > size[0] + reach or wp.abs(center[1]) - bound > size[1] + reach:
-        return
+    return geoms, margin, gap, condim, friction, solref, solreffriction, solimp, adhesion
 
-    field = field_of(size, c.hfield_nrow[patch], c.hfield_ncol[patch], c.hfield_adr[patch])
-    core = core_of(
+
+@wp.func
+def reach_of(c: Collisions, pair: int, world: int) -> float:
+    """Return the distance up to which a pair has contacts, m."""
+    params = params_of(c, pair, world)
+    return params[1] + params[2]
+
+
+@wp.func
+def field_below(c: Collisions, pair: int, world: int) -> Field:
+    """Return the height field of a pair in one world."""
+    patch = c.geom_dataid[world % c.geom_dataid.shape[0], c.pairs[pair][0]]
+    return field_of(
+        c.hfield_size[patch], c.hfield_nrow[patch], c.hfield_ncol[patch], c.hfield_adr[patch]
+    )
+
+
+@wp.func
+def core_in_field(c: Collisions, pair: int, world: int) -> Core:
+    """Return the core of a pair's geom in the frame of its field, where the lattice is aligned with the axes."""
+    ground = c.pairs[pair][0]
+    geom = c.pairs[pair][1]
+    field_turn = wp.transpose(c.geom_xmat[world, ground])
+    return core_of(
         c.geom_type[geom],
         c.geom_size[world % c.geom_size.shape[0], geom],
-        center,
-        wp.transpose(field_turn) @ c.geom_xmat[world, geom],
+        field_turn @ (c.geom_xpos[world, geom] - c.geom_xpos[world, ground]),
+        field_turn @ c.geom_xmat[world, geom],
     )
-    # How far the geom is from its centre along each axis, with the distance at which contacts exist.
+
+
+@wp.func
+def cells_below(field: Field, core: Core, reach: float) -> Cells:
+    """Return the cells below the box of a geom along the axes, grown by the distance at which contacts exist."""
     span = wp.vec3()
     for axis in range(3):
         row_of_turn = wp.vec3(core.turn[axis, 0], core.turn[axis, 1], core.turn[axis, 2])
         span[axis] = wp.dot(wp.abs(row_of_turn), core.half) + core.radius + reach
-    # The cells of the lattice below the geom's box.
-    low_column = wp.max(int(wp.floor((center[0] - span[0] + field.half_x) / field.dx)), 0)
-    low_row = wp.max(int(wp.floor((center[1] - span[1] + field.half_y) / field.dy)), 0)
+    center = core.center
+    cells = Cells()
+    cells.lowest = center[2] - span[2]
+    # Nothing is below the base of the ground.
+    if center[2] + span[2] < -field.base:
+        return cells
+    cells.low_column = wp.max(int(wp.floor((center[0] - span[0] + field.half_x) / field.dx)), 0)
+    cells.low_row = wp.max(int(wp.floor((center[1] - span[1] + field.half_y) / field.dy)), 0)
     high_column = wp.min(
         int(wp.floor((center[0] + span[0] + field.half_x) / field.dx)), field.columns - 2
     )
     high_row = wp.min(
         int(wp.floor((center[1] + span[1] + field.half_y) / field.dy)), field.rows - 2
     )
-    found = int(0)
-    for row in range(low_row, high_row + 1):
-        for column in range(low_column, high_column + 1):
-            for half in range(2):
-                prism = prism_of(field, c.hfield_data, row, column, half)
-                # The whole prism is below the geom.
-                if wp.max(wp.max(prism.a[2], prism.b[2]), prism.c[2]) < center[2] - span[2]:
-                    continue
-                touch = touch_of_core(prism, core, reach)
-                if touch.distance >= reach:
-                    continue
-                # C stops here in silence; we set a bit of the overflow report.
-                if found == MOST:
-                    wp.atomic_or(c.overflow, world, TOO_MANY)
-                    return
+    # None beside the field.
+    cells.rows = wp.max(high_row - cells.low_row + 1, 0)
+    cells.columns = wp.max(high_column - cells.low_column + 1, 0)
+    return cells
+
+
+@wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
+def list_near_pairs(c: Collisions):
+    """List one pair (height field, geom) of one world if a point of the lattice below the geom reaches up to it."""
+    # Neighbouring threads have the same geom in different worlds, so that all have about as many cells.
+    pair, world = wp.tid()
+    reach = reach_of(c, pair, world)
+    field = field_below(c, pair, world)
+    core = core_in_field(c, pair, world)
+    # The bounding sphere rules out most pairs that are far above all of the ground.
+    bound = c.geom_rbound[world % c.geom_rbound.shape[0], c.pairs[pair][1]]
+    if core.center[2] - bound > field.top + reach:
+        return
+    cells = cells_below(field, core, reach)
+    if cells.rows == 0 or cells.columns == 0:
+        return
+    for row in range(cells.low_row, cells.low_row + cells.rows + 1):
+        for column in range(cells.low_column, cells.low_column + cells.columns + 1):
+            if field_point(field, c.hfield_data, row, column)[2] >= cells.lowest:
+                c.listed[wp.atomic_add(c.count, 0, 1)] = pair * c.worlds + world
+                return
+
+
+@wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
+def height_field_contacts(c: Collisions):
+    """Append the contacts of the listed pairs, one for each prism that a geom touches, in the order of C."""
+    warp, lane = wp.tid()
+    item = int(warp)
+    while item < c.count[0]:
+        pair = c.listed[item] // c.worlds
+        world = c.listed[item] % c.worlds
+        geoms, margin, gap, condim, friction, solref, solreffriction, solimp, adhesion = params_of(
+            c, pair, world
+        )
+        # Contacts exist up to this distance, m.
+        reach = margin + gap
+        ground = c.pairs[pair][0]
+        field_turn = c.geom_xmat[world, ground]
+        field = field_below(c, pair, world)
+        core = core_in_field(c, pair, world)
+        cells = cells_below(field, core, reach)
+        num_prisms = 2 * cells.rows * cells.columns
+        found = int(0)
+        first = int(0)
+        # All lanes go through the loop as often as each other, since they count together.
+        while first < num_prisms and found <= MOST:
+            prism_index = first + lane
+            cell = prism_index // 2
+            touches = int(0)
+            touch = Touch()
+            if prism_index < num_prisms:
+                prism = prism_of(
+                    field,
+                    c.hfield_data,
+                    cells.low_row + cell // cells.columns,
+                    cells.low_column + cell % cells.columns,
+                    prism_index % 2,
+                )
+                # Else the whole prism is below the geom.
+                if wp.max(wp.max(prism.a[2], prism.b[2]), prism.c[2]) >= cells.lowest:
+                    touch = touch_of_core(prism, core, reach)
+                    touches = wp.where(touch.distance < reach, 1, 0)
+            # How many prisms before its own a lane has found to be touched.
+            counted = wp.tile(touches)
+            place = found + wp.untile(wp.tile_scan_exclusive(counted))
+            total = wp.tile_sum(counted)
+            found += total[0]
+            if touches == 1 and place < MOST:
                 write_contact(
                     c.naconmax,
-                    found,
+                    place,
                     touch.distance,
                     field_turn @ touch.place + c.geom_xpos[world, ground],
                     make_frame(field_turn @ touch.normal),
@@ -188,7 +297,11 @@ def height_field_contacts(c: Collisions):
                     c.contact_adhesion,
                     c.nacon,
                 )
-                found += 1
+            first += wp.block_dim()
+        # C leaves out the others in silence; we set a bit of the overflow report.
+        if found > MOST and lane == 0:
+            wp.atomic_or(c.overflow, world, TOO_MANY)
+        item += c.warps
 
 
 def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None] | None:
@@ -219,16 +332,27 @@ def take_over_height_fields(warp_model: mjw.Model) -> Callable[[mjw.Model, mjw.D
         for chosen in (is_exact, is_convex)
     ]
 
-    # Made at the first launch, which nothing records, since it depends on the number of worlds.
+    # Made at the first launch for so many worlds, which nothing records.
     memory: dict[str, wp.array] = {}
+    lists_of_near: dict[int, dict[str, Any]] = {}
 
     def append(warp_model: mjw.Model, warp_data_E: mjw.Data) -> None:
+        worlds = warp_data_E.nworld
         if is_exact.any():
-            collisions = filled(Collisions, lists[0], warp_model, warp_data_E)
-            wp.launch(
-                height_field_contacts,
-                dim=(warp_data_E.nworld, int(is_exact.sum())),
-                inputs=[collisions],
+            num_pairs = int(is_exact.sum())
+            if worlds not in lists_of_near:
+                lists_of_near[worlds] = {
+                    "listed": wp.empty(num_pairs * worlds, dtype=int),
+                    "count": wp.zeros(1, dtype=int),
+                    "worlds": worlds,
+                    "warps": min(num_pairs * worlds, MOST_WARPS),
+                }
+            near = lists_of_near[worlds]
+            near["count"].zero_()
+            collisions = filled(Collisions, {**lists[0], **near}, warp_model, warp_data_E)
+            wp.launch(list_near_pairs, dim=(num_pairs, worlds), inputs=[collisions])
+            wp.launch_tiled(
+                height_field_contacts, dim=[near["warps"]], inputs=[collisions], block_dim=LANES
             )
         if is_convex.any():
             if not memory:

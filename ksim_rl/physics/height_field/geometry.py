@@ -206,8 +206,8 @@ def closest_on_face(prism: Prism, face: int, point: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def touch_of_point(prism: Prism, point: wp.vec3) -> Touch:
-    """Return how far a point is from a prism, and the closest place of its surface."""
+def highest_face(prism: Prism, point: wp.vec3) -> Touch:
+    """Return how far a point is above the face of a prism that looks most towards it: no more than from the prism."""
     # Inside of all faces, the face least deep is the way out.
     touch = Touch()
     touch.distance = -FAR
@@ -217,8 +217,15 @@ def touch_of_point(prism: Prism, point: wp.vec3) -> Touch:
         if height > touch.distance:
             touch.distance = height
             touch.normal = normal
-    # The foot of the perpendicular is on the face itself only for points inside; others continue below.
+    # The foot of the perpendicular is on the face itself only for points inside.
     touch.place = point - touch.distance * touch.normal
+    return touch
+
+
+@wp.func
+def touch_of_point(prism: Prism, point: wp.vec3) -> Touch:
+    """Return how far a point is from a prism, and the closest place of its surface."""
+    touch = highest_face(prism, point)
     if touch.distance <= 0.0:
         return touch
     # The closest place of a convex shape is on a face that looks towards the point.
@@ -288,8 +295,11 @@ def column_of(turn: wp.mat33, column: int) -> wp.vec3:
 
 
 @wp.func
-def widest_axis(prism: Prism, core: Core) -> Touch:
-    """Return the direction along which prism and core are the farthest apart, or the least deep in each other."""
+def widest_axis(prism: Prism, core: Core, enough: float) -> Touch:
+    """Return the direction along which prism and core are the farthest apart, or the least deep in each other.
+
+    The search ends with the first direction along which they are as far apart as is `enough` to leave the prism out.
+    """
     # The separating axis theorem: convex bodies are apart where the projections on one of the axes are.
     best = Touch()
     best.distance = -FAR
@@ -327,6 +337,8 @@ def widest_axis(prism: Prism, core: Core) -> Touch:
             if wp.max(above, below) > needed:
                 best.distance = wp.max(above, below)
                 best.normal = wp.where(above >= below, normal, -normal)
+                if best.distance >= enough:
+                    return best
     return best
 
 
@@ -336,13 +348,16 @@ def touch_of_core(prism: Prism, core: Core, reach: float) -> Touch:
     touch = Touch()
     # A sphere is a point with a radius.
     if core.num_edges == 0:
+        touch.distance = FAR
+        # Most prisms below a geom are out of reach: their closest places are never computed.
+        if highest_face(prism, core.center).distance - core.radius >= reach:
+            return touch
         touch = touch_of_point(prism, core.center)
         touch.distance = touch.distance - core.radius
         touch.place = touch.place + 0.5 * touch.distance * touch.normal
         return touch
-    widest = widest_axis(prism, core)
+    widest = widest_axis(prism, core, reach + core.radius)
     touch.distance = FAR
-    # Most prisms below a geom are out of reach: their closest places are never computed.
     if widest.distance - core.radius >= reach:
         return touch
     # Shapes that are in each other are drawn apart until they touch, which tells where.
