@@ -36,6 +36,7 @@ from ksim_rl.physics.height_field.geometry import (
     field_point,
     prism_of,
     touch_of_core,
+    with_normals,
 )
 from ksim_rl.physics.structs import filled, struct_with
 from ksim_rl.physics.upstream import contact_params, make_frame, write_contact
@@ -98,6 +99,7 @@ def core_of(kind: int, size: wp.vec3, center: wp.vec3, turn: wp.mat33) -> Core:
     if kind == CAPSULE:
         # The edge of a box along its third axis.
         core.half = wp.vec3(0.0, 0.0, size[1])
+        core.first_axis = 2
         core.first_edge = 8
         core.num_edges = 1
         core.corner_step = 4
@@ -255,7 +257,7 @@ def height_field_contacts(c: Collisions):
                 )
                 # Else the whole prism is below the geom.
                 if wp.max(wp.max(prism.a[2], prism.b[2]), prism.c[2]) >= cells.lowest:
-                    touch = touch_of_core(prism, core, reach)
+                    touch = touch_of_core(with_normals(prism), core, reach)
                     touches = wp.where(touch.distance < reach, 1, 0)
             # How many prisms before its own a lane has found to be touched.
             counted = wp.tile(touches)

@@ -31,10 +31,8 @@ NEARLY = wp.constant(1.0e-6)
 FACES = wp.constant(5)
 EDGES = wp.constant(9)
 CORNERS = wp.constant(6)
-# The directions that may separate a prism and a box: normals of faces of each, then of each two edges that differ in
-# direction, of which a prism has seven.
-FACE_AXES = wp.constant(8)
-AXES = wp.constant(29)
+# Edges of a prism that differ in direction: those at the top and at the base, and one of the vertical ones.
+DIRECTIONS = wp.constant(7)
 
 
 @wp.struct
@@ -54,22 +52,30 @@ class Field:
 
 @wp.struct
 class Prism:
-    """The ground below one triangle."""
+    """The ground below one triangle, with the outward normals of its sides and of its top, which `with_normals` sets."""
 
     a: wp.vec3
     b: wp.vec3
     c: wp.vec3
     base: float
+    side_a: wp.vec3
+    side_b: wp.vec3
+    side_c: wp.vec3
+    up: wp.vec3
 
 
 @wp.struct
 class Core:
-    """The part of a geom that collides, without its radius: a box, one edge of it (capsule) or its centre (sphere)."""
+    """The part of a geom that collides, without its radius: a box, one edge of it (capsule) or its centre (sphere).
+
+    A capsule's edge lies along the third axis, the `first_axis` of the three that has a length.
+    """
 
     center: wp.vec3
     turn: wp.mat33
     half: wp.vec3
     radius: float
+    first_axis: int
     first_edge: int
     num_edges: int
     corner_step: int
@@ -158,22 +164,34 @@ def start_and_end(prism: Prism, edge: int):
 
 
 @wp.func
+def outward(start: wp.vec3, end: wp.vec3, inside: wp.vec3) -> wp.vec3:
+    """Return the normal of a side between two corners that points away from the third."""
+    # Sides are vertical: their normals are horizontal, and only the sign depends on the sense.
+    along = end - start
+    normal = wp.normalize(wp.vec3(along[1], -along[0], 0.0))
+    return wp.where(wp.dot(normal, inside - start) > 0.0, -normal, normal)
+
+
+@wp.func
+def with_normals(prism: Prism) -> Prism:
+    """Return a prism with its normals."""
+    prism.side_a = outward(prism.a, prism.b, prism.c)
+    prism.side_b = outward(prism.b, prism.c, prism.a)
+    prism.side_c = outward(prism.c, prism.a, prism.b)
+    # The two triangles of a cell turn in opposite senses, so that the sign is chosen by its z.
+    up = wp.normalize(wp.cross(prism.b - prism.a, prism.c - prism.a))
+    prism.up = wp.where(up[2] < 0.0, -up, up)
+    return prism
+
+
+@wp.func
 def normal_of_face(prism: Prism, face: int) -> wp.vec3:
     """Return the outward normal of a face: three at the sides, then top and base."""
     if face == 4:
         return wp.vec3(0.0, 0.0, -1.0)
     if face == 3:
-        # The two triangles of a cell turn in opposite senses, so that the sign is chosen by its z.
-        up = wp.normalize(wp.cross(prism.b - prism.a, prism.c - prism.a))
-        return wp.where(up[2] < 0.0, -up, up)
-    # Sides are vertical: their normals are horizontal, and only the sign depends on the sense.
-    start = corner_of_prism(prism, face)
-    along = corner_of_prism(prism, (face + 1) % 3) - start
-    normal = wp.normalize(wp.vec3(along[1], -along[0], 0.0))
-    # The third corner is inside, so that an outward normal points away from it.
-    return wp.where(
-        wp.dot(normal, corner_of_prism(prism, (face + 2) % 3) - start) > 0.0, -normal, normal
-    )
+        return prism.up
+    return wp.where(face == 0, prism.side_a, wp.where(face == 1, prism.side_b, prism.side_c))
 
 
 @wp.func
@@ -206,8 +224,11 @@ def closest_on_face(prism: Prism, face: int, point: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def highest_face(prism: Prism, point: wp.vec3) -> Touch:
-    """Return how far a point is above the face of a prism that looks most towards it: no more than from the prism."""
+def touch_of_point(prism: Prism, point: wp.vec3, most: float) -> Touch:
+    """Return how far a point is from a prism, and the closest place of its surface.
+
+    Beyond a distance of `most` it is enough to know that: the search ends with a face that is so far below the point.
+    """
     # Inside of all faces, the face least deep is the way out.
     touch = Touch()
     touch.distance = -FAR
@@ -217,16 +238,9 @@ def highest_face(prism: Prism, point: wp.vec3) -> Touch:
         if height > touch.distance:
             touch.distance = height
             touch.normal = normal
-    # The foot of the perpendicular is on the face itself only for points inside.
+    # The foot of the perpendicular is on the face itself only for points inside; others continue below.
     touch.place = point - touch.distance * touch.normal
-    return touch
-
-
-@wp.func
-def touch_of_point(prism: Prism, point: wp.vec3) -> Touch:
-    """Return how far a point is from a prism, and the closest place of its surface."""
-    touch = highest_face(prism, point)
-    if touch.distance <= 0.0:
+    if touch.distance <= 0.0 or touch.distance >= most:
         return touch
     # The closest place of a convex shape is on a face that looks towards the point.
     axis = touch.normal
@@ -266,7 +280,7 @@ def gap_between(prism: Prism, core: Core) -> Gap:
     # Corners of the core against the prism; a step of 8 leaves one for a core that is a point.
     for corner in range(0, 8, core.corner_step):
         point = core.center + core.turn @ corner_of(corner, core.half)
-        touch = touch_of_point(prism, point)
+        touch = touch_of_point(prism, point, FAR)
         # A corner in the prism has no gap.
         gap = nearer(gap, wp.where(touch.distance > 0.0, touch.place, point), point)
     # Corners of the prism against the core, if it is more than an edge.
@@ -295,6 +309,34 @@ def column_of(turn: wp.mat33, column: int) -> wp.vec3:
 
 
 @wp.func
+def projected(normal: wp.vec3, corner: wp.vec3, base: float) -> wp.vec2:
+    """Return the least and the largest projection of a corner of a prism and of the point at the base below it."""
+    flat = normal[0] * corner[0] + normal[1] * corner[1]
+    top = flat + normal[2] * corner[2]
+    below = flat + normal[2] * base
+    return wp.vec2(wp.min(top, below), wp.max(top, below))
+
+
+@wp.func
+def wider(best: Touch, prism: Prism, core: Core, normal: wp.vec3, margin: float) -> Touch:
+    """Return a direction as the widest if prism and core are farther apart along it, by more than the margin."""
+    at_a = projected(normal, prism.a, prism.base)
+    at_b = projected(normal, prism.b, prism.base)
+    at_c = projected(normal, prism.c, prism.base)
+    low = wp.min(wp.min(at_a[0], at_b[0]), at_c[0])
+    high = wp.max(wp.max(at_a[1], at_b[1]), at_c[1])
+    middle = wp.dot(normal, core.center)
+    reach = wp.dot(wp.abs(wp.transpose(core.turn) @ normal), core.half)
+    # The signed distance in both senses of the axis.
+    above = middle - reach - high
+    below = low - middle - reach
+    if wp.max(above, below) > best.distance + margin:
+        best.distance = wp.max(above, below)
+        best.normal = wp.where(above >= below, normal, -normal)
+    return best
+
+
+@wp.func
 def widest_axis(prism: Prism, core: Core, enough: float) -> Touch:
     """Return the direction along which prism and core are the farthest apart, or the least deep in each other.
 
@@ -303,40 +345,27 @@ def widest_axis(prism: Prism, core: Core, enough: float) -> Touch:
     # The separating axis theorem: convex bodies are apart where the projections on one of the axes are.
     best = Touch()
     best.distance = -FAR
-    for axis in range(AXES):
-        normal = wp.vec3()
-        if axis < FACES:
-            normal = normal_of_face(prism, axis)
-        elif axis < FACE_AXES:
-            normal = column_of(core.turn, axis - FACES)
-        else:
-            # Cross products of each edge of the prism with each axis of the core.
-            edge = (axis - FACE_AXES) // 3
-            start, end = start_and_end(prism, edge)
-            normal = wp.cross(
-                wp.normalize(end - start), column_of(core.turn, (axis - FACE_AXES) % 3)
-            )
-        length = wp.length(normal)
-        # Parallel edges have no common normal, and the faces' normals cover them.
-        if length > PARALLEL:
-            normal = normal / length
-            # The projections of the prism, then of the core, on the axis.
-            low = float(FAR)
-            high = float(-FAR)
-            for corner in range(CORNERS):
-                along = wp.dot(normal, corner_of_prism(prism, corner))
-                low = wp.min(low, along)
-                high = wp.max(high, along)
-            middle = wp.dot(normal, core.center)
-            reach = wp.dot(wp.abs(wp.transpose(core.turn) @ normal), core.half)
-            # The signed distance in both senses of the axis.
-            above = middle - reach - high
-            below = low - middle - reach
-            # Between equal axes, a face's normal wins over the rounding of a cross product.
-            needed = best.distance + wp.where(axis < FACE_AXES, 0.0, NEARLY)
-            if wp.max(above, below) > needed:
-                best.distance = wp.max(above, below)
-                best.normal = wp.where(above >= below, normal, -normal)
+    for face in range(FACES):
+        best = wider(best, prism, core, normal_of_face(prism, face), 0.0)
+        if best.distance >= enough:
+            return best
+    # One edge alone has no faces.
+    if core.num_edges > 1:
+        for axis in range(3):
+            best = wider(best, prism, core, column_of(core.turn, axis), 0.0)
+            if best.distance >= enough:
+                return best
+    # Cross products of each edge of the prism with each edge of the core.
+    for edge in range(DIRECTIONS):
+        start, end = start_and_end(prism, edge)
+        along = wp.normalize(end - start)
+        for axis in range(core.first_axis, 3):
+            normal = wp.cross(along, column_of(core.turn, axis))
+            length = wp.length(normal)
+            # Parallel edges have no common normal, and the faces' normals cover them.
+            if length > PARALLEL:
+                # Between equal axes, a face's normal wins over the rounding of a cross product.
+                best = wider(best, prism, core, normal / length, NEARLY)
                 if best.distance >= enough:
                     return best
     return best
@@ -348,16 +377,13 @@ def touch_of_core(prism: Prism, core: Core, reach: float) -> Touch:
     touch = Touch()
     # A sphere is a point with a radius.
     if core.num_edges == 0:
-        touch.distance = FAR
-        # Most prisms below a geom are out of reach: their closest places are never computed.
-        if highest_face(prism, core.center).distance - core.radius >= reach:
-            return touch
-        touch = touch_of_point(prism, core.center)
+        touch = touch_of_point(prism, core.center, reach + core.radius)
         touch.distance = touch.distance - core.radius
         touch.place = touch.place + 0.5 * touch.distance * touch.normal
         return touch
     widest = widest_axis(prism, core, reach + core.radius)
     touch.distance = FAR
+    # Most prisms below a geom are out of reach: their closest places are never computed.
     if widest.distance - core.radius >= reach:
         return touch
     # Shapes that are in each other are drawn apart until they touch, which tells where.
