@@ -23,7 +23,7 @@ PAGE = Path(__file__).with_name("pad.html")
 # Bytes of a message; a page sends a few dozen.
 MOST_BYTES = 1024
 # Axes by number, as the page sends them; the panel knows which field each drives.
-AXES = ("0", "1", "2")
+AXES = ("0", "1", "2", "3")
 DOES = ("pause", "step", "reset", "push")
 
 

@@ -60,6 +60,10 @@ class Panel:
         if motion is not None:
             with gui.add_folder("Motion"):
                 self._scrubber = self._add_scrubber(motion.motion)
+        self._action: list[viser.GuiSliderHandle[float]] = []
+        if session.driver is not None:
+            with gui.add_folder("Action"):
+                self._add_action(session.driver.ranges)
         # Commands without ranges cannot be set by hand.
         steerable = {name: term for name, term in session.ours.cfg.commands.items() if term.ranges}
         if steerable:
@@ -100,8 +104,16 @@ class Panel:
     def drive(self, shares: Mapping[int, float]) -> None:
         """Set the fields of the first command to shares of their ranges: -1 is the low end, 0 rest, 1 the high end.
 
-        Rest is 0 where the range holds it, else its middle. From any thread.
+        Rest is 0 where the range holds it, else its middle. Where a person acts it is columns of the action instead.
+        From any thread.
         """
+        if self._action:
+            for number, share in shares.items():
+                if number < len(self._action):
+                    slider = self._action[number]
+                    slider.value = _at_share(share, float(slider.min), float(slider.max))
+            self._session.ask(self._act)
+            return
         # Only the first command: the loop returns in its first pass.
         for command, (by_hand, sliders) in self._steering.items():
             for number, share in shares.items():
@@ -150,6 +162,22 @@ class Panel:
             sliders[field] = gui.add_slider(prefix + field, low, max(high, low + step), step, rest)
             sliders[field].on_update(partial(self._moved, name))
         self._steering[name] = (by_hand, sliders)
+
+    def _add_action(self, ranges: Mapping[str, tuple[float, float]]) -> None:
+        for name, (low, high) in ranges.items():
+            step = max((high - low) / 100, 1e-3)
+            rest = _at_share(0.0, low, high)
+            slider = self._gui.add_slider(name, low, max(high, low + step), step, rest)
+            slider.on_update(self._acted)
+            self._action.append(slider)
+
+    def _acted(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:  # else moved by the program, which asks for itself
+            self._session.ask(self._act)
+
+    def _act(self) -> None:
+        values = {column: float(slider.value) for column, slider in enumerate(self._action)}
+        self._session.drive(values)
 
     def _moved(self, name: str, event: viser.GuiEvent) -> None:
         if event.client is None:  # moved by the program, which asks for itself

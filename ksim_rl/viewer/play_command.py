@@ -19,6 +19,7 @@ from ksim_rl.trainers import RunProgress, record_video
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.video import FPS
 from ksim_rl.viewer.drive_recorder import check_new, recording
+from ksim_rl.viewer.driven_agent import HAND
 from ksim_rl.viewer.played import Played, find, names_run
 from ksim_rl.viewer.session import AGENTS, Conditions, Session
 from ksim_rl.viewer.shown_motion import with_choice
@@ -126,7 +127,9 @@ def _parser() -> OneLineParser:
         "--viewer", choices=("browser", "native"), help="look and drive; native is MuJoCo's window"
     )
     parser.add_argument(
-        "--agent", choices=AGENTS, help="act without a policy: not at all, or at random"
+        "--agent",
+        choices=(*AGENTS, HAND),
+        help="act without a policy: not at all, at random, or by hand in the browser viewer",
     )
     parser.add_argument(
         "--motion",
@@ -179,6 +182,8 @@ def _check(options: argparse.Namespace) -> None:
     if options.num_envs is None:
         options.num_envs = 4 if options.record is None else 1
     check_count("--num-envs", options.num_envs)
+    if options.agent == HAND and options.viewer != "browser":
+        raise ValueError("--agent hand: actions are driven in the browser viewer: add --live")
     if options.record is not None:
         if options.viewer is None:
             raise ValueError("--record: of a viewer, in which one drives: add --live")

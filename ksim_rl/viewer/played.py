@@ -13,6 +13,7 @@ from ksim_rl.trainers import RunCfg, checkpoint
 from ksim_rl.trainers.other_physics import ENGINE, judged_by, trained_with
 from ksim_rl.trainers.run_cfg import check_run_tree
 from ksim_rl.trainers.run_folder import policy_of, without_nan_guard
+from ksim_rl.viewer.driven_agent import HAND, DrivenAgent
 from ksim_rl.viewer.session import UntrainedAgent, showing_motion
 from ksim_rl.viewer.shown_motion import following, place_of
 from ksim_rl.zoo import locate
@@ -30,6 +31,8 @@ class Played:
 
     def policy(self, env: EnvBase) -> TensorDictModuleBase:
         """Return the policy that acts in an env of `cfg`."""
+        if self.agent == HAND:
+            return DrivenAgent(env)
         if self.actor is None:
             return UntrainedAgent(self.agent, env)
         return self.actor
@@ -59,7 +62,8 @@ def find(
     if not is_run:
         if agent is None or not any(text.startswith("task=") for text in what):
             raise ValueError(
-                f"{first!r}: expected a run folder, or task=NAME with --agent zero or random, as it has no policy"
+                f"{first!r}: expected a run folder, or task=NAME with --agent zero or random, or hand, as it has no "
+                "policy"
             )
         return _without_policy(conf.compose([*what, f"device={device}"], learns=False), agent)
     changed = None
@@ -102,7 +106,9 @@ def _motion(what: Sequence[str], motion: str, *, device: str) -> Played:
 def _without_policy(cfg: RunCfg, agent: str) -> Played:
     return Played(
         cfg=without_nan_guard(cfg),
-        title=f"{cfg.task_name}, {agent} actions",
+        title=f"{cfg.task_name}, driven by hand"
+        if agent == HAND
+        else f"{cfg.task_name}, {agent} actions",
         folder=Path(),
         agent=agent,
     )

@@ -21,6 +21,7 @@ from ksim_rl.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from ksim_rl.envs.contract import part
 from ksim_rl.mdp.motion_tracking import with_motions_in_use
 from ksim_rl.transforms import ActionDelay, ObservationDelay, ObservationNoise
+from ksim_rl.viewer.driven_agent import DrivenAgent
 from ksim_rl.viewer.shown_motion import ShownMotion, shown_motion
 
 AGENTS = ("zero", "random")
@@ -153,6 +154,7 @@ class Session:
         self.listener: Callable[[TensorDictBase, bool], None] | None = None
         self._is_new = True  # no step since all envs were reset
         self._steered: dict[str, dict[str, float]] = {}
+        self._driven: dict[int, float] = {}
         self._sought: tuple[int, float] | None = None
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue(MOST_REQUESTS)
         self.refused = 0
@@ -318,6 +320,21 @@ class Session:
             # Kept, so that a rebuilt env is steered as this one is.
             self._steered[command] = dict(values)
 
+    @property
+    def driver(self) -> DrivenAgent | None:
+        """The agent whose actions a person drives; None where others act."""
+        if isinstance(self.agent, DrivenAgent):
+            return self.agent
+        return None
+
+    def drive(self, values: Mapping[int, float]) -> None:
+        """Hold columns of the action at values; an error where a policy acts."""
+        if self.driver is None:
+            raise ValueError('a policy acts: only the agent "hand" takes actions of a person')
+        # Kept, so that a rebuilt env is driven as this one is.
+        self._driven.update(values)
+        self.driver.drive(values)
+
     def change(self, conditions: Conditions) -> None:
         """Build the env again under other conditions, and start new episodes in it."""
         self.conditions = conditions
@@ -380,6 +397,8 @@ class Session:
         # The new env may have fewer rows.
         self.env_index = min(self.env_index, self.ours.num_envs - 1)
         self.agent = self._make_agent(self.env)
+        if self.driver is not None:
+            self.driver.drive(self._driven)
         self.built += 1
         # The same seed, so that two conditions are compared on the same starts.
         self.env.set_seed(self.seed)

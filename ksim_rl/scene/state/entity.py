@@ -48,7 +48,7 @@ class GroundScan(NearNames):
 
     @quantity
     def normal_E3(self) -> Float[Tensor, "E 3"]:
-        """The upward normal of the plane through the ground at the points, world frame; z where there is none."""
+        """The upward normal of the plane through the ground at the points, or z, world frame; position stage."""
         # In axes that turn with the root's yaw, where x and y of the points are constant.
         places_EN2 = torch.stack((self._x_N, self._y_N), dim=-1).expand(*self.below_EN.shape, 2)
         points_EN3 = torch.cat((places_EN2, -self.below_EN[..., None]), dim=-1)
