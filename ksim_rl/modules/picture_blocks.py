@@ -1,5 +1,7 @@
 """The first convolution of an encoder reads pictures in blocks of pixels: one copy of the bytes, and many channels."""
 
+from functools import partial
+
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
@@ -76,9 +78,19 @@ class BlockConvolution(nn.Conv2d):
         # [O, I, M, S, M, S]
         parts = self.weight.unflatten(3, (windows, self.block)).unflatten(2, (windows, self.block))
         weight_OIMM = parts.permute(0, 3, 5, 1, 2, 4).flatten(1, 3) * self.scale
-        return functional.conv2d(
-            blocks_BCHW, weight_OIMM, self.bias, stride=self.stride[0] // self.block
+        convolve = partial(
+            functional.conv2d,
+            weight=weight_OIMM,
+            bias=self.bias,
+            stride=self.stride[0] // self.block,
         )
+        # Bytes have become what autocast asks for. Within torch.func.vmap it is on and rounds no weights: a convolution
+        # of no pictures tells, for which next to nothing runs.
+        if blocks_BCHW.dtype != weight_OIMM.dtype:
+            none = convolve(blocks_BCHW[:0].to(weight_OIMM.dtype))
+            if none.dtype == weight_OIMM.dtype:
+                blocks_BCHW = blocks_BCHW.to(weight_OIMM.dtype)
+        return convolve(blocks_BCHW)
 
 
 def _block_size(kernel_size: int, stride: int) -> int:

@@ -132,6 +132,51 @@ def test_blocks_of_pixels_are_read_as_by_torchrls_network(kernel_size, stride):
     assert rounded.dtype == torch.bfloat16 and torch.equal(rounded.float(), exact)
 
 
+@pytest.mark.parametrize("over", ["pictures", "weights", "both"])
+def test_under_vmap_autocast_rounds_nothing_and_pictures_are_read_all_the_same(over):
+    """Within torch.func.vmap autocast leaves convolutions as they are, so that bytes have to become floats."""
+    torch.manual_seed(0)
+    encoder = Encoder(SMALL, picture_spec(H, W, 3))
+    pictures = torch.randint(256, (2, E, H, W, 3), dtype=torch.uint8)
+    weights = {name: torch.stack((own, own + 0.1)) for name, own in encoder.named_parameters()}
+
+    def call(own, seen):
+        return torch.func.functional_call(encoder, own, (seen,))
+
+    in_dims = {"pictures": (None, 0), "weights": (0, None), "both": (0, 0)}[over]
+    given = (
+        weights if in_dims[0] == 0 else dict(encoder.named_parameters()),
+        pictures if in_dims[1] == 0 else pictures[0],
+    )
+    expected = []
+    for place in range(2):
+        own = {name: value[place] for name, value in weights.items()}
+        expected.append(
+            call(
+                own if in_dims[0] == 0 else given[0],
+                pictures[place] if in_dims[1] == 0 else given[1],
+            )
+        )
+    with torch.autocast("cpu", torch.bfloat16):
+        found = torch.func.vmap(call, in_dims=in_dims)(*given)
+    torch.testing.assert_close(found, torch.stack(expected), atol=1e-5, rtol=1e-5)
+
+
+def test_gradients_of_a_function_are_rounded_as_those_of_a_backward_pass():
+    encoder = Encoder(SMALL, picture_spec(H, W, 3))
+    pictures = torch.randint(256, (E, H, W, 3), dtype=torch.uint8)
+    own = dict(encoder.named_parameters())
+    with torch.autocast("cpu", torch.bfloat16):
+        features = encoder(pictures)
+        assert features.dtype == torch.bfloat16
+        found = torch.func.grad(
+            lambda weights: torch.func.functional_call(encoder, weights, (pictures,)).float().sum()
+        )(own)
+    expected = torch.autograd.grad(features.float().sum(), list(own.values()))
+    for name, gradient in zip(own, expected, strict=True):
+        torch.testing.assert_close(found[name], gradient)
+
+
 def test_spatial_softmax_is_where_a_channel_is_brightest():
     # One pixel far above all others, of 5 rows and 3 columns; and a channel without any difference.
     channels_BCHW = torch.zeros(1, 3, 5, 3)
