@@ -21,7 +21,7 @@ from ksim_rl.modules.critic import (
     make_q_network,
 )
 from ksim_rl.modules.distributions import DiagonalGaussian, TanhGaussian, TruncatedGaussian
-from ksim_rl.modules.encoders import Encoder, EncoderCfg, SpatialSoftmax, picture_layouts
+from ksim_rl.modules.encoders import Encoder, EncoderCfg, SpatialSoftmax, picture_encoders
 from ksim_rl.modules.make_for_spec import make_for_spec
 from ksim_rl.modules.mlp import ACTIVATIONS, mlp
 from ksim_rl.modules.network import (

@@ -18,6 +18,7 @@ from ksim_rl.device.state_tree import DESCRIPTION
 from ksim_rl.modules.mlp import ACTIVATIONS, Device
 from ksim_rl.modules.picture_blocks import BlockConvolution, PictureBlocks
 from ksim_rl.transforms.pictures.layout import Layout, check_layout, framed
+from ksim_rl.transforms.specs import spell
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,11 +195,21 @@ class Encoder(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
-def picture_layouts(*networks: nn.Module) -> dict[NestedKey, Layout]:
-    """Return the observations that networks read through encoders, and in which order the dims of each stand."""
-    found: dict[NestedKey, Layout] = {}
+def picture_encoders(*networks: nn.Module) -> dict[NestedKey, Encoder]:
+    """Return the observations that networks read through encoders, and one of the encoders of each.
+
+    A ValueError if two of them read one observation by different layouts, as one would take rows for channels.
+    """
+    found: dict[NestedKey, Encoder] = {}
     for network in networks:
         for module in network.modules():
-            if isinstance(module, TensorDictModule) and isinstance(module.module, Encoder):
-                found[unravel_key(module.in_keys[0])] = module.module.layout
+            if not isinstance(module, TensorDictModule) or not isinstance(module.module, Encoder):
+                continue
+            key = unravel_key(module.in_keys[0])
+            other = found.setdefault(key, module.module)
+            if other.layout != module.module.layout:
+                raise ValueError(
+                    f"encoders.{spell(key)}.layout: one network reads it as {other.layout!r} and another one as "
+                    f"{module.module.layout!r}: give it the same layout in modules.actor and modules.critic"
+                )
     return found

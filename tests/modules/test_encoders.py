@@ -1,5 +1,7 @@
 """Encoders of pictures, against torch's own convolutions, closed forms and networks that are put together by hand."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -28,6 +30,7 @@ from ksim_rl.modules import (
     make_recurrent_actor,
     make_shared_trunk,
     make_squashed_actor,
+    picture_encoders,
     update_normalizers,
 )
 from ksim_rl.modules.network import ObservingNetwork
@@ -175,6 +178,20 @@ def test_gradients_of_a_function_are_rounded_as_those_of_a_backward_pass():
     expected = torch.autograd.grad(features.float().sum(), list(own.values()))
     for name, gradient in zip(own, expected, strict=True):
         torch.testing.assert_close(found[name], gradient)
+
+
+def test_one_picture_has_one_layout_for_all_networks():
+    spec = Composite(rgb=Unbounded((2, 9, 9, 9), dtype=torch.uint8))
+    networks = []
+    for layout in ("HWC", "HWC", "CHW"):
+        cfg = CriticCfg(
+            in_keys=("rgb",), encoders={"rgb": replace(SMALL, layout=layout)}, hidden_dims=(4,)
+        )
+        networks.append(make_for_spec(make_critic, cfg, spec))
+    found = picture_encoders(*networks[:2])
+    assert list(found) == ["rgb"] and found["rgb"].layout == "HWC"
+    with pytest.raises(ValueError, match="encoders.rgb.layout: .* 'HWC' and another one as 'CHW'"):
+        picture_encoders(*networks)
 
 
 def test_spatial_softmax_is_where_a_channel_is_brightest():

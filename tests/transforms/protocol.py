@@ -78,7 +78,7 @@ KINDS: dict[str, Callable[[LeafEnv], Transform]] = {
     "ObservationDelay": lambda env: ObservationDelay(env.key, delay=LATE),
     "ObservationDelay of two": lambda env: ObservationDelay([env.key, "again"], delay=LATE),
     "ObservationHold": lambda env: ObservationHold(env.key, every=2, fresh_key="fresh"),
-    "PictureEffects": lambda env: PictureEffects(env.key, effects={"shift": RandomShift()}),
+    "PictureEffects": lambda env: PictureEffects(env.key, effects={"shift": RandomShift(pixels=1)}),
     "ObservationHistory": lambda env: ObservationHistory(env.key, length=3),
     "ObservationHistory of two": lambda env: ObservationHistory([env.key, "again"], length=3),
     "ObservationHistory stacked": lambda env: ObservationHistory(env.key, length=3, flat=False),

@@ -24,7 +24,7 @@ from ksim_rl.device import state_tree
 from ksim_rl.device.capture import Captured
 from ksim_rl.device.compiling import compiled
 from ksim_rl.device.state_tree import State, branch
-from ksim_rl.modules import ExploringPolicy, picture_layouts, update_normalizers
+from ksim_rl.modules import ExploringPolicy, picture_encoders, update_normalizers
 from ksim_rl.objectives import (
     FlatAdamW,
     OffPolicyCfg,
@@ -103,12 +103,15 @@ class OffPolicyUpdate(RolloutUpdate):
             )
         self._shifted = None
         if cfg.random_shift:
-            layouts = picture_layouts(self.actor, self.critic)
+            encoders = picture_encoders(self.actor, self.critic)
             self._shifted = ShiftedPictures(
-                layouts,
+                {key: encoder.layout for key, encoder in encoders.items()},
                 pixels=cfg.random_shift,
                 minibatch=data.num_env_states_per_minibatch,
             )
+            # Before anything is collected.
+            for key, encoder in encoders.items():
+                self._shifted.check_shape(key, encoder.shape)
         self._read = fast(self._stored)
         self._count_ = fast(self._counted_)
         self._critic_loss = fast(loss.critic_loss)

@@ -64,6 +64,11 @@ class RandomShift(PictureEffect):
     def num_draws(self, shape: Sequence[int]) -> int:
         return 2
 
+    def new_shape(self, shape: Sequence[int]) -> tuple[int, ...]:
+        # By as many nothing would be left of the picture but its edge.
+        _check_size("pixels", self.pixels + 1, shape, given=self.pixels)
+        return tuple(shape)
+
     def __call__(self, pictures_ENHWC: Pictures, draws_EK: Draws) -> Changed:
         height, width = pictures_ENHWC.shape[2:4]
         offset_E2 = (draws_EK * (2 * self.pixels + 1)).long() - self.pixels
@@ -139,9 +144,17 @@ class Blur(Light):
 
     sigma: NonNegativeRange = (0.0, 1.0)
 
-    def __call__(self, pictures_ENHWC: Pictures, draws_EK: Draws) -> Changed:
+    @property
+    def _reach(self) -> int:
         # Three standard deviations hold 99.7 % of the light; the number of pixels must not depend on the draw.
-        reach = max(1, math.ceil(3 * self.sigma[1]))
+        return max(1, math.ceil(3 * self.sigma[1]))
+
+    def new_shape(self, shape: Sequence[int]) -> tuple[int, ...]:
+        _check_size("sigma", self._reach + 1, shape, given=self.sigma)
+        return tuple(shape)
+
+    def __call__(self, pictures_ENHWC: Pictures, draws_EK: Draws) -> Changed:
+        reach = self._reach
         offset_K = torch.arange(-reach, reach + 1, device=draws_EK.device)
         # A width of zero would divide zero by zero in the middle.
         sigma_E1 = _between(draws_EK, self.sigma).flatten(1).clamp(min=1e-3)
@@ -184,6 +197,10 @@ class CutOut(Light):
     def num_draws(self, shape: Sequence[int]) -> int:
         return 4
 
+    def new_shape(self, shape: Sequence[int]) -> tuple[int, ...]:
+        _check_size("pixels", self.pixels[1], shape, given=self.pixels)
+        return tuple(shape)
+
     def __call__(self, pictures_ENHWC: Pictures, draws_EK: Draws) -> Changed:
         inside = []
         for axis, size in enumerate(pictures_ENHWC.shape[2:4]):
@@ -215,6 +232,10 @@ class DepthHoles(PictureEffect):
 
     def num_draws(self, shape: Sequence[int]) -> int:
         return math.prod(self._blocks(shape))
+
+    def new_shape(self, shape: Sequence[int]) -> tuple[int, ...]:
+        _check_size("pixels", self.pixels, shape, given=self.pixels)
+        return tuple(shape)
 
     def new_ends(self, ends: Range, top: float) -> Range:
         return _with(ends, self.missing)
@@ -271,6 +292,16 @@ class DepthRange(PictureEffect):
         low, high = self.reach
         is_beyond = (pictures_ENHWC < low) | (pictures_ENHWC > high)
         return pictures_ENHWC.masked_fill(is_beyond, self.missing)
+
+
+def _check_size(field: str, needed: float, shape: Sequence[int], *, given: object) -> None:
+    """Refuse a field that needs more pixels than a side of pictures [N, H, W, C] has."""
+    height, width = shape[1:3]
+    if needed > min(height, width):
+        raise ValueError(
+            f"{field}={given}: it takes pictures of at least {math.ceil(needed)} pixels in height and width, and these "
+            f"have {height} x {width}: choose less"
+        )
 
 
 def top_of(pictures: Shaped[Tensor, "*pictures"]) -> float:
