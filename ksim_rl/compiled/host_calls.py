@@ -3,6 +3,7 @@
 Their answers would become constants of a recording. Code of libraries may read the host for its own purposes.
 """
 
+import cProfile
 import datetime
 import inspect
 import io
@@ -76,7 +77,12 @@ def host_calls(parts: Parts) -> Iterator[list[HostCall]]:
     try:
         yield tracer.found
     finally:
-        sys.setprofile(before)
+        # Up to Python 3.11 cProfile's own function is written in C: it is put back by its object alone.
+        if isinstance(before, cProfile.Profile):
+            sys.setprofile(None)
+            before.enable()
+        else:
+            sys.setprofile(before)
         tracer.end()
 
 

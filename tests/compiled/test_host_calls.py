@@ -1,5 +1,6 @@
 """What a step asks the host for is found, with who asks; what libraries ask for themselves is not."""
 
+import cProfile
 import os
 import random
 import sys
@@ -87,3 +88,17 @@ def test_the_profiler_of_before_is_there_afterwards():
         assert sys.getprofile() is profiler
     finally:
         sys.setprofile(None)
+
+
+def test_cprofile_goes_on_afterwards():
+    profile = cProfile.Profile()
+    profile.enable()
+    try:
+        with host_calls({}):
+            pass
+        helper()
+    finally:
+        profile.disable()
+    # Without the names of built-in functions, which stand for their code.
+    seen = {getattr(entry.code, "co_name", entry.code) for entry in profile.getstats()}
+    assert "helper" in seen
