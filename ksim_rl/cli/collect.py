@@ -9,6 +9,7 @@ from ksim_rl.checks import OneLineParser, check_count
 from ksim_rl.cli.errors import say
 from ksim_rl.cli.report import shown, shown_working
 from ksim_rl.data import check_lerobot, read_episodes, write_lerobot
+from ksim_rl.files.writing import check_place
 from ksim_rl.terminal import show
 from ksim_rl.trainers.collecting import CollectCfg, collect_episodes
 from ksim_rl.viewer.played import find
@@ -23,6 +24,7 @@ def collect(arguments: list[str]) -> int:
     """Run `ksim-rl collect <arguments>` and return its exit code."""
     options = _parser().parse_intermixed_args(arguments)
     check_count("--episodes", options.episodes)
+    check_place("--output", options.output, is_folder=True)
     if options.num_envs is None:
         num_envs = min(options.episodes, MOST_ENVS)
     else:

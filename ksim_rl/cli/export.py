@@ -8,6 +8,7 @@ from ksim_rl.checks import OneLineParser
 from ksim_rl.cli.errors import say
 from ksim_rl.export import export
 from ksim_rl.export.standalone.files import Json
+from ksim_rl.files.writing import check_place
 from ksim_rl.terminal import show
 from ksim_rl.zoo import locate, read_card
 
@@ -39,6 +40,7 @@ def run_export(arguments: Sequence[str]) -> int:
         "--no-noise", dest="noise", action="store_false", help="record without sensors' noise"
     )
     options: Any = parser.parse_args(arguments)
+    check_place("--output", options.output, is_folder=True)
     how = {"episodes": options.episodes, "seed": options.seed, "noise": options.noise}
     run = locate(options.run, note=say)
     folder = export(run, options.output, device=options.device, origin=_origin(options.run), **how)

@@ -15,7 +15,7 @@ from ksim_rl import envs
 from ksim_rl.checks import OneLineParser
 from ksim_rl.cli.report import shown, shown_working
 from ksim_rl.files.reading import MOST_MODEL_BYTES, read_bytes
-from ksim_rl.files.writing import write_whole
+from ksim_rl.files.writing import check_place, write_whole
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
@@ -50,6 +50,7 @@ def new_task(arguments: list[str]) -> int:
     parser.add_argument("--output", type=Path, help="the folder of the file; default: here")
     options = parser.parse_args(arguments)
     _check_name(options.name, options.name, field="NAME")
+    check_place("--output", options.output, is_folder=True)
     file = (options.output or Path()) / f"{options.name}.py"
     if file.exists():
         raise ValueError(f"{file}: exists already; choose another name, or a folder with --output")
@@ -85,6 +86,7 @@ def new_robot(arguments: list[str]) -> int:
         "--output", type=Path, help="the new folder; default: the package's name, here"
     )
     options = parser.parse_args(arguments)
+    check_place("--output", options.output, is_folder=True)
     name = options.name or robot_name(options.model)
     folder = options.output or Path(name)
     task = f"{name}_velocity_flat"

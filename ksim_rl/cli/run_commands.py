@@ -13,7 +13,7 @@ from ksim_rl.cli.report import run_and_report, shown_working, verdict
 from ksim_rl.cli.runs import print_table
 from ksim_rl.device.state_tree import branch, number
 from ksim_rl.envs.contract import part
-from ksim_rl.files.writing import check_links
+from ksim_rl.files.writing import check_links, check_place
 from ksim_rl.objectives import AMPCfg
 from ksim_rl.scene.robots import analyse
 from ksim_rl.scene.robots.analysis import TRIAL_S
@@ -266,6 +266,7 @@ def robot(arguments: list[str]) -> int:
         "--picture", type=Path, metavar="PNG", help="also draw the stance into this file"
     )
     options = parser.parse_args(arguments)
+    check_place("--picture", options.picture, is_folder=False)
     if options.picture is not None and options.picture.suffix != ".png":
         raise ValueError(f"--picture {options.picture}: expected a file that ends in .png")
     # Trials of several poses take seconds.

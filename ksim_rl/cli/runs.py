@@ -12,7 +12,7 @@ from rich.text import Text
 
 from ksim_rl.checks import OneLineParser
 from ksim_rl.cli.report import shown
-from ksim_rl.files.writing import whole_file
+from ksim_rl.files.writing import check_place, whole_file
 from ksim_rl.runs import comparison, listing
 from ksim_rl.terminal import printable, show
 
@@ -63,6 +63,7 @@ def compare(arguments: list[str]) -> int:
         raise ValueError(f"{options.runs[0]}: name at least two runs to compare")
     if options.output.suffix != ".png":
         raise ValueError(f"--output {options.output}: expected a file that ends in .png")
+    check_place("--output", options.output, is_folder=False)
     for folder in options.runs:
         if not (folder / listing.CONFIG).exists():
             # Not `find`: these folders were named, so a wrong name is an error.

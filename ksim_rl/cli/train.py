@@ -22,7 +22,7 @@ from ksim_rl.cli.report import run_and_report
 from ksim_rl.cli.upstream import parse_flags
 from ksim_rl.config import plugins
 from ksim_rl.data import ReplayCfg
-from ksim_rl.files.writing import check_links
+from ksim_rl.files.writing import check_links, check_place
 from ksim_rl.runs.run_lock import is_locked
 from ksim_rl.terminal import show
 from ksim_rl.trainers import RunCfg
@@ -107,6 +107,11 @@ def train(arguments: list[str]) -> int:
         overrides.append(f"hydra.job.config.override_dirname.exclude_keys=[{same}]")
     # Overrides come together: Hydra takes those after a flag for faults.
     options = [text for text in arguments if text not in flags.overrides]
+    for text in flags.overrides:
+        field, _, folder = text.partition("=")
+        # Hydra makes these folders itself; with references in them they are known to it alone.
+        if field in ("hydra.run.dir", "hydra.sweep.dir") and "${" not in folder:
+            check_place(field, Path(folder.strip("'\"")), is_folder=True)
     sys.argv = ["ksim-rl train", *options, *away, *overrides]
     try:
         job()

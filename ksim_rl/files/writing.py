@@ -37,6 +37,26 @@ def open_streams() -> None:
             setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
+def check_place(option: str, path: Path | None, *, is_folder: bool) -> None:
+    """Refuse a place in which no folder or no file can be made, before any work is done for it.
+
+    `option` is how the user has named it, such as "--output"; without a `path` nothing is checked. The ValueError names
+    the file that lies in the way.
+    """
+    if path is None:
+        return
+    if is_folder and path.exists() and not path.is_dir():
+        raise ValueError(f"{option} {path}: a file lies there: name a new folder")
+    if not is_folder and path.is_dir():
+        raise ValueError(f"{option} {path}: a folder lies there: name a new file")
+    for above in path.parents:
+        # A file has no `..` below it either, so that the first that is there decides.
+        if os.path.lexists(above):
+            if not above.is_dir():
+                raise ValueError(f"{option} {path}: {above} is a file: name a place in a folder")
+            return
+
+
 def check_own(path: Path) -> None:
     """Refuse a path at which something else lies than a file of this folder alone."""
     check_name(path)

@@ -9,7 +9,7 @@ import numpy as np
 from ksim_rl import envs
 from ksim_rl.checks import OneLineParser, check_choice, check_in_range
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-from ksim_rl.files.writing import make_folder, write_whole
+from ksim_rl.files.writing import check_place, make_folder, write_whole
 from ksim_rl.identification.actuator_nets import fit_nets
 from ksim_rl.identification.excitation import RATE, SECONDS, propose
 from ksim_rl.identification.fit import fit
@@ -48,6 +48,7 @@ def identify(arguments: Sequence[str]) -> int:
 
 
 def _propose(options: Any) -> int:
+    check_place("--output", options.output, is_folder=False)
     for name in ("robot", "task", "nets", "timestep"):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name}: it is of logs; --propose has the name of the robot itself")
@@ -68,6 +69,7 @@ def _propose(options: Any) -> int:
 
 
 def _find(options: Any) -> int:
+    check_place("--output", options.output, is_folder=False)
     robot = hold(options.robot, quat=options.base)
     # Everything that could be refused is, before minutes of work.
     cfg = None if options.task is None else envs.task(options.task).cfg()

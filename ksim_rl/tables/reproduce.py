@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from ksim_rl.checks import OneLineParser, check_in_range, near
+from ksim_rl.files.writing import check_place
 from ksim_rl.tables import report
 from ksim_rl.tables.levels import is_reached
 from ksim_rl.tables.lineage import depth_of
@@ -24,6 +25,8 @@ def reproduce(arguments: Sequence[str]) -> int:
     options = _parser().parse_args(arguments)
     began = time.monotonic()
     smoke = options.smoke
+    check_place("--output", options.output, is_folder=True)
+    check_place("--runs", options.runs, is_folder=True)
     table = load(options.table)
     seeds = [int(word) for word in options.seeds.split(",") if word]
     rows = {name: row for name, row in table.rows.items() if re.fullmatch(options.rows, name)}

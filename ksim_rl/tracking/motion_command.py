@@ -14,6 +14,7 @@ from ksim_rl.clips.motion_file import write_motion
 from ksim_rl.clips.retarget import read_retarget, retargeted
 from ksim_rl.clips.robot_csv import read_csv
 from ksim_rl.clips.tracking_file import read_tracking
+from ksim_rl.files.writing import check_place
 from ksim_rl.physics import load_spec
 from ksim_rl.scene.motions.motion_set import MIRRORED
 from ksim_rl.scene.names import match_names
@@ -47,7 +48,9 @@ def motion(arguments: Sequence[str]) -> int:
     """Convert one file, or write a folder of our own motions; a ValueError names a fault."""
     options = _parser().parse_args(arguments)
     if options.kind == "generate":
+        check_place("folder", options.folder, is_folder=True)
         return _generate(options.folder, options.only)
+    check_place("motion", options.motion, is_folder=False)
     if options.kind == "rollout":
         return _roll_out(options)
     model = model_of(options.robot)

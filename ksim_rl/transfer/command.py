@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ksim_rl.checks import OneLineParser, check_count, check_in_range
-from ksim_rl.files.writing import whole_folder
+from ksim_rl.files.writing import check_place, whole_folder
 from ksim_rl.terminal import show
 from ksim_rl.trainers import checkpoint
 from ksim_rl.trainers.run_cfg import check_run_tree
@@ -42,6 +42,7 @@ def card(arguments: Sequence[str]) -> int:
     )
     options: Any = parser.parse_args(arguments)
     check_count("--episodes", options.episodes)
+    check_place("--output", options.output, is_folder=True)
     check_in_range("--seconds", options.seconds, low=0.0, low_open=True)
     run = locate(options.run)
     how = {"episodes": options.episodes, "seconds": options.seconds, "note": show}

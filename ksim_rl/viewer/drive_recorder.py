@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 
 from ksim_rl.data import EpisodeRecorder, EpisodeWriter, leaves_of
-from ksim_rl.files.writing import write_whole
+from ksim_rl.files.writing import check_place, write_whole
 from ksim_rl.runs.listing import CONFIG
 from ksim_rl.runs.record import recorded
 from ksim_rl.trainers.recorders import env_state_keys, max_length_of, origin_of
@@ -20,7 +20,8 @@ MOST_EPISODES = 2**31
 
 
 def check_new(folder: Path) -> None:
-    """Refuse a folder that holds something, by a ValueError."""
+    """Refuse a folder that holds something, or is none, by a ValueError."""
+    check_place("--record", folder, is_folder=True)
     if folder.exists() and any(folder.iterdir()):
         raise ValueError(f"--record {folder}: it holds something: name a new folder")
 

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from ksim_rl.checks import OneLineParser, check_count, check_in_range
 from ksim_rl.device.kernel_loading import compile_notice
-from ksim_rl.files.writing import check_links
+from ksim_rl.files.writing import check_links, check_place
 from ksim_rl.trainers import RunProgress, record_video
 from ksim_rl.trainers.build import build_env
 from ksim_rl.trainers.video import FPS
@@ -198,6 +198,7 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError(
             f"--output {options.output}: expected a file that ends in {' or '.join(VIDEO_SUFFIXES)}"
         )
+    check_place("--output", options.output, is_folder=False)
     # A missing package, display or port is reported now, not after minutes of compiling.
     if options.viewer == "browser":
         check_viser()
