@@ -27,6 +27,8 @@ MOVED = {
     **{f"ksim_rl.tasks.{task}": "ksim_rl.tasks.control_suite" for task in _CONTROL_SUITE},
 }
 """Paths of 0.1 and where their classes are now, applied in turn; else a class is found by its package's exports."""
+MOVED_CLASSES = {"ksim_rl.tasks.planar.PoseDistance": "ksim_rl.mdp"}
+"""Classes that have left a module which is still there, by their earlier paths, and where they are now."""
 GONE = {("SimCfg", "deterministic")}
 """Fields that earlier versions wrote into configs, by their class, and that nothing needs any more."""
 
@@ -69,7 +71,7 @@ def find(
     names: list[str] = []
     declined: Any = None
     # The path as written, then the packages that may export the class now.
-    for candidate in _modules(module_name):
+    for candidate in _modules(module_name, class_name):
         try:
             module = importlib.import_module(candidate)
         except ModuleNotFoundError as error:
@@ -101,8 +103,8 @@ def find(
     raise ValueError(f"{where}: no {kind} {class_name!r} there: {near(class_name, names)}")
 
 
-def _modules(name: str) -> list[str]:
-    """Return the module of a path and, for ours, where its classes may have moved to: the packages above it."""
+def _modules(name: str, class_name: str) -> list[str]:
+    """Return the module of a class's path and, for ours, where it may have moved to: the packages above it."""
     if name.split(".")[0] != OWN:
         return [name]
     moved = name
@@ -110,6 +112,7 @@ def _modules(name: str) -> list[str]:
     for old, new in MOVED.items():
         if f"{moved}.".startswith(f"{old}."):
             moved = moved.replace(old, new, 1)
+    moved = MOVED_CLASSES.get(f"{moved}.{class_name}", moved)
     # Longest first, so that a module counts before the packages above it.
     parts = moved.split(".")
     candidates = [name]

@@ -17,7 +17,7 @@ from torch import Tensor
 from ksim_rl.checked import Positive, Within, named_files
 from ksim_rl.checks import near
 from ksim_rl.envs.manager_based_rl_env_cfg import ManagerBasedRlEnvCfg
-from ksim_rl.envs.term import EventTerm, ObservationTerm, Term, TerminationTerm
+from ksim_rl.envs.term import EventTerm, MetricTerm, ObservationTerm, Term, TerminationTerm
 from ksim_rl.envs.view import EnvView
 from ksim_rl.mdp.constants import constant
 from ksim_rl.mdp.fields import GaussianReward, OfJoints
@@ -297,3 +297,18 @@ def with_motions_in_use(cfg: ManagerBasedRlEnvCfg) -> ManagerBasedRlEnvCfg:
     named = named_files(cfg)
     motions = {name: chosen for name, chosen in cfg.scene.motions.items() if name in named}
     return dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, motions=motions))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseDistance(OfMotion, MetricTerm):
+    """The root mean square of the joint angles' distance to the nearest pose of a motion, rad, [E]; position stage."""
+
+    joints: Patterns
+
+    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
+        joints = view.joints(self.joints)
+        # All frames of the motion, in the order of the joints.
+        poses_FL = view.motion(self.file).joint_pos_FL[:, joints.index]
+        own_EL = joints.pos_EL
+        # Root mean square over joints, at the nearest frame.
+        return torch.cdist(own_EL, poses_FL).amin(-1) / own_EL.shape[-1] ** 0.5

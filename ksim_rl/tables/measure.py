@@ -22,6 +22,7 @@ from ksim_rl import conf
 from ksim_rl.checks import check_in_range, naming
 from ksim_rl.config import plugins
 from ksim_rl.config.child_processes import go_to_parents_folder
+from ksim_rl.config.class_paths import MOVED_CLASSES
 from ksim_rl.config.trees import Tree
 from ksim_rl.device.kernel_loading import compile_notice
 from ksim_rl.envs.contract import EpisodeSums, part
@@ -195,6 +196,10 @@ def settings(row: Row, cfg: RunCfg, *, sources: Sequence[str] = ()) -> str:
         tree["row"]["sources"] = list(sources)
     # Later fields with values that change nothing must not make older results invalid.
     text = LATER.sub("", json.dumps(tree, sort_keys=True, default=str))
+    # Neither must paths that classes have had since the first tables.
+    for earlier, package in MOVED_CLASSES.items():
+        now = f"{package}.{earlier.rpartition('.')[2]}"
+        text = text.replace(f'"{now}"', f'"{earlier}"')
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -24,7 +23,6 @@ from ksim_rl.mdp.rewards.tracking import tolerance
 from ksim_rl.modules import ActorCfg, CriticCfg
 from ksim_rl.objectives import AMPCfg, PPOCfg
 from ksim_rl.physics import SimCfg
-from ksim_rl.scene.names import Patterns
 from ksim_rl.scene.robots.control_models import WALKER_SERVOS, Cheetah, Hopper, Walker
 from ksim_rl.scene.scene import SceneCfg
 from ksim_rl.scene.terrains import PlaneTerrain
@@ -282,21 +280,6 @@ class WalkAt(RewardTerm):
         return tolerance(forward_speed(view), low=low, high=high, margin=self.speed)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PoseDistance(mdp.OfMotion, MetricTerm):
-    """The root mean square of the joint angles' distance to the nearest pose of a motion, rad, [E]; position stage."""
-
-    joints: Patterns
-
-    def __call__(self, view: EnvView) -> Float[Tensor, " E"]:
-        joints = view.joints(self.joints)
-        # All frames of the motion, in the order of the joints.
-        poses_FL = view.motion(self.file).joint_pos_FL[:, joints.index]
-        own_EL = joints.pos_EL
-        # Root mean square over joints, at the nearest frame.
-        return torch.cdist(own_EL, poses_FL).amin(-1) / own_EL.shape[-1] ** 0.5
-
-
 def _motion_cfg(
     terms: Mapping[str, ObservationTermCfg],
     groups: Sequence[str] = ("actor", "critic"),
@@ -328,7 +311,7 @@ def walker_amp() -> ManagerBasedRlEnvCfg:
         terminations={"time_out": mdp.TimeOut(), "fallen": mdp.RootHeightBelow(minimum_height=0.8)},
         metrics={
             "forward_speed": ForwardSpeed(),
-            "pose_distance": PoseDistance(file=MOTION, joints=Walker.joints),
+            "pose_distance": mdp.PoseDistance(file=MOTION, joints=Walker.joints),
         },
         # One per step at most, as in the other planar tasks.
         scale_rewards_by_dt=False,

@@ -16,7 +16,6 @@ from ksim_rl.modules import ActorCfg
 from ksim_rl.objectives import AMPCfg
 from ksim_rl.scene.motions.motion_set import MotionSet
 from ksim_rl.tasks import velocity, velocity_training
-from ksim_rl.tasks.planar import PoseDistance
 from ksim_rl.tasks.velocity_flat import g1_velocity_flat
 from ksim_rl.tracking.tasks import ANCHOR, ENDS, ROBOT, SET
 from ksim_rl.tracking.terms import BodiesFromAnchor
@@ -71,7 +70,10 @@ def g1_style() -> ManagerBasedRlEnvCfg:
         observations={**cfg.observations, "style": style()},
         events={"start": mdp.ResetToMotion(file=SET), **events},
         rewards={name: cfg.rewards[name] for name in COMMANDED},
-        metrics={**cfg.metrics, "pose_distance": PoseDistance(file=SET, joints=ROBOT.joint_names)},
+        metrics={
+            **cfg.metrics,
+            "pose_distance": mdp.PoseDistance(file=SET, joints=ROBOT.joint_names),
+        },
     )
 
 

@@ -1,6 +1,7 @@
 """Paths of classes in configs: public ones now, and those that 0.1 wrote."""
 
 import dataclasses
+import importlib
 import json
 from pathlib import Path
 
@@ -48,6 +49,26 @@ def test_each_path_that_0_1_wrote_leads_to_its_class(target):
         )
         is found
     )
+
+
+@pytest.mark.parametrize("target", sorted(class_paths.MOVED_CLASSES))
+def test_a_class_that_has_left_its_module_is_found_by_its_earlier_path(target):
+    """Configs of runs and of checkpoints keep the path with which they were written."""
+    found = class_paths.find(target, "x", kind="class", accepts=lambda value: True)
+    package = class_paths.MOVED_CLASSES[target]
+    name = target.rpartition(".")[2]
+    assert class_paths.public_path(found) == f"{package}.{name}"
+    # The module is there, and has it no more, so that nothing else finds it.
+    assert not hasattr(importlib.import_module(target.rpartition(".")[0]), name)
+
+
+def test_a_stored_task_that_names_an_earlier_path_builds_the_same_task():
+    cfg = envs.task("walker_amp").cfg()
+    tree = to_tree(cfg, ManagerBasedRlEnvCfg)
+    now = tree["metrics"]["pose_distance"]["_target_"]
+    assert now == "ksim_rl.mdp.PoseDistance"
+    tree["metrics"]["pose_distance"]["_target_"] = "ksim_rl.tasks.planar.PoseDistance"
+    assert from_tree(ManagerBasedRlEnvCfg, tree) == cfg
 
 
 @pytest.mark.parametrize("name", sorted(RUNS))

@@ -152,3 +152,21 @@ def test_settings_out_of_range_are_refused():
         mdp.MotionPhase(file=CLIP, cycle_s=-1.0)
     with pytest.raises(ValueError, match=r"distance=0\.0"):
         mdp.FarFromMotion(file=CLIP, bodies="torso", distance=0.0)
+
+
+def test_the_distance_of_a_pose_is_to_the_nearest_frame_of_the_whole_motion(bench):
+    at(bench, 0.0, 1.24, 3.33, 7.9)
+    mj_model = bench.world.mj_model
+    legs = bench.view.joints(LEGS).names
+    places = [int(mj_model.joint(name).qposadr[0]) for name in legs]
+    bench.world.qpos_EL[:, places[0]] += 0.4
+    bench.world.refresh()
+    bench.driver.refreshed()
+    frames_FL = np.load(motion_path(CLIP))["qpos"][:, places]
+    expected = []
+    for qpos_L in bench.world.qpos_EL.double().numpy():
+        errors_FL = frames_FL - qpos_L[places]
+        expected.append(np.sqrt((errors_FL**2).mean(1)).min())
+    found = read(bench, mdp.PoseDistance(file=CLIP, joints=LEGS))
+    assert min(expected) > 0.02
+    torch.testing.assert_close(found, torch.tensor(expected).float(), atol=1e-4, rtol=0.0)
