@@ -86,10 +86,12 @@ def feasibility(
     *,
     figure: Figure,
     planted_FN: Bool[Array, "F N"] | None = None,
+    level_FN: Float[Array, "F N"] | None = None,
 ) -> Feasibility:
     """Return the demands of a motion of a robot that is alone in its model.
 
-    `planted_FN` says which of the feet stand; None: those whose soles are low and slow.
+    `planted_FN` says which of the feet stand; None: those whose soles are low and slow. `level_FN` says on what height
+    they stand, m; None: on the ground.
     """
     soles_FN3, heading_FN = _soles(mj_model, qpos_FL, figure)
     speed_FN = np.linalg.norm(np.gradient(soles_FN3, 1.0 / fps, axis=0), axis=-1)
@@ -97,7 +99,9 @@ def feasibility(
     standing_FN = is_low_FN & (speed_FN < STANDING_SPEED)
     if planted_FN is not None:
         standing_FN = planted_FN
-    asked = demand(mj_model, qpos_FL, fps, feet=figure.feet, planted_FN=standing_FN)
+    asked = demand(
+        mj_model, qpos_FL, fps, feet=figure.feet, planted_FN=standing_FN, level_FN=level_FN
+    )
     weight = float(mj_model.body_subtreemass[1]) * GRAVITY
     push_F = asked.force_F3[:, 2]
     aside_F = np.linalg.norm(asked.force_F3[:, :2], axis=-1)

@@ -29,6 +29,7 @@ class FootMove(Checked):
     Attributes:
         foot: 0 or 1, the place among `Figure.feet`.
         to: x, y (m) and heading (rad) of the middle of the sole.
+        up: height of that place above the ground, m, such as the top of a box.
         lift, forward, pitch: added on the way: m up, m along the foot's heading, rad by which the toes point
             down; keys at seconds since `begin_s`, zero at both ends.
     """
@@ -37,6 +38,7 @@ class FootMove(Checked):
     begin_s: float
     end_s: float
     to: tuple[float, float, float]
+    up: float = 0.0
     lift: Keys = ()
     forward: Keys = ()
     pitch: Keys = ()
@@ -109,7 +111,10 @@ def smoothed(value_FN: Float[Array, "F N"], frames: float) -> Float[Array, "F N"
 def foot_paths(
     plan: Choreography, time_F: Float[Array, " F"]
 ) -> tuple[Float[Array, "F N 5"], Bool[Array, "F N"]]:
-    """Return x, y, height, heading and pitch of both feet, m and rad, and when they stand."""
+    """Return x, y, height, heading and pitch of both feet, m and rad, and when they stand.
+
+    Heights are of soles above the ground: a foot that stands on a box is as high as the box.
+    """
     # Last dim: x, y, height, heading, pitch.
     paths_FN5 = np.zeros((len(time_F), 2, 5))
     planted_FN = np.ones((len(time_F), 2), bool)
@@ -119,8 +124,9 @@ def foot_paths(
         # In the order of time, as each move starts where the one before has ended.
         moves = [move for move in plan.moves if move.foot == foot]
         for move in sorted(moves, key=lambda move: move.begin_s):
-            from_3 = paths_FN5[-1, foot, [0, 1, 3]]
-            for column, start, end in zip((0, 1, 3), from_3, move.to, strict=True):
+            from_4 = paths_FN5[-1, foot, :4]
+            x, y, heading = move.to
+            for column, start, end in zip(range(4), from_4, (x, y, move.up, heading), strict=True):
                 # Before the move the path so far; after it `eased` holds the place.
                 paths_FN5[:, foot, column] = np.where(
                     time_F < move.begin_s,
@@ -231,8 +237,12 @@ def perform(
     middle_F1 = paths_FN5[:, :, 3].mean(1, keepdims=True)
     heading_F = smoothed(middle_F1, 0.1 * fps)[:, 0]
     solver = InverseKinematics(mj_model)
+    # The height of what is stood on, without jumps.
+    level_FN = paths_FN5[:, :, 2]
+    standing_F = np.where(planted_FN, level_FN, 0.0).sum(1) / np.maximum(planted_FN.sum(1), 1)
+    level_F = smoothed(standing_F[:, None], 0.1 * fps)[:, 0]
     # A first guess of the centre of mass: somewhat below the root. It is replaced by the true one.
-    height_F = root_F - 0.09
+    height_F = root_F - 0.09 - level_F
     aim_F2 = zmp_F2.copy()
     qpos_FL = posture_FL
     asked = None
@@ -242,8 +252,15 @@ def perform(
         qpos_FL = _solved(
             solver, figure, paths_FN5, com_F2, root_F, lean_F, heading_F, posture_FL, weight_M
         )
-        asked = demand(mj_model, qpos_FL, fps, feet=figure.feet, planted_FN=planted_FN)
-        height_F = asked.com_F3[:, 2]
+        asked = demand(
+            mj_model,
+            qpos_FL,
+            fps,
+            feet=figure.feet,
+            planted_FN=planted_FN,
+            level_FN=level_FN,
+        )
+        height_F = asked.com_F3[:, 2] - level_F
         # Move the aim against the error, blurred as frames next to each other disagree.
         aim_F2 = aim_F2 + smoothed(zmp_F2 - asked.zmp_F2, 1.0)
     assert asked is not None

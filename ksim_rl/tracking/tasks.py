@@ -8,6 +8,7 @@ with a quarter of the weight; and half of the starts are spread evenly.
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 
 from ksim_rl import mdp
@@ -19,11 +20,13 @@ from ksim_rl.modules import ActorCfg
 from ksim_rl.objectives import PPOCfg
 from ksim_rl.scene.motions.motion_set import MotionSet
 from ksim_rl.scene.robots.unitree_g1 import SIDES, UnitreeG1
+from ksim_rl.scene.terrains import PlaneWithBoxes
 from ksim_rl.scene.viewer_cfg import ViewerCfg
 from ksim_rl.tasks import velocity, velocity_training
 from ksim_rl.tasks.velocity import noisy
 from ksim_rl.tracking import terms
 from ksim_rl.tracking.assistance import AssistRoot, assisted
+from ksim_rl.tracking.g1_boxes import BOX_CLIPS
 from ksim_rl.tracking.starts import FailedParts, StartInMotion
 from ksim_rl.trainers import ModulesCfg, TrainerCfg, TrainingCfg
 from ksim_rl.transforms.groups.group_cfg import ObservationGroupCfg, ObservationTermCfg
@@ -179,6 +182,13 @@ def track_cfg(file: str) -> ManagerBasedRlEnvCfg:
     )
 
 
+def on_box_cfg(name: str) -> ManagerBasedRlEnvCfg:
+    """Return the config of following a motion of `BOX_CLIPS`, in a scene that has its box."""
+    cfg = track_cfg(name)
+    ground = PlaneWithBoxes(boxes=(BOX_CLIPS[name].box,))
+    return dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, terrain=ground))
+
+
 def assisted_cfg() -> ManagerBasedRlEnvCfg:
     """Return the config of `g1_track` with help at the pelvis, of 60 % of the weight at most, that is withdrawn.
 
@@ -235,11 +245,11 @@ def training() -> TrainingCfg:
     )
 
 
-def _task(clip: str, what: str) -> Task:
+def _task(clip: str, what: str, cfg: Callable[[str], ManagerBasedRlEnvCfg] = track_cfg) -> Task:
     return Task(
         name=f"g1_track_{clip}",
         description=f"Unitree G1 follows {what} with its whole body",
-        cfg=partial(track_cfg, f"g1_{clip}"),
+        cfg=partial(cfg, f"g1_{clip}"),
         training=training(),
         other_trainings=(velocity_training.fast_sac_training(symmetry="none"),),
     )
@@ -262,5 +272,7 @@ TASKS = (
     _task("squat", "squats"),
     _task("turn", "a turn on the spot"),
     _task("kick", "kicks on one leg"),
+    _task("step", "steps onto a box and back down", on_box_cfg),
+    _task("sit", "sitting down on a seat and rising", on_box_cfg),
 )
 """The tasks, for the registry."""

@@ -23,6 +23,8 @@ def test_there_is_a_motion_for_each_task_that_fits_into_an_episode():
         "g1_track_squat",
         "g1_track_turn",
         "g1_track_kick",
+        "g1_track_step",
+        "g1_track_sit",
     ]
     for task in SINGLE:
         cfg = task.cfg()

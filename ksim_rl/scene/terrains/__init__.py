@@ -22,6 +22,6 @@ from ksim_rl.scene.terrains.kinds import (
     Waves,
 )
 from ksim_rl.scene.terrains.patch import Lattice, TerrainPatch
-from ksim_rl.scene.terrains.terrain import PlaneTerrain, Terrain
+from ksim_rl.scene.terrains.terrain import GroundBox, PlaneTerrain, PlaneWithBoxes, Terrain
 
 __all__ = sorted(name for name, value in vars().items() if isinstance(value, type))  # pyright: ignore

@@ -3,10 +3,14 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import mujoco
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from ksim_rl.checked import Checked, NonNegative
+from ksim_rl.checked import Checked, Filled, NonNegative, Positive
 from ksim_rl.scene.state.ground import Ground
 from ksim_rl.scene.state.world_view import WorldView
 
@@ -72,7 +76,7 @@ def add_ground(
 
 @dataclass(frozen=True, kw_only=True)
 class Terrain(Checked, ABC):
-    """The ground of a scene: one static body with one geom, both called "terrain"."""
+    """The ground of a scene: one static body and its geom, both called "terrain"."""
 
     @property
     def per_world_fields(self) -> tuple[str, ...]:
@@ -100,3 +104,65 @@ class PlaneTerrain(Terrain):
         add_ground(
             spec, friction=self.friction, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.01]
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundBox(Checked):
+    """A box on the ground: x and y of its middle, and its edges along x, y and z, m."""
+
+    pos: tuple[float, float] = (0.0, 0.0)
+    size: tuple[Positive, Positive, Positive]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneWithBoxes(PlaneTerrain):
+    """An infinite plane at z = 0 with boxes on it, the same in all worlds: steps, or seats.
+
+    The boxes are geoms "terrain_box0", "terrain_box1", ... of the body "terrain". What terms read as the ground's
+    height is the top of the highest box at that place.
+    """
+
+    boxes: Annotated[tuple[GroundBox, ...], Filled("name a box, or take PlaneTerrain")]
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        super().add_to(spec)
+        for number, box in enumerate(self.boxes):
+            half = [edge / 2 for edge in box.size]
+            spec.body(BODY).add_geom(
+                name=f"{BODY}_box{number}",
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=[*box.pos, half[2]],
+                size=half,
+                friction=list(self.friction),
+                # As the plane, which has none: sums over the whole model are then of what moves.
+                mass=0.0,
+                contype=1,
+                conaffinity=1,
+                condim=3,
+                rgba=[0.55, 0.5, 0.45, 1.0],
+            )
+
+    def ground(self, view: WorldView) -> Ground:
+        """Return the ground of the worlds of `view`: 0, and on a box its top."""
+        return BoxedGround(view.num_envs, view.device, self.boxes)
+
+
+class BoxedGround(Ground):
+    """The ground of a plane with boxes."""
+
+    is_flat = False
+
+    def __init__(self, num_envs: int, device: torch.device, boxes: Sequence[GroundBox]) -> None:
+        super().__init__(num_envs, device)
+        self._boxes = tuple(boxes)
+
+    def heights(self, points_EN2: Float[Tensor, "E N 2"]) -> Float[Tensor, "E N"]:
+        """Return the height of the ground at x, y (world frame, m), m."""
+        x_EN, y_EN = points_EN2.unbind(-1)
+        height_EN = torch.zeros_like(x_EN)
+        for box in self._boxes:
+            on_x_EN = (x_EN - box.pos[0]).abs() <= box.size[0] / 2
+            on_y_EN = (y_EN - box.pos[1]).abs() <= box.size[1] / 2
+            top_EN = torch.where(on_x_EN & on_y_EN, box.size[2], 0.0)
+            height_EN = torch.maximum(height_EN, top_EN)
+        return height_EN
