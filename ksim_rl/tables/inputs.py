@@ -124,38 +124,28 @@ def hashes_of(files: Iterable[ReadFile]) -> dict[str, str]:
     return {file.name: file.sha256() for file in files}
 
 
-@dataclass(frozen=True, kw_only=True)
 class FilesHere:
-    """The files that a row reads and that are on this machine.
+    """The files that a row reads, as they are on this machine: each is hashed once, where it is asked for."""
 
-    Attributes:
-        hashes: by name.
-        reads_own: whether the row reads files of the user's own, here or elsewhere.
-    """
-
-    hashes: Mapping[str, str]
-    reads_own: bool
-
-    @classmethod
-    def of(cls, files: Iterable[ReadFile]) -> "FilesHere":
-        """Read them; files that cannot be read are left out."""
-        hashes = {}
-        reads_own = False
-        for file in files:
-            reads_own = reads_own or file.is_own
-            with suppress(ValueError, OSError):
-                hashes[file.name] = file.sha256()
-        return cls(hashes=hashes, reads_own=reads_own)
+    def __init__(self, files: Iterable[ReadFile]) -> None:
+        self._files = tuple(files)
+        self._hashes: dict[str, str] | None = None
 
     def fit(self, recorded: Mapping[str, str] | None) -> bool:
         """Return whether these are the files that a result has `recorded`.
 
-        Files that are not here are taken for unchanged. A result of before there were records counts where its row
-        reads no files of the user's own.
+        Files that cannot be read here are taken for unchanged. A result of before there were records counts where its
+        row reads no files of the user's own.
         """
         if recorded is None:
-            return not self.reads_own
-        return all(recorded.get(name) == sha256 for name, sha256 in self.hashes.items())
+            return not any(file.is_own for file in self._files)
+        # Only now: models of the menagerie may have to be downloaded.
+        if self._hashes is None:
+            self._hashes = {}
+            for file in self._files:
+                with suppress(ValueError, OSError):
+                    self._hashes[file.name] = file.sha256()
+        return all(recorded.get(name) == sha256 for name, sha256 in self._hashes.items())
 
 
 def _sha256_of_folder(folder: Path) -> str:

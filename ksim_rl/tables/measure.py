@@ -173,7 +173,7 @@ class RowCfgs:
             return False
         # Hashed once: large models take a second.
         if name not in self._files:
-            self._files[name] = FilesHere.of(self.read_by(name))
+            self._files[name] = FilesHere(self.read_by(name))
         return self._files[name].fit(result.get("files"))
 
 

@@ -21,6 +21,7 @@ from ksim_rl.config.trees import Plain
 from ksim_rl.files.reading import MOST_TEXT_BYTES, read_bytes
 from ksim_rl.files.writing import check_links, whole_folder, write_whole
 from ksim_rl.physics.model_files.packing import ModelFiles, files_of_model
+from ksim_rl.physics.model_files.source import is_xml
 from ksim_rl.scene.motions.contents import sha256_of
 from ksim_rl.scene.motions.motion import motion_path
 from ksim_rl.scene.motions.motion_set import MotionSet
@@ -98,8 +99,9 @@ class ReadFile:
 def files_read(cfg: RunCfg) -> Iterator[ReadFile]:
     """Yield the models and the files of data that a config reads."""
     for name, source in _sources(cfg):
-        is_own = Path(source).expanduser().is_file()
-        yield ReadFile(name=name, is_own=is_own, sha256=partial(_sha256_of_model, source))
+        yield ReadFile(
+            name=name, is_own=_is_own_model(source), sha256=partial(_sha256_of_model, source)
+        )
     for data in _data(cfg):
         yield ReadFile(name=data.name, is_own=data.is_own, sha256=data.sha256)
 
@@ -301,6 +303,13 @@ def _sha256_of_model(source: str) -> str:
     if files is None:
         return hashlib.sha256(source.encode()).hexdigest()
     return files.sha256()
+
+
+def _is_own_model(source: str) -> bool:
+    """Return whether a model is a file, and no text and no name of the menagerie, which has no suffix."""
+    if is_xml(source):
+        return False
+    return Path(source).suffix != "" or os.path.exists(os.path.expanduser(source))
 
 
 def _is_own(source: str) -> bool:

@@ -1,6 +1,7 @@
 """A run goes on with the models that it began with: in other folders, after edits, and never in silence."""
 
 import dataclasses
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -16,7 +17,12 @@ from ksim_rl.scene.actuators import MLPActuator
 from ksim_rl.scene.motions import MotionSet
 from ksim_rl.scene.scene import MjcfRobot
 from ksim_rl.trainers import RunCfg, kept_models
-from ksim_rl.trainers.kept_models import keep_models, read_record, with_kept_models
+from ksim_rl.trainers.kept_models import (
+    files_read,
+    keep_models,
+    read_record,
+    with_kept_models,
+)
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 ROBOT = """
@@ -300,3 +306,36 @@ def test_files_of_data_that_have_changed_are_told(kind, run, tmp_path):
     assert said == [
         f"{where}: {file} has changed since the run began: its policy may not fit any more"
     ]
+
+
+def read_by(source: str | Path) -> tuple[bool, str]:
+    """Return whether the model of a config is the user's own, and its hash."""
+    (file,) = files_read(cfg_of(source))
+    assert file.name == "robots/cart"
+    return file.is_own, file.sha256()
+
+
+@pytest.mark.parametrize("part", ["robot/cart.xml", "robot/parts/asset.xml", "meshes/cart.obj"])
+def test_a_table_knows_a_model_by_all_of_its_files(robot, part):
+    is_own, before = read_by(robot)
+    assert is_own
+    # Wherever it lies.
+    assert read_by(robot.absolute()) == (True, before)
+    text = Path(part).read_text()
+    Path(part).write_text(f"{text} ")
+    assert read_by(robot)[1] != before
+    Path(part).write_text(text)
+    assert read_by(robot)[1] == before
+
+
+def test_a_model_that_is_text_is_no_file_of_ones_own(robot):
+    long = ROBOT.replace('<include file="parts/asset.xml"/>', f"<!-- {300 * 'long '} -->")
+    is_own, sha256 = read_by(long)
+    assert not is_own
+    assert sha256 == hashlib.sha256(long.encode()).hexdigest()
+    (missing,) = files_read(cfg_of("robot/none.xml"))
+    assert missing.is_own
+    with pytest.raises(ValueError, match="no such file"):
+        missing.sha256()
+    (named,) = files_read(cfg_of("unitree_go1"))
+    assert not named.is_own
