@@ -15,6 +15,7 @@ from ksim_rl.runs.record import read as read_sessions
 from ksim_rl.tables.levels import Result
 from ksim_rl.tables.lineage import overrides_of, run_of, sources_of
 from ksim_rl.tables.table import Row
+from ksim_rl.terminal import printable
 from ksim_rl.trainers import RunCfg
 from ksim_rl.trainers.checkpoint import MANIFEST, CheckpointError, load_latest
 from ksim_rl.trainers.kept_models import ReadFile
@@ -60,11 +61,18 @@ class Sources:
 
     def finished(self, name: str, seed: int) -> Result | str:
         """Return what the finished run of a row says of itself, or why there is none that others may learn from."""
+        try:
+            return self._finished(name, seed)
+        # Of a stranger's file.
+        except ValueError as error:
+            return f"{error}; {self._fix(name, seed)}"
+
+    def _finished(self, name: str, seed: int) -> Result | str:
         folder = run_of(self.runs, name, seed)
         path = folder / FINISHED
         if not path.exists():
             return f"{folder} is no finished run of it with seed {seed}; {self._fix(name, seed)}"
-        finished = json.loads(read_bytes(path, limit=MOST_TEXT_BYTES))
+        finished = _facts(path)
         sessions = read_sessions(folder)
         # Whoever went on with the run by hand has other networks in its folder.
         is_last = bool(sessions) and sessions[-1].began == finished["date"]
@@ -75,8 +83,8 @@ class Sources:
         result = self.results / name / f"seed_{seed}.json"
         if not result.exists():
             return finished
-        counted = json.loads(read_bytes(result, limit=MOST_TEXT_BYTES))
-        if any(counted.get(key) != finished[key] for key in OF_RESULT):
+        counted = _facts(result)
+        if any(counted[key] != finished[key] for key in OF_RESULT):
             return f"{folder} is another run than {result} is of; {self._fix(name, seed)}"
         return finished
 
@@ -88,6 +96,18 @@ class Sources:
         if not result.exists():
             return fix
         return f"move {result} away, and {fix} anew"
+
+
+def _facts(path: Path) -> Result:
+    """Return what tells a run from all others, by its result or by `write_finished`; a ValueError for other files."""
+    try:
+        tree = json.loads(read_bytes(path, limit=MOST_TEXT_BYTES))
+        facts = {key: str(tree[key]) for key in OF_RESULT if key != "files"}
+        hashes = {str(name): str(sha256) for name, sha256 in tree.get("files", {}).items()}
+        return {**facts, "files": hashes, "seed": tree.get("seed")}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        what = printable(f"{type(error).__name__} {error}")
+        raise ValueError(f"{path}: no record of a row's run: {what}") from error
 
 
 def write_finished(run_folder: Path, result: Result, seed: int) -> None:

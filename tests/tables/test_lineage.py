@@ -233,6 +233,10 @@ def test_a_row_learns_from_the_finished_run_that_its_source_counts_with(tmp_path
     assert is_asked(tmp_path) == {"pole/nothing": {"seed": 1, **RESULT}}
 
 
+def write_another_thing(folder, result):
+    (folder / "row.json").write_text("[1, 2]")
+
+
 def begin_anew(folder, result):
     clear_finished(folder)
 
@@ -259,6 +263,7 @@ def leave_an_empty_folder(folder, result):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (write_another_thing, "row.json: no record of a row's run: TypeError"),
         (begin_anew, "is no finished run of it with seed 1; move .*seed_1.json away"),
         (leave_an_empty_folder, "is no finished run of it with seed 1"),
         (take_another_seeds, "is a run of another seed, other settings or other files"),
