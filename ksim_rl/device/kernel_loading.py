@@ -11,7 +11,7 @@ first line of a burst to stderr; a program with its own display sets another:
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, partial
 
@@ -139,7 +139,9 @@ def load(modules: Iterable[tuple[wp.Module, int | None]], device: torch.device) 
             load_it()
         return
     waiting = [_compilers(workers).submit(load_it) for load_it in loads]
-    wait(waiting)
+    # Waits for each, so that none goes on behind an exception of another.
+    for one in waiting:
+        one.exception()
     for one in waiting:
         one.result()
 

@@ -178,6 +178,7 @@ def test_a_header_that_a_precompiled_one_would_help_out_is_compiled_without(toy,
     assert syntax.begins_with_builtin(header, toy.parent) == begins
 
 
+@pytest.mark.full
 def test_a_precompiled_header_hides_no_error(toy, tmp_path):
     compiler = syntax.COMPILERS[0]
     if shutil.which(compiler) is None:
